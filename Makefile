@@ -1,0 +1,37 @@
+# Two commands matter: `make demo` sets up and runs the main job, `make test` sets up and passes the tests.
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: setup demo test check proof bench lab clean
+
+setup: $(VENV)/.ready
+
+$(VENV)/.ready: pyproject.toml scripts/setup
+	scripts/setup $(VENV)
+	touch $@
+
+demo: setup
+	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/demo
+
+test: setup
+	$(BIN)/pytest -n 2 --dist loadgroup
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+# The long proofs: every kill point, hundreds of virtual nodes, hours of virtual time.
+proof: setup
+	$(BIN)/pytest -m proof
+
+bench: setup
+	$(BIN)/pip install --quiet -e '.[bench]'
+	$(BIN)/python -m benchmarks
+
+lab: setup
+	$(BIN)/meshctl lab up
+
+clean:
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache dist build
