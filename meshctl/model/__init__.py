@@ -1,0 +1,65 @@
+"""The fleet as frozen values: what an inventory means once ranges, groups, defaults and addresses are worked out.
+
+Everything above (lint, resolve, plan, status) reads these and nothing else of the inventory's text, except through
+`Fleet.where`, which tells the file, line and column a value came from.
+"""
+
+from meshctl.model.fleet import (
+    ApplyPolicy,
+    Computer,
+    Fleet,
+    MissingOrigin,
+    Node,
+    NodeState,
+    Operators,
+    Origin,
+    Radio,
+    Robot,
+    Role,
+    SshSettings,
+    SystemSettings,
+    UdpMesh,
+)
+from meshctl.model.hardware import AntennaKind, Band, Firmware, HardwareProfile, RadioHardware
+from meshctl.model.mesh import Backend, Batman, Encryption, Mesh, MeshMode, OperatorParts
+from meshctl.model.release import RELEASES, PackageTool, Release
+from meshctl.model.secret import MASK, Secret, SecretKind, SecretRef
+from meshctl.model.topic import Outbox, Topic, TopicClass
+
+__all__ = [
+    "MASK",
+    "RELEASES",
+    "AntennaKind",
+    "ApplyPolicy",
+    "Backend",
+    "Band",
+    "Batman",
+    "Computer",
+    "Encryption",
+    "Firmware",
+    "Fleet",
+    "HardwareProfile",
+    "Mesh",
+    "MeshMode",
+    "MissingOrigin",
+    "Node",
+    "NodeState",
+    "OperatorParts",
+    "Operators",
+    "Origin",
+    "Outbox",
+    "PackageTool",
+    "Radio",
+    "RadioHardware",
+    "Release",
+    "Robot",
+    "Role",
+    "Secret",
+    "SecretKind",
+    "SecretRef",
+    "SshSettings",
+    "SystemSettings",
+    "Topic",
+    "TopicClass",
+    "UdpMesh",
+]

@@ -1,0 +1,230 @@
+"""Nodes, robots and the fleet that holds them, with the place every value came from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from ipaddress import IPv4Address, IPv4Interface
+from types import MappingProxyType
+
+from meshctl.diagnostics import Position
+from meshctl.model.hardware import HardwareProfile, RadioHardware
+from meshctl.model.mesh import Mesh
+from meshctl.model.release import Release
+from meshctl.model.secret import SecretRef
+from meshctl.model.topic import Topic
+
+
+class Role(Enum):
+    """BASE is the operator's radio, ROBOT rides on a robot, BEACON is dropped behind it."""
+
+    BASE = "base"
+    ROBOT = "robot"
+    BEACON = "beacon"
+
+
+class NodeState(Enum):
+    """CARRIED: in its rack, may be off. DEPLOYED: must answer. SPARE: in the box. LOST and RETIRED: not managed."""
+
+    CARRIED = "carried"
+    DEPLOYED = "deployed"
+    SPARE = "spare"
+    LOST = "lost"
+    RETIRED = "retired"
+
+    @property
+    def is_managed(self) -> bool:
+        return self not in (NodeState.LOST, NodeState.RETIRED)
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where a value came from: `layer` is `node`, `group NAME`, `defaults`, `hardware NAME`, `mesh NAME`, `rule`
+    (computed, e.g. an address) or `built-in`."""
+
+    position: Position
+    layer: str
+
+
+class MissingOrigin(LookupError):
+    """A path that the inventory does not have."""
+
+
+@dataclass(frozen=True, slots=True)
+class Radio:
+    """One radio of a node: its hardware, the mesh it joins (None: switched off) and the drive level UCI gets."""
+
+    hardware: RadioHardware
+    mesh: str | None
+    tx_power_dbm: int
+    mac: str = ""
+
+    @property
+    def name(self) -> str:
+        return self.hardware.name
+
+    @property
+    def conducted_dbm(self) -> float:
+        """Power at the antenna's connector: drive level, amplifier and cable, at most what the box is rated for."""
+        driven = self.tx_power_dbm + self.hardware.amplifier_gain_db
+        return min(driven, self.hardware.rated_power_dbm) - self.hardware.cable_loss_db
+
+    @property
+    def eirp_dbm(self) -> float:
+        return self.conducted_dbm + self.hardware.antenna_gain_dbi
+
+
+@dataclass(frozen=True, slots=True)
+class SshSettings:
+    """How to reach a device: `host` empty means its own address; `jump` names another node to go through."""
+
+    host: str = ""
+    port: int = 22
+    user: str = "root"
+    key_files: tuple[str, ...] = ()
+    jump: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """One radio device. `address` is its management address with the prefix length, in its mesh's network."""
+
+    name: str
+    hostname: str
+    role: Role
+    state: NodeState
+    hardware: HardwareProfile
+    release: Release
+    address: IPv4Interface
+    radios: tuple[Radio, ...]
+    lan_ports: tuple[str, ...]
+    ssh: SshSettings = SshSettings()
+    robot: str = ""
+    label: str = ""
+    serial: str = ""
+    mac: str = ""
+    host_keys: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
+    confirm_window_s: int = 120
+    packages: tuple[str, ...] = ()
+    extra_uci: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    gateway: IPv4Address | None = None
+
+    @property
+    def meshes(self) -> tuple[str, ...]:
+        """The names of the meshes its radios join, each once, in the radios' order."""
+        return tuple(dict.fromkeys(radio.mesh for radio in self.radios if radio.mesh is not None))
+
+
+@dataclass(frozen=True, slots=True)
+class Computer:
+    """A robot's computer, where the udp_mesh daemon runs."""
+
+    address: IPv4Interface
+    ssh: SshSettings = SshSettings()
+    python: str = "python3"
+    arch: str = "x86_64"
+    ros: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """A robot, or the operator's base station (`is_base`): the peer that udp_mesh knows by `name`."""
+
+    name: str
+    nodes: tuple[str, ...]
+    computer: Computer | None = None
+    is_base: bool = False
+    carries: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Operators:
+    """Who may log in: public keys for root on every node; whether passwords stay allowed (they should not)."""
+
+    ssh_keys: tuple[str, ...] = ()
+    password_login: bool = False
+    known_hosts: str = "known_hosts"
+
+
+@dataclass(frozen=True, slots=True)
+class SystemSettings:
+    """OpenWrt's system package, the same on all nodes."""
+
+    timezone: str = "UTC"
+    zonename: str = "UTC"
+    log_size_kib: int = 64
+    log_host: str = ""
+    log_port: int = 514
+    ntp_servers: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ApplyPolicy:
+    """How carefully a fleet is changed: nodes down at once, a canary first, when to stop."""
+
+    max_down: int = 1
+    canary: bool = True
+    stop_after_failures: int = 1
+    quorum: float = 0.8
+    parallel: int = 8
+
+
+@dataclass(frozen=True, slots=True)
+class UdpMesh:
+    """The transport's settings for all robots; `keys` are the live fleet keys, the first seals."""
+
+    port: int = 8700
+    keys: tuple[SecretRef, ...] = ()
+    heartbeat_s: float = 1.0
+    offline_after_s: float = 10.0
+    fragment_bytes: int = 1400
+    window: int | None = None
+    broadcast: bool = True
+    metrics_port: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """Everything an inventory says. Mappings are read-only and in the inventory's order."""
+
+    name: str
+    country: str
+    meshes: Mapping[str, Mesh]
+    hardware: Mapping[str, HardwareProfile]
+    nodes: Mapping[str, Node]
+    robots: Mapping[str, Robot]
+    topics: tuple[Topic, ...]
+    udp_mesh: UdpMesh
+    operators: Operators
+    system: SystemSettings
+    apply: ApplyPolicy
+    origins: Mapping[tuple[str, ...], Origin]
+    files: tuple[str, ...] = ()
+    base: str = ""
+
+    def where(self, *path: str) -> Origin:
+        """The origin of a value, or of the nearest thing around it that was written down.
+
+        `path` is the dotted place in parts: `("nodes", "b03", "radios", "radio0", "tx_power_dbm")`. Raises
+        MissingOrigin when not even its first part is known.
+        """
+        for end in range(len(path), 0, -1):
+            origin = self.origins.get(path[:end])
+            if origin is not None:
+                return origin
+        raise MissingOrigin(".".join(path))
+
+    @property
+    def base_node(self) -> Node | None:
+        """The operator's radio: the first managed node with the role BASE."""
+        return next((node for node in self.managed() if node.role is Role.BASE), None)
+
+    def managed(self) -> Iterator[Node]:
+        """The nodes that are neither lost nor retired, in order."""
+        return (node for node in self.nodes.values() if node.state.is_managed)
+
+    def members(self, mesh: str) -> Iterator[Node]:
+        """The managed nodes with at least one radio in `mesh`."""
+        return (node for node in self.managed() if mesh in node.meshes)

@@ -1,0 +1,85 @@
+"""A mesh: one radio cell that all its radios share, and the routing above it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from ipaddress import IPv4Network
+
+from meshctl.model.hardware import Band
+from meshctl.model.secret import SecretRef
+
+
+class MeshMode(Enum):
+    """What runs below the routing: an IBSS cell or 802.11s without its own forwarding."""
+
+    ADHOC = "adhoc"
+    MESH = "mesh"
+
+
+class Encryption(Enum):
+    NONE = "none"
+    PSK2 = "psk2+ccmp"
+    SAE = "sae"
+
+
+class Backend(Enum):
+    BATMAN = "batman-adv"
+    MESHMERIZE = "meshmerize"
+
+
+@dataclass(frozen=True, slots=True)
+class Batman:
+    """batman-adv's options by their UCI names; `orig_interval_ms` None means: chosen from `Mesh.reconnect_s`."""
+
+    routing_algo: str = "BATMAN_IV"
+    bridge_loop_avoidance: bool = True
+    distributed_arp_table: bool = True
+    aggregated_ogms: bool = True
+    multicast_mode: bool = True
+    fragmentation: bool = True
+    hop_penalty: int = 30
+    orig_interval_ms: int | None = None
+    elp_interval_ms: int | None = None
+    gw_mode: str = "off"
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorParts:
+    """What the operator supplies for meshmerize, which has no public package or schema (openwrt-facts.md section 8):
+    a directory of templates, package files, the service's name, a command that prints its status."""
+
+    templates: str = ""
+    package_files: tuple[str, ...] = ()
+    packages: tuple[str, ...] = ()
+    service: str = ""
+    status_command: str = ""
+    interface: str = ""
+    base: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """`channel` and `htmode` as UCI has them; `network` holds every node's management address; `mtu` is the hard
+    interface's (batman-adv adds 32 bytes to 1500); `reconnect_s` is the wanted time to heal after a cut."""
+
+    name: str
+    ssid: str
+    bssid: str
+    band: Band
+    channel: int
+    network: IPv4Network
+    htmode: str = "HT20"
+    mode: MeshMode = MeshMode.ADHOC
+    encryption: Encryption = Encryption.NONE
+    key: SecretRef | None = None
+    mcast_rate_kbps: int = 12000
+    distance_m: int = 1000
+    beacon_interval_tu: int = 100
+    mtu: int = 1536
+    lan_mtu: int = 1500
+    reconnect_s: float = 5.0
+    min_beacons: int = 0
+    backend: Backend = Backend.BATMAN
+    batman: Batman = Batman()
+    operator_parts: OperatorParts = OperatorParts()

@@ -1,0 +1,20 @@
+"""Files that ship with meshctl: templates, example inventories, lint pages.
+
+In a checkout they stand at the top of the repository, in an installed wheel below the package (pyproject.toml maps
+one to the other).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).resolve().parent
+_SHIPPED = _PACKAGE / "_shipped"
+_CHECKOUT = {"templates": "templates", "inventory": "inventory", "lint": "docs/lint"}
+
+
+def shipped(kind: str) -> Path:
+    """The directory of `kind`: `templates`, `inventory` (the examples) or `lint` (the rules' pages)."""
+    if _SHIPPED.is_dir():
+        return _SHIPPED / kind
+    return _PACKAGE.parent / _CHECKOUT[kind]
