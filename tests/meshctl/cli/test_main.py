@@ -1,0 +1,89 @@
+"""The root command: help imports nothing heavy, errors become a message and an exit code, completion works."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from meshctl import __version__
+from meshctl.cli import main as root
+from meshctl.cli.commands import COMMANDS
+from meshctl.errors import InputError
+
+HEAVY = ("pydantic", "paramiko", "jinja2", "yaml", "cryptography")
+
+
+def run(*arguments: str, **environ: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "meshctl", *arguments],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **environ},
+        check=False,
+    )
+
+
+def test_help_names_every_command_and_imports_nothing_heavy() -> None:
+    script = (
+        "import sys\nfrom meshctl.cli.main import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit as end:\n    code = end.code\n"
+        f"print('HEAVY', [m for m in {HEAVY!r} if m in sys.modules], code)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "HEAVY [] 0"
+    for name in COMMANDS:
+        assert name in done.stdout
+
+
+def test_version_is_the_packages_version() -> None:
+    done = run("--version")
+    assert (done.returncode, done.stdout.strip()) == (0, f"meshctl {__version__}")
+
+
+def test_an_unknown_command_is_a_usage_error_with_a_suggestion() -> None:
+    done = run("lnit")
+    assert done.returncode == 2
+    assert "lnit" in done.stderr
+    assert "lint" in done.stderr
+
+
+@pytest.mark.parametrize("name", list(COMMANDS))
+def test_each_command_has_help_with_an_example(name: str) -> None:
+    """Groups show their commands; a command's own help holds one line that starts with the program's name."""
+    done = run(name, "--help", COLUMNS="200", TERM="dumb")
+    assert done.returncode == 0, done.stderr
+    assert COMMANDS[name].attribute == "app" or f"meshctl {name}" in done.stdout.split("Usage:", 1)[1].split("\n", 1)[1]
+
+
+def test_completion_offers_the_commands(tmp_path: Path) -> None:
+    done = run(_MESHCTL_COMPLETE="complete_bash", COMP_WORDS="meshctl li", COMP_CWORD="1")
+    assert "lint" in done.stdout
+
+
+def test_an_error_is_one_message_with_its_hint_and_exit_code(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails() -> None:
+        raise InputError("fleet.yaml:3:1: expected a mapping, found a list", hint="see `meshctl init`")
+
+    monkeypatch.setattr("meshctl.cli.lint.lint", fails)
+    with pytest.raises(SystemExit) as end:
+        root.main(["lint"])
+    assert end.value.code == 2
+    assert capsys.readouterr().err == (
+        "error: fleet.yaml:3:1: expected a mapping, found a list\nhint: see `meshctl init`\n"
+    )
+
+
+def test_ctrl_c_ends_with_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("meshctl.cli.lint.lint", interrupted)
+    with pytest.raises(SystemExit) as end:
+        root.main(["lint"])
+    assert end.value.code == 130
