@@ -1,0 +1,93 @@
+"""How the network is, for the autonomy to decide by: per peer rates, round trip, loss, queues; counters of the node."""
+
+from dataclasses import dataclass
+
+from udp_mesh.core.settings import Address
+
+
+@dataclass(frozen=True, slots=True)
+class QueueConditions:
+    """What waits for one peer on one priority level, and how that level fares."""
+
+    priority: int
+    messages: int
+    bytes: int
+    oldest_s: float
+    """Age of the message at the head."""
+    starved_s: float
+    """Time in which this level waited while only more urgent ones were sent, since the peer came online."""
+    held_s: float
+    """Time in which this level was held back for other robots' more urgent messages."""
+
+
+@dataclass(frozen=True, slots=True)
+class PeerConditions:
+    """One peer. Rates are over the last second; times in seconds; None where nothing was measured yet."""
+
+    name: str
+    online: bool
+    legacy: bool
+    address: Address | None
+    link: str | None
+    online_since: float | None
+    last_heard: float | None
+    round_trip_s: float | None
+    least_round_trip_s: float | None
+    loss: float
+    """Share of packets lost on the way to the peer, 0 to 1, smoothed."""
+    sent_bits_per_s: float
+    """Wire bits sent to the peer, with IP and UDP headers."""
+    delivered_bits_per_s: float
+    """Payload bits the peer acknowledged."""
+    received_bits_per_s: float
+    """Wire bits received from the peer."""
+    capacity_bits_per_s: float | None
+    """The link's estimated rate for payload, where enough was sent to see it."""
+    window_packets: float
+    in_flight_packets: int
+    retransmitted_packets: int
+    queues: tuple[QueueConditions, ...]
+    outbox_messages: int
+    outbox_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Counters:
+    """Totals since the node's start."""
+
+    datagrams_sent: int = 0
+    bytes_sent: int = 0
+    datagrams_received: int = 0
+    bytes_received: int = 0
+    heartbeats_sent: int = 0
+    acknowledgements_sent: int = 0
+    fragments_sent: int = 0
+    fragments_retransmitted: int = 0
+    fragments_received: int = 0
+    duplicates_received: int = 0
+    messages_sent: int = 0
+    messages_delivered: int = 0
+    messages_expired: int = 0
+    messages_peer_lost: int = 0
+    messages_received: int = 0
+    dropped_malformed: int = 0
+    dropped_unauthenticated: int = 0
+    dropped_replayed: int = 0
+    dropped_unproven: int = 0
+    dropped_over_limit: int = 0
+    events_dropped: int = 0
+    repairs_asked: int = 0
+    repairs_sent: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """A snapshot at `now`."""
+
+    now: float
+    name: str
+    peers: tuple[PeerConditions, ...]
+    counters: Counters
+    partial_bytes: int
+    queued_bytes: int
+    repair_bytes: int

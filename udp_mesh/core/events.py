@@ -1,0 +1,169 @@
+"""What a node tells its driver, in the order it happened: peers come and go, messages arrive, sent messages end.
+
+Every reliable message ends, per destination, in exactly one of `MessageDelivered`, `MessageExpired`, `MessagePeerLost`.
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import NewType
+
+from udp_mesh.core.settings import Address
+
+MessageId = NewType("MessageId", int)
+"""Number of one `Node.send`, unique within a node's life; its outcomes carry it once per destination."""
+
+
+class RejectReason(Enum):
+    """Why `Node.send` took nothing on."""
+
+    UNKNOWN_TOPIC = "unknown topic"
+    UNKNOWN_PEER = "unknown peer"
+    TOO_LARGE = "too large"
+    QUEUE_FULL = "queue full"
+    RATE_LIMIT = "rate limit"
+    CLOSED = "closed"
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """`Node.send` refused the message; nothing of it is kept and no outcome follows."""
+
+    reason: RejectReason
+    detail: str
+
+
+class ExpiryReason(Enum):
+    """Why an accepted message was given up."""
+
+    DEADLINE = "deadline"
+    SUPERSEDED = "superseded by a newer one"
+    REFUSED = "refused by the receiver"
+    CLOSED = "node closed"
+    OUTBOX_FULL = "outbox full"
+
+
+@dataclass(frozen=True, slots=True)
+class PeerOnline:
+    """A peer proved itself alive for the first time, or after having been offline."""
+
+    peer: str
+    address: Address
+    link: str
+
+
+@dataclass(frozen=True, slots=True)
+class PeerOffline:
+    """Nothing came from the peer for `offline_s`, or it said good-bye (`left`)."""
+
+    peer: str
+    left: bool
+
+
+@dataclass(frozen=True, slots=True)
+class PeerRestarted:
+    """The peer runs anew: whatever it had not finished receiving is being sent again."""
+
+    peer: str
+
+
+@dataclass(frozen=True, slots=True)
+class PeerAddressChanged:
+    """The same run of the same peer is now reached elsewhere."""
+
+    peer: str
+    old: Address
+    new: Address
+    link: str
+
+
+@dataclass(frozen=True, slots=True)
+class NameConflict:
+    """Two running nodes use one name (ours, when `own`). Neither is believed over the other."""
+
+    name: str
+    first: Address
+    second: Address
+    own: bool
+
+
+@dataclass(frozen=True, slots=True)
+class KeyMismatch:
+    """Datagrams come from here that none of our keys opens (reported at most once a minute per address)."""
+
+    address: Address
+    link: str
+
+
+@dataclass(frozen=True, slots=True)
+class Incompatible:
+    """A peer speaks only versions that we do not (`versions` is its lowest and highest)."""
+
+    peer: str
+    address: Address
+    versions: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class MessageReceived:
+    """A complete message. `payload` is as given to the sender's `send`."""
+
+    source: str
+    topic: str
+    type_name: str
+    payload: bytes
+    priority: int
+    broadcast: bool
+
+
+@dataclass(frozen=True, slots=True)
+class MessageDelivered:
+    """The destination holds the whole message. `latency_s` is from `send` to knowing it."""
+
+    message_id: MessageId
+    peer: str
+    topic: str
+    latency_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class MessageExpired:
+    """The message was given up for this destination before it was delivered."""
+
+    message_id: MessageId
+    peer: str
+    topic: str
+    reason: ExpiryReason
+
+
+@dataclass(frozen=True, slots=True)
+class MessagePeerLost:
+    """The destination stayed silent for `peer_lost_s` (or left) and no outbox keeps the message."""
+
+    message_id: MessageId
+    peer: str
+    topic: str
+
+
+@dataclass(frozen=True, slots=True)
+class TopicStarved:
+    """Messages of the topic have waited this long because more urgent ones keep leaving first."""
+
+    peer: str
+    topic: str
+    waited_s: float
+
+
+Event = (
+    PeerOnline
+    | PeerOffline
+    | PeerRestarted
+    | PeerAddressChanged
+    | NameConflict
+    | KeyMismatch
+    | Incompatible
+    | MessageReceived
+    | MessageDelivered
+    | MessageExpired
+    | MessagePeerLost
+    | TopicStarved
+)

@@ -1,0 +1,76 @@
+"""A node: bytes and the time in; datagrams, events and one timer out. It never waits, reads no clock and opens nothing.
+
+A driver repeats: `receive` what arrived, `handle_timer` when `next_timer` has come, then `datagrams_to_send` until it
+returns none, then `next_event` until None.
+"""
+
+from udp_mesh.core.conditions import Conditions
+from udp_mesh.core.events import Event, MessageId, Rejected
+from udp_mesh.core.seams import Datagram, RandomSource, Store
+from udp_mesh.core.settings import Address, LinkInfo, Settings
+
+
+class Node:
+    """One run of one named node. `boot_id` (16 random bytes, never used before) tells this run from all others."""
+
+    def __init__(
+        self, settings: Settings, *, boot_id: bytes, rng: RandomSource, now: float, store: Store | None = None
+    ) -> None:
+        """`now` is seconds on any clock that never runs backwards. `store` holds outboxes on disk (None: in memory)."""
+        raise NotImplementedError
+
+    def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
+        """Take in one datagram. Bad bytes are counted and dropped; this never raises because of what was received."""
+        raise NotImplementedError
+
+    def datagrams_to_send(self, now: float, *, max_bytes: int | None = None) -> list[Datagram]:
+        """The datagrams that leave now, most urgent first, about 64 KiB at most per call (`max_bytes`, if given).
+
+        Call again until the list is empty. With `max_bytes` a driver whose socket is full asks for less.
+        """
+        raise NotImplementedError
+
+    def next_timer(self) -> float | None:
+        """When `handle_timer` wants to be called next (None: never). Cheap; may be in the past."""
+        raise NotImplementedError
+
+    def handle_timer(self, now: float) -> None:
+        """Do what is due at `now`. Calling early or late is harmless."""
+        raise NotImplementedError
+
+    def next_event(self) -> Event | None:
+        """The oldest event not yet fetched."""
+        raise NotImplementedError
+
+    def send(
+        self, topic: str, payload: bytes, *, destination: str | None = None, now: float, type_name: str = ""
+    ) -> MessageId | Rejected:
+        """Accept a message for one peer, or (None) for the topic's destinations, or for all.
+
+        Per destination of a reliable topic exactly one outcome event follows. A message to all that fits one datagram
+        is broadcast and has no outcome. A peer never heard of is `UNKNOWN_PEER` unless an outbox may hold the message.
+        """
+        raise NotImplementedError
+
+    def link_up(self, link: LinkInfo, now: float) -> None:
+        """A network attachment appeared, or changed its addresses or MTU (same name)."""
+        raise NotImplementedError
+
+    def link_down(self, name: str, now: float) -> None:
+        """The attachment is gone; peers reached over it are reached over others as they are heard there."""
+        raise NotImplementedError
+
+    def apply(self, settings: Settings, now: float) -> list[str]:
+        """Change topics, window, rates, limits, keys and neighbours; returns one line per change made.
+
+        Drops no accepted message. A changed name or port raises ValueError: these need a new run.
+        """
+        raise NotImplementedError
+
+    def conditions(self, now: float) -> Conditions:
+        """A snapshot for the autonomy, the status page and the metrics."""
+        raise NotImplementedError
+
+    def close(self, now: float) -> None:
+        """Say good-bye: fetch the last datagrams and events after it. Reliable messages still open end as expired."""
+        raise NotImplementedError

@@ -1,0 +1,65 @@
+"""What the driver hands to a node besides bytes and the time, and what the node hands back to be sent."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from udp_mesh.core.settings import Address
+
+
+@dataclass(frozen=True, slots=True)
+class Datagram:
+    """One UDP datagram to send on a link. `destination` None means the link's broadcast address.
+
+    Consecutive bulk datagrams to one destination have one size (the last may be shorter), ready for segmentation
+    offload.
+    An `urgent` one is worth its own system call if the driver batches.
+    """
+
+    link: str
+    destination: Address | None
+    data: bytes
+    urgent: bool
+
+
+class RandomSource(Protocol):
+    """The part of `random.Random` that a node draws from."""
+
+    def random(self) -> float:
+        """A float in [0, 1)."""
+        ...
+
+    def getrandbits(self, k: int, /) -> int:
+        """An integer of k random bits."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class StoredMessage:
+    """One message held for one peer by a topic whose outbox is on disk.
+
+    `key` is unique within the store and orders messages by age. `wall_deadline` is not kept: a deadline's life restarts
+    when the node does, so `remaining_s` is what was left when it was stored.
+    """
+
+    key: int
+    peer: str
+    topic: str
+    type_name: str
+    payload: bytes
+    remaining_s: float | None
+
+
+class Store(Protocol):
+    """Where outboxes on disk live; the daemon's is a directory. Calls are few and synchronous."""
+
+    def put(self, message: StoredMessage) -> None:
+        """Keep the message until `remove`; it survives a crash once this returns."""
+        ...
+
+    def remove(self, key: int) -> None:
+        """Forget the message; unknown keys are ignored."""
+        ...
+
+    def load(self) -> list[StoredMessage]:
+        """Everything kept, oldest first; called once, when a node starts."""
+        ...
