@@ -1,0 +1,172 @@
+"""A channel: all datagrams from one boot of a node to one boot of another, or to all.
+
+1. Both ends derive the channel's key from the fleet key and the two boot ids (HKDF-Expand, RFC 5869). Boot ids are random per
+   process, so a restarted sender or receiver has new keys: packet numbers may start at 0 again without ever repeating a
+   nonce, and packets recorded for an earlier boot open nowhere.
+2. The sender seals: header | AES-128-GCM(key, nonce = salt ‖ packet number, frames, associated data = header).
+3. The receiver checks the header's hash (long header), the replay window, and only then the cipher.
+
+A channel to all is keyed by the sender's boot alone, so its packets can be replayed to a node that has just started and has no
+window yet: accept them only from a boot that has proved itself in a channel of its own (an INTRODUCTION or DATA datagram bound
+to our boot), and raise the window's floor to that heartbeat's `broadcast_number`.
+"""
+
+from __future__ import annotations
+
+import hmac
+import struct
+from typing import NamedTuple
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+from udp_mesh.crypto.keys import Key
+from udp_mesh.crypto.replay import ReplayWindow
+from udp_mesh.wire.errors import DecodeError
+from udp_mesh.wire.header import (
+    CHECK_BYTES,
+    LONG_HEADER_BYTES,
+    SEAL_TAG_BYTES,
+    SHORT_HEADER_BYTES,
+    Kind,
+    LongHeader,
+    encode_long,
+    encode_short,
+)
+from udp_mesh.wire.limits import BOOT_ID_BYTES
+
+MAX_PACKET_NUMBER = (1 << 48) - 1
+"""An acknowledgement names a packet in 48 bits: 89 years at 100,000 packets a second."""
+
+SHORT_OVERHEAD_BYTES = SHORT_HEADER_BYTES + SEAL_TAG_BYTES
+"""23 B: what a BROADCAST or DATA datagram adds to its frames."""
+LONG_OVERHEAD_BYTES = LONG_HEADER_BYTES + SEAL_TAG_BYTES
+"""49 B: what a HELLO or INTRODUCTION datagram adds to its frames."""
+
+TO_ALL = bytes(BOOT_ID_BYTES)
+"""Stands for the receiver's boot in a channel to all."""
+
+_NONCE = struct.Struct(">4sQ")
+
+
+class OpenError(DecodeError):
+    """The datagram does not open: forged, damaged, or for another boot."""
+
+
+class ReplayError(OpenError):
+    """The datagram's packet number was already seen, or is too old to know."""
+
+
+class Opened(NamedTuple):
+    number: int
+    """Full packet number."""
+    frames: bytes
+    """The encoded frames, for `codec.decode`."""
+
+
+class _ChannelKey:
+    """What both ends derive: cipher, nonce salt and the public tag."""
+
+    __slots__ = ("cipher", "salt", "tag")
+
+    def __init__(self, key: Key, sender_boot: bytes, receiver_boot: bytes) -> None:
+        if len(sender_boot) != BOOT_ID_BYTES or len(receiver_boot) != BOOT_ID_BYTES:
+            raise ValueError(f"a boot id has {BOOT_ID_BYTES} bytes")
+        material = hmac.digest(key.prk, b"channel" + sender_boot + receiver_boot + b"\x01", "sha256")
+        self.cipher = AESGCM(material[:16])
+        self.salt = material[16:20]
+        self.tag = int.from_bytes(material[20:22], "big")
+
+
+class SendChannel:
+    """Seals; owns the packet numbers. `receiver_boot=TO_ALL` for the channel to all."""
+
+    __slots__ = ("_cipher", "_long", "_salt", "_short", "boot_id", "key", "next_number", "tag")
+
+    def __init__(self, key: Key, sender_boot: bytes, receiver_boot: bytes = TO_ALL) -> None:
+        derived = _ChannelKey(key, sender_boot, receiver_boot)
+        self.key = key
+        self.boot_id = sender_boot
+        self.tag = derived.tag
+        self.next_number = 0
+        """The packet number of the next datagram sealed."""
+        self._cipher = derived.cipher
+        self._salt = derived.salt
+        to_all = receiver_boot == TO_ALL
+        self._short = Kind.BROADCAST if to_all else Kind.DATA
+        self._long = Kind.HELLO if to_all else Kind.INTRODUCTION
+
+    def seal(self, frames: bytes | bytearray | memoryview) -> tuple[int, bytes]:
+        """Packet number and datagram with the short header (23 B more than the frames)."""
+        number = self._take_number()
+        header = encode_short(self._short, self.tag, number)
+        return number, header + self._cipher.encrypt(_NONCE.pack(self._salt, number), frames, header)
+
+    def seal_long(self, frames: bytes | bytearray | memoryview) -> tuple[int, bytes]:
+        """Packet number and datagram with the long header (49 B more): for who may not know this boot yet."""
+        number = self._take_number()
+        clear = encode_long(self._long, self.key.key_id, self.boot_id, number)
+        header = clear + self.key.check(clear)
+        return number, header + self._cipher.encrypt(_NONCE.pack(self._salt, number), frames, header)
+
+    def _take_number(self) -> int:
+        number = self.next_number
+        if number > MAX_PACKET_NUMBER:
+            raise OverflowError("packet numbers of this channel are used up; the node needs a new boot id")
+        self.next_number = number + 1
+        return number
+
+
+class ReceiveChannel:
+    """Opens the datagrams of one sender boot to us (or to all), each packet number once."""
+
+    __slots__ = ("_cipher", "_salt", "key", "tag", "window")
+
+    def __init__(self, key: Key, sender_boot: bytes, receiver_boot: bytes = TO_ALL) -> None:
+        derived = _ChannelKey(key, sender_boot, receiver_boot)
+        self.key = key
+        self.tag = derived.tag
+        """First two derived bytes: short headers carry it; several channels may share one, try each."""
+        self.window = ReplayWindow()
+        self._cipher = derived.cipher
+        self._salt = derived.salt
+
+    def open(self, data: bytes | bytearray | memoryview, number_low: int) -> Opened:
+        """Opens a datagram with a short header; `number_low` is that header's. Raises `ReplayError` or `OpenError`."""
+        number = expand_number(number_low, self.window.largest)
+        return self._open(memoryview(data), number, SHORT_HEADER_BYTES)
+
+    def open_long(self, data: bytes | bytearray | memoryview, header: LongHeader) -> Opened:
+        """Opens a datagram with a long header whose check has passed (`check_long`)."""
+        if header.number > MAX_PACKET_NUMBER:
+            raise OpenError(f"packet number: expected at most 48 bits, found {header.number}")
+        return self._open(memoryview(data), header.number, LONG_HEADER_BYTES)
+
+    def _open(self, view: memoryview, number: int, header_bytes: int) -> Opened:
+        window = self.window
+        if not window.would_accept(number):
+            raise ReplayError(f"packet {number} was already seen or is too old")
+        try:
+            frames = self._cipher.decrypt(_NONCE.pack(self._salt, number), view[header_bytes:], view[:header_bytes])
+        except InvalidTag as error:
+            raise OpenError(f"packet {number} does not open") from error
+        window.accept(number)
+        return Opened(number, frames)
+
+
+def check_long(key: Key, data: bytes | bytearray | memoryview, header: LongHeader) -> None:
+    """Raises `OpenError` unless the long header was written by a holder of `key` (one short hash, no key derived)."""
+    clear = memoryview(data)[: LONG_HEADER_BYTES - CHECK_BYTES]
+    if not hmac.compare_digest(key.check(clear), header.check):
+        raise OpenError("long header: its check does not match")
+
+
+def expand_number(low: int, largest: int) -> int:
+    """The full packet number with these low 32 bits that lies nearest to the number expected next (as RFC 9000, A.3)."""
+    expected = largest + 1
+    candidate = (expected & ~0xFFFFFFFF) | low
+    if candidate <= expected - 0x80000000:
+        return candidate + 0x100000000
+    if candidate > expected + 0x80000000 and candidate >= 0x100000000:
+        return candidate - 0x100000000
+    return candidate

@@ -1,0 +1,104 @@
+"""The fleet's keys: 32 secret bytes each, one or two live at a time; the first one seals, all of them open.
+
+Rotation without a gap: every node gets (old, new), then (new, old), then (new,). `Keyring.unkeyed()` uses a key everyone
+knows: the same format and the same code, no protection; nodes with it cannot talk to nodes with a real key, and say so.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import hmac
+from dataclasses import dataclass, field
+
+from udp_mesh.wire.errors import DecodeError
+from udp_mesh.wire.header import CHECK_BYTES
+
+SECRET_BYTES = 32
+KEY_ID_BYTES = 4
+MAX_LIVE_KEYS = 2
+"""More would multiply what a forged datagram can make us compute; rotation needs two."""
+
+_EXTRACT_SALT = b"udp_mesh wire 1 fleet key"
+_UNKEYED_SECRET = hashlib.sha256(b"udp_mesh: no key, no protection").digest()
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Key:
+    """One fleet key. Its secret never appears in `repr`, messages or logs; `key_id` does."""
+
+    secret: bytes
+    prk: bytes = field(init=False, compare=False)
+    """HKDF-Extract of the secret (RFC 5869), from which every channel's key is expanded."""
+    key_id: bytes = field(init=False, compare=False)
+    """4 public bytes by which a peer names the key it used."""
+    check_key: bytes = field(init=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if len(self.secret) != SECRET_BYTES:
+            raise ValueError(f"a fleet key has {SECRET_BYTES} bytes, this one {len(self.secret)}")
+        prk = hmac.digest(_EXTRACT_SALT, self.secret, "sha256")
+        object.__setattr__(self, "prk", prk)
+        object.__setattr__(self, "key_id", hmac.digest(prk, b"key id", "sha256")[:KEY_ID_BYTES])
+        object.__setattr__(self, "check_key", hmac.digest(prk, b"header check", "sha256"))
+
+    def __repr__(self) -> str:
+        return f"Key({self.key_id.hex()})"
+
+    @classmethod
+    def parse(cls, text: str) -> Key:
+        """A key from 64 hexadecimal digits or 44 characters of base64; raises ValueError (without the text)."""
+        compact = text.strip()
+        try:
+            if len(compact) == 2 * SECRET_BYTES:
+                return cls(bytes.fromhex(compact))
+            return cls(base64.b64decode(compact, validate=True))
+        except (ValueError, binascii.Error) as error:
+            raise ValueError(
+                f"expected a key of {SECRET_BYTES} bytes as 64 hexadecimal digits or 44 characters of base64, "
+                f"found {len(compact)} characters"
+            ) from error
+
+    def check(self, header: bytes | memoryview) -> bytes:
+        """The 4-byte keyed hash behind a long header (RFC 7693): cheap, and enough to drop invented senders."""
+        return hashlib.blake2s(header, key=self.check_key, digest_size=CHECK_BYTES).digest()
+
+
+class UnknownKeyError(DecodeError):
+    """A datagram sealed with a key that is not live here; `key_id` is what it names (unauthenticated)."""
+
+    def __init__(self, key_id: bytes) -> None:
+        super().__init__(f"sealed with key {key_id.hex()}, which is not live here")
+        self.key_id = key_id
+
+
+@dataclass(frozen=True, slots=True)
+class Keyring:
+    """The live keys, the sealing one first."""
+
+    keys: tuple[Key, ...]
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.keys) <= MAX_LIVE_KEYS:
+            raise ValueError(f"expected 1 to {MAX_LIVE_KEYS} live keys, found {len(self.keys)}")
+
+    @classmethod
+    def unkeyed(cls) -> Keyring:
+        """The key everyone knows: for the bench only."""
+        return cls((Key(_UNKEYED_SECRET),))
+
+    @property
+    def is_unkeyed(self) -> bool:
+        return any(key.secret == _UNKEYED_SECRET for key in self.keys)
+
+    @property
+    def sealing(self) -> Key:
+        return self.keys[0]
+
+    def find(self, key_id: bytes) -> Key:
+        """The live key of this id; raises `UnknownKeyError`."""
+        for key in self.keys:
+            if key.key_id == key_id:
+                return key
+        raise UnknownKeyError(key_id)

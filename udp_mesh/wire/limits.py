@@ -1,0 +1,58 @@
+"""Every cap of the wire format, with the attack or overload it bounds.
+
+A decoder raises `DecodeError` on anything past its cap, before it allocates. Sizes are bytes unless the name says otherwise.
+"""
+
+MAX_DATAGRAM_BYTES = 65_507
+"""Largest UDP payload over IPv4: nothing larger can arrive, nothing larger is built."""
+
+MAX_FRAMES_PER_DATAGRAM = 64
+"""Bounds the work one datagram can cause (a flood of two-byte frames); real datagrams carry one to ten."""
+
+MAX_NAME_BYTES = 63
+"""A node's name: fits the fielded 64-byte Pascal string, and bounds the memory a heartbeat can pin per peer."""
+
+MAX_TOPIC_BYTES = 255
+"""A topic's name: ROS names stay below; bounds the memory of the announced-topic table."""
+
+MAX_TYPE_BYTES = 255
+"""A topic's type name (`pkg/Type`, optionally with a checksum): same reason as MAX_TOPIC_BYTES."""
+
+MAX_REASON_BYTES = 255
+"""Free text in Bye and Refused: shown to a person, never interpreted."""
+
+MAX_MESSAGE_BYTES = 1 << 30
+"""1 GiB: the largest message the format can announce. Nodes configure less; bounds what a single head can make a peer reserve."""
+
+MAX_FRAGMENTS_PER_MESSAGE = 1 << 21
+"""2 Mi fragments (1 GiB at 512 B each). The fielded code allocated straight from a 32-bit field: this is the cap it lacked."""
+
+MAX_HEARD = 96
+"""Neighbours a heartbeat lists as heard (8 B each, 768 B): keeps a heartbeat in one datagram whatever the team's size."""
+
+MAX_WAITING = 16
+"""One entry per priority level, and there are 16 levels: a longer list is nonsense."""
+
+MAX_IDS = 256
+"""Message ids in one Delivered or Cancel (4 B each): bounds the lookups one datagram can cause."""
+
+MAX_RANGES = 64
+"""Ranges of missing fragments in one Nack: bounds the repairs one datagram can ask for."""
+
+ACK_BITMAP_BITS = 256
+"""Packets an acknowledgement covers below its largest number (32 B at most, 0 B where nothing is missing)."""
+
+PRIORITY_LEVELS = 16
+"""Priorities 0 (most urgent) to 15: four bits on the wire."""
+
+BOOT_ID_BYTES = 16
+"""A node's random name for one run of its process: 128 bits never repeat in a fleet's life."""
+
+HEARD_TAG_BYTES = 8
+"""Leading bytes of a boot id by which a heartbeat says whom it hears: 64 bits do not collide within a team."""
+
+MAX_LEGACY_FRAGMENT_BYTES = 1300
+"""Fragment payload of the fielded format."""
+
+MAX_LEGACY_FRAGMENTS = 1 << 16
+"""Fragments of one fielded message (85 MB): the fielded code took any 32-bit number and allocated it."""
