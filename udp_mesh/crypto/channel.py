@@ -1,14 +1,14 @@
 """A channel: all datagrams from one boot of a node to one boot of another, or to all.
 
-1. Both ends derive the channel's key from the fleet key and the two boot ids (HKDF-Expand, RFC 5869). Boot ids are random per
-   process, so a restarted sender or receiver has new keys: packet numbers may start at 0 again without ever repeating a
-   nonce, and packets recorded for an earlier boot open nowhere.
+1. Both ends derive the channel's key from the fleet key and the two boot ids (HKDF-Expand, RFC 5869). Boot ids are
+   random per process, so a restarted sender or receiver has new keys: packet numbers may start at 0 again without
+   ever repeating a nonce, and packets recorded for an earlier boot open nowhere.
 2. The sender seals: header | AES-128-GCM(key, nonce = salt ‖ packet number, frames, associated data = header).
 3. The receiver checks the header's hash (long header), the replay window, and only then the cipher.
 
-A channel to all is keyed by the sender's boot alone, so its packets can be replayed to a node that has just started and has no
-window yet: accept them only from a boot that has proved itself in a channel of its own (an INTRODUCTION or DATA datagram bound
-to our boot), and raise the window's floor to that heartbeat's `broadcast_number`.
+A channel to all is keyed by the sender's boot alone, so its packets can be replayed to a node that has just started
+and has no window yet: accept them only from a boot that has proved itself in a channel of its own (an INTRODUCTION or
+DATA datagram bound to our boot), and raise the window's floor to that heartbeat's `broadcast_number`.
 """
 
 from __future__ import annotations
@@ -162,7 +162,8 @@ def check_long(key: Key, data: bytes | bytearray | memoryview, header: LongHeade
 
 
 def expand_number(low: int, largest: int) -> int:
-    """The full packet number with these low 32 bits that lies nearest to the number expected next (as RFC 9000, A.3)."""
+    """The full packet number with these low 32 bits that lies nearest to the number expected next (as RFC 9000,
+    A.3)."""
     expected = largest + 1
     candidate = (expected & ~0xFFFFFFFF) | low
     if candidate <= expected - 0x80000000:

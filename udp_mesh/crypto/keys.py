@@ -1,7 +1,8 @@
 """The fleet's keys: 32 secret bytes each, one or two live at a time; the first one seals, all of them open.
 
-Rotation without a gap: every node gets (old, new), then (new, old), then (new,). `Keyring.unkeyed()` uses a key everyone
-knows: the same format and the same code, no protection; nodes with it cannot talk to nodes with a real key, and say so.
+Rotation without a gap: every node gets (old, new), then (new, old), then (new,). `Keyring.unkeyed()` uses a key
+everyone knows: the same format and the same code, no protection; nodes with it cannot talk to nodes with a real key,
+and say so.
 """
 
 from __future__ import annotations

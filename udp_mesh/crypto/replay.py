@@ -1,4 +1,5 @@
-"""Which packet numbers were already seen: the sliding window of RFC 6479 (blocks in a ring, so that nothing is shifted).
+"""Which packet numbers were already seen: the sliding window of RFC 6479 (blocks in a ring, so that nothing is
+shifted).
 
 `would_accept(number)` before the cipher (a replay costs no decryption), `accept(number)` after it succeeded.
 """
@@ -8,11 +9,13 @@ from __future__ import annotations
 BLOCK_BITS = 64
 WINDOW_BLOCKS = 64
 WINDOW_PACKETS = (WINDOW_BLOCKS - 1) * BLOCK_BITS
-"""4,032 packets: at a gigabit of full datagrams 45 ms of reordering, at 10 Mbit/s over 4 s; 512 B of memory per channel."""
+"""4,032 packets: at a gigabit of full datagrams 45 ms of reordering, at 10 Mbit/s over 4 s; 512 B of memory per
+channel."""
 
 
 class ReplayWindow:
-    """Equals a plain set of numbers, except that everything older than the window (or below its floor) counts as seen."""
+    """Equals a plain set of numbers, except that everything older than the window (or below its floor) counts as
+    seen."""
 
     __slots__ = ("_blocks", "_floor", "_top")
 

@@ -1,7 +1,7 @@
 """A reader that cannot run past its slice, and the text checks every decoder shares.
 
-Big-endian integers, length-prefixed text and bytes. Every read names what it wanted, so that an error says it. The idea is
-that of dnspython's `wirebase`: a decoder built on it can only return a value or raise `DecodeError`.
+Big-endian integers, length-prefixed text and bytes. Every read names what it wanted, so that an error says it. The
+idea is that of dnspython's `wirebase`: a decoder built on it can only return a value or raise `DecodeError`.
 """
 
 from __future__ import annotations

@@ -1,12 +1,14 @@
 """The frames: what one node says to another inside a sealed datagram.
 
-A datagram carries one or more frames. Discovery: `Heartbeat` (to all, or to one peer as an introduction), `Bye`. Messages:
-`TopicAnnounce` gives a number to a topic, `Fragment` carries a piece of a message (the first piece carries the `MessageHead`),
-`Delivered`, `Refused` and `Cancel` end it. Reliability: `Ack` answers packets, `Nack` asks for missing pieces of a broadcast.
-`Ping` and `Pong` measure. Fields that come from the wire have already passed the caps of `limits`; a constructor checks nothing.
+A datagram carries one or more frames. Discovery: `Heartbeat` (to all, or to one peer as an introduction), `Bye`.
+Messages: `TopicAnnounce` gives a number to a topic, `Fragment` carries a piece of a message (the first piece carries
+the `MessageHead`), `Delivered`, `Refused` and `Cancel` end it. Reliability: `Ack` answers packets, `Nack` asks for
+missing pieces of a broadcast. `Ping` and `Pong` measure. Fields that come from the wire have already passed the caps
+of `limits`; a constructor checks nothing.
 
-Numbers: a *packet number* counts the datagrams of one channel (sender's boot to one receiver's boot, or to all), starts at 0
-and is never used twice; a *message id* counts the messages of one such channel and is the same in every retransmission.
+Numbers: a *packet number* counts the datagrams of one channel (sender's boot to one receiver's boot, or to all),
+starts at 0 and is never used twice; a *message id* counts the messages of one such channel and is the same in every
+retransmission.
 """
 
 from __future__ import annotations
@@ -48,7 +50,8 @@ class Heartbeat:
     features: int
     """Bits of `Feature`."""
     interval_ms: int
-    """When to expect the next one at the latest, 1 to 65,535 ms: heartbeats grow sparser where traffic proves the link."""
+    """When to expect the next one at the latest, 1 to 65,535 ms: heartbeats grow sparser where traffic proves the
+    link."""
     known_peers: int
     """Peers online at the speaker."""
     send_rate: int
@@ -77,7 +80,7 @@ class MessageFlag(IntFlag):
 
 @dataclass(frozen=True, slots=True)
 class MessageHead:
-    """What the first fragment (index 0) says about its message."""
+    """What the first fragment (position 0) says about its message."""
 
     size_bytes: int
     """Bytes of the whole message as sent (after compression)."""
@@ -98,12 +101,12 @@ class Fragment(NamedTuple):
 
     message_id: int
     """32 bits, counts the messages of this channel (or the broadcast channel, see `broadcast_id`)."""
-    index: int
+    position: int
     """0 to fragments - 1."""
     payload: Payload
     """The bytes; a decoded fragment's is a view into its datagram."""
     head: MessageHead | None = None
-    """Present exactly where index is 0."""
+    """Present exactly where position is 0."""
     ack_now: bool = False
     """Acknowledge at once, do not wait to batch (urgent messages, the last fragments in flight)."""
     broadcast_id: bool = False
@@ -164,7 +167,7 @@ class Nack:
 
     message_id: int
     ranges: tuple[tuple[int, int], ...] = ()
-    """(first index, count >= 1) each."""
+    """(first position, count >= 1) each."""
 
 
 @dataclass(frozen=True, slots=True)

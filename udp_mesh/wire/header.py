@@ -7,8 +7,8 @@ version, bits 3-0 the kind. Then either
   key id (4), sender's boot id (16), packet number (8), check (4); or
 - the short header (7 B: BROADCAST, DATA): channel tag (2), low 32 bits of the packet number (4).
 
-The check is a short keyed hash of the long header: a flood of invented senders is dropped before any key is derived for them.
-The tag is derived from the channel's key, so that only who holds the key can link it to a node.
+The check is a short keyed hash of the long header: a flood of invented senders is dropped before any key is derived
+for them. The tag is derived from the channel's key, so that only who holds the key can link it to a node.
 """
 
 from __future__ import annotations
@@ -83,20 +83,21 @@ def encode_long(kind: Kind, key_id: bytes, boot_id: bytes, number: int) -> bytes
 def parse_header(data: bytes | bytearray | memoryview) -> LongHeader | ShortHeader:
     """The header of a datagram.
 
-    Raises `UnknownVersionError` for another version, `DecodeError` for anything that is not ours or too short to be sealed.
+    Raises `UnknownVersionError` for another version, `DecodeError` for anything that is not ours or too short to be
+    sealed.
     """
     size = len(data)
     if size < SHORT_HEADER_BYTES + SEAL_TAG_BYTES:
         raise DecodeError(f"datagram: expected at least {SHORT_HEADER_BYTES + SEAL_TAG_BYTES} bytes, found {size}")
     first = data[0]
-    if first == _DATA_BYTE or first == _BROADCAST_BYTE:
+    if first in (_DATA_BYTE, _BROADCAST_BYTE):
         _, tag, low = _SHORT.unpack_from(data)
         return ShortHeader(Kind.DATA if first == _DATA_BYTE else Kind.BROADCAST, tag, low)
     if first < MARK:
         raise DecodeError(f"datagram: expected the mark bit, found first byte {first:#04x}")
     if (first >> 4) & 7 != VERSION:
         raise UnknownVersionError((first >> 4) & 7)
-    if first != _HELLO_BYTE and first != _INTRODUCTION_BYTE:
+    if first not in (_HELLO_BYTE, _INTRODUCTION_BYTE):
         raise DecodeError(f"datagram: expected a kind 0-3, found {first & 15}")
     if size < LONG_HEADER_BYTES + SEAL_TAG_BYTES or size > MAX_DATAGRAM_BYTES:
         raise DecodeError(f"datagram: expected {LONG_HEADER_BYTES + SEAL_TAG_BYTES} bytes or more, found {size}")

@@ -1,6 +1,7 @@
 """Every cap of the wire format, with the attack or overload it bounds.
 
-A decoder raises `DecodeError` on anything past its cap, before it allocates. Sizes are bytes unless the name says otherwise.
+A decoder raises `DecodeError` on anything past its cap, before it allocates. Sizes are bytes unless the name says
+otherwise.
 """
 
 MAX_DATAGRAM_BYTES = 65_507
@@ -22,13 +23,16 @@ MAX_REASON_BYTES = 255
 """Free text in Bye and Refused: shown to a person, never interpreted."""
 
 MAX_MESSAGE_BYTES = 1 << 30
-"""1 GiB: the largest message the format can announce. Nodes configure less; bounds what a single head can make a peer reserve."""
+"""1 GiB: the largest message the format can announce. Nodes configure less; bounds what a single head can make a peer
+reserve."""
 
 MAX_FRAGMENTS_PER_MESSAGE = 1 << 21
-"""2 Mi fragments (1 GiB at 512 B each). The fielded code allocated straight from a 32-bit field: this is the cap it lacked."""
+"""2 Mi fragments (1 GiB at 512 B each). The fielded code allocated straight from a 32-bit field: this is the cap it
+lacked."""
 
 MAX_HEARD = 96
-"""Neighbours a heartbeat lists as heard (8 B each, 768 B): keeps a heartbeat in one datagram whatever the team's size."""
+"""Neighbours a heartbeat lists as heard (8 B each, 768 B): keeps a heartbeat in one datagram whatever the team's
+size."""
 
 MAX_WAITING = 16
 """One entry per priority level, and there are 16 levels: a longer list is nonsense."""
