@@ -1,0 +1,102 @@
+"""Laws of the mesh's graph: distances, cut vertices, and what each loss cuts off."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from meshctl.topology import EMPTY, Graph, Link, graph_of
+
+NAMES = [f"n{index}" for index in range(9)]
+
+
+@st.composite
+def graphs(draw: st.DrawFn) -> Graph:
+    pairs = draw(st.lists(st.tuples(st.sampled_from(NAMES), st.sampled_from(NAMES)), max_size=18))
+    qualities = draw(st.lists(st.floats(0.05, 1.0), min_size=len(pairs), max_size=len(pairs)))
+    return graph_of(NAMES, [Link(a, b, quality) for (a, b), quality in zip(pairs, qualities, strict=True)])
+
+
+def line(length: int) -> Graph:
+    names = [f"n{index}" for index in range(length)]
+    return graph_of(names, [Link(a, b, 0.9) for a, b in itertools.pairwise(names)])
+
+
+def test_in_a_line_every_inner_node_cuts_off_all_behind_it() -> None:
+    assert line(5).cut_off_by("n0") == {"n1": ("n2", "n3", "n4"), "n2": ("n3", "n4"), "n3": ("n4",)}
+
+
+def test_a_ring_has_no_cut_vertex() -> None:
+    names = NAMES[:5]
+    ring = graph_of(names, [Link(a, b) for a, b in zip(names, [*names[1:], names[0]], strict=True)])
+    assert ring.cut_vertices("n0") == frozenset()
+
+
+@given(graphs())
+def test_cut_off_is_what_a_search_without_the_node_does_not_reach(graph: Graph) -> None:
+    entry = "n0"
+    whole = graph.reachable(entry)
+    slow = {
+        name: tuple(sorted(whole - graph.reachable(entry, [name]) - {name}))
+        for name in graph.nodes
+        if name != entry and name in whole
+    }
+    assert graph.cut_off_by(entry) == {name: lost for name, lost in slow.items() if lost}
+
+
+@given(graphs())
+def test_one_node_down_cuts_off_the_same_as_a_set_of_one(graph: Graph) -> None:
+    cut = graph.cut_off_by("n0")
+    for name in NAMES[1:]:
+        assert graph.cut_off_by_all("n0", [name]) == frozenset(cut.get(name, ()))
+
+
+@given(graphs())
+def test_a_path_is_one_hop_longer_than_that_of_its_next_node(graph: Graph) -> None:
+    paths = graph.paths("n0")
+    assert set(paths) == graph.reachable("n0")
+    for name, path in paths.items():
+        if name == "n0":
+            assert (path.hops, path.quality) == (0, 1.0)
+            continue
+        link = graph.neighbours[name][path.via]
+        assert path.hops == paths[path.via].hops + 1
+        assert path.quality == pytest.approx(paths[path.via].quality * link.quality)
+
+
+@given(graphs())
+def test_farthest_first_names_every_node_once_and_never_a_nearer_before_a_farther(graph: Graph) -> None:
+    order = graph.farthest_first("n0")
+    paths = graph.paths("n0")
+    assert sorted(order) == sorted(graph.nodes)
+    hops = [paths[name].hops if name in paths else len(NAMES) for name in order]
+    assert hops == sorted(hops, reverse=True)
+
+
+def test_a_strong_detour_beats_a_weak_direct_link() -> None:
+    graph = graph_of([], [Link("base", "far", 0.2), Link("base", "mid", 0.9), Link("mid", "far", 0.9)])
+    assert graph.paths("base")["far"].via == "mid"
+    assert graph.paths("base")["far"].hops == 2
+
+
+def test_a_wire_wins_over_a_radio_link() -> None:
+    graph = graph_of([], [Link("front", "rear", 0.4), Link("front", "rear", 1.0, wired=True), Link("rear", "front")])
+    assert graph.links == (Link("front", "rear", 1.0, wired=True),)
+
+
+def test_a_long_line_needs_no_recursion() -> None:
+    assert len(line(3000).cut_off_by("n0")) == 2998
+
+
+def test_an_unknown_entry_reaches_nothing() -> None:
+    assert EMPTY.paths("base") == {}
+    assert EMPTY.cut_off_by("base") == {}
+    assert line(2).reachable("base") == frozenset()
+
+
+def test_a_quality_outside_its_range_is_refused() -> None:
+    with pytest.raises(ValueError, match="a-b: quality 255"):
+        graph_of([], [Link("a", "b", 255)])

@@ -1,0 +1,40 @@
+"""Laws of turning nodes' reports into one graph."""
+
+from __future__ import annotations
+
+from meshctl.topology import Heard, Link, Report, Sighting, observed_graph, seen_by
+
+BASE = Report("base", ("02:00:00:00:00:01",), (Heard("02:00:00:00:00:02", 100, 0.9),))
+B01 = Report(
+    "b01", ("02:00:00:00:00:02",), (Heard("02:00:00:00:00:01", 200, 0.7), Heard("02:00:00:00:00:03", 4000, 0.5, -71))
+)
+
+
+def test_a_link_has_the_worse_quality_of_its_two_directions() -> None:
+    assert (
+        Link("b01", "base", 0.7) in observed_graph([BASE, B01]).links
+        or Link("base", "b01", 0.7) in observed_graph([BASE, B01]).links
+    )
+
+
+def test_a_node_that_does_not_answer_is_in_the_graph_by_its_known_mac() -> None:
+    graph = observed_graph([BASE, B01], known_macs={"02:00:00:00:00:03": "b02"})
+    assert graph.neighbours["b02"]["b01"].quality == 0.5
+
+
+def test_a_stranger_stands_under_its_mac() -> None:
+    assert "02:00:00:00:00:03" in observed_graph([BASE, B01])
+
+
+def test_a_neighbour_silent_for_long_is_no_link() -> None:
+    stale = Report("b01", ("02:00:00:00:00:02",), (Heard("02:00:00:00:00:01", 60_000, 1.0),))
+    assert observed_graph([stale], known_macs={"02:00:00:00:00:01": "base"}).links == ()
+
+
+def test_two_radios_of_a_robot_are_joined_by_their_wire() -> None:
+    graph = observed_graph([Report("front", ()), Report("rear", ())], wires=[("front", "rear")])
+    assert graph.links == (Link("front", "rear", 1.0, wired=True),)
+
+
+def test_who_hears_a_silent_node_is_told_with_its_age() -> None:
+    assert seen_by([BASE, B01], {"02:00:00:00:00:03": "b02"})["b02"] == (Sighting("b01", 4000, -71),)
