@@ -1,0 +1,120 @@
+"""The seam between meshctl and a node: where it is, with what we come, how long we wait, and what a command gave back.
+
+`Endpoint`, `Credentials` and `Deadlines` go into `meshctl.device.ssh.connect`, which gives a `Connection`; every verb
+of this package (`observe`, `upload`, `openwrt`, `deadman`) takes one and knows nothing of SSH.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from meshctl.device.errors import CommandFailed
+from meshctl.model import Secret
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Where a node answers. `identity` is the name its host key is pinned under.
+
+    It is the node's name in the inventory rather than its address, because factory devices all answer at 192.168.1.1
+    and a node's address may change with a plan (OpenSSH calls this `HostKeyAlias`).
+    """
+
+    host: str
+    port: int = 22
+    user: str = "root"
+    identity: str = ""
+
+    @property
+    def address(self) -> str:
+        """`host` or `[host]:port`, as known_hosts writes it."""
+        return self.host if self.port == 22 else f"[{self.host}]:{self.port}"
+
+    @property
+    def pin_name(self) -> str:
+        return self.identity or self.address
+
+    @property
+    def label(self) -> str:
+        """For messages: `b03 (10.42.0.13)`."""
+        return f"{self.identity} ({self.address})" if self.identity else self.address
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """What we try, in this order: key files, the agent's keys, `password`, and, if `empty_password`, none at all.
+
+    `empty_password` is for first contact alone: a factory device lets root in with no password.
+    """
+
+    key_files: tuple[Path, ...] = ()
+    use_agent: bool = True
+    password: Secret | None = None
+    empty_password: bool = False
+    passphrase: Secret | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Deadlines:
+    """How long each wait may take, in seconds; every one ends in `Timeout` with its own `phase`.
+
+    A radio with a 560 MHz MIPS core needs about two seconds for the key exchange when idle; a mesh of five hops that
+    loses packets needs several times that.
+    """
+
+    connect_s: float = 10.0
+    handshake_s: float = 30.0
+    auth_s: float = 30.0
+    channel_s: float = 15.0
+    run_s: float = 60.0
+    # A dead link shows after about three of these, because the server's answer to each is awaited by TCP.
+    keepalive_s: int = 15
+
+
+@dataclass(frozen=True, slots=True)
+class Completed:
+    """What one command gave back. Text is decoded as UTF-8 with replacement: SSIDs and names may hold any byte."""
+
+    stdout_bytes: bytes = field(repr=False)
+    stderr_bytes: bytes = field(repr=False)
+    exit_status: int
+
+    @property
+    def stdout(self) -> str:
+        return self.stdout_bytes.decode("utf-8", "replace")
+
+    @property
+    def stderr(self) -> str:
+        return self.stderr_bytes.decode("utf-8", "replace")
+
+    def check(self, attempted: str) -> Completed:
+        """Itself, or `CommandFailed` naming what was attempted, the status and the last words on stderr."""
+        if self.exit_status == 0:
+            return self
+        words = (self.stderr.strip() or self.stdout.strip()).splitlines()
+        last = f": {words[-1]}" if words else ""
+        raise CommandFailed(
+            f"{attempted}: exit status {self.exit_status}{last}", exit_status=self.exit_status, stderr=self.stderr
+        )
+
+
+class Connection(Protocol):
+    """An authenticated session with one node. Not shared between threads; `close()` may come from any."""
+
+    @property
+    def endpoint(self) -> Endpoint: ...
+
+    def run(
+        self, script: str, *, stdin: bytes | Iterable[bytes] = b"", timeout_s: float | None = None
+    ) -> Completed:
+        """Run a POSIX shell script of any length on the node, with `stdin` as its standard input.
+
+        `timeout_s` bounds the whole call (default `Deadlines.run_s`). Raises `Timeout`, `ConnectionLost`; an exit
+        status other than zero is data, see `Completed.check`.
+        """
+        ...
+
+    def close(self) -> None: ...

@@ -1,0 +1,245 @@
+"""What was seen of one node at one moment: `Observation` and its parts, all frozen.
+
+A fact is `None` when the node did not tell it or told it in a form the parsers do not know, and `notes` says why; an
+empty tuple or mapping means that the node told there is none. Shapes and sources: docs/facts/openwrt-facts.md, section 5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseInfo:
+    """`ubus call system board` .release, or /etc/openwrt_release (DISTRIB_*)."""
+
+    distribution: str
+    version: str
+    revision: str
+    target: str
+    description: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class BoardInfo:
+    """`ubus call system board`, /tmp/sysinfo and /etc/board.json. `board_name` is `vendor,model`."""
+
+    board_name: str
+    model: str = ""
+    hostname: str = ""
+    kernel: str = ""
+    # /etc/board.json .network.lan: `ports` or the single `device`/`ifname`
+    lan_ports: tuple[str, ...] = ()
+    label_mac: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """Bytes. `available` is the kernel's MemAvailable."""
+
+    total: int
+    free: int
+    available: int
+
+
+@dataclass(frozen=True, slots=True)
+class Space:
+    """One file system, in bytes, after `df -k`."""
+
+    path: str
+    total: int
+    free: int
+
+
+@dataclass(frozen=True, slots=True)
+class RadioState:
+    """One radio of `ubus call network.wireless status`; `config` holds its options as text."""
+
+    name: str
+    up: bool
+    pending: bool
+    disabled: bool
+    setup_failed: bool
+    config: Mapping[str, str]
+    interfaces: tuple[tuple[str, str], ...]
+    """(UCI section, interface name) of each wifi-iface; the name is empty while it is down."""
+
+
+@dataclass(frozen=True, slots=True)
+class WirelessLink:
+    """One interface of `iw dev`: what the radio really does, whatever the configuration says."""
+
+    ifname: str
+    mode: str
+    """`IBSS`, `mesh point`, `AP`, `managed`, ... as iw writes it."""
+    mac: str = ""
+    ssid: str | None = None
+    bssid: str | None = None
+    channel: int | None = None
+    frequency_mhz: int | None = None
+    width: str = ""
+    tx_power_dbm: float | None = None
+    joined: bool | None = None
+    """From `iw dev IF link`: whether an IBSS is really joined; None when iw does not tell for this mode."""
+
+
+@dataclass(frozen=True, slots=True)
+class Station:
+    """One neighbour as the radio sees it (`iw dev IF station dump`)."""
+
+    ifname: str
+    mac: str
+    signal_dbm: int | None = None
+    inactive_ms: int | None = None
+    rx_bytes: int | None = None
+    tx_bytes: int | None = None
+    tx_packets: int | None = None
+    tx_retries: int | None = None
+    tx_failed: int | None = None
+    tx_mbit_s: float | None = None
+    rx_mbit_s: float | None = None
+    expected_mbit_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class NetInterface:
+    """One logical interface of `ubus call network.interface dump`."""
+
+    name: str
+    up: bool
+    pending: bool
+    proto: str
+    device: str = ""
+    addresses: tuple[str, ...] = ()
+    """IPv4 with prefix length: `10.42.0.11/24`."""
+    errors: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Bridge:
+    """One bridge and its ports, from /sys/class/net."""
+
+    name: str
+    ports: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class MeshInfo:
+    """`batctl meshif bat0 mesh_json`; on 19.07 what its text commands give."""
+
+    version: str = ""
+    algorithm: str = ""
+    hard_interfaces: tuple[str, ...] = ()
+    settings: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class MeshNeighbour:
+    """One direct neighbour of batman-adv (`neighbors_json` or `batctl n`)."""
+
+    mac: str
+    ifname: str
+    last_seen_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class Originator:
+    """One path of batman-adv (`originators_json` or `batctl o`). `tq` 0..255 (BATMAN_IV), `throughput_kbit_s` (V)."""
+
+    mac: str
+    next_hop: str
+    ifname: str
+    last_seen_ms: int
+    best: bool
+    tq: int | None = None
+    throughput_kbit_s: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class HostKeyInfo:
+    """The node's own host key, read on the node: `key_type` as in known_hosts, `fingerprint` `SHA256:...`."""
+
+    key_type: str
+    fingerprint: str
+
+
+@dataclass(frozen=True, slots=True)
+class FileInfo:
+    """One file asked for by path. `text` is None for what is not UTF-8 text; `sha256` is of its bytes."""
+
+    path: str
+    mode: int
+    sha256: str
+    text: str | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeStatus:
+    """The dead-man's switch's own line (`deadman.sh status`); see docs/device-scripts.md for the states."""
+
+    state: str
+    change_id: str = ""
+    owner: str = ""
+    window_s: int | None = None
+    left_s: float | None = None
+    due_uptime_s: float | None = None
+    reload_status: int | None = None
+    lock_owner: str = ""
+    lock_left_s: float | None = None
+    last_id: str = ""
+    last_outcome: str = ""
+    last_reason: str = ""
+    version: str = ""
+    installed: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """Everything one round trip told. `asked_at_s` and `answered_at_s` are the observer's clock around it (Unix time)."""
+
+    asked_at_s: float
+    answered_at_s: float
+    release: ReleaseInfo | None = None
+    board: BoardInfo | None = None
+    boot_id: str | None = None
+    uptime_s: float | None = None
+    clock_s: float | None = None
+    memory: Memory | None = None
+    overlay: Space | None = None
+    tmp: Space | None = None
+    macs: Mapping[str, str] | None = None
+    """Interface name -> MAC address, from /sys/class/net."""
+    radios: tuple[RadioState, ...] | None = None
+    links: tuple[WirelessLink, ...] | None = None
+    stations: tuple[Station, ...] | None = None
+    interfaces: tuple[NetInterface, ...] | None = None
+    bridges: tuple[Bridge, ...] | None = None
+    mesh: MeshInfo | None = None
+    neighbours: tuple[MeshNeighbour, ...] | None = None
+    originators: tuple[Originator, ...] | None = None
+    package_tool: str | None = None
+    packages: Mapping[str, str] | None = None
+    """Installed package -> version."""
+    uci: Mapping[str, str] | None = field(default=None, repr=False)
+    """UCI package -> the text of /etc/config/PACKAGE; keys of encrypted meshes are in it."""
+    uci_changes: tuple[str, ...] | None = None
+    """Foreign uncommitted changes (`uci changes`), one line each."""
+    authorized_keys: tuple[str, ...] | None = None
+    host_keys: tuple[HostKeyInfo, ...] | None = None
+    files: Mapping[str, FileInfo | None] = field(default_factory=dict, repr=False)
+    """The extra paths asked for; None for one that does not exist."""
+    change: ChangeStatus | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def clock_offset_s(self) -> float | None:
+        """How far the node's clock is ahead of the observer's, at the middle of the round trip."""
+        if self.clock_s is None:
+            return None
+        return self.clock_s - (self.asked_at_s + self.answered_at_s) / 2
+
+    @property
+    def uptime_error_s(self) -> float:
+        """The bound on how wrong `uptime_s` can be against the observer's clock: half the round trip."""
+        return (self.answered_at_s - self.asked_at_s) / 2
