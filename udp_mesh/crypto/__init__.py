@@ -4,3 +4,33 @@
 boots (or of one boot to all), `replay` remembers which packet numbers were seen. docs/threat-model.md says against
 whom.
 """
+
+from udp_mesh.crypto.channel import (
+    LONG_OVERHEAD_BYTES,
+    SHORT_OVERHEAD_BYTES,
+    TO_ALL,
+    Opened,
+    OpenError,
+    ReceiveChannel,
+    ReplayError,
+    SendChannel,
+    check_long,
+)
+from udp_mesh.crypto.keys import Key, Keyring, UnknownKeyError
+from udp_mesh.crypto.replay import ReplayWindow
+
+__all__ = [
+    "LONG_OVERHEAD_BYTES",
+    "SHORT_OVERHEAD_BYTES",
+    "TO_ALL",
+    "Key",
+    "Keyring",
+    "OpenError",
+    "Opened",
+    "ReceiveChannel",
+    "ReplayError",
+    "ReplayWindow",
+    "SendChannel",
+    "UnknownKeyError",
+    "check_long",
+]

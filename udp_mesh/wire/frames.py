@@ -119,7 +119,7 @@ class Ack(NamedTuple):
     largest: int
     """Largest packet number received (48 bits)."""
     received: int
-    """256-bit bitmap: bit i set means packet `largest - 1 - i` arrived."""
+    """256-bit bitmap: bit i set means packet `largest - 1 - i` arrived. Bits below packet 0 are clear."""
     delay_us: int
     """From the arrival of `largest` to this acknowledgement's sending, at most 2**24-1 us."""
     receive_rate: int
