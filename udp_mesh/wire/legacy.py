@@ -1,0 +1,203 @@
+"""The fielded format (docs/facts/legacy-wire.md): datagrams of one-byte types, messages as serialized
+`PriorityMeshData`.
+
+Datagram -> `Host`, `Payload`, `LegacyAck` or `PayloadNoAck`; the payloads of one message, in order ->
+`PriorityMeshData`. Both directions, so that nodes of either kind can share a fleet while it moves over. Nothing in
+this format is authenticated: whoever decodes it must believe an address, not a name. Little-endian throughout, unlike
+the rest of `wire`.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TypeAlias, assert_never
+
+from udp_mesh.wire.buffer import decode_text
+from udp_mesh.wire.errors import DecodeError
+from udp_mesh.wire.limits import (
+    MAX_LEGACY_FRAGMENT_BYTES,
+    MAX_LEGACY_FRAGMENTS,
+    MAX_NAME_BYTES,
+    MAX_TOPIC_BYTES,
+    MAX_TYPE_BYTES,
+)
+
+_HEADER = struct.Struct("<BHIIH")
+LEGACY_OVERHEAD_BYTES = _HEADER.size + 1
+"""Header and the trailing byte of a disabled checksum."""
+BROADCAST_SEQUENCE = 0x8000
+"""High bit of a sequence number: counts messages to all; unicast numbers run 1 to 0x7fff per peer and wrap to 1."""
+_HOST = struct.Struct("<64p16p")
+_NAME_CAPACITY_BYTES = 63
+_ADDRESS_CAPACITY_BYTES = 15
+
+
+class LegacyType(IntEnum):
+    PAYLOAD = 1
+    ACK = 2
+    HOST = 4
+    PAYLOAD_NOACK = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Host:
+    """Heartbeat, once a second: a name and a dotted IPv4 address, both as claimed."""
+
+    name: str
+    address: str
+
+
+@dataclass(frozen=True, slots=True)
+class LegacyPayload:
+    """A fragment; `wants_ack` tells PAYLOAD from PAYLOAD_NOACK (broadcast)."""
+
+    sequence: int
+    position: int
+    total: int
+    data: bytes
+    wants_ack: bool
+
+
+@dataclass(frozen=True, slots=True)
+class LegacyAck:
+    """Acknowledges one fragment."""
+
+    sequence: int
+    position: int
+
+
+LegacyDatagram: TypeAlias = Host | LegacyPayload | LegacyAck
+
+
+@dataclass(frozen=True, slots=True)
+class PriorityMeshData:
+    """The message that the fielded system reassembles: opaque user bytes with where they belong."""
+
+    host: str
+    type_name: str
+    priority: int
+    """0 (most urgent) to 255."""
+    topic: str
+    data: bytes
+    sequence: int = 0
+    stamp_s: int = 0
+    stamp_ns: int = 0
+    frame_id: str = ""
+
+
+def is_legacy(data: bytes | memoryview) -> bool:
+    """Whether the first byte is a type of the fielded format."""
+    return len(data) >= LEGACY_OVERHEAD_BYTES and data[0] in (1, 2, 4, 5)
+
+
+def encode_legacy(datagram: LegacyDatagram) -> bytes:
+    """Raises ValueError for a value the format cannot carry."""
+    match datagram:
+        case Host(name, address):
+            raw_name, raw_address = name.encode(), address.encode()
+            if not 0 < len(raw_name) <= _NAME_CAPACITY_BYTES or not 0 < len(raw_address) <= _ADDRESS_CAPACITY_BYTES:
+                raise ValueError(f"legacy heartbeat: {name!r} at {address!r} does not fit its fields")
+            return _frame(LegacyType.HOST, 0, 0, 0, _HOST.pack(raw_name, raw_address))
+        case LegacyPayload(sequence, position, total, data, wants_ack):
+            if len(data) > MAX_LEGACY_FRAGMENT_BYTES or not 0 <= position < total <= MAX_LEGACY_FRAGMENTS:
+                raise ValueError(f"legacy fragment {position} of {total} with {len(data)} bytes")
+            kind = LegacyType.PAYLOAD if wants_ack else LegacyType.PAYLOAD_NOACK
+            return _frame(kind, sequence, position, total, data)
+        case LegacyAck(sequence, position):
+            return _frame(LegacyType.ACK, sequence, position, 0, b"")
+        case _:
+            assert_never(datagram)
+
+
+def _frame(kind: LegacyType, sequence: int, position: int, total: int, data: bytes) -> bytes:
+    return _HEADER.pack(kind, sequence, position, total, len(data)) + data + b"\x00"
+
+
+def decode_legacy(raw: bytes | memoryview) -> LegacyDatagram:
+    """Raises DecodeError for anything else; the trailing checksum byte is ignored, as the fielded receiver does."""
+    if len(raw) < LEGACY_OVERHEAD_BYTES:
+        raise DecodeError(f"legacy datagram: expected {LEGACY_OVERHEAD_BYTES} bytes or more, found {len(raw)}")
+    kind, sequence, position, total, length = _HEADER.unpack_from(raw)
+    data = bytes(raw[_HEADER.size : _HEADER.size + length])
+    if len(raw) != LEGACY_OVERHEAD_BYTES + length:
+        raise DecodeError(f"legacy datagram: expected {LEGACY_OVERHEAD_BYTES + length} bytes, found {len(raw)}")
+    if kind in (LegacyType.PAYLOAD, LegacyType.PAYLOAD_NOACK):
+        if length > MAX_LEGACY_FRAGMENT_BYTES:
+            raise DecodeError(f"legacy fragment: expected at most {MAX_LEGACY_FRAGMENT_BYTES} bytes, found {length}")
+        if not position < total <= MAX_LEGACY_FRAGMENTS:
+            raise DecodeError(f"legacy fragment: position {position} of {total} is out of range")
+        return LegacyPayload(sequence, position, total, data, kind == LegacyType.PAYLOAD)
+    if kind == LegacyType.ACK:
+        return LegacyAck(sequence, position)
+    if kind == LegacyType.HOST:
+        if length != _HOST.size:
+            raise DecodeError(f"legacy heartbeat: expected {_HOST.size} bytes, found {length}")
+        raw_name, raw_address = _HOST.unpack(data)
+        name, address = decode_text(raw_name, "legacy name"), decode_text(raw_address, "legacy address")
+        if not name or "/" in name or " " in name:
+            raise DecodeError(f"legacy name: expected a host name, found {name!r}")
+        return Host(name, address)
+    raise DecodeError(f"legacy type: expected 1, 2, 4 or 5, found {kind}")
+
+
+def fragment_legacy(message: bytes) -> list[bytes]:
+    """The fragments of a message as the fielded receiver counts them: `n // 1300 + 1`, an exact multiple ends empty."""
+    size = MAX_LEGACY_FRAGMENT_BYTES
+    return [message[start : start + size] for start in range(0, len(message) // size * size + 1, size)]
+
+
+def encode_mesh_data(message: PriorityMeshData) -> bytes:
+    """ROS 1 serialization of `PriorityMeshData`. Raises ValueError for a priority outside 0 to 255."""
+    if not 0 <= message.priority <= 255:
+        raise ValueError(f"legacy priority: expected 0 to 255, got {message.priority}")
+    return b"".join(
+        (
+            struct.pack("<III", message.sequence, message.stamp_s, message.stamp_ns),
+            _string(message.frame_id.encode()),
+            _string(message.host.encode()),
+            _string(message.type_name.encode()),
+            bytes((message.priority,)),
+            _string(message.topic.encode()),
+            _string(message.data),
+        )
+    )
+
+
+def _string(raw: bytes) -> bytes:
+    return struct.pack("<I", len(raw)) + raw
+
+
+def decode_mesh_data(raw: bytes) -> PriorityMeshData:
+    """The inverse of `encode_mesh_data`; raises DecodeError, also for bytes behind the message."""
+    if len(raw) < 12:
+        raise DecodeError(f"legacy message: expected a header of 12 bytes, found {len(raw)}")
+    sequence, stamp_s, stamp_ns = struct.unpack_from("<III", raw)
+    place = 12
+    frame_id, place = _take_text(raw, place, MAX_TOPIC_BYTES, "frame id")
+    host, place = _take_text(raw, place, MAX_NAME_BYTES, "host")
+    type_name, place = _take_text(raw, place, MAX_TYPE_BYTES, "type")
+    if place >= len(raw):
+        raise DecodeError("legacy priority: expected 1 byte, found 0")
+    priority = raw[place]
+    topic, place = _take_text(raw, place + 1, MAX_TOPIC_BYTES, "topic")
+    data, place = _take(raw, place, len(raw), "data")
+    if place != len(raw):
+        raise DecodeError(f"legacy message: {len(raw) - place} bytes too many")
+    return PriorityMeshData(host, type_name, priority, topic, data, sequence, stamp_s, stamp_ns, frame_id)
+
+
+def _take(raw: bytes, place: int, limit_bytes: int, what: str) -> tuple[bytes, int]:
+    if place + 4 > len(raw):
+        raise DecodeError(f"legacy {what}: expected a length of 4 bytes, found {len(raw) - place}")
+    length = int.from_bytes(raw[place : place + 4], "little")
+    end = place + 4 + length
+    if length > limit_bytes or end > len(raw):
+        raise DecodeError(f"legacy {what}: {length} bytes are more than {min(limit_bytes, len(raw) - place - 4)}")
+    return raw[place + 4 : end], end
+
+
+def _take_text(raw: bytes, place: int, limit_bytes: int, what: str) -> tuple[str, int]:
+    value, end = _take(raw, place, limit_bytes, what)
+    return decode_text(value, f"legacy {what}"), end
