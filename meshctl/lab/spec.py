@@ -1,0 +1,150 @@
+"""What a virtual fleet consists of: nodes, radios, links, as frozen values that travel as JSON.
+
+A spec is made from an inventory (`twin.spec_of`) or by hand in a test; the supervisor reads it from the fleet's
+directory, so everything here converts to JSON and back without loss.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from enum import Enum
+from typing import Any
+
+from meshctl.errors import InputError
+from meshctl.model import Release
+
+
+class Medium(Enum):
+    """How the operator's machine is wired to a node's LAN port."""
+
+    # not wired: reached through the mesh alone
+    NONE = "none"
+    # on the bench: its LAN port is plugged into the operator's machine, whatever address it has
+    BENCH = "bench"
+    # the base: the operator's machine sits on its LAN, and reaches the mesh through it
+    BASE = "base"
+
+
+@dataclass(frozen=True, slots=True)
+class RadioSpec:
+    """One radio as the board has it; the UCI section's name, the kernel's path, `2g` or `5g`, its MAC address."""
+
+    name: str = "radio0"
+    path: str = "platform/ahb/18100000.wmac"
+    band: str = "2g"
+    mac: str = ""
+    max_tx_power_dbm: int = 27
+
+
+@dataclass(frozen=True, slots=True)
+class NodeSpec:
+    """One node as it comes out of its box: factory image, factory address 192.168.1.1, no password.
+
+    `release` names the series; its revision and kernel are the lab's (`releases`). `packages` are baked into its image
+    beside the release's own. `mac` is the label's address, on the first LAN port; radios without one get `mac` + 1, ...
+    `overlay_kib` is the flash left for changes, `memory_kib` the RAM. `host_key_types` None: as the release makes them
+    (19.07 RSA, later RSA and ed25519); naming `("ed25519",)` alone makes big fleets start faster.
+    `flash_s` is how long writing an image takes.
+    """
+
+    name: str
+    board: str = "compex,wpj344-16m"
+    model: str = "Compex WPJ344 (16MB flash)"
+    target: str = "ath79/generic"
+    release: Release = Release.V23_05
+    packages: tuple[str, ...] = ("kmod-batman-adv", "batctl-default", "wpad-openssl")
+    radios: tuple[RadioSpec, ...] = (RadioSpec(),)
+    lan_ports: tuple[str, ...] = ("eth0",)
+    mac: str = ""
+    medium: Medium = Medium.BENCH
+    overlay_kib: int = 8192
+    memory_kib: int = 128 * 1024
+    host_key_types: tuple[str, ...] | None = None
+    flash_s: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSpec:
+    """Two nodes that can hear each other while their radios share a cell; the same in both directions.
+
+    `tq` is batman-adv's link quality (0..255), `delay_ms` one way, `loss` 0..1 of packets, `rate_kbps` None: unlimited.
+    """
+
+    a: str
+    b: str
+    tq: int = 255
+    signal_dbm: int = -58
+    delay_ms: float = 0.0
+    loss: float = 0.0
+    rate_kbps: int | None = None
+    up: bool = True
+
+    @property
+    def ends(self) -> frozenset[str]:
+        return frozenset((self.a, self.b))
+
+
+@dataclass(frozen=True, slots=True)
+class FleetSpec:
+    """A whole fleet. `port` is the one TCP port all its loopback addresses listen on (`twin.loopback_of`).
+
+    0 lets the supervisor choose a free one; `VirtualFleet.port` tells which.
+    """
+
+    name: str
+    nodes: tuple[NodeSpec, ...]
+    links: tuple[LinkSpec, ...] = ()
+    port: int = 0
+    # how long a link takes until batman-adv knows it; real meshes need 10 to 20 s
+    convergence_s: float = 0.2
+
+    def __post_init__(self) -> None:
+        names = [node.name for node in self.nodes]
+        doubles = sorted({name for name in names if names.count(name) > 1})
+        if doubles:
+            raise InputError(f"lab fleet {self.name}: expected each node once, found twice: {', '.join(doubles)}")
+        for link in self.links:
+            for end in (link.a, link.b):
+                if end not in names:
+                    raise InputError(f"lab fleet {self.name}: link {link.a}-{link.b}: no node named {end}")
+
+    def node(self, name: str) -> NodeSpec:
+        for node in self.nodes:
+            if node.name == name:
+                return node
+        raise InputError(f"lab fleet {self.name}: no node named {name}", hint=f"nodes: {', '.join(self.names)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(node.name for node in self.nodes)
+
+
+def dump(spec: FleetSpec) -> str:
+    """The spec as JSON text."""
+
+    def plain(value: Any) -> Any:
+        return value.value if isinstance(value, Enum) else value
+
+    return json.dumps(asdict(spec, dict_factory=lambda items: {key: plain(value) for key, value in items}), indent=1)
+
+
+def load(text: str) -> FleetSpec:
+    """The spec that `dump` wrote."""
+    data = json.loads(text)
+    nodes = tuple(
+        NodeSpec(
+            **{
+                **node,
+                "release": Release(node["release"]),
+                "medium": Medium(node["medium"]),
+                "packages": tuple(node["packages"]),
+                "lan_ports": tuple(node["lan_ports"]),
+                "radios": tuple(RadioSpec(**radio) for radio in node["radios"]),
+                "host_key_types": None if node["host_key_types"] is None else tuple(node["host_key_types"]),
+            }
+        )
+        for node in data.pop("nodes")
+    )
+    links = tuple(LinkSpec(**link) for link in data.pop("links"))
+    return FleetSpec(nodes=nodes, links=links, **data)
