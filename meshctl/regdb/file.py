@@ -1,0 +1,29 @@
+"""Find and read the regulatory database: a given file, the machine's own, or the copy shipped here.
+
+The shipped copy is the database of Debian's package wireless-regdb (ISC licence, beside it), so that lint works on
+machines without it; `scripts/update-regdb` brings in a newer one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from meshctl.regdb.binary import MAX_BYTES, RegdbError, decode
+from meshctl.regdb.values import Regdb
+
+SYSTEM = Path("/lib/firmware/regulatory.db")
+SHIPPED = Path(__file__).with_name("regulatory.db")
+
+
+def load(path: Path | None = None) -> Regdb:
+    """The database at `path`; by default the machine's, or the shipped one where the machine has none.
+
+    Raises RegdbError naming the file, and what is wrong with it.
+    """
+    chosen = path or (SYSTEM if SYSTEM.is_file() else SHIPPED)
+    try:
+        with chosen.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise RegdbError(f"{chosen}: cannot be read: {error.strerror}") from error
+    return decode(data, str(chosen))

@@ -1,0 +1,105 @@
+"""Hold a channel of a width against a country's rules, as the kernel's cfg80211 does.
+
+`judge` finds the rules that cover the occupied range (neighbouring rules join only where they carry AUTO_BW), and says
+what they forbid; `legal_channels` lists what would pass instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from meshctl.model import Band
+from meshctl.regdb.channels import CHANNELS, Span, center_mhz, occupied, width_mhz
+from meshctl.regdb.values import NO_FLAGS, Country, Flag, Rule
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What a country says about a channel of a width.
+
+    `covered` is False when some of the range lies outside every rule (`flags` and `max_eirp_dbm` then mean nothing).
+    `max_bandwidth_khz` is the widest channel that the rules at this place allow, `max_eirp_dbm` the least of them.
+    """
+
+    covered: bool
+    max_eirp_dbm: float = 0.0
+    max_bandwidth_khz: int = 0
+    flags: Flag = NO_FLAGS
+
+    def allows(self, span_mhz: int) -> bool:
+        return self.covered and span_mhz * 1000 <= self.max_bandwidth_khz
+
+
+def judge(country: Country, span: Span, *, ofdm: bool = True) -> Verdict:
+    """The rules' verdict on the range `span`; `ofdm` False asks for the rules of 802.11b too (channel 14 in Japan)."""
+    low, high = span.low_mhz * 1000, span.high_mhz * 1000
+    whole = _whole(country, low, high, ofdm=ofdm)
+    if whole is not None:
+        joined = _joined_khz(country, whole) if whole.flags & Flag.AUTO_BW else whole.max_bandwidth_khz
+        return Verdict(True, whole.max_eirp_dbm, max(whole.max_bandwidth_khz, joined), whole.flags)
+    pieces = _chain(country, low, high)
+    if not pieces:
+        return Verdict(False)
+    flags = NO_FLAGS
+    for rule in pieces:
+        flags |= rule.flags
+    return Verdict(True, min(rule.max_eirp_dbm for rule in pieces), high - low, flags)
+
+
+def legal_channels(country: Country, band: Band, htmode: str, *, forbidden: Flag) -> tuple[int, ...]:
+    """The channels of `band` that carry `htmode` in the country under rules with none of the `forbidden` flags.
+
+    Raises ValueError for an htmode that does not exist.
+    """
+    width = width_mhz(htmode)
+    legal = []
+    for channel in CHANNELS[band]:
+        span = occupied(band, channel, htmode)
+        if span is None:
+            continue
+        verdict = judge(country, span)
+        if verdict.allows(width) and not verdict.flags & forbidden:
+            legal.append(channel)
+    return tuple(legal)
+
+
+def primary(band: Band, channel: int) -> Span:
+    """The channel's own 20 MHz. Raises ValueError for a number the band does not have."""
+    center = center_mhz(band, channel)
+    return Span(center - 10, center + 10)
+
+
+def _whole(country: Country, low_khz: int, high_khz: int, *, ofdm: bool) -> Rule | None:
+    """The first rule that covers the range alone, the one with the fewest restrictions if several do."""
+    covering = [
+        rule
+        for rule in country.rules
+        if rule.start_khz <= low_khz and high_khz <= rule.end_khz and not (ofdm and rule.flags & Flag.NO_OFDM)
+    ]
+    return min(covering, key=lambda rule: (rule.flags & ~Flag.AUTO_BW).bit_count(), default=None)
+
+
+def _chain(country: Country, low_khz: int, high_khz: int) -> tuple[Rule, ...]:
+    """Adjoining AUTO_BW rules that cover the range together, empty when there are none."""
+    chain: list[Rule] = []
+    reached = low_khz
+    for rule in sorted(country.rules, key=lambda rule: rule.start_khz):
+        if rule.flags & Flag.AUTO_BW and rule.start_khz <= reached < rule.end_khz:
+            chain.append(rule)
+            reached = rule.end_khz
+            if reached >= high_khz:
+                return tuple(chain)
+    return ()
+
+
+def _joined_khz(country: Country, rule: Rule) -> int:
+    """The width of the unbroken AUTO_BW range that `rule` is part of."""
+    low, high = rule.start_khz, rule.end_khz
+    neighbours = [other for other in country.rules if other.flags & Flag.AUTO_BW]
+    for other in sorted(neighbours, key=lambda other: other.start_khz):
+        if other.start_khz <= high < other.end_khz:
+            high = other.end_khz
+    for other in sorted(neighbours, key=lambda other: other.end_khz, reverse=True):
+        if other.start_khz < low <= other.end_khz:
+            low = other.start_khz
+    return high - low

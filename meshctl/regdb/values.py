@@ -1,0 +1,62 @@
+"""A regulatory database as frozen values: countries, each with the rules for its frequency ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum, IntFlag
+
+# the alpha-2 code of the world domain, which the kernel uses until it is told a country
+WORLD = "00"
+
+
+class Flag(IntFlag):
+    """A rule's restrictions by the kernel's bits (net/wireless/reg.c, enum fwdb_flags)."""
+
+    NO_OFDM = 1
+    NO_OUTDOOR = 2
+    DFS = 4
+    NO_IR = 8
+    AUTO_BW = 16
+
+
+NO_FLAGS = Flag(0)
+
+
+class DfsRegion(Enum):
+    """Whose radar rules a country follows (enum nl80211_dfs_regions)."""
+
+    UNSET = 0
+    FCC = 1
+    ETSI = 2
+    JP = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One frequency range: its edges, the widest channel, the highest power and the restrictions."""
+
+    start_khz: int
+    end_khz: int
+    max_bandwidth_khz: int
+    max_eirp_dbm: float
+    flags: Flag = NO_FLAGS
+
+
+@dataclass(frozen=True, slots=True)
+class Country:
+    alpha2: str
+    dfs_region: DfsRegion
+    rules: tuple[Rule, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Regdb:
+    """All countries by their ISO 3166-1 alpha-2 code; `source` says which file they came from."""
+
+    countries: Mapping[str, Country]
+    source: str
+
+    def country(self, alpha2: str) -> Country | None:
+        """The country's rules, None when the database has none."""
+        return self.countries.get(alpha2)

@@ -1,0 +1,109 @@
+"""Channels are judged as the kernel judges them."""
+
+import pytest
+
+from meshctl.model import Band
+from meshctl.regdb import (
+    CHANNELS,
+    SHIPPED,
+    Flag,
+    Span,
+    center_mhz,
+    channel_at,
+    judge,
+    legal_channels,
+    load,
+    occupied,
+    width_mhz,
+)
+
+_REGDB = load(SHIPPED)
+_US = _REGDB.countries["US"]
+_DE = _REGDB.countries["DE"]
+_ADHOC = Flag.DFS | Flag.NO_IR
+
+
+@pytest.mark.parametrize(("band", "channel"), [(band, channel) for band in Band for channel in CHANNELS[band]])
+def test_a_channel_and_its_frequency_convert_both_ways(band: Band, channel: int) -> None:
+    assert channel_at(center_mhz(band, channel)) == (band, channel)
+
+
+def test_frequencies_between_channels_belong_to_none() -> None:
+    assert channel_at(2413) is None
+    assert channel_at(5181) is None
+    assert channel_at(2477) is None
+    with pytest.raises(ValueError, match="no channel 7"):
+        center_mhz(Band.G5, 7)
+
+
+@pytest.mark.parametrize(
+    ("band", "channel", "htmode", "low", "high"),
+    [
+        (Band.G2, 6, "HT20", 2427, 2447),
+        (Band.G2, 6, "NOHT", 2427, 2447),
+        (Band.G2, 1, "HT40", 2402, 2442),
+        (Band.G2, 11, "HT40", 2432, 2472),
+        (Band.G2, 6, "HT40-", 2407, 2447),
+        (Band.G2, 14, "HT20", 2474, 2494),
+        (Band.G5, 36, "HT40+", 5170, 5210),
+        (Band.G5, 40, "HT40-", 5170, 5210),
+        (Band.G5, 149, "VHT80", 5735, 5815),
+        (Band.G5, 161, "HE80", 5735, 5815),
+        (Band.G5, 100, "VHT160", 5490, 5650),
+    ],
+)
+def test_a_wide_channel_occupies_its_group(band: Band, channel: int, htmode: str, low: int, high: int) -> None:
+    assert occupied(band, channel, htmode) == Span(low, high)
+
+
+@pytest.mark.parametrize(
+    ("band", "channel", "htmode"),
+    [
+        (Band.G2, 1, "HT40-"),
+        (Band.G2, 11, "HT40+"),
+        (Band.G2, 14, "HT40"),
+        (Band.G2, 6, "VHT80"),
+        (Band.G5, 36, "HT40-"),
+        (Band.G5, 144, "VHT160"),
+        (Band.G5, 40, "HT40+"),
+    ],
+)
+def test_a_width_without_its_other_half_does_not_exist(band: Band, channel: int, htmode: str) -> None:
+    assert occupied(band, channel, htmode) is None
+
+
+def test_an_unknown_htmode_is_an_error_of_the_caller() -> None:
+    with pytest.raises(ValueError, match="no such htmode"):
+        width_mhz("HT30")
+
+
+def test_the_united_states_end_at_channel_11() -> None:
+    assert legal_channels(_US, Band.G2, "HT20", forbidden=_ADHOC) == tuple(range(1, 12))
+    assert legal_channels(_DE, Band.G2, "HT20", forbidden=_ADHOC) == tuple(range(1, 14))
+    assert legal_channels(_US, Band.G2, "HT40+", forbidden=_ADHOC) == tuple(range(1, 8))
+
+
+def test_adhoc_has_no_radar_and_no_passive_channels() -> None:
+    assert legal_channels(_US, Band.G5, "HT20", forbidden=_ADHOC) == (36, 40, 44, 48, 149, 153, 157, 161, 165)
+    assert 52 in legal_channels(_US, Band.G5, "HT20", forbidden=Flag.NO_IR)
+    assert legal_channels(_US, Band.G5, "VHT80", forbidden=_ADHOC) == (36, 40, 44, 48, 149, 153, 157, 161)
+
+
+def test_the_least_power_of_joined_rules_counts() -> None:
+    verdict = judge(_US, Span(5170, 5330))
+    assert verdict.covered
+    assert verdict.max_eirp_dbm == 23.0
+    assert verdict.flags & Flag.DFS
+    assert verdict.allows(160)
+
+
+def test_a_range_outside_every_rule_is_not_covered() -> None:
+    verdict = judge(_US, Span(2457, 2477))
+    assert not verdict.covered
+    assert not verdict.allows(20)
+
+
+def test_channel_14_is_for_the_old_rates_in_japan_only() -> None:
+    japan = _REGDB.countries["JP"]
+    assert not judge(japan, Span(2474, 2494)).covered
+    assert judge(japan, Span(2474, 2494), ofdm=False).covered
