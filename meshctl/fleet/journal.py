@@ -1,0 +1,325 @@
+"""What was done to the fleet, on disk: runs, steps, outcomes, and the last known state of every node.
+
+One SQLite file in `$XDG_STATE_HOME/meshctl` (WAL, so that two meshctl processes write at once and a killed one leaves
+it readable). `Journal.begin` opens a run; `Run.step`, `Run.finish_node` and `Run.end` fill it; `runs`, `steps`,
+`outcomes`, `unfinished` and `last_known` read it. Nothing secret is ever written.
+"""
+
+from __future__ import annotations
+
+import getpass
+import json
+import os
+import socket
+import sqlite3
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from meshctl.errors import MeshctlError
+from meshctl.fleet.outcome import Outcome, Result
+
+SCHEMA_VERSION = 1
+# Two processes may write at once; each transaction takes milliseconds, so this is far more than ever needed.
+BUSY_TIMEOUT_S = 60.0
+_RUN_COLUMNS = "id, command, fleet, inventory, owner, process, plan, began_s, ended_s, result"
+_SCHEMA = """
+CREATE TABLE runs (
+    id INTEGER PRIMARY KEY, command TEXT NOT NULL, fleet TEXT NOT NULL, inventory TEXT NOT NULL, owner TEXT NOT NULL,
+    process TEXT NOT NULL, plan TEXT NOT NULL, began_s REAL NOT NULL, ended_s REAL, result TEXT NOT NULL DEFAULT ''
+) STRICT;
+CREATE TABLE outcomes (
+    run INTEGER NOT NULL REFERENCES runs(id), node TEXT NOT NULL, result TEXT NOT NULL, reason TEXT NOT NULL DEFAULT '',
+    began_s REAL NOT NULL, duration_s REAL NOT NULL DEFAULT 0, facts TEXT NOT NULL DEFAULT '{}', PRIMARY KEY (run, node)
+) STRICT;
+CREATE TABLE steps (
+    id INTEGER PRIMARY KEY, run INTEGER NOT NULL REFERENCES runs(id), node TEXT NOT NULL, step TEXT NOT NULL,
+    began_s REAL NOT NULL, duration_s REAL, result TEXT NOT NULL DEFAULT ''
+) STRICT;
+CREATE INDEX steps_of_run ON steps(run, node);
+CREATE TABLE nodes (
+    fleet TEXT NOT NULL, node TEXT NOT NULL, seen_s REAL NOT NULL, facts TEXT NOT NULL, PRIMARY KEY (fleet, node)
+) STRICT;
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord:
+    """One run; `result` is empty while it is under way, `interrupted` when its process died without a word."""
+
+    id: int
+    command: str
+    fleet: str
+    inventory: str
+    owner: str
+    process: str
+    plan: str
+    began_s: float
+    ended_s: float | None
+    result: str
+
+    @property
+    def is_over(self) -> bool:
+        return self.ended_s is not None or not process_lives(self.process)
+
+    @property
+    def state(self) -> str:
+        if self.ended_s is not None:
+            return self.result
+        return "under way" if process_lives(self.process) else "interrupted"
+
+
+@dataclass(frozen=True, slots=True)
+class StepRecord:
+    node: str
+    step: str
+    began_s: float
+    duration_s: float | None
+    result: str
+
+
+@dataclass(frozen=True, slots=True)
+class LastKnown:
+    """What a node told when it was last seen, at `seen_s` (Unix time)."""
+
+    node: str
+    seen_s: float
+    facts: Mapping[str, str]
+
+
+class Journal:
+    """The file. Safe to use from several threads and processes; close it, or use it in a `with` block."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = threading.Lock()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            self._database = sqlite3.connect(
+                path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False
+            )
+        except (OSError, sqlite3.Error) as error:
+            raise MeshctlError(f"{path}: cannot open the journal: {error}") from error
+        try:
+            self._enter_wal()
+            self._database.execute("PRAGMA synchronous = NORMAL")
+            self._database.execute("PRAGMA foreign_keys = ON")
+            self._create()
+        except (sqlite3.Error, MeshctlError) as error:
+            self._database.close()
+            if isinstance(error, MeshctlError):
+                raise
+            raise MeshctlError(
+                f"{path}: not a journal of meshctl: {error}", hint="move the file away and run again"
+            ) from error
+
+    def _enter_wal(self) -> None:
+        # Two processes that create the file at once: SQLite answers "locked" here without waiting.
+        deadline = time.monotonic() + BUSY_TIMEOUT_S
+        while True:
+            try:
+                self._database.execute("PRAGMA journal_mode = WAL")
+            except sqlite3.OperationalError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.01)
+            else:
+                return
+
+    def _create(self) -> None:
+        with self._write() as database:
+            (version,) = database.execute("PRAGMA user_version").fetchone()
+            if version == 0:
+                for statement in _SCHEMA.split(";\n"):
+                    if statement.strip():
+                        database.execute(statement)
+                database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            elif version != SCHEMA_VERSION:
+                raise MeshctlError(f"{self.path}: journal of version {version}, expected {SCHEMA_VERSION}")
+
+    @contextmanager
+    def _write(self) -> Iterator[sqlite3.Connection]:
+        with self._lock:
+            try:
+                self._database.execute("BEGIN IMMEDIATE")
+                try:
+                    yield self._database
+                except BaseException:
+                    self._database.execute("ROLLBACK")
+                    raise
+                self._database.execute("COMMIT")
+            except sqlite3.Error as error:
+                raise MeshctlError(f"{self.path}: cannot write the journal: {error}") from error
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        with self._lock:
+            self._database.close()
+
+    def begin(self, command: str, *, fleet: str, inventory: str, nodes: tuple[str, ...], plan: str = "") -> Run:
+        """A new run; every node of it stands as PENDING until it has an outcome."""
+        now = time.time()
+        with self._write() as database:
+            cursor = database.execute(
+                "INSERT INTO runs (command, fleet, inventory, owner, process, plan, began_s)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?)",
+                (command, fleet, inventory, owner(), this_process(), plan, now),
+            )
+            run_id = int(cursor.lastrowid or 0)
+            database.executemany(
+                "INSERT INTO outcomes (run, node, result, began_s) VALUES (?, ?, ?, ?)",
+                [(run_id, node, Result.PENDING.value, now) for node in dict.fromkeys(nodes)],
+            )
+        return Run(self, run_id)
+
+    def runs(self, *, fleet: str | None = None, limit: int = 20) -> tuple[RunRecord, ...]:
+        """The latest runs, newest first."""
+        rows = self._read(
+            f"SELECT {_RUN_COLUMNS} FROM runs WHERE ?1 IS NULL OR fleet = ?1 ORDER BY id DESC LIMIT ?2",
+            (fleet, limit),
+        )
+        return tuple(RunRecord(*row) for row in rows)
+
+    def run(self, run_id: int) -> RunRecord | None:
+        rows = self._read(f"SELECT {_RUN_COLUMNS} FROM runs WHERE id = ?", (run_id,))
+        return RunRecord(*rows[0]) if rows else None
+
+    def outcomes(self, run_id: int) -> tuple[Outcome, ...]:
+        rows = self._read(
+            "SELECT node, result, reason, duration_s, facts FROM outcomes WHERE run = ? ORDER BY rowid", (run_id,)
+        )
+        return tuple(
+            Outcome(node, Result(result), reason, duration_s=duration, facts=json.loads(facts))
+            for node, result, reason, duration, facts in rows
+        )
+
+    def steps(self, run_id: int, node: str | None = None) -> tuple[StepRecord, ...]:
+        rows = self._read(
+            "SELECT node, step, began_s, duration_s, result FROM steps WHERE run = ?1 AND (?2 IS NULL OR node = ?2)"
+            " ORDER BY id",
+            (run_id, node),
+        )
+        return tuple(StepRecord(*row) for row in rows)
+
+    def unfinished(self, run_id: int) -> tuple[str, ...]:
+        """The nodes of a run that a resume has to take up, in the run's order."""
+        return tuple(outcome.node for outcome in self.outcomes(run_id) if not outcome.result.is_settled)
+
+    def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
+        """Keep what a node told; an older sighting never replaces a newer one."""
+        self.remember_all(fleet, {node: facts}, seen_s)
+
+    def remember_all(self, fleet: str, facts: Mapping[str, Mapping[str, str]], seen_s: float) -> None:
+        with self._write() as database:
+            database.executemany(
+                "INSERT INTO nodes (fleet, node, seen_s, facts) VALUES (?1, ?2, ?3, ?4) ON CONFLICT (fleet, node)"
+                " DO UPDATE SET seen_s = ?3, facts = ?4 WHERE ?3 >= seen_s",
+                [(fleet, node, seen_s, json.dumps(dict(told), sort_keys=True)) for node, told in facts.items()],
+            )
+
+    def last_known(self, fleet: str) -> dict[str, LastKnown]:
+        rows = self._read("SELECT node, seen_s, facts FROM nodes WHERE fleet = ? ORDER BY node", (fleet,))
+        return {node: LastKnown(node, seen_s, json.loads(facts)) for node, seen_s, facts in rows}
+
+    def _read(self, query: str, values: tuple[object, ...]) -> list[tuple[Any, ...]]:
+        with self._lock:
+            try:
+                return self._database.execute(query, values).fetchall()
+            except sqlite3.Error as error:
+                raise MeshctlError(f"{self.path}: cannot read the journal: {error}") from error
+
+
+class Run:
+    """One run being written. Steps and outcomes may come from several threads."""
+
+    def __init__(self, journal: Journal, run_id: int) -> None:
+        self._journal = journal
+        self.id = run_id
+
+    @contextmanager
+    def step(self, node: str, name: str) -> Iterator[None]:
+        """Record a step and how long it took; a step without an end was cut short by our own death."""
+        began_s, clock = time.time(), time.monotonic()
+        with self._journal._write() as database:
+            row = database.execute(
+                "INSERT INTO steps (run, node, step, began_s) VALUES (?, ?, ?, ?)", (self.id, node, name, began_s)
+            ).lastrowid
+        result = "done"
+        try:
+            yield
+        except BaseException as error:
+            result = f"failed: {error}" if isinstance(error, MeshctlError) else f"failed: {type(error).__name__}"
+            raise
+        finally:
+            with self._journal._write() as database:
+                database.execute(
+                    "UPDATE steps SET duration_s = ?, result = ? WHERE id = ?",
+                    (round(time.monotonic() - clock, 3), result, row),
+                )
+
+    def finish_node(self, outcome: Outcome) -> None:
+        with self._journal._write() as database:
+            database.execute(
+                "INSERT INTO outcomes (run, node, result, reason, began_s, duration_s, facts)"
+                " VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7) ON CONFLICT (run, node)"
+                " DO UPDATE SET result = ?3, reason = ?4, duration_s = ?6, facts = ?7",
+                (
+                    self.id,
+                    outcome.node,
+                    outcome.result.value,
+                    outcome.reason,
+                    time.time() - outcome.duration_s,
+                    outcome.duration_s,
+                    json.dumps(dict(outcome.facts), sort_keys=True),
+                ),
+            )
+
+    def end(self, result: str) -> None:
+        with self._journal._write() as database:
+            database.execute("UPDATE runs SET ended_s = ?, result = ? WHERE id = ?", (time.time(), result, self.id))
+
+
+def default_path(environ: Mapping[str, str]) -> Path:
+    """`$XDG_STATE_HOME/meshctl/journal.sqlite`, by default under ~/.local/state (XDG Base Directory 0.8)."""
+    state = environ.get("XDG_STATE_HOME", "")
+    root = Path(state) if state.startswith("/") else Path(environ.get("HOME", "~")).expanduser() / ".local" / "state"
+    return root / "meshctl" / "journal.sqlite"
+
+
+def owner() -> str:
+    """`user@host`: who holds a lock or began a run."""
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):
+        user = str(os.getuid())
+    return f"{user}@{socket.gethostname()}"
+
+
+def this_process() -> str:
+    """`host:pid:start`, where start tells a process from a later one with the same pid."""
+    return f"{socket.gethostname()}:{os.getpid()}:{_start_ticks(os.getpid())}"
+
+
+def process_lives(process: str) -> bool:
+    """Whether the process that wrote a run still runs; one on another host counts as alive, we cannot know."""
+    host, _, rest = process.rpartition(":")
+    host, _, pid = host.rpartition(":")
+    return host != socket.gethostname() or (pid.isdigit() and _start_ticks(int(pid)) == rest)
+
+
+def _start_ticks(pid: int) -> str:
+    """Field 22 of /proc/PID/stat (proc(5)), empty for a process that is not there."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+    return text.rpartition(")")[2].split()[19]

@@ -1,0 +1,121 @@
+"""Laws of the journal: it survives our death, holds one outcome per node, and bears two processes at once."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from meshctl.errors import MeshctlError, NodeError
+from meshctl.fleet import Outcome, Result
+from meshctl.fleet.journal import Journal, default_path, process_lives, this_process
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "state" / "meshctl" / "journal.sqlite"
+
+
+def test_every_node_of_a_run_is_pending_until_it_has_an_outcome(path: Path) -> None:
+    with Journal(path) as journal:
+        run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a", "b", "c"))
+        run.finish_node(Outcome("b", Result.DONE, facts={"revision": "r1"}))
+        run.finish_node(Outcome("c", Result.ROLLED_BACK, "no neighbour"))
+        assert [outcome.result for outcome in journal.outcomes(run.id)] == [
+            Result.PENDING,
+            Result.DONE,
+            Result.ROLLED_BACK,
+        ]
+        assert journal.outcomes(run.id)[1].facts == {"revision": "r1"}
+        assert journal.unfinished(run.id) == ("a", "c")
+
+
+def test_steps_tell_what_failed_and_what_was_cut_short(path: Path) -> None:
+    with Journal(path) as journal:
+        run = journal.begin("apply", fleet="f", inventory="inv", nodes=("a",))
+        with run.step("a", "upload"):
+            pass
+        with pytest.raises(NodeError), run.step("a", "arm"):
+            raise NodeError("locked by bob")
+        cut = run.step("a", "apply")
+        cut.__enter__()
+        steps = journal.steps(run.id)
+        assert [(step.step, step.result) for step in steps] == [
+            ("upload", "done"),
+            ("arm", "failed: locked by bob"),
+            ("apply", ""),
+        ]
+        assert steps[0].duration_s is not None
+        assert steps[2].duration_s is None
+        cut.__exit__(None, None, None)
+
+
+def test_a_run_whose_process_died_is_over_and_called_interrupted(path: Path) -> None:
+    script = (
+        "import os, sys; from pathlib import Path; from meshctl.fleet.journal import Journal\n"
+        "Journal(Path(sys.argv[1])).begin('provision', fleet='f', inventory='i', nodes=('a',)); os._exit(9)"
+    )
+    subprocess.run([sys.executable, "-c", script, str(path)], check=False)
+    with Journal(path) as journal:
+        (record,) = journal.runs()
+        assert (record.is_over, record.state) == (True, "interrupted")
+        own = journal.run(journal.begin("plan", fleet="g", inventory="i", nodes=()).id)
+        assert own is not None
+        assert (own.is_over, own.state) == (False, "under way")
+        assert [run.fleet for run in journal.runs(fleet="f")] == ["f"]
+
+
+def test_two_processes_write_at_once_and_nothing_is_lost(path: Path) -> None:
+    script = (
+        "import sys; from pathlib import Path; from meshctl.fleet import Outcome, Result\n"
+        "from meshctl.fleet.journal import Journal\n"
+        "with Journal(Path(sys.argv[1])) as journal:\n"
+        "    run = journal.begin('p', fleet='f', inventory='i', nodes=tuple(f'n{i}' for i in range(50)))\n"
+        "    for i in range(50): run.finish_node(Outcome(f'n{i}', Result.DONE))\n"
+        "    run.end('ok')\n"
+    )
+    workers = [subprocess.Popen([sys.executable, "-c", script, str(path)]) for _ in range(3)]
+    assert [worker.wait(timeout=120) for worker in workers] == [0, 0, 0]
+    with Journal(path) as journal:
+        runs = journal.runs()
+        assert [run.result for run in runs] == ["ok"] * 3
+        for run in runs:
+            assert [outcome.result for outcome in journal.outcomes(run.id)] == [Result.DONE] * 50
+
+
+def test_an_older_sighting_never_replaces_a_newer_one(path: Path) -> None:
+    with Journal(path) as journal:
+        journal.remember("f", "a", {"boot_id": "new"}, 200.0)
+        journal.remember("f", "a", {"boot_id": "old"}, 100.0)
+        assert journal.last_known("f")["a"].facts == {"boot_id": "new"}
+        assert journal.last_known("other") == {}
+
+
+def test_what_is_no_journal_is_refused_with_its_path(path: Path) -> None:
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"this is no database, it is a letter" * 100)
+    with pytest.raises(MeshctlError, match=str(path)):
+        Journal(path)
+
+
+def test_a_journal_of_a_later_version_is_refused(path: Path) -> None:
+    with Journal(path) as journal:
+        journal._database.execute("PRAGMA user_version = 7")
+    with pytest.raises(MeshctlError, match="version 7, expected 1"):
+        Journal(path)
+
+
+def test_the_journal_stands_in_the_users_state_directory() -> None:
+    assert default_path({"XDG_STATE_HOME": "/s"}) == Path("/s/meshctl/journal.sqlite")
+    assert default_path({"HOME": "/home/a", "XDG_STATE_HOME": "relative"}) == Path(
+        "/home/a/.local/state/meshctl/journal.sqlite"
+    )
+
+
+def test_our_own_process_lives_and_a_later_one_with_the_same_pid_is_another() -> None:
+    own = this_process()
+    assert process_lives(own)
+    assert not process_lives(own + "1")
+    assert process_lives("elsewhere:1:1")
