@@ -1,0 +1,43 @@
+"""The replay window equals a plain set of numbers, within its width."""
+
+import random
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from udp_mesh.crypto.replay import WINDOW_PACKETS, ReplayWindow
+
+
+@given(st.integers(0, 1 << 40), st.lists(st.integers(-5000, 5000), max_size=80), st.integers(0, 10_000))
+def test_the_window_equals_a_plain_set(start: int, steps: list[int], floor: int) -> None:
+    window, seen = ReplayWindow(), set[int]()
+    window.raise_floor(floor)
+    number = start
+    for step in steps:
+        number = max(0, number + step)
+        fresh = number not in seen and number >= floor
+        expected_certain = not seen or number > max(seen) - WINDOW_PACKETS
+        if expected_certain:
+            assert window.would_accept(number) == fresh
+            assert window.accept(number) == fresh
+        else:
+            assert not window.accept(number) or fresh
+        seen.add(number)
+
+
+def test_a_long_random_walk_never_accepts_twice() -> None:
+    source, window, accepted, number = random.Random(4), ReplayWindow(), set[int](), 0
+    for _ in range(20_000):
+        number = max(0, number + source.choice((1, 1, 1, 2, 70, -3, -64, -200, 300)))
+        if window.accept(number):
+            assert number not in accepted
+            accepted.add(number)
+    assert len(accepted) > 5_000
+    assert window.largest == max(accepted)
+
+
+def test_numbers_older_than_the_window_count_as_seen() -> None:
+    window = ReplayWindow()
+    assert window.accept(1_000_000)
+    assert window.accept(1_000_000 - WINDOW_PACKETS)
+    assert not window.accept(1_000_000 - WINDOW_PACKETS - 128)

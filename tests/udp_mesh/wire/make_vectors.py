@@ -1,0 +1,153 @@
+"""Writes the wire vectors: `python -m tests.udp_mesh.wire.make_vectors`. The tests compare the files with what it
+makes.
+
+Another implementation reads `vectors/*.json`: frames as JSON with their bytes in hexadecimal, sealed datagrams with
+the keys and boot ids that open them, and datagrams and messages of the fielded format.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from udp_mesh.crypto import Key, SendChannel
+from udp_mesh.wire.codec import encode
+from udp_mesh.wire.frames import (
+    Ack,
+    Bye,
+    Cancel,
+    Delivered,
+    Fragment,
+    Frame,
+    Heartbeat,
+    MessageHead,
+    Nack,
+    Ping,
+    Pong,
+    Refused,
+    RefuseReason,
+    TopicAnnounce,
+    Waiting,
+)
+from udp_mesh.wire.legacy import (
+    Host,
+    LegacyAck,
+    LegacyDatagram,
+    LegacyPayload,
+    PriorityMeshData,
+    encode_legacy,
+    encode_mesh_data,
+)
+
+FOLDER = Path(__file__).parent / "vectors"
+
+FRAMES: dict[str, list[Frame]] = {
+    "heartbeat": [
+        Heartbeat(
+            "ugv1", 1, 1, 3, 1000, 4, 125_000, 77, 5, (b"peerone!", b"peertwo!"), (Waiting(0, 12), Waiting(8, 900))
+        )
+    ],
+    "heartbeat of a node alone": [Heartbeat("basestation", 1, 1, 0, 3000, 0, 0, 0, 0)],
+    "whole message in one fragment": [Fragment(1, 0, b"hello", MessageHead(5, 1, 2, 0, 1, 40), ack_now=True)],
+    "empty message": [Fragment(2, 0, b"", MessageHead(0, 1, 2, 8, 0))],
+    "later fragment": [Fragment(0xFFFFFFFE, 300, b"payload")],
+    "fragment past position 65,535": [Fragment(3, 70_000, b"payload")],
+    "repair of a broadcast": [Fragment(9, 4, b"again", broadcast_id=True)],
+    "announce and first fragment": [
+        TopicAnnounce(2, "map/diff", "mesh_msgs/MapDiff"),
+        Fragment(4, 0, b"begin", MessageHead(12, 2, 2, 6, 3)),
+    ],
+    "fragment followed by an acknowledgement": [Fragment(4, 1, b"the end"), Ack(41, (1 << 41) - 1, 250, 0)],
+    "acknowledgement with gaps": [Ack(1000, (1 << 256) - 1 - 0b101000, 2500, 1_250_000, (Waiting(1, 30),))],
+    "delivered": [Delivered((4, 5)), Delivered((7,), broadcast_ids=True)],
+    "refused": [Refused(6, RefuseReason.TOO_LARGE)],
+    "cancel": [Cancel((8, 9, 10))],
+    "nack of pieces and of all": [Nack(11, ((0, 2), (9, 1))), Nack(12)],
+    "ping and pong": [Ping(0x0102030405060708), Pong(0x0102030405060708, 1500)],
+    "bye": [Bye("shutting down")],
+}
+
+LEGACY: dict[str, LegacyDatagram] = {
+    "host": Host("ugv1", "10.10.0.1"),
+    "payload": LegacyPayload(0x7FFF, 1, 3, b"data", wants_ack=True),
+    "payload to all": LegacyPayload(0x8001, 0, 1, b"data", wants_ack=False),
+    "empty last fragment": LegacyPayload(5, 1, 2, b"", wants_ack=True),
+    "ack": LegacyAck(0x7FFF, 1),
+}
+
+MESH_DATA = PriorityMeshData("ugv1", "std_msgs/String", 0, "status", b"\x02\x00\x00\x00ok", 7, 1_580_000_000, 5, "base")
+
+
+def describe(value: object) -> object:
+    """JSON of a frame: its type's name and fields; bytes in hexadecimal."""
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        fields: Mapping[str, object] = value._asdict()
+        return {"type": type(value).__name__, **{name: describe(field) for name, field in fields.items()}}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        named = {field.name: describe(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {"type": type(value).__name__, **named}
+    if isinstance(value, tuple | list):
+        return [describe(item) for item in value]
+    if isinstance(value, int) and not isinstance(value, bool):
+        # A bitmap of 256 bits is no number that every JSON reader can hold.
+        return hex(value) if value >= 1 << 53 else int(value)
+    return value
+
+
+def make_frames() -> object:
+    return {name: {"frames": describe(frames), "hex": encode(frames).hex()} for name, frames in FRAMES.items()}
+
+
+def make_sealed() -> object:
+    key, sender, receiver = Key(bytes(range(32))), bytes(range(16)), bytes(range(100, 116))
+    vectors = []
+    for title, to, long in (
+        ("hello", None, True),
+        ("broadcast", None, False),
+        ("introduction", receiver, True),
+        ("data", receiver, False),
+    ):
+        channel = SendChannel(key, sender, to) if to else SendChannel(key, sender)
+        channel.next_number = 0x1_0000_0005
+        frames = encode([Ping(7)])
+        number, data = channel.seal_long(frames) if long else channel.seal(frames)
+        vectors.append(
+            {
+                "title": title,
+                "fleet_key": key.secret.hex(),
+                "key_id": key.key_id.hex(),
+                "sender_boot": sender.hex(),
+                "receiver_boot": to.hex() if to else None,
+                "tag": channel.tag,
+                "packet_number": number,
+                "frames": frames.hex(),
+                "datagram": data.hex(),
+            }
+        )
+    return vectors
+
+
+def make_legacy() -> object:
+    datagrams = {
+        name: {"datagram": describe(value), "hex": encode_legacy(value).hex()} for name, value in LEGACY.items()
+    }
+    return {
+        "datagrams": datagrams,
+        "message": {"message": describe(MESH_DATA), "hex": encode_mesh_data(MESH_DATA).hex()},
+    }
+
+
+MAKERS = {"frames.json": make_frames, "sealed.json": make_sealed, "legacy.json": make_legacy}
+
+
+def main() -> None:
+    for name, make in MAKERS.items():
+        (FOLDER / name).write_text(json.dumps(make(), indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

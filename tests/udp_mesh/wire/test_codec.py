@@ -1,0 +1,127 @@
+"""Laws of the frames: what is encoded is decoded, and any bytes give frames or DecodeError."""
+
+import struct
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from tests.udp_mesh.wire.strategies import frames as any_frame
+from udp_mesh.wire import limits
+from udp_mesh.wire.codec import FRAGMENT_BYTES, decode, encode
+from udp_mesh.wire.errors import DecodeError
+from udp_mesh.wire.frames import Ack, Cancel, Fragment, Frame, Heartbeat, MessageHead, Nack, Ping, Waiting
+
+
+@given(st.lists(any_frame, min_size=1, max_size=6))
+def test_decoding_inverts_encoding(frames: list[Frame]) -> None:
+    assert decode(encode(frames)) == frames
+
+
+@given(st.lists(any_frame, min_size=1, max_size=3), st.data())
+def test_a_cut_datagram_gives_fewer_frames_or_an_error(frames: list[Frame], data: st.DataObject) -> None:
+    raw = encode(frames)
+    cut = raw[: data.draw(st.integers(0, len(raw) - 1))]
+    try:
+        decoded = decode(cut)
+    except DecodeError:
+        return
+    assert len(decoded) <= len(frames)
+
+
+@given(st.binary(max_size=200))
+@example(b"")
+@example(b"\x80")
+@example(b"\xff" * 40)
+def test_any_bytes_give_frames_within_the_caps_or_an_error(raw: bytes) -> None:
+    try:
+        frames = decode(raw)
+    except DecodeError:
+        return
+    assert 1 <= len(frames) <= limits.MAX_FRAMES_PER_DATAGRAM
+    # Nothing is accepted that would not be written: the format has one spelling per value, but for trailing lengths.
+    assert decode(encode(frames)) == frames
+
+
+@given(any_frame, st.data())
+def test_a_flipped_byte_gives_frames_or_an_error(frame: Frame, data: st.DataObject) -> None:
+    raw = bytearray(encode([frame]))
+    raw[data.draw(st.integers(0, len(raw) - 1))] ^= data.draw(st.integers(1, 255))
+    try:
+        decode(bytes(raw))
+    except DecodeError:
+        return
+
+
+def test_a_bulk_fragment_costs_seven_bytes() -> None:
+    raw = encode([Fragment(5, 17, b"x" * 1400)])
+    assert len(raw) == 1400 + FRAGMENT_BYTES == 1407
+
+
+def test_an_acknowledgement_without_gaps_costs_no_bitmap() -> None:
+    complete = encode([Ack(1000, (1 << 256) - 1, 0, 0)])
+    gap = encode([Ack(1000, (1 << 256) - 1 - (1 << 9), 0, 0)])
+    assert len(complete) == 16
+    assert len(gap) == 18
+
+
+def test_a_full_heartbeat_fits_one_datagram() -> None:
+    heard = tuple(struct.pack(">Q", n) for n in range(limits.MAX_HEARD))
+    waiting = tuple(Waiting(level, 65_535) for level in range(16))
+    beat = Heartbeat("n" * 63, 1, 1, 0, 1000, 1000, 0, 0, 0, heard, waiting)
+    assert len(encode([beat])) < 1000
+
+
+def test_too_many_frames_are_refused() -> None:
+    with pytest.raises(DecodeError, match="at most 64 frames"):
+        decode(encode([Ping(1)]) * 65)
+
+
+@pytest.mark.parametrize(
+    ("raw", "message"),
+    [
+        (b"\x00", "frame type"),
+        (b"\x0b", "frame type"),
+        (b"\xe0" + bytes(8), "flags"),
+        (struct.pack(">BIH", 0x80, 1, 0) + b"x", "head"),
+        (struct.pack(">BIH", 0x80, 1, 4), "payload"),
+        (struct.pack(">BIHIIIHBB", 0x81, 1, 0, 0xFFFFFFFF, 1, 0, 0, 0, 0), "message size"),
+        (struct.pack(">BIHIIIHBB", 0x81, 1, 0, 10, 0xFFFFFFFF, 0, 0, 0, 0), "number of fragments"),
+        (struct.pack(">BIHIIIHBB", 0x81, 1, 0, 10, 11, 0, 0, 0, 0), "empty"),
+        (struct.pack(">BIHIIIHBB", 0x81, 1, 0, 10, 0, 0, 0, 0, 0), "empty"),
+        (struct.pack(">BIHIIIHBB", 0x81, 1, 0, 2, 1, 0, 0, 0, 0) + b"x", "contradict"),
+        (struct.pack(">BIHIIIHBB", 0x81, 1, 0, 1, 1, 0, 0, 16, 0) + b"x", "priority"),
+        (struct.pack(">BIHH", 0x82, 1, 3, 100) + b"x" * 99, "expected 100 bytes, found 99"),
+        (struct.pack(">BII", 0x88, 1, 1 << 21) + b"x", "out of range"),
+        (struct.pack(">BIBII", 6, 1, 1, 0, 0xFFFFFFFF), "out of range"),
+        (bytes((3, 0, 255, 255)), "number of message ids"),
+        (bytes((2,)) + bytes(13) + bytes((33,)), "bitmap length"),
+        (bytes((1, 3)) + b"a b" + bytes(40), "white space"),
+    ],
+)
+def test_a_value_past_its_cap_is_an_error_that_names_it(raw: bytes, message: str) -> None:
+    with pytest.raises(DecodeError, match=message):
+        decode(raw)
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        Fragment(1, 0, b"x"),
+        Fragment(1, 1, b"x", MessageHead(1, 1, 0, 0, 0)),
+        Fragment(1, 0, b"x", MessageHead(1, 2, 0, 0, 0)),
+        Fragment(1, 0, b"x", MessageHead(1, 1, 0, 16, 0)),
+        Cancel(()),
+        Nack(1, ((0, 1),) * 65),
+        Heartbeat("n" * 64, 1, 1, 0, 1, 0, 0, 0, 0),
+    ],
+)
+def test_our_own_mistakes_raise_value_error(frame: Frame) -> None:
+    with pytest.raises(ValueError):
+        encode([frame])
+
+
+def test_a_heartbeat_of_a_later_version_may_be_longer() -> None:
+    beat = Heartbeat("ugv1", 1, 2, 0, 1000, 0, 0, 0, 0)
+    raw = encode([beat])
+    assert decode(raw[:-1] + b"\x03new" + encode([Ping(7)])) == [beat, Ping(7)]

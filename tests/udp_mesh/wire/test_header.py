@@ -1,0 +1,44 @@
+"""Laws of the clear header."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from udp_mesh.wire.errors import DecodeError, UnknownVersionError
+from udp_mesh.wire.header import Kind, LongHeader, ShortHeader, encode_long, encode_short, is_ours, parse_header
+
+
+@given(st.sampled_from([Kind.BROADCAST, Kind.DATA]), st.integers(0, 65_535), st.integers(0, (1 << 48) - 1))
+def test_a_short_header_comes_back_with_the_low_half_of_its_number(kind: Kind, tag: int, number: int) -> None:
+    raw = encode_short(kind, tag, number) + bytes(16)
+    assert parse_header(raw) == ShortHeader(kind, tag, number & 0xFFFFFFFF)
+    assert is_ours(raw)
+
+
+@given(st.sampled_from([Kind.HELLO, Kind.INTRODUCTION]), st.binary(min_size=16, max_size=16))
+def test_a_long_header_comes_back(kind: Kind, boot: bytes) -> None:
+    raw = encode_long(kind, b"keyi", boot, 77) + b"chek" + bytes(16)
+    assert parse_header(memoryview(raw)) == LongHeader(kind, b"keyi", boot, 77, b"chek")
+
+
+@given(st.binary(max_size=80))
+def test_any_bytes_give_a_header_or_an_error(raw: bytes) -> None:
+    try:
+        parse_header(raw)
+    except DecodeError:
+        return
+    assert raw[0] in (0x90, 0x91, 0x92, 0x93)
+
+
+@pytest.mark.parametrize("first", [1, 2, 4, 5])
+def test_no_fielded_datagram_looks_like_ours(first: int) -> None:
+    raw = bytes((first,)) + bytes(60)
+    assert not is_ours(raw)
+    with pytest.raises(DecodeError, match="mark"):
+        parse_header(raw)
+
+
+def test_another_version_is_named() -> None:
+    with pytest.raises(UnknownVersionError) as caught:
+        parse_header(bytes((0x80 | 3 << 4,)) + bytes(60))
+    assert caught.value.version == 3
