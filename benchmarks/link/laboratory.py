@@ -1,0 +1,213 @@
+"""Network namespaces joined by the emulated link: make, tune while running, count, take down.
+
+`Laboratory` compiles the emulator if its source is newer, makes one namespace per host, starts the emulator with one
+port in each, gives addresses 10.99.0.1, .2, ... and fixed neighbour entries (so that ARP under loss is not what is
+measured). Needs root. All names carry the process id, so two laboratories never meet.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import shutil
+import socket
+import subprocess
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+SOURCE = Path(__file__).with_name("emulator.c")
+INTERFACE = "mesh0"
+# a healthy emulator is ready within milliseconds; a busy machine may need longer
+READY_TIMEOUT_S = 30.0
+ANSWER_TIMEOUT_S = 10.0
+_TEACH = """import socket, sys
+with socket.socket(type=socket.SOCK_DGRAM) as teacher:
+    teacher.sendto(b"x", (sys.argv[1], 9))
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """What the link is like. `queue` is in frames, `attempts` are those of the radio itself, `half` shares one
+    transmitter among all hosts; `burst_*` are the Gilbert-Elliott chain's probabilities per frame."""
+
+    rate: float = 10e6
+    delay_ms: float = 10.0
+    loss: float = 0.0
+    burst_enter: float = 0.0
+    burst_leave: float = 1.0
+    burst_loss: float = 1.0
+    queue: int = 100
+    overhead_us: float = 0.0
+    attempts: int = 1
+    half: int = 0
+    up: int = 1
+
+    def as_settings(self) -> dict[str, float]:
+        return {name: float(getattr(self, name)) for name in self.__slots__}
+
+
+@dataclass(frozen=True, slots=True)
+class PortCount:
+    """One host's counters since the last reset; bytes are of IP packets."""
+
+    in_frames: int
+    in_bytes: int
+    queue_drops: int
+    losses: int
+    down_drops: int
+    out_frames: int
+    out_bytes: int
+    max_waiting: int
+
+
+@dataclass(frozen=True, slots=True)
+class Count:
+    """`airtime_s` is the time the transmitters were busy, retries included."""
+
+    airtime_s: float
+    ports: tuple[PortCount, ...]
+
+
+class LaboratoryError(RuntimeError):
+    """The emulator or a namespace could not be set up, or the emulator answered with something else than `ok`."""
+
+
+def compiled_emulator(directory: Path) -> Path:
+    """The emulator's program, compiled into `directory`."""
+    program = directory / "emulator"
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        raise LaboratoryError("no C compiler found (install gcc)")
+    done = subprocess.run(
+        [compiler, "-O2", "-Wall", "-o", str(program), str(SOURCE)], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise LaboratoryError(f"the emulator does not compile:\n{done.stderr}")
+    return program
+
+
+class Laboratory:
+    """Hosts on one link. Use `laboratory(...)`; it takes everything down again."""
+
+    def __init__(self, hosts: int, seed: int, directory: Path, prefix: str) -> None:
+        self.namespaces = tuple(f"{prefix}{index}" for index in range(hosts))
+        self.addresses = tuple(f"10.99.0.{index + 1}" for index in range(hosts))
+        self.directory = directory
+        self._seed = seed
+        self._emulator: subprocess.Popen[str] | None = None
+        self._control: socket.socket | None = None
+        self._made: list[str] = []
+
+    def start(self) -> None:
+        for namespace in self.namespaces:
+            _ip("netns", "add", namespace)
+            self._made.append(namespace)
+            _ip("-n", namespace, "link", "set", "lo", "up")
+        program = compiled_emulator(self.directory)
+        path = str(self.directory / "control")
+        self._emulator = subprocess.Popen(
+            [str(program), path, str(self._seed), *(f"{name}:{INTERFACE}" for name in self.namespaces)],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self._emulator.stdout is not None
+        readable, _, _ = select.select([self._emulator.stdout], [], [], READY_TIMEOUT_S)
+        if not readable or self._emulator.stdout.readline() != "ready\n":
+            raise LaboratoryError("the emulator did not start")
+        self._control = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._control.bind(f"{path}.answer")
+        self._control.connect(path)
+        self._control.settimeout(ANSWER_TIMEOUT_S)
+        for namespace, address in zip(self.namespaces, self.addresses, strict=True):
+            _ip("-n", namespace, "addr", "add", f"{address}/24", "brd", "10.99.0.255", "dev", INTERFACE)
+            # IPv6's own chatter would be counted as the transport's
+            self.run(self.namespaces.index(namespace), ["sysctl", "-qw", "net.ipv6.conf.all.disable_ipv6=1"])
+            _ip("-n", namespace, "link", "set", INTERFACE, "mtu", "1500", "txqueuelen", "1000", "up")
+        self._fix_neighbours()
+
+    def _fix_neighbours(self) -> None:
+        macs = []
+        for namespace in self.namespaces:
+            shown = json.loads(_ip("-n", namespace, "-j", "link", "show", INTERFACE))
+            macs.append(shown[0]["address"])
+        for here, namespace in enumerate(self.namespaces):
+            for there, address in enumerate(self.addresses):
+                if there != here:
+                    _ip("-n", namespace, "neigh", "replace", address, "lladdr", macs[there], "dev", INTERFACE,
+                        "nud", "permanent")  # fmt: skip
+        # one datagram from each host teaches the emulator where every address is
+        for here, _ in enumerate(self.namespaces):
+            self.run(here, ["python3", "-c", _TEACH, self.addresses[(here + 1) % len(self.addresses)]])
+
+    def set(self, **settings: float) -> None:
+        """Change the link now; names and units as in `Link`."""
+        answer = self._ask("set " + " ".join(f"{name}={value}" for name, value in settings.items()))
+        if answer != "ok":
+            raise LaboratoryError(answer)
+
+    def become(self, link: Link) -> None:
+        """Make the link exactly this."""
+        self.set(**link.as_settings())
+
+    def count(self) -> Count:
+        answer = json.loads(self._ask("count"))
+        return Count(answer["airtime_ns"] / 1e9, tuple(PortCount(**port) for port in answer["ports"]))
+
+    def reset(self) -> None:
+        self._ask("reset")
+
+    def _ask(self, command: str) -> str:
+        if self._control is None:
+            raise LaboratoryError("the laboratory is not started")
+        self._control.send(command.encode())
+        return self._control.recv(65536).decode()
+
+    def inside(self, host: int, command: Sequence[str]) -> list[str]:
+        """The command line that runs `command` on a host."""
+        return ["ip", "netns", "exec", self.namespaces[host], *command]
+
+    def run(self, host: int, command: Sequence[str]) -> str:
+        """Run to the end; the output."""
+        return subprocess.run(self.inside(host, command), check=True, capture_output=True, text=True).stdout
+
+    def popen(self, host: int, command: Sequence[str], environ: Mapping[str, str] | None = None,
+              stderr: int | None = None) -> subprocess.Popen[bytes]:  # fmt: skip
+        """Start and return at once; the caller ends it."""
+        return subprocess.Popen(self.inside(host, command), env={**os.environ, **(environ or {})}, stderr=stderr)
+
+    def stop(self) -> None:
+        if self._control is not None:
+            self._control.close()
+        if self._emulator is not None:
+            self._emulator.terminate()
+            self._emulator.wait()
+            if self._emulator.stdout is not None:
+                self._emulator.stdout.close()
+        for namespace in self._made:
+            _ip("netns", "del", namespace)
+        self._made.clear()
+
+
+@contextmanager
+def laboratory(hosts: int = 2, *, seed: int = 1, link: Link | None = None) -> Iterator[Laboratory]:
+    """A started laboratory; everything is gone afterwards, also after a failure."""
+    with tempfile.TemporaryDirectory(prefix="link-") as directory:
+        made = Laboratory(hosts, seed, Path(directory), f"link{os.getpid()}-")
+        try:
+            made.start()
+            made.become(link or Link())
+            yield made
+        finally:
+            made.stop()
+
+
+def _ip(*arguments: str) -> str:
+    done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise LaboratoryError(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
+    return done.stdout
