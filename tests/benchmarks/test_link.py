@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -39,10 +40,12 @@ def send(lab: Laboratory, count: int) -> None:
 
 def settled(lab: Laboratory, count: int) -> None:
     """Wait until the link has dealt with every frame it was given."""
-    while True:
+    for _ in range(3000):
         port, other = lab.count().ports
         if port.queue_drops + port.losses + port.down_drops + other.out_frames >= count:
             return
+        time.sleep(0.01)
+    raise AssertionError(f"{count} frames were sent, the link tells of {lab.count()}")
 
 
 def test_a_clean_link_carries_every_frame_and_its_airtime_is_bytes_over_rate(lab: Laboratory) -> None:
