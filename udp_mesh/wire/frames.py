@@ -142,6 +142,8 @@ class RefuseReason(IntEnum):
     """The receiver's reassembly memory for this sender is full: try again later."""
     CORRUPT = 3
     """The bytes do not decompress, or the fragments contradict their head."""
+    FORGOTTEN = 4
+    """The receiver no longer has the fragments it acknowledged (or the topic's name): send the message anew."""
 
 
 @dataclass(frozen=True, slots=True)
