@@ -1,0 +1,29 @@
+"""Fleet -> Intent per node: what each node shall be, worked out completely, before any template sees it."""
+
+from meshctl.resolve.airtime import originator_airtime
+from meshctl.resolve.intent import BatmanInterface, Intent, Lan, Login, MeshInterface, RadioIntent
+from meshctl.resolve.intervals import MEASURED_HEAL_S, Intervals, UnreachableTarget, batman_intervals, heal_s
+from meshctl.resolve.node import resolve
+from meshctl.resolve.packages import FULL_SUPPLICANTS, Need, PackagePlan, package_needs, package_plan, supplicant_need
+
+__all__ = [
+    "FULL_SUPPLICANTS",
+    "MEASURED_HEAL_S",
+    "BatmanInterface",
+    "Intent",
+    "Intervals",
+    "Lan",
+    "Login",
+    "MeshInterface",
+    "Need",
+    "PackagePlan",
+    "RadioIntent",
+    "UnreachableTarget",
+    "batman_intervals",
+    "heal_s",
+    "originator_airtime",
+    "package_needs",
+    "package_plan",
+    "resolve",
+    "supplicant_need",
+]

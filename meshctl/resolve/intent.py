@@ -1,0 +1,128 @@
+"""What one node shall be, complete and frozen: everything that templates need, and nothing they must work out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from ipaddress import IPv4Address, IPv4Interface
+from types import MappingProxyType
+
+from meshctl.diagnostics import Position
+from meshctl.model import (
+    Backend,
+    Band,
+    Batman,
+    Encryption,
+    MeshMode,
+    OperatorParts,
+    Release,
+    Role,
+    Secret,
+    SystemSettings,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class MeshInterface:
+    """A radio's interface in a mesh. `name` is section, device and ifname at once; `master` the batman-adv interface
+    it belongs to, empty with another back end; `key` is set exactly when the mesh is encrypted."""
+
+    name: str
+    mesh: str
+    mode: MeshMode
+    ssid: str
+    bssid: str
+    mcast_rate_kbps: int
+    encryption: Encryption
+    key: Secret | None
+    mtu: int
+    master: str
+    # only BATMAN_V has the ELP interval
+    elp_interval_ms: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class RadioIntent:
+    """A radio; `interface` None means switched off, `channel` is None then."""
+
+    name: str
+    path: str
+    band: Band
+    country: str
+    channel: int | None
+    htmode: str
+    tx_power_dbm: int
+    distance_m: int
+    beacon_interval_tu: int
+    interface: MeshInterface | None
+
+    @property
+    def hwmode(self) -> str:
+        """The name that 19.07 has for the band."""
+        return "11g" if self.band is Band.G2 else "11a"
+
+
+@dataclass(frozen=True, slots=True)
+class BatmanInterface:
+    """A batman-adv interface (`bat0`) with its options, and the interval that the reconnect target asks for."""
+
+    name: str
+    mesh: str
+    options: Batman
+    orig_interval_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class Lan:
+    """The bridge that joins the node's wired ports with its mesh; it carries the management address."""
+
+    bridge: str
+    ports: tuple[str, ...]
+    address: IPv4Interface
+    gateway: IPv4Address | None
+    mtu: int
+
+
+@dataclass(frozen=True, slots=True)
+class Login:
+    """Who may log in over SSH, and how."""
+
+    port: int
+    is_password_allowed: bool
+    keys: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Intent:
+    """One node, written at `position`. `extra_uci` holds UCI text per package, which is appended to what the templates
+    give; `extra_positions` tells where it was written."""
+
+    fleet: str
+    node: str
+    hostname: str
+    label: str
+    role: Role
+    release: Release
+    board: str
+    radios: tuple[RadioIntent, ...]
+    batman: tuple[BatmanInterface, ...]
+    lan: Lan
+    login: Login
+    system: SystemSettings
+    backend: Backend
+    operator_parts: OperatorParts
+    packages: tuple[str, ...]
+    removed_packages: tuple[str, ...]
+    position: Position
+    extra_uci: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    extra_positions: Mapping[str, Position] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def interfaces(self) -> tuple[MeshInterface, ...]:
+        """The mesh interfaces of all radios, in order."""
+        return tuple(radio.interface for radio in self.radios if radio.interface is not None)
+
+    @property
+    def secrets(self) -> tuple[Secret, ...]:
+        """Every secret that a file of this node may hold."""
+        return tuple(dict.fromkeys(interface.key for interface in self.interfaces if interface.key is not None))

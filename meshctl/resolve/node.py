@@ -1,0 +1,208 @@
+"""Fleet -> one node's Intent: meshes grouped under routing interfaces, the bridge put together, intervals chosen.
+
+A radio that joins a mesh gets the interface `mesh0`, `mesh1`, ... in the radios' order. Meshes of one network and
+routing algorithm share one batman-adv interface (`bat0`), so that a node with two radios, or one in each band, routes
+between them; any other mesh gets an interface of its own, which relays but is not bridged. The bridge joins the wired
+ports with the routing interface of the mesh whose network holds the node's address.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from ipaddress import IPv4Network
+
+from meshctl.diagnostics import InvalidInput
+from meshctl.model import Backend, Encryption, Fleet, Mesh, Node, OperatorParts, Radio, Secret, SecretRef
+from meshctl.resolve.intent import BatmanInterface, Intent, Lan, Login, MeshInterface, RadioIntent
+from meshctl.resolve.intervals import Intervals, UnreachableTarget, batman_intervals
+from meshctl.resolve.packages import package_plan
+from meshctl.resolve.refusals import COMBINATION, RECONNECT, Refusals
+
+BRIDGE = "br-lan"
+
+
+def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) -> Intent:
+    """Everything the templates need for `node`.
+
+    Raises InvalidInput with every value that the node's files cannot hold, each at its place (docs/render.md).
+    """
+    refusals = Refusals(fleet)
+    meshes = tuple(fleet.meshes[name] for name in node.meshes)
+    primary = _primary(meshes, node)
+    keys = _keys(meshes, node, secrets, refusals)
+    masters = _masters(meshes)
+    intervals = {mesh.name: _intervals(mesh, refusals) for mesh in meshes if mesh.backend is Backend.BATMAN}
+    if len({(mesh.backend, mesh.operator_parts) for mesh in meshes}) > 1:
+        path = ("nodes", node.name, "radios")
+        refusals.add(
+            COMBINATION, path, "meshes of one back end", ", ".join(f"{m.name}: {m.backend.value}" for m in meshes)
+        )
+    plan = package_plan(fleet, node)
+    radios = _radios(fleet, node, keys, masters, intervals)
+    intent = Intent(
+        fleet=fleet.name,
+        node=node.name,
+        hostname=node.hostname,
+        label=node.label,
+        role=node.role,
+        release=node.release,
+        board=node.hardware.board,
+        radios=radios,
+        batman=_batman(meshes, masters, intervals),
+        lan=_lan(node, primary, masters, radios),
+        login=Login(node.ssh.port, fleet.operators.password_login, fleet.operators.ssh_keys),
+        system=fleet.system,
+        backend=primary.backend if primary is not None else Backend.BATMAN,
+        operator_parts=primary.operator_parts if primary is not None else OperatorParts(),
+        packages=plan.install,
+        removed_packages=plan.remove,
+        extra_uci=node.extra_uci,
+        extra_positions={name: refusals.position("nodes", node.name, "extra_uci", name) for name in node.extra_uci},
+        position=refusals.position("nodes", node.name),
+    )
+    _refuse(fleet, node, intent, refusals)
+    if refusals.found:
+        raise InvalidInput(refusals.found)
+    return intent
+
+
+def _primary(meshes: tuple[Mesh, ...], node: Node) -> Mesh | None:
+    """The mesh that the node's address belongs to, or else its first."""
+    holding = (mesh for mesh in meshes if node.address.ip in mesh.network)
+    return next(holding, meshes[0] if meshes else None)
+
+
+def _keys(
+    meshes: tuple[Mesh, ...], node: Node, secrets: Callable[[SecretRef], Secret], refusals: Refusals
+) -> dict[str, Secret]:
+    keys = {}
+    for mesh in meshes:
+        refusals.mesh(mesh, node.release)
+        if mesh.encryption is not Encryption.NONE and mesh.key is not None:
+            keys[mesh.name] = secrets(mesh.key)
+            refusals.key(mesh, keys[mesh.name], node.release)
+    return keys
+
+
+def _masters(meshes: tuple[Mesh, ...]) -> dict[str, str]:
+    """Mesh -> the batman-adv interface above it."""
+    names: dict[tuple[IPv4Network, str], str] = {}
+    for mesh in meshes:
+        if mesh.backend is Backend.BATMAN:
+            names.setdefault(_group(mesh), f"bat{len(names)}")
+    return {mesh.name: names[_group(mesh)] for mesh in meshes if mesh.backend is Backend.BATMAN}
+
+
+def _group(mesh: Mesh) -> tuple[IPv4Network, str]:
+    return mesh.network, mesh.batman.routing_algo
+
+
+def _intervals(mesh: Mesh, refusals: Refusals) -> Intervals:
+    try:
+        return batman_intervals(mesh)
+    except UnreachableTarget as target:
+        path = ("meshes", mesh.name, "reconnect_s")
+        refusals.add(RECONNECT, path, f"at least {target.fastest_s:g} s", f"{mesh.reconnect_s:g} s")
+        return Intervals(100, 50)
+
+
+def _radios(
+    fleet: Fleet, node: Node, keys: dict[str, Secret], masters: dict[str, str], intervals: dict[str, Intervals]
+) -> tuple[RadioIntent, ...]:
+    radios = []
+    joined = 0
+    for radio in node.radios:
+        mesh = fleet.meshes[radio.mesh] if radio.mesh is not None else None
+        interface = None
+        if mesh is not None:
+            elp_ms = intervals[mesh.name].elp_interval_ms if mesh.batman.routing_algo == "BATMAN_V" else None
+            interface = _interface(f"mesh{joined}", mesh, keys.get(mesh.name), masters.get(mesh.name, ""), elp_ms)
+            joined += 1
+        radios.append(_radio(fleet.country, radio, mesh, interface))
+    return tuple(radios)
+
+
+def _interface(name: str, mesh: Mesh, key: Secret | None, master: str, elp_interval_ms: int | None) -> MeshInterface:
+    return MeshInterface(
+        name=name,
+        mesh=mesh.name,
+        mode=mesh.mode,
+        ssid=mesh.ssid,
+        bssid=mesh.bssid,
+        mcast_rate_kbps=mesh.mcast_rate_kbps,
+        encryption=mesh.encryption,
+        key=key,
+        mtu=mesh.mtu,
+        master=master,
+        elp_interval_ms=elp_interval_ms if master else None,
+    )
+
+
+def _radio(country: str, radio: Radio, mesh: Mesh | None, interface: MeshInterface | None) -> RadioIntent:
+    return RadioIntent(
+        name=radio.name,
+        path=radio.hardware.path,
+        band=radio.hardware.band,
+        country=country,
+        channel=mesh.channel if mesh is not None else None,
+        htmode=mesh.htmode if mesh is not None else "HT20",
+        tx_power_dbm=radio.tx_power_dbm,
+        distance_m=mesh.distance_m if mesh is not None else 0,
+        beacon_interval_tu=mesh.beacon_interval_tu if mesh is not None else 100,
+        interface=interface,
+    )
+
+
+def _batman(
+    meshes: tuple[Mesh, ...], masters: dict[str, str], intervals: dict[str, Intervals]
+) -> tuple[BatmanInterface, ...]:
+    """One interface per group; where meshes share one, the first mesh's options hold and the shortest interval."""
+    interfaces: dict[str, BatmanInterface] = {}
+    for mesh in meshes:
+        if mesh.name not in masters:
+            continue
+        name = masters[mesh.name]
+        orig_ms = intervals[mesh.name].orig_interval_ms
+        if name in interfaces:
+            orig_ms = min(orig_ms, interfaces[name].orig_interval_ms)
+            mesh_name, options = interfaces[name].mesh, interfaces[name].options
+        else:
+            mesh_name, options = mesh.name, mesh.batman
+        interfaces[name] = BatmanInterface(name, mesh_name, options, orig_ms)
+    return tuple(interfaces.values())
+
+
+def _lan(node: Node, primary: Mesh | None, masters: dict[str, str], radios: tuple[RadioIntent, ...]) -> Lan:
+    ports = list(node.lan_ports)
+    if primary is not None:
+        match primary.backend:
+            case Backend.BATMAN:
+                ports.append(masters[primary.name])
+            case Backend.MESHMERIZE if primary.operator_parts.interface:
+                ports.append(primary.operator_parts.interface)
+            case Backend.MESHMERIZE:
+                pass
+    mtu = primary.lan_mtu if primary is not None else 1500
+    return Lan(BRIDGE, tuple(dict.fromkeys(ports)), node.address, node.gateway, mtu)
+
+
+def _refuse(fleet: Fleet, node: Node, intent: Intent, refusals: Refusals) -> None:
+    """Hold every text of the intent that did not come from a closed set against what the node can read."""
+    path = ("nodes", node.name)
+    refusals.text(path, intent.node)
+    refusals.text(("fleet",), intent.fleet)
+    refusals.hostname((*path, "hostname"), intent.hostname)
+    refusals.text((*path, "label"), intent.label)
+    for index, port in enumerate(intent.lan.ports):
+        refusals.device((*path, "lan_ports", str(index)), port)
+    for radio in intent.radios:
+        place = ("hardware", node.hardware.name, "radios", radio.name)
+        refusals.section(place, radio.name)
+        refusals.text((*place, "path"), radio.path, is_required=True)
+    refusals.text(("system", "timezone"), fleet.system.timezone, is_required=True)
+    refusals.text(("system", "zonename"), fleet.system.zonename)
+    refusals.text(("system", "log_host"), fleet.system.log_host)
+    for index, server in enumerate(fleet.system.ntp_servers):
+        refusals.text(("system", "ntp_servers", str(index)), server, is_required=True)
+    login = intent.login
+    refusals.login(login.keys, is_password_allowed=login.is_password_allowed, release=intent.release)

@@ -1,0 +1,93 @@
+"""Which OpenWrt packages a node needs for what the inventory asks of it, and which stock ones they replace."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from meshctl.model import Backend, Encryption, Fleet, Mesh, MeshMode, Node, Release
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """One of `any_of` must be installed (the first is taken when the inventory names none), because of `reason`."""
+
+    any_of: tuple[str, ...]
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class PackagePlan:
+    """`install` on top of the stock image, `remove` from it; both sorted."""
+
+    install: tuple[str, ...]
+    remove: tuple[str, ...]
+
+
+def package_plan(fleet: Fleet, node: Node) -> PackagePlan:
+    """What the inventory names for the node and its hardware, completed by what its meshes need."""
+    named = {package for package in (*node.hardware.packages, *node.packages) if not package.startswith("-")}
+    dropped = {package[1:] for package in (*node.hardware.packages, *node.packages) if package.startswith("-")}
+    for need in package_needs(fleet, node):
+        if not named.intersection(need.any_of):
+            named.add(need.any_of[0])
+    if any(package in FULL_SUPPLICANTS for package in named):
+        dropped.add(stock_supplicant(node.release))
+    return PackagePlan(tuple(sorted(named)), tuple(sorted(dropped - named)))
+
+
+def package_needs(fleet: Fleet, node: Node) -> tuple[Need, ...]:
+    """Every need of the node's meshes, each once, in the meshes' order."""
+    needs: dict[Need, None] = {}
+    for name in node.meshes:
+        mesh = fleet.meshes[name]
+        needs.update(dict.fromkeys(_backend_needs(mesh)))
+        supplicant = supplicant_need(mesh, node.release)
+        if supplicant is not None:
+            needs[supplicant] = None
+    return tuple(needs)
+
+
+def _backend_needs(mesh: Mesh) -> tuple[Need, ...]:
+    tools = (Need(("iw",), "meshctl reads the radio's links with it"),)
+    match mesh.backend:
+        case Backend.BATMAN:
+            return (
+                Need(("kmod-batman-adv",), f"mesh {mesh.name} routes with batman-adv"),
+                # batctl-tiny prints no JSON and knows no loop avoidance tables
+                Need(("batctl-default", "batctl-full"), f"meshctl reads the routes of mesh {mesh.name} with it"),
+                *tools,
+            )
+        case Backend.MESHMERIZE:
+            reason = f"mesh {mesh.name} routes with meshmerize"
+            return (*(Need((package,), reason) for package in mesh.operator_parts.packages), *tools)
+
+
+# wpa_supplicant builds with CONFIG_IBSS_RSN and SAE in mesh mode; `wpad-basic*` and `wpad-mini` have neither.
+FULL_SUPPLICANTS = (
+    "wpad-mesh-mbedtls",
+    "wpad-mesh-openssl",
+    "wpad-mesh-wolfssl",
+    "wpad-mbedtls",
+    "wpad-openssl",
+    "wpad-wolfssl",
+    "wpad",
+)
+
+
+def supplicant_need(mesh: Mesh, release: Release) -> Need | None:
+    """The supplicant that an encrypted mesh needs, in the build that the release ships with its own TLS library."""
+    if mesh.encryption is Encryption.NONE:
+        return None
+    library = "mbedtls" if release >= Release.V23_05 else "wolfssl"
+    preferred = f"wpad-mesh-{library}"
+    offered = tuple(name for name in FULL_SUPPLICANTS if release >= Release.V23_05 or not name.endswith("mbedtls"))
+    what = "an encrypted ad-hoc cell" if mesh.mode is MeshMode.ADHOC else "an encrypted 802.11s mesh"
+    rest = tuple(name for name in offered if name != preferred)
+    return Need((preferred, *rest), f"mesh {mesh.name} is {what}, which wpad-basic cannot join")
+
+
+def stock_supplicant(release: Release) -> str:
+    """The supplicant in the release's stock images, which conflicts with a full one."""
+    if release >= Release.V23_05:
+        return "wpad-basic-mbedtls"
+    return "wpad-basic-wolfssl" if release >= Release.V21_02 else "wpad-basic"

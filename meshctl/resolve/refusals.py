@@ -1,0 +1,142 @@
+"""Values that a node's files cannot hold, or that would lock the operator out: found here, with their place.
+
+Lint judges whether a configuration is wise; this judges only whether it can be written down and read back by the node
+as it was meant. UCI itself holds any text, but the programs behind it (netifd's shell, wpa_supplicant's file) do not.
+"""
+
+from __future__ import annotations
+
+import re
+
+from meshctl.diagnostics import Diagnostic, Position, Severity
+from meshctl.model import Encryption, Fleet, Mesh, MeshMode, MissingOrigin, Release, Secret
+
+# The codes of this package, each with what it means (docs/render.md).
+VALUE = "RND001"
+COMBINATION = "RND002"
+LOCKED_OUT = "RND003"
+RECONNECT = "RND004"
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+_HOSTNAME = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(?<!-)")
+_SECTION = re.compile(r"[A-Za-z0-9_]+")
+_MAC = re.compile(r"[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}")
+# IFNAMSIZ is 16 with the terminator; 19.07 joins a bridge's ports with spaces
+_DEVICE = re.compile(r"[^\s/:'\"\\\x00-\x1f]{1,15}")
+_PUBLIC_KEY = re.compile(
+    r"(ssh-(?:rsa|ed25519)|ecdsa-sha2-nistp(?:256|384|521)|sk-[a-z0-9@.-]+) [A-Za-z0-9+/]+={0,3}( .*)?"
+)
+_RAW_PSK = re.compile(r"[0-9A-Fa-f]{64}")
+_PASSPHRASE = re.compile(r"[ -~]{8,63}")
+# 802.11: an SSID has at most 32 bytes
+_MAX_SSID_BYTES = 32
+# what hostapd and wpa_supplicant take in one line of their configuration
+_MAX_SAE_CHARACTERS = 128
+
+
+class Refusals:
+    """Collects what is wrong with one fleet's values; `found` holds every diagnostic."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._fleet = fleet
+        self.found: list[Diagnostic] = []
+
+    def position(self, *path: str) -> Position:
+        """Where a value was written, or else the inventory's first file."""
+        try:
+            return self._fleet.where(*path).position
+        except MissingOrigin:
+            return Position(self._fleet.files[0] if self._fleet.files else self._fleet.name)
+
+    def add(
+        self, code: str, path: tuple[str, ...], expected: str, found: str, *, message: str = "", hint: str = ""
+    ) -> None:
+        """One refusal at the place of `path`."""
+        self.found.append(
+            Diagnostic(code, Severity.ERROR, self.position(*path), message, ".".join(path), expected, found, hint)
+        )
+
+    def text(self, path: tuple[str, ...], value: str, *, is_required: bool = False) -> None:
+        """Any text of one line."""
+        if _CONTROL.search(value):
+            self.add(VALUE, path, "text without line breaks and control characters", repr(value))
+        if is_required and not value:
+            self.add(VALUE, path, "a value", "none")
+
+    def section(self, path: tuple[str, ...], value: str) -> None:
+        """The name of a UCI section."""
+        if not _SECTION.fullmatch(value):
+            self.add(VALUE, path, "a UCI section's name of letters, digits and _", repr(value))
+
+    def hostname(self, path: tuple[str, ...], value: str) -> None:
+        """A host name by RFC 1123, without dots."""
+        if not _HOSTNAME.fullmatch(value):
+            self.add(VALUE, path, "a host name of letters, digits and inner hyphens, at most 63", repr(value))
+
+    def device(self, path: tuple[str, ...], value: str) -> None:
+        """The name of a network device."""
+        if not _DEVICE.fullmatch(value):
+            self.add(VALUE, path, "a network device's name of at most 15 characters", repr(value))
+
+    def mesh(self, mesh: Mesh, release: Release) -> None:
+        """A mesh's name on air, its cell, and whether this release can join it."""
+        path = ("meshes", mesh.name)
+        self._ssid((*path, "ssid"), mesh.ssid, release)
+        if mesh.mode is MeshMode.ADHOC and not _MAC.fullmatch(mesh.bssid):
+            self.add(VALUE, (*path, "bssid"), "six pairs of hex digits, as in 02:ca:fe:00:00:01", repr(mesh.bssid))
+        match (mesh.mode, mesh.encryption):
+            case (MeshMode.ADHOC, Encryption.SAE):
+                self.add(COMBINATION, (*path, "encryption"), "none or psk2+ccmp in ad-hoc mode", "sae")
+            case (MeshMode.MESH, Encryption.PSK2):
+                self.add(COMBINATION, (*path, "encryption"), "none or sae in 802.11s mode", "psk2+ccmp")
+            case (MeshMode.ADHOC, Encryption.PSK2) if release >= Release.V25_12:
+                hint = "use mode: mesh with encryption: sae, or an earlier release"
+                message = f"OpenWrt {release} joins an encrypted ad-hoc cell open, without a word"
+                self.add(COMBINATION, (*path, "encryption"), "none", "psk2+ccmp", message=message, hint=hint)
+            case _:
+                pass
+        if mesh.encryption is not Encryption.NONE and mesh.key is None:
+            self.add(COMBINATION, (*path, "key"), f"a reference to the key of {mesh.encryption.value}", "none")
+
+    def _ssid(self, path: tuple[str, ...], ssid: str, release: Release) -> None:
+        size = len(ssid.encode("utf-8", "surrogatepass"))
+        if not 1 <= size <= _MAX_SSID_BYTES:
+            self.add(VALUE, path, f"1 to {_MAX_SSID_BYTES} bytes", f"{size} bytes in {ssid!r}")
+        self.text(path, ssid)
+        if release >= Release.V25_12 and "'" in ssid:
+            self.add(VALUE, path, f"no single quote (OpenWrt {release} hands it to a shell)", repr(ssid))
+
+    def key(self, mesh: Mesh, key: Secret, release: Release) -> None:
+        """A mesh's key by the rules of its encryption; a refusal never shows it."""
+        path = ("meshes", mesh.name, "key")
+        value = key.reveal()
+        if mesh.encryption is Encryption.PSK2:
+            if not _PASSPHRASE.fullmatch(value) and not _RAW_PSK.fullmatch(value):
+                self.add(VALUE, path, "8 to 63 printable ASCII characters or 64 hex digits", _outline(value))
+        elif not 1 <= len(value) <= _MAX_SAE_CHARACTERS or _CONTROL.search(value):
+            self.add(VALUE, path, f"1 to {_MAX_SAE_CHARACTERS} characters without line breaks", _outline(value))
+        if release >= Release.V25_12 and "'" in value:
+            self.add(VALUE, path, f"no single quote (OpenWrt {release} hands it to a shell)", _outline(value))
+
+    def login(self, keys: tuple[str, ...], *, is_password_allowed: bool, release: Release) -> None:
+        """Public keys of one line each, at least one of which this release's dropbear knows."""
+        usable = 0
+        for index, key in enumerate(keys):
+            found = _PUBLIC_KEY.fullmatch(key)
+            if found is None or _CONTROL.search(key):
+                self.add(VALUE, ("operators", "ssh_keys", str(index)), "one OpenSSH public key on one line", repr(key))
+            elif release.has_ed25519 or found[1] == "ssh-rsa":
+                usable += 1
+        if usable == 0 and not is_password_allowed:
+            kinds = (
+                "an OpenSSH public key" if release.has_ed25519 else f"an RSA key, the only kind OpenWrt {release} knows"
+            )
+            message = "nobody could log in to the node any more"
+            path = ("operators", "ssh_keys")
+            self.add(LOCKED_OUT, path, kinds, "none", message=message, hint="add a key to operators.ssh_keys")
+
+
+def _outline(secret: str) -> str:
+    """A secret's shape, for a message: nothing of its letters."""
+    plain = "" if secret.isascii() and secret.isprintable() else ", some of them not printable ASCII"
+    return f"{len(secret)} characters{plain}"
