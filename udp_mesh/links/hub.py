@@ -1,0 +1,66 @@
+"""Keeps the open sockets equal to the attachments that exist: interfaces come and go while the node runs.
+
+`refresh` -> dump the kernel's interfaces -> choose -> close what is gone, open what is new, reopen what changed. A
+socket that cannot be opened is reported and tried again at the next refresh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from udp_mesh.links.attachments import Attachment, LinkWish, choose
+from udp_mesh.links.netlink import interfaces
+from udp_mesh.links.udp import UdpLink
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """What a refresh did. A reopened link is in `gone` and in `opened`."""
+
+    opened: tuple[UdpLink, ...] = ()
+    gone: tuple[UdpLink, ...] = ()
+    """Closed already; `attachment` says what they were."""
+    failed: dict[str, str] = field(default_factory=dict)
+    """Link name -> why its socket could not be opened."""
+
+
+class LinkHub:
+    """The open links by name."""
+
+    def __init__(self, wishes: Sequence[LinkWish], port: int, *, urgent_dscp: int = 0) -> None:
+        self.wishes = tuple(wishes)
+        self.links: dict[str, UdpLink] = {}
+        self._port = port
+        self._urgent_dscp = urgent_dscp
+
+    def refresh(self) -> Changes:
+        """Brings the sockets up to date with the kernel. Raises NetlinkError where it cannot be asked."""
+        wanted = {attachment.name: attachment for attachment in choose(interfaces(), self.wishes, self._port)}
+        gone = [link for name, link in self.links.items() if wanted.get(name) != link.attachment]
+        for link in gone:
+            link.close()
+            del self.links[link.attachment.name]
+        opened: list[UdpLink] = []
+        failed: dict[str, str] = {}
+        for name, attachment in wanted.items():
+            if name not in self.links:
+                outcome = self._open(attachment)
+                if isinstance(outcome, UdpLink):
+                    self.links[name] = outcome
+                    opened.append(outcome)
+                else:
+                    failed[name] = outcome
+        return Changes(tuple(opened), tuple(gone), failed)
+
+    def _open(self, attachment: Attachment) -> UdpLink | str:
+        try:
+            return UdpLink(attachment, urgent_dscp=self._urgent_dscp)
+        except OSError as error:
+            host, port = attachment.address
+            return f"{error.strerror or error} (UDP port {port} at {host} on {attachment.device})"
+
+    def close(self) -> None:
+        for link in self.links.values():
+            link.close()
+        self.links.clear()

@@ -1,0 +1,211 @@
+"""One UDP socket: datagrams out in runs (segmentation offload), datagrams in in runs (receive offload), never waiting.
+
+Out: consecutive datagrams of one size to one destination become one system call with UDP_SEGMENT (linux/udp.h); where
+the kernel or a device refuses that, the socket falls back to one call per datagram and remembers it. In: one call may
+return up to 64 datagrams of one sender, told apart by the size that UDP_GRO reports. Measured reasons stand in the
+transport's fact sheet.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import socket
+import struct
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from udp_mesh.links.attachments import Address, Attachment
+
+SOL_UDP, UDP_SEGMENT, UDP_GRO = 17, 103, 104
+SO_BINDTODEVICE, SO_RCVBUFFORCE = 25, 33
+
+MAX_SEGMENTS = 64
+"""UDP_MAX_SEGMENTS of older kernels (newer take 128)."""
+MAX_RUN_BYTES = 65_000
+"""One run must fit one IP packet of 65,535 B before it is cut."""
+RECEIVE_BUFFER_BYTES = 4 << 20
+"""Kernel receive buffer: 30 ms of a gigabit, so that a busy core loses nothing; capped by net.core.rmem_max."""
+SEND_BUFFER_BYTES = 1 << 20
+"""Kernel send buffer: a few runs; what waits here is beyond the scheduler's reach, so no more."""
+_DATAGRAM_BYTES = 1 << 16
+_INT = struct.Struct("=i")
+_ANCILLARY_BYTES = socket.CMSG_SPACE(4)
+
+_TRANSIENT = frozenset(
+    {
+        errno.ENETUNREACH,
+        errno.EHOSTUNREACH,
+        errno.ENETDOWN,
+        errno.ENODEV,
+        errno.ENXIO,
+        errno.EADDRNOTAVAIL,
+        errno.ECONNREFUSED,
+        errno.EPERM,
+        errno.EACCES,
+        errno.EINVAL,
+        errno.EMSGSIZE,
+        errno.ENOBUFS,
+        errno.EIO,
+    }
+)
+"""Errors that mean "this datagram is lost": the transport's reliability answers them, an exception would only do
+harm."""
+
+
+class Outgoing(Protocol):
+    """What is sent: the core's datagram. `destination` None means the link's broadcast address."""
+
+    @property
+    def destination(self) -> Address | None: ...
+    @property
+    def data(self) -> bytes: ...
+    @property
+    def urgent(self) -> bool: ...
+
+
+class UdpLink:
+    """The open socket of one attachment."""
+
+    def __init__(self, attachment: Attachment, *, urgent_dscp: int = 0) -> None:
+        """Raises OSError where the address or port is taken, or the device is not ours to use."""
+        self.attachment = attachment
+        self.segmentation = True
+        """Whether runs are still handed to the kernel whole."""
+        self.datagrams_lost_on_send = 0
+        """Datagrams the kernel refused (unreachable, device gone, too long)."""
+        self.system_calls = 0
+        self._buffer = memoryview(bytearray(_DATAGRAM_BYTES))
+        family = socket.AF_INET6 if ":" in attachment.address[0] else socket.AF_INET
+        level, name = (
+            (socket.IPPROTO_IP, socket.IP_TOS)
+            if family == socket.AF_INET
+            else (socket.IPPROTO_IPV6, socket.IPV6_TCLASS)
+        )
+        self._urgent = [(level, name, _INT.pack(urgent_dscp << 2))] if urgent_dscp else []
+        self._socket = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
+        try:
+            self._set_up()
+        except OSError:
+            self._socket.close()
+            raise
+
+    def _set_up(self) -> None:
+        own, attachment = self._socket, self.attachment
+        own.setsockopt(socket.SOL_SOCKET, SO_BINDTODEVICE, attachment.device.encode() + b"\0")
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        # Without CAP_NET_ADMIN the buffer stays within net.core.rmem_max.
+        with contextlib.suppress(PermissionError):
+            own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
+        # Before Linux 5.0 datagrams come one by one.
+        with contextlib.suppress(OSError):
+            own.setsockopt(SOL_UDP, UDP_GRO, 1)
+        if attachment.broadcast is not None:
+            own.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            # Broadcasts reach only sockets bound to no address; the device keeps other interfaces' traffic out.
+            own.bind(("", attachment.address[1]))
+        else:
+            own.bind(attachment.address)
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def receive(self, deliver: Callable[[memoryview, Address], None], limit: int) -> int:
+        """Hands up to about `limit` waiting datagrams to `deliver`; returns how many. Our own broadcasts are left out.
+
+        The bytes handed over are overwritten by the next call: who keeps them copies them.
+        """
+        count, buffer, own = 0, self._buffer, self.attachment.address
+        receive = self._socket.recvmsg_into
+        buffers = [buffer]
+        while count < limit:
+            try:
+                size, ancillary, _, source = receive(buffers, _ANCILLARY_BYTES)
+            except BlockingIOError:
+                break
+            except OSError:
+                # A pending error of the socket (an ICMP answer, the device going down): reading it clears it.
+                break
+            self.system_calls += 1
+            address = (source[0], source[1])
+            if address == own:
+                continue
+            segment = size
+            for level, kind, data in ancillary:
+                if level == SOL_UDP and kind == UDP_GRO:
+                    segment = _INT.unpack_from(data)[0]
+            if size <= segment:
+                deliver(buffer[:size], address)
+                count += 1
+                continue
+            for start in range(0, size, segment):
+                deliver(buffer[start : min(start + segment, size)], address)
+                count += 1
+        return count
+
+    def send(self, datagrams: Sequence[Outgoing]) -> int:
+        """Sends from the front; returns how many are done with (sent, or lost as on a radio). Fewer: the socket is
+        full."""
+        done, total = 0, len(datagrams)
+        while done < total:
+            first = datagrams[done]
+            destination = first.destination or self.attachment.broadcast
+            if destination is None:
+                # A broadcast on a link of fixed neighbours: nobody to send it to.
+                done += 1
+                continue
+            end = self._run_end(datagrams, done) if self.segmentation else done + 1
+            sent = self._send_run(datagrams[done:end], destination)
+            if sent is None:
+                break
+            done += sent
+        return done
+
+    def _run_end(self, datagrams: Sequence[Outgoing], start: int) -> int:
+        """Where the run from `start` ends: same destination and urgency, equal sizes, the last one may be shorter."""
+        first = datagrams[start]
+        size, destination, urgent = len(first.data), first.destination, first.urgent
+        end = start + 1
+        limit = min(len(datagrams), start + MAX_SEGMENTS, start + max(1, MAX_RUN_BYTES // max(1, size)))
+        while end < limit:
+            following = datagrams[end]
+            length = len(following.data)
+            if following.destination != destination or following.urgent != urgent or length > size:
+                break
+            end += 1
+            if length < size:
+                break
+        return end
+
+    def _send_run(self, run: Sequence[Outgoing], destination: Address) -> int | None:
+        """How many of the run are done with; None where the socket is full."""
+        ancillary = list(self._urgent) if run[0].urgent else []
+        if len(run) > 1:
+            ancillary.append((SOL_UDP, UDP_SEGMENT, struct.pack("=H", len(run[0].data))))
+        try:
+            self.system_calls += 1
+            if ancillary:
+                self._socket.sendmsg([datagram.data for datagram in run], ancillary, 0, destination)
+            else:
+                self._socket.sendto(run[0].data, destination)
+        except BlockingIOError:
+            return None
+        except OSError as error:
+            if len(run) > 1 and error.errno in (errno.EIO, errno.EINVAL, errno.EMSGSIZE, errno.EOPNOTSUPP):
+                # No segmentation on this device or path (EMSGSIZE: a datagram above the path's MTU).
+                self.segmentation = error.errno == errno.EMSGSIZE
+                return self._send_singly(run, destination)
+            if error.errno not in _TRANSIENT:
+                raise
+            self.datagrams_lost_on_send += len(run)
+        return len(run)
+
+    def _send_singly(self, run: Sequence[Outgoing], destination: Address) -> int | None:
+        for place, datagram in enumerate(run):
+            if self._send_run([datagram], destination) is None:
+                return place or None
+        return len(run)
+
+    def close(self) -> None:
+        self._socket.close()
