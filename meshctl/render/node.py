@@ -1,0 +1,171 @@
+"""Intent -> templates -> text -> parsed back -> canonical files, with the marker that names them.
+
+What is diffed and pushed is the parsed tree's own text, never the template's: a file that leaves here has been read by
+our UCI parser, and looks the same however its template is laid out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+from meshctl import uci
+from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
+from meshctl.model import MASK, Fleet, Node, Secret, SecretRef
+from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, RenderedFile
+from meshctl.render.templates import NOT_UCI, TemplateFile, Templates
+from meshctl.resolve import Intent, resolve
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceFacts:
+    """What only the device knows and its new configuration keeps: system.compat_version, which sysupgrade reads."""
+
+    compat_version: str = ""
+
+
+class UnknownNode(InvalidInput):
+    """A node that the inventory does not have, or that it has given up."""
+
+
+def render_fleet(
+    fleet: Fleet, secrets: Callable[[SecretRef], Secret], templates: Templates | None = None
+) -> Iterator[Rendered]:
+    """Every managed node in the inventory's order, one at a time. Raises InvalidInput."""
+    shared = templates if templates is not None else Templates.of(fleet)
+    return (render(resolve(fleet, node, secrets), shared) for node in fleet.managed())
+
+
+def render_node(
+    fleet: Fleet,
+    name: str,
+    secrets: Callable[[SecretRef], Secret],
+    templates: Templates | None = None,
+    device_facts: DeviceFacts | None = None,
+) -> Rendered:
+    """One node's files. Raises UnknownNode, or InvalidInput with every value that cannot be written down."""
+    node = _managed(fleet, name)
+    shared = templates if templates is not None else Templates.of(fleet)
+    return render(resolve(fleet, node, secrets), shared, device_facts)
+
+
+def _managed(fleet: Fleet, name: str) -> Node:
+    place = Position(fleet.files[0] if fleet.files else fleet.name)
+    node = fleet.nodes.get(name)
+    if node is None:
+        raise UnknownNode(
+            [Diagnostic("RND020", Severity.ERROR, place, "", expected="a node of the fleet", found=repr(name))]
+        )
+    if not node.state.is_managed:
+        message = f"{name} is {node.state.value}: it has no configuration"
+        place = fleet.where("nodes", name).position
+        raise UnknownNode([Diagnostic("RND021", Severity.ERROR, place, message)])
+    return node
+
+
+def render(intent: Intent, templates: Templates, device_facts: DeviceFacts | None = None) -> Rendered:
+    """The files of one node, the same bytes for the same intent, facts and templates.
+
+    Raises InvalidInput for a template that fails, or whose text is no UCI.
+    """
+    context = {"intent": intent, "device": device_facts or DeviceFacts()}
+    files = list(_files(intent, templates, context))
+    config_hash = _config_hash(files, intent.secrets)
+    marker = f"fleet={intent.fleet}\nnode={intent.node}\nconfig={config_hash}\n"
+    files.append(RenderedFile(MARKER_PATH, 0o644, marker.encode(), marker))
+    return Rendered(
+        node=intent.node,
+        release=str(intent.release),
+        files=tuple(sorted(files, key=lambda file: file.path)),
+        packages=intent.packages,
+        removed_packages=intent.removed_packages,
+        config_hash=config_hash,
+    )
+
+
+def _files(intent: Intent, templates: Templates, context: Mapping[str, object]) -> Iterator[RenderedFile]:
+    rest = dict(intent.extra_uci)
+    for file in templates.files(intent.backend, intent.operator_parts):
+        text = templates.text(file, intent.backend, intent.operator_parts, context)
+        if file.is_uci:
+            name = file.path.removeprefix(CONFIG_FOLDER)
+            yield _uci_file(intent, name, _parsed(file, text), rest.pop(name, ""))
+        else:
+            yield _file(file.path, text, 0o755 if file.is_executable else 0o644, intent.secrets, None)
+    for name, extra in rest.items():
+        yield _uci_file(intent, name, uci.Package(name), extra)
+
+
+def _parsed(file: TemplateFile, text: str) -> uci.Package:
+    name = file.path.removeprefix(CONFIG_FOLDER)
+    try:
+        return uci.parse(text, file.path, name=name)
+    except InvalidInput as error:
+        place = Position(str(file.source))
+        message = f"the rendered text is no UCI: {error}"
+        raise InvalidInput([Diagnostic(NOT_UCI, Severity.ERROR, place, message)]) from error
+
+
+def _uci_file(intent: Intent, name: str, package: uci.Package, extra: str) -> RenderedFile:
+    """The package with the inventory's own text behind it; sections of the same name are continued."""
+    if extra:
+        place = intent.extra_positions.get(name, intent.position)
+        try:
+            # on its own first, so that it cannot continue the last section of the template
+            uci.parse(extra, name)
+            package = uci.parse(uci.dump(package) + extra, name)
+        except InvalidInput as error:
+            message = f"extra_uci.{name} is no UCI: {error}"
+            raise InvalidInput([Diagnostic(NOT_UCI, Severity.ERROR, place, message)]) from error
+    return _file(CONFIG_FOLDER + name, uci.dump(package), 0o644, intent.secrets, package)
+
+
+def _file(path: str, text: str, mode: int, secrets: tuple[Secret, ...], package: uci.Package | None) -> RenderedFile:
+    masked = _without(text, secrets, lambda _: MASK)
+    has_secret = masked != text
+    # keys that log in, and keys of the mesh, are root's business alone
+    is_private = has_secret or path.startswith("etc/dropbear/")
+    return RenderedFile(path, mode & 0o700 if is_private else mode, text.encode(), masked, has_secret, package)
+
+
+def _without(text: str, secrets: tuple[Secret, ...], stand_in: Callable[[Secret], str]) -> str:
+    """`text` with every secret replaced, as it is written in UCI and as it is."""
+    # the longest first, so that no secret inside another leaves half of it behind
+    for secret in sorted(secrets, key=lambda secret: -len(secret.reveal())):
+        for form in (uci.quote(secret.reveal())[1:-1], secret.reveal()):
+            text = text.replace(form, stand_in(secret))
+    return text
+
+
+def _config_hash(files: list[RenderedFile], secrets: tuple[Secret, ...]) -> str:
+    """SHA-256 over every file but for what the device brought itself, with each secret replaced by its fingerprint.
+
+    The hash is shown to everybody and kept in logs, so it must not let anyone try passwords against it cheaply.
+    """
+    digest = hashlib.sha256()
+    for file in sorted(files, key=lambda file: file.path):
+        text = _without_facts(file)
+        if file.has_secret:
+            text = _without(text, secrets, _fingerprint)
+        content = text.encode()
+        digest.update(f"{file.path}\0{file.mode:o}\0{len(content)}\0".encode())
+        digest.update(content)
+    return digest.hexdigest()
+
+
+def _without_facts(file: RenderedFile) -> str:
+    if file.package is None or file.package.name != "system":
+        return file.content.decode()
+    sections = tuple(
+        uci.Section(s.type, s.name, {name: value for name, value in s.options.items() if name != "compat_version"})
+        for s in file.package.sections
+    )
+    return uci.dump(uci.Package("system", sections))
+
+
+# One derivation per key and process: about 50 ms each.
+@lru_cache(maxsize=64)
+def _fingerprint(secret: Secret) -> str:
+    return hashlib.scrypt(secret.reveal().encode(), salt=b"meshctl config hash", n=2**14, r=8, p=1, dklen=32).hex()

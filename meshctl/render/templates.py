@@ -1,0 +1,169 @@
+"""Where templates come from and how they run: folders searched in order, one sandbox, nothing undefined.
+
+A folder holds `common/`, rendered for every back end, and one folder per back end (`batman-adv/`, `meshmerize/`);
+below them a template stands where its file goes on the device, with `.j2` behind its name. What begins with `_` is
+included by others and is no file of its own. The inventory's `templates/` comes before what ships with meshctl, file by file, and
+the operator's parts of a back end before both.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from jinja2 import (
+    BaseLoader,
+    ChoiceLoader,
+    FileSystemLoader,
+    PrefixLoader,
+    StrictUndefined,
+    Template,
+    TemplateError,
+    TemplateNotFound,
+    TemplateSyntaxError,
+)
+from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
+from meshctl.model import Backend, Fleet, MeshMode, OperatorParts, Release
+from meshctl.render.quoting import only_quoted, quoted, revealed
+from meshctl.render.rendered import CONFIG_FOLDER
+from meshctl.resources import shipped
+
+# The codes of this package, each with what it means (docs/render.md).
+TEMPLATE = "RND010"
+NOT_UCI = "RND011"
+NO_TEMPLATE = "RND012"
+
+COMMON = "common"
+_SUFFIX = ".j2"
+
+
+@dataclass(frozen=True, slots=True)
+class TemplateFile:
+    """A template that makes a file: `path` on the device, `name` for the loader, `source` on disk."""
+
+    path: str
+    name: str
+    source: Path
+
+    @property
+    def is_uci(self) -> bool:
+        return self.path.startswith(CONFIG_FOLDER)
+
+    @property
+    def is_executable(self) -> bool:
+        """Whether the template's own file may be executed: then the rendered one may, too."""
+        return bool(self.source.stat().st_mode & 0o100)
+
+
+class Templates:
+    """The templates of one fleet. Compiles each once, so share one between the nodes."""
+
+    def __init__(self, folders: tuple[Path, ...]) -> None:
+        self._folders = folders
+        self._sets: dict[tuple[Backend, OperatorParts], _TemplateSet] = {}
+
+    @classmethod
+    def of(cls, fleet: Fleet) -> Templates:
+        """The inventory's own folder `templates`, when it has one, before the shipped templates."""
+        own = Path(fleet.base) / "templates"
+        return cls((own, shipped("templates")) if fleet.base and own.is_dir() else (shipped("templates"),))
+
+    def files(self, backend: Backend, parts: OperatorParts) -> tuple[TemplateFile, ...]:
+        """The templates that make files for a back end, sorted by path. Raises InvalidInput when parts are missing."""
+        return self._set(backend, parts).files
+
+    def text(self, file: TemplateFile, backend: Backend, parts: OperatorParts, context: Mapping[str, object]) -> str:
+        """The template's text for one node. Raises InvalidInput naming the template and its line."""
+        return self._set(backend, parts).text(file, context)
+
+    def _set(self, backend: Backend, parts: OperatorParts) -> _TemplateSet:
+        key = (backend, parts)
+        if key not in self._sets:
+            self._sets[key] = _TemplateSet(self._folders, backend, parts)
+        return self._sets[key]
+
+
+class _TemplateSet:
+    """The templates of one back end with one operator's parts."""
+
+    def __init__(self, folders: tuple[Path, ...], backend: Backend, parts: OperatorParts) -> None:
+        layers: list[tuple[str, Path]] = []
+        loaders: list[BaseLoader] = []
+        if parts.templates:
+            own = Path(parts.base) / parts.templates
+            if not own.is_dir():
+                found = Diagnostic(
+                    NO_TEMPLATE, Severity.ERROR, Position(str(own)), "", "", "a folder of templates", "none"
+                )
+                raise InvalidInput([found])
+            layers.append((backend.value, own))
+            loaders.append(PrefixLoader({backend.value: FileSystemLoader(own)}))
+        for folder in folders:
+            layers.extend((part, folder / part) for part in (backend.value, COMMON))
+        loaders.append(FileSystemLoader(folders))
+        loader = ChoiceLoader(loaders)
+        self._plain = _environment(loader)
+        self._uci = _environment(loader, is_uci=True)
+        self._compiled: dict[str, Template] = {}
+        self.files = _files(layers)
+
+    def text(self, file: TemplateFile, context: Mapping[str, object]) -> str:
+        try:
+            if file.name not in self._compiled:
+                self._compiled[file.name] = (self._uci if file.is_uci else self._plain).get_template(file.name)
+            return self._compiled[file.name].render(context)
+        except InvalidInput:
+            raise
+        except Exception as error:
+            # a template can raise anything; whatever it is, the person who wrote the template needs the place
+            raise InvalidInput([_diagnostic(file, error)]) from error
+
+
+def _files(layers: list[tuple[str, Path]]) -> tuple[TemplateFile, ...]:
+    """One template per path on the device: the first layer that has it wins."""
+    found: dict[str, TemplateFile] = {}
+    for prefix, folder in layers:
+        for source in sorted(folder.rglob(f"*{_SUFFIX}")):
+            inside = source.relative_to(folder).as_posix()
+            if not source.name.startswith("_") and source.is_file():
+                path = inside.removesuffix(_SUFFIX)
+                found.setdefault(path, TemplateFile(path, f"{prefix}/{inside}", source))
+    return tuple(found[path] for path in sorted(found))
+
+
+def _environment(loader: BaseLoader, *, is_uci: bool = False) -> ImmutableSandboxedEnvironment:
+    environment = ImmutableSandboxedEnvironment(
+        loader=loader,
+        undefined=StrictUndefined,
+        autoescape=False,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        auto_reload=False,
+        finalize=only_quoted if is_uci else None,
+    )
+    environment.filters["uci"] = quoted
+    environment.filters["reveal"] = revealed
+    environment.globals["Release"] = Release
+    environment.globals["MeshMode"] = MeshMode
+    return environment
+
+
+def _diagnostic(file: TemplateFile, error: Exception) -> Diagnostic:
+    """The error at the innermost template line it passed through."""
+    place = Position(str(file.source))
+    match error:
+        case TemplateSyntaxError():
+            place = Position(error.filename or str(file.source), error.lineno)
+        case TemplateNotFound():
+            return Diagnostic(TEMPLATE, Severity.ERROR, place, "", expected="a template", found=f"none named {error}")
+        case _:
+            lines = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.endswith(_SUFFIX)]
+            if lines:
+                place = Position(lines[-1].filename, lines[-1].lineno or 0)
+    kind = "" if isinstance(error, TemplateError | ValueError | TypeError) else f"{type(error).__name__}: "
+    return Diagnostic(TEMPLATE, Severity.ERROR, place, f"{kind}{error}")
