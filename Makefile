@@ -27,11 +27,12 @@ proof: setup
 	$(BIN)/pytest -m proof
 
 bench: setup
-	$(BIN)/pip install --quiet -e '.[bench]'
-	$(BIN)/python -m benchmarks
+	test -x $(VENV)-bench/bin/python || python3 -m venv $(VENV)-bench
+	$(VENV)-bench/bin/pip install --quiet -e '.[dev,bench]'
+	$(VENV)-bench/bin/python -m benchmarks
 
 lab: setup
 	$(BIN)/meshctl lab up
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache dist build
+	rm -rf $(VENV) $(VENV)-bench .mypy_cache .ruff_cache .pytest_cache .import_linter_cache dist build

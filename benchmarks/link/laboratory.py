@@ -125,8 +125,10 @@ class Laboratory:
         self._control.settimeout(ANSWER_TIMEOUT_S)
         for namespace, address in zip(self.namespaces, self.addresses, strict=True):
             _ip("-n", namespace, "addr", "add", f"{address}/24", "brd", "10.99.0.255", "dev", INTERFACE)
-            # the only queue that may overflow is the emulator's; IPv6's own chatter would be counted as the transport's
-            self.run(self.namespaces.index(namespace), ["sysctl", "-qw", "net.ipv6.conf.all.disable_ipv6=1"])
+            # IPv6's own chatter would be counted as the transport's; a robot's kernel uses cubic where nobody chose
+            for setting in ("net.ipv6.conf.all.disable_ipv6=1", "net.ipv4.tcp_congestion_control=cubic"):
+                self.run(self.namespaces.index(namespace), ["sysctl", "-qw", setting])
+            # the only queue that may overflow is the emulator's
             _ip("-n", namespace, "link", "set", INTERFACE, "mtu", "1500", "txqueuelen", "20000", "up")
         self._fix_neighbours()
 

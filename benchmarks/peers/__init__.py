@@ -1,0 +1,62 @@
+"""The transports that are compared, each behind the same two roles.
+
+A `Sender` carries two kinds of message to one receiver: `bulk` (returns when the transport will take more, so that a
+sender never queues without end) and `urgent`. A receiver calls `on_message` with each message as it was sent. Every
+message starts with the header of `benchmarks.peers.message`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass
+from typing import Protocol
+
+PORT = 7447
+
+
+class Sender(Protocol):
+    """One open way to the receiver."""
+
+    async def bulk(self, data: bytes) -> None: ...
+
+    async def urgent(self, data: bytes) -> None: ...
+
+
+class Transport(Protocol):
+    """What a module of this package offers for one variant of a transport."""
+
+    def sender(self, address: str) -> AbstractAsyncContextManager[Sender]: ...
+
+    def receiver(self, on_message: Callable[[bytes], None]) -> AbstractAsyncContextManager[None]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """`variant` is handed to the module's `transport(variant)`."""
+
+    name: str
+    module: str
+    variant: str
+
+
+PEERS: dict[str, Peer] = {
+    peer.name: peer
+    for peer in (
+        Peer("udp_mesh", "benchmarks.peers.ours", "adaptive"),
+        Peer("udp_mesh, window 3", "benchmarks.peers.ours", "3"),
+        Peer("udp_mesh, window 32", "benchmarks.peers.ours", "32"),
+        Peer("TCP cubic", "benchmarks.peers.tcp", "cubic"),
+        Peer("TCP BBR", "benchmarks.peers.tcp", "bbr"),
+        Peer("QUIC (aioquic, cubic)", "benchmarks.peers.quic", "cubic"),
+        Peer("Zenoh (TCP, priorities)", "benchmarks.peers.zenoh_tcp", "priorities"),
+    )
+}
+
+
+def transport(name: str) -> Transport:
+    """The transport of a peer by its name in the tables."""
+    peer = PEERS[name]
+    made: Transport = importlib.import_module(peer.module).transport(peer.variant)
+    return made
