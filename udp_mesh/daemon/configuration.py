@@ -1,0 +1,351 @@
+"""The daemon's configuration: TOML file -> `Configuration`, with every problem named by file and line.
+
+`load` reads the file and the key file it names; `read` is the pure part. The values the core takes are in `settings`,
+what only the daemon needs stands beside it. Reading the same file again on SIGHUP gives the next `Configuration`; a
+file with problems changes nothing. The keys of the file are described in docs/udp-mesh.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import ipaddress
+import re
+import socket
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from udp_mesh.core.settings import (
+    DEFAULT_PORT,
+    Address,
+    Limits,
+    Neighbour,
+    Outbox,
+    Rates,
+    Settings,
+    Topic,
+)
+from udp_mesh.crypto import Key
+from udp_mesh.daemon.toml_source import ConfigurationError, Problem, Source, Table, parse
+from udp_mesh.links.attachments import EVERY_INTERFACE, LinkWish
+from udp_mesh.wire.limits import MAX_NAME_BYTES, MAX_TOPIC_BYTES
+
+DEFAULT_PATH = Path("/etc/udp-mesh/udp-mesh.toml")
+DEFAULT_SOCKET = Path("/run/udp-mesh/udp-mesh.sock")
+DEFAULT_STATE = Path("/var/lib/udp-mesh")
+MAX_FILE_BYTES = 1 << 20
+"""A configuration of a megabyte is a mistake (a wrong path), not a configuration."""
+
+RESERVED_PREFIX = "~mesh/"
+"""Topics of the daemon's own: ping, pong and the benchmark."""
+PING_TOPIC, PONG_TOPIC, BENCH_TOPIC = "~mesh/ping", "~mesh/pong", "~mesh/bench"
+RESERVED_TOPICS = (
+    Topic(PING_TOPIC, priority=0, reliable=False, deadline_s=10.0),
+    Topic(PONG_TOPIC, priority=0, reliable=False, deadline_s=10.0),
+    Topic(BENCH_TOPIC, priority=15, reliable=True),
+)
+CONDITIONS_TOPIC = "~mesh/conditions"
+"""What local subscribers get of the network's conditions; it never leaves the machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class DaemonSettings:
+    """What the process needs besides the core's settings."""
+
+    socket: Path = DEFAULT_SOCKET
+    socket_mode: int = 0o660
+    socket_group: str | None = None
+    user: str | None = None
+    """Whom to become once sockets are open (None: stay)."""
+    state_directory: Path = DEFAULT_STATE
+    metrics_address: Address | None = None
+    """Where Prometheus may ask over TCP: a loopback address (None: only through the local socket)."""
+    conditions_period_s: float = 1.0
+    outbox_disk_bytes: int = 1 << 30
+    """All outboxes on disk together: a partner that stays away for days."""
+    record_bytes: int = 1 << 30
+    """One recording: a forgotten one must not fill the disk."""
+    urgent_dscp: int = 46
+    """DSCP of urgent datagrams: 46 (EF, RFC 3246) takes wifi's video queue, ahead of best effort."""
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """Everything a daemon is told."""
+
+    settings: Settings
+    links: tuple[LinkWish, ...] = EVERY_INTERFACE
+    daemon: DaemonSettings = field(default_factory=DaemonSettings)
+    file: Path | None = None
+
+
+def load(path: Path) -> Configuration:
+    """The configuration in this file, with the keys of the key file it names. Raises ConfigurationError."""
+    text = _read_text(path, str(path), 0)
+    top = parse(text, str(path))
+    key_file, unkeyed = top.text("key_file"), top.boolean("unkeyed", False)
+    keys: tuple[Key, ...] = ()
+    if key_file is not None and unkeyed:
+        top.report("unkeyed", "either key_file or unkeyed", "both")
+    if key_file is not None:
+        try:
+            # Relative to the configuration, so that a bundle can be moved as a whole.
+            keys = read_keys(path.parent / key_file)
+        except ConfigurationError as error:
+            line = top.source.line(("key_file",))
+            top.source.problems += [
+                dataclasses.replace(problem, file=str(path), line=line) if problem.line == 0 else problem
+                for problem in error.problems
+            ]
+    elif not unkeyed:
+        top.report("key_file", "a file with the fleet's key", "none", "unkeyed = true runs without protection")
+    return dataclasses.replace(read(top, keys), file=path)
+
+
+def read_keys(path: Path) -> tuple[Key, ...]:
+    """The one or two keys of a key file, one per line, the sealing one first. Raises ConfigurationError."""
+    keys: list[Key] = []
+    problems: list[Problem] = []
+    for number, line in enumerate(_read_text(path, str(path), 0).splitlines(), start=1):
+        words = line.split("#")[0].strip()
+        if not words:
+            continue
+        try:
+            keys.append(Key.parse(words))
+        except ValueError as error:
+            expected, _, found = str(error).removeprefix("expected ").partition(", found ")
+            problems.append(Problem(str(path), number, "", expected, found))
+    if not problems and not 1 <= len(keys) <= 2:
+        problems.append(Problem(str(path), 1, "", "one or two keys, one per line", f"{len(keys)}"))
+    if problems:
+        raise ConfigurationError(problems)
+    return tuple(keys)
+
+
+def _read_text(path: Path, name: str, line: int) -> str:
+    try:
+        with path.open("rb") as file:
+            raw = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise ConfigurationError([Problem(name, line, "", "a readable file", f"{path}: {error.strerror}")]) from error
+    if len(raw) > MAX_FILE_BYTES:
+        raise ConfigurationError([Problem(name, line, "", f"a file of at most {MAX_FILE_BYTES} bytes", "a larger one")])
+    try:
+        return raw.decode()
+    except UnicodeDecodeError as error:
+        place = raw[: error.start].count(b"\n") + 1
+        raise ConfigurationError([Problem(name, place, "", "UTF-8", f"byte {raw[error.start]:#04x}")]) from error
+
+
+def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
+    """The configuration in a parsed file. Raises ConfigurationError with every problem found in it."""
+    source = top.source
+    top.text("key_file")
+    unkeyed = top.boolean("unkeyed", False)
+    name = top.text("name", socket.gethostname().split(".")[0]) or ""
+    _check_name(top, "name", name, MAX_NAME_BYTES)
+    port = top.integer("port", DEFAULT_PORT, 1, 65_535) or DEFAULT_PORT
+    window = top.integer_or_word("window", "adaptive", 1, 4096)
+    fragment_bytes = top.integer("fragment_bytes", 1400, 64, 8192) or 1400
+    topics = tuple(read_topic(topic, entry) for topic, entry in top.table("topics").named_tables())
+    undeclared = read_topic("*", top.table("undeclared")) if top.has("undeclared") else None
+    links = tuple(_read_link(entry) for entry in top.tables("links")) or EVERY_INTERFACE
+    neighbours = tuple(_read_neighbour(entry, port) for entry in top.tables("neighbours"))
+    rates, limits = read_rates(top.table("rates")), _read_limits(top.table("limits"))
+    daemon = _read_daemon(top.table("daemon"))
+    top.finish()
+    if source.problems:
+        raise ConfigurationError(sorted(source.problems, key=lambda problem: problem.line))
+    try:
+        settings = Settings(
+            name=name,
+            port=port,
+            keys=keys,
+            unkeyed=unkeyed,
+            topics=(*topics, *RESERVED_TOPICS),
+            undeclared=undeclared,
+            neighbours=tuple(neighbour for neighbour in neighbours if neighbour is not None),
+            window=_window(window),
+            fragment_bytes=fragment_bytes,
+            rates=rates,
+            limits=limits,
+        )
+    except ValueError as error:
+        raise ConfigurationError([problem_of(source, error)]) from error
+    return Configuration(settings, links, daemon)
+
+
+def _window(packets: int | None) -> Literal["adaptive"] | int:
+    return "adaptive" if packets is None else packets
+
+
+def problem_of(source: Source, error: ValueError) -> Problem:
+    """What a value's own check found, as a problem at its key's line where the text names one."""
+    text = str(error)
+    parts = re.fullmatch(r"(?P<key>[^:]+): (?:expected )?(?P<expected>.*?)(?:, found (?P<found>.*))?", text)
+    if parts is None:
+        return Problem(source.file, 1, "", "a valid configuration", text)
+    path = tuple(parts["key"].split("."))
+    return Problem(source.file, source.line(path), parts["key"], parts["expected"], parts["found"] or "otherwise")
+
+
+def _check_name(table: Table, key: str, name: str, limit_bytes: int) -> None:
+    size = len(name.encode())
+    if not 1 <= size <= limit_bytes or not name.isprintable() or any(c.isspace() or c == "/" for c in name):
+        table.report(key, f"a name of 1 to {limit_bytes} bytes without space or slash", name)
+
+
+def read_topic(name: str, table: Table) -> Topic:
+    """How one topic travels: an entry of `[topics]`, or what a command sets. Problems go to the table's source."""
+    size = len(name.encode())
+    if name.startswith(RESERVED_PREFIX):
+        table.source.report(table.path, f"a topic outside {RESERVED_PREFIX}", name)
+    elif not 1 <= size <= MAX_TOPIC_BYTES or not name.isprintable() or any(c.isspace() for c in name):
+        table.source.report(table.path, f"a topic of 1 to {MAX_TOPIC_BYTES} bytes without space", name)
+    default = Topic("default")
+    topic = Topic(
+        name="default",
+        priority=_or(table.integer("priority", default.priority, 0, 15), default.priority),
+        reliable=table.boolean("reliable", default.reliable),
+        keep_last=table.integer("keep_last", None, 1, 1 << 20),
+        deadline_s=table.number("deadline_s", None, 0.001, 1e7),
+        rate_limit_bytes_per_s=table.integer("rate_limit_bytes_per_s", None, 1, 1 << 40),
+        compression=table.boolean("compression", default.compression),
+        destinations=table.texts("destinations"),
+        outbox=Outbox(table.choice("outbox", default.outbox.value, [member.value for member in Outbox])),
+        outbox_bytes=_or(table.integer("outbox_bytes", default.outbox_bytes, 0, 1 << 40), default.outbox_bytes),
+        outbox_on_disk=table.boolean("outbox_on_disk", default.outbox_on_disk),
+        repair=table.boolean("repair", default.repair),
+    )
+    table.finish()
+    if topic.outbox_on_disk and topic.outbox is Outbox.NONE:
+        table.report("outbox_on_disk", 'outbox = "last" or "all" beside it', topic.outbox_on_disk)
+    return dataclasses.replace(topic, name=name) if 1 <= size <= MAX_TOPIC_BYTES else topic
+
+
+def _or(value: int | None, default: int) -> int:
+    return default if value is None else value
+
+
+def _read_link(table: Table) -> LinkWish:
+    interface, address = table.text("interface"), table.text("address")
+    kind = table.choice("kind", "broadcast", ("broadcast", "neighbours"))
+    mtu = table.integer("mtu", None, 200, 65_535)
+    table.finish()
+    if (interface is None) == (address is None):
+        table.source.report(table.path, "either interface or address", "both" if interface else "neither")
+    if address is not None:
+        try:
+            ipaddress.ip_address(address)
+        except ValueError:
+            table.report("address", "an IPv4 or IPv6 address", address)
+    return LinkWish(interface, address, kind == "broadcast", mtu)
+
+
+def _read_neighbour(table: Table, port: int) -> Neighbour | None:
+    text, name = table.text("address"), table.text("name")
+    link, legacy = table.text("link"), table.boolean("legacy", False)
+    table.finish()
+    if text is None:
+        table.source.report(table.path, "an address", "none")
+        return None
+    if legacy and name is None:
+        table.source.report(table.path, "a name, since a legacy neighbour's own claim is not authenticated", "none")
+        return None
+    address = parse_address(text, port)
+    if address is None:
+        table.report("address", "an IP address, optionally with a port (10.0.0.2, 10.0.0.2:8700, [fd00::2]:8700)", text)
+        return None
+    return Neighbour(address, name, link, legacy)
+
+
+def parse_address(text: str, port: int) -> Address | None:
+    """Host and port of `10.0.0.2`, `10.0.0.2:8700`, `fd00::2` or `[fd00::2]:8700`; None for anything else."""
+    host, number = text, str(port)
+    bracketed = re.fullmatch(r"\[(?P<host>[^]]+)\](?::(?P<port>\d+))?", text)
+    if bracketed:
+        host, number = bracketed["host"], bracketed["port"] or number
+    elif text.count(":") == 1:
+        host, _, number = text.partition(":")
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return None
+    if not number.isdigit() or not 1 <= int(number) <= 65_535:
+        return None
+    return host, int(number)
+
+
+def read_rates(table: Table, current: Rates | None = None) -> Rates:
+    """The protocol's times and thresholds; what the table leaves out stays as in `current`."""
+    base = current or Rates()
+    changes: dict[str, float | int] = {}
+    for entry in dataclasses.fields(Rates):
+        before = getattr(base, entry.name)
+        value: float | int | None
+        if isinstance(before, int):
+            value = table.integer(entry.name, None, 0, 1 << 16)
+        else:
+            value = table.number(entry.name, None, 0.0, 86_400.0)
+        if value is not None:
+            changes[entry.name] = value
+    table.finish()
+    try:
+        return dataclasses.replace(base, **changes)  # type: ignore[arg-type]
+    except ValueError as error:
+        table.source.problems.append(problem_of(table.source, error))
+        return base
+
+
+def _read_limits(table: Table) -> Limits:
+    values = {
+        entry.name: _or(table.integer(entry.name, None, 1, 1 << 40), getattr(Limits(), entry.name))
+        for entry in dataclasses.fields(Limits)
+    }
+    table.finish()
+    return Limits(**values)
+
+
+def _read_daemon(table: Table) -> DaemonSettings:
+    default = DaemonSettings()
+    mode_text = table.text("socket_mode", f"{default.socket_mode:04o}") or ""
+    mode = default.socket_mode
+    if re.fullmatch(r"0?[0-7]{3}", mode_text):
+        mode = int(mode_text, 8)
+    else:
+        table.report("socket_mode", 'octal permissions such as "0660"', mode_text)
+    metrics_text = table.text("metrics_address")
+    metrics = parse_address(metrics_text, 0) if metrics_text is not None and metrics_text.count(":") else None
+    if metrics_text is not None and (metrics is None or not ipaddress.ip_address(metrics[0]).is_loopback):
+        table.report("metrics_address", "a loopback address with a port (127.0.0.1:9871)", metrics_text)
+    settings = DaemonSettings(
+        socket=Path(table.text("socket") or default.socket),
+        socket_mode=mode,
+        socket_group=table.text("socket_group"),
+        user=table.text("user"),
+        state_directory=Path(table.text("state_directory") or default.state_directory),
+        metrics_address=metrics,
+        conditions_period_s=table.number("conditions_period_s", default.conditions_period_s, 0.05, 3600) or 1.0,
+        outbox_disk_bytes=_or(table.integer("outbox_disk_bytes", None, 0, 1 << 40), default.outbox_disk_bytes),
+        record_bytes=_or(table.integer("record_bytes", None, 1 << 16, 1 << 40), default.record_bytes),
+        urgent_dscp=_or(table.integer("urgent_dscp", None, 0, 63), default.urgent_dscp),
+    )
+    table.finish()
+    return settings
+
+
+def topic_from_values(name: str, values: dict[str, object], current: Topic | None) -> Topic:
+    """A topic from a command's fields; fields left out stay as in `current`. Raises ConfigurationError."""
+    merged: dict[str, object] = {}
+    if current is not None:
+        for entry in dataclasses.fields(Topic):
+            value = getattr(current, entry.name)
+            if entry.name != "name" and value is not None:
+                merged[entry.name] = value.value if isinstance(value, Outbox) else value
+        merged["destinations"] = list(current.destinations)
+    merged.update(values)
+    source = Source("command", {})
+    topic = read_topic(name, Table({key: value for key, value in merged.items() if value is not None}, source, (name,)))
+    if source.problems:
+        raise ConfigurationError(source.problems)
+    return topic

@@ -1,0 +1,153 @@
+"""Messages held on disk for peers that are away: one file per message in one directory.
+
+`put` writes a file under a temporary name and renames it: from then on it survives the end of this process (SIGKILL
+too). `flush` makes everything put so far survive a power cut (fsync of files and directory), away from the event
+loop; the daemon answers a publisher of such a topic after it. `load` reads what is kept, and sets aside what is
+damaged. The directory is bounded: past `limit_bytes` a message is refused and counted rather than filling the disk.
+
+A file is a JSON line with the message's fields and the payload's CRC-32, then the payload.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import zlib
+from pathlib import Path
+
+from udp_mesh.core.seams import StoredMessage
+
+log = logging.getLogger(__name__)
+
+SUFFIX = ".message"
+
+
+class DirectoryStore:
+    """The core's `Store` over a directory (made if missing, readable by its owner only)."""
+
+    def __init__(self, directory: Path, limit_bytes: int) -> None:
+        """Raises OSError where the directory cannot be made."""
+        directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+        self._directory = directory
+        self._limit_bytes = limit_bytes
+        self._sizes: dict[int, int] = {}
+        self._unflushed: set[Path] = set()
+        self.bytes = 0
+        """Bytes of all files kept."""
+        self.refused = 0
+        """Messages not kept because the directory is full or the disk failed: they are held in memory only."""
+
+    def put(self, message: StoredMessage) -> None:
+        head = json.dumps(
+            {
+                "key": message.key,
+                "peer": message.peer,
+                "topic": message.topic,
+                "type": message.type_name,
+                "remaining_s": message.remaining_s,
+                "bytes": len(message.payload),
+                "crc32": zlib.crc32(message.payload),
+            }
+        ).encode()
+        size = len(head) + 1 + len(message.payload)
+        if self.bytes + size > self._limit_bytes:
+            self.refused += 1
+            log.warning("outbox-full directory=%s bytes=%d limit=%d", self._directory, self.bytes, self._limit_bytes)
+            return
+        path = self._path(message.key)
+        try:
+            temporary = path.with_suffix(".new")
+            with temporary.open("wb") as file:
+                file.write(head + b"\n")
+                file.write(message.payload)
+            temporary.rename(path)
+        except OSError as error:
+            self.refused += 1
+            log.error("outbox-write-failed path=%s error=%s", path, error)
+            return
+        self.bytes += size - self._sizes.get(message.key, 0)
+        self._sizes[message.key] = size
+        self._unflushed.add(path)
+
+    def remove(self, key: int) -> None:
+        size = self._sizes.pop(key, None)
+        if size is None:
+            return
+        path = self._path(key)
+        self.bytes -= size
+        self._unflushed.discard(path)
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            log.error("outbox-remove-failed path=%s error=%s", path, error)
+
+    def load(self) -> list[StoredMessage]:
+        messages: list[StoredMessage] = []
+        for path in sorted(self._directory.glob(f"*{SUFFIX}")):
+            message = _read(path)
+            if message is None:
+                # Kept for a person to look at, out of the way of the next start.
+                path.rename(path.with_suffix(".damaged"))
+                log.error("outbox-damaged path=%s", path)
+                continue
+            size = path.stat().st_size
+            self._sizes[message.key] = size
+            self.bytes += size
+            messages.append(message)
+        for leftover in self._directory.glob("*.new"):
+            leftover.unlink()
+        return messages
+
+    @property
+    def needs_flush(self) -> bool:
+        return bool(self._unflushed)
+
+    def take_unflushed(self) -> list[Path]:
+        """The files put since the last call, to be handed to `flush`."""
+        paths = sorted(self._unflushed)
+        self._unflushed.clear()
+        return paths
+
+    def flush(self, paths: list[Path]) -> None:
+        """Waits until the disk holds these files; runs in a thread of its own. A file already removed is no error."""
+        for path in paths:
+            try:
+                _sync(path, os.O_RDONLY)
+            except FileNotFoundError:
+                continue
+            except OSError as error:
+                log.error("outbox-flush-failed path=%s error=%s", path, error)
+        if paths:
+            _sync(self._directory, os.O_RDONLY | os.O_DIRECTORY)
+
+    def _path(self, key: int) -> Path:
+        return self._directory / f"{key:020d}{SUFFIX}"
+
+
+def _sync(path: Path, flags: int) -> None:
+    descriptor = os.open(path, flags | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _read(path: Path) -> StoredMessage | None:
+    """The message in a file; None where it is damaged."""
+    try:
+        head, _, payload = path.read_bytes().partition(b"\n")
+        fields = json.loads(head)
+        if len(payload) != fields["bytes"] or zlib.crc32(payload) != fields["crc32"]:
+            return None
+        remaining = fields["remaining_s"]
+        return StoredMessage(
+            key=int(fields["key"]),
+            peer=str(fields["peer"]),
+            topic=str(fields["topic"]),
+            type_name=str(fields["type"]),
+            payload=payload,
+            remaining_s=None if remaining is None else float(remaining),
+        )
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,270 @@
+"""TOML with places: text -> tables that know the line of every key, and collect every problem instead of the first.
+
+`parse` reads the text, `Table` hands out checked values by key and remembers which keys it knows, `Table.finish`
+reports the others with the nearest known name. `tomllib` gives no lines, so `locate` finds them by scanning the text
+for tables and keys.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing wrong with a configuration: where, what was expected, what was found, perhaps what was meant."""
+
+    file: str
+    line: int
+    key: str
+    expected: str
+    found: str
+    hint: str = ""
+
+    def __str__(self) -> str:
+        where = f"{self.key}: " if self.key else ""
+        hint = f" ({self.hint})" if self.hint else ""
+        return f"{self.file}:{self.line}: {where}expected {self.expected}, found {self.found}{hint}"
+
+
+class ConfigurationError(Exception):
+    """The configuration cannot be used; `problems` has all that is wrong with it."""
+
+    def __init__(self, problems: Iterable[Problem]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(map(str, self.problems)))
+
+
+Path = tuple[str | int, ...]
+
+
+def locate(text: str) -> dict[Path, int]:
+    """Line of every table and of every key that starts a line; keys inside an inline table are found at its line."""
+    lines: dict[Path, int] = {}
+    table: Path = ()
+    counts: dict[Path, int] = {}
+    open_brackets, open_string = 0, ""
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not open_brackets and not open_string:
+            header = _HEADER.match(line)
+            if header:
+                keys = tuple(_split_key(header["key"]))
+                if header["array"]:
+                    counts[keys] = counts.get(keys, -1) + 1
+                    table = (*keys, counts[keys])
+                else:
+                    table = _enter(keys, counts)
+                lines.setdefault(table, number)
+                continue
+            assignment = _ASSIGNMENT.match(line)
+            if assignment:
+                keys = tuple(_split_key(assignment["key"]))
+                for end in range(1, len(keys) + 1):
+                    lines.setdefault(table + keys[:end], number)
+                line = line[assignment.end() :]
+        open_brackets, open_string = _scan_value(line, open_brackets, open_string)
+    return lines
+
+
+_KEY = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\]|\\.)*"|'[^']*')"""
+_HEADER = re.compile(rf"\s*\[(?P<array>\[)?\s*(?P<key>{_KEY}(?:\s*\.\s*{_KEY})*)\s*\]")
+_ASSIGNMENT = re.compile(rf"\s*(?P<key>{_KEY}(?:\s*\.\s*{_KEY})*)\s*=")
+
+
+def _split_key(dotted: str) -> Iterator[str]:
+    for part in re.findall(_KEY, dotted):
+        yield part[1:-1] if part[0] in "\"'" else part
+
+
+def _enter(keys: tuple[str, ...], counts: Mapping[Path, int]) -> Path:
+    """The path of a plain table, inside the latest element where its parent is an array of tables."""
+    path: Path = ()
+    for key in keys:
+        path = (*path, key)
+        if path != keys and path in counts:
+            path = (*path, counts[path])
+    return path
+
+
+def _scan_value(line: str, brackets: int, string: str) -> tuple[int, str]:
+    """Open brackets and open multi-line string after this line, so that their inside is not taken for keys."""
+    place = 0
+    while place < len(line):
+        if string:
+            end = line.find(string, place)
+            if end < 0:
+                return brackets, string if len(string) == 3 else ""
+            place, string = end + len(string), ""
+            continue
+        character = line[place]
+        if character == "#":
+            break
+        if character in "\"'":
+            string = character * 3 if line.startswith(character * 3, place) else character
+            place += len(string)
+            continue
+        brackets += (character in "[{") - (character in "]}")
+        place += 1
+    return max(brackets, 0), string if len(string) == 3 else ""
+
+
+@dataclass(slots=True)
+class Source:
+    """One configuration file: its name for messages, the lines of its keys, the problems found so far."""
+
+    file: str
+    lines: dict[Path, int]
+    problems: list[Problem] = field(default_factory=list)
+
+    def line(self, path: Path) -> int:
+        """The line of this key, or of the nearest table around it."""
+        while path and path not in self.lines:
+            path = path[:-1]
+        return self.lines.get(path, 1)
+
+    def report(self, path: Path, expected: str, found: str, hint: str = "") -> None:
+        key = ".".join(str(part) for part in path)
+        self.problems.append(Problem(self.file, self.line(path), key, expected, found, hint))
+
+
+def parse(text: str, file: str) -> Table:
+    """The top table of a TOML text. Raises ConfigurationError where it is no TOML."""
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        at = re.search(r"at line (\d+)", str(error))
+        line = int(at[1]) if at else text.count("\n") + 1
+        reason = re.sub(r" \(at .*\)$", "", str(error))
+        raise ConfigurationError([Problem(file, line, "", "TOML", f"{reason[:1].lower()}{reason[1:]}")]) from error
+    return Table(values, Source(file, locate(text)), ())
+
+
+class Table:
+    """One table; every getter takes a key's default, checks what is there, and reports rather than raises."""
+
+    def __init__(self, values: Mapping[str, object], source: Source, path: Path) -> None:
+        self._values = values
+        self._known: set[str] = set()
+        self.source = source
+        self.path = path
+
+    def has(self, key: str) -> bool:
+        return key in self._values
+
+    def _take(self, key: str) -> object:
+        self._known.add(key)
+        return self._values.get(key)
+
+    def report(self, key: str, expected: str, found: object, hint: str = "") -> None:
+        self.source.report((*self.path, key), expected, show(found), hint)
+
+    def text(self, key: str, default: str | None = None) -> str | None:
+        value = self._take(key)
+        if value is None or isinstance(value, str):
+            return default if value is None else value
+        self.report(key, "a string", value)
+        return default
+
+    def boolean(self, key: str, default: bool) -> bool:
+        value = self._take(key)
+        if value is None or isinstance(value, bool):
+            return default if value is None else value
+        self.report(key, "true or false", value)
+        return default
+
+    def integer(self, key: str, default: int | None, low: int, high: int) -> int | None:
+        value = self._take(key)
+        if value is None:
+            return default
+        if isinstance(value, int) and not isinstance(value, bool) and low <= value <= high:
+            return value
+        self.report(key, f"an integer from {low} to {high}", value)
+        return default
+
+    def number(self, key: str, default: float | None, low: float, high: float) -> float | None:
+        value = self._take(key)
+        if value is None:
+            return default
+        if isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high:
+            return float(value)
+        self.report(key, f"a number from {low:g} to {high:g}", value)
+        return default
+
+    def choice(self, key: str, default: str, choices: Iterable[str]) -> str:
+        value, allowed = self._take(key), tuple(choices)
+        if value is None:
+            return default
+        if isinstance(value, str) and value in allowed:
+            return value
+        self.report(key, " or ".join(f'"{name}"' for name in allowed), value, meant(value, allowed))
+        return default
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        value = self._take(key)
+        if value is None:
+            return ()
+        if isinstance(value, list) and all(isinstance(item, str) for item in value):
+            return tuple(value)
+        self.report(key, "a list of strings", value)
+        return ()
+
+    def integer_or_word(self, key: str, word: str, low: int, high: int) -> int | None:
+        """An integer, or None for `word` and for nothing."""
+        value = self._take(key)
+        if value is None or value == word:
+            return None
+        if isinstance(value, int) and not isinstance(value, bool) and low <= value <= high:
+            return value
+        self.report(key, f'"{word}" or an integer from {low} to {high}', value)
+        return None
+
+    def table(self, key: str) -> Table:
+        """The table of this key; an empty one where there is none."""
+        value = self._take(key)
+        if value is None:
+            value = {}
+        elif not isinstance(value, dict):
+            self.report(key, "a table", value)
+            value = {}
+        return Table(value, self.source, (*self.path, key))
+
+    def tables(self, key: str) -> list[Table]:
+        """The tables of an array of tables."""
+        value = self._take(key)
+        if value is None:
+            return []
+        if isinstance(value, list) and all(isinstance(item, dict) for item in value):
+            return [Table(item, self.source, (*self.path, key, place)) for place, item in enumerate(value)]
+        self.report(key, f"tables [[{'.'.join(str(part) for part in (*self.path, key))}]]", value)
+        return []
+
+    def named_tables(self) -> list[tuple[str, Table]]:
+        """Every entry of this table, each of which must be a table."""
+        return [(name, self.table(name)) for name in self._values]
+
+    def finish(self) -> None:
+        """Reports every key nobody asked for."""
+        for key, value in self._values.items():
+            if key not in self._known:
+                self.report(key, "a known key", f"{key!r} = {show(value)}", meant(key, self._known))
+
+
+def meant(found: object, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(str(found), list(known), n=1, cutoff=0.6)
+    return f"did you mean {near[0]!r}?" if near else ""
+
+
+def show(value: object) -> str:
+    """A value as a person would write it, cut to a line."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, dict):
+        return "a table"
+    if isinstance(value, str):
+        return f'"{value}"' if len(value) <= 60 else f'"{value[:57]}..."'
+    text = str(value)
+    return text if len(text) <= 60 else text[:57] + "..."
