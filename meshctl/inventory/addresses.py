@@ -1,0 +1,126 @@
+"""Addresses of nodes: written out, or one rule for all nodes that share it.
+
+`10.42.0.11` takes its prefix length from the mesh's network, `10.42.0.11/24` brings its own. `{from: 10.42.0.101}`
+counts up from that address, `{rule: network + 100 + 2 * index}` reckons; `index` counts, from 1, the nodes that the
+rule holds for, in the inventory's order: along the range it stands at, or through the group or the defaults.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from ipaddress import AddressValueError, IPv4Address, IPv4Interface, IPv4Network, NetmaskValueError
+from typing import Annotated
+
+from pydantic import PlainValidator, WithJsonSchema
+
+from meshctl.inventory.fields import wrong
+
+_TERM = re.compile(
+    r"\s*([+-])?\s*(?:(\d{1,9})\s*\*\s*)?(network|index|\d{1,3}(?:\.\d{1,3}){3}|\d{1,9})(?:\s*\*\s*(\d{1,9}))?\s*"
+)
+
+
+class BadAddress(ValueError):
+    """A rule that leads nowhere for this node; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class AddressRule:
+    """`start` (None: the mesh's network) + `offset` + `factor` x index."""
+
+    start: IPv4Address | None
+    offset: int
+    factor: int
+
+    def address(self, network: IPv4Network | None, index: int) -> IPv4Address:
+        """The address of the node with `index` (from 1). Raises BadAddress."""
+        start = self.start
+        if start is None:
+            if network is None:
+                raise BadAddress("the rule counts from `network`, but the node is in no mesh")
+            start = network.network_address
+        try:
+            return start + (self.offset + self.factor * index)
+        except AddressValueError:
+            raise BadAddress(f"the rule leaves the IPv4 addresses at index {index}") from None
+
+
+AddressValue = IPv4Interface | IPv4Address | AddressRule
+
+
+def parse_address(value: object) -> AddressValue:
+    """What stands under `address`: text, or a mapping with `from` or `rule`."""
+    match value:
+        case str():
+            return _static(str(value))
+        case {"from": str() as text, **others} if not others:
+            start = _static(str(text))
+            if isinstance(start, IPv4Address) and not isinstance(start, IPv4Interface):
+                return AddressRule(start, -1, 1)
+            raise wrong("an IPv4 address without a prefix length under `from`")
+        case {"rule": str() as text, **others} if not others:
+            return parse_rule(str(text))
+        case _:
+            raise wrong("an IPv4 address, {from: ADDRESS} or {rule: network + NUMBER + index}")
+
+
+def _static(text: str) -> IPv4Interface | IPv4Address:
+    try:
+        return IPv4Interface(text) if "/" in text else IPv4Address(text)
+    except (AddressValueError, NetmaskValueError):
+        raise wrong("an IPv4 address such as 10.42.0.11 or 10.42.0.11/24") from None
+
+
+def parse_rule(text: str) -> AddressRule:
+    """A sum of one start (`network` or an address), numbers and multiples of `index`."""
+    refused = wrong("a sum such as network + 100 + index, of `network` or an address, numbers and multiples of index")
+    start: list[IPv4Address | None] = []
+    offset = factor = at = 0
+    while at < len(text):
+        match = _TERM.match(text, at)
+        if match is None or (match[1] is None) != (at == 0):
+            raise refused
+        sign = -1 if match[1] == "-" else 1
+        times = int(match[2] or 1) * int(match[4] or 1)
+        word = match[3]
+        if word == "network" or "." in word:
+            if match[2] or match[4] or sign < 0:
+                raise refused
+            address = None if word == "network" else _static(word)
+            start.append(address)
+        elif word == "index":
+            factor += sign * times
+        else:
+            offset += sign * times * int(word)
+        at = match.end()
+    if len(start) != 1:
+        raise refused
+    return AddressRule(start[0], offset, factor)
+
+
+AddressField = Annotated[
+    AddressValue,
+    PlainValidator(parse_address),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "string", "pattern": r"^[0-9]+(\.[0-9]+){3}(/[0-9]+)?$"},
+                {
+                    "type": "object",
+                    "properties": {
+                        "from": {"type": "string", "format": "ipv4", "description": "The first node's address."}
+                    },
+                    "required": ["from"],
+                    "additionalProperties": False,
+                },
+                {
+                    "type": "object",
+                    "properties": {"rule": {"type": "string", "description": "A sum such as network + 100 + index."}},
+                    "required": ["rule"],
+                    "additionalProperties": False,
+                },
+            ]
+        }
+    ),
+]

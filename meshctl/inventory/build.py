@@ -1,0 +1,279 @@
+"""Document + node plans -> fleet: each section turned into the model's frozen values.
+
+Order: hardware, meshes, robots (who carries which node), nodes, topics, settings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+from meshctl.diagnostics import Diagnostic, Position
+from meshctl.inventory import codes
+from meshctl.inventory.compose import shown
+from meshctl.inventory.documents import (
+    ComputerDocument,
+    HardwareDocument,
+    InventoryDocument,
+    MeshDocument,
+    RobotDocument,
+    SecretDocument,
+    TopicDocument,
+)
+from meshctl.inventory.layers import NodePlan
+from meshctl.inventory.nodes import build_nodes, ssh_settings
+from meshctl.inventory.origins import Origins
+from meshctl.inventory.ranges import BadRange, expand
+from meshctl.inventory.tree import MappingNode, descend, place_of
+from meshctl.model import (
+    ApplyPolicy,
+    Batman,
+    Computer,
+    Firmware,
+    Fleet,
+    HardwareProfile,
+    Mesh,
+    OperatorParts,
+    Operators,
+    RadioHardware,
+    Robot,
+    SecretKind,
+    SecretRef,
+    SystemSettings,
+    Topic,
+    UdpMesh,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Built:
+    """`fleet` is None when there is any diagnostic."""
+
+    fleet: Fleet | None
+    diagnostics: tuple[Diagnostic, ...]
+
+
+def build(
+    document: InventoryDocument, root: MappingNode, plans: Mapping[str, NodePlan], files: tuple[Path, ...]
+) -> Built:
+    """`files` are those read, the first one first."""
+    hardware = {name: _hardware(name, item, root) for name, item in document.hardware.items()}
+    meshes = {name: _mesh(name, item, root) for name, item in document.meshes.items()}
+    diagnostics: list[Diagnostic] = []
+    robots = {name: _robot(name, item, root, diagnostics) for name, item in document.robots.items()}
+    robot_of: dict[str, str] = {}
+    for names in ("nodes", "carries"):
+        for robot in robots.values():
+            for node in getattr(robot, names):
+                robot_of.setdefault(node, robot.name)
+    built = build_nodes(plans, hardware, meshes, robot_of)
+    diagnostics.extend(built.diagnostics)
+    if diagnostics:
+        return Built(None, tuple(diagnostics))
+    fleet = Fleet(
+        name=document.fleet,
+        country=document.country,
+        meshes=MappingProxyType(meshes),
+        hardware=MappingProxyType(hardware),
+        nodes=MappingProxyType(built.nodes),
+        robots=MappingProxyType(robots),
+        topics=tuple(_topic(name, item) for name, item in document.topics.items()),
+        udp_mesh=_udp_mesh(document, root),
+        operators=Operators(
+            ssh_keys=tuple(document.operators.ssh_keys),
+            password_login=document.operators.password_login,
+            known_hosts=document.operators.known_hosts,
+        ),
+        system=SystemSettings(
+            timezone=document.system.timezone,
+            zonename=document.system.zonename,
+            log_size_kib=document.system.log_size_kib,
+            log_host=document.system.log_host,
+            log_port=document.system.log_port,
+            ntp_servers=tuple(document.system.ntp_servers),
+        ),
+        apply=ApplyPolicy(
+            max_down=document.apply.max_down,
+            canary=document.apply.canary,
+            stop_after_failures=document.apply.stop_after_failures,
+            quorum=document.apply.quorum,
+            parallel=document.apply.parallel,
+        ),
+        origins=Origins(root, plans, robot_of),
+        files=tuple(str(path) for path in files),
+        base=str(files[0].parent),
+    )
+    return Built(fleet, ())
+
+
+def _base(root: MappingNode, *path: str | int) -> str:
+    """The directory of the file that writes `path`; of the first file when none does."""
+    tree = descend(root, path)
+    return str(Path((root if tree is None else tree).file).parent)
+
+
+def _hardware(name: str, document: HardwareDocument, root: MappingNode) -> HardwareProfile:
+    return HardwareProfile(
+        name=name,
+        board=document.board,
+        profile=document.profile,
+        target=document.target,
+        release=document.release,
+        radios=tuple(
+            RadioHardware(
+                name=radio_name,
+                path=radio.path,
+                band=radio.band,
+                rated_power_dbm=radio.rated_power_dbm,
+                max_drive_dbm=radio.max_drive_dbm,
+                amplifier_gain_db=radio.amplifier_gain_db,
+                antenna_gain_dbi=radio.antenna_gain_dbi,
+                cable_loss_db=radio.cable_loss_db,
+                antenna=radio.antenna,
+                beamwidth_deg=radio.beamwidth_deg,
+                chains=radio.chains,
+            )
+            for radio_name, radio in document.radios.items()
+        ),
+        lan_ports=tuple(document.lan_ports),
+        memory_mib=document.memory_mib,
+        flash_mib=document.flash_mib,
+        firmware=Firmware(
+            image=document.firmware.image,
+            sha256=document.firmware.sha256.lower(),
+            revision=document.firmware.revision,
+            usign_key=document.firmware.usign_key,
+            base=_base(root, "hardware", name, "firmware"),
+        ),
+        packages=tuple(document.packages),
+        package_files=tuple(document.package_files),
+        confirm_window_s=document.confirm_window_s,
+        recovery=document.recovery,
+    )
+
+
+def _mesh(name: str, document: MeshDocument, root: MappingNode) -> Mesh:
+    batman, parts = document.batman, document.operator_parts
+    return Mesh(
+        name=name,
+        ssid=document.ssid,
+        bssid=document.bssid,
+        band=document.band,
+        channel=document.channel,
+        network=document.network,
+        htmode=document.htmode,
+        mode=document.mode,
+        encryption=document.encryption,
+        key=_secret(document.key, _base(root, "meshes", name, "key")) if document.key is not None else None,
+        mcast_rate_kbps=document.mcast_rate_kbps,
+        distance_m=document.distance_m,
+        beacon_interval_tu=document.beacon_interval_tu,
+        mtu=document.mtu,
+        lan_mtu=document.lan_mtu,
+        reconnect_s=document.reconnect_s,
+        min_beacons=document.min_beacons,
+        backend=document.backend,
+        batman=Batman(
+            routing_algo=batman.routing_algo,
+            bridge_loop_avoidance=batman.bridge_loop_avoidance,
+            distributed_arp_table=batman.distributed_arp_table,
+            aggregated_ogms=batman.aggregated_ogms,
+            multicast_mode=batman.multicast_mode,
+            fragmentation=batman.fragmentation,
+            hop_penalty=batman.hop_penalty,
+            orig_interval_ms=batman.orig_interval_ms,
+            elp_interval_ms=batman.elp_interval_ms,
+            gw_mode=batman.gw_mode,
+        ),
+        operator_parts=OperatorParts(
+            templates=parts.templates,
+            package_files=tuple(parts.package_files),
+            packages=tuple(parts.packages),
+            service=parts.service,
+            status_command=parts.status_command,
+            interface=parts.interface,
+            base=_base(root, "meshes", name, "operator_parts"),
+        ),
+    )
+
+
+def _secret(document: SecretDocument, base: str) -> SecretRef:
+    if document.env:
+        return SecretRef(SecretKind.ENV, document.env, base=base)
+    if document.file:
+        return SecretRef(SecretKind.FILE, document.file, document.key, base=base)
+    return SecretRef(SecretKind.AGE, document.age, document.key, document.identity, base)
+
+
+def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: list[Diagnostic]) -> Robot:
+    def names(key: str, patterns: tuple[str, ...]) -> tuple[str, ...]:
+        made: list[str] = []
+        for number, pattern in enumerate(patterns):
+            try:
+                made.extend(expand(pattern))
+            except BadRange as reason:
+                place = place_of(root, ("robots", name, key, number)) or Position(root.file)
+                message = f"not a range such as b[01-12]: {reason}"
+                diagnostics.append(
+                    codes.error(
+                        codes.BAD_RANGE, place, message, path=f"robots.{name}.{key}", found=f"'{shown(pattern)}'"
+                    )
+                )
+        return tuple(made)
+
+    return Robot(
+        name=name,
+        nodes=names("nodes", document.nodes),
+        computer=_computer(document.computer) if document.computer is not None else None,
+        is_base=document.is_base,
+        carries=names("carries", document.carries),
+    )
+
+
+def _computer(document: ComputerDocument) -> Computer:
+    written = {key: getattr(document.ssh, key) for key in document.ssh.model_fields_set}
+    return Computer(
+        address=document.address,
+        ssh=ssh_settings(written, user=""),
+        python=document.python,
+        arch=document.arch,
+        ros=document.ros,
+    )
+
+
+def _topic(name: str, document: TopicDocument) -> Topic:
+    return Topic(
+        name=name,
+        priority=document.priority,
+        topic_class=document.topic_class,
+        type_name=document.type_name,
+        reliable=document.reliable,
+        sources=tuple(document.sources),
+        destinations=tuple(document.destinations),
+        rate_hz=document.rate_hz,
+        size_bytes=document.size_bytes,
+        keep_last=document.keep_last,
+        deadline_s=document.deadline_s,
+        rate_limit_bytes_per_s=document.rate_limit_bytes_per_s,
+        compression=document.compression,
+        outbox=document.outbox,
+        outbox_bytes=document.outbox_bytes,
+        outbox_on_disk=document.outbox_on_disk,
+        repair=document.repair,
+    )
+
+
+def _udp_mesh(document: InventoryDocument, root: MappingNode) -> UdpMesh:
+    settings = document.udp_mesh
+    return UdpMesh(
+        port=settings.port,
+        keys=tuple(_secret(key, _base(root, "udp_mesh", "keys", number)) for number, key in enumerate(settings.keys)),
+        heartbeat_s=settings.heartbeat_s,
+        offline_after_s=settings.offline_after_s,
+        fragment_bytes=settings.fragment_bytes,
+        window=settings.window,
+        broadcast=settings.broadcast,
+        metrics_port=settings.metrics_port,
+    )

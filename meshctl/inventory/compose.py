@@ -1,0 +1,234 @@
+"""Text -> YAML events (libyaml's parser where PyYAML has it) -> one tree, with every limit kept on the way.
+
+The tree is built from events with a stack of its own: deep nesting cannot exhaust Python's, and an alias shares the
+value it names, so a bomb costs nothing before it is refused. Refused with a place: tags, merge keys, keys that are not
+text, several documents. Everything but a syntax error is reported together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import yaml
+
+from meshctl.diagnostics import Diagnostic, Position
+from meshctl.inventory import codes
+from meshctl.inventory.source import Source
+from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, position
+
+# The deepest place of the format, nodes.*.radios.*.mesh, is five levels down.
+MAX_DEPTH = 32
+# 10,000 nodes with 20 values each are 200,000. Bounds memory (about 300 bytes a value) and alias bombs.
+MAX_VALUES = 1_000_000
+
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+@dataclass(frozen=True, slots=True)
+class Composed:
+    """`root` is None when the text could not be read to its end; the diagnostics then say why."""
+
+    root: Tree | None
+    diagnostics: tuple[Diagnostic, ...]
+
+
+def compose(source: Source) -> Composed:
+    """The one document of `source`. Never raises for any text."""
+    composer = _Composer(source.file)
+    try:
+        for event in _events(source.text):
+            if not composer.take(event):
+                break
+    except yaml.MarkedYAMLError as reason:
+        composer.fail(_syntax_error(source, reason))
+    except yaml.YAMLError as reason:
+        composer.fail(codes.error(codes.YAML_SYNTAX, Position(source.file), f"not valid YAML: {reason}"))
+    if composer.root is None and not composer.is_broken:
+        composer.fail(codes.error(codes.EMPTY, Position(source.file, 1, 1), "the file is empty", expected="a mapping"))
+    return Composed(None if composer.is_broken else composer.root, tuple(composer.diagnostics))
+
+
+def _events(text: str) -> Iterator[yaml.Event]:
+    events: Iterator[yaml.Event] = yaml.parse(text, Loader=_LOADER)
+    return events
+
+
+def _syntax_error(source: Source, reason: yaml.MarkedYAMLError) -> Diagnostic:
+    mark = reason.problem_mark or reason.context_mark
+    place = Position(source.file) if mark is None else Position(source.file, mark.line + 1, mark.column + 1)
+    hint = ""
+    lines = source.text.splitlines()
+    if mark is not None and mark.line < len(lines) and "\t" in lines[mark.line][: mark.column + 1]:
+        hint = "YAML is indented with spaces, never with tabs"
+    context = f" {reason.context}" if reason.context else ""
+    return codes.error(codes.YAML_SYNTAX, place, f"not valid YAML{context}: {reason.problem}", hint=hint)
+
+
+class _Mark(Protocol):
+    """A place in the text, counted from 0; both of PyYAML's parsers have one."""
+
+    line: int
+    column: int
+    index: int
+
+
+def _marks(event: yaml.Event) -> tuple[_Mark, _Mark]:
+    """Where an event begins and ends; the parsers always say so."""
+    start, end = event.start_mark, event.end_mark
+    assert start is not None
+    assert end is not None
+    return start, end
+
+
+@dataclass(slots=True)
+class _Composer:
+    """The open containers, innermost last, each with the key that waits for its value and the anchor it defines."""
+
+    file: str
+    root: Tree | None = None
+    is_broken: bool = False
+    diagnostics: list[Diagnostic] = field(default_factory=list)
+    _open: list[tuple[SequenceNode | MappingNode, str | None]] = field(default_factory=list)
+    _key: Scalar | None = None
+    _waiting: list[Scalar | None] = field(default_factory=list)
+    _anchors: dict[str, Tree] = field(default_factory=dict)
+    _count: int = 0
+
+    def fail(self, diagnostic: Diagnostic) -> None:
+        self.is_broken = True
+        self.diagnostics.append(diagnostic)
+
+    def take(self, event: yaml.Event) -> bool:
+        """One event; False when reading on is of no use."""
+        match event:
+            case yaml.ScalarEvent():
+                self._refuse_tag(event)
+                self._scalar(event)
+            case yaml.MappingStartEvent() | yaml.SequenceStartEvent():
+                self._refuse_tag(event)
+                self._start(event)
+            case yaml.MappingEndEvent() | yaml.SequenceEndEvent():
+                self._end(event)
+            case yaml.AliasEvent():
+                self._alias(event)
+            case yaml.DocumentStartEvent() if self.root is not None:
+                self._refuse(event, "only one YAML document may stand in a file", hint="remove the line `---`")
+                return False
+            case _:
+                pass
+        return not self.is_broken
+
+    def _scalar(self, event: yaml.ScalarEvent) -> None:
+        start, end = _marks(event)
+        is_plain = event.style in (None, "")
+        scalar = Scalar(self.file, start.line + 1, start.column + 1, start.index, end.index, event.value, is_plain)
+        self._add(scalar, event.anchor)
+
+    def _start(self, event: yaml.MappingStartEvent | yaml.SequenceStartEvent) -> None:
+        start, end = _marks(event)
+        kind = MappingNode if isinstance(event, yaml.MappingStartEvent) else SequenceNode
+        container = kind(
+            self.file, start.line + 1, start.column + 1, start.index, end.index, is_flow=bool(event.flow_style)
+        )
+        if len(self._open) >= MAX_DEPTH:
+            self.fail(
+                codes.error(
+                    codes.TOO_DEEP, position(container), "nested too deep", expected=f"at most {MAX_DEPTH} levels"
+                )
+            )
+            return
+        self._open.append((container, event.anchor))
+        self._waiting.append(self._key)
+        self._key = None
+
+    def _end(self, event: yaml.MappingEndEvent | yaml.SequenceEndEvent) -> None:
+        container, anchor = self._open.pop()
+        container.end = _marks(event)[1].index
+        self._key = self._waiting.pop()
+        self._add(container, anchor)
+
+    def _alias(self, event: yaml.AliasEvent) -> None:
+        target = self._anchors.get(event.anchor or "")
+        if target is None:
+            inside = any(anchor == event.anchor for _, anchor in self._open)
+            what = "stands inside the value it names" if inside else "names no anchor written before it"
+            place = self._place(event)
+            self.fail(codes.error(codes.YAML_FEATURE, place, f"the alias *{event.anchor} {what}"))
+            return
+        self._add(target, None)
+
+    def _add(self, tree: Tree, anchor: str | None) -> None:
+        """A complete value: a key, an entry's value, a list's item or the document."""
+        if anchor is not None:
+            self._anchors[anchor] = tree
+        self._count += 1
+        if not self._open:
+            self.root = tree
+            return
+        container, _ = self._open[-1]
+        if isinstance(container, MappingNode) and self._key is None:
+            self._take_key(tree)
+            return
+        container.weight += tree.weight
+        if max(container.weight, self._count) > MAX_VALUES:
+            self.fail(
+                codes.error(
+                    codes.TOO_MANY_VALUES,
+                    position(tree),
+                    "too many values, counted with aliases followed",
+                    expected=f"at most {MAX_VALUES}",
+                    hint="write nodes that are alike as a range, and what they share as a group",
+                )
+            )
+        elif isinstance(container, SequenceNode):
+            container.items.append(tree)
+        else:
+            self._entry(container, tree)
+
+    def _take_key(self, tree: Tree) -> None:
+        if isinstance(tree, Scalar):
+            self._key = tree
+            return
+        self.fail(codes.error(codes.YAML_FEATURE, position(tree), "a key must be text", found="a list or a mapping"))
+
+    def _entry(self, mapping: MappingNode, value: Tree) -> None:
+        key, self._key = self._key, None
+        assert key is not None
+        first = mapping.keys.get(key.text)
+        if key.is_plain and key.text == "<<":
+            hint = "let nodes share values through `groups` and `defaults`"
+            self.diagnostics.append(
+                codes.error(codes.YAML_FEATURE, position(key), "merge keys are not supported", hint=hint)
+            )
+        elif first is not None:
+            self.diagnostics.append(
+                codes.error(
+                    codes.DUPLICATE_KEY,
+                    position(key),
+                    f"the key '{shown(key.text)}' stands twice in one mapping",
+                    found=f"the first in line {first.line}",
+                )
+            )
+        else:
+            mapping.keys[key.text] = key
+            mapping.values[key.text] = value
+
+    def _refuse_tag(self, event: yaml.ScalarEvent | yaml.MappingStartEvent | yaml.SequenceStartEvent) -> None:
+        if event.tag is not None:
+            hint = "remove it; quote a value that must stay text"
+            self._refuse(event, f"YAML tags are not supported: {shown(event.tag)}", hint=hint)
+
+    def _refuse(self, event: yaml.Event, message: str, *, hint: str) -> None:
+        self.diagnostics.append(codes.error(codes.YAML_FEATURE, self._place(event), message, hint=hint))
+
+    def _place(self, event: yaml.Event) -> Position:
+        start, _ = _marks(event)
+        return Position(self.file, start.line + 1, start.column + 1)
+
+
+def shown(text: str, limit: int = 60) -> str:
+    """Text on one line and of bounded length, for a message."""
+    flat = "".join(letter if letter.isprintable() else "?" for letter in text)
+    return flat if len(flat) <= limit else flat[: limit - 3] + "..."

@@ -1,0 +1,50 @@
+"""The inventory's format: one model per mapping, unknown keys forbidden, each key's docstring its description.
+
+The models hold what was written in one place; ranges, groups and references are worked out afterwards.
+"""
+
+from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument
+from meshctl.inventory.documents.node import GroupDocument, NodeDocument, NodeLayer, RadioLayer, SshLayer
+from meshctl.inventory.documents.radio import (
+    BatmanDocument,
+    FirmwareDocument,
+    HardwareDocument,
+    MeshDocument,
+    OperatorPartsDocument,
+    RadioHardwareDocument,
+)
+from meshctl.inventory.documents.robot import (
+    ApplyDocument,
+    ComputerDocument,
+    OperatorsDocument,
+    RobotDocument,
+    SystemDocument,
+    TopicDocument,
+    UdpMeshDocument,
+)
+from meshctl.inventory.documents.root import InventoryDocument
+
+__all__ = [
+    "NOT_WRITTEN",
+    "ApplyDocument",
+    "BatmanDocument",
+    "ComputerDocument",
+    "Document",
+    "FirmwareDocument",
+    "GroupDocument",
+    "HardwareDocument",
+    "InventoryDocument",
+    "MeshDocument",
+    "NodeDocument",
+    "NodeLayer",
+    "OperatorPartsDocument",
+    "OperatorsDocument",
+    "RadioHardwareDocument",
+    "RadioLayer",
+    "RobotDocument",
+    "SecretDocument",
+    "SshLayer",
+    "SystemDocument",
+    "TopicDocument",
+    "UdpMeshDocument",
+]

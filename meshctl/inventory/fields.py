@@ -1,0 +1,157 @@
+"""Types of single values: what a scalar's text means to the field that reads it, strictly.
+
+Each type refuses with an error whose context says what was `expected`; the message never repeats the value, which may
+be a secret put in the wrong place.
+"""
+
+from __future__ import annotations
+
+import re
+from ipaddress import AddressValueError, IPv4Address, IPv4Interface, IPv4Network, NetmaskValueError
+from typing import Annotated
+
+from pydantic import AfterValidator, BeforeValidator, PlainValidator, WithJsonSchema
+from pydantic_core import PydanticCustomError
+
+from meshctl.inventory.tree import Plain
+
+FORMAT_VERSION = 1
+
+_WHOLE = re.compile(r"[-+]?[0-9]{1,15}")
+_REAL = re.compile(r"[-+]?(?:[0-9]{1,15}(?:\.[0-9]{0,15})?|\.[0-9]{1,15})(?:[eE][-+]?[0-9]{1,2})?")
+_FLAGS = {"true": True, "false": False, "yes": True, "no": False, "on": True, "off": False}
+_NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
+_MAC = re.compile(r"[0-9A-Fa-f]{2}(?:[:-][0-9A-Fa-f]{2}){5}")
+
+
+def wrong(expected: str) -> PydanticCustomError:
+    """The error that a field type raises; `expected` completes `expected ...` in the message."""
+    return PydanticCustomError("meshctl", "expected {expected}", {"expected": expected})
+
+
+def _whole(value: object) -> object:
+    if isinstance(value, Plain) and _WHOLE.fullmatch(value):
+        return int(value)
+    raise wrong("a whole number")
+
+
+def _real(value: object) -> object:
+    if isinstance(value, Plain) and _REAL.fullmatch(value):
+        return float(value)
+    raise wrong("a number")
+
+
+def _flag(value: object) -> object:
+    known = _FLAGS.get(value.lower()) if isinstance(value, Plain) else None
+    if known is None:
+        raise wrong("true or false")
+    return known
+
+
+def _text(value: object) -> str:
+    if isinstance(value, str):
+        return str(value)
+    raise wrong("text")
+
+
+def is_name(value: str) -> bool:
+    """Names become host names, file names and keys: letters, digits, `.`, `_`, `-`, at most 63 of them."""
+    return _NAME.fullmatch(value) is not None
+
+
+def _name(value: str) -> str:
+    if is_name(value):
+        return value
+    raise wrong(
+        "a name of letters, digits, '.', '_' and '-', at most 63 of them, starting and ending with a letter or digit"
+    )
+
+
+def _mac(value: str) -> str:
+    if _MAC.fullmatch(value):
+        return value.lower().replace("-", ":")
+    raise wrong("a MAC address such as 02:ca:fe:00:00:01")
+
+
+def _country(value: str) -> str:
+    if re.fullmatch("[A-Z]{2}", value):
+        return value
+    raise wrong("a country code of two capital letters such as US")
+
+
+def _address(value: object) -> IPv4Address:
+    try:
+        return IPv4Address(_text(value))
+    except AddressValueError:
+        raise wrong("an IPv4 address such as 10.42.0.1") from None
+
+
+def _interface(value: object) -> IPv4Interface:
+    text = _text(value)
+    if "/" in text:
+        try:
+            return IPv4Interface(text)
+        except (AddressValueError, NetmaskValueError):
+            pass
+    raise wrong("an IPv4 address with its prefix length such as 10.42.0.100/24")
+
+
+def _network(value: object) -> IPv4Network:
+    try:
+        return IPv4Network(_text(value))
+    except (AddressValueError, NetmaskValueError):
+        pass
+    except ValueError:
+        raise wrong("a network address: the part behind the prefix must be zero") from None
+    raise wrong("an IPv4 network such as 10.42.0.0/24")
+
+
+def _window(value: object) -> object:
+    if value == "adaptive":
+        return None
+    if isinstance(value, Plain) and _WHOLE.fullmatch(value) and 1 <= int(value) <= 1024:
+        return int(value)
+    raise wrong("'adaptive' or a number of fragments from 1 to 1024")
+
+
+def _version(value: object) -> object:
+    if isinstance(value, Plain) and value == str(FORMAT_VERSION):
+        return FORMAT_VERSION
+    raise wrong(f"{FORMAT_VERSION}, the version of this format")
+
+
+def empty_mapping(value: object) -> object:
+    """A section with nothing under it is an empty one."""
+    return {} if value is None else value
+
+
+Whole = Annotated[int, BeforeValidator(_whole)]
+Real = Annotated[float, BeforeValidator(_real)]
+Flag = Annotated[bool, BeforeValidator(_flag)]
+Text = Annotated[str, BeforeValidator(_text)]
+Name = Annotated[str, BeforeValidator(_text), AfterValidator(_name)]
+Mac = Annotated[
+    str,
+    BeforeValidator(_text),
+    AfterValidator(_mac),
+    WithJsonSchema({"type": "string", "pattern": f"^{_MAC.pattern}$"}),
+]
+Country = Annotated[
+    str,
+    BeforeValidator(_text),
+    AfterValidator(_country),
+    WithJsonSchema({"type": "string", "pattern": "^[A-Z]{2}$"}),
+]
+Version = Annotated[int, BeforeValidator(_version), WithJsonSchema({"const": FORMAT_VERSION})]
+Window = Annotated[
+    int | None,
+    BeforeValidator(_window),
+    WithJsonSchema({"anyOf": [{"const": "adaptive"}, {"type": "integer", "minimum": 1, "maximum": 1024}]}),
+]
+Address = Annotated[IPv4Address, PlainValidator(_address), WithJsonSchema({"type": "string", "format": "ipv4"})]
+Interface = Annotated[
+    IPv4Interface, PlainValidator(_interface), WithJsonSchema({"type": "string", "pattern": "^[0-9.]+/[0-9]+$"})
+]
+Network = Annotated[
+    IPv4Network, PlainValidator(_network), WithJsonSchema({"type": "string", "pattern": "^[0-9.]+/[0-9]+$"})
+]

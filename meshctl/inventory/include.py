@@ -1,0 +1,176 @@
+"""The inventory's files -> one tree: the first file, then what it includes, each key in one place only."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from meshctl.diagnostics import Diagnostic
+from meshctl.inventory import codes
+from meshctl.inventory.compose import MAX_VALUES, compose
+from meshctl.inventory.source import Reader, Source, read_bytes, read_source
+from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, describe, position
+
+# Files, counted with every include; bounds the time that a crafted inventory can cost.
+MAX_FILES = 256
+# The name that a directory's first file has.
+FIRST_FILE = "fleet.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class Gathered:
+    """`root` is None when a file could not be read as a mapping. `files` are in the order they were read."""
+
+    root: MappingNode | None
+    files: tuple[Path, ...]
+    diagnostics: tuple[Diagnostic, ...]
+
+
+def first_file(path: Path) -> Path:
+    """The file to begin with: `path`, or `fleet.yaml` in it when it is a directory."""
+    return path / FIRST_FILE if path.is_dir() else path
+
+
+def gather(path: Path, environ: Mapping[str, str], read: Reader = read_bytes) -> Gathered:
+    """Read `path` and its includes. An include's `~` is `HOME` of `environ`."""
+    gathering = _Gathering(environ, read)
+    root = gathering.file(first_file(path), ())
+    complete = root if not gathering.is_broken else None
+    return Gathered(complete, tuple(gathering.files), tuple(gathering.diagnostics))
+
+
+@dataclass(slots=True)
+class _Gathering:
+    environ: Mapping[str, str]
+    read: Reader
+    files: list[Path] = field(default_factory=list)
+    diagnostics: list[Diagnostic] = field(default_factory=list)
+    is_broken: bool = False
+    weight: int = 0
+
+    def file(self, path: Path, above: tuple[str, ...]) -> MappingNode | None:
+        """One file with everything it includes; `above` are the real paths of the files that led here."""
+        source = read_source(path, self.read)
+        if not isinstance(source, Source):
+            self._fail(source)
+            return None
+        self.files.append(path)
+        composed = compose(source)
+        self.diagnostics.extend(composed.diagnostics)
+        root = composed.root
+        if root is None:
+            self.is_broken = True
+            return None
+        if not isinstance(root, MappingNode):
+            what = "the file is empty" if isinstance(root, Scalar) and root.is_null else ""
+            code = codes.EMPTY if what else codes.WRONG_VALUE
+            self._fail(codes.error(code, position(root), what, expected="a mapping of keys", found=describe(root)))
+            return None
+        self.weight += root.weight
+        if self.weight > MAX_VALUES:
+            self._fail(
+                codes.error(
+                    codes.TOO_MANY_VALUES,
+                    position(root),
+                    "too many values in all files together",
+                    expected=f"at most {MAX_VALUES}",
+                )
+            )
+            return None
+        self._follow(root, path, (*above, os.path.realpath(path)))
+        return root
+
+    def _fail(self, diagnostic: Diagnostic) -> None:
+        self.is_broken = True
+        self.diagnostics.append(diagnostic)
+
+    def _follow(self, root: MappingNode, path: Path, above: tuple[str, ...]) -> None:
+        includes = root.values.get("include")
+        if not isinstance(includes, SequenceNode):
+            return
+        for item in includes.items:
+            if self.is_broken and len(self.diagnostics) > MAX_FILES:
+                return
+            target = self._target(item, path)
+            if target is None:
+                continue
+            real = os.path.realpath(target)
+            if real in above:
+                circle = " -> ".join(Path(name).name for name in (*above[above.index(real) :], real))
+                self._fail(codes.error(codes.INCLUDE, position(item), f"files include each other: {circle}"))
+            elif any(os.path.realpath(known) == real for known in self.files):
+                self._fail(codes.error(codes.INCLUDE, position(item), f"{target} is included twice"))
+            elif len(self.files) >= MAX_FILES:
+                self._fail(
+                    codes.error(codes.INCLUDE, position(item), "too many files", expected=f"at most {MAX_FILES} files")
+                )
+                return
+            else:
+                known = len(self.diagnostics)
+                below = self.file(target, above)
+                self._tell_where_from(item, target, known)
+                if below is not None:
+                    self._merge(root, below)
+
+    def _target(self, item: Tree, path: Path) -> Path | None:
+        """The path that an entry of `include` names; None when it is no text (the format check reports that)."""
+        if not isinstance(item, Scalar) or item.is_null:
+            return None
+        if item.text.startswith("~/"):
+            home = self.environ.get("HOME", "")
+            if not home:
+                self._fail(codes.error(codes.INCLUDE, position(item), "`~` needs the environment variable HOME"))
+                return None
+            return Path(home) / item.text[2:]
+        return path.parent / item.text
+
+    def _tell_where_from(self, item: Scalar | Tree, target: Path, known: int) -> None:
+        """A file that cannot be read is reported where it is included."""
+        for number in range(known, len(self.diagnostics)):
+            problem = self.diagnostics[number]
+            if problem.code == codes.UNREADABLE and problem.position.file == str(target):
+                self.diagnostics[number] = codes.error(
+                    codes.UNREADABLE, position(item), f"the include {target} {problem.message}"
+                )
+
+    def _merge(self, root: MappingNode, below: MappingNode) -> None:
+        """Add an included file's keys: new sections as they are, mappings in both key by key."""
+        for key, value in below.values.items():
+            here = root.values.get(key)
+            if key == "include" or (key == "meshctl" and here is not None and _same_text(here, value)):
+                continue
+            if here is None or (isinstance(here, Scalar) and here.is_null):
+                root.keys[key], root.values[key] = below.keys[key], value
+            elif isinstance(here, MappingNode) and isinstance(value, MappingNode):
+                joined = MappingNode(here.file, here.line, here.column, here.start, here.end, here.is_flow)
+                joined.keys.update(here.keys)
+                joined.values.update(here.values)
+                self._join(key, joined, value)
+                root.values[key] = joined
+            elif not (isinstance(value, Scalar) and value.is_null):
+                self._clash(key, root.keys[key], below.keys[key])
+
+    def _join(self, section: str, here: MappingNode, other: MappingNode) -> None:
+        for key, value in other.values.items():
+            if key in here.values:
+                self._clash(f"{section}.{key}", here.keys[key], other.keys[key])
+            else:
+                here.keys[key], here.values[key] = other.keys[key], value
+
+    def _clash(self, path: str, first: Scalar, second: Scalar) -> None:
+        self.diagnostics.append(
+            codes.error(
+                codes.INCLUDE_CLASH,
+                position(second),
+                "written in two files",
+                path=path,
+                found=f"also in {position(first)}",
+                hint="keep it in one of them",
+            )
+        )
+
+
+def _same_text(one: Tree, other: Tree) -> bool:
+    return isinstance(one, Scalar) and isinstance(other, Scalar) and one.text == other.text

@@ -1,0 +1,221 @@
+"""Who says what about a node: entries expanded, groups followed, layers in order, nearest first.
+
+defaults < groups (a parent below its child, an earlier below a later) < range < the node's own entry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from meshctl.diagnostics import Diagnostic, Position
+from meshctl.inventory import codes
+from meshctl.inventory.compose import shown
+from meshctl.inventory.documents import GroupDocument, InventoryDocument, NodeDocument, NodeLayer
+from meshctl.inventory.fields import is_name
+from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand, is_range
+from meshctl.inventory.suggest import did_you_mean
+from meshctl.inventory.tree import MappingNode, Tree, key_position, place_of, position
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layer:
+    """One place that says something about nodes. `title` is what an origin calls it; `path` is where it stands."""
+
+    title: str
+    path: tuple[str, ...]
+    document: NodeLayer
+    tree: Tree
+    place: Position
+
+    def place_of(self, path: Sequence[str | int]) -> Position:
+        """Where the layer writes `path`; where it stands itself when it does not."""
+        return (place_of(self.tree, path) if path else None) or self.place
+
+
+@dataclass(frozen=True, slots=True)
+class NodePlan:
+    """A node before it is built: its layers, nearest first, its groups, and its number (from 1) in its range."""
+
+    name: str
+    layers: tuple[Layer, ...]
+    groups: tuple[str, ...]
+    range_index: int = 0
+
+    @property
+    def entry(self) -> Layer:
+        """The layer that is reported when something is wrong with the node."""
+        return self.layers[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Layered:
+    """`plans` in the inventory's order."""
+
+    plans: dict[str, NodePlan]
+    diagnostics: tuple[Diagnostic, ...]
+
+
+def lay(document: InventoryDocument, root: MappingNode) -> Layered:
+    """Work out the layers of every node; groups that do not exist or inherit in a circle are reported."""
+    return _Laying(document, root).run()
+
+
+@dataclass(slots=True)
+class _Entry:
+    """A key under `nodes`: its layer and, for a range, the number of each name in it."""
+
+    layer: Layer
+    document: NodeDocument
+    index: int = 0
+
+
+@dataclass(slots=True)
+class _Laying:
+    document: InventoryDocument
+    root: MappingNode
+    diagnostics: list[Diagnostic] = field(default_factory=list)
+    _groups: dict[str, Layer] = field(default_factory=dict)
+    _stacks: dict[tuple[str, ...], tuple[Layer, ...]] = field(default_factory=dict)
+    _joined: dict[tuple[int, ...], tuple[Layer, ...]] = field(default_factory=dict)
+
+    def run(self) -> Layered:
+        for name, group in self.document.groups.items():
+            self._groups[name] = self._layer(f"group {name}", ("groups", name), group)
+        for name in self.document.groups:
+            self._check_group(name)
+        defaults = (self._layer("defaults", ("defaults",), self.document.defaults),)
+        plans: dict[str, NodePlan] = {}
+        cyclic = {problem.path for problem in self.diagnostics if problem.code == codes.GROUP_CYCLE}
+        for name, entries in self._entries().items():
+            own = tuple(entry.layer for entry in entries)
+            groups = next(
+                (entry.document.groups for entry in entries if "groups" in entry.document.model_fields_set), ()
+            )
+            stack = () if cyclic else self._stack(groups)
+            key = (*map(id, own), *map(id, stack))
+            layers = self._joined.setdefault(key, (*own, *stack, *defaults))
+            plans[name] = NodePlan(name, layers, groups, entries[-1].index)
+        return Layered(plans, tuple(self.diagnostics))
+
+    def _layer(self, title: str, path: tuple[str, ...], document: NodeLayer) -> Layer:
+        tree: Tree = self.root
+        place = position(self.root)
+        for part in path:
+            if not isinstance(tree, MappingNode) or part not in tree.values:
+                break
+            place = key_position(tree, part)
+            tree = tree.values[part]
+        return Layer(title, path, document, tree, place)
+
+    def _check_group(self, name: str) -> None:
+        """Report parents that do not exist, and the circle that `name` is the first of."""
+        layer = self._groups[name]
+        document = self.document.groups[name]
+        for number, parent in enumerate(document.inherits):
+            self._check_known(parent, layer, "inherits", number)
+        trail = [name]
+        seen = {name}
+        pending = [(parent, 1) for parent in reversed(document.inherits)]
+        while pending:
+            parent, depth = pending.pop()
+            del trail[depth:]
+            trail.append(parent)
+            if parent == name:
+                if name == min(trail):
+                    self.diagnostics.append(
+                        codes.error(
+                            codes.GROUP_CYCLE,
+                            layer.place,
+                            f"groups inherit from each other: {' -> '.join(trail)}",
+                            path=f"groups.{name}",
+                        )
+                    )
+                return
+            if parent in seen or parent not in self.document.groups:
+                continue
+            seen.add(parent)
+            pending.extend((above, depth + 1) for above in reversed(self.document.groups[parent].inherits))
+
+    def _check_known(self, name: str, layer: Layer, key: str, number: int) -> None:
+        if name in self._groups:
+            return
+        place = layer.place_of((key, number))
+        self.diagnostics.append(
+            codes.error(
+                codes.UNKNOWN_GROUP,
+                place,
+                f"unknown group '{shown(name)}'",
+                path=".".join((*layer.path, key)),
+                hint=did_you_mean(name, self._groups),
+            )
+        )
+
+    def _stack(self, groups: tuple[str, ...]) -> tuple[Layer, ...]:
+        """The groups' layers, nearest first, each group once, at its farthest place."""
+        known = self._stacks.get(groups)
+        if known is not None:
+            return known
+        ordered: list[str] = []
+        pending = [(name, False) for name in reversed(groups)]
+        seen: set[str] = set()
+        while pending:
+            name, is_done = pending.pop()
+            if is_done:
+                ordered.append(name)
+            elif name not in seen and name in self._groups:
+                seen.add(name)
+                pending.append((name, True))
+                group = self._groups[name].document
+                assert isinstance(group, GroupDocument)
+                pending.extend((parent, False) for parent in reversed(group.inherits))
+        stack = tuple(self._groups[name] for name in reversed(ordered))
+        self._stacks[groups] = stack
+        return stack
+
+    def _entries(self) -> dict[str, list[_Entry]]:
+        """Each node's entries, its own before its range's."""
+        made: dict[str, list[_Entry]] = {}
+        for pattern, document in self.document.nodes.items():
+            ranged = is_range(pattern)
+            layer = self._layer(f"range {pattern}" if ranged else "node", ("nodes", pattern), document)
+            for number, group in enumerate(document.groups):
+                self._check_known(group, layer, "groups", number)
+            names = self._names(pattern, layer)
+            if len(made) + len(names) > MAX_NAMES:
+                self._refuse(layer, f"too many nodes: at most {MAX_NAMES} are allowed")
+                break
+            for index, name in enumerate(names, start=1):
+                entries = made.setdefault(name, [])
+                if not ranged:
+                    entries.insert(0, _Entry(layer, document))
+                elif entries and entries[-1].index:
+                    first = entries[-1].layer
+                    self.diagnostics.append(
+                        codes.error(
+                            codes.NODE_TWICE,
+                            layer.place,
+                            f"makes the node '{name}', which '{first.path[1]}' makes too",
+                            path=f"nodes.{pattern}",
+                            found=f"also in {first.place}",
+                        )
+                    )
+                    break
+                else:
+                    entries.append(_Entry(layer, document, index))
+        return made
+
+    def _names(self, pattern: str, layer: Layer) -> tuple[str, ...]:
+        try:
+            names = expand(pattern)
+        except BadRange as reason:
+            self._refuse(layer, f"not a range such as b[01-12]: {reason}")
+            return ()
+        wrong = next((name for name in names if not is_name(name)), None)
+        if wrong is not None:
+            self._refuse(layer, f"'{shown(wrong)}' is not a name of letters, digits, '.', '_' and '-', at most 63")
+            return ()
+        return names
+
+    def _refuse(self, layer: Layer, message: str) -> None:
+        self.diagnostics.append(codes.error(codes.BAD_RANGE, layer.place, message, path=shown(".".join(layer.path))))

@@ -1,0 +1,56 @@
+"""Files -> tree -> document -> node plans -> fleet; every stage adds its diagnostics, none stops at the first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+from meshctl.diagnostics import Diagnostic, InvalidInput, sorted_diagnostics
+from meshctl.inventory.build import build
+from meshctl.inventory.include import gather
+from meshctl.inventory.layers import lay
+from meshctl.inventory.source import Reader, read_bytes
+from meshctl.inventory.validate import validate
+from meshctl.model import Fleet
+
+_NO_ENVIRON: Mapping[str, str] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """`fleet` is None exactly when `diagnostics` holds an error. `files` are those read, the first one first."""
+
+    fleet: Fleet | None
+    diagnostics: tuple[Diagnostic, ...]
+    files: tuple[str, ...]
+
+
+def load(path: Path, *, environ: Mapping[str, str] = _NO_ENVIRON, read: Reader = read_bytes) -> Loaded:
+    """The fleet that `path` describes: a YAML file, or a directory that holds `fleet.yaml`.
+
+    `environ` gives `~` in includes its meaning (`HOME`); `read` gets a file's bytes and may raise OSError. Never raises
+    for anything a file holds.
+    """
+    gathered = gather(path, environ, read)
+    files = tuple(str(file) for file in gathered.files)
+    problems = list(gathered.diagnostics)
+    fleet: Fleet | None = None
+    if gathered.root is not None:
+        validated = validate(gathered.root)
+        problems.extend(validated.diagnostics)
+        if validated.document is not None:
+            layered = lay(validated.document, gathered.root)
+            built = build(validated.document, gathered.root, layered.plans, gathered.files)
+            problems.extend((*layered.diagnostics, *built.diagnostics))
+            fleet = built.fleet
+    return Loaded(None if problems else fleet, sorted_diagnostics(problems), files)
+
+
+def load_fleet(path: Path, *, environ: Mapping[str, str] = _NO_ENVIRON) -> Fleet:
+    """The fleet. Raises InvalidInput with every diagnostic when there is any."""
+    loaded = load(path, environ=environ)
+    if loaded.fleet is None:
+        raise InvalidInput(loaded.diagnostics)
+    return loaded.fleet

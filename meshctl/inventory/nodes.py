@@ -1,0 +1,254 @@
+"""Layers -> nodes: values joined, radios matched with hardware and mesh, addresses worked out.
+
+Nodes with the same layers (a range) are worked out once; only name, host name and address differ.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from ipaddress import IPv4Address, IPv4Interface, IPv4Network
+from types import MappingProxyType
+from typing import Any
+
+from meshctl.diagnostics import Diagnostic
+from meshctl.inventory import codes
+from meshctl.inventory.addresses import AddressRule, AddressValue, BadAddress
+from meshctl.inventory.documents import RadioLayer, SshLayer
+from meshctl.inventory.layers import Layer, NodePlan
+from meshctl.inventory.suggest import did_you_mean
+from meshctl.model import Band, HardwareProfile, Mesh, Node, NodeState, Radio, Role, SshSettings
+
+# Stands in a template until the node's own address is known.
+_NO_ADDRESS = IPv4Interface("0.0.0.0/0")
+
+
+@dataclass(frozen=True, slots=True)
+class BuiltNodes:
+    nodes: dict[str, Node]
+    diagnostics: tuple[Diagnostic, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Template:
+    """What all nodes with the same layers share."""
+
+    node: Node
+    address: AddressValue
+    address_layer: Layer
+    hostname: str
+    network: IPv4Network | None
+
+
+def build_nodes(
+    plans: Mapping[str, NodePlan],
+    hardware: Mapping[str, HardwareProfile],
+    meshes: Mapping[str, Mesh],
+    robot_of: Mapping[str, str],
+) -> BuiltNodes:
+    """Every node that can be built; a diagnostic, once for a whole range, for each that cannot.
+
+    `robot_of` names the robot that lists a node, for nodes that do not name it themselves.
+    """
+    building = _Building(hardware, meshes)
+    nodes: dict[str, Node] = {}
+    for plan in plans.values():
+        node = building.node(plan, robot_of.get(plan.name, ""))
+        if node is not None:
+            nodes[plan.name] = node
+    return BuiltNodes(nodes, tuple(building.diagnostics))
+
+
+def joined(layers: tuple[Layer, ...]) -> dict[str, Any]:
+    """The values written in any layer, the nearest winning; mappings (`radios`, `ssh`, `extra_uci`) join key by key."""
+    values: dict[str, Any] = {}
+    for layer in reversed(layers):
+        document = layer.document
+        for name in document.model_fields_set:
+            value = getattr(document, name)
+            match value:
+                case SshLayer():
+                    values[name] = {**values.get(name, {}), **_written(value)}
+                case dict() if name == "radios":
+                    radios = dict(values.get(name, {}))
+                    for radio, settings in value.items():
+                        radios[radio] = {**radios.get(radio, {}), **_written(settings)}
+                    values[name] = radios
+                case dict():
+                    values[name] = {**values.get(name, {}), **value}
+                case _:
+                    values[name] = value
+    return values
+
+
+def _written(document: SshLayer | RadioLayer) -> dict[str, Any]:
+    return {name: getattr(document, name) for name in document.model_fields_set}
+
+
+@dataclass(slots=True)
+class _Building:
+    hardware: Mapping[str, HardwareProfile]
+    meshes: Mapping[str, Mesh]
+    diagnostics: list[Diagnostic] = field(default_factory=list)
+    _templates: dict[tuple[Layer, ...], _Template | None] = field(default_factory=dict)
+    _counts: Counter[Layer] = field(default_factory=Counter)
+    _failed: set[Layer] = field(default_factory=set)
+
+    def node(self, plan: NodePlan, robot: str) -> Node | None:
+        index_of = self._count(plan)
+        if plan.layers not in self._templates:
+            self._templates[plan.layers] = self._template(plan)
+        template = self._templates[plan.layers]
+        if template is None:
+            return None
+        address = self._address(plan, template, index_of)
+        if address is None:
+            return None
+        return replace(
+            template.node,
+            name=plan.name,
+            hostname=template.hostname or plan.name,
+            address=address,
+            robot=template.node.robot or robot,
+        )
+
+    def _count(self, plan: NodePlan) -> dict[Layer, int]:
+        """The node's number under each rule that holds for it, also where a nearer layer overrules it, so that one
+        node with an address of its own does not move the others."""
+        index_of = {}
+        for layer in plan.layers:
+            if isinstance(layer.document.address, AddressRule):
+                self._counts[layer] += 1
+                in_range = layer.title.startswith("range ")
+                index_of[layer] = plan.range_index if in_range else self._counts[layer]
+        return index_of
+
+    def _template(self, plan: NodePlan) -> _Template | None:
+        values = joined(plan.layers)
+        profile = self._profile(plan, values)
+        address_layer = next((layer for layer in plan.layers if "address" in layer.document.model_fields_set), None)
+        if address_layer is None:
+            hint = "write `address: 10.42.0.11`, or a rule in its group or range: `address: {from: 10.42.0.101}`"
+            self._report(codes.BAD_ADDRESS, plan.entry, "the node has no address", hint=hint)
+        if profile is None or address_layer is None:
+            return None
+        radios = self._radios(plan, values, profile)
+        first_mesh = next((radio.mesh for radio in radios if radio.mesh in self.meshes), None)
+        node = Node(
+            name=plan.name,
+            hostname="",
+            role=values.get("role", Role.BEACON),
+            state=values.get("state", NodeState.DEPLOYED),
+            hardware=profile,
+            release=values.get("release", profile.release),
+            address=_NO_ADDRESS,
+            radios=radios,
+            lan_ports=tuple(values.get("lan_ports", profile.lan_ports)),
+            ssh=ssh_settings(values.get("ssh", {}), user="root"),
+            robot=values.get("robot", ""),
+            label=values.get("label", ""),
+            serial=values.get("serial", ""),
+            mac=values.get("mac", ""),
+            host_keys=tuple(values.get("host_keys", ())),
+            groups=plan.groups,
+            confirm_window_s=values.get("confirm_window_s", profile.confirm_window_s),
+            packages=tuple(values.get("packages", ())),
+            extra_uci=MappingProxyType(values.get("extra_uci", {})),
+            gateway=values.get("gateway"),
+        )
+        network = self.meshes[first_mesh].network if first_mesh is not None else None
+        return _Template(node, values["address"], address_layer, values.get("hostname", ""), network)
+
+    def _profile(self, plan: NodePlan, values: Mapping[str, Any]) -> HardwareProfile | None:
+        name = values.get("hardware")
+        if name is None:
+            hint = "write `hardware: NAME` at the node, in its group or in `defaults`"
+            self._report(codes.UNKNOWN_HARDWARE, plan.entry, "the node has no hardware", hint=hint)
+            return None
+        profile = self.hardware.get(name)
+        if profile is None:
+            layer = next(layer for layer in plan.layers if "hardware" in layer.document.model_fields_set)
+            self._report(
+                codes.UNKNOWN_HARDWARE,
+                layer,
+                f"unknown hardware '{name}'",
+                below=("hardware",),
+                hint=did_you_mean(name, self.hardware),
+            )
+        return profile
+
+    def _radios(self, plan: NodePlan, values: Mapping[str, Any], profile: HardwareProfile) -> tuple[Radio, ...]:
+        written: dict[str, dict[str, Any]] = values.get("radios", {})
+        known = [radio.name for radio in profile.radios]
+        for name in written:
+            if name not in known:
+                layer = next(layer for layer in plan.layers if name in layer.document.radios)
+                self._report(
+                    codes.UNKNOWN_RADIO,
+                    layer,
+                    f"the hardware '{profile.name}' has no radio '{name}'",
+                    below=("radios", name),
+                    expected=f"one of {', '.join(known)}" if known else "no radios",
+                )
+        return tuple(
+            Radio(
+                hardware=radio,
+                mesh=settings["mesh"] if "mesh" in settings else self._only_mesh(radio.band),
+                tx_power_dbm=settings.get("tx_power_dbm", radio.max_drive_dbm),
+                mac=settings.get("mac", ""),
+            )
+            for radio in profile.radios
+            for settings in (written.get(radio.name, {}),)
+        )
+
+    def _only_mesh(self, band: Band) -> str | None:
+        """The mesh of a band, when the fleet has exactly one there."""
+        names = [mesh.name for mesh in self.meshes.values() if mesh.band is band]
+        return names[0] if len(names) == 1 else None
+
+    def _address(self, plan: NodePlan, template: _Template, index_of: Mapping[Layer, int]) -> IPv4Interface | None:
+        value, layer = template.address, template.address_layer
+        if isinstance(value, IPv4Interface):
+            return value
+        if isinstance(value, AddressRule):
+            try:
+                value = value.address(template.network, index_of[layer])
+            except BadAddress as reason:
+                self._report(codes.BAD_ADDRESS, layer, f"{reason} (node '{plan.name}')", below=("address",))
+                return None
+        return IPv4Interface((value, self._prefix_length(value, template.network)))
+
+    def _prefix_length(self, address: IPv4Address, network: IPv4Network | None) -> int:
+        """That of the node's own mesh; of the mesh that holds the address for a node in none; else of one host."""
+        if network is None:
+            network = next((mesh.network for mesh in self.meshes.values() if address in mesh.network), None)
+        return 32 if network is None else network.prefixlen
+
+    def _report(
+        self,
+        code: str,
+        layer: Layer,
+        message: str,
+        *,
+        below: tuple[str, ...] = (),
+        expected: str = "",
+        hint: str = "",
+    ) -> None:
+        place = layer.place_of(below)
+        diagnostic = codes.error(
+            code, place, message, path=".".join((*layer.path, *below)), expected=expected, hint=hint
+        )
+        if diagnostic not in self.diagnostics[-8:]:
+            self.diagnostics.append(diagnostic)
+
+
+def ssh_settings(values: Mapping[str, Any], *, user: str) -> SshSettings:
+    """`user` is taken where none is written."""
+    return SshSettings(
+        host=values.get("host", ""),
+        port=values.get("port", 22),
+        user=values.get("user", user),
+        key_files=tuple(values.get("key_files", ())),
+        jump=values.get("jump", ""),
+    )

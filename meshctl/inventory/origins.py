@@ -1,0 +1,98 @@
+"""Where every value was written, looked up when asked: a fleet of thousands keeps one tree, not a table of places."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from meshctl.inventory.layers import Layer, NodePlan
+from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, child, place_of
+from meshctl.model import Origin
+
+# How an origin names a value of each section; `{}` is the entry's name.
+_TITLES = {
+    "hardware": "hardware {}",
+    "meshes": "mesh {}",
+    "groups": "group {}",
+    "robots": "robot {}",
+    "topics": "topic {}",
+    "defaults": "defaults",
+}
+
+
+class Origins(Mapping[tuple[str, ...], Origin]):
+    """Paths such as `("nodes", "b03", "radios", "radio0", "tx_power_dbm")` to origins.
+
+    A node's values stand under the node's path with the layer they came from, a value of the file's other sections
+    under its own path, `("operators", "ssh_keys", "0")`.
+    """
+
+    __slots__ = ("_plans", "_robot_of", "_root")
+
+    def __init__(self, root: MappingNode, plans: Mapping[str, NodePlan], robot_of: Mapping[str, str]) -> None:
+        self._root = root
+        self._plans = plans
+        self._robot_of = robot_of
+
+    def __getitem__(self, path: tuple[str, ...]) -> Origin:
+        found = self._node(path) if path[:1] == ("nodes",) and len(path) > 1 else self._section(path)
+        if found is None:
+            raise KeyError(path)
+        return found
+
+    def __iter__(self) -> Iterator[tuple[str, ...]]:
+        for section, tree in self._root.values.items():
+            if section != "nodes":
+                yield from _paths(tree, (section,))
+        for name, plan in self._plans.items():
+            below = {path for layer in plan.layers for path in _paths(layer.tree, ())}
+            yield from (("nodes", name, *path) for path in sorted(below) if path[:1] != ("inherits",))
+            if ("robot",) not in below and name in self._robot_of:
+                yield ("nodes", name, "robot")
+        if "nodes" in self._root.values:
+            yield ("nodes",)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    def _section(self, path: tuple[str, ...]) -> Origin | None:
+        place = place_of(self._root, path) if path else None
+        if place is None:
+            return None
+        title = _TITLES.get(path[0], "fleet")
+        return Origin(place, title.format(path[1]) if len(path) > 1 else "fleet" if "{}" in title else title)
+
+    def _node(self, path: tuple[str, ...]) -> Origin | None:
+        plan = self._plans.get(path[1])
+        below = path[2:]
+        if plan is None or below[:1] == ("inherits",):
+            return None
+        for layer in plan.layers:
+            if below and not _writes(layer, below):
+                continue
+            is_rule = below == ("address",) and isinstance(child(layer.tree, "address"), MappingNode)
+            return Origin(layer.place_of(below), "rule" if is_rule else layer.title)
+        robot = self._robot_of.get(plan.name)
+        if below == ("robot",) and robot is not None:
+            return self._section(("robots", robot))
+        return None
+
+
+def _writes(layer: Layer, path: tuple[str, ...]) -> bool:
+    tree: Tree | None = layer.tree
+    for part in path:
+        tree = None if tree is None else child(tree, part)
+    return tree is not None
+
+
+def _paths(tree: Tree, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    """Every path in `tree`, containers before what they hold."""
+    yield path
+    match tree:
+        case MappingNode():
+            for key, value in tree.values.items():
+                yield from _paths(value, (*path, key))
+        case SequenceNode():
+            for number, item in enumerate(tree.items):
+                yield from _paths(item, (*path, str(number)))
+        case Scalar():
+            pass

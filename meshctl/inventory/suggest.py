@@ -1,0 +1,26 @@
+"""Did you mean: the known name nearest to one that is not known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+def nearest(wrong: str, known: Iterable[str]) -> str:
+    """The known name that `wrong` most likely stands for, or the empty text."""
+    # Names longer than this are no slip of the pen, and comparing them costs the square of their length.
+    if len(wrong) > 64:
+        return ""
+    names = list(known)
+    lowered = {name.lower(): name for name in names}
+    exact = lowered.get(wrong.lower().replace("-", "_"))
+    if exact is not None:
+        return exact
+    matches = get_close_matches(wrong.lower(), lowered, n=1, cutoff=0.6)
+    return lowered[matches[0]] if matches else ""
+
+
+def did_you_mean(wrong: str, known: Iterable[str]) -> str:
+    """`did you mean 'channel'?`, or the empty text."""
+    name = nearest(wrong, known)
+    return f"did you mean '{name}'?" if name else ""

@@ -1,0 +1,141 @@
+"""YAML as values that know where they stand: scalars keep their text, the field that reads one decides its type.
+
+So `country: NO` stays Norway, `release: 24.10` keeps its zero and `mac: 12:34:56:12:34:56` is no number in base 60.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from meshctl.diagnostics import Position
+
+_NULLS = frozenset({"", "~", "null", "Null", "NULL"})
+
+
+class Plain(str):
+    """A scalar written without quotes, whose type is still open; a plain `str` was quoted and is text."""
+
+    __slots__ = ()
+
+
+@dataclass(slots=True)
+class Scalar:
+    """`line` and `column` count from 1; `start` and `end` are offsets into the file's text, quotes included."""
+
+    file: str
+    line: int
+    column: int
+    start: int
+    end: int
+    text: str
+    is_plain: bool
+
+    @property
+    def is_null(self) -> bool:
+        return self.is_plain and self.text in _NULLS
+
+    @property
+    def weight(self) -> int:
+        return 1
+
+
+@dataclass(slots=True)
+class SequenceNode:
+    """`weight` is the number of values in it with aliases followed. `end` is exact for flow style (`[a, b]`) only."""
+
+    file: str
+    line: int
+    column: int
+    start: int
+    end: int
+    is_flow: bool
+    items: list[Tree] = field(default_factory=list)
+    weight: int = 1
+
+
+@dataclass(slots=True)
+class MappingNode:
+    """`keys` and `values` have the same keys in the same order. `end` is exact for flow style only."""
+
+    file: str
+    line: int
+    column: int
+    start: int
+    end: int
+    is_flow: bool
+    keys: dict[str, Scalar] = field(default_factory=dict)
+    values: dict[str, Tree] = field(default_factory=dict)
+    weight: int = 1
+
+
+Tree = Scalar | SequenceNode | MappingNode
+
+
+def position(tree: Tree) -> Position:
+    return Position(tree.file, tree.line, tree.column)
+
+
+def plain_data(tree: Tree) -> object:
+    """Dictionaries, lists, `Plain`, `str` and None: what the document models read."""
+    match tree:
+        case Scalar():
+            if tree.is_null:
+                return None
+            return Plain(tree.text) if tree.is_plain else tree.text
+        case SequenceNode():
+            return [plain_data(item) for item in tree.items]
+        case MappingNode():
+            return {key: plain_data(value) for key, value in tree.values.items()}
+
+
+def child(tree: Tree, part: str | int) -> Tree | None:
+    """The value under a key or a list index (also as text), or None."""
+    match tree:
+        case MappingNode():
+            return tree.values.get(str(part))
+        case SequenceNode():
+            index = int(part) if isinstance(part, int) or part.isdecimal() else -1
+            return tree.items[index] if 0 <= index < len(tree.items) else None
+        case Scalar():
+            return None
+
+
+def descend(tree: Tree, path: Sequence[str | int]) -> Tree | None:
+    """The value at `path`, or None when any part is not there."""
+    found: Tree | None = tree
+    for part in path:
+        if found is None:
+            return None
+        found = child(found, part)
+    return found
+
+
+def key_position(tree: MappingNode, key: str) -> Position:
+    """Where `key` is written in `tree`; the mapping's own place when it is not."""
+    written = tree.keys.get(key)
+    return position(tree if written is None else written)
+
+
+def place_of(root: Tree, path: Sequence[str | int]) -> Position | None:
+    """Where the value at `path` is written: a single value itself, a list or mapping (or nothing) by its key."""
+    tree, place = root, position(root)
+    for part in path:
+        below = child(tree, part)
+        if below is None:
+            return None
+        by_key = isinstance(tree, MappingNode) and (not isinstance(below, Scalar) or below.is_null)
+        place = key_position(tree, str(part)) if by_key and isinstance(tree, MappingNode) else position(below)
+        tree = below
+    return place
+
+
+def describe(tree: Tree) -> str:
+    """What kind of value stands there, never the value: it may be a secret."""
+    match tree:
+        case Scalar():
+            return "nothing" if tree.is_null else "a single value"
+        case SequenceNode():
+            return "a list"
+        case MappingNode():
+            return "a mapping"

@@ -1,0 +1,161 @@
+"""Tree -> document, or one diagnostic with its place for everything that the format forbids."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from meshctl.diagnostics import Diagnostic, Position
+from meshctl.inventory import codes
+from meshctl.inventory.compose import shown
+from meshctl.inventory.documents import InventoryDocument, SecretDocument
+from meshctl.inventory.suggest import did_you_mean
+from meshctl.inventory.tree import MappingNode, Scalar, Tree, child, describe, key_position, plain_data, position
+
+_REFERENCE = "a reference: {env: NAME}, {file: PATH, key: NAME} or {age: PATH, key: NAME}"
+# Keys whose values may be secrets written where a reference belongs; a message never repeats them.
+_SECRET_KEYS = frozenset({"key", "keys", "env", "password", "passphrase", "psk"})
+_KINDS = {
+    "model_type": "a mapping",
+    "dict_type": "a mapping",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "string_type": "text",
+    "string_too_short": "text that is not empty",
+}
+_BOUNDS = {
+    "greater_than_equal": ("at least", "ge"),
+    "greater_than": ("more than", "gt"),
+    "less_than_equal": ("at most", "le"),
+    "less_than": ("less than", "lt"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Validated:
+    """`document` is None when there is any diagnostic."""
+
+    document: InventoryDocument | None
+    diagnostics: tuple[Diagnostic, ...]
+
+
+def validate(root: MappingNode) -> Validated:
+    """Check the whole tree against the format."""
+    try:
+        return Validated(InventoryDocument.model_validate(plain_data(root)), ())
+    except ValidationError as reason:
+        errors = reason.errors(include_url=False, include_input=False)
+        return Validated(None, tuple(_diagnostic(root, error) for error in errors))
+
+
+def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
+    """Translate one of pydantic's errors; its location is a path into the tree."""
+    location = error["loc"]
+    is_key = bool(location) and location[-1] == "[key]"
+    path = location[:-1] if is_key else location
+    kind = error["type"]
+    place = _place(root, path, is_key=is_key or kind == "extra_forbidden")
+    dotted = ".".join(shown(str(part)) for part in path)
+    if kind == "missing":
+        dotted = ".".join(shown(str(part)) for part in path[:-1])
+        return codes.error(codes.MISSING_KEY, place, f"the key '{path[-1]}' is missing", path=dotted)
+    if kind == "extra_forbidden":
+        known = _known_keys(path[:-1])
+        wrong = str(path[-1])
+        hint = did_you_mean(wrong, known) or f"known keys: {', '.join(known)}"
+        return codes.error(codes.UNKNOWN_KEY, place, f"unknown key '{shown(wrong)}'", path=dotted, hint=hint)
+    expected = _expected(error)
+    found = f"'{shown(str(path[-1]))}'" if is_key else _found(root, path, kind)
+    hint = _enum_hint(root, path, error) if kind == "enum" else ""
+    return codes.error(codes.WRONG_VALUE, place, "", path=dotted, expected=expected, found=found, hint=hint)
+
+
+def _place(root: MappingNode, path: tuple[int | str, ...], *, is_key: bool) -> Position:
+    """The value at `path`; what encloses it when it is not there, by its key."""
+    tree: Tree = root
+    place = position(root)
+    for number, part in enumerate(path):
+        if isinstance(tree, MappingNode) and str(part) in tree.keys:
+            place = key_position(tree, str(part))
+        below = child(tree, part)
+        if below is None:
+            return place
+        tree = below
+        is_last = number == len(path) - 1
+        written_here = isinstance(tree, Scalar) and not tree.is_null
+        if (is_last and not is_key and written_here) or isinstance(part, int):
+            place = position(tree)
+    return place
+
+
+def _expected(error: ErrorDetails) -> str:
+    kind = error["type"]
+    context: Mapping[str, Any] = error.get("ctx", {})
+    if kind == "model_type" and context.get("class_name") == SecretDocument.__name__:
+        return _REFERENCE
+    if kind in _KINDS:
+        return _KINDS[kind]
+    if kind in _BOUNDS:
+        words, key = _BOUNDS[kind]
+        return f"{words} {context[key]:g}"
+    if kind == "string_pattern_mismatch":
+        return f"text that matches {context['pattern']}"
+    if "expected" in context:
+        return str(context["expected"]).replace("' or '", "', '") if kind == "enum" else str(context["expected"])
+    return error["msg"]
+
+
+def _found(root: MappingNode, path: tuple[int | str, ...], kind: str) -> str:
+    tree: Tree | None = root
+    for part in path:
+        tree = None if tree is None else child(tree, part)
+    if tree is None:
+        return ""
+    is_secret = any(part in _SECRET_KEYS for part in path) or kind in ("model_type", "dict_type")
+    if not isinstance(tree, Scalar) or tree.is_null or is_secret:
+        return describe(tree)
+    return f"'{shown(tree.text)}'"
+
+
+def _enum_hint(root: MappingNode, path: tuple[int | str, ...], error: ErrorDetails) -> str:
+    found = _found(root, path, "enum").strip("'")
+    known = [word for word in str(error.get("ctx", {}).get("expected", "")).split("'") if word.strip(", or")]
+    return did_you_mean(found, known)
+
+
+def _known_keys(path: tuple[int | str, ...]) -> list[str]:
+    """The keys of the model that stands at `path`."""
+    kind: Any = InventoryDocument
+    for part in path:
+        kind = _step(kind, part)
+    model = _model(kind)
+    return [] if model is None else [field.alias or name for name, field in model.model_fields.items()]
+
+
+def _step(kind: Any, part: int | str) -> Any:
+    """The type one part further down."""
+    model = _model(kind)
+    if model is not None:
+        for name, field in model.model_fields.items():
+            if (field.alias or name) == part:
+                return field.annotation
+        return None
+    bare = _bare(kind)
+    arguments = get_args(bare)
+    return arguments[-1] if arguments else None
+
+
+def _model(kind: Any) -> type[BaseModel] | None:
+    bare = _bare(kind)
+    return bare if isinstance(bare, type) and issubclass(bare, BaseModel) else None
+
+
+def _bare(kind: Any) -> Any:
+    while get_origin(kind) in (Annotated, Union, UnionType):
+        kind = get_args(kind)[0]
+    return kind
