@@ -40,8 +40,8 @@ class NodeState(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where a value came from: `layer` is `node`, `group NAME`, `defaults`, `hardware NAME`, `mesh NAME`, `rule`
-    (computed, e.g. an address) or `built-in`."""
+    """Where a value came from: `layer` is `node`, `range PATTERN`, `group NAME`, `defaults`, `rule` (computed, e.g. an
+    address), `hardware NAME`, `mesh NAME`, `robot NAME`, `topic NAME`, `fleet` (its other sections) or `built-in`."""
 
     position: Position
     layer: str
