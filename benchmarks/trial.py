@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
 import sys
 import time
@@ -16,11 +17,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.link.laboratory import Count, Laboratory, Link
+from benchmarks.link.laboratory import Count, Laboratory, Link, compiled
+from benchmarks.peers import PEERS
 
 READY_TIMEOUT_S = 60.0
 # after the sender stops, what is still under way may arrive
 DRAIN_S = 4.0
+_CONGESTION_CONTROL = Path(__file__).with_name("peers") / "congestion_control.c"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,13 +77,12 @@ def run(lab: Laboratory, peer: str, link: Link, load: Load) -> Measured:
     results = [lab.directory / "sent.json", lab.directory / "received.json"]
     for result in results:
         result.unlink(missing_ok=True)
-    python = [sys.executable, "-m", "benchmarks.peers.end"]
     receive_s = load.seconds + DRAIN_S
-    ends = [_start(lab, 1, [*python, "receive", peer, str(results[1]), str(receive_s), str(max(0, load.bulk_bytes))])]
+    ends = [_start(lab, 1, peer, "receive", str(results[1]), str(receive_s), str(max(0, load.bulk_bytes)))]
     try:
         _ready(ends[0])
-        load_words = [str(load.seconds), str(load.bulk_bytes), str(load.urgent_hz)]
-        ends.append(_start(lab, 0, [*python, "send", peer, lab.addresses[1], str(results[0]), *load_words]))
+        words = [str(results[0]), str(load.seconds), str(load.bulk_bytes), str(load.urgent_hz)]
+        ends.append(_start(lab, 0, peer, "send", lab.addresses[1], *words))
         _ready(ends[1])
         lab.become(link)
         lab.reset()
@@ -113,8 +115,15 @@ def _while_it_runs(lab: Laboratory, load: Load) -> float | None:
     return None
 
 
-def _start(lab: Laboratory, host: int, command: Sequence[str]) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(lab.inside(host, command), stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+def _start(lab: Laboratory, host: int, peer: str, role: str, *words: str) -> subprocess.Popen[bytes]:
+    """An end in its host, with the congestion control that the comparison says."""
+    environ = dict(os.environ)
+    chosen = PEERS[peer].congestion_control
+    if chosen:
+        library = compiled(_CONGESTION_CONTROL, lab.directory, "-shared", "-fPIC")
+        environ |= {"LD_PRELOAD": str(library), "BENCHMARK_CONGESTION_CONTROL": chosen}
+    command = [sys.executable, "-m", "benchmarks.peers.end", role, peer, *words]
+    return subprocess.Popen(lab.inside(host, command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environ)
 
 
 def _ready(end: subprocess.Popen[bytes]) -> None:

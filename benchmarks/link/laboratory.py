@@ -77,17 +77,17 @@ class LaboratoryError(RuntimeError):
     """The emulator or a namespace could not be set up, or the emulator answered with something else than `ok`."""
 
 
-def compiled_emulator(directory: Path) -> Path:
-    """The emulator's program, compiled into `directory`."""
-    program = directory / "emulator"
+def compiled(source: Path, directory: Path, *flags: str) -> Path:
+    """The program (or, with `-shared`, the library) made from one C source, in `directory`."""
+    program = directory / source.stem
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         raise LaboratoryError("no C compiler found (install gcc)")
     done = subprocess.run(
-        [compiler, "-O2", "-Wall", "-o", str(program), str(SOURCE)], capture_output=True, text=True, check=False
+        [compiler, "-O2", "-Wall", *flags, "-o", str(program), str(source)], capture_output=True, text=True, check=False
     )
     if done.returncode:
-        raise LaboratoryError(f"the emulator does not compile:\n{done.stderr}")
+        raise LaboratoryError(f"{source} does not compile:\n{done.stderr}")
     return program
 
 
@@ -108,7 +108,7 @@ class Laboratory:
             _ip("netns", "add", namespace)
             self._made.append(namespace)
             _ip("-n", namespace, "link", "set", "lo", "up")
-        program = compiled_emulator(self.directory)
+        program = compiled(SOURCE, self.directory)
         path = str(self.directory / "control")
         self._emulator = subprocess.Popen(
             [str(program), path, str(self._seed), *(f"{name}:{INTERFACE}" for name in self.namespaces)],
@@ -125,9 +125,8 @@ class Laboratory:
         self._control.settimeout(ANSWER_TIMEOUT_S)
         for namespace, address in zip(self.namespaces, self.addresses, strict=True):
             _ip("-n", namespace, "addr", "add", f"{address}/24", "brd", "10.99.0.255", "dev", INTERFACE)
-            # IPv6's own chatter would be counted as the transport's; a robot's kernel uses cubic where nobody chose
-            for setting in ("net.ipv6.conf.all.disable_ipv6=1", "net.ipv4.tcp_congestion_control=cubic"):
-                self.run(self.namespaces.index(namespace), ["sysctl", "-qw", setting])
+            # IPv6's own chatter would be counted as the transport's
+            self.run(self.namespaces.index(namespace), ["sysctl", "-qw", "net.ipv6.conf.all.disable_ipv6=1"])
             # the only queue that may overflow is the emulator's
             _ip("-n", namespace, "link", "set", INTERFACE, "mtu", "1500", "txqueuelen", "20000", "up")
         self._fix_neighbours()

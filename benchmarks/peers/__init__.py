@@ -39,6 +39,8 @@ class Peer:
     name: str
     module: str
     variant: str
+    # set for every TCP socket of a program that has no setting of its own for it
+    congestion_control: str = ""
 
 
 PEERS: dict[str, Peer] = {
@@ -50,7 +52,8 @@ PEERS: dict[str, Peer] = {
         Peer("TCP cubic", "benchmarks.peers.tcp", "cubic"),
         Peer("TCP BBR", "benchmarks.peers.tcp", "bbr"),
         Peer("QUIC (aioquic, cubic)", "benchmarks.peers.quic", "cubic"),
-        Peer("Zenoh (TCP, priorities)", "benchmarks.peers.zenoh_tcp", "priorities"),
+        Peer("Zenoh (TCP cubic)", "benchmarks.peers.zenoh_tcp", "priorities", "cubic"),
+        Peer("Zenoh (TCP BBR)", "benchmarks.peers.zenoh_tcp", "priorities", "bbr"),
     )
 }
 
