@@ -1,7 +1,23 @@
 """UCI, OpenWrt's configuration format: text -> tree -> text, and the difference of two trees."""
 
+from meshctl.uci.difference import ChangeKind, Diff, OptionChange, SectionChange, apply, diff, is_secret_option
 from meshctl.uci.parser import parse, parse_export
 from meshctl.uci.text import dump, quote
 from meshctl.uci.tree import Package, Section, Value
 
-__all__ = ["Package", "Section", "Value", "dump", "parse", "parse_export", "quote"]
+__all__ = [
+    "ChangeKind",
+    "Diff",
+    "OptionChange",
+    "Package",
+    "Section",
+    "SectionChange",
+    "Value",
+    "apply",
+    "diff",
+    "dump",
+    "is_secret_option",
+    "parse",
+    "parse_export",
+    "quote",
+]
