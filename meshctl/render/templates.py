@@ -2,8 +2,8 @@
 
 A folder holds `common/`, rendered for every back end, and one folder per back end (`batman-adv/`, `meshmerize/`);
 below them a template stands where its file goes on the device, with `.j2` behind its name. What begins with `_` is
-included by others and is no file of its own. The inventory's `templates/` comes before what ships with meshctl, file by file, and
-the operator's parts of a back end before both.
+included by others and is no file of its own. The inventory's `templates/` comes before what ships with meshctl, file
+by file, and the operator's parts of a back end before both.
 """
 
 from __future__ import annotations
