@@ -1,10 +1,12 @@
 """The mesh as a graph: who hears whom, how far each node is from where we stand, what each node's loss cuts off."""
 
 from meshctl.topology.graph import EMPTY, Graph, Link, Path, graph_of
-from meshctl.topology.observed import Heard, Report, Sighting, observed_graph, seen_by
+from meshctl.topology.observed import NEIGHBOUR_FRESH_MS, Heard, Report, Sighting, observed_graph, seen_by
+from meshctl.topology.reports import mesh_macs, report_of
 
 __all__ = [
     "EMPTY",
+    "NEIGHBOUR_FRESH_MS",
     "Graph",
     "Heard",
     "Link",
@@ -12,6 +14,8 @@ __all__ = [
     "Report",
     "Sighting",
     "graph_of",
+    "mesh_macs",
     "observed_graph",
+    "report_of",
     "seen_by",
 ]

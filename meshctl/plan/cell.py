@@ -1,0 +1,89 @@
+"""What radios must share to hear each other, read out of UCI: two nodes with different cells are in different meshes.
+
+wireless + network (as text or trees) -> `cells` -> one `Cell` per radio; `differences` names what parts two of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+from meshctl.uci import Package, Section
+
+# batman-adv's default when the option is not there (openwrt-facts.md section 1)
+DEFAULT_ROUTING = "BATMAN_IV"
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Everything that must be equal on both ends; `key` is only ever compared, never shown."""
+
+    mode: str
+    channel: str
+    htmode: str
+    ssid: str
+    bssid: str
+    encryption: str
+    key: str
+    routing_algo: str
+
+    def __repr__(self) -> str:
+        return f"Cell({self.mode}, {self.ssid!r}, channel {self.channel}, {self.htmode})"
+
+
+def cells(wireless: Package | None, network: Package | None) -> dict[str, Cell]:
+    """Radio section -> the cell it is configured for. Radios that are off, or in no mesh mode, have none."""
+    found: dict[str, Cell] = {}
+    if wireless is None:
+        return found
+    devices = {section.name: section for section in wireless.of_type("wifi-device")}
+    for iface in wireless.of_type("wifi-iface"):
+        device = devices.get(iface.get("device"))
+        if device is None or device.name is None or iface.get("mode") not in ("adhoc", "mesh"):
+            continue
+        if "1" in (device.get("disabled", "0"), iface.get("disabled", "0")):
+            continue
+        found[device.name] = _cell(device, iface, _routing_algo(network, iface.get("network")))
+    return found
+
+
+def _cell(device: Section, iface: Section, routing: str) -> Cell:
+    encryption = iface.get("encryption", "none")
+    return Cell(
+        mode=iface.get("mode"),
+        channel=device.get("channel"),
+        htmode=device.get("htmode"),
+        ssid=iface.get("mesh_id") or iface.get("ssid"),
+        bssid=iface.get("bssid").lower(),
+        encryption=encryption,
+        key="" if encryption == "none" else iface.get("key"),
+        routing_algo=routing,
+    )
+
+
+def _routing_algo(network: Package | None, interface: str) -> str:
+    """The algorithm of the batman-adv interface that this hard interface belongs to; empty with another back end."""
+    hard = None if network is None else network.section(interface)
+    if network is None or hard is None or hard.get("proto") != "batadv_hardif":
+        return ""
+    master = network.section(hard.get("master"))
+    return DEFAULT_ROUTING if master is None else master.get("routing_algo", DEFAULT_ROUTING)
+
+
+def differences(before: Cell, after: Cell) -> tuple[str, ...]:
+    """`channel 6 -> 11`, one for each field that differs; a key is only said to change."""
+    told = []
+    for item in fields(Cell):
+        old, new = getattr(before, item.name), getattr(after, item.name)
+        if old != new:
+            told.append(f"{item.name} changes" if item.name == "key" else f"{item.name} {old or '-'} -> {new or '-'}")
+    return tuple(told)
+
+
+def split_differences(before: Mapping[str, Cell], after: Mapping[str, Cell]) -> dict[str, tuple[str, ...]]:
+    """Radio -> what parts its present cell from the one to come; radios without a present cell part from nothing."""
+    return {
+        radio: told
+        for radio, cell in before.items()
+        if (told := differences(cell, after[radio]) if radio in after else ("leaves the mesh",))
+    }

@@ -1,0 +1,71 @@
+"""Which services a change of configuration reloads, and what that cuts.
+
+`reload_config` reloads the service of each package that changed (procd's triggers); what that interrupts depends on
+what changed within it, since netifd takes down only what differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from meshctl.plan.values import Cut, Effect
+from meshctl.uci import Package, Section
+
+# Package -> (service, what its reload cuts), where the content does not matter.
+_SIMPLE: Mapping[str, tuple[str, Cut]] = {
+    "system": ("system, log", Cut.NOTHING),
+    "dhcp": ("dnsmasq, odhcpd", Cut.NOTHING),
+    "firewall": ("firewall", Cut.NOTHING),
+    "dropbear": ("dropbear", Cut.LOGIN),
+    "wireless": ("wifi", Cut.MESH),
+}
+
+
+def effects(
+    changed: Iterable[str], before: Mapping[str, Package | None], after: Mapping[str, Package | None]
+) -> tuple[Effect, ...]:
+    """The effects of changing these files (`etc/config/network`, ...), the worst first."""
+    found = [effect for path in changed for effect in _effects(path, before, after)]
+    return tuple(sorted(found, key=lambda effect: (-effect.cut, effect.service)))
+
+
+def _effects(path: str, before: Mapping[str, Package | None], after: Mapping[str, Package | None]) -> list[Effect]:
+    if not path.startswith("etc/config/"):
+        # keys and markers are read when they are needed
+        return []
+    package = path.rpartition("/")[2]
+    if package == "network":
+        return _network(before.get(package), after.get(package))
+    if package == "wireless" and not _has_live_radio(before.get(package)):
+        return [Effect("wifi", Cut.NOTHING, "radios were off")]
+    service, cut = _SIMPLE.get(package, (package, Cut.MESH))
+    return [Effect(service, cut, f"{package} changes")]
+
+
+def _has_live_radio(wireless: Package | None) -> bool:
+    devices = () if wireless is None else wireless.of_type("wifi-device")
+    return any(device.get("disabled", "0") != "1" for device in devices)
+
+
+def _network(before: Package | None, after: Package | None) -> list[Effect]:
+    if before is None or after is None:
+        return [Effect("network", Cut.MESH, "network changes")]
+    old, new = _by_key(before), _by_key(after)
+    differing = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+    involved = [section for key in differing for section in (old.get(key), new.get(key)) if section is not None]
+    told = []
+    if any(section.get("proto") in ("batadv", "batadv_hardif") for section in involved):
+        # any option of bat0 destroys and recreates it (openwrt-facts.md section 1)
+        told.append(Effect("network", Cut.MESH, "bat0 is made anew"))
+    address = _address(old.get("lan")), _address(new.get("lan"))
+    if address[0] != address[1]:
+        told.append(Effect("network", Cut.LAN, f"its address moves from {address[0] or '-'} to {address[1] or '-'}"))
+    return told or [Effect("network", Cut.LAN, "network changes")]
+
+
+def _by_key(package: Package) -> dict[str, Section]:
+    return dict(zip(package.keys(), package.sections, strict=True))
+
+
+def _address(section: Section | None) -> str:
+    return "" if section is None else section.get("ipaddr").partition("/")[0]

@@ -1,0 +1,132 @@
+"""One node: what the inventory wants of it against what was seen of it -> `NodePlan`.
+
+`node_plan` looks for what forbids touching it (`objections`), then for the firmware step, the package step, the files
+that differ, what their reload cuts, and what would part the node from its mesh. A second plan after an apply is empty.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from meshctl.device.observation import Observation
+from meshctl.model import Node
+from meshctl.plan.cell import cells, split_differences
+from meshctl.plan.effects import effects
+from meshctl.plan.firmware import firmware_step
+from meshctl.plan.masking import Fingerprints, masked_text, secrets_of
+from meshctl.plan.objections import objection
+from meshctl.plan.packages import NO_NEEDS, Needs, package_step
+from meshctl.plan.seen import file_info, fingerprint_texts, is_meshed, packages_seen, parsed, text_of
+from meshctl.plan.values import Cut, Effect, FileChange, NodePlan, Verdict
+from meshctl.render import RenderedFile
+from meshctl.uci import Package
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What the inventory wants of one node: its rendered files, the secrets in them, its packages."""
+
+    node: Node
+    files: Sequence[RenderedFile] = field(repr=False)
+    secrets: tuple[str, ...] = field(repr=False, default=())
+    needs: Needs = NO_NEEDS
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        return tuple(file.path for file in self.files)
+
+
+def node_plan(
+    wanted: Wanted,
+    seen: Observation | None,
+    fingerprints: Fingerprints,
+    *,
+    away: str = "",
+    owner: str = "",
+    with_firmware: bool = True,
+) -> NodePlan:
+    """The plan of one node. `seen` None means it did not answer, `away` says why; `owner` is who we are to its lock."""
+    node = wanted.node
+    target = fingerprints.of(
+        {file.path: f"{file.mode:o} " + file.content.decode("utf-8", "surrogateescape") for file in wanted.files},
+        wanted.secrets,
+    )
+    if seen is None:
+        return NodePlan(node.name, Verdict.AWAY, away or "did not answer", meshes=node.meshes, wanted=target)
+    before = packages_seen(wanted.paths, seen)
+    after = {file.package.name: file.package for file in wanted.files if file.package is not None}
+    live = cells(before.get("wireless"), before.get("network"))
+    old_secrets = (secret for package in before.values() if package is not None for secret in secrets_of(package))
+    basis = NodePlan(
+        node.name,
+        Verdict.SAME,
+        meshes=node.meshes,
+        has_cell=bool(live),
+        is_meshed=is_meshed(seen, live),
+        observed=fingerprints.of(fingerprint_texts(wanted.paths, seen), (*wanted.secrets, *old_secrets)),
+        wanted=target,
+    )
+    firmware = firmware_step(node, seen) if with_firmware else None
+    packages = package_step(wanted.needs, seen, node.hardware.package_files)
+    problem = objection(node, seen, before, owner=owner, is_flashed=firmware is not None, packages=packages)
+    if problem is not None:
+        return replace(basis, verdict=Verdict.REFUSED, reason=problem.reason, hint=problem.hint)
+    files = file_changes(wanted.files, seen)
+    told = effects((change.path for change in files), before, after)
+    if firmware is not None:
+        told = (Effect("firmware", Cut.NODE, f"{firmware.from_revision} -> {firmware.to_revision}"), *told)
+    split = split_differences(live, cells(after.get("wireless"), after.get("network")))
+    return replace(
+        basis,
+        verdict=Verdict.CHANGE if files or firmware or packages else Verdict.SAME,
+        firmware=firmware,
+        packages=packages,
+        files=files,
+        effects=told,
+        splits=tuple(f"{radio}: {one}" for radio, all_of_it in split.items() for one in all_of_it),
+        notes=seen.notes,
+    )
+
+
+def file_changes(files: Sequence[RenderedFile], seen: Observation) -> tuple[FileChange, ...]:
+    """The files that are not on the node as they shall be, each with a masked diff.
+
+    UCI packages are compared as trees: other quoting, comments or blank lines are no difference to OpenWrt.
+    """
+    return tuple(change for file in files if (change := _file_change(file, seen)) is not None)
+
+
+def _file_change(file: RenderedFile, seen: Observation) -> FileChange | None:
+    live = text_of(file.path, seen)
+    if file.package is not None:
+        return _package_change(file.path, file.package, live)
+    info = file_info(file.path, seen)
+    if info is None:
+        return FileChange(file.path, "added", _diff(file.path, "", file.masked))
+    content = file.content.decode("utf-8", "surrogateescape")
+    if live == content and info.mode == file.mode:
+        return None
+    if live == content:
+        return FileChange(file.path, "changed", f"mode {info.mode:04o} -> {file.mode:04o}\n")
+    # what stands there now may hold secrets of a kind that nobody can tell: only UCI and keys are shown
+    old = live if live is not None and file.path.endswith("authorized_keys") else "(not shown)\n"
+    return FileChange(file.path, "changed", _diff(file.path, old, file.masked))
+
+
+def _package_change(path: str, wanted: Package, live: str | None) -> FileChange | None:
+    if live is None:
+        return FileChange(path, "added", _diff(path, "", masked_text(wanted)))
+    current = parsed(live, wanted.name)
+    if current is None:
+        return FileChange(path, "changed", f"--- a/{path}\n(no UCI reader accepts what is there)\n+++ b/{path}\n")
+    if current == wanted:
+        return None
+    old = masked_text(current, differing_from=wanted)
+    return FileChange(path, "changed", _diff(path, old, masked_text(wanted)))
+
+
+def _diff(path: str, old: str, new: str) -> str:
+    lines = difflib.unified_diff(old.splitlines(), new.splitlines(), f"a/{path}", f"b/{path}", lineterm="", n=2)
+    return "".join(f"{line}\n" for line in lines)

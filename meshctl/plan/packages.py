@@ -1,0 +1,63 @@
+"""Which packages a node lacks, and which package files bring them (nodes have no internet)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from meshctl.device.observation import Observation
+from meshctl.plan.values import PackageStep
+
+# opkg: NAME_VERSION_ARCH.ipk; apk: NAME-VERSION.apk, where a version starts with a digit
+_IPK = re.compile(r"(?P<name>[^_/]+)_[^/]*\.ipk")
+_APK = re.compile(r"(?P<name>[^/]+?)-[0-9][^/]*\.apk")
+
+
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """`any_of`: of each group one must be installed, the first is preferred; `removed` must not be."""
+
+    any_of: tuple[tuple[str, ...], ...] = ()
+    removed: tuple[str, ...] = ()
+
+
+NO_NEEDS = Needs()
+
+
+def package_name(file: str) -> str | None:
+    """`path/kmod-batman-adv_5.15-1_mips_24kc.ipk` -> `kmod-batman-adv`; None for what is no package file."""
+    base = file.rpartition("/")[2]
+    match = _IPK.fullmatch(base) or _APK.fullmatch(base)
+    return None if match is None else match["name"]
+
+
+def missing_packages(needs: Needs, seen: Observation) -> tuple[tuple[str, ...], ...]:
+    """The groups of which nothing is installed; none when the node did not tell its packages."""
+    if seen.packages is None:
+        return ()
+    return tuple(group for group in needs.any_of if not any(name in seen.packages for name in group))
+
+
+def package_step(needs: Needs, seen: Observation, files: Iterable[str]) -> PackageStep | None:
+    """What to install and remove. All given files go along with a missing package, since they hold what it depends on.
+
+    None when nothing is to do. A group that no file brings stands in `install` all the same: see `unavailable`.
+    """
+    missing = missing_packages(needs, seen)
+    if not missing:
+        return None
+    installed = seen.packages or {}
+    offered = {name: file for file in files if (name := package_name(file)) is not None}
+    install = tuple(next((name for name in group if name in offered), group[0]) for group in missing)
+    return PackageStep(
+        install,
+        tuple(file for name, file in offered.items() if name not in installed),
+        tuple(name for name in needs.removed if name in installed),
+    )
+
+
+def unavailable(step: PackageStep) -> tuple[str, ...]:
+    """The packages of a step that none of its files brings."""
+    brought = {package_name(file) for file in step.files}
+    return tuple(name for name in step.install if name not in brought)

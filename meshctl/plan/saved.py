@@ -1,0 +1,154 @@
+"""A plan as a JSON file, and back: what was agreed on is what is applied, even by another person on another day.
+
+`dump` and `load` are inverse; `moved_on` compares a saved plan with a fresh one and names what differs. The file holds
+masked diffs and salted fingerprints, no secret.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from enum import Enum
+from types import MappingProxyType
+from typing import Any
+
+from meshctl.errors import InputError
+from meshctl.plan.values import (
+    Cut,
+    Effect,
+    FileChange,
+    FirmwareStep,
+    NodePlan,
+    PackageStep,
+    Plan,
+    Stage,
+    StageKind,
+    Verdict,
+)
+
+FORMAT = "meshctl-plan"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class SavedPlan:
+    """`salt` is what the fingerprints were made with; `inventory` the path it was made from, as given."""
+
+    plan: Plan
+    salt: bytes
+    inventory: str
+    with_firmware: bool = True
+
+
+def dump(saved: SavedPlan) -> str:
+    """The plan as JSON text."""
+    plan = saved.plan
+    document = {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "fleet": plan.fleet,
+        "inventory": saved.inventory,
+        "created_s": plan.created_s,
+        "entry": plan.entry,
+        "salt": saved.salt.hex(),
+        "with_firmware": saved.with_firmware,
+        "refusal": plan.refusal,
+        "refusal_hint": plan.refusal_hint,
+        "notes": plan.notes,
+        "stages": [_plain(stage) for stage in plan.stages],
+        "nodes": [_plain(node) for node in plan.nodes.values()],
+    }
+    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+
+
+def _plain(value: Any) -> dict[str, Any]:
+    return asdict(
+        value, dict_factory=lambda items: {key: item.value if isinstance(item, Enum) else item for key, item in items}
+    )
+
+
+def load(text: str, file: str) -> SavedPlan:
+    """The plan that `dump` wrote. Raises InputError naming the file and what is wrong with it."""
+    try:
+        document = json.loads(text)
+    except ValueError as error:
+        raise InputError(f"{file}: expected a plan in JSON: {error}") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise InputError(f"{file}: expected a plan written by `meshctl plan --out`, found something else")
+    if document.get("version") != FORMAT_VERSION:
+        raise InputError(
+            f"{file}: expected a plan of version {FORMAT_VERSION}, found {document.get('version')!r}",
+            hint="make the plan anew with this meshctl",
+        )
+    try:
+        nodes = [_node(node) for node in document["nodes"]]
+        plan = Plan(
+            str(document["fleet"]),
+            float(document["created_s"]),
+            str(document["entry"]),
+            MappingProxyType({node.node: node for node in nodes}),
+            tuple(_stage(stage) for stage in document["stages"]),
+            _texts(document["notes"]),
+            str(document["refusal"]),
+            str(document["refusal_hint"]),
+        )
+        strangers = [name for stage in plan.stages for name in stage.nodes if name not in plan.nodes]
+        if strangers:
+            raise ValueError(f"stages name {', '.join(strangers)}, which is no node of the plan")
+        return SavedPlan(
+            plan, bytes.fromhex(document["salt"]), str(document["inventory"]), bool(document["with_firmware"])
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
+        raise InputError(f"{file}: damaged plan: {what}", hint="make the plan anew") from error
+
+
+def _node(data: Mapping[str, Any]) -> NodePlan:
+    firmware, packages = data["firmware"], data["packages"]
+    return NodePlan(
+        node=str(data["node"]),
+        verdict=Verdict(data["verdict"]),
+        reason=str(data["reason"]),
+        hint=str(data["hint"]),
+        firmware=None if firmware is None else FirmwareStep(**{key: str(text) for key, text in firmware.items()}),
+        packages=None if packages is None else PackageStep(**{key: _texts(names) for key, names in packages.items()}),
+        files=tuple(FileChange(**{key: str(text) for key, text in change.items()}) for change in data["files"]),
+        effects=tuple(Effect(str(item["service"]), Cut(item["cut"]), str(item["why"])) for item in data["effects"]),
+        splits=_texts(data["splits"]),
+        meshes=_texts(data["meshes"]),
+        has_cell=bool(data["has_cell"]),
+        is_meshed=bool(data["is_meshed"]),
+        observed=str(data["observed"]),
+        wanted=str(data["wanted"]),
+        notes=_texts(data["notes"]),
+    )
+
+
+def _stage(data: Mapping[str, Any]) -> Stage:
+    return Stage(
+        StageKind(data["kind"]),
+        _texts(data["nodes"]),
+        str(data["reason"]),
+        _texts(data["cuts_off"]),
+        str(data["mesh"]),
+    )
+
+
+def _texts(items: Any) -> tuple[str, ...]:
+    if not isinstance(items, list):
+        raise TypeError(f"expected a list, found {items!r}")
+    return tuple(str(item) for item in items)
+
+
+def moved_on(agreed: NodePlan, now: NodePlan) -> str:
+    """Why a node can no longer be done as agreed; empty when it can. Both plans must share a salt."""
+    if now.verdict is Verdict.AWAY:
+        return ""
+    if agreed.wanted != now.wanted:
+        return "the inventory wants something else now than when the plan was made"
+    if agreed.observed != now.observed:
+        return "the node is not as it was when the plan was made"
+    if now.verdict is Verdict.REFUSED and agreed.verdict is not Verdict.REFUSED:
+        return now.reason
+    return ""

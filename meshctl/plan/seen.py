@@ -1,0 +1,76 @@
+"""What an observation says of the files a plan is about, and of the node's place in the mesh.
+
+Paths are written without a leading slash (`etc/config/network`), as rendered files have them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from meshctl.device.observation import FileInfo, Observation
+from meshctl.diagnostics import InvalidInput
+from meshctl.plan.cell import Cell
+from meshctl.topology import NEIGHBOUR_FRESH_MS
+from meshctl.uci import Package, parse
+
+CONFIG = "etc/config/"
+
+
+def package_of(path: str) -> str | None:
+    """The UCI package that a path is, or None."""
+    return path.removeprefix(CONFIG) if path.startswith(CONFIG) else None
+
+
+def text_of(path: str, seen: Observation) -> str | None:
+    """A file's text on the node; None when it is not there or is not text."""
+    package = package_of(path)
+    if package is not None:
+        return (seen.uci or {}).get(package)
+    info = file_info(path, seen)
+    return None if info is None else info.text
+
+
+def file_info(path: str, seen: Observation) -> FileInfo | None:
+    """What was told about a file that was asked for by path."""
+    return seen.files.get(f"/{path}") or seen.files.get(path)
+
+
+def packages_seen(paths: Iterable[str], seen: Observation) -> dict[str, Package | None]:
+    """The UCI packages among these paths as trees; None for one that is missing or that no UCI reader accepts."""
+    found: dict[str, Package | None] = {}
+    for path in paths:
+        package = package_of(path)
+        if package is not None:
+            found[package] = parsed(text_of(path, seen), package)
+    return found
+
+
+def parsed(text: str | None, package: str) -> Package | None:
+    """A package's tree, or None for what is missing or unreadable."""
+    if text is None:
+        return None
+    try:
+        return parse(text, package)
+    except InvalidInput:
+        return None
+
+
+def fingerprint_texts(paths: Iterable[str], seen: Observation) -> dict[str, str]:
+    """Everything a plan rests on, by name: when any of it differs later, the node has moved on."""
+    texts = {f"file {path}": "missing" if (text := text_of(path, seen)) is None else f"text {text}" for path in paths}
+    for path in paths:
+        info = file_info(path, seen)
+        if info is not None:
+            texts[f"mode {path}"] = f"{info.mode:o} {info.sha256}"
+    texts["board"] = seen.board.board_name if seen.board else "?"
+    texts["revision"] = seen.release.revision if seen.release else "?"
+    return texts
+
+
+def is_meshed(seen: Observation, live: Mapping[str, Cell]) -> bool:
+    """Whether it is part of a running mesh: a radio in a cell, and somebody heard lately (or nobody can tell)."""
+    if not live:
+        return False
+    if seen.neighbours is not None:
+        return any(neighbour.last_seen_ms <= NEIGHBOUR_FRESH_MS for neighbour in seen.neighbours)
+    return seen.stations is None or bool(seen.stations)

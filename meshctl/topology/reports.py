@@ -1,0 +1,58 @@
+"""From one node's observation to its `Report`: which MACs it has in the mesh, whom it hears and how well."""
+
+from __future__ import annotations
+
+from meshctl.device.observation import Observation, Originator
+from meshctl.topology.observed import Heard, Report
+
+# batman-adv's transmit quality is one byte (BATMAN_IV).
+TQ_MAX = 255
+# BATMAN_V tells throughput instead: at this rate and above a link counts as perfect, since a 20 MHz channel shared by
+# a team carries about as much (docs/facts/lab-facts.md).
+FULL_THROUGHPUT_KBIT_S = 20_000
+
+
+def report_of(node: str, seen: Observation) -> Report:
+    """What the node tells of its place in the mesh: batman-adv's tables first, the radio's where there are none."""
+    signals = {station.mac.lower(): station.signal_dbm for station in seen.stations or ()}
+    if seen.neighbours is None:
+        heard = [
+            Heard(station.mac.lower(), station.inactive_ms or 0, None, station.signal_dbm)
+            for station in seen.stations or ()
+        ]
+        return Report(node, mesh_macs(seen), tuple(heard))
+    quality = _direct_quality(seen.originators or ())
+    return Report(
+        node,
+        mesh_macs(seen),
+        tuple(
+            Heard(mac, neighbour.last_seen_ms, quality.get(mac), signals.get(mac))
+            for neighbour in seen.neighbours
+            for mac in (neighbour.mac.lower(),)
+        ),
+    )
+
+
+def mesh_macs(seen: Observation) -> tuple[str, ...]:
+    """The MACs its neighbours know it by: those of batman-adv's hard interfaces, and of every mesh radio."""
+    hard = seen.mesh.hard_interfaces if seen.mesh is not None else ()
+    macs = [(seen.macs or {}).get(name, "") for name in hard]
+    macs += [link.mac for link in seen.links or () if link.mode.lower() in ("ibss", "mesh point")]
+    return tuple(dict.fromkeys(mac.lower() for mac in macs if mac))
+
+
+def _direct_quality(originators: tuple[Originator, ...]) -> dict[str, float]:
+    """MAC -> quality of the direct link: the originator entries whose next hop is the originator itself."""
+    best: dict[str, float] = {}
+    for entry in originators:
+        mac = entry.mac.lower()
+        if entry.next_hop.lower() != mac:
+            continue
+        if entry.tq is not None:
+            value = entry.tq / TQ_MAX
+        elif entry.throughput_kbit_s is not None:
+            value = entry.throughput_kbit_s / FULL_THROUGHPUT_KBIT_S
+        else:
+            continue
+        best[mac] = min(1.0, max(value, best.get(mac, 0.0)))
+    return best

@@ -1,0 +1,150 @@
+"""Laws of the fleet's plan: a split is one switch, nobody is left behind unasked, a saved plan binds."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from types import MappingProxyType
+
+import pytest
+
+from meshctl.errors import InputError
+from meshctl.model import Fleet, Node, NodeState
+from meshctl.plan import Plan, StageKind, Verdict, fleet_plan
+from meshctl.plan.saved import SavedPlan, dump, load, moved_on
+from tests.meshctl.plan.support import PASS_PHRASE, SALT, factory, fleet, graph, planned, plans, running
+
+TEAM = ("base", "b01", "b02", "b03", "b04", "b05")
+STAR = graph(*(f"base-{name}" for name in TEAM[1:]))
+
+
+def with_state(team: Fleet, name: str, state: NodeState) -> Fleet:
+    nodes: dict[str, Node] = {**team.nodes, name: replace(team.nodes[name], state=state)}
+    return replace(team, nodes=MappingProxyType(nodes))
+
+
+def changed_channel(*, away: tuple[str, ...] = (), already: tuple[str, ...] = ()) -> Plan:
+    new = fleet(channel=11)
+    seen = {name: None if name in away else running(new if name in already else fleet(), name) for name in TEAM}
+    return fleet_plan(new, plans(new, seen), STAR, now_s=0.0)
+
+
+def test_another_channel_is_one_switch_of_the_whole_mesh() -> None:
+    plan = changed_channel()
+    assert [(stage.kind, set(stage.nodes)) for stage in plan.stages] == [(StageKind.SWITCH, set(TEAM))]
+    assert plan.refusal == ""
+
+
+def test_a_switch_never_leaves_anybody_behind_unasked() -> None:
+    plan = changed_channel(away=("b03",))
+    assert "would leave behind b03" in plan.refusal
+    assert plan.refusal_hint == "switch them on, or acknowledge with --leave-behind b03"
+    new = fleet(channel=11)
+    seen = {name: None if name == "b03" else running(fleet(), name) for name in TEAM}
+    assert fleet_plan(new, plans(new, seen), STAR, now_s=0.0, leave_behind=["b03"]).refusal == ""
+    assert fleet_plan(new, plans(new, seen), STAR, now_s=0.0, leave_behind=["all"]).refusal == ""
+    assert fleet_plan(new, plans(new, seen), STAR, now_s=0.0, never_meshed=["b03"]).refusal == ""
+    spare = with_state(new, "b03", NodeState.SPARE)
+    assert fleet_plan(spare, plans(new, seen), STAR, now_s=0.0).refusal == ""
+
+
+def test_a_switch_of_a_part_of_the_mesh_is_refused() -> None:
+    new = fleet(channel=11)
+    some = plans(new, {name: running(fleet(), name) for name in TEAM[:3]})
+    assert "would leave behind b03, b04, b05" in fleet_plan(new, some, STAR, now_s=0.0).refusal
+
+
+def test_even_a_base_that_hears_nobody_does_not_leave_its_mesh_unasked() -> None:
+    new = fleet(channel=11)
+    seen = {name: running(fleet(), name, neighbours=()) if name == "base" else None for name in TEAM}
+    assert "would leave behind b01" in fleet_plan(new, plans(new, seen), STAR, now_s=0.0).refusal
+
+
+def test_a_stray_comes_back_to_its_mesh_by_itself() -> None:
+    plan = changed_channel(already=TEAM[:5])
+    assert [(stage.kind, stage.nodes) for stage in plan.stages] == [(StageKind.ROLLING, ("b05",))]
+    assert plan.notes[0].startswith("b05: alone in its cell")
+
+
+def test_a_switch_with_a_refused_member_is_refused() -> None:
+    new = fleet(channel=11)
+    seen = {name: running(fleet(), name) for name in TEAM}
+    seen["b02"] = replace(seen["b02"], uci_changes=("network.lan=x",))
+    assert "b02: somebody has uncommitted changes" in fleet_plan(new, plans(new, seen), STAR, now_s=0.0).refusal
+
+
+def test_a_switch_and_new_firmware_at_once_are_refused() -> None:
+    new = fleet(channel=11, firmware="firmware: {image: box.bin, revision: r24106}")
+    plan = fleet_plan(new, plans(new, {name: running(fleet(), name) for name in TEAM}), STAR, now_s=0.0)
+    assert "its firmware changes too" in plan.refusal
+
+
+def test_flashing_a_cut_vertex_has_to_be_acknowledged() -> None:
+    team = fleet(firmware="firmware: {image: box.bin, revision: r24106}")
+    line = graph("base-b01", "b01-b02")
+    todo = plans(team, {"b01": running(team, "b01")})
+    plan = fleet_plan(team, todo, line, now_s=0.0)
+    assert plan.refusal == "flashing b01 cuts off b02, for good if it does not come back"
+    assert fleet_plan(team, todo, line, now_s=0.0, accept_cuts=["b01"]).refusal == ""
+
+
+def test_factory_devices_are_all_taken_at_once_after_one_canary() -> None:
+    team = fleet(canary=True)
+    plan = fleet_plan(team, plans(team, {name: factory(team, name) for name in TEAM}), graph(), now_s=0.0)
+    assert [(stage.kind, len(stage.nodes)) for stage in plan.stages] == [(StageKind.CANARY, 1), (StageKind.FREE, 5)]
+
+
+def test_a_right_fleet_has_an_empty_plan() -> None:
+    plan = fleet_plan(fleet(), plans(fleet(), {name: running(fleet(), name) for name in TEAM}), STAR, now_s=0.0)
+    assert plan.is_empty
+    assert len(plan.of(Verdict.SAME)) == len(TEAM)
+
+
+def test_a_saved_plan_reads_back_equal_and_holds_no_secret() -> None:
+    team = fleet(channel=11, firmware="firmware: {image: box.bin, revision: r24106}")
+    seen = {"base": running(fleet(), "base"), "b01": factory(fleet(), "b01"), "b02": None}
+    saved = SavedPlan(fleet_plan(team, plans(team, seen), STAR, now_s=12.5), SALT, "inventory/")
+    text = dump(saved)
+    assert load(text, "plan.json") == saved
+    assert PASS_PHRASE not in text
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda document: document.update(format="other"), "expected a plan written by"),
+        (lambda document: document.update(version=9), "expected a plan of version 1, found 9"),
+        (lambda document: document.pop("stages"), "'stages' is missing"),
+        (lambda document: document["nodes"][0].update(verdict="maybe"), "'maybe' is not a valid Verdict"),
+        (lambda document: document["stages"][0].update(nodes=["b99"]), "stages name b99"),
+        (lambda document: document["stages"][0].update(nodes="b99"), "expected a list"),
+        (lambda document: document["nodes"][0].update(firmware={"x": "y"}), "damaged plan"),
+        (lambda document: document.update(nodes=7), "damaged plan"),
+    ],
+)
+def test_a_damaged_plan_is_refused_with_its_file(damage: object, message: str) -> None:
+    assert callable(damage)
+    document = json.loads(dump(SavedPlan(changed_channel(), SALT, "i")))
+    damage(document)
+    with pytest.raises(InputError, match=r"plan\.json") as caught:
+        load(json.dumps(document), "plan.json")
+    assert message in str(caught.value)
+
+
+def test_what_is_no_json_is_refused() -> None:
+    with pytest.raises(InputError, match=r"x\.json: expected a plan in JSON"):
+        load("{", "x.json")
+
+
+def test_a_node_that_moved_on_is_told_from_one_that_did_not() -> None:
+    agreed = planned(fleet(channel=11), "b01", running(fleet(), "b01"))
+    assert moved_on(agreed, agreed) == ""
+    edited = running(fleet(), "b01")
+    assert edited.uci is not None
+    edited = replace(edited, uci={**edited.uci, "dhcp": edited.uci["dhcp"] + "config dhcp 'wan'\n"})
+    assert "not as it was" in moved_on(agreed, planned(fleet(channel=11), "b01", edited))
+    assert "inventory wants something else" in moved_on(
+        agreed, planned(fleet(channel=1), "b01", running(fleet(), "b01"))
+    )
+    rebooted = replace(running(fleet(), "b01"), boot_id="another", uptime_s=3.0)
+    assert moved_on(agreed, planned(fleet(channel=11), "b01", rebooted)) == ""

@@ -1,0 +1,141 @@
+"""Laws of one node's plan: nothing when it is right, the difference when it is not, and refusal before harm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from meshctl.device.observation import BoardInfo, ChangeStatus, ReleaseInfo
+from meshctl.plan import Cut, Verdict
+from meshctl.plan.masking import Fingerprints
+from tests.meshctl.plan.support import PASS_PHRASE, factory, fleet, planned, running, wanted
+
+
+def test_a_node_that_runs_what_is_wanted_has_nothing_to_do() -> None:
+    plan = planned(fleet(), "b01", running(fleet(), "b01"))
+    assert (plan.verdict, plan.files, plan.effects, plan.splits) == (Verdict.SAME, (), (), ())
+    assert (plan.has_cell, plan.is_meshed) == (True, True)
+
+
+def test_other_quoting_and_comments_are_no_difference() -> None:
+    seen = running(fleet(), "b01")
+    assert seen.uci is not None
+    loose = {name: "# by hand\n" + text.replace("'", '"') + "\n\n" for name, text in seen.uci.items()}
+    assert planned(fleet(), "b01", replace(seen, uci=loose)).verdict is Verdict.SAME
+
+
+def test_a_factory_device_gets_everything_and_nothing_in_use_is_cut() -> None:
+    plan = planned(fleet(), "b01", factory(fleet(), "b01"))
+    assert plan.verdict is Verdict.CHANGE
+    assert {file.path for file in plan.files} == {file.path for file in wanted(fleet(), "b01").files}
+    assert (plan.has_cell, plan.is_meshed, plan.splits) == (False, False, ())
+    assert any("moves from 192.168.1.1 to 10.42.0.101" in effect.why for effect in plan.effects)
+
+
+def test_another_channel_parts_the_node_from_its_mesh_and_says_so() -> None:
+    plan = planned(fleet(channel=11), "b01", running(fleet(), "b01"))
+    assert plan.splits == ("radio0: channel 6 -> 11",)
+    assert plan.cut is Cut.MESH
+    assert [file.path for file in plan.files] == ["etc/config/wireless", "etc/meshctl/node"]
+    assert "-\toption channel '6'\n+\toption channel '11'" in plan.files[0].diff
+
+
+def test_another_key_is_told_and_never_shown() -> None:
+    seen = running(fleet(), "b01")
+    assert seen.uci is not None
+    old = {**seen.uci, "wireless": seen.uci["wireless"].replace(PASS_PHRASE, "the old pass phrase")}
+    plan = planned(fleet(), "b01", replace(seen, uci=old))
+    assert plan.splits == ("radio0: key changes",)
+    assert "-\toption key '******** (another)'\n+\toption key '********'" in plan.files[0].diff
+    assert PASS_PHRASE not in repr(plan)
+    assert "the old pass phrase" not in repr(plan)
+
+
+def test_a_host_name_cuts_nothing() -> None:
+    seen = running(fleet(), "b01")
+    assert seen.uci is not None
+    other = {**seen.uci, "system": seen.uci["system"].replace("b01", "OpenWrt")}
+    plan = planned(fleet(), "b01", replace(seen, uci=other))
+    assert ([file.path for file in plan.files], plan.cut) == (["etc/config/system"], Cut.NOTHING)
+
+
+def test_a_key_file_with_another_mode_is_a_difference() -> None:
+    seen = running(fleet(), "b01")
+    path = "/etc/dropbear/authorized_keys"
+    info = seen.files[path]
+    assert info is not None
+    plan = planned(fleet(), "b01", replace(seen, files={**seen.files, path: replace(info, mode=0o644)}))
+    assert [(file.path, file.diff) for file in plan.files] == [("etc/dropbear/authorized_keys", "mode 0644 -> 0600\n")]
+
+
+def test_what_no_reader_accepts_is_replaced_and_not_shown() -> None:
+    seen = running(fleet(), "b01")
+    assert seen.uci is not None
+    plan = planned(fleet(), "b01", replace(seen, uci={**seen.uci, "wireless": "config wifi-device 'radio0"}))
+    assert [file.path for file in plan.files] == ["etc/config/wireless"]
+    assert "wifi-device" not in plan.files[0].diff
+
+
+def test_a_silent_node_is_away_with_its_reason() -> None:
+    plan = planned(fleet(), "b01", None, away="no answer at 10.42.0.101")
+    assert (plan.verdict, plan.reason) == (Verdict.AWAY, "no answer at 10.42.0.101")
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"board": BoardInfo("ubnt,rocket-m")}, "wrong board: expected compex,wpj344-16m (box), found ubnt,rocket-m"),
+        ({"board": None}, "it did not tell its board"),
+        ({"uci": None}, "it did not tell its configuration"),
+        (
+            {"release": ReleaseInfo("OpenWrt", "21.02.7", "r1", "ath79/generic")},
+            "its configuration is for OpenWrt 23.05, it runs 21.02.7",
+        ),
+        ({"macs": {"lan1": "02:00:00:00:00:10"}}, "it has no port eth0: found lan1"),
+        ({"uci_changes": ("network.lan.ipaddr='1.2.3.4'",)}, "somebody has uncommitted changes on it"),
+        ({"packages": {"dropbear": "1"}}, "it lacks batctl-default, iw, kmod-batman-adv"),
+        (
+            {"change": ChangeStatus("idle", lock_owner="bob@laptop:1", lock_left_s=42.0)},
+            "bob@laptop:1 has locked it for another 42 s",
+        ),
+        ({"change": ChangeStatus("applied", owner="bob@laptop:1")}, "a change of bob@laptop:1 is applied on it"),
+    ],
+)
+def test_what_must_not_be_touched_is_refused_with_its_reason(changes: dict[str, Any], reason: str) -> None:
+    plan = planned(fleet(), "b01", running(fleet(), "b01", **changes), owner="alice@base:7")
+    assert plan.verdict is Verdict.REFUSED
+    assert plan.reason.startswith(reason)
+
+
+def test_a_radio_at_another_path_is_refused() -> None:
+    seen = factory(fleet(), "b01")
+    assert seen.uci is not None
+    moved = {**seen.uci, "wireless": seen.uci["wireless"].replace("18100000", "18200000")}
+    plan = planned(fleet(), "b01", replace(seen, uci=moved))
+    assert "radio0 stands at another path: expected platform/ahb/18100000.wmac" in plan.reason
+
+
+def test_our_own_lock_is_no_obstacle() -> None:
+    seen = running(fleet(), "b01", change=ChangeStatus("idle", lock_owner="alice@base:7", lock_left_s=42.0))
+    assert planned(fleet(), "b01", seen, owner="alice@base:7").verdict is Verdict.SAME
+
+
+def test_another_revision_is_flashed_when_the_inventory_names_an_image() -> None:
+    team = fleet(firmware="firmware: {image: box.bin, revision: r24106}")
+    plan = planned(team, "b01", running(team, "b01"))
+    assert plan.firmware is not None
+    assert (plan.firmware.from_revision, plan.firmware.to_revision) == ("r23809", "r24106")
+    assert plan.cut is Cut.NODE
+    assert planned(team, "b01", running(team, "b01"), with_firmware=False).firmware is None
+    old = running(team, "b01", release=ReleaseInfo("OpenWrt", "21.02.7", "r1", "ath79/generic"))
+    assert planned(team, "b01", old).verdict is Verdict.CHANGE
+
+
+def test_a_fingerprint_depends_on_the_files_and_the_salt_and_not_on_order() -> None:
+    one = Fingerprints(b"salt")
+    assert one.of({"a": "1", "b": "2"}) == one.of({"b": "2", "a": "1"})
+    assert one.of({"a": "1", "b": "2"}) != one.of({"a": "12", "b": ""})
+    assert one.of({"a": "1"}) != Fingerprints(b"pepper").of({"a": "1"})
+    assert one.of({"a": "key x"}, ["x"]) != one.of({"a": "key y"}, ["y"])
