@@ -1,0 +1,249 @@
+"""A client of the udp-mesh daemon in one file: standard library, Python 3.8 or later. Copy it where you need it.
+
+    with MeshClient() as mesh:
+        mesh.subscribe("status")
+        mesh.publish("status", b"ready", to="base")
+        for message in mesh.messages():
+            print(message.source, message.topic, message.payload)
+
+On the daemon's Unix socket both sides send frames: two big-endian 32-bit lengths, a JSON object of the first length
+(the header), raw bytes of the second (the payload). A request has "op" and a number "id"; its reply repeats the id
+and has "ok". What the daemon sends on its own has "event". docs/local-api.md lists them all.
+
+Threads: `publish(..., wait=False)` may be called from any thread; everything else from one thread at a time.
+"""
+
+import json
+import select
+import socket
+import struct
+import threading
+import time
+from collections import deque
+from typing import Any, Deque, Dict, Iterator, List, NamedTuple, Optional, Tuple, Union
+
+DEFAULT_SOCKET = "/run/udp-mesh/udp-mesh.sock"
+MAX_HEADER_BYTES = 1 << 16
+MAX_PAYLOAD_BYTES = 1 << 30
+_LENGTHS = struct.Struct(">II")
+_READ_BYTES = 1 << 18
+
+Header = Dict[str, Any]
+Frame = Tuple[Header, bytes]
+
+
+class MeshError(Exception):
+    """The daemon refused a request, or cannot be reached. `code` is a word such as "unknown-topic" or "unreachable"."""
+
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+class Message(NamedTuple):
+    """One message that arrived."""
+
+    source: str
+    topic: str
+    type: str
+    payload: bytes
+    priority: int
+    broadcast: bool
+
+
+def encode_frame(header: Header, payload: Union[bytes, memoryview] = b"") -> bytes:
+    """The bytes of one frame."""
+    head = json.dumps(header, separators=(",", ":")).encode()
+    return b"".join((_LENGTHS.pack(len(head), len(payload)), head, payload))
+
+
+class FrameReader:
+    """Bytes in any pieces -> frames. Raises MeshError where they are none."""
+
+    def __init__(self, max_payload_bytes: int = MAX_PAYLOAD_BYTES) -> None:
+        self._buffer = bytearray()
+        self._max_payload_bytes = max_payload_bytes
+        self._needed = _LENGTHS.size
+
+    def feed(self, data: bytes) -> List[Frame]:
+        """The frames that these bytes complete."""
+        buffer = self._buffer
+        buffer += data
+        frames: List[Frame] = []
+        start = 0
+        while len(buffer) - start >= self._needed:
+            head_bytes, payload_bytes = _LENGTHS.unpack_from(buffer, start)
+            if head_bytes > MAX_HEADER_BYTES or payload_bytes > self._max_payload_bytes:
+                raise MeshError("bad-frame", "a frame of {} and {} bytes is too long".format(head_bytes, payload_bytes))
+            body = start + _LENGTHS.size
+            end = body + head_bytes + payload_bytes
+            if len(buffer) < end:
+                self._needed = end - start
+                break
+            with memoryview(buffer) as view:
+                frames.append(
+                    (_parse_header(bytes(view[body : body + head_bytes])), bytes(view[body + head_bytes : end]))
+                )
+            start = end
+            self._needed = _LENGTHS.size
+        del buffer[:start]
+        return frames
+
+
+def _parse_header(raw: bytes) -> Header:
+    try:
+        header = json.loads(raw.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise MeshError("bad-frame", "a frame's header is no JSON: {}".format(error)) from error
+    if not isinstance(header, dict):
+        raise MeshError("bad-frame", "a frame's header is no JSON object")
+    return header
+
+
+class MeshClient:
+    """One connection to the daemon."""
+
+    def __init__(self, path: str = DEFAULT_SOCKET, timeout_s: float = 10.0) -> None:
+        """Connects. Raises MeshError ("unreachable") where no daemon listens at `path`."""
+        self.path = path
+        self.timeout_s = timeout_s
+        self._reader = FrameReader()
+        self._events: Deque[Frame] = deque()
+        self._replies: Dict[int, Frame] = {}
+        self._next_id = 1
+        self._write_lock = threading.Lock()
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            self._socket.connect(path)
+        except OSError as error:
+            self._socket.close()
+            raise MeshError("unreachable", "no udp-mesh daemon at {}: {}".format(path, error.strerror)) from error
+        # A process-wide default timeout (rospy sets one) must not apply here.
+        self._socket.settimeout(None)
+
+    def __enter__(self) -> "MeshClient":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def fileno(self) -> int:
+        """For `select`: readable means `next_frame(0)` may return something."""
+        return self._socket.fileno()
+
+    # Requests
+
+    def request(self, op: str, payload: bytes = b"", **fields: Any) -> Header:
+        """The reply's header. Raises MeshError where the daemon refuses, or does not answer within `timeout_s`."""
+        return self.request_frame(op, payload, **fields)[0]
+
+    def request_frame(self, op: str, payload: bytes = b"", **fields: Any) -> Frame:
+        """As `request`, with the reply's payload."""
+        number = self._next_id
+        self._next_id += 1
+        self._write(dict(fields, op=op, id=number), payload)
+        deadline = time.monotonic() + self.timeout_s
+        while number not in self._replies:
+            if not self._read(deadline - time.monotonic()):
+                raise MeshError("timeout", "the daemon did not answer {!r} within {:g} s".format(op, self.timeout_s))
+        header, body = self._replies.pop(number)
+        if not header.get("ok"):
+            raise MeshError(str(header.get("code", "error")), str(header.get("error", "refused")))
+        return header, body
+
+    def publish(
+        self,
+        topic: str,
+        payload: bytes,
+        to: Optional[str] = None,
+        type: str = "",
+        notify: bool = False,
+        wait: bool = True,
+    ) -> Optional[int]:
+        """Hands a message to the daemon; returns its number once it is accepted.
+
+        `to` names one peer (None: the topic's destinations, or all). With `notify` an event "outcome" follows per
+        destination of a reliable topic. With `wait=False` nothing is returned, and a refusal arrives as an event
+        "rejected".
+        """
+        fields: Header = {"topic": topic}
+        if to is not None:
+            fields["to"] = to
+        if type:
+            fields["type"] = type
+        if notify:
+            fields["notify"] = True
+        if not wait:
+            self._write(dict(fields, op="publish"), payload)
+            return None
+        return int(self.request("publish", payload, **fields)["message"])
+
+    def subscribe(self, *topics: str) -> None:
+        """From now on messages of these topics arrive here; patterns such as "map/*" and "*" work."""
+        self.request("subscribe", topics=list(topics))
+
+    # What arrives
+
+    def messages(self, timeout_s: Optional[float] = None) -> Iterator[Message]:
+        """Messages as they arrive; other events are dropped. Ends after `timeout_s` without one (None: never)."""
+        while True:
+            frame = self.next_frame(timeout_s)
+            if frame is None:
+                return
+            message = as_message(frame)
+            if message is not None:
+                yield message
+
+    def next_frame(self, timeout_s: Optional[float] = None) -> Optional[Frame]:
+        """The next event with its payload; None after `timeout_s` seconds. Raises MeshError when the daemon is gone."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while not self._events:
+            if not self._read(None if deadline is None else deadline - time.monotonic()):
+                return None
+        return self._events.popleft()
+
+    # The socket
+
+    def _write(self, header: Header, payload: bytes) -> None:
+        try:
+            with self._write_lock:
+                self._socket.sendall(encode_frame(header, payload))
+        except OSError as error:
+            raise MeshError("unreachable", "the daemon closed the connection: {}".format(error.strerror)) from error
+
+    def _read(self, timeout_s: Optional[float]) -> bool:
+        """Reads once; False where nothing came in time."""
+        ready, _, _ = select.select([self._socket], [], [], None if timeout_s is None else max(0.0, timeout_s))
+        if not ready:
+            return False
+        try:
+            data = self._socket.recv(_READ_BYTES)
+        except OSError as error:
+            raise MeshError("unreachable", "the daemon closed the connection: {}".format(error.strerror)) from error
+        if not data:
+            raise MeshError("unreachable", "the daemon closed the connection")
+        for frame in self._reader.feed(data):
+            number = frame[0].get("id")
+            if isinstance(number, int) and "event" not in frame[0]:
+                self._replies[number] = frame
+            else:
+                self._events.append(frame)
+        return True
+
+
+def as_message(frame: Frame) -> Optional[Message]:
+    """The message in an event's frame; None for any other event."""
+    header, payload = frame
+    if header.get("event") != "message":
+        return None
+    return Message(
+        str(header["source"]),
+        str(header["topic"]),
+        str(header.get("type", "")),
+        payload,
+        int(header["priority"]),
+        bool(header["broadcast"]),
+    )

@@ -1,0 +1,332 @@
+"""Moves bytes and time between the sockets and the core, on an asyncio loop, in batches.
+
+1. A socket becomes readable: all waiting datagrams go to the core (`_drain`).
+2. `_pump`: timers that are due, datagrams that may leave now (in runs, through segmentation offload), events to the
+   listener, one timer for what comes next.
+3. Where single datagrams keep waking the loop (a radio at 10 Mbit/s delivers one per millisecond), the readers are
+   taken off the loop and the sockets are looked at once per `TICK_S` instead: a third of the wake-ups, a few
+   milliseconds of delay. Where each wake-up brings many datagrams (a wire), there is nothing to gain and the readers
+   stay.
+4. The kernel reports a change of interfaces: the links are brought up to date, the core is told.
+
+A full socket never blocks the other links: its datagrams wait in a short queue, and past that they are lost as on a
+radio.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable, Sequence
+
+from udp_mesh.core.conditions import Conditions
+from udp_mesh.core.events import Event, MessageId, Rejected
+from udp_mesh.core.node import Node
+from udp_mesh.core.seams import Datagram, RandomSource, Store
+from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
+from udp_mesh.links.attachments import Address, LinkWish
+from udp_mesh.links.hub import LinkHub
+from udp_mesh.links.netlink import InterfaceMonitor
+from udp_mesh.links.udp import UdpLink
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.003
+"""How often the sockets are looked at while small batches keep coming: the pacing quantum of the core."""
+SMALL_BATCH = 4
+"""A wake-up that brings fewer datagrams than this costs more than it carries."""
+BUSY_WAKEUPS = 8
+"""So many small wake-ups within `TICK_S` of each other start the ticking."""
+IDLE_TICKS = 4
+"""So many ticks without a datagram end it."""
+DRAIN_DATAGRAMS = 256
+"""Datagrams read per wake-up before timers and sending get their turn (3 ms of work)."""
+PUMP_BYTES = 1 << 20
+"""Bytes sent before the sockets get their turn again."""
+BLOCKED_DATAGRAMS = 256
+"""Datagrams that wait for one full socket; more are lost."""
+INTERFACE_SETTLE_S = 0.05
+"""After a notice of the kernel more follow (link, then addresses): one refresh answers them all."""
+RETRY_LINK_S = 2.0
+"""Until a socket that could not be opened is tried again."""
+
+
+class Driver:
+    """Runs one node on the running loop, from `start` to `close`."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        links: Sequence[LinkWish],
+        *,
+        boot_id: bytes,
+        rng: RandomSource,
+        on_event: Callable[[Event], None],
+        store: Store | None = None,
+        urgent_dscp: int = 0,
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._clock = self._loop.time
+        self.node = Node(settings, boot_id=boot_id, rng=rng, now=self._clock(), store=store)
+        self.hub = LinkHub(links, settings.port, urgent_dscp=urgent_dscp)
+        self.link_failures: dict[str, str] = {}
+        self.lost_on_full_socket = 0
+        self.wakeups = 0
+        self._on_event = on_event
+        self._monitor: InterfaceMonitor | None = None
+        self._blocked: dict[str, deque[Datagram]] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_at = 0.0
+        self._refresh: asyncio.TimerHandle | None = None
+        self._pump_requested = False
+        self._ticking = False
+        self._small_wakeups = 0
+        self._last_wakeup = 0.0
+        self._idle_ticks = 0
+        self._closed = False
+        self._now = 0.0
+        self._link_name = ""
+
+    # Life
+
+    def start(self) -> None:
+        """Opens the links that exist and begins. Raises OSError where the kernel cannot be asked for interfaces."""
+        self._monitor = InterfaceMonitor()
+        self._loop.add_reader(self._monitor.fileno(), self._interfaces_changed)
+        self.refresh_links()
+        self._pump()
+
+    def close(self) -> None:
+        """Says good-bye, sends the last datagrams, reports the last events, closes everything."""
+        if self._closed:
+            return
+        self.node.close(self._clock())
+        self._transmit_all()
+        self._report_events()
+        self._closed = True
+        for handle in (self._timer, self._refresh):
+            if handle is not None:
+                handle.cancel()
+        if self._monitor is not None:
+            self._loop.remove_reader(self._monitor.fileno())
+            self._monitor.close()
+        for link in self.hub.links.values():
+            self._unwatch(link)
+        self.hub.close()
+
+    # What the application asks
+
+    def send(
+        self, topic: str, payload: bytes, *, destination: str | None = None, type_name: str = ""
+    ) -> MessageId | Rejected:
+        """`Node.send`, now; the datagrams leave in this turn of the loop."""
+        outcome = self.node.send(topic, payload, destination=destination, now=self._clock(), type_name=type_name)
+        self._pump_soon()
+        return outcome
+
+    def apply(self, settings: Settings) -> list[str]:
+        """`Node.apply`, now. Raises ValueError for a changed name or port."""
+        changes = self.node.apply(settings, self._clock())
+        self._pump_soon()
+        return changes
+
+    def apply_links(self, wishes: Sequence[LinkWish]) -> None:
+        """Other links from now on; those wished for before and now stay open."""
+        self.hub.wishes = tuple(wishes)
+        self.refresh_links()
+        self._pump_soon()
+
+    def conditions(self) -> Conditions:
+        return self.node.conditions(self._clock())
+
+    def now(self) -> float:
+        """The clock that conditions and events are told by, in seconds."""
+        return self._clock()
+
+    # Links
+
+    def refresh_links(self) -> None:
+        """Brings sockets and core up to date with the kernel's interfaces."""
+        self._refresh = None
+        open_before = list(self.hub.links.values())
+        for link in open_before:
+            self._unwatch(link)
+        changes = self.hub.refresh()
+        now = self._clock()
+        reopened = {link.attachment.name for link in changes.opened}
+        for link in changes.gone:
+            name = link.attachment.name
+            self._blocked.pop(name, None)
+            if name not in reopened:
+                log.info("link-down link=%s", name)
+                self.node.link_down(name, now)
+        for link in changes.opened:
+            log.info("link-up link=%s address=%s", link.attachment.name, link.attachment.address[0])
+            self.node.link_up(_link_info(link), now)
+        for name, reason in changes.failed.items():
+            if self.link_failures.get(name) != reason:
+                log.error("link-failed link=%s reason=%s", name, reason)
+        self.link_failures = changes.failed
+        for link in self.hub.links.values():
+            if self._blocked.get(link.attachment.name):
+                self._loop.add_writer(link.fileno(), self._writable, link)
+            if not self._ticking:
+                self._loop.add_reader(link.fileno(), self._readable, link)
+        if changes.failed:
+            self._refresh = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
+
+    def _interfaces_changed(self) -> None:
+        assert self._monitor is not None
+        if self._monitor.drain():
+            if self._refresh is not None:
+                self._refresh.cancel()
+            self._refresh = self._loop.call_later(INTERFACE_SETTLE_S, self._refresh_and_pump)
+
+    def _refresh_and_pump(self) -> None:
+        self.refresh_links()
+        self._pump()
+
+    def _unwatch(self, link: UdpLink) -> None:
+        self._loop.remove_reader(link.fileno())
+        self._loop.remove_writer(link.fileno())
+
+    # In
+
+    def _readable(self, link: UdpLink) -> None:
+        count = self._drain(link)
+        now = self._now
+        if count < SMALL_BATCH and now - self._last_wakeup < TICK_S:
+            self._small_wakeups += 1
+        else:
+            self._small_wakeups = 0
+        self._last_wakeup = now
+        if self._small_wakeups >= BUSY_WAKEUPS:
+            self._start_ticking()
+        self._pump()
+
+    def _drain(self, link: UdpLink) -> int:
+        self.wakeups += 1
+        self._now = self._clock()
+        self._link_name = link.attachment.name
+        return link.receive(self._deliver, DRAIN_DATAGRAMS)
+
+    def _deliver(self, data: memoryview, source: Address) -> None:
+        self.node.receive(data, self._link_name, source, self._now)
+
+    def _start_ticking(self) -> None:
+        self._ticking = True
+        self._small_wakeups = self._idle_ticks = 0
+        for link in self.hub.links.values():
+            self._loop.remove_reader(link.fileno())
+        self._schedule(self._clock() + TICK_S)
+
+    def _tick(self) -> None:
+        count = sum(self._drain(link) for link in self.hub.links.values())
+        self._idle_ticks = 0 if count else self._idle_ticks + 1
+        if self._idle_ticks >= IDLE_TICKS or count >= DRAIN_DATAGRAMS:
+            self._ticking = False
+            for link in self.hub.links.values():
+                self._loop.add_reader(link.fileno(), self._readable, link)
+        self._pump()
+
+    # Out
+
+    def _pump_soon(self) -> None:
+        if not self._pump_requested and not self._closed:
+            self._pump_requested = True
+            self._loop.call_soon(self._pump)
+
+    def _pump(self) -> None:
+        self._pump_requested = False
+        if self._closed:
+            return
+        now = self._clock()
+        due = self.node.next_timer()
+        if due is not None and due <= now:
+            self.node.handle_timer(now)
+        more = self._transmit_all()
+        self._report_events()
+        if more:
+            self._pump_soon()
+        due = self.node.next_timer()
+        if self._ticking:
+            # Everything waits for the next tick, a few milliseconds at most.
+            self._schedule(self._clock() + TICK_S)
+        elif due is not None:
+            self._schedule(due)
+
+    def _schedule(self, at: float) -> None:
+        """One timer, at `at` or earlier: waking early is harmless, moving a timer for every datagram is not cheap."""
+        if self._timer is not None:
+            if self._timer_at <= at:
+                return
+            self._timer.cancel()
+        self._timer_at = at
+        self._timer = self._loop.call_at(at, self._timer_due)
+
+    def _timer_due(self) -> None:
+        self._timer = None
+        if self._ticking:
+            self._tick()
+        else:
+            self._pump()
+
+    def _transmit_all(self) -> bool:
+        """Sends what may leave now, up to `PUMP_BYTES`; True where there may be more."""
+        sent = 0
+        while sent < PUMP_BYTES:
+            batch = self.node.datagrams_to_send(self._clock())
+            if not batch:
+                return False
+            start = 0
+            while start < len(batch):
+                name = batch[start].link
+                end = start + 1
+                while end < len(batch) and batch[end].link == name:
+                    end += 1
+                self._transmit(name, batch[start:end] if end - start < len(batch) else batch)
+                start = end
+            sent += sum(len(datagram.data) for datagram in batch)
+        return True
+
+    def _transmit(self, name: str, datagrams: list[Datagram]) -> None:
+        link = self.hub.links.get(name)
+        if link is None:
+            return
+        waiting = self._blocked.get(name)
+        done = 0 if waiting else link.send(datagrams)
+        if done == len(datagrams):
+            return
+        if waiting is None:
+            waiting = self._blocked[name] = deque()
+        if not waiting:
+            self._loop.add_writer(link.fileno(), self._writable, link)
+        room = max(0, BLOCKED_DATAGRAMS - len(waiting))
+        rest = datagrams[done:]
+        waiting.extend(rest[:room])
+        self.lost_on_full_socket += len(rest) - len(rest[:room])
+
+    def _writable(self, link: UdpLink) -> None:
+        waiting = self._blocked.get(link.attachment.name)
+        if waiting:
+            for _ in range(link.send(list(waiting))):
+                waiting.popleft()
+        if not waiting:
+            self._loop.remove_writer(link.fileno())
+            self._pump()
+
+    def _report_events(self) -> None:
+        while (event := self.node.next_event()) is not None:
+            self._on_event(event)
+
+
+def _link_info(link: UdpLink) -> LinkInfo:
+    attachment = link.attachment
+    return LinkInfo(
+        name=attachment.name,
+        kind=LinkKind.NEIGHBOURS if attachment.broadcast is None else LinkKind.BROADCAST,
+        address=attachment.address,
+        broadcast=attachment.broadcast,
+        mtu=attachment.mtu,
+    )
