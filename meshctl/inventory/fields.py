@@ -14,6 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, PlainValidator, WithJsonSc
 from pydantic_core import PydanticCustomError
 
 from meshctl.inventory.tree import Plain
+from meshctl.model import Release
 
 FORMAT_VERSION = 1
 
@@ -148,6 +149,9 @@ Window = Annotated[
     BeforeValidator(_window),
     WithJsonSchema({"anyOf": [{"const": "adaptive"}, {"type": "integer", "minimum": 1, "maximum": 1024}]}),
 ]
+# Releases look like numbers; editors must accept them without quotes, as the loader does.
+_RELEASES = [release.value for release in Release]
+ReleaseName = Annotated[Release, WithJsonSchema({"enum": [*_RELEASES, *map(float, _RELEASES)]})]
 Address = Annotated[IPv4Address, PlainValidator(_address), WithJsonSchema({"type": "string", "format": "ipv4"})]
 Interface = Annotated[
     IPv4Interface, PlainValidator(_interface), WithJsonSchema({"type": "string", "pattern": "^[0-9.]+/[0-9]+$"})

@@ -6,8 +6,8 @@ from pydantic import Field
 
 from meshctl.inventory.addresses import AddressField
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document
-from meshctl.inventory.fields import Address, Mac, Name, Text, Whole
-from meshctl.model import NodeState, Release, Role
+from meshctl.inventory.fields import Address, Mac, Name, ReleaseName, Text, Whole
+from meshctl.model import NodeState, Role
 
 
 class RadioLayer(Document):
@@ -52,7 +52,7 @@ class NodeLayer(Document):
     """Its radios by the names of the hardware profile."""
     hostname: Name = NOT_WRITTEN
     """Host name; without it the node's name."""
-    release: Release = NOT_WRITTEN
+    release: ReleaseName = NOT_WRITTEN
     """OpenWrt's release series, where it differs from the hardware profile's."""
     lan_ports: tuple[Text, ...] = NOT_WRITTEN
     """Ports bridged into the LAN, where they differ from the hardware profile's."""

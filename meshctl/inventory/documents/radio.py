@@ -5,8 +5,8 @@ from __future__ import annotations
 from pydantic import Field
 
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument
-from meshctl.inventory.fields import Flag, Mac, Name, Network, Real, Text, Whole
-from meshctl.model import AntennaKind, Backend, Band, Encryption, MeshMode, Release
+from meshctl.inventory.fields import Flag, Mac, Name, Network, Real, ReleaseName, Text, Whole
+from meshctl.model import AntennaKind, Backend, Band, Encryption, MeshMode
 
 
 class RadioHardwareDocument(Document):
@@ -56,7 +56,7 @@ class HardwareDocument(Document):
     """The ImageBuilder's name for it, such as ubnt_rocket-m."""
     target: Text
     """OpenWrt's target, such as ath79/generic."""
-    release: Release
+    release: ReleaseName
     """OpenWrt's release series."""
     radios: dict[Name, RadioHardwareDocument]
     """Its radios by the names of their UCI sections."""

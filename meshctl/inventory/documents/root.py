@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from pydantic import BeforeValidator, Field
 
@@ -18,6 +18,14 @@ from meshctl.inventory.documents.robot import (
     UdpMeshDocument,
 )
 from meshctl.inventory.fields import Country, Name, Text, Version, empty_mapping
+
+_Entry = TypeVar("_Entry")
+
+# Nothing written under a key means an empty mapping: `b03:` is a node with all its values from elsewhere.
+OrEmpty = Annotated[_Entry, BeforeValidator(empty_mapping)]
+Section = OrEmpty[dict[Name, _Entry]]
+NodeSection = OrEmpty[dict[Text, OrEmpty[NodeDocument]]]
+TopicSection = OrEmpty[dict[Text, TopicDocument]]
 
 
 class InventoryDocument(Document):
@@ -37,25 +45,19 @@ class InventoryDocument(Document):
     """OpenWrt's system settings."""
     apply: ApplyDocument = ApplyDocument()
     """How carefully the fleet is changed."""
-    hardware: Annotated[dict[Name, HardwareDocument], BeforeValidator(empty_mapping)] = Field(default_factory=dict)
+    hardware: Section[HardwareDocument] = Field(default_factory=dict)
     """Hardware profiles by name."""
-    meshes: Annotated[dict[Name, MeshDocument], BeforeValidator(empty_mapping)] = Field(default_factory=dict)
+    meshes: Section[MeshDocument] = Field(default_factory=dict)
     """Meshes by name."""
-    defaults: Annotated[NodeLayer, BeforeValidator(empty_mapping)] = NodeLayer()
+    defaults: OrEmpty[NodeLayer] = NodeLayer()
     """What holds for every node that does not say otherwise."""
-    groups: Annotated[
-        dict[Name, Annotated[GroupDocument, BeforeValidator(empty_mapping)]], BeforeValidator(empty_mapping)
-    ] = Field(default_factory=dict)
+    groups: Section[OrEmpty[GroupDocument]] = Field(default_factory=dict)
     """Groups of nodes by name."""
-    nodes: Annotated[
-        dict[Text, Annotated[NodeDocument, BeforeValidator(empty_mapping)]], BeforeValidator(empty_mapping)
-    ] = Field(default_factory=dict)
+    nodes: NodeSection = Field(default_factory=dict)
     """Nodes by name; `b[01-12]` stands for twelve."""
-    robots: Annotated[
-        dict[Name, Annotated[RobotDocument, BeforeValidator(empty_mapping)]], BeforeValidator(empty_mapping)
-    ] = Field(default_factory=dict)
+    robots: Section[OrEmpty[RobotDocument]] = Field(default_factory=dict)
     """Robots by name."""
     udp_mesh: UdpMeshDocument = UdpMeshDocument()
     """The transport's settings."""
-    topics: Annotated[dict[Text, TopicDocument], BeforeValidator(empty_mapping)] = Field(default_factory=dict)
+    topics: TopicSection = Field(default_factory=dict)
     """Topics by name."""
