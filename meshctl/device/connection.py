@@ -107,9 +107,7 @@ class Connection(Protocol):
     @property
     def endpoint(self) -> Endpoint: ...
 
-    def run(
-        self, script: str, *, stdin: bytes | Iterable[bytes] = b"", timeout_s: float | None = None
-    ) -> Completed:
+    def run(self, script: str, *, stdin: bytes | Iterable[bytes] = b"", timeout_s: float | None = None) -> Completed:
         """Run a POSIX shell script of any length on the node, with `stdin` as its standard input.
 
         `timeout_s` bounds the whole call (default `Deadlines.run_s`). Raises `Timeout`, `ConnectionLost`; an exit

@@ -1,7 +1,8 @@
 """What was seen of one node at one moment: `Observation` and its parts, all frozen.
 
 A fact is `None` when the node did not tell it or told it in a form the parsers do not know, and `notes` says why; an
-empty tuple or mapping means that the node told there is none. Shapes and sources: docs/facts/openwrt-facts.md, section 5.
+empty tuple or mapping means that the node told there is none. Shapes and sources: docs/facts/openwrt-facts.md,
+section 5.
 """
 
 from __future__ import annotations
@@ -196,7 +197,7 @@ class ChangeStatus:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """Everything one round trip told. `asked_at_s` and `answered_at_s` are the observer's clock around it (Unix time)."""
+    """Everything one round trip told. `asked_at_s` and `answered_at_s`: the observer's clock around it (Unix time)."""
 
     asked_at_s: float
     answered_at_s: float

@@ -1,0 +1,74 @@
+"""Our side of an SSH login: `Credentials` become `Attempt`s, in the order they are tried.
+
+OpenWrt's dropbear hangs up after three refused attempts (`MaxAuthTries` in its init script), so the caller tries at
+most that many on one connection. `auth_none` is not counted by dropbear, and comes first at first contact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import paramiko
+from cryptography.exceptions import UnsupportedAlgorithm
+from paramiko.pkey import PKey, UnknownKeyType
+
+from meshctl.device.connection import Credentials
+from meshctl.device.legacy_rsa import with_sha1
+from meshctl.errors import InputError
+from meshctl.model import Secret
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One try: `name` for messages, and one of a key, a password, or neither (no authentication at all)."""
+
+    name: str
+    key: PKey | None = None
+    password: Secret | None = None
+
+    def run(self, transport: paramiko.Transport, user: str) -> None:
+        """Raises what paramiko raises; returns once the server has let us in."""
+        if self.key is not None:
+            transport.auth_publickey(user, self.key)
+        elif self.password is not None:
+            transport.auth_password(user, self.password.reveal())
+        else:
+            transport.auth_none(user)
+
+
+@contextmanager
+def attempts(credentials: Credentials, *, legacy_rsa_sha1: bool) -> Iterator[tuple[Attempt, ...]]:
+    """All attempts, while the agent's socket is open. Raises InputError for a key file that cannot be used."""
+    agent = paramiko.Agent() if credentials.use_agent else None
+    try:
+        found: list[Attempt] = []
+        if credentials.empty_password:
+            found.append(Attempt("no password"))
+        for path in credentials.key_files:
+            key = load_key(path, credentials.passphrase)
+            found.append(Attempt(f"key {path}", with_sha1(key) if legacy_rsa_sha1 else key))
+        if agent is not None:
+            found += [Attempt(f"agent key {key.comment or key.get_name()}", key) for key in agent.get_keys()]
+        if credentials.password is not None:
+            found.append(Attempt("password", password=credentials.password))
+        if credentials.empty_password:
+            found.append(Attempt("empty password", password=Secret("")))
+        yield tuple(found)
+    finally:
+        if agent is not None:
+            agent.close()
+
+
+def load_key(path: Path, passphrase: Secret | None) -> PKey:
+    """A private key file in OpenSSH's or PEM format. Raises InputError saying what is wrong with it."""
+    try:
+        return PKey.from_path(path, None if passphrase is None else passphrase.reveal().encode())  # type: ignore[arg-type]
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such key file") from error
+    except (paramiko.PasswordRequiredException, TypeError) as error:
+        raise InputError(f"{path}: the key is encrypted, or a passphrase was given for one that is not") from error
+    except (paramiko.SSHException, UnknownKeyType, UnsupportedAlgorithm, ValueError, OSError) as error:
+        raise InputError(f"{path}: cannot be used as a private key: {error}") from error

@@ -1,0 +1,12 @@
+"""The shell scripts meshctl runs on a node, as they are in this directory (docs/device-scripts.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_DIRECTORY = Path(__file__).resolve().parent
+
+
+def script(name: str) -> str:
+    """The text of one script: `observe.sh`, `deadman.sh`, `deadman.init`."""
+    return (_DIRECTORY / name).read_text(encoding="utf-8")

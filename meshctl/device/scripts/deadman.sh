@@ -1,0 +1,489 @@
+#!/bin/sh
+# meshctl-deadman: change a node's files so that every way out but a confirmation leads back to what was before.
+#
+#   lock -> stage -> arm -> apply -> confirm          (docs/device-scripts.md has the verbs and states)
+#
+# The state is the name of a marker file in flash, and every decision is one rename of it, which either happened or
+# did not: `staged.ID` -> `armed.ID` -> `confirmed.ID` or `restoring.ID`. So confirm and the timer cannot both win, and
+# after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
+# Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
+# free flash.
+VERSION=1
+SELF=/usr/sbin/meshctl-deadman
+CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to)
+LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
+RUN=/tmp/meshctl           # RAM: locks and timers; a reboot forgets them, as it should
+SPARE_KIB=64               # flash that must stay free: uci, dropbear and jffs2's garbage collector write too
+GUARD_GRACE_CS=3000        # the second timer fires 30 s after the first should have
+START_LIMIT_CS=1500        # a loaded radio starts a process within 15 s, or something is wrong with it
+RELOAD_LIMIT_CS=12000      # a reload of the restored state that takes over 120 s is stuck; then reboot
+
+refuse() { echo "refused $1 $2"; exit 3; }
+
+# NOW: centiseconds of uptime. The wall clock may be off by years or jump; this one only counts.
+now() { read -r up _ </proc/uptime; NOW=$((${up%.*} * 100 + 1${up#*.} - 100)); }
+
+# put FILE: stdin becomes its content, all of it or none, also after a power cut
+put() { cat >"${1%/*}/.put" && sync && mv -f "${1%/*}/.put" "$1" && sync; }
+
+exists() { [ -e "$1" ] || [ -L "$1" ]; }
+
+hash_of() { sum=$(sha256sum <"$1") && echo "${sum%% *}"; }
+
+word() { case $1 in '' | [!A-Za-z0-9]* | *[!A-Za-z0-9@._:+-]*) refuse usage "expected a word, found '$1'" ;; esac; }
+
+number() { case $1 in '' | 0?* | *[!0-9]*) refuse usage "expected a number, found '$1'" ;; esac; }
+
+# seconds TEXT: CS = centiseconds of "12", "12.3" or "12.34"
+seconds() {
+	case $1 in *.*) frac=${1#*.}00 ;; *) frac=00 ;; esac
+	frac=1${frac%"${frac#??}"}
+	number "${1%%.*}"
+	number "$frac"
+	CS=$((${1%%.*} * 100 + frac - 100))
+}
+
+as_seconds() { echo "$(($1 / 100)).$(($1 / 10 % 10))$(($1 % 10))"; }
+
+# --- lock: RUN/lock.N, the highest N counts. Each step makes the next N by hard link, which only one process can. ---
+
+read_lock() {
+	LOCK_N=0 LOCK_OWNER='' LOCK_LEFT=0
+	for f in "$RUN"/lock.*; do
+		[ -e "$f" ] && [ "${f##*.}" -gt "$LOCK_N" ] && LOCK_N=${f##*.}
+	done
+	[ "$LOCK_N" -gt 0 ] || return 0
+	read -r LOCK_OWNER until boot 2>/dev/null <"$RUN/lock.$LOCK_N"
+	read -r this_boot </proc/sys/kernel/random/boot_id
+	now
+	[ "$boot" = "$this_boot" ] && [ "$until" -gt "$NOW" ] && LOCK_LEFT=$((until - NOW)) && return 0
+	LOCK_OWNER=''
+}
+
+write_lock() { # OWNER TTL_CS
+	next=$((LOCK_N + 1))
+	now
+	read -r this_boot </proc/sys/kernel/random/boot_id
+	echo "$1 $((NOW + $2)) $this_boot" >"$RUN/new.$$"
+	ln "$RUN/new.$$" "$RUN/lock.$next" 2>/dev/null
+	made=$?
+	rm -f "$RUN/new.$$"
+	[ $made -eq 0 ] || refuse locked "another process was faster"
+	read_lock
+	# a slow process may have read the directory before a winner tidied it, and so made a number that is too low
+	[ "$LOCK_N" = $next ] || { rm -f "$RUN/lock.$next" && refuse locked "another process was faster"; }
+	for f in "$RUN"/lock.*; do
+		[ "${f##*.}" -ge $next ] || rm -f "$f"
+	done
+}
+
+need_lock() { # OWNER
+	word "$1"
+	read_lock
+	[ "$LOCK_OWNER" = "$1" ] && return 0
+	[ -n "$LOCK_OWNER" ] && refuse locked "held by $LOCK_OWNER for another $((LOCK_LEFT / 100)) s"
+	refuse not-locked "take the lock first"
+}
+
+lock() { # OWNER TTL_S
+	word "$1"
+	number "$2"
+	read_lock
+	[ -z "$LOCK_OWNER" ] || need_lock "$1"
+	write_lock "$1" $(($2 * 100))
+	echo "ok lock_owner=$1"
+}
+
+unlock() { # OWNER
+	read_lock
+	[ "$LOCK_OWNER" != "$1" ] || write_lock "$1" 0
+	echo "ok"
+}
+
+# --- marker ---------------------------------------------------------------------------------------------------------
+
+# read_marker: MARKER (idle, staged, armed, confirmed, restoring), what it holds, and TIMER, the change's files in RAM
+read_marker() {
+	MARKER=idle ID='' OWNER='' NONCE='' WINDOW=0
+	for m in restoring confirmed armed staged; do
+		for f in "$CHANGE/$m".*; do
+			[ -f "$f" ] && MARKER=$m && read -r ID OWNER NONCE WINDOW <"$f" && break 2
+		done
+	done
+	TIMER=$RUN/change-$ID
+}
+
+is_armed() { [ -f "$CHANGE/armed.$ID" ]; }
+
+alive() { # PIDFILE: a process of ours still runs under that number
+	read -r pid 2>/dev/null <"$1" && grep -q meshctl-deadman "/proc/$pid/cmdline" 2>/dev/null
+}
+
+# finish OUTCOME REASON: remember how it ended, then forget the change; the marker goes first, because a directory
+# without one is rubbish to every verb
+finish() {
+	echo "$ID $1 $2 ${NONCE:--}" | put "$LAST"
+	rm -f "$CHANGE"/*."$ID"
+	sync
+	rm -rf "$CHANGE" "$TIMER"
+	sync
+}
+
+# tidy: complete what a killed process had decided, remove what one left half done
+tidy() {
+	read_marker
+	case $MARKER in
+	confirmed) finish confirmed operator && read_marker ;;
+	idle) rm -rf "$CHANGE" ;;
+	esac
+	for d in "$CHANGE".*; do
+		kill -0 "${d##*.}" 2>/dev/null || rm -rf "$d"
+	done
+}
+
+# --- stage: build everything in a directory of this process, then rename it -----------------------------------------
+
+no_foreign_changes() {
+	changes=$(uci changes 2>/dev/null)
+	[ -z "$changes" ] || refuse foreign-changes "uncommitted: $(echo "$changes" | tr '\n' ';')"
+}
+
+# The last line of df, because a long device name breaks its row in two
+kib_free() { df -k "$1" 2>/dev/null | awk 'END { if (NF > 3) print $(NF - 2) }'; }
+
+check_space() { # BUNDLE
+	free=$(kib_free "${CHANGE%/*}")
+	need=$((SPARE_KIB + $(gzip -dc "$1" | wc -c) / 1024 + 1))
+	# shellcheck disable=SC2013 # words are lines here: paths have no blanks, see check_path
+	for p in $(tar -xzOf "$1" manifest | sed 's/.* //'); do
+		[ -f "$p" ] && need=$((need + $(wc -c <"$p") / 1024 + 1))
+	done
+	[ -z "$free" ] || [ "$free" -ge "$need" ] || refuse flash-full "needs $need KiB of flash, $free KiB are free"
+}
+
+check_path() {
+	case $1 in
+	*[!A-Za-z0-9._/+@-]* | *//* | */../* | */./* | */. | */.. | */) refuse bad-path "$1" ;;
+	/etc/meshctl/* | /tmp/* | /var/* | /dev/* | /proc/* | /sys/*) refuse bad-path "$1 is not kept in flash, or is ours" ;;
+	/*/*) [ -L "$1" ] || [ ! -d "$1" ] || refuse bad-path "$1 is a directory" ;;
+	*) refuse bad-path "$1" ;;
+	esac
+}
+
+was_as_expected() { # EXPECTED PATH
+	case $1 in
+	-) return 0 ;;
+	absent) ! exists "$2" ;;
+	*) [ -f "$2" ] && [ "$(hash_of "$2")" = "$1" ] ;;
+	esac
+}
+
+keep_previous() { # DIRECTORY PATH
+	if exists "$2"; then
+		mkdir -p "$1/prev${2%/*}" && cp -a "$2" "$1/prev$2" && echo "had $2"
+		return
+	fi
+	echo "not $2"
+	dir=${2%/*}
+	while [ -n "$dir" ] && [ ! -d "$dir" ]; do
+		echo "dir $dir"
+		dir=${dir%/*}
+	done
+}
+
+check_new() { # DIRECTORY: every new file is there, whole
+	while read -r kind _ sha _ path; do
+		[ "$kind" != file ] || [ "$(hash_of "$1/new$path" 2>/dev/null)" = "$sha" ] || return 1
+	done <"$1/manifest"
+}
+
+same() { # PATH PATH: both the same file's content, or the same link
+	if [ -L "$1" ] || [ -L "$2" ]; then
+		[ "$(readlink "$1")" = "$(readlink "$2")" ]
+	else
+		cmp -s "$1" "$2"
+	fi
+}
+
+unchanged_since_kept() { # DIRECTORY: what is live is what was kept
+	while read -r kind path; do
+		case $kind in
+		had) same "$path" "$1/prev$path" ;;
+		not) ! exists "$path" ;;
+		esac || return 1
+	done <"$1/previous"
+}
+
+drop() { # DIRECTORY CODE TEXT
+	rm -rf "$1"
+	refuse "$2" "$3"
+}
+
+stage() { # OWNER ID BUNDLE
+	need_lock "$1"
+	word "$2"
+	tidy
+	case $MARKER in armed | restoring) refuse busy "change $ID of $OWNER is $MARKER" ;; esac
+	{ [ -f "$3" ] && gzip -t "$3" 2>/dev/null; } || refuse bad-bundle "$3 is missing or damaged"
+	no_foreign_changes
+	rm -rf "$CHANGE"
+	check_space "$3"
+	w=$CHANGE.$$
+	mkdir -p "$w/new" "$w/prev" || drop "$w" flash-full "cannot make $w"
+	tar -xzf "$3" -C "$w" 2>/dev/null || drop "$w" flash-full "the bundle did not unpack"
+	{ [ -f "$w/manifest" ] && [ -f "$w/reload" ]; } || drop "$w" bad-bundle "no manifest or reload in it"
+	check_new "$w" || drop "$w" flash-full "what was unpacked is not what was sent"
+	while read -r kind mode _ expected path; do
+		(check_path "$path") || { rm -rf "$w" && exit 3; }
+		[ "$kind" != file ] || chmod "$mode" "$w/new$path" || drop "$w" bad-bundle "mode $mode of $path"
+		was_as_expected "$expected" "$path" || drop "$w" moved-on "$path is not what the plan saw"
+		keep_previous "$w" "$path" >>"$w/previous" || drop "$w" flash-full "could not keep $path"
+	done <"$w/manifest"
+	unchanged_since_kept "$w" || drop "$w" flash-full "what was kept is not what is there"
+	for conf in "$w"/new/etc/config/*; do
+		[ ! -f "$conf" ] || uci -c "$w/new/etc/config" show "${conf##*/}" >/dev/null 2>&1 ||
+			drop "$w" bad-uci "uci cannot read the new ${conf##*/}"
+	done
+	echo "$2 $1 - 0" | put "$w/staged.$2" || drop "$w" flash-full "could not write the marker"
+	mv "$w" "$CHANGE" || drop "$w" flash-full "could not put the stage in place"
+	sync
+	echo "ok state=staged id=$2"
+}
+
+# --- arm, apply, confirm, abort -------------------------------------------------------------------------------------
+
+arm() { # OWNER ID NONCE_SHA256 WINDOW_S
+	need_lock "$1"
+	word "$3"
+	number "$4"
+	tidy
+	if [ "$MARKER $ID $OWNER $NONCE $WINDOW" != "armed $2 $1 $3 $4" ]; then
+		[ "$MARKER $ID" = "staged $2" ] || refuse wrong-state "change ${ID:--} is $MARKER, expected $2 staged"
+		{ [ -L /etc/rc.d/S05meshctl-deadman ] && [ -x /etc/init.d/meshctl-deadman ]; } ||
+			refuse not-enabled "the boot hook is missing: a power cut would not be undone"
+		no_foreign_changes
+		check_new "$CHANGE" || refuse bad-bundle "a staged file is damaged; stage again"
+		unchanged_since_kept "$CHANGE" || refuse moved-on "a file changed since it was staged"
+		echo "$2 $1 $3 $4" | put "$CHANGE/armed.$2" || refuse flash-full "could not write the marker"
+		rm -f "$CHANGE/staged.$2"
+		rm -rf "$TIMER"
+	fi
+	echo "ok state=armed id=$2"
+}
+
+detach() { # NAME ARGS: a process of its own session, which no closing connection takes along
+	mkdir -p "$TIMER"
+	start-stop-daemon -S -q -b -m -p "$TIMER/$1.pid" -x "$SELF" -- "$@"
+}
+
+apply() { # OWNER ID now | in SECONDS | at UPTIME_SECONDS
+	tidy
+	[ "$MARKER $ID $OWNER" = "armed $2 $1" ] || refuse wrong-state "change ${ID:--} of ${OWNER:--} is $MARKER"
+	[ ! -e "$TIMER/due" ] || refuse busy "change $ID was already started"
+	now
+	case $3 in
+	now) due=$NOW ;;
+	in) seconds "$4" && due=$((NOW + CS)) ;;
+	at) seconds "$4" && due=$CS ;;
+	*) refuse usage "expected now, in or at" ;;
+	esac
+	[ $due -ge $NOW ] || refuse too-late "uptime $4 is $((NOW - due)) hundredths of a second ago"
+	detach guard "$ID" $due
+	detach watch "$ID" $due
+	limit=$((NOW + START_LIMIT_CS))
+	until [ -e "$TIMER/due" ]; do
+		# should it start after all, it finds the abort and changes nothing
+		now && [ $NOW -lt $limit ] || { : >"$TIMER/abort" && refuse no-watcher "the timer did not start in time"; }
+		nap
+	done
+	echo "ok state=waiting id=$ID due_uptime_s=$(as_seconds $due)"
+}
+
+# where sleep knows no fractions, this returns at once and its callers spin
+nap() { sleep 0.05 2>/dev/null || :; }
+
+put_new() {
+	while read -r kind _ _ _ path; do
+		case $kind in
+		file) mkdir -p "${path%/*}" && mv -f "$CHANGE/new$path" "$path" ;;
+		remove) rm -f "$path" ;;
+		esac || return 1
+	done <"$CHANGE/manifest"
+	sync
+}
+
+# moved back, not copied: atomic for each file, and a full flash cannot stop it; what frees flash comes first
+put_previous() {
+	rm -rf "$CHANGE/new"
+	while read -r kind path; do
+		case $kind in
+		not) rm -f "$path" ;;
+		dir) rmdir "$path" 2>/dev/null ;;
+		esac
+	done <"$CHANGE/previous"
+	left=0
+	while read -r kind path; do
+		[ "$kind" = had ] && exists "$CHANGE/prev$path" || continue
+		mkdir -p "${path%/*}" && mv -f "$CHANGE/prev$path" "$path"
+		! exists "$CHANGE/prev$path" || left=1
+	done <"$CHANGE/previous"
+	sync
+	return $left
+}
+
+# wait_until CS: 1 when the change is no longer ours to end
+wait_until() {
+	while now && [ $NOW -lt "$1" ]; do
+		is_armed || return 1
+		[ ! -e "$TIMER/abort" ] || return 0
+		if [ $(($1 - NOW)) -gt 150 ]; then sleep 1; else nap; fi
+	done
+	is_armed
+}
+
+reload() { # SCRIPT: in the background, so that no hanging reload holds up the timer
+	rm -f "$RUN/reloaded"
+	(
+		sh "$1" >"$RUN/reload.log" 2>&1
+		echo $? >"$RUN/reloaded"
+	) &
+	reload_pid=$!
+}
+
+# restore REASON: the marker's rename decides who does it; nothing happens when the change was confirmed meanwhile
+restore() {
+	mv "$CHANGE/armed.$ID" "$CHANGE/restoring.$ID" 2>/dev/null || [ -f "$CHANGE/restoring.$ID" ] || return 0
+	sync
+	cp "$CHANGE/reload" "$RUN/restored"
+	reload_it=no
+	[ ! -e "$TIMER/applied" ] || reload_it=yes
+	[ -z "$reload_pid" ] || kill "$reload_pid" 2>/dev/null
+	put_previous || return 0 # the marker stays: abort, the second timer and the next boot try again
+	finish restored "$1"
+	[ $reload_it = yes ] || return 0
+	reload "$RUN/restored"
+	now
+	limit=$((NOW + RELOAD_LIMIT_CS))
+	until [ -e "$RUN/reloaded" ] || { now && [ $NOW -ge $limit ]; }; do sleep 1; done
+	read -r status 2>/dev/null <"$RUN/reloaded"
+	# the boot path is the one that is known to bring the restored state up
+	[ "$status" = 0 ] || /sbin/reboot
+}
+
+unkillable() { echo -1000 2>/dev/null >/proc/self/oom_score_adj; }
+
+# applied_at_now: from here on a restore has to reload as well
+applied_at_now() { now && mkdir -p "$TIMER" && echo $NOW >"$TIMER/applied"; }
+
+watch() { # ID DUE_CS: detached
+	unkillable
+	read_marker
+	[ "$MARKER $ID" = "armed $1" ] || exit 0
+	echo "$2" >"$TIMER/due"
+	wait_until "$2" || exit 0
+	if [ -e "$TIMER/abort" ]; then
+		restore abort
+	elif ! unchanged_since_kept "$CHANGE"; then
+		# somebody's edit would be overwritten, and restoring would overwrite it too: leave everything as it is
+		mv "$CHANGE/armed.$ID" "$CHANGE/staged.$ID" && finish refused moved-on
+	elif ! put_new; then
+		applied_at_now
+		restore failed
+	else
+		cp "$CHANGE/reload" "$RUN/reload"
+		reload "$RUN/reload"
+		applied_at_now
+		wait_until $((NOW + WINDOW * 100)) || exit 0
+		reason=timeout
+		[ ! -e "$TIMER/abort" ] || reason=abort
+		restore $reason
+	fi
+}
+
+guard() { # ID DUE_CS: detached; ends the change if `watch` was killed
+	unkillable
+	read_marker
+	[ "$ID" = "$1" ] || exit 0
+	limit=$(($2 + WINDOW * 100 + GUARD_GRACE_CS))
+	while now && [ $NOW -lt $limit ] && is_armed; do sleep 1; done
+	while [ -f "$CHANGE/restoring.$ID" ] && alive "$TIMER/watch.pid"; do sleep 1; done
+	{ is_armed || [ -f "$CHANGE/restoring.$ID" ]; } || exit 0
+	applied_at_now
+	restore guard
+}
+
+orphan() { # ID: detached; takes a change back whose timer is gone
+	unkillable
+	read_marker
+	[ "$ID" = "$1" ] && applied_at_now && restore abort
+}
+
+confirm() { # ID NONCE
+	given=$(printf %s "$2" | sha256sum)
+	tidy
+	read -r last_id last_outcome last_reason last_nonce 2>/dev/null <"$LAST"
+	if [ "$last_id $last_nonce" = "$1 ${given%% *}" ] && [ "$ID" != "$1" ]; then
+		# an answer was lost on the way; say again what became of it
+		[ "$last_outcome" = confirmed ] || refuse restored "change $1 was $last_outcome ($last_reason)"
+	else
+		[ "$MARKER $ID" = "armed $1" ] || refuse wrong-state "change ${ID:--} is $MARKER, expected $1 applied"
+		[ "$NONCE" = "${given%% *}" ] || refuse wrong-nonce "this is not the nonce change $1 was armed with"
+		[ -e "$TIMER/applied" ] || refuse not-applied "change $ID is not applied yet"
+		mv "$CHANGE/armed.$ID" "$CHANGE/confirmed.$ID" 2>/dev/null || refuse restored "the window has just run out"
+		sync
+		finish confirmed operator
+	fi
+	echo "ok state=idle id=$1 outcome=confirmed"
+}
+
+abort() { # OWNER ID
+	tidy
+	[ "$ID" = "$2" ] || refuse wrong-state "change ${ID:--} is $MARKER"
+	[ "$OWNER" = "$1" ] || need_lock "$1"
+	if [ "$MARKER" = staged ]; then
+		finish aborted operator
+	elif [ ! -e "$TIMER/due" ] && [ "$MARKER" = armed ]; then
+		restore abort
+	elif alive "$TIMER/watch.pid"; then
+		: >"$TIMER/abort"
+	else
+		detach orphan "$ID"
+	fi
+	read_marker
+	echo "ok state=$MARKER id=$2"
+}
+
+# --- boot, status ---------------------------------------------------------------------------------------------------
+
+boot() { # before anything reads the configuration, so nothing is reloaded
+	rm -rf "$RUN"/*
+	tidy
+	case $MARKER in armed | restoring) restore boot ;; esac
+}
+
+status() {
+	read_marker
+	read_lock
+	read -r last_id last_outcome last_reason _ 2>/dev/null <"$LAST"
+	read -r reloaded 2>/dev/null <"$RUN/reloaded"
+	now
+	state=$MARKER left='' due=''
+	if [ "$MARKER" = armed ] && read -r due 2>/dev/null <"$TIMER/due"; then
+		state=waiting
+		due=$(as_seconds "$due")
+		read -r applied 2>/dev/null <"$TIMER/applied" && state=applied left=$(((applied - NOW) / 100 + WINDOW))
+		alive "$TIMER/watch.pid" || state=orphaned
+	fi
+	echo "version=$VERSION state=$state id=$ID owner=$OWNER window_s=$WINDOW left_s=$left due_uptime_s=$due" \
+		"reload_status=$reloaded lock_owner=$LOCK_OWNER lock_left_s=$((LOCK_LEFT / 100))" \
+		"last_id=$last_id last_outcome=$last_outcome last_reason=$last_reason uptime_s=$(as_seconds $NOW)"
+}
+
+umask 022
+mkdir -p -m 700 "$RUN" "${CHANGE%/*}"
+verb=$1
+[ $# -eq 0 ] || shift
+case $verb in
+lock | unlock | stage | arm | apply | watch | guard | orphan | confirm | abort | boot | status) "$verb" "$@" ;;
+*) refuse usage "unknown verb '$verb'" ;;
+esac

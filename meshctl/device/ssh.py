@@ -1,0 +1,391 @@
+"""SSH to one node: socket or tunnel -> key exchange -> host key judged -> login -> `SshConnection` -> `run`.
+
+`connect` walks that line, each step under its own deadline. paramiko waits without bound in places (the answer to
+`exec`, a full TCP buffer), so every wait here runs under `_Deadline`, which closes the transport when time is up: all
+of paramiko's waits end then. A connection that timed out is closed and cannot be used again.
+"""
+
+from __future__ import annotations
+
+import logging
+import select
+import socket
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from types import TracebackType
+
+import paramiko
+
+from meshctl.device.authentication import Attempt, attempts
+from meshctl.device.connection import Completed, Connection, Credentials, Deadlines, Endpoint
+from meshctl.device.errors import (
+    AuthenticationRefused,
+    ChannelClosed,
+    ConnectionLost,
+    IncompatibleServer,
+    Timeout,
+    Unreachable,
+    UploadFailed,
+)
+from meshctl.device.framing import framed
+from meshctl.device.legacy_rsa import SSH_RSA, LegacyTransport
+from meshctl.device.trust import HostKey, HostKeyPolicy
+from meshctl.model import Release
+
+__all__ = ["SshConnection", "connect"]
+
+# OpenWrt's dropbear closes after three refusals (MaxAuthTries in /etc/init.d/dropbear).
+TRIES_PER_CONNECTION = 3
+# What one command may say; more than any observation, less than what would hurt the host with 200 nodes at once.
+MAX_OUTPUT_BYTES = 16 << 20
+# Up to this much stdin fits the receive window of every dropbear (24 KiB) and needs no thread of its own.
+INLINE_STDIN_BYTES = 8 << 10
+_READ_BYTES = 32 << 10
+_RSA_SHA2 = ("rsa-sha2-512", "rsa-sha2-256")
+
+# paramiko reports every failed connection on stderr unless its logger has a handler; our errors say it once.
+logging.getLogger("paramiko").addHandler(logging.NullHandler())
+
+
+def connect(
+    endpoint: Endpoint,
+    *,
+    credentials: Credentials,
+    trust: HostKeyPolicy,
+    deadlines: Deadlines | None = None,
+    via: SshConnection | None = None,
+    release: Release | None = None,
+    legacy_rsa_sha1: bool = False,
+) -> SshConnection:
+    """An authenticated connection to `endpoint`, through the node of `via` if given.
+
+    `legacy_rsa_sha1` offers RSA with SHA-1 from the start; a server that offers nothing else is met with it when the
+    node's `release` is 19.07. Raises Unreachable, Timeout, ConnectionLost, IncompatibleServer, HostKeyUnknown,
+    HostKeyChanged, AuthenticationRefused, and InputError for an unusable key file.
+    """
+    limits = deadlines or Deadlines()
+    legacy = legacy_rsa_sha1
+    with attempts(credentials, legacy_rsa_sha1=legacy or release is Release.V19_07) as wanted:
+        left = list(wanted)
+        tried: list[str] = []
+        allowed: tuple[str, ...] = ()
+        while True:
+            try:
+                transport = _handshake(endpoint, limits, trust, via, legacy=legacy)
+            except _OnlySha1 as error:
+                if legacy or release is not Release.V19_07:
+                    raise IncompatibleServer(
+                        f"{endpoint.label}: offers only RSA with SHA-1 as host key",
+                        hint="only OpenWrt 19.07 does; set the node's release, or upgrade it by cable",
+                    ) from error
+                legacy = True
+                continue
+            try:
+                accepted, refused = _login(endpoint, transport, left[:TRIES_PER_CONNECTION], limits)
+            except BaseException:
+                transport.close()
+                raise
+            if accepted:
+                return SshConnection(endpoint, transport, limits)
+            transport.close()
+            tried += [attempt.name for attempt in left[:TRIES_PER_CONNECTION]]
+            allowed = refused or allowed
+            left = left[TRIES_PER_CONNECTION:]
+            if not left:
+                given = ", ".join(tried) or "no credentials at all"
+                raise AuthenticationRefused(
+                    f"{endpoint.label}: let {endpoint.user} in with none of: {given}",
+                    tried=tuple(tried),
+                    allowed=allowed,
+                    hint="name a key file whose public part is in the node's /etc/dropbear/authorized_keys",
+                )
+
+
+class _OnlySha1(Exception):
+    """No host key algorithm in common; 19.07's dropbear is the known reason."""
+
+
+class _Deadline:
+    """Closes `transport` when `seconds` have passed; `passed` tells whether that happened."""
+
+    def __init__(self, transport: paramiko.Transport, seconds: float) -> None:
+        self.passed = False
+        self._transport = transport
+        self._timer = threading.Timer(max(seconds, 0.0), self._close)
+        self._timer.daemon = True
+
+    def _close(self) -> None:
+        self.passed = True
+        self._transport.close()
+
+    def __enter__(self) -> _Deadline:
+        self._timer.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._timer.cancel()
+
+
+@contextmanager
+def _translated(endpoint: Endpoint, transport: paramiko.Transport, seconds: float, phase: str) -> Iterator[None]:
+    """Foreign exceptions become ours here; a passed deadline is a Timeout whatever it made paramiko raise."""
+    with _Deadline(transport, seconds) as deadline:
+        try:
+            yield
+        except (paramiko.SSHException, OSError, EOFError) as error:
+            if deadline.passed:
+                raise Timeout(f"{endpoint.label}: no answer to {phase} within {seconds:g} s", phase=phase) from error
+            if transport.is_active():
+                raise ChannelClosed(f"{endpoint.label}: {phase} was refused or cut: {error}") from error
+            raise ConnectionLost(f"{endpoint.label}: the connection broke during {phase}: {error}") from error
+    if deadline.passed:
+        raise Timeout(f"{endpoint.label}: no answer to {phase} within {seconds:g} s", phase=phase)
+
+
+def _open_socket(endpoint: Endpoint, limits: Deadlines, via: SshConnection | None) -> socket.socket | paramiko.Channel:
+    if via is not None:
+        return via.tunnel(endpoint)
+    try:
+        sock = socket.create_connection((endpoint.host, endpoint.port), timeout=limits.connect_s)
+    except TimeoutError as error:
+        raise Timeout(
+            f"{endpoint.label}: no answer to connect within {limits.connect_s:g} s", phase="connect"
+        ) from error
+    except OSError as error:
+        raise Unreachable(f"{endpoint.label}: cannot connect: {error.strerror or error}") from error
+    # keepalives ask for no answer, so the kernel has to notice that nobody acknowledges them
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 4 * limits.keepalive_s * 1000)
+    return sock
+
+
+def _handshake(
+    endpoint: Endpoint, limits: Deadlines, trust: HostKeyPolicy, via: SshConnection | None, *, legacy: bool
+) -> paramiko.Transport:
+    known = trust.known(endpoint)
+    transport = (LegacyTransport if legacy else paramiko.Transport)(_open_socket(endpoint, limits, via))
+    transport.daemon = True
+    transport.banner_timeout = transport.handshake_timeout = limits.handshake_s * 2  # ours comes first
+    transport.auth_timeout = limits.auth_s * 2
+    transport.clear_to_send_timeout = limits.run_s
+    _prefer(transport, known, legacy=legacy)
+    try:
+        with _translated(endpoint, transport, limits.handshake_s, "the SSH handshake"):
+            try:
+                transport.start_client(timeout=limits.handshake_s * 2)
+            except paramiko.ssh_exception.IncompatiblePeer as error:
+                if "host key" in str(error):
+                    raise _OnlySha1(str(error)) from error
+                raise IncompatibleServer(f"{endpoint.label}: {error}") from error
+            except paramiko.SSHException as error:
+                if "protocol version" in str(error) or "SSH banner" in str(error):
+                    raise IncompatibleServer(f"{endpoint.label}: what answers there does not speak SSH") from error
+                raise
+        remote = transport.get_remote_server_key()
+        trust.check(endpoint, HostKey(remote.get_name(), remote.asbytes()))
+    except BaseException:
+        transport.close()
+        raise
+    transport.set_keepalive(limits.keepalive_s)
+    return transport
+
+
+def _prefer(transport: paramiko.Transport, known: tuple[HostKey, ...], *, legacy: bool) -> None:
+    """Ask for a host key of a type that is pinned; the others stay offered, so that a change is seen as one."""
+    rsa = (*_RSA_SHA2, SSH_RSA) if legacy else _RSA_SHA2
+    pinned = [name for key in known for name in (rsa if key.key_type == SSH_RSA else (key.key_type,))]
+    options = transport.get_security_options()
+    usual = tuple(options.key_types)
+    options.key_types = (
+        *(name for name in dict.fromkeys(pinned) if name in usual),
+        *(n for n in usual if n not in pinned),
+    )
+
+
+def _login(
+    endpoint: Endpoint, transport: paramiko.Transport, wanted: list[Attempt], limits: Deadlines
+) -> tuple[bool, tuple[str, ...]]:
+    """Whether one of `wanted` was accepted, and otherwise what the server said it would accept."""
+    allowed: tuple[str, ...] = ()
+    for attempt in wanted:
+        with _translated(endpoint, transport, limits.auth_s, "authentication"):
+            try:
+                attempt.run(transport, endpoint.user)
+            except paramiko.BadAuthenticationType as error:
+                allowed = tuple(error.allowed_types)
+            except paramiko.AuthenticationException:
+                if not transport.is_active():
+                    # it hung up on the refusal, as dropbear does after the last one it allows
+                    return False, allowed
+            except (paramiko.SSHException, EOFError):
+                if not transport.is_active() and attempt is wanted[-1]:
+                    return False, allowed
+                raise
+            if transport.is_authenticated():
+                return True, ()
+    return False, allowed
+
+
+class SshConnection(Connection):
+    """See `Connection`. Also carries tunnels to nodes behind this one."""
+
+    def __init__(self, endpoint: Endpoint, transport: paramiko.Transport, limits: Deadlines) -> None:
+        self._endpoint = endpoint
+        self._transport = transport
+        self._limits = limits
+
+    @property
+    def endpoint(self) -> Endpoint:
+        return self._endpoint
+
+    @property
+    def is_open(self) -> bool:
+        return self._transport.is_active()
+
+    @property
+    def server_version(self) -> str:
+        """The server's identification: `SSH-2.0-dropbear_2022.83`."""
+        return self._transport.remote_version
+
+    @property
+    def host_key(self) -> HostKey:
+        key = self._transport.get_remote_server_key()
+        return HostKey(key.get_name(), key.asbytes())
+
+    def tunnel(self, target: Endpoint) -> paramiko.Channel:
+        """A TCP stream from this node to `target` (direct-tcpip, RFC 4254 section 7.2)."""
+        with _translated(target, self._transport, self._limits.connect_s, f"a tunnel through {self._endpoint.label}"):
+            try:
+                return self._transport.open_channel("direct-tcpip", (target.host, target.port), ("127.0.0.1", 0))
+            except paramiko.ChannelException as error:
+                raise Unreachable(f"{target.label}: {self._endpoint.label} cannot reach it: {error.text}") from error
+
+    def run(self, script: str, *, stdin: bytes | Iterable[bytes] = b"", timeout_s: float | None = None) -> Completed:
+        sent = framed(script)
+        seconds = self._limits.run_s if timeout_s is None else timeout_s
+        pieces = (stdin,) if isinstance(stdin, bytes) else stdin
+        with _translated(self._endpoint, self._transport, min(seconds, self._limits.channel_s), "opening a channel"):
+            channel = self._transport.open_session()
+        try:
+            with _translated(self._endpoint, self._transport, seconds, "a command"):
+                channel.exec_command(sent.command)
+                with _fed(channel, sent.preamble, pieces, inline=isinstance(stdin, bytes)) as feeder:
+                    out, err = _collect(channel)
+                status = channel.recv_exit_status()
+                if status < 0:
+                    raise EOFError("no exit status: it was killed, or the link was cut")
+            if feeder is not None and feeder.failure is not None:
+                raise feeder.failure
+        finally:
+            with _quiet():
+                channel.close()
+        return Completed(out, err, status)
+
+    def close(self) -> None:
+        self._transport.close()
+        # its thread closes the socket; a caller that opens hundreds should not outrun them
+        self._transport.join(timeout=2.0)
+
+    def __enter__(self) -> SshConnection:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Closing what is already gone is no error."""
+    try:
+        yield
+    except (paramiko.SSHException, OSError, EOFError):
+        return
+
+
+class _Feeder(threading.Thread):
+    """Writes stdin while the main thread reads; `failure` is what the source of the bytes raised, if anything."""
+
+    def __init__(self, channel: paramiko.Channel, pieces: Iterable[bytes]) -> None:
+        super().__init__(daemon=True)
+        self.failure: Exception | None = None
+        self._channel = channel
+        self._pieces = pieces
+
+    def run(self) -> None:
+        source = iter(self._pieces)
+        while True:
+            try:
+                piece = next(source)
+            except StopIteration:
+                break
+            except OSError as error:
+                self.failure = UploadFailed(f"cannot read what is to be sent: {error}")
+                break
+            try:
+                self._channel.sendall(piece)
+            except OSError:
+                return  # the command ended without reading all of it; its exit status says what that means
+        with _quiet():
+            self._channel.shutdown_write()
+
+
+@contextmanager
+def _fed(
+    channel: paramiko.Channel, preamble: bytes, pieces: Iterable[bytes], *, inline: bool
+) -> Iterator[_Feeder | None]:
+    """Send `preamble` and `pieces` to the command: at once when they fit its window, else beside the reading."""
+    if inline:
+        text = preamble + b"".join(pieces)
+        if len(text) <= INLINE_STDIN_BYTES:
+            with _quiet():
+                channel.sendall(text)
+                channel.shutdown_write()
+            yield None
+            return
+        pieces = (text[at : at + _READ_BYTES] for at in range(0, len(text), _READ_BYTES))
+        preamble = b""
+    feeder = _Feeder(channel, _chained(preamble, pieces))
+    feeder.start()
+    try:
+        yield feeder
+    finally:
+        with _quiet():
+            channel.shutdown_write()
+        feeder.join(timeout=5.0)
+
+
+def _chained(first: bytes, rest: Iterable[bytes]) -> Iterator[bytes]:
+    if first:
+        yield first
+    yield from rest
+
+
+def _collect(channel: paramiko.Channel) -> tuple[bytes, bytes]:
+    """Both outputs, read side by side until the command has closed them and told its status."""
+    out, err = bytearray(), bytearray()
+    poll = select.poll()
+    poll.register(channel.fileno(), select.POLLIN)
+    while True:
+        ended = channel.exit_status_ready() and (channel.eof_received or channel.closed)
+        while channel.recv_ready():
+            out += channel.recv(_READ_BYTES)
+        while channel.recv_stderr_ready():
+            err += channel.recv_stderr(_READ_BYTES)
+        if len(out) + len(err) > MAX_OUTPUT_BYTES:
+            raise EOFError(f"it said more than {MAX_OUTPUT_BYTES >> 20} MiB")
+        if ended:
+            return bytes(out), bytes(err)
+        # the exit status has no file descriptor, so look again from time to time
+        poll.poll(_next_look_ms(channel))
+
+
+def _next_look_ms(channel: paramiko.Channel) -> int:
+    """Output or EOF wakes the poll at once; after EOF only the exit status is missing, and it follows at once."""
+    if not channel.eof_received:
+        return 500
+    channel.status_event.wait(0.5)
+    return 0

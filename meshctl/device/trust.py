@@ -1,0 +1,261 @@
+"""Which host key is believed: pins in the fleet's own file, in OpenSSH's known_hosts format.
+
+A server's key arrives as `HostKey`; a `HostKeyPolicy` accepts it or raises. `TrustStore` is the file: a known key
+passes, an unknown one is `HostKeyUnknown`, another one `HostKeyChanged`. `FirstContact` asks about unknown keys and pins
+the accepted; `AfterFlash` lets one announced change through. Names are those of the inventory, so that
+`ssh -o UserKnownHostsFile=FILE -o HostKeyAlias=b03 root@10.42.0.13` trusts the same.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import fcntl
+import hashlib
+import hmac
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from meshctl.device.connection import Endpoint
+from meshctl.device.errors import HostKeyChanged, HostKeyUnknown
+from meshctl.errors import InputError
+
+
+@dataclass(frozen=True, slots=True)
+class HostKey:
+    """A server's public key: its type (`ssh-ed25519`) and the blob that known_hosts writes in base64."""
+
+    key_type: str
+    blob: bytes
+
+    @property
+    def fingerprint(self) -> str:
+        """`SHA256:...`, as `ssh-keygen -l` and newer dropbearkey show it (base64 without padding)."""
+        return "SHA256:" + base64.b64encode(hashlib.sha256(self.blob).digest()).decode().rstrip("=")
+
+    @property
+    def text(self) -> str:
+        """`ssh-ed25519 AAAA...`, as in known_hosts and authorized_keys."""
+        return f"{self.key_type} {base64.b64encode(self.blob).decode()}"
+
+
+def parse_key(text: str) -> HostKey:
+    """A key from `TYPE BASE64 [comment]`. Raises ValueError when it is none or its blob names another type."""
+    words = text.split()
+    if len(words) < 2:
+        raise ValueError(f"expected `TYPE BASE64`, found {text!r}")
+    try:
+        blob = base64.b64decode(words[1], validate=True)
+    except binascii.Error as error:
+        raise ValueError(f"expected base64 after {words[0]}: {error}") from error
+    # RFC 4253 section 6.6: a blob begins with its own type as a length-prefixed string
+    length = int.from_bytes(blob[:4], "big")
+    if len(blob) < 4 or blob[4 : 4 + length] != words[0].encode("ascii", "replace"):
+        raise ValueError(f"the key's data is not of type {words[0]}")
+    return HostKey(words[0], blob)
+
+
+@dataclass(frozen=True, slots=True)
+class Pin:
+    """One line of the file: the names it is for, its marker (`@revoked` or empty), the key."""
+
+    names: tuple[str, ...]
+    key: HostKey
+    marker: str = ""
+
+    def covers(self, name: str) -> bool:
+        return any(_hashed_as(own, name) if own.startswith("|1|") else own == name for own in self.names)
+
+    @property
+    def line(self) -> str:
+        return " ".join(filter(None, (self.marker, ",".join(self.names), self.key.text)))
+
+
+def _hashed_as(pattern: str, name: str) -> bool:
+    """OpenSSH's HashKnownHosts: `|1|salt|HMAC-SHA1(salt, name)`, both in base64 (hostfile.c)."""
+    try:
+        salt, digest = (base64.b64decode(part, validate=True) for part in pattern.split("|")[2:])
+    except (ValueError, binascii.Error):
+        return False
+    return hmac.compare_digest(hmac.new(salt, name.encode(), hashlib.sha1).digest(), digest)
+
+
+def parse_pins(text: str, *, source: str = "known_hosts") -> tuple[Pin, ...]:
+    """All lines of a known_hosts file. Raises InputError naming the line that cannot be read.
+
+    `@cert-authority` lines and patterns with `*`, `?` or `!` are refused: a fleet's file names each node.
+    """
+    pins = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        marker = words.pop(0) if words[0].startswith("@") else ""
+        try:
+            if marker not in {"", "@revoked"}:
+                raise ValueError(f"expected a plain or @revoked line, found {marker}")
+            names = tuple(words[0].split(",")) if words else ()
+            if any(set(name) & set("*?!") for name in names):
+                raise ValueError(f"expected names without patterns, found {words[0]}")
+            pins.append(Pin(names, parse_key(" ".join(words[1:3])), marker))
+        except ValueError as error:
+            raise InputError(f"{source}:{number}: {error}", hint="one line is `NAME TYPE BASE64`") from error
+    return tuple(pins)
+
+
+def dump_pins(pins: tuple[Pin, ...]) -> str:
+    return "".join(f"{pin.line}\n" for pin in pins)
+
+
+class HostKeyPolicy(Protocol):
+    """Says which keys are known for a node, so that the server is asked for one of their types, and judges its key."""
+
+    def known(self, endpoint: Endpoint) -> tuple[HostKey, ...]: ...
+
+    def check(self, endpoint: Endpoint, key: HostKey) -> None:
+        """Return if the key is to be believed; else raise HostKeyUnknown or HostKeyChanged."""
+        ...
+
+
+class TrustStore:
+    """The fleet's file of pins. `inventory` adds the keys an inventory pins itself (node name -> `TYPE BASE64` lines).
+
+    Reads are fresh each time; writes lock, replace the file in one rename, and keep every line they do not concern.
+    """
+
+    def __init__(self, path: Path, *, inventory: Mapping[str, tuple[str, ...]] | None = None) -> None:
+        self.path = path
+        self._inventory: dict[str, tuple[HostKey, ...]] = {}
+        for name, lines in (inventory or {}).items():
+            try:
+                self._inventory[name] = tuple(parse_key(line) for line in lines)
+            except ValueError as error:
+                raise InputError(f"host key of {name}: {error}") from error
+
+    def pins(self) -> tuple[Pin, ...]:
+        try:
+            text = self.path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            return ()
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{self.path}: cannot read the pinned host keys: {error}") from error
+        return parse_pins(text, source=str(self.path))
+
+    def known(self, endpoint: Endpoint) -> tuple[HostKey, ...]:
+        return self.pinned(endpoint.pin_name)
+
+    def pinned(self, name: str) -> tuple[HostKey, ...]:
+        """The keys believed for `name`, those of the file first."""
+        pins = self.pins()
+        revoked = {pin.key for pin in pins if pin.marker}
+        keys = [pin.key for pin in pins if not pin.marker and pin.covers(name)]
+        keys += self._inventory.get(name, ())
+        return tuple(key for key in dict.fromkeys(keys) if key not in revoked)
+
+    def check(self, endpoint: Endpoint, key: HostKey) -> None:
+        if any(pin.marker and pin.key == key for pin in self.pins()):
+            raise HostKeyChanged(
+                f"{endpoint.label}: shows a revoked host key {key.fingerprint} ({key.key_type})",
+                fingerprint=key.fingerprint,
+                key_type=key.key_type,
+            )
+        pinned = self.pinned(endpoint.pin_name)
+        if key in pinned:
+            return
+        if not pinned:
+            raise HostKeyUnknown(
+                f"{endpoint.label}: no host key is pinned; it shows {key.fingerprint} ({key.key_type})",
+                fingerprint=key.fingerprint,
+                key_type=key.key_type,
+                hint="compare it with the node's own, then run `meshctl trust`",
+            )
+        raise HostKeyChanged(
+            f"{endpoint.label}: the host key changed: pinned {', '.join(pin.fingerprint for pin in pinned)}, "
+            f"shows {key.fingerprint} ({key.key_type})",
+            fingerprint=key.fingerprint,
+            key_type=key.key_type,
+            pinned=tuple(pin.fingerprint for pin in pinned),
+            hint="another device, a flash meshctl did not do, or an attack; `meshctl trust --replace` once you know",
+        )
+
+    def add(self, name: str, *keys: HostKey) -> None:
+        """Pin further keys for `name`; those already pinned stay."""
+        with self._rewriting() as pins:
+            pins += [Pin((name,), key) for key in keys if not any(pin.covers(name) and pin.key == key for pin in pins)]
+
+    def replace(self, name: str, *keys: HostKey) -> None:
+        """Pin exactly these keys for `name`."""
+        with self._rewriting() as pins:
+            pins[:] = [*_without(pins, name), *(Pin((name,), key) for key in keys)]
+
+    def forget(self, name: str) -> None:
+        self.replace(name)
+
+    @contextmanager
+    def _rewriting(self) -> Iterator[list[Pin]]:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with (self.path.parent / f".{self.path.name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            pins = list(self.pins())
+            yield pins
+            with tempfile.NamedTemporaryFile("w", dir=self.path.parent, delete=False, encoding="utf-8") as new:
+                new.write(dump_pins(tuple(pins)))
+                new.flush()
+                os.fsync(new.fileno())
+            Path(new.name).replace(self.path)
+
+
+def _without(pins: list[Pin], name: str) -> Iterator[Pin]:
+    for pin in pins:
+        if pin.marker or not pin.covers(name):
+            yield pin
+        elif others := tuple(other for other in pin.names if other != name and not other.startswith("|1|")):
+            yield Pin(others, pin.key)
+
+
+class FirstContact:
+    """Asks `accept` about a key nobody pinned yet, and pins it when the answer is yes; a changed key stays refused."""
+
+    def __init__(self, store: TrustStore, accept: Callable[[Endpoint, HostKey], bool]) -> None:
+        self._store = store
+        self._accept = accept
+
+    def known(self, endpoint: Endpoint) -> tuple[HostKey, ...]:
+        return self._store.known(endpoint)
+
+    def check(self, endpoint: Endpoint, key: HostKey) -> None:
+        try:
+            self._store.check(endpoint, key)
+        except HostKeyUnknown:
+            if not self._accept(endpoint, key):
+                raise
+            self._store.add(endpoint.pin_name, key)
+
+
+class AfterFlash:
+    """The one change of key that is expected: after a flash, a node may show one of `expected` and nothing else new.
+
+    `expected` are the fingerprints of the keys that went into the flashed configuration. The pin is replaced when the
+    node shows one of them.
+    """
+
+    def __init__(self, store: TrustStore, name: str, expected: tuple[str, ...]) -> None:
+        self._store = store
+        self._name = name
+        self._expected = expected
+
+    def known(self, endpoint: Endpoint) -> tuple[HostKey, ...]:
+        return self._store.known(endpoint)
+
+    def check(self, endpoint: Endpoint, key: HostKey) -> None:
+        try:
+            self._store.check(endpoint, key)
+        except (HostKeyChanged, HostKeyUnknown):
+            if endpoint.pin_name != self._name or key.fingerprint not in self._expected:
+                raise
+            self._store.replace(self._name, key)

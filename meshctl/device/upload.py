@@ -1,0 +1,225 @@
+"""Bring a file to a node that has no SFTP, over a link that drops: survey, send what is missing, prove, put in place.
+
+The node's partial file is named after the target and the content's hash, so two contents never mix. A survey hashes
+what is there chunk by chunk; everything up to the first chunk that differs is kept and the rest sent, one chunk for each
+command, each answered with the hash of what was written. At the end the whole is hashed on the node and renamed. A cut
+at any point leaves a partial file, and the next `upload` goes on from it. Bytes travel by `cat`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from meshctl.device.connection import Connection
+from meshctl.device.errors import UploadFailed
+from meshctl.device.framing import quoted
+from meshctl.errors import InputError
+
+# Long enough that the two extra round trips of a chunk do not count, short enough to lose little by a cut: at 1 Mbit/s
+# a chunk takes two seconds.
+CHUNK_BYTES = 256 << 10
+# A link slower than this is as good as gone; it bounds how long one chunk may take.
+SLOWEST_BYTES_PER_S = 4 << 10
+# Pieces a rate limit is held with.
+_PIECE_BYTES = 4 << 10
+_PATIENCE_S = 60.0
+# How often a chunk that arrived damaged is surveyed anew; a leftover writer of a cut connection can cause one.
+_SURVEYS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """`verified` of `total` bytes are on the node and their hashes agree."""
+
+    verified: int
+    total: int
+
+
+@dataclass(frozen=True, slots=True)
+class Uploaded:
+    """What an upload did: `sent` bytes travelled, `kept` were there from before a cut."""
+
+    path: str
+    sha256: str
+    total: int
+    sent: int
+    kept: int
+
+
+class Content:
+    """What is to be sent, read chunk by chunk: bytes in memory or a file. Raises InputError for an unreadable file."""
+
+    def __init__(self, source: bytes | Path) -> None:
+        self._source = source
+        self.size = 0
+        digest = hashlib.sha256()
+        try:
+            self.size = len(source) if isinstance(source, bytes) else source.stat().st_size
+            for index in range(self.chunks):
+                digest.update(self.chunk(index))
+        except OSError as error:
+            raise InputError(f"{source!s}: cannot be read: {error.strerror or error}") from error
+        self.sha256 = digest.hexdigest()
+
+    @property
+    def chunks(self) -> int:
+        return -(-self.size // CHUNK_BYTES)
+
+    def chunk(self, index: int) -> bytes:
+        start = index * CHUNK_BYTES
+        if isinstance(self._source, bytes):
+            return self._source[start : start + CHUNK_BYTES]
+        with self._source.open("rb") as file:
+            file.seek(start)
+            return file.read(CHUNK_BYTES)
+
+
+def upload(
+    connection: Connection,
+    source: bytes | Path,
+    path: str,
+    *,
+    mode: int = 0o644,
+    rate_bytes_per_s: float | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Uploaded:
+    """Make `path` on the node hold exactly `source`, with `mode`; a second call after a cut goes on where it stopped.
+
+    Raises UploadFailed when the node has no room or the bytes do not agree, Timeout and ConnectionLost for the link;
+    in each case `path` is untouched.
+    """
+    content = Content(source)
+    partial = _partial(path, content)
+    tell = progress or (lambda _: None)
+    sent = 0
+    kept_at_first: int | None = None
+    for _ in range(_SURVEYS):
+        survey = _survey(connection, path, partial, content)
+        if survey.done:
+            tell(Progress(content.size, content.size))
+            return Uploaded(path, content.sha256, content.size, sent, content.size - sent)
+        good = survey.good_chunks
+        kept_at_first = good * CHUNK_BYTES if kept_at_first is None else kept_at_first
+        tell(Progress(min(good * CHUNK_BYTES, content.size), content.size))
+        while good < content.chunks:
+            data = content.chunk(good)
+            arrived = _send_chunk(connection, partial, good, data, rate_bytes_per_s, sleep)
+            sent += len(data)
+            if not arrived:
+                break
+            good += 1
+            tell(Progress(min(good * CHUNK_BYTES, content.size), content.size))
+        if good == content.chunks and _put_in_place(connection, partial, path, content, mode):
+            return Uploaded(path, content.sha256, content.size, sent, min(kept_at_first, content.size))
+    raise UploadFailed(f"{connection.endpoint.label}: {path}: the bytes that arrive are not those sent")
+
+
+@dataclass(frozen=True, slots=True)
+class _Survey:
+    done: bool
+    good_chunks: int
+
+
+def _partial(path: str, content: Content) -> str:
+    target = PurePosixPath(path)
+    if not target.is_absolute() or target.name in {"", "..", "."}:
+        raise ValueError(f"{path!r}: expected the absolute path of a file")
+    return str(target.parent / f".{target.name}.{content.sha256[:16]}.part")
+
+
+# The oldest partial files of other contents go: nobody will resume them, and they fill a small /tmp.
+_SURVEY = """\
+t={target} p={partial} size={size}
+d=${{t%/*}}
+mkdir -p "$d" || exit 1
+for old in "$d"/.${{t##*/}}.*.part; do [ "$old" = "$p" ] || rm -f "$old"; done
+[ ! -f "$t" ] || [ "$(wc -c <"$t")" -ne $size ] || sha256sum <"$t" | sed 's/^/whole /'
+have=0; [ ! -f "$p" ] || have=$(wc -c <"$p")
+free=$(df -k "$d" 2>/dev/null | awk 'END {{ if (NF > 3) print $(NF - 2) }}')
+[ -z "$free" ] || [ $((free * 1024 + have)) -ge $size ] || {{ echo "full $free"; exit 0; }}
+i=0
+while [ $((i * {chunk})) -lt "$have" ]; do
+	dd if="$p" bs={chunk} skip=$i count=1 2>/dev/null | sha256sum | sed 's/^/chunk /'
+	i=$((i + 1))
+done
+"""
+
+
+def _survey(connection: Connection, path: str, partial: str, content: Content) -> _Survey:
+    script = _SURVEY.format(target=quoted(path), partial=quoted(partial), size=content.size, chunk=CHUNK_BYTES)
+    answer = connection.run(script, timeout_s=_PATIENCE_S * 2).check(f"{connection.endpoint.label}: look at {path}")
+    chunks: list[str] = []
+    for line in answer.stdout.splitlines():
+        match line.split():
+            case ["whole", digest, *_] if digest == content.sha256:
+                return _Survey(True, content.chunks)
+            case ["chunk", digest, *_]:
+                chunks.append(digest)
+            case ["full", free]:
+                raise UploadFailed(
+                    f"{connection.endpoint.label}: {path}: needs {content.size // 1024 + 1} KiB, {free} KiB are free"
+                )
+            case _:
+                continue
+    good = 0
+    while good < min(len(chunks), content.chunks) and chunks[good] == hashlib.sha256(content.chunk(good)).hexdigest():
+        good += 1
+    return _Survey(False, good)
+
+
+# dd with nothing to copy only cuts the file at its seek position: OpenWrt has no truncate.
+_CHUNK = """\
+p={partial}
+dd if=/dev/null of="$p" bs=1 seek={start} 2>/dev/null || exit 1
+cat >>"$p" || exit 1
+tail -c {length} "$p" | sha256sum
+"""
+
+
+def _send_chunk(
+    connection: Connection,
+    partial: str,
+    index: int,
+    data: bytes,
+    rate_bytes_per_s: float | None,
+    sleep: Callable[[float], None],
+) -> bool:
+    script = _CHUNK.format(partial=quoted(partial), start=index * CHUNK_BYTES, length=len(data))
+    slowest = min(SLOWEST_BYTES_PER_S, (rate_bytes_per_s or SLOWEST_BYTES_PER_S) / 2)
+    answer = connection.run(
+        script,
+        stdin=data if rate_bytes_per_s is None else _paced(data, rate_bytes_per_s, sleep),
+        timeout_s=_PATIENCE_S + len(data) / slowest,
+    )
+    if answer.exit_status != 0:
+        raise UploadFailed(f"{connection.endpoint.label}: {partial}: cannot be written: {answer.stderr.strip()}")
+    return answer.stdout.split()[:1] == [hashlib.sha256(data).hexdigest()]
+
+
+def _paced(data: bytes, rate_bytes_per_s: float, sleep: Callable[[float], None]) -> Iterator[bytes]:
+    """`data` in pieces, each followed by the pause its size costs at that rate."""
+    for start in range(0, len(data), _PIECE_BYTES):
+        piece = data[start : start + _PIECE_BYTES]
+        yield piece
+        sleep(len(piece) / rate_bytes_per_s)
+
+
+_FINISH = """\
+p={partial} t={target}
+[ -f "$p" ] || : >"$p"
+[ "$(sha256sum <"$p")" = "{sha256}  -" ] || {{ echo damaged; exit 0; }}
+chmod {mode:o} "$p" && sync && mv -f "$p" "$t" && sync && echo placed
+"""
+
+
+def _put_in_place(connection: Connection, partial: str, path: str, content: Content, mode: int) -> bool:
+    script = _FINISH.format(partial=quoted(partial), target=quoted(path), sha256=content.sha256, mode=mode)
+    answer = connection.run(script, timeout_s=_PATIENCE_S * 2).check(
+        f"{connection.endpoint.label}: put {path} in place"
+    )
+    return answer.stdout.strip() == "placed"
