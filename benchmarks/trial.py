@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.link.laboratory import Count, Laboratory, Link, compiled
-from benchmarks.peers import PEERS
+from benchmarks.peers import peer_called
 
 READY_TIMEOUT_S = 60.0
 # after the sender stops, what is still under way may arrive
@@ -118,7 +118,7 @@ def _while_it_runs(lab: Laboratory, load: Load) -> float | None:
 def _start(lab: Laboratory, host: int, peer: str, role: str, *words: str) -> subprocess.Popen[bytes]:
     """An end in its host, with the congestion control that the comparison says."""
     environ = dict(os.environ)
-    chosen = PEERS[peer].congestion_control
+    chosen = peer_called(peer).congestion_control
     if chosen:
         library = compiled(_CONGESTION_CONTROL, lab.directory, "-shared", "-fPIC")
         environ |= {"LD_PRELOAD": str(library), "BENCHMARK_CONGESTION_CONTROL": chosen}

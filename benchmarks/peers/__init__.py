@@ -48,7 +48,6 @@ PEERS: dict[str, Peer] = {
     for peer in (
         Peer("udp_mesh", "benchmarks.peers.ours", "adaptive"),
         Peer("udp_mesh, window 3", "benchmarks.peers.ours", "3"),
-        Peer("udp_mesh, window 32", "benchmarks.peers.ours", "32"),
         Peer("TCP cubic", "benchmarks.peers.tcp", "cubic"),
         Peer("TCP BBR", "benchmarks.peers.tcp", "bbr"),
         Peer("QUIC (aioquic, cubic)", "benchmarks.peers.quic", "cubic"),
@@ -58,8 +57,14 @@ PEERS: dict[str, Peer] = {
 }
 
 
+def peer_called(name: str) -> Peer:
+    """A peer by its name in the tables; `udp_mesh, window N` is ours with a fixed number in flight."""
+    ours, _, window = name.partition(", window ")
+    return PEERS[name] if name in PEERS else Peer(name, PEERS[ours].module, window)
+
+
 def transport(name: str) -> Transport:
     """The transport of a peer by its name in the tables."""
-    peer = PEERS[name]
+    peer = peer_called(name)
     made: Transport = importlib.import_module(peer.module).transport(peer.variant)
     return made

@@ -1,0 +1,58 @@
+"""Run the comparison: `python -m benchmarks [--quick] [--sets loss,cut] [--results FILE] [--tables]`.
+
+Each finished cell is appended to the results at once; a cell that is there already is not run again, so a run that was
+interrupted is taken up by the same command.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from benchmarks.cells import QUICK, SETS, Cell, cells, measure
+from benchmarks.link.laboratory import laboratory
+from benchmarks.tables import report
+
+RESULTS = Path(__file__).with_name("results") / "transports.jsonl"
+
+
+def finished(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def wanted(arguments: argparse.Namespace) -> list[Cell]:
+    names = arguments.sets.split(",") if arguments.sets else list(QUICK if arguments.quick else SETS)
+    chosen = [cell for name in names for cell in cells(name)]
+    if arguments.quick:
+        chosen = [cell for cell in chosen if cell.name in QUICK.get(cell.set, (cell.name,))]
+    return [cell for cell in chosen if not arguments.peer or cell.peer in arguments.peer]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="a few cells that tell most")
+    parser.add_argument("--sets", default="", help=f"comma-separated, of {', '.join(SETS)}")
+    parser.add_argument("--peer", action="append", default=[], help="only this transport (repeatable)")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--tables", action="store_true", help="only print the tables of what was measured")
+    arguments = parser.parse_args()
+    results = finished(arguments.results)
+    if not arguments.tables:
+        arguments.results.parent.mkdir(parents=True, exist_ok=True)
+        known = {(r["set"], r["peer"], r["name"]) for r in results}
+        todo = [cell for cell in wanted(arguments) if (cell.set, cell.peer, cell.name) not in known]
+        with laboratory(2) as lab:
+            for number, cell in enumerate(todo, 1):
+                print(f"[{number}/{len(todo)}] {cell.set}: {cell.name}: {cell.peer}", file=sys.stderr, flush=True)
+                result = measure(lab, cell)
+                results.append(result)
+                with arguments.results.open("a") as file:
+                    file.write(json.dumps(result) + "\n")
+    print(report(results))
+
+
+if __name__ == "__main__":
+    main()

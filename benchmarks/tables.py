@@ -1,0 +1,69 @@
+"""Results as Markdown: one table per set, then every goal with our figure, met or missed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from benchmarks.goals import judged
+
+_COLUMNS: dict[str, tuple[str, float, str]] = {
+    # figure: heading, factor, format
+    "goodput": ("goodput, Mbit/s", 1e-6, ".2f"),
+    "share": ("of rate x (1 - loss)", 1, ".3f"),
+    "urgent_p50_s": ("urgent p50, ms", 1e3, ".0f"),
+    "urgent_p99_s": ("urgent p99, ms", 1e3, ".0f"),
+    "urgent_arrived": ("urgent arrived", 100, ".0f %"),
+    "wire_ratio": ("wire bytes per byte", 1, ".3f"),
+    "datagrams_per_mb": ("datagrams per MB", 1, ".0f"),
+    "sender_cpu": ("sender, cores", 1, ".3f"),
+    "receiver_cpu": ("receiver, cores", 1, ".3f"),
+    "recovery_fresh_s": ("first fresh urgent after the cut, s", 1, ".2f"),
+    "recovery_any_s": ("first urgent of any age, s", 1, ".2f"),
+    "goodput_after": ("goodput in the next 8 s, Mbit/s", 1e-6, ".2f"),
+    "settled_p50_s": ("settled urgent p50, ms", 1e3, ".0f"),
+    "settled_p99_s": ("settled urgent p99, ms", 1e3, ".0f"),
+}
+
+
+def row(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def shown(figure: str, value: float | None) -> str:
+    if value is None:
+        return "none"
+    _, factor, form = _COLUMNS[figure]
+    form, _, suffix = form.partition(" ")
+    return f"{value * factor:{form}}" + (f" {suffix}" if suffix else "")
+
+
+def table(results: Sequence[Mapping[str, Any]]) -> str:
+    """One set's results, in the order they were run."""
+    figures = [figure for figure in _COLUMNS if any(figure in result for result in results)]
+    lines = [
+        row(["link", "transport", *(_COLUMNS[figure][0] for figure in figures)]),
+        row(["---"] * (2 + len(figures))),
+    ]
+    lines += [
+        row([result["name"], result["peer"], *(shown(figure, result.get(figure)) for figure in figures)])
+        for result in results
+    ]
+    return "\n".join(lines)
+
+
+def report(results: Sequence[Mapping[str, Any]]) -> str:
+    """Everything measured, as one Markdown text."""
+    sets = list(dict.fromkeys(result["set"] for result in results))
+    parts = [f"## {name}\n\n{table([r for r in results if r['set'] == name])}" for name in sets]
+    goals = [row(["set", "link", "figure", "goal", "measured", ""]), row(["---"] * 6)]
+    for goal, value, met in judged(results):
+        heading, factor, _ = _COLUMNS[goal.figure]
+        bound = goal.at_least if goal.at_least is not None else goal.at_most
+        assert bound is not None
+        sign = ">=" if goal.at_least is not None else "<="
+        goals.append(
+            row([goal.set, goal.cell, heading, f"{sign} {bound * factor:g}", shown(goal.figure, value),
+                 "met" if met else "**missed**"])
+        )  # fmt: skip
+    return "\n\n".join([*parts, "## goals\n\n" + "\n".join(goals)]) + "\n"

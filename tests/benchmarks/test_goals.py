@@ -1,0 +1,41 @@
+"""The comparison's bookkeeping: every goal names a cell that is run, and a missed goal is told as missed."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks.cells import OURS, SETS, cells
+from benchmarks.goals import GOALS, judged
+from benchmarks.tables import report
+from benchmarks.trial import percentile
+
+
+def test_every_goal_names_a_cell_of_ours_that_is_run() -> None:
+    known = {(cell.set, cell.name) for name in SETS for cell in cells(name) if cell.peer == OURS}
+    assert {(goal.set, goal.cell) for goal in GOALS} <= known
+
+
+def test_cells_are_named_once() -> None:
+    names = [(cell.set, cell.peer, cell.name) for name in SETS for cell in cells(name)]
+    assert len(names) == len(set(names))
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(0.96, True), (0.94, False), (None, False)])
+def test_a_goal_is_met_only_by_a_figure_that_reaches_it(share: float | None, verdict: bool) -> None:
+    results = [{"set": "loss", "name": "0%", "peer": OURS, "share": share}]
+    verdicts = {goal.figure: met for goal, _, met in judged(results)}
+    assert verdicts["share"] is verdict
+    assert ("**missed**" in report(results)) is True
+
+
+@given(st.lists(st.floats(0, 100), min_size=1), st.sampled_from([0.5, 0.9, 0.99, 1.0]))
+def test_a_percentile_is_the_smallest_value_that_its_share_does_not_exceed(values: list[float], share: float) -> None:
+    ordered = sorted(values)
+    found = percentile(ordered, share)
+    assert found is not None
+    assert sum(value <= found for value in ordered) >= math.ceil(share * len(ordered))
+    assert all(sum(value <= lower for value in ordered) < share * len(ordered) for lower in ordered if lower < found)
