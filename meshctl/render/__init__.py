@@ -1,18 +1,39 @@
 """Intent -> the files of a node, deterministic to the byte, each UCI file parsed back before it leaves."""
 
+from meshctl.render.compare import (
+    FileDifference,
+    NodeChange,
+    NodeDifference,
+    compare_files,
+    compare_fleets,
+    compare_nodes,
+)
+from meshctl.render.imagebuilder import ImageFolder, folder_files, image_folders
 from meshctl.render.node import DeviceFacts, UnknownNode, render, render_fleet, render_node
 from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, RenderedFile
 from meshctl.render.templates import Templates
+from meshctl.render.write import write_folder, write_node
 
 __all__ = [
     "CONFIG_FOLDER",
     "MARKER_PATH",
     "DeviceFacts",
+    "FileDifference",
+    "ImageFolder",
+    "NodeChange",
+    "NodeDifference",
     "Rendered",
     "RenderedFile",
     "Templates",
     "UnknownNode",
+    "compare_files",
+    "compare_fleets",
+    "compare_nodes",
+    "folder_files",
+    "image_folders",
     "render",
     "render_fleet",
     "render_node",
+    "write_folder",
+    "write_node",
 ]

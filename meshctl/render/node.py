@@ -14,7 +14,7 @@ from functools import lru_cache
 from meshctl import uci
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.model import MASK, Fleet, Node, Secret, SecretRef
-from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, RenderedFile
+from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, RenderedFile, replace_secrets
 from meshctl.render.templates import NOT_UCI, TemplateFile, Templates
 from meshctl.resolve import Intent, resolve
 
@@ -72,7 +72,7 @@ def render(intent: Intent, templates: Templates, device_facts: DeviceFacts | Non
     """
     context = {"intent": intent, "device": device_facts or DeviceFacts()}
     files = list(_files(intent, templates, context))
-    config_hash = _config_hash(files, intent.secrets)
+    config_hash = _config_hash(files)
     marker = f"fleet={intent.fleet}\nnode={intent.node}\nconfig={config_hash}\n"
     files.append(RenderedFile(MARKER_PATH, 0o644, marker.encode(), marker))
     return Rendered(
@@ -123,33 +123,21 @@ def _uci_file(intent: Intent, name: str, package: uci.Package, extra: str) -> Re
 
 
 def _file(path: str, text: str, mode: int, secrets: tuple[Secret, ...], package: uci.Package | None) -> RenderedFile:
-    masked = _without(text, secrets, lambda _: MASK)
-    has_secret = masked != text
+    inside = tuple(secret for secret in secrets if replace_secrets(text, (secret,), lambda _: MASK) != text)
+    masked = replace_secrets(text, inside, lambda _: MASK)
     # keys that log in, and keys of the mesh, are root's business alone
-    is_private = has_secret or path.startswith("etc/dropbear/")
-    return RenderedFile(path, mode & 0o700 if is_private else mode, text.encode(), masked, has_secret, package)
+    is_private = bool(inside) or path.startswith("etc/dropbear/")
+    return RenderedFile(path, mode & 0o700 if is_private else mode, text.encode(), masked, inside, package)
 
 
-def _without(text: str, secrets: tuple[Secret, ...], stand_in: Callable[[Secret], str]) -> str:
-    """`text` with every secret replaced, as it is written in UCI and as it is."""
-    # the longest first, so that no secret inside another leaves half of it behind
-    for secret in sorted(secrets, key=lambda secret: -len(secret.reveal())):
-        for form in (uci.quote(secret.reveal())[1:-1], secret.reveal()):
-            text = text.replace(form, stand_in(secret))
-    return text
-
-
-def _config_hash(files: list[RenderedFile], secrets: tuple[Secret, ...]) -> str:
+def _config_hash(files: list[RenderedFile]) -> str:
     """SHA-256 over every file but for what the device brought itself, with each secret replaced by its fingerprint.
 
     The hash is shown to everybody and kept in logs, so it must not let anyone try passwords against it cheaply.
     """
     digest = hashlib.sha256()
     for file in sorted(files, key=lambda file: file.path):
-        text = _without_facts(file)
-        if file.has_secret:
-            text = _without(text, secrets, _fingerprint)
-        content = text.encode()
+        content = replace_secrets(_without_facts(file), file.secrets, _fingerprint).encode()
         digest.update(f"{file.path}\0{file.mode:o}\0{len(content)}\0".encode())
         digest.update(content)
     return digest.hexdigest()

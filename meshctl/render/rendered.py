@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from meshctl import uci
+from meshctl.model import MASK, Secret
 
 # The marker that tells which node's and which configuration a device carries: lines of `key=value`.
 MARKER_PATH = "etc/meshctl/node"
@@ -15,15 +17,29 @@ CONFIG_FOLDER = "etc/config/"
 class RenderedFile:
     """One file: `path` from the device's root without a leading slash, `content` with secrets, `masked` without.
 
-    `package` is the tree of a UCI file (under etc/config), None of any other; `has_secret` files have mode 0600.
+    `package` is the tree of a UCI file (under etc/config), None of any other; `secrets` are those in it: a file with
+    any is open to root alone.
     """
 
     path: str
     mode: int
     content: bytes = field(repr=False)
     masked: str
-    has_secret: bool = False
+    secrets: tuple[Secret, ...] = ()
     package: uci.Package | None = field(default=None, repr=False)
+
+    def hide(self, text: str) -> str:
+        """`text`, for instance a line of a difference, with this file's secrets masked."""
+        return replace_secrets(text, self.secrets, lambda _: MASK)
+
+
+def replace_secrets(text: str, secrets: tuple[Secret, ...], stand_in: Callable[[Secret], str]) -> str:
+    """`text` with every secret replaced, both as it is written in UCI and as it is."""
+    # the longest first, so that no secret inside another leaves half of it behind
+    for secret in sorted(secrets, key=lambda secret: -len(secret.reveal())):
+        for form in (uci.quote(secret.reveal())[1:-1], secret.reveal()):
+            text = text.replace(form, stand_in(secret))
+    return text
 
 
 @dataclass(frozen=True, slots=True)

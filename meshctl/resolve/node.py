@@ -193,6 +193,8 @@ def _refuse(fleet: Fleet, node: Node, intent: Intent, refusals: Refusals) -> Non
     refusals.text(("fleet",), intent.fleet)
     refusals.hostname((*path, "hostname"), intent.hostname)
     refusals.text((*path, "label"), intent.label)
+    for package in intent.extra_uci:
+        refusals.package((*path, "extra_uci", package), package)
     for index, port in enumerate(intent.lan.ports):
         refusals.device((*path, "lan_ports", str(index)), port)
     for radio in intent.radios:

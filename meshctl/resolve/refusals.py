@@ -19,6 +19,7 @@ RECONNECT = "RND004"
 
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _HOSTNAME = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(?<!-)")
+_PACKAGE = re.compile(r"[A-Za-z0-9_-]+")
 _SECTION = re.compile(r"[A-Za-z0-9_]+")
 _MAC = re.compile(r"[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}")
 # IFNAMSIZ is 16 with the terminator; 19.07 joins a bridge's ports with spaces
@@ -62,6 +63,11 @@ class Refusals:
             self.add(VALUE, path, "text without line breaks and control characters", repr(value))
         if is_required and not value:
             self.add(VALUE, path, "a value", "none")
+
+    def package(self, path: tuple[str, ...], value: str) -> None:
+        """The name of a UCI package, which is the name of a file."""
+        if not _PACKAGE.fullmatch(value):
+            self.add(VALUE, path, "a UCI package's name of letters, digits, _ and -", repr(value))
 
     def section(self, path: tuple[str, ...], value: str) -> None:
         """The name of a UCI section."""

@@ -1,0 +1,135 @@
+"""Two fleets -> what changes on which node: rendered, compared tree by tree, secrets masked.
+
+Comparing needs no secret: each is stood in for by a text made from its reference, so a key that is looked for somewhere
+else shows as changed, and a key whose value changed in its store does not.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+
+from meshctl import uci
+from meshctl.model import Fleet, Secret, SecretRef
+from meshctl.render.node import render_fleet
+from meshctl.render.rendered import MARKER_PATH, Rendered, RenderedFile
+
+
+class NodeChange(Enum):
+    ADDED = "added"
+    REMOVED = "removed"
+    CHANGED = "changed"
+
+
+@dataclass(frozen=True, slots=True)
+class FileDifference:
+    """One file that differs; `lines` are for people and hold no secret."""
+
+    path: str
+    change: NodeChange
+    lines: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class NodeDifference:
+    """One node that differs; the package lists name what its image gains and loses."""
+
+    node: str
+    change: NodeChange
+    release: tuple[str, str]
+    files: tuple[FileDifference, ...] = ()
+    packages_added: tuple[str, ...] = ()
+    packages_removed: tuple[str, ...] = ()
+
+
+def compare_fleets(before: Fleet, after: Fleet) -> Iterator[NodeDifference]:
+    """The nodes that differ: those of `before` in its order, then new ones. Raises InvalidInput from rendering."""
+    old = {item.node: item for item in render_fleet(before, stand_in)}
+    new = {item.node: item for item in render_fleet(after, stand_in)}
+    for name in dict.fromkeys((*old, *new)):
+        difference = compare_nodes(old.get(name), new.get(name))
+        if difference is not None:
+            yield difference
+
+
+def stand_in(ref: SecretRef) -> Secret:
+    """A text that stands for a secret: as long as the longest key, of the letters that every kind of key may have."""
+    return Secret(hashlib.sha256(str(ref).encode()).hexdigest())
+
+
+def compare_nodes(old: Rendered | None, new: Rendered | None) -> NodeDifference | None:
+    """What differs between two renderings of a node; None on one side means that it is new or gone."""
+    if old is None or new is None:
+        present = new or old
+        if present is None:
+            return None
+        change = NodeChange.ADDED if old is None else NodeChange.REMOVED
+        release = ("", present.release) if old is None else (present.release, "")
+        return NodeDifference(present.node, change, release)
+    files = tuple(_files(old, new))
+    added = _packages(new) - _packages(old)
+    removed = _packages(old) - _packages(new)
+    if not files and not added and not removed and old.release == new.release:
+        return None
+    return NodeDifference(
+        node=new.node,
+        change=NodeChange.CHANGED,
+        release=(old.release, new.release),
+        files=files,
+        packages_added=tuple(sorted(added)),
+        packages_removed=tuple(sorted(removed)),
+    )
+
+
+def _packages(rendered: Rendered) -> frozenset[str]:
+    return frozenset((*rendered.packages, *(f"-{name}" for name in rendered.removed_packages)))
+
+
+def _files(old: Rendered, new: Rendered) -> Iterator[FileDifference]:
+    before = {file.path: file for file in old.files}
+    after = {file.path: file for file in new.files}
+    for path in sorted(before.keys() | after.keys()):
+        # the marker changes exactly when something else does
+        if path == MARKER_PATH:
+            continue
+        left, right = before.get(path), after.get(path)
+        if left is None or right is None:
+            change = NodeChange.ADDED if left is None else NodeChange.REMOVED
+            yield FileDifference(path, change, tuple(compare_files(left, right)))
+        elif (left.content, left.mode) != (right.content, right.mode):
+            yield FileDifference(path, NodeChange.CHANGED, tuple(compare_files(left, right)))
+
+
+def compare_files(old: RenderedFile | None, new: RenderedFile | None) -> Iterator[str]:
+    """The difference of two versions of a file in lines for people, without a secret."""
+    if old is not None and new is not None and old.mode != new.mode:
+        yield f"mode {old.mode:04o} -> {new.mode:04o}"
+    left, right = _package(old, new), _package(new, old)
+    if left is not None and right is not None:
+        yield from (_hidden(line, old, new) for line in uci.diff(left, right).lines())
+        return
+    old_text, new_text = (file.masked if file is not None else "" for file in (old, new))
+    if old is not None and new is not None and old_text == new_text and old.content != new.content:
+        yield "~ a secret in it"
+    lines = difflib.unified_diff(old_text.splitlines(), new_text.splitlines(), lineterm="", n=1)
+    # the first two lines only repeat the file's name
+    yield from list(lines)[2:]
+
+
+def _hidden(line: str, *files: RenderedFile | None) -> str:
+    """The line with the secrets of both versions masked, in options of any name."""
+    for file in files:
+        line = file.hide(line) if file is not None else line
+    return line
+
+
+def _package(file: RenderedFile | None, other: RenderedFile | None) -> uci.Package | None:
+    """The file's tree; an empty one when only the other side is UCI."""
+    if file is not None:
+        return file.package
+    if other is not None and other.package is not None:
+        return uci.Package(other.package.name)
+    return None

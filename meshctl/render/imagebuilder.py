@@ -1,0 +1,112 @@
+"""What OpenWrt's ImageBuilder needs to bake nodes' configurations and packages into images.
+
+Per hardware and release one folder: `files/NODE/` overlays, `packages.txt`, and `build.sh` with the exact `make image`
+call of every node, to be run inside the unpacked ImageBuilder. Nodes in the field have no internet, so the packages go
+into the image.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from meshctl.model import Fleet, HardwareProfile, Node, Release
+from meshctl.render.rendered import Rendered, RenderedFile
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFolder:
+    """One folder for the ImageBuilder of `release` and the hardware's target; `overlays` are by node."""
+
+    name: str
+    hardware: HardwareProfile
+    release: Release
+    overlays: tuple[Rendered, ...]
+    package_files: tuple[Path, ...]
+
+    @property
+    def packages_text(self) -> str:
+        """Every package that any of the nodes wants, and with `-` in front those that it removes, one a line."""
+        wanted = sorted({name for node in self.overlays for name in node.packages})
+        removed = sorted({f"-{name}" for node in self.overlays for name in node.removed_packages})
+        return "".join(f"{name}\n" for name in (*wanted, *removed))
+
+    @property
+    def script(self) -> str:
+        """The shell script with the call of every node."""
+        return "".join(f"{line}\n" for line in (*_HEAD, *self._about(), *_SETUP, *self._copies(), *self._calls()))
+
+    def make_call(self, rendered: Rendered) -> str:
+        """`make image` for one node, as it stands in the script."""
+        packages = " ".join((*rendered.packages, *(f"-{name}" for name in rendered.removed_packages)))
+        return (
+            f"make image PROFILE={shlex.quote(self.hardware.profile)} PACKAGES={shlex.quote(packages)}"
+            f' FILES="$here"/files/{shlex.quote(rendered.node)} EXTRA_IMAGE_NAME={shlex.quote(rendered.node)}'
+        )
+
+    def _about(self) -> tuple[str, ...]:
+        return (f"# Builds for {self.hardware.board} with the ImageBuilder of {self.release}, {self.hardware.target}.",)
+
+    def _copies(self) -> tuple[str, ...]:
+        return tuple(f"cp {shlex.quote(str(path))} packages/" for path in self.package_files)
+
+    def _calls(self) -> tuple[str, ...]:
+        return tuple(f"wanted {shlex.quote(node.node)} && {self.make_call(node)}" for node in self.overlays)
+
+
+_HEAD = ("#!/bin/sh",)
+_SETUP = (
+    "# Run it in the unpacked ImageBuilder; name nodes to build only theirs. The images carry keys: keep them private.",
+    "set -eu",
+    'here=$(CDPATH="" cd -- "$(dirname -- "$0")" && pwd)',
+    'names=" $* "',
+    'wanted() { case "$names" in "  " | *" $1 "*) return 0 ;; esac; return 1; }',
+    "umask 077",
+)
+
+
+def image_folders(fleet: Fleet, rendered: Iterable[Rendered]) -> tuple[ImageFolder, ...]:
+    """The nodes grouped by hardware and release, in the inventory's order."""
+    groups: dict[tuple[str, Release], list[Rendered]] = {}
+    for item in rendered:
+        node = fleet.nodes[item.node]
+        groups.setdefault((node.hardware.name, node.release), []).append(item)
+    return tuple(
+        ImageFolder(
+            name=f"{name}-{release}",
+            hardware=fleet.nodes[items[0].node].hardware,
+            release=release,
+            overlays=tuple(items),
+            package_files=_package_files(fleet, [fleet.nodes[item.node] for item in items]),
+        )
+        for (name, release), items in groups.items()
+    )
+
+
+def _package_files(fleet: Fleet, nodes: list[Node]) -> tuple[Path, ...]:
+    """Package files of the hardware and of the nodes' back ends, as absolute paths, each once."""
+    found: dict[Path, None] = {}
+    for node in nodes:
+        found.update(dict.fromkeys(_absolute(fleet.base, path) for path in node.hardware.package_files))
+        for name in node.meshes:
+            parts = fleet.meshes[name].operator_parts
+            found.update(dict.fromkeys(_absolute(parts.base or fleet.base, path) for path in parts.package_files))
+    return tuple(found)
+
+
+def _absolute(base: str, path: str) -> Path:
+    return (Path(base) / path).resolve()
+
+
+def folder_files(folder: ImageFolder) -> tuple[RenderedFile, ...]:
+    """Everything of the folder as files, the overlays below `files/NODE/`."""
+    files = [
+        RenderedFile(f"files/{node.node}/{file.path}", file.mode, file.content, file.masked, file.secrets)
+        for node in folder.overlays
+        for file in node.files
+    ]
+    files.append(RenderedFile("packages.txt", 0o644, folder.packages_text.encode(), folder.packages_text))
+    files.append(RenderedFile("build.sh", 0o755, folder.script.encode(), folder.script))
+    return tuple(files)

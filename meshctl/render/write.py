@@ -1,0 +1,93 @@
+"""A node's files onto the disk: all of them or none, with their modes, and no secret where others can read it.
+
+A folder is written beside its place and then put there in one rename, so what stands there is always one whole
+rendering and nothing else. A folder that meshctl did not write is never replaced.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+from meshctl.errors import InputError
+from meshctl.render.rendered import MARKER_PATH, Rendered, RenderedFile
+
+
+def write_node(rendered: Rendered, out: Path) -> Path:
+    """Write the node's files to `out/NODE/`, exactly them, and return that folder.
+
+    Raises InputError when the place cannot be written, is not ours to replace, or cannot keep a secret.
+    """
+    return write_folder(rendered.files, out / rendered.node)
+
+
+def write_folder(files: Iterable[RenderedFile], place: Path) -> Path:
+    """Put the files, and nothing else, at `place`. Raises InputError as `write_node` does."""
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        _refuse_foreign(place)
+        fresh = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
+        try:
+            for file in files:
+                _write(file, fresh)
+            fresh.chmod(0o700)
+            _swap(fresh, place)
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
+    except OSError as error:
+        raise InputError(f"{place}: cannot be written: {error.strerror or error}") from error
+    return place
+
+
+def _refuse_foreign(place: Path) -> None:
+    if place.is_symlink() or (place.exists() and not place.is_dir()):
+        raise InputError(f"{place}: expected a folder or nothing, found something else")
+    if place.is_dir() and any(place.iterdir()) and not (place / MARKER_PATH).is_file():
+        raise InputError(
+            f"{place}: expected a folder that meshctl rendered, found one without {MARKER_PATH}",
+            hint="choose another --out, or remove the folder yourself",
+        )
+    others_may_write = place.parent.stat().st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    is_sticky = place.parent.stat().st_mode & stat.S_ISVTX
+    if others_may_write and not is_sticky:
+        raise InputError(
+            f"{place.parent}: others may write here, and could exchange a node's files",
+            hint=f"chmod go-w {place.parent}, or choose another --out",
+        )
+
+
+def _write(file: RenderedFile, root: Path) -> None:
+    path = root / file.path
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    # closed to others from its first moment, whatever the umask
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+    with os.fdopen(handle, "wb") as stream:
+        os.fchmod(stream.fileno(), file.mode)
+        mode = stat.S_IMODE(os.fstat(stream.fileno()).st_mode)
+        if file.secrets and mode & 0o077:
+            raise InputError(
+                f"{path}: expected a file system that keeps a secret (mode {file.mode:04o}), found mode {mode:04o}",
+                hint="choose an --out on a file system with permissions",
+            )
+        stream.write(file.content)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _swap(fresh: Path, place: Path) -> None:
+    if not place.exists():
+        fresh.rename(place)
+        return
+    old = Path(tempfile.mkdtemp(prefix=f".{place.name}.old.", dir=place.parent))
+    try:
+        place.rename(old / place.name)
+        fresh.rename(place)
+    finally:
+        if not place.exists():
+            # the second rename failed: put back what stood there
+            (old / place.name).rename(place)
+        shutil.rmtree(old, ignore_errors=True)
