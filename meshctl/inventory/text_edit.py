@@ -1,0 +1,161 @@
+"""Text + tree -> text with one value set or removed, everything else left as it stands.
+
+These functions only place characters; whether the result says what was meant is checked by reading it again
+(`edit.Editor`), so an unusual layout leads to a refusal and never to a wrong file.
+"""
+
+from __future__ import annotations
+
+from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree
+from meshctl.inventory.yaml_text import Value, block, flow, line
+
+# Indentation of new blocks in a file that shows none.
+_STEP = 2
+
+
+def replace_value(text: str, old: Tree, value: Value, key: Scalar | None) -> str:
+    """`old` replaced in place, in flow style. `key` is the key it stands under, None in a list."""
+    end = content_end(text, old)
+    if isinstance(old, Scalar) or old.is_flow:
+        space = "" if old.start == 0 or text[old.start - 1] in " \n" else " "
+        return f"{text[: old.start]}{space}{flow(value)}{text[max(end, old.start) :]}"
+    if key is None:
+        return f"{text[: old.start]}{flow(value)}{text[end:]}"
+    # A block stands below its key: the new value joins the key's line, before a comment there.
+    colon = text.index(":", key.end) + 1
+    return f"{text[:colon]} {flow(value)}{text[colon : _line_end(text, colon)]}{text[end:]}"
+
+
+def insert_entry(text: str, mapping: MappingNode, key: str, value: Value, *, after: str = "") -> str:
+    """A new entry at the end of `mapping`, or behind its entry `after`, in the style of the entry before it."""
+    if mapping.is_flow:
+        return _insert_into_flow(text, mapping, key, value)
+    newline = _newline(text)
+    last = after if after in mapping.keys else next(reversed(mapping.keys))
+    indent = mapping.keys[last].column - 1
+    end = _line_end(text, max(content_end(text, mapping.values[last]), mapping.keys[last].end))
+    neighbour = mapping.values[last]
+    is_line = isinstance(neighbour, MappingNode) and neighbour.is_flow
+    entry = line(key, value, indent) if is_line else block(key, value, indent, _STEP, newline)
+    gap = newline if isinstance(neighbour, MappingNode) and not is_line and _has_gaps(text, mapping) else ""
+    return f"{text[:end]}{newline}{gap}{entry}{text[end:]}"
+
+
+def fill_empty(text: str, old: Tree, indent: int, key: str, value: Value) -> str:
+    """`section:` or `section: {}` given its first entry, `indent` columns in."""
+    if isinstance(old, MappingNode) and old.is_flow:
+        return _insert_into_flow(text, old, key, value)
+    newline = _newline(text)
+    start, end = old.start, _line_end(text, old.end)
+    kept = text[old.end : end]
+    return f"{text[:start].rstrip(' ')}{kept}{newline}{block(key, value, indent, _STEP, newline)}{text[end:]}"
+
+
+def append_section(text: str, section: str, key: str, value: Value) -> str:
+    """A new section at the end of the file, holding one entry."""
+    newline = _newline(text)
+    entry = block(key, value, _STEP, _STEP, newline)
+    return f"{text.rstrip()}{newline}{newline}{section}:{newline}{entry}{newline}"
+
+
+def append_value(text: str, key: str, value: Value) -> str:
+    """A new key at the end of the file."""
+    newline = _newline(text)
+    return f"{text.rstrip()}{newline}{newline}{block(key, value, 0, _STEP, newline)}{newline}"
+
+
+def remove_entry(text: str, mapping: MappingNode, key: str) -> str:
+    """`mapping` without `key`; comments above the entry stay. The last entry leaves `{}`."""
+    written, value = mapping.keys[key], mapping.values[key]
+    end = max(content_end(text, value), written.end)
+    if mapping.is_flow:
+        return _remove_from_flow(text, mapping, written, end)
+    if len(mapping.keys) == 1:
+        return _empty(text, mapping, written, end)
+    start = text.rfind("\n", 0, written.start) + 1
+    stop = _line_end(text, end)
+    if stop < len(text):
+        stop += len(_newline(text)) if text.startswith(_newline(text), stop) else 1
+    if _is_blank_before(text, start) and _is_blank_at(text, stop):
+        start = text.rfind("\n", 0, start - 1) + 1
+    return text[:start] + text[stop:]
+
+
+def content_end(text: str, tree: Tree) -> int:
+    """Where the last character of a value stands; a block's own mark lies beyond comments and blank lines."""
+    while isinstance(tree, MappingNode | SequenceNode) and not tree.is_flow:
+        if isinstance(tree, MappingNode):
+            key = next(reversed(tree.keys))
+            below = tree.values[key]
+            if isinstance(below, Scalar) and below.start == below.end:
+                return text.index(":", tree.keys[key].end) + 1
+            tree = below
+        else:
+            tree = tree.items[-1]
+    return len(text[: tree.end].rstrip()) if text[tree.start : tree.end].strip() else tree.end
+
+
+def _insert_into_flow(text: str, mapping: MappingNode, key: str, value: Value) -> str:
+    entry = flow({key: value})[1:-1]
+    if not mapping.keys:
+        return f"{text[: mapping.start + 1]}{entry}{text[mapping.start + 1 :]}"
+    last = next(reversed(mapping.keys))
+    end = max(content_end(text, mapping.values[last]), mapping.keys[last].end)
+    return f"{text[:end]}, {entry}{text[end:]}"
+
+
+def _remove_from_flow(text: str, mapping: MappingNode, written: Scalar, end: int) -> str:
+    start = written.start
+    rest = text[end : mapping.end - 1]
+    if rest.lstrip().startswith(","):
+        stop = end + rest.index(",") + 1
+        stop += len(text[stop : mapping.end - 1]) - len(text[stop : mapping.end - 1].lstrip(" "))
+        return text[:start] + text[stop:]
+    before = text[mapping.start + 1 : start].rstrip()
+    if before.endswith(","):
+        start = mapping.start + len(before)
+    return text[:start] + text[end:]
+
+
+def _empty(text: str, mapping: MappingNode, written: Scalar, end: int) -> str:
+    """A block mapping whose only entry goes: `{}` behind the colon of the line above that has one."""
+    colon = text.rfind(":", 0, text.rfind("\n", 0, written.start) + 1) + 1
+    return f"{text[:colon]} {{}}{text[colon : _line_end(text, colon)]}{text[_line_end(text, end) :]}"
+
+
+def _has_gaps(text: str, mapping: MappingNode) -> bool:
+    """Whether the entries are set apart by blank lines."""
+    starts = [key.start for key in mapping.keys.values()]
+    return len(starts) > 1 and any(_is_blank_before(text, _block_start(text, start)) for start in starts[1:])
+
+
+def _block_start(text: str, start: int) -> int:
+    """The line of `start`, or the first of the comment lines right above it."""
+    begin = text.rfind("\n", 0, start) + 1
+    while begin:
+        above = text.rfind("\n", 0, begin - 1) + 1
+        if not text[above:begin].lstrip().startswith("#"):
+            break
+        begin = above
+    return begin
+
+
+def _is_blank_before(text: str, start: int) -> bool:
+    above = text.rfind("\n", 0, max(start - 1, 0)) + 1
+    return start > 0 and not text[above:start].strip()
+
+
+def _is_blank_at(text: str, start: int) -> bool:
+    return not text[start : _line_end(text, start)].strip()
+
+
+def _line_end(text: str, at: int) -> int:
+    """The offset of the line's end, before the newline."""
+    end = text.find("\n", at)
+    if end < 0:
+        return len(text)
+    return end - 1 if text[end - 1] == "\r" and end > at else end
+
+
+def _newline(text: str) -> str:
+    return "\r\n" if "\r\n" in text else "\n"
