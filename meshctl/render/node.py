@@ -14,6 +14,7 @@ from functools import lru_cache
 from meshctl import uci
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.model import MASK, Fleet, Node, Secret, SecretRef
+from meshctl.render.extra import with_extra
 from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, RenderedFile, replace_secrets
 from meshctl.render.templates import NOT_UCI, TemplateFile, Templates
 from meshctl.resolve import Intent, resolve
@@ -86,16 +87,16 @@ def render(intent: Intent, templates: Templates, device_facts: DeviceFacts | Non
 
 
 def _files(intent: Intent, templates: Templates, context: Mapping[str, object]) -> Iterator[RenderedFile]:
-    rest = dict(intent.extra_uci)
+    packages: dict[str, uci.Package] = {}
     for file in templates.files(intent.backend, intent.operator_parts):
         text = templates.text(file, intent.backend, intent.operator_parts, context)
         if file.is_uci:
-            name = file.path.removeprefix(CONFIG_FOLDER)
-            yield _uci_file(intent, name, _parsed(file, text), rest.pop(name, ""))
+            package = _parsed(file, text)
+            packages[package.name] = package
         else:
             yield _file(file.path, text, 0o755 if file.is_executable else 0o644, intent.secrets, None)
-    for name, extra in rest.items():
-        yield _uci_file(intent, name, uci.Package(name), extra)
+    for name, package in with_extra(packages, intent).items():
+        yield _file(CONFIG_FOLDER + name, uci.dump(package), 0o644, intent.secrets, package)
 
 
 def _parsed(file: TemplateFile, text: str) -> uci.Package:
@@ -106,20 +107,6 @@ def _parsed(file: TemplateFile, text: str) -> uci.Package:
         place = Position(str(file.source))
         message = f"the rendered text is no UCI: {error}"
         raise InvalidInput([Diagnostic(NOT_UCI, Severity.ERROR, place, message)]) from error
-
-
-def _uci_file(intent: Intent, name: str, package: uci.Package, extra: str) -> RenderedFile:
-    """The package with the inventory's own text behind it; sections of the same name are continued."""
-    if extra:
-        place = intent.extra_positions.get(name, intent.position)
-        try:
-            # on its own first, so that it cannot continue the last section of the template
-            uci.parse(extra, name)
-            package = uci.parse(uci.dump(package) + extra, name)
-        except InvalidInput as error:
-            message = f"extra_uci.{name} is no UCI: {error}"
-            raise InvalidInput([Diagnostic(NOT_UCI, Severity.ERROR, place, message)]) from error
-    return _file(CONFIG_FOLDER + name, uci.dump(package), 0o644, intent.secrets, package)
 
 
 def _file(path: str, text: str, mode: int, secrets: tuple[Secret, ...], package: uci.Package | None) -> RenderedFile:

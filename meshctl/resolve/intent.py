@@ -94,8 +94,8 @@ class Login:
 
 @dataclass(frozen=True, slots=True)
 class Intent:
-    """One node, written at `position`. `extra_uci` holds UCI text per package, which is appended to what the templates
-    give; `extra_positions` tells where it was written."""
+    """One node, written at `position`. `extra_uci` holds options by their full names (`wireless.radio0.rts`), set
+    on top of what the templates give; `extra_positions` tells where each was written."""
 
     fleet: str
     node: str

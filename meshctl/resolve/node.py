@@ -12,11 +12,12 @@ from collections.abc import Callable
 from ipaddress import IPv4Network
 
 from meshctl.diagnostics import InvalidInput
+from meshctl.errors import InputError
 from meshctl.model import Backend, Encryption, Fleet, Mesh, Node, OperatorParts, Radio, Secret, SecretRef
 from meshctl.resolve.intent import BatmanInterface, Intent, Lan, Login, MeshInterface, RadioIntent
 from meshctl.resolve.intervals import Intervals, UnreachableTarget, batman_intervals
 from meshctl.resolve.packages import package_plan
-from meshctl.resolve.refusals import COMBINATION, RECONNECT, Refusals
+from meshctl.resolve.refusals import COMBINATION, RECONNECT, SECRET, Refusals
 
 BRIDGE = "br-lan"
 
@@ -57,7 +58,7 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
         packages=plan.install,
         removed_packages=plan.remove,
         extra_uci=node.extra_uci,
-        extra_positions={name: refusals.position("nodes", node.name, "extra_uci", name) for name in node.extra_uci},
+        extra_positions={key: refusals.position("nodes", node.name, "extra_uci", key) for key in node.extra_uci},
         position=refusals.position("nodes", node.name),
     )
     _refuse(fleet, node, intent, refusals)
@@ -79,8 +80,12 @@ def _keys(
     for mesh in meshes:
         refusals.mesh(mesh, node.release)
         if mesh.encryption is not Encryption.NONE and mesh.key is not None:
-            keys[mesh.name] = secrets(mesh.key)
-            refusals.key(mesh, keys[mesh.name], node.release)
+            try:
+                keys[mesh.name] = secrets(mesh.key)
+            except InputError as error:
+                refusals.add(SECRET, ("meshes", mesh.name, "key"), "", "", message=str(error), hint=error.hint)
+            else:
+                refusals.key(mesh, keys[mesh.name], node.release)
     return keys
 
 
@@ -193,8 +198,9 @@ def _refuse(fleet: Fleet, node: Node, intent: Intent, refusals: Refusals) -> Non
     refusals.text(("fleet",), intent.fleet)
     refusals.hostname((*path, "hostname"), intent.hostname)
     refusals.text((*path, "label"), intent.label)
-    for package in intent.extra_uci:
-        refusals.package((*path, "extra_uci", package), package)
+    for key, value in intent.extra_uci.items():
+        refusals.uci_key((*path, "extra_uci", key), key)
+        refusals.text((*path, "extra_uci", key), value)
     for index, port in enumerate(intent.lan.ports):
         refusals.device((*path, "lan_ports", str(index)), port)
     for radio in intent.radios:

@@ -16,10 +16,12 @@ VALUE = "RND001"
 COMBINATION = "RND002"
 LOCKED_OUT = "RND003"
 RECONNECT = "RND004"
+SECRET = "RND005"
 
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _HOSTNAME = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(?<!-)")
-_PACKAGE = re.compile(r"[A-Za-z0-9_-]+")
+# the package's name is the name of a file; a section may be addressed as `@TYPE[INDEX]`
+_UCI_KEY = re.compile(r"[A-Za-z0-9_-]+\.([A-Za-z0-9_]+|@[A-Za-z0-9_-]+\[\d+\])(\.[A-Za-z0-9_]+)?")
 _SECTION = re.compile(r"[A-Za-z0-9_]+")
 _MAC = re.compile(r"[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}")
 # IFNAMSIZ is 16 with the terminator; 19.07 joins a bridge's ports with spaces
@@ -64,10 +66,10 @@ class Refusals:
         if is_required and not value:
             self.add(VALUE, path, "a value", "none")
 
-    def package(self, path: tuple[str, ...], value: str) -> None:
-        """The name of a UCI package, which is the name of a file."""
-        if not _PACKAGE.fullmatch(value):
-            self.add(VALUE, path, "a UCI package's name of letters, digits, _ and -", repr(value))
+    def uci_key(self, path: tuple[str, ...], value: str) -> None:
+        """The full name of a UCI section or option."""
+        if not _UCI_KEY.fullmatch(value):
+            self.add(VALUE, path, "PACKAGE.SECTION.OPTION or PACKAGE.SECTION", repr(value))
 
     def section(self, path: tuple[str, ...], value: str) -> None:
         """The name of a UCI section."""

@@ -1,0 +1,56 @@
+"""The inventory's own options on top of what the templates give: `network.lan.mtu: "1400"`.
+
+A key of two parts makes a section, with its type as the value (`network.switch0: switch`), a key of three sets an
+option, an empty value removes it: what `uci set` means by the same words. Sections are made before options are set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from meshctl.diagnostics import Diagnostic, InvalidInput, Severity
+from meshctl.resolve import Intent
+from meshctl.uci import Package, Section
+
+# The code of what cannot be set (docs/render.md).
+EXTRA = "RND013"
+
+
+def with_extra(packages: Mapping[str, Package], intent: Intent) -> dict[str, Package]:
+    """The packages with `intent.extra_uci` applied, new ones last. Raises InvalidInput with every key that fails."""
+    result = dict(packages)
+    failed: list[Diagnostic] = []
+    for key, value in sorted(intent.extra_uci.items(), key=lambda item: item[0].count(".")):
+        name, _, rest = key.partition(".")
+        package = result.get(name, Package(name))
+        section, _, option = rest.partition(".")
+        try:
+            result[name] = _set_option(package, section, option, value) if option else _make(package, section, value)
+        except ValueError as error:
+            place = intent.extra_positions.get(key, intent.position)
+            failed.append(Diagnostic(EXTRA, Severity.ERROR, place, f"cannot be set: {error}", f"extra_uci.{key}"))
+    if failed:
+        raise InvalidInput(failed)
+    return result
+
+
+def _make(package: Package, name: str, type_name: str) -> Package:
+    known = package.section(name)
+    if known is None:
+        return Package(package.name, (*package.sections, Section(type_name, name)))
+    if known.type != type_name:
+        raise ValueError(f"expected a section of type {known.type!r} as rendered, found {type_name!r}")
+    return package
+
+
+def _set_option(package: Package, key: str, option: str, value: str) -> Package:
+    keys = package.keys()
+    if key not in keys:
+        raise ValueError(f"expected a section of {package.name} ({', '.join(keys) or 'it has none'}), found {key!r}")
+    index = keys.index(key)
+    old = package.sections[index]
+    options = {name: before for name, before in old.options.items() if name != option or value}
+    if value:
+        options[option] = value
+    sections = (*package.sections[:index], Section(old.type, old.name, options), *package.sections[index + 1 :])
+    return Package(package.name, sections)
