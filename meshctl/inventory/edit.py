@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from difflib import unified_diff
+from itertools import takewhile
 from pathlib import Path
 from types import MappingProxyType
 
@@ -112,13 +113,17 @@ class Editor:
         """Whether a file writes `path`."""
         return any(descend(self._roots[file], path) is not None for file in self._texts)
 
-    def range_of(self, node: str) -> str:
-        """The range under `nodes` that makes `node`, or the empty text."""
+    def sibling_of(self, node: str) -> str:
+        """The entry that `node`'s own belongs behind: the range that makes it, or the last of its nodes' own entries
+        right below the range; the empty text when no range makes it."""
         for file in self._texts:
             nodes = self._roots[file].values.get("nodes")
-            for pattern in nodes.keys if isinstance(nodes, MappingNode) else ():
-                if is_range(pattern) and node in _names(pattern):
-                    return pattern
+            patterns = list(nodes.keys) if isinstance(nodes, MappingNode) else []
+            for number, pattern in enumerate(patterns):
+                names = set(_names(pattern)) if is_range(pattern) else set()
+                if node in names:
+                    own = takewhile(names.__contains__, patterns[number + 1 :])
+                    return [pattern, *own][-1]
         return ""
 
     def _read(self, path: Path) -> bytes:
@@ -177,7 +182,7 @@ class Editor:
 def set_node(editor: Editor, node: str, values: Mapping[str, Value]) -> None:
     """Write values at one node. A node that a range makes gets an entry of its own, behind the range."""
     if not editor.has(("nodes", node)):
-        editor.set(("nodes", node), dict(values), after=editor.range_of(node))
+        editor.set(("nodes", node), dict(values), after=editor.sibling_of(node))
         return
     for key, value in values.items():
         editor.set(("nodes", node, key), value)

@@ -76,8 +76,9 @@ def remove_entry(text: str, mapping: MappingNode, key: str) -> str:
     stop = _line_end(text, end)
     if stop < len(text):
         stop += len(_newline(text)) if text.startswith(_newline(text), stop) else 1
-    if _is_blank_before(text, start) and _is_blank_at(text, stop):
-        start = text.rfind("\n", 0, start - 1) + 1
+    is_first = next(iter(mapping.keys)) == key
+    if _is_blank_at(text, stop) and stop < len(text) and (is_first or _is_blank_before(text, start)):
+        stop = text.index("\n", stop) + 1
     return text[:start] + text[stop:]
 
 

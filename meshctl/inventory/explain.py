@@ -1,0 +1,88 @@
+"""A node's values, each with the layer and the line it comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from meshctl.model import Fleet, Node, Origin, Radio
+
+
+@dataclass(frozen=True, slots=True)
+class Why:
+    """`key` is the place below the node (`radios.radio0.mesh`); `value` is text for people."""
+
+    key: str
+    value: str
+    origin: Origin
+
+
+def explain(fleet: Fleet, node: Node) -> tuple[Why, ...]:
+    """Everything that holds for `node`, in the order of the format. A value that nobody wrote is `built-in`, at the
+    place of what encloses it."""
+    return tuple(Why(key, value, _origin(fleet, node, key)) for key, value in _values(node))
+
+
+def _values(node: Node) -> Iterator[tuple[str, str]]:
+    yield "role", node.role.value
+    yield "state", node.state.value
+    yield "hardware", node.hardware.name
+    yield "board", node.hardware.board
+    yield "release", str(node.release)
+    yield "hostname", node.hostname
+    yield "address", str(node.address)
+    for radio in node.radios:
+        for key, value in _radio_values(radio):
+            yield f"radios.{radio.name}.{key}", value
+    yield "lan_ports", _listed(node.lan_ports)
+    yield "ssh.host", node.ssh.host
+    yield "ssh.port", str(node.ssh.port)
+    yield "ssh.user", node.ssh.user
+    yield "ssh.key_files", _listed(node.ssh.key_files)
+    yield "ssh.jump", node.ssh.jump
+    yield "groups", _listed(node.groups)
+    yield "robot", node.robot
+    yield "label", node.label
+    yield "serial", node.serial
+    yield "mac", node.mac
+    yield "host_keys", _listed(node.host_keys)
+    yield "confirm_window_s", str(node.confirm_window_s)
+    yield "packages", _listed((*node.hardware.packages, *node.packages))
+    for option, value in node.extra_uci.items():
+        yield f"extra_uci.{option}", value
+    yield "gateway", "" if node.gateway is None else str(node.gateway)
+
+
+def _radio_values(radio: Radio) -> Iterator[tuple[str, str]]:
+    yield "mesh", radio.mesh or "(off)"
+    yield "tx_power_dbm", str(radio.tx_power_dbm)
+    yield "mac", radio.mac
+    yield "path", radio.hardware.path
+    yield "band", radio.hardware.band.value
+    yield "rated_power_dbm", f"{radio.hardware.rated_power_dbm:g}"
+    yield "max_drive_dbm", str(radio.hardware.max_drive_dbm)
+    yield "amplifier_gain_db", f"{radio.hardware.amplifier_gain_db:g}"
+    yield "antenna_gain_dbi", f"{radio.hardware.antenna_gain_dbi:g}"
+    yield "cable_loss_db", f"{radio.hardware.cable_loss_db:g}"
+    yield "antenna", radio.hardware.antenna.value
+
+
+def _origin(fleet: Fleet, node: Node, key: str) -> Origin:
+    # Names of UCI options hold dots of their own.
+    parts = ("extra_uci", key.removeprefix("extra_uci.")) if key.startswith("extra_uci.") else tuple(key.split("."))
+    for path in (("nodes", node.name, *parts), ("hardware", node.hardware.name, *parts)):
+        written = fleet.origins.get(path)
+        if written is not None:
+            return written
+    if parts[0] == "radios":
+        place = fleet.where("hardware", node.hardware.name, *parts[:2])
+        # The drive level defaults to the most that the driver offers, the mesh to the only one of the band.
+        source = {"tx_power_dbm": "max_drive_dbm", "mesh": "band"}.get(parts[2])
+        if source is not None:
+            place = fleet.where("hardware", node.hardware.name, *parts[:2], source)
+        return Origin(place.position, "built-in")
+    return Origin(fleet.where("nodes", node.name).position, "built-in")
+
+
+def _listed(items: tuple[str, ...]) -> str:
+    return ", ".join(items)

@@ -1,0 +1,33 @@
+"""A first inventory for a new team: the commented starter that ships with meshctl, written into a directory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from meshctl.errors import InputError
+from meshctl.inventory.edit import Editor, save
+from meshctl.resources import shipped
+
+
+def write_starter(directory: Path, ssh_key: str = "") -> tuple[Path, ...]:
+    """Copy the starter into `directory` and enter `ssh_key`; returns the files written.
+
+    Raises InputError, before anything is written, when a file of the same name is there already.
+    """
+    source = shipped("inventory") / "starter"
+    names = sorted(path.name for path in source.iterdir() if path.is_file())
+    taken = [name for name in names if (directory / name).exists() or (directory / name).is_symlink()]
+    if taken:
+        raise InputError(f"{directory / taken[0]} exists and is left as it is", hint="choose another directory")
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            with (directory / name).open("xb") as stream:
+                stream.write((source / name).read_bytes())
+    except OSError as reason:
+        raise InputError(f"{reason.filename or directory} cannot be written: {reason.strerror}") from reason
+    if ssh_key:
+        editor = Editor.open(directory)
+        editor.set(("operators", "ssh_keys"), [ssh_key])
+        save(editor.changes())
+    return tuple(directory / name for name in names)
