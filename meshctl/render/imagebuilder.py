@@ -53,7 +53,11 @@ class ImageFolder:
         return tuple(f"cp {shlex.quote(str(path))} packages/" for path in self.package_files)
 
     def _calls(self) -> tuple[str, ...]:
-        return tuple(f"wanted {shlex.quote(node.node)} && {self.make_call(node)}" for node in self.overlays)
+        return tuple(
+            line
+            for node in self.overlays
+            for line in (f"if wanted {shlex.quote(node.node)}; then", f"\t{self.make_call(node)}", "fi")
+        )
 
 
 _HEAD = ("#!/bin/sh",)
@@ -63,7 +67,6 @@ _SETUP = (
     'here=$(CDPATH="" cd -- "$(dirname -- "$0")" && pwd)',
     'names=" $* "',
     'wanted() { case "$names" in "  " | *" $1 "*) return 0 ;; esac; return 1; }',
-    "umask 077",
 )
 
 

@@ -22,14 +22,17 @@ def write_node(rendered: Rendered, out: Path) -> Path:
 
     Raises InputError when the place cannot be written, is not ours to replace, or cannot keep a secret.
     """
-    return write_folder(rendered.files, out / rendered.node)
+    return write_folder(rendered.files, out / rendered.node, marker=MARKER_PATH)
 
 
-def write_folder(files: Iterable[RenderedFile], place: Path) -> Path:
-    """Put the files, and nothing else, at `place`. Raises InputError as `write_node` does."""
+def write_folder(files: Iterable[RenderedFile], place: Path, *, marker: str) -> Path:
+    """Put the files, and nothing else, at `place`. Raises InputError as `write_node` does.
+
+    What stands there already is replaced only if it holds the file `marker`, by which meshctl knows its own.
+    """
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        _refuse_foreign(place)
+        _refuse_foreign(place, marker)
         fresh = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
         try:
             for file in files:
@@ -43,12 +46,12 @@ def write_folder(files: Iterable[RenderedFile], place: Path) -> Path:
     return place
 
 
-def _refuse_foreign(place: Path) -> None:
+def _refuse_foreign(place: Path, marker: str) -> None:
     if place.is_symlink() or (place.exists() and not place.is_dir()):
         raise InputError(f"{place}: expected a folder or nothing, found something else")
-    if place.is_dir() and any(place.iterdir()) and not (place / MARKER_PATH).is_file():
+    if place.is_dir() and any(place.iterdir()) and not (place / marker).is_file():
         raise InputError(
-            f"{place}: expected a folder that meshctl rendered, found one without {MARKER_PATH}",
+            f"{place}: expected a folder that meshctl rendered, found one without {marker}",
             hint="choose another --out, or remove the folder yourself",
         )
     others_may_write = place.parent.stat().st_mode & (stat.S_IWGRP | stat.S_IWOTH)
@@ -62,7 +65,7 @@ def _refuse_foreign(place: Path) -> None:
 
 def _write(file: RenderedFile, root: Path) -> None:
     path = root / file.path
-    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    _make_folders(path.parent, root)
     # closed to others from its first moment, whatever the umask
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
     with os.fdopen(handle, "wb") as stream:
@@ -76,6 +79,19 @@ def _write(file: RenderedFile, root: Path) -> None:
         stream.write(file.content)
         stream.flush()
         os.fsync(stream.fileno())
+
+
+def _make_folders(folder: Path, root: Path) -> None:
+    """The folders below `root` with the modes they have on a device, whatever the umask: the ImageBuilder copies them.
+
+    `root` itself is closed to others, so nothing below it is open to them here.
+    """
+    if folder == root:
+        return
+    _make_folders(folder.parent, root)
+    folder.mkdir(exist_ok=True)
+    # as OpenWrt has it: dropbear's keys are root's alone
+    folder.chmod(0o700 if folder.name == "dropbear" else 0o755)
 
 
 def _swap(fresh: Path, place: Path) -> None:

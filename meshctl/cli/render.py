@@ -1,0 +1,174 @@
+"""`meshctl render` and `meshctl diff`: what each node gets, and what changes between two inventories."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.revision import opened
+from meshctl.errors import ExitCode, InputError
+from meshctl.inventory import load_fleet
+from meshctl.inventory.secrets import SecretStore
+from meshctl.model import Fleet, Secret, SecretRef
+from meshctl.render import (
+    ImageFolder,
+    NodeChange,
+    NodeDifference,
+    Rendered,
+    Templates,
+    compare_fleets,
+    folder_files,
+    image_folders,
+    render_node,
+    write_folder,
+    write_node,
+)
+
+
+def render(
+    nodes: Annotated[
+        list[str] | None, typer.Argument(help="Nodes, or patterns such as 'husky*'; default: all.")
+    ] = None,
+    inventory: InventoryPath = Path(),
+    out: Annotated[Path | None, typer.Option("--out", help="Write each node's files to DIR/NODE/.")] = None,
+    imagebuilder: Annotated[
+        Path | None, typer.Option("--imagebuilder", help="Write overlays, package lists and build scripts to DIR.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write the files each node gets; without --out or --imagebuilder print them, secrets masked.
+
+    Example: meshctl render 'husky1-*' --out build/
+    """
+    fleet = load_fleet(inventory, environ=os.environ)
+    secrets = _secrets(fleet)
+    templates = Templates.of(fleet)
+    # all of them before anything is written: a fleet is rendered whole or not at all
+    rendered = [render_node(fleet, name, secrets, templates) for name in _chosen(fleet, nodes or [])]
+    folders = {item.node: write_node(item, out) for item in rendered} if out is not None else {}
+    builds = (
+        [(item, _write_build(item, imagebuilder)) for item in image_folders(fleet, rendered)] if imagebuilder else []
+    )
+    if as_json:
+        typer.echo(json.dumps(_report(rendered, folders, builds), indent=2, ensure_ascii=False))
+    elif out is None and imagebuilder is None:
+        typer.echo("".join(f"### {item.node} ({item.release})\n{item.masked_text}" for item in rendered), nl=False)
+    else:
+        for node, folder in folders.items():
+            typer.echo(f"{node}: {folder}")
+        for build, folder in builds:
+            typer.echo(f"{build.name}: cd IMAGEBUILDER && sh {(folder / 'build.sh').resolve()}")
+
+
+def _secrets(fleet: Fleet) -> Callable[[SecretRef], Secret]:
+    store = SecretStore(os.environ, Path(fleet.base))
+    return lambda ref: store.get(ref)
+
+
+def _chosen(fleet: Fleet, patterns: Iterable[str]) -> list[str]:
+    """The nodes that any pattern names, in the inventory's order. Raises InputError for one that names none."""
+    wanted = list(patterns)
+    if not wanted:
+        return [node.name for node in fleet.managed()]
+    names = list(fleet.nodes)
+    for pattern in wanted:
+        matches = [name for name in names if fnmatchcase(name, pattern)]
+        if not matches:
+            raise InputError(f"no node is named {pattern!r}", hint="`meshctl inventory show` lists the nodes")
+    chosen = [name for name in names if any(fnmatchcase(name, pattern) for pattern in wanted)]
+    # a pattern passes over what has no configuration any more; a name that is spelled out gets its reason
+    return [name for name in chosen if name in wanted or fleet.nodes[name].state.is_managed]
+
+
+def _write_build(folder: ImageFolder, out: Path) -> Path:
+    return write_folder(folder_files(folder), out / folder.name, marker="build.sh")
+
+
+def _report(
+    rendered: list[Rendered], folders: dict[str, Path], builds: list[tuple[ImageFolder, Path]]
+) -> dict[str, Any]:
+    return {
+        "nodes": [
+            {
+                "node": item.node,
+                "release": item.release,
+                "config_hash": item.config_hash,
+                "packages": list(item.packages),
+                "removed_packages": list(item.removed_packages),
+                "folder": str(folders[item.node]) if item.node in folders else None,
+                "files": [
+                    {"path": f"/{file.path}", "mode": f"{file.mode:04o}", "content": file.masked} for file in item.files
+                ],
+            }
+            for item in rendered
+        ],
+        "imagebuilder": [
+            {
+                "name": build.name,
+                "release": str(build.release),
+                "target": build.hardware.target,
+                "profile": build.hardware.profile,
+                "folder": str(folder),
+                "calls": {item.node: build.make_call(item) for item in build.overlays},
+            }
+            for build, folder in builds
+        ],
+    }
+
+
+def diff(
+    before: Annotated[str, typer.Argument(metavar="A", help="Inventory, or REVISION:PATH in git.")],
+    after: Annotated[str, typer.Argument(metavar="B", help="Inventory, or REVISION:PATH in git.")],
+    as_json: AsJson = False,
+) -> None:
+    """Show what changes on which node between two inventories; exit 1 when anything does. Needs no secrets.
+
+    Example: meshctl diff HEAD~1:inventory/subt-final inventory/subt-final
+    """
+    with opened(before) as old, opened(after) as new:
+        differences = list(compare_fleets(old.fleet(), new.fleet()))
+    if as_json:
+        typer.echo(json.dumps({"nodes": [_as_json(item) for item in differences]}, indent=2, ensure_ascii=False))
+    else:
+        for item in differences:
+            _show(item)
+    if differences:
+        raise typer.Exit(int(ExitCode.FINDINGS))
+
+
+def _show(difference: NodeDifference) -> None:
+    if difference.change is not NodeChange.CHANGED:
+        typer.echo(f"{difference.node}: {difference.change.value}")
+        return
+    typer.echo(f"{difference.node}:")
+    old, new = difference.release
+    if old != new:
+        typer.echo(f"  release {old} -> {new}")
+    for file in difference.files:
+        mark = "" if file.change is NodeChange.CHANGED else f" ({file.change.value})"
+        typer.echo(f"  /{file.path}{mark}")
+        for line in file.lines:
+            typer.echo(f"    {line}")
+    for sign, packages in (("+", difference.packages_added), ("-", difference.packages_removed)):
+        for package in packages:
+            typer.echo(f"  {sign} package {package}")
+
+
+def _as_json(difference: NodeDifference) -> dict[str, Any]:
+    return {
+        "node": difference.node,
+        "change": difference.change.value,
+        "release": {"before": difference.release[0], "after": difference.release[1]},
+        "files": [
+            {"path": f"/{file.path}", "change": file.change.value, "lines": list(file.lines)}
+            for file in difference.files
+        ],
+        "packages": {"added": list(difference.packages_added), "removed": list(difference.packages_removed)},
+    }
