@@ -1,8 +1,8 @@
 """Which host key is believed: pins in the fleet's own file, in OpenSSH's known_hosts format.
 
 A server's key arrives as `HostKey`; a `HostKeyPolicy` accepts it or raises. `TrustStore` is the file: a known key
-passes, an unknown one is `HostKeyUnknown`, another one `HostKeyChanged`. `FirstContact` asks about unknown keys and pins
-the accepted; `AfterFlash` lets one announced change through. Names are those of the inventory, so that
+passes, an unknown one is `HostKeyUnknown`, another one `HostKeyChanged`. `FirstContact` asks about unknown keys and
+pins the accepted; `AfterFlash` lets one announced change through. Names are those of the inventory, so that
 `ssh -o UserKnownHostsFile=FILE -o HostKeyAlias=b03 root@10.42.0.13` trusts the same.
 """
 

@@ -1,9 +1,9 @@
 """Bring a file to a node that has no SFTP, over a link that drops: survey, send what is missing, prove, put in place.
 
 The node's partial file is named after the target and the content's hash, so two contents never mix. A survey hashes
-what is there chunk by chunk; everything up to the first chunk that differs is kept and the rest sent, one chunk for each
-command, each answered with the hash of what was written. At the end the whole is hashed on the node and renamed. A cut
-at any point leaves a partial file, and the next `upload` goes on from it. Bytes travel by `cat`.
+what is there chunk by chunk; everything up to the first chunk that differs is kept and the rest sent, one chunk for
+each command, each answered with the hash of what was written. At the end the whole is hashed on the node and renamed. A
+cut at any point leaves a partial file, and the next `upload` goes on from it. Bytes travel by `cat`.
 """
 
 from __future__ import annotations
