@@ -1,6 +1,39 @@
 """udp_mesh moves prioritized messages between robots over nothing but unicast and broadcast UDP.
 
 The flow: bytes -> frame -> session -> scheduler -> message (docs/design.md, docs/wire-format.md).
+
+`from udp_mesh import Node, Settings, Topic, Key` is the library; the names are loaded when they are first used, so
+that the client and the bridges, which import this package on older Pythons, load nothing of it.
 """
 
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from udp_mesh.client.mesh_client import MeshClient as MeshClient
+    from udp_mesh.core.settings import Neighbour as Neighbour
+    from udp_mesh.core.settings import Settings as Settings
+    from udp_mesh.core.settings import Topic as Topic
+    from udp_mesh.crypto.keys import Key as Key
+    from udp_mesh.daemon.library import Node as Node
+    from udp_mesh.daemon.library import SendRefusedError as SendRefusedError
+    from udp_mesh.links.attachments import LinkWish as LinkWish
+
 __version__ = "0.1.0"
+
+_EXPORTS = {
+    "Node": "udp_mesh.daemon.library",
+    "SendRefusedError": "udp_mesh.daemon.library",
+    "LinkWish": "udp_mesh.links.attachments",
+    "Settings": "udp_mesh.core.settings",
+    "Topic": "udp_mesh.core.settings",
+    "Neighbour": "udp_mesh.core.settings",
+    "Key": "udp_mesh.crypto.keys",
+    "MeshClient": "udp_mesh.client.mesh_client",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _EXPORTS:
+        raise AttributeError(f"module 'udp_mesh' has no attribute {name!r}")
+    return getattr(importlib.import_module(_EXPORTS[name]), name)

@@ -120,6 +120,8 @@ class MeshClient:
             raise MeshError("unreachable", "no udp-mesh daemon at {}: {}".format(path, error.strerror)) from error
         # A process-wide default timeout (rospy sets one) must not apply here.
         self._socket.settimeout(None)
+        self._poll = select.poll()
+        self._poll.register(self._socket, select.POLLIN)
 
     def __enter__(self) -> "MeshClient":
         return self
@@ -216,8 +218,7 @@ class MeshClient:
 
     def _read(self, timeout_s: Optional[float]) -> bool:
         """Reads once; False where nothing came in time."""
-        ready, _, _ = select.select([self._socket], [], [], None if timeout_s is None else max(0.0, timeout_s))
-        if not ready:
+        if not self._poll.poll(None if timeout_s is None else max(0.0, timeout_s) * 1000):
             return False
         try:
             data = self._socket.recv(_READ_BYTES)

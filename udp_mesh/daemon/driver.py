@@ -84,7 +84,7 @@ class Driver:
         self._small_wakeups = 0
         self._last_wakeup = 0.0
         self._idle_ticks = 0
-        self._closed = False
+        self.closed = False
         self._now = 0.0
         self._link_name = ""
 
@@ -99,12 +99,12 @@ class Driver:
 
     def close(self) -> None:
         """Says good-bye, sends the last datagrams, reports the last events, closes everything."""
-        if self._closed:
+        if self.closed:
             return
         self.node.close(self._clock())
         self._transmit_all()
         self._report_events()
-        self._closed = True
+        self.closed = True
         for handle in (self._timer, self._refresh):
             if handle is not None:
                 handle.cancel()
@@ -233,13 +233,13 @@ class Driver:
     # Out
 
     def _pump_soon(self) -> None:
-        if not self._pump_requested and not self._closed:
+        if not self._pump_requested and not self.closed:
             self._pump_requested = True
             self._loop.call_soon(self._pump)
 
     def _pump(self) -> None:
         self._pump_requested = False
-        if self._closed:
+        if self.closed:
             return
         now = self._clock()
         due = self.node.next_timer()

@@ -24,11 +24,9 @@ SUFFIX = ".message"
 
 
 class DirectoryStore:
-    """The core's `Store` over a directory (made if missing, readable by its owner only)."""
+    """The core's `Store` over a directory (made with the first message, readable by its owner only)."""
 
     def __init__(self, directory: Path, limit_bytes: int) -> None:
-        """Raises OSError where the directory cannot be made."""
-        directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         self._directory = directory
         self._limit_bytes = limit_bytes
         self._sizes: dict[int, int] = {}
@@ -57,6 +55,7 @@ class DirectoryStore:
             return
         path = self._path(message.key)
         try:
+            self._directory.mkdir(parents=True, exist_ok=True, mode=0o700)
             temporary = path.with_suffix(".new")
             with temporary.open("wb") as file:
                 file.write(head + b"\n")

@@ -1,0 +1,209 @@
+"""The local API's transport: a Unix socket, frames in, frames out (docs/local-api.md).
+
+A connection hands each request to the service and writes what the service gives back. What a slow reader does not
+fetch is bounded: past `CLIENT_BACKLOG_BYTES` messages for it are dropped, and it is told how many once it reads
+again. Other readers and the mesh never wait for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import grp
+import logging
+import os
+import socket
+import stat
+from pathlib import Path
+from typing import Protocol, cast
+
+from udp_mesh.client.mesh_client import Frame, FrameReader, Header, MeshError, encode_frame
+
+log = logging.getLogger(__name__)
+
+CLIENT_BACKLOG_BYTES = 32 << 20
+"""Bytes written to one client and not yet read by it: a stopped subscriber. A few of the largest usual messages."""
+MAX_CLIENTS = 128
+"""Connections at a time: a program that leaks them must not take the daemon's descriptors."""
+
+
+class RequestError(Exception):
+    """A request that is refused; `code` is a word for programs, the text is for people."""
+
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+class Requests(Protocol):
+    """Who answers."""
+
+    def request(self, client: Client, header: Header, payload: bytes) -> None:
+        """Answers now or later through `client`; raises RequestError to refuse."""
+        ...
+
+    def client_gone(self, client: Client) -> None: ...
+
+
+class Client(asyncio.Protocol):
+    """One connected program."""
+
+    def __init__(self, server: LocalServer) -> None:
+        self._server = server
+        self._reader = FrameReader(server.max_payload_bytes)
+        self._transport: asyncio.Transport | None = None
+        self._dropped = 0
+
+    # What the service calls
+
+    def reply(self, request_id: object, payload: bytes = b"", **fields: object) -> None:
+        """Answers a request; one without an id wanted no answer."""
+        if request_id is not None:
+            self._write({"id": request_id, "ok": True, **fields}, payload)
+
+    def refuse(self, request_id: object, code: str, text: str) -> None:
+        """Refuses a request; one without an id hears of it as an event."""
+        if request_id is None:
+            self._write({"event": "rejected", "code": code, "error": text})
+        else:
+            self._write({"id": request_id, "ok": False, "code": code, "error": text})
+
+    def tell(self, header: Header, payload: bytes = b"") -> None:
+        """An event; dropped and counted where the program does not read."""
+        transport = self._transport
+        if transport is None:
+            return
+        if transport.get_write_buffer_size() + len(payload) > CLIENT_BACKLOG_BYTES:
+            self._dropped += 1
+            self._server.dropped_for_slow_clients += 1
+            return
+        if self._dropped:
+            self._report_dropped()
+        self._write(header, payload)
+
+    def tell_encoded(self, frame: bytes) -> None:
+        """As `tell`, for a frame that several clients get."""
+        transport = self._transport
+        if transport is None:
+            return
+        if transport.get_write_buffer_size() + len(frame) > CLIENT_BACKLOG_BYTES:
+            self._dropped += 1
+            self._server.dropped_for_slow_clients += 1
+            return
+        if self._dropped:
+            self._report_dropped()
+        transport.write(frame)
+
+    def close(self) -> None:
+        if self._transport is not None:
+            self._transport.close()
+
+    def _report_dropped(self) -> None:
+        dropped, self._dropped = self._dropped, 0
+        self._write({"event": "dropped", "messages": dropped})
+
+    def _write(self, header: Header, payload: bytes = b"") -> None:
+        if self._transport is not None:
+            self._transport.write(encode_frame(header, payload))
+
+    # What asyncio calls
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.Transport, transport)
+        if len(self._server.clients) >= MAX_CLIENTS:
+            self.refuse(None, "too-many-clients", f"at most {MAX_CLIENTS} programs connect at a time")
+            self.close()
+            return
+        self._server.clients.add(self)
+
+    def data_received(self, data: bytes) -> None:
+        try:
+            frames = self._reader.feed(data)
+        except MeshError as error:
+            self.refuse(None, error.code, str(error))
+            self.close()
+            return
+        for frame in frames:
+            self._handle(frame)
+
+    def _handle(self, frame: Frame) -> None:
+        header, payload = frame
+        try:
+            self._server.requests.request(self, header, payload)
+        except RequestError as error:
+            self.refuse(header.get("id"), error.code, str(error))
+
+    def resume_writing(self) -> None:
+        if self._dropped:
+            self._report_dropped()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._transport = None
+        self._server.clients.discard(self)
+        self._server.requests.client_gone(self)
+
+
+class LocalServer:
+    """The listening socket and its connections."""
+
+    def __init__(self, requests: Requests, path: Path, *, mode: int, group: str | None, max_payload_bytes: int) -> None:
+        self.requests = requests
+        self.clients: set[Client] = set()
+        self.max_payload_bytes = max_payload_bytes
+        self.dropped_for_slow_clients = 0
+        self._path = path
+        self._mode = mode
+        self._group = group
+        self._server: asyncio.AbstractServer | None = None
+
+    async def start(self) -> None:
+        """Listens. Raises OSError: in use by another daemon, no such directory, no such group, not allowed."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        if _answers(self._path):
+            raise OSError(f"another daemon answers at {self._path}")
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+        try:
+            if self._path.exists() and stat.S_ISSOCK(self._path.stat().st_mode):
+                self._path.unlink()
+            # Nobody may connect before mode and group are right.
+            mask = os.umask(0o177)
+            try:
+                listener.bind(str(self._path))
+            finally:
+                os.umask(mask)
+            if self._group is not None:
+                os.chown(self._path, -1, _group_id(self._group))
+            self._path.chmod(self._mode)
+            listener.setblocking(False)
+            loop = asyncio.get_running_loop()
+            self._server = await loop.create_unix_server(lambda: Client(self), sock=listener)
+        except OSError:
+            listener.close()
+            raise
+
+    async def close(self) -> None:
+        """Stops listening, lets what is written be read, closes every connection, removes the socket's file."""
+        if self._server is None:
+            return
+        self._server.close()
+        for client in list(self.clients):
+            client.close()
+        await asyncio.sleep(0)
+        self._server = None
+        self._path.unlink(missing_ok=True)
+
+
+def _answers(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(str(path))
+        except OSError:
+            return False
+        return True
+
+
+def _group_id(name: str) -> int:
+    try:
+        return grp.getgrnam(name).gr_gid
+    except KeyError as error:
+        raise OSError(f"daemon.socket_group: expected a group of this machine, found {name!r}") from error

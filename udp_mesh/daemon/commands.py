@@ -1,0 +1,300 @@
+"""The requests of the local API: each a function of the service, the client, the header's fields and the payload.
+
+A command returns the reply's fields, or something to await for them; it raises RequestError to refuse.
+docs/local-api.md shows every request with its reply.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable
+from dataclasses import replace
+from pathlib import Path
+
+from udp_mesh import __version__
+from udp_mesh.client.mesh_client import Header
+from udp_mesh.core.settings import Neighbour, Settings
+from udp_mesh.daemon import metrics
+from udp_mesh.daemon.api import Client, RequestError
+from udp_mesh.daemon.configuration import (
+    CONDITIONS_TOPIC,
+    RESERVED_PREFIX,
+    parse_address,
+    read_keys,
+    read_rates,
+    topic_from_values,
+)
+from udp_mesh.daemon.service import Service
+from udp_mesh.daemon.status import conditions_json, plain, show_address, topic_json, topics_json
+from udp_mesh.daemon.toml_source import ConfigurationError, Source, Table
+from udp_mesh.wire.header import VERSION as WIRE_VERSION
+
+MAX_PING_S = 60.0
+
+
+# Reading a request's fields
+
+
+def _text(header: Header, key: str) -> str:
+    value = header.get(key)
+    if not isinstance(value, str) or not value:
+        raise RequestError("bad-request", f"{key}: expected text, found {value!r}")
+    return value
+
+
+def _optional_text(header: Header, key: str) -> str | None:
+    return None if header.get(key) is None else _text(header, key)
+
+
+def _texts(header: Header, key: str) -> list[str]:
+    value = header.get(key)
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        raise RequestError("bad-request", f"{key}: expected a list of text, found {value!r}")
+    return value
+
+
+def _values(header: Header, key: str) -> dict[str, object]:
+    value = header.get(key, {})
+    if not isinstance(value, dict):
+        raise RequestError("bad-request", f"{key}: expected an object, found {value!r}")
+    return value
+
+
+def _refusal(error: ConfigurationError) -> RequestError:
+    text = "; ".join(str(problem).removeprefix("command:1: ") for problem in error.problems)
+    return RequestError("bad-configuration", text)
+
+
+# Messages
+
+
+def publish(service: Service, client: Client, header: Header, payload: bytes) -> Header | Awaitable[Header]:
+    topic, destination = _text(header, "topic"), _optional_text(header, "to")
+    notify = client if header.get("notify") else None
+    type_name = header.get("type", "")
+    if not isinstance(type_name, str):
+        raise RequestError("bad-request", f"type: expected text, found {type_name!r}")
+    message = service.publish(topic, payload, destination, type_name, notify)
+    if isinstance(message, int):
+        return {"message": message}
+
+    async def later() -> Header:
+        return {"message": await message}
+
+    return later()
+
+
+def subscribe(service: Service, client: Client, header: Header, _: bytes) -> Header:
+    service.subscribe(client, _texts(header, "topics"))
+    return {}
+
+
+def unsubscribe(service: Service, client: Client, header: Header, _: bytes) -> Header:
+    service.unsubscribe(client, _texts(header, "topics"))
+    return {}
+
+
+def events(service: Service, client: Client, _header: Header, _: bytes) -> Header:
+    service.watch(client)
+    return {}
+
+
+def ping(service: Service, _client: Client, header: Header, _: bytes) -> Awaitable[Header]:
+    peer, timeout_s = _text(header, "peer"), header.get("timeout_s", 2.0)
+    if not isinstance(timeout_s, int | float) or not 0 < timeout_s <= MAX_PING_S:
+        raise RequestError("bad-request", f"timeout_s: expected up to {MAX_PING_S:g}, found {timeout_s!r}")
+
+    async def answer() -> Header:
+        return {"round_trip_s": await service.ping(peer, float(timeout_s))}
+
+    return answer()
+
+
+# What is
+
+
+def status(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
+    settings, driver = service.settings, service.driver
+    recorder = service.recorder
+    return {
+        "version": __version__,
+        "wire_version": WIRE_VERSION,
+        "boot": service.boot_id.hex(),
+        "uptime_s": round(driver.now() - service.started, 3),
+        "unkeyed": settings.unkeyed,
+        "keys": [key.key_id.hex() for key in settings.keys],
+        "window": settings.window,
+        "configuration": plain(service.configuration.file),
+        "links": [
+            {
+                "name": link.attachment.name,
+                "device": link.attachment.device,
+                "address": show_address(link.attachment.address),
+                "broadcast": show_address(link.attachment.broadcast),
+                "mtu": link.attachment.mtu,
+                "segmentation_offload": link.segmentation,
+                "lost_on_send": link.datagrams_lost_on_send,
+            }
+            for link in driver.hub.links.values()
+        ],
+        "link_failures": driver.link_failures,
+        "recording": None if recorder is None else {"path": str(recorder.path), "bytes": recorder.bytes},
+        "conditions": conditions_json(driver.conditions()),
+    }
+
+
+def peers(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
+    return {"peers": conditions_json(service.driver.conditions())["peers"]}
+
+
+def topics(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
+    undeclared = service.settings.undeclared
+    return {
+        "topics": topics_json(service.settings, service.counts),
+        "undeclared": None if undeclared is None else topic_json(undeclared),
+    }
+
+
+def metrics_page(service: Service, client: Client, header: Header, _: bytes) -> None:
+    client.reply(header.get("id"), render_metrics(service).encode())
+
+
+def render_metrics(service: Service) -> str:
+    """The page for Prometheus."""
+    driver = service.driver
+    extra = {
+        "wakeups": driver.wakeups,
+        "datagrams_lost_on_full_socket": driver.lost_on_full_socket,
+        "datagrams_lost_on_send": sum(link.datagrams_lost_on_send for link in driver.hub.links.values()),
+        "outbox_messages_refused_by_disk": service.store.refused,
+    }
+    visible = {name: count for name, count in service.counts.items() if not name.startswith(RESERVED_PREFIX)}
+    return metrics.render(driver.conditions(), visible, extra)
+
+
+# What shall be
+
+
+def _changed(service: Service, settings: Settings) -> Header:
+    return {"changes": service.apply(settings)}
+
+
+def set_topic(service: Service, _client: Client, header: Header, _: bytes) -> Header:
+    name, values = _text(header, "topic"), _values(header, "values")
+    settings = service.settings
+    current = next((topic for topic in settings.topics if topic.name == name), None)
+    try:
+        topic = topic_from_values(name, values, current)
+    except ConfigurationError as error:
+        raise _refusal(error) from error
+    others = tuple(other for other in settings.topics if other.name != name)
+    return _changed(service, replace(settings, topics=(*others, topic)))
+
+
+def drop_topic(service: Service, _client: Client, header: Header, _: bytes) -> Header:
+    name, settings = _text(header, "topic"), service.settings
+    others = tuple(other for other in settings.topics if other.name != name)
+    if name.startswith(RESERVED_PREFIX) or len(others) == len(settings.topics):
+        raise RequestError("unknown-topic", f"no topic {name!r} is configured")
+    return _changed(service, replace(settings, topics=others))
+
+
+def set_window(service: Service, _client: Client, header: Header, _: bytes) -> Header:
+    value = header.get("window")
+    if value != "adaptive" and (not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= 4096):
+        raise RequestError("bad-request", f'window: expected "adaptive" or 1 to 4096 packets, found {value!r}')
+    return _changed(service, replace(service.settings, window=value))
+
+
+def set_rates(service: Service, _client: Client, header: Header, _: bytes) -> Header:
+    source = Source("command", {})
+    rates = read_rates(Table(_values(header, "values"), source, ("rates",)), service.settings.rates)
+    if source.problems:
+        raise _refusal(ConfigurationError(source.problems))
+    return _changed(service, replace(service.settings, rates=rates))
+
+
+def set_neighbour(service: Service, _client: Client, header: Header, _: bytes) -> Header:
+    text, settings = _text(header, "address"), service.settings
+    address = parse_address(text, settings.port)
+    if address is None:
+        raise RequestError("bad-request", f"address: expected an IP address with or without a port, found {text!r}")
+    try:
+        neighbour = Neighbour(
+            address, _optional_text(header, "name"), _optional_text(header, "link"), bool(header.get("legacy"))
+        )
+    except ValueError as error:
+        raise RequestError("bad-request", str(error)) from error
+    others = tuple(other for other in settings.neighbours if other.address != address)
+    return _changed(service, replace(settings, neighbours=(*others, neighbour)))
+
+
+def drop_neighbour(service: Service, _client: Client, header: Header, _: bytes) -> Header:
+    text, settings = _text(header, "address"), service.settings
+    address = parse_address(text, settings.port)
+    others = tuple(other for other in settings.neighbours if other.address != address)
+    if len(others) == len(settings.neighbours):
+        raise RequestError("unknown-neighbour", f"no neighbour {text} is configured")
+    return _changed(service, replace(settings, neighbours=others))
+
+
+def neighbours(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
+    return {"neighbours": [plain(neighbour) for neighbour in service.settings.neighbours]}
+
+
+def set_keys(service: Service, _client: Client, header: Header, _: bytes) -> Header:
+    """Takes the keys of a key file, so that no key crosses the socket."""
+    path = Path(_text(header, "file"))
+    try:
+        keys = read_keys(path)
+    except ConfigurationError as error:
+        raise _refusal(error) from error
+    changes = service.apply(replace(service.settings, keys=keys, unkeyed=False))
+    return {"changes": changes, "keys": [key.key_id.hex() for key in keys]}
+
+
+def reload(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
+    try:
+        return {"changes": service.reload()}
+    except ConfigurationError as error:
+        raise _refusal(error) from error
+
+
+# Recording
+
+
+def record_start(service: Service, _client: Client, header: Header, _: bytes) -> Header:
+    service.start_recording(Path(_text(header, "path")), bool(header.get("payloads")))
+    return {}
+
+
+def record_stop(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
+    recorder = service.stop_recording()
+    if recorder is None:
+        raise RequestError("not-recording", "nothing is being recorded")
+    return {"path": str(recorder.path), "bytes": recorder.bytes, "lines": recorder.lines}
+
+
+COMMANDS = {
+    "publish": publish,
+    "subscribe": subscribe,
+    "unsubscribe": unsubscribe,
+    "events": events,
+    "ping": ping,
+    "status": status,
+    "peers": peers,
+    "topics": topics,
+    "metrics": metrics_page,
+    "set-topic": set_topic,
+    "drop-topic": drop_topic,
+    "set-window": set_window,
+    "set-rates": set_rates,
+    "set-neighbour": set_neighbour,
+    "drop-neighbour": drop_neighbour,
+    "neighbours": neighbours,
+    "set-keys": set_keys,
+    "reload": reload,
+    "record-start": record_start,
+    "record-stop": record_stop,
+}
+
+__all__ = ["COMMANDS", "CONDITIONS_TOPIC", "render_metrics"]

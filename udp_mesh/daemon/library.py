@@ -1,0 +1,163 @@
+"""The transport inside your own asyncio program, without a daemon.
+
+    settings = Settings(name="ugv1", keys=(Key.parse(text),), topics=(Topic("status", priority=0),))
+    async with Node(settings) as node:
+        await node.send("status", b"ready", to="base")
+        async for message in node.messages():
+            ...
+
+A node opens its links on entry, says good-bye on exit. What it receives and what happens wait in bounded queues until
+they are read; `deliver` waits for a reliable message's end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+from collections import deque
+from collections.abc import AsyncIterator, Sequence
+from types import TracebackType
+
+from udp_mesh.core.conditions import Conditions
+from udp_mesh.core.events import (
+    Event,
+    MessageDelivered,
+    MessageExpired,
+    MessageId,
+    MessagePeerLost,
+    MessageReceived,
+    Rejected,
+    RejectReason,
+)
+from udp_mesh.core.settings import Settings
+from udp_mesh.daemon.driver import Driver
+from udp_mesh.daemon.outbox import DirectoryStore
+from udp_mesh.links.attachments import EVERY_INTERFACE, LinkWish
+from udp_mesh.wire.limits import BOOT_ID_BYTES
+
+Outcome = MessageDelivered | MessageExpired | MessagePeerLost
+
+MAX_UNREAD = 65_536
+"""Messages or events nobody reads: the oldest is dropped and counted, as the reader's own fault."""
+
+
+class SendRefusedError(Exception):
+    """The core took nothing on; `reason` says why."""
+
+    def __init__(self, rejected: Rejected) -> None:
+        super().__init__(f"{rejected.reason.value}: {rejected.detail}")
+        self.reason: RejectReason = rejected.reason
+
+
+class Node:
+    """One node in this process, alive inside its `async with`."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        links: Sequence[LinkWish] = EVERY_INTERFACE,
+        store: DirectoryStore | None = None,
+        urgent_dscp: int = 46,
+    ) -> None:
+        self._settings = settings
+        self._links = tuple(links)
+        self._store = store
+        self._urgent_dscp = urgent_dscp
+        self._driver: Driver | None = None
+        self._messages: deque[MessageReceived] = deque(maxlen=MAX_UNREAD)
+        self._events: deque[Event] = deque(maxlen=MAX_UNREAD)
+        self._arrived = asyncio.Event()
+        self._happened = asyncio.Event()
+        self._outcomes: dict[tuple[MessageId, str], asyncio.Future[Outcome]] = {}
+        self.unread_dropped = 0
+
+    async def __aenter__(self) -> Node:
+        """Opens the links. Raises OSError where the kernel cannot be asked for interfaces."""
+        self._driver = Driver(
+            self._settings,
+            self._links,
+            boot_id=os.urandom(BOOT_ID_BYTES),
+            rng=random.SystemRandom(),
+            on_event=self._event,
+            store=self._store,
+            urgent_dscp=self._urgent_dscp,
+        )
+        self._driver.start()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.driver.close()
+        self._arrived.set()
+        self._happened.set()
+
+    @property
+    def driver(self) -> Driver:
+        """The running driver. Raises RuntimeError outside of `async with`."""
+        if self._driver is None:
+            raise RuntimeError("a node lives inside its `async with`")
+        return self._driver
+
+    async def send(self, topic: str, payload: bytes, *, to: str | None = None, type_name: str = "") -> MessageId:
+        """Accepts a message for one peer, or for the topic's destinations, or for all. Raises SendRefusedError."""
+        outcome = self.driver.send(topic, payload, destination=to, type_name=type_name)
+        if isinstance(outcome, Rejected):
+            raise SendRefusedError(outcome)
+        # A sender in a loop must let the datagrams leave.
+        await asyncio.sleep(0)
+        return outcome
+
+    async def deliver(self, topic: str, payload: bytes, *, to: str, type_name: str = "") -> Outcome:
+        """Sends a message of a reliable topic to one peer and waits for its end. Raises SendRefusedError."""
+        outcome = self.driver.send(topic, payload, destination=to, type_name=type_name)
+        if isinstance(outcome, Rejected):
+            raise SendRefusedError(outcome)
+        future: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
+        self._outcomes[outcome, to] = future
+        try:
+            return await future
+        finally:
+            del self._outcomes[outcome, to]
+
+    async def messages(self) -> AsyncIterator[MessageReceived]:
+        """Messages in the order they became complete, until the node is closed."""
+        while True:
+            while self._messages:
+                yield self._messages.popleft()
+            if self.driver.closed:
+                return
+            self._arrived.clear()
+            await self._arrived.wait()
+
+    async def events(self) -> AsyncIterator[Event]:
+        """Everything but received messages: peers, outcomes, conflicts, starvation."""
+        while True:
+            while self._events:
+                yield self._events.popleft()
+            if self.driver.closed:
+                return
+            self._happened.clear()
+            await self._happened.wait()
+
+    def apply(self, settings: Settings) -> list[str]:
+        """Changes topics, window, rates, limits, keys, neighbours; drops no message. Raises ValueError."""
+        return self.driver.apply(settings)
+
+    def conditions(self) -> Conditions:
+        return self.driver.conditions()
+
+    def _event(self, event: Event) -> None:
+        if isinstance(event, MessageReceived):
+            self.unread_dropped += len(self._messages) == MAX_UNREAD
+            self._messages.append(event)
+            self._arrived.set()
+            return
+        if isinstance(event, Outcome):
+            future = self._outcomes.get((event.message_id, event.peer))
+            if future is not None and not future.done():
+                future.set_result(event)
+        self._events.append(event)
+        self._happened.set()

@@ -1,0 +1,87 @@
+"""Conditions -> the text format of Prometheus (exposition format 0.0.4). Pure."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+
+from udp_mesh.core.conditions import Conditions, PeerConditions
+from udp_mesh.daemon.status import TopicCount
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+
+Sample = tuple[Mapping[str, str], float]
+
+_PEER_GAUGES = (
+    ("peer_online", "1 where the peer is online.", lambda peer: float(peer.online)),
+    ("peer_round_trip_seconds", "Smoothed round trip.", lambda peer: peer.round_trip_s),
+    ("peer_least_round_trip_seconds", "Least round trip lately.", lambda peer: peer.least_round_trip_s),
+    ("peer_loss_ratio", "Share of packets lost on the way to the peer.", lambda peer: peer.loss),
+    ("peer_sent_bits_per_second", "Wire bits sent to the peer.", lambda peer: peer.sent_bits_per_s),
+    ("peer_delivered_bits_per_second", "Payload bits the peer acknowledged.", lambda peer: peer.delivered_bits_per_s),
+    ("peer_received_bits_per_second", "Wire bits received from the peer.", lambda peer: peer.received_bits_per_s),
+    ("peer_capacity_bits_per_second", "Estimated rate of the link.", lambda peer: peer.capacity_bits_per_s),
+    ("peer_window_packets", "Packets that may be in flight.", lambda peer: peer.window_packets),
+    ("peer_in_flight_packets", "Packets in flight.", lambda peer: float(peer.in_flight_packets)),
+    ("peer_outbox_messages", "Messages held for the peer while it is away.", lambda peer: float(peer.outbox_messages)),
+    ("peer_outbox_bytes", "Bytes held for the peer while it is away.", lambda peer: float(peer.outbox_bytes)),
+)
+_QUEUE_GAUGES = (
+    ("queue_messages", "Messages waiting.", lambda queue: float(queue.messages)),
+    ("queue_bytes", "Bytes waiting.", lambda queue: float(queue.bytes)),
+    ("queue_oldest_seconds", "Age of the oldest message waiting.", lambda queue: queue.oldest_s),
+    ("queue_starved_seconds", "Time waited while only more urgent ones were sent.", lambda queue: queue.starved_s),
+    ("queue_held_seconds", "Time held back for other robots' urgent messages.", lambda queue: queue.held_s),
+)
+
+
+def render(conditions: Conditions, topics: Mapping[str, TopicCount], extra: Mapping[str, float]) -> str:
+    """The page that Prometheus reads; `extra` are counters of the daemon's own."""
+    lines: list[str] = []
+    for item in dataclasses.fields(conditions.counters):
+        value = getattr(conditions.counters, item.name)
+        _family(lines, f"{item.name}_total", "counter", item.name.replace("_", " ").capitalize() + ".", [({}, value)])
+    for name in ("partial_bytes", "queued_bytes", "repair_bytes"):
+        help_text = f"{name.replace('_', ' ').capitalize()} held."
+        _family(lines, name, "gauge", help_text, [({}, getattr(conditions, name))])
+    for name, help_text, read in _PEER_GAUGES:
+        samples = [({"peer": peer.name}, value) for peer in conditions.peers if (value := read(peer)) is not None]
+        _family(lines, name, "gauge", help_text, samples)
+    retransmitted = [({"peer": peer.name}, float(peer.retransmitted_packets)) for peer in conditions.peers]
+    _family(lines, "peer_retransmitted_packets_total", "counter", "Packets sent again.", retransmitted)
+    for name, help_text, read_queue in _QUEUE_GAUGES:
+        samples = [
+            ({"peer": peer.name, "priority": str(queue.priority)}, read_queue(queue))
+            for peer in conditions.peers
+            for queue in peer.queues
+        ]
+        _family(lines, name, "gauge", help_text, samples)
+    for field_name in ("sent_messages", "sent_bytes", "received_messages", "received_bytes"):
+        samples = [({"topic": topic}, float(getattr(count, field_name))) for topic, count in sorted(topics.items())]
+        help_text = f"{field_name.replace('_', ' ').capitalize()} of the topic."
+        _family(lines, f"topic_{field_name}_total", "counter", help_text, samples)
+    for name, number in extra.items():
+        _family(lines, f"{name}_total", "counter", name.replace("_", " ").capitalize() + ".", [({}, number)])
+    return "\n".join(lines) + "\n"
+
+
+def peers_online(peers: Iterable[PeerConditions]) -> int:
+    return sum(peer.online for peer in peers)
+
+
+def _family(lines: list[str], name: str, kind: str, help_text: str, samples: Iterable[Sample]) -> None:
+    rows = list(samples)
+    if not rows:
+        return
+    lines += [f"# HELP udp_mesh_{name} {help_text}", f"# TYPE udp_mesh_{name} {kind}"]
+    for labels, value in rows:
+        inner = ",".join(f'{label}="{_escape(text)}"' for label, text in labels.items())
+        lines.append(f"udp_mesh_{name}{{{inner}}} {_number(value)}" if inner else f"udp_mesh_{name} {_number(value)}")
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if float(value).is_integer() else repr(value)
+
+
+def _escape(text: str) -> str:
+    return text.replace("\\", "\\\\").replace("\n", "\\n").replace('"', '\\"')

@@ -1,0 +1,51 @@
+"""Answers Prometheus over TCP on a loopback address: one request, one page, closed (RFC 9112, as little as it
+takes)."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from udp_mesh.core.settings import Address
+from udp_mesh.daemon.metrics import CONTENT_TYPE
+
+REQUEST_BYTES = 8192
+"""A scraper's request is a few hundred bytes; more is refused."""
+REQUEST_S = 5.0
+"""A connection that says nothing is closed."""
+
+
+class MetricsServer:
+    """Serves `GET /metrics`."""
+
+    def __init__(self, address: Address, render: Callable[[], str]) -> None:
+        self._address = address
+        self._render = render
+        self._server: asyncio.Server | None = None
+
+    async def start(self) -> None:
+        """Raises OSError where the port is taken."""
+        host, port = self._address
+        self._server = await asyncio.start_server(self._answer, host, port, limit=REQUEST_BYTES)
+
+    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            async with asyncio.timeout(REQUEST_S):
+                request = await reader.readuntil(b"\r\n\r\n")
+                if request.startswith(b"GET /metrics "):
+                    status, body = "200 OK", self._render().encode()
+                else:
+                    status, body = "404 Not Found", b"GET /metrics\n"
+                head = f"HTTP/1.1 {status}\r\nContent-Type: {CONTENT_TYPE}\r\nContent-Length: {len(body)}\r\n"
+                writer.write(head.encode() + b"Connection: close\r\n\r\n" + body)
+                await writer.drain()
+        except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            # A scraper that went away or never asked: nothing to answer.
+            return
+        finally:
+            writer.close()
+
+    async def close(self) -> None:
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()

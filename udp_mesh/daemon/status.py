@@ -1,0 +1,122 @@
+"""What the daemon knows, as JSON values: conditions -> peers, events -> dictionaries, settings -> topics. Pure.
+
+Times the core tells on its own clock become ages here ("heard_ago_s"), since no reader shares that clock.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from enum import Enum
+from pathlib import Path
+
+from udp_mesh.core.conditions import Conditions, PeerConditions
+from udp_mesh.core.events import Event
+from udp_mesh.core.settings import Address, Settings, Topic
+from udp_mesh.daemon.configuration import RESERVED_PREFIX
+
+Json = dict[str, object]
+
+
+def show_address(address: Address | None) -> str | None:
+    """`10.0.0.2:8700` or `[fd00::2]:8700`."""
+    if address is None:
+        return None
+    host, port = address
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def plain(value: object) -> object:
+    """A value of ours as JSON: dataclasses as objects, enums as their values, addresses as text; payloads are left
+    out."""
+    match value:
+        case Enum():
+            return value.value
+        case Path():
+            return str(value)
+        case bytes() | bytearray() | memoryview():
+            return bytes(value).hex()
+        case float():
+            return round(value, 6)
+        case (str() as host, int() as port):
+            return show_address((host, port))
+        case tuple() | list():
+            return [plain(item) for item in value]
+        case dict():
+            return {str(key): plain(item) for key, item in value.items()}
+        case _ if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            return {item.name: plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
+        case _:
+            return value
+
+
+def event_name(event: Event) -> str:
+    """`peer-online` for `PeerOnline`."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "-", type(event).__name__).lower()
+
+
+def event_json(event: Event) -> Json:
+    """An event's fields under its name; a received message's payload is only counted."""
+    fields: Json = {"event": event_name(event)}
+    for item in dataclasses.fields(event):
+        value = getattr(event, item.name)
+        if isinstance(value, bytes):
+            fields["bytes"] = len(value)
+        else:
+            fields[item.name] = plain(value)
+    return fields
+
+
+def peer_json(peer: PeerConditions, now: float) -> Json:
+    """One peer's conditions."""
+    fields = plain(peer)
+    assert isinstance(fields, dict)
+    online_since, last_heard = fields.pop("online_since"), fields.pop("last_heard")
+    fields["online_for_s"] = None if online_since is None or not peer.online else round(now - online_since, 3)
+    fields["heard_ago_s"] = None if last_heard is None else round(now - last_heard, 3)
+    return fields
+
+
+def conditions_json(conditions: Conditions) -> Json:
+    """All peers and the node's counters."""
+    return {
+        "name": conditions.name,
+        "peers": [peer_json(peer, conditions.now) for peer in conditions.peers],
+        "counters": plain(conditions.counters),
+        "partial_bytes": conditions.partial_bytes,
+        "queued_bytes": conditions.queued_bytes,
+        "repair_bytes": conditions.repair_bytes,
+    }
+
+
+@dataclasses.dataclass(slots=True)
+class TopicCount:
+    """What passed through this daemon of one topic."""
+
+    sent_messages: int = 0
+    sent_bytes: int = 0
+    received_messages: int = 0
+    received_bytes: int = 0
+
+
+def topic_json(topic: Topic) -> Json:
+    fields = plain(topic)
+    assert isinstance(fields, dict)
+    return fields
+
+
+def topics_json(settings: Settings, counts: Mapping[str, TopicCount]) -> list[Json]:
+    """Configured topics in order of priority, then topics that only arrived; each with its counts."""
+    configured = [topic for topic in settings.topics if not topic.name.startswith(RESERVED_PREFIX)]
+    rows = [
+        {**topic_json(topic), "configured": True, **dataclasses.asdict(counts.get(topic.name, TopicCount()))}
+        for topic in sorted(configured, key=lambda topic: (topic.priority, topic.name))
+    ]
+    known = {topic.name for topic in configured}
+    rows += [
+        {"name": name, "configured": False, **dataclasses.asdict(count)}
+        for name, count in sorted(counts.items())
+        if name not in known and not name.startswith(RESERVED_PREFIX)
+    ]
+    return rows
