@@ -1,0 +1,78 @@
+"""`set`, `drop`, `reload`: change the running daemon. What commands change lasts until the next reload or restart."""
+
+from __future__ import annotations
+
+import argparse
+import tomllib
+from typing import Any
+
+from udp_mesh.cli.output import Exit, complain, say, say_json
+from udp_mesh.client.mesh_client import MeshClient
+
+
+def set_topic(arguments: argparse.Namespace) -> int:
+    values = _values(arguments.values)
+    return Exit.USAGE if values is None else _change(arguments, "set-topic", topic=arguments.topic, values=values)
+
+
+def set_window(arguments: argparse.Namespace) -> int:
+    window: str | int = int(arguments.window) if arguments.window.isdigit() else arguments.window
+    return _change(arguments, "set-window", window=window)
+
+
+def set_rates(arguments: argparse.Namespace) -> int:
+    values = _values(arguments.values)
+    return Exit.USAGE if values is None else _change(arguments, "set-rates", values=values)
+
+
+def set_neighbour(arguments: argparse.Namespace) -> int:
+    return _change(
+        arguments,
+        "set-neighbour",
+        address=arguments.address,
+        name=arguments.name,
+        link=arguments.link,
+        legacy=arguments.legacy,
+    )
+
+
+def set_keys(arguments: argparse.Namespace) -> int:
+    return _change(arguments, "set-keys", file=str(arguments.file.absolute()))
+
+
+def drop_topic(arguments: argparse.Namespace) -> int:
+    return _change(arguments, "drop-topic", topic=arguments.topic)
+
+
+def drop_neighbour(arguments: argparse.Namespace) -> int:
+    return _change(arguments, "drop-neighbour", address=arguments.address)
+
+
+def reload(arguments: argparse.Namespace) -> int:
+    return _change(arguments, "reload")
+
+
+def _change(arguments: argparse.Namespace, op: str, **fields: Any) -> int:
+    with MeshClient(arguments.socket) as mesh:
+        changes = mesh.request(op, **fields)["changes"]
+    if arguments.json:
+        say_json({"changes": changes})
+    else:
+        say("\n".join(changes) if changes else "nothing to change")
+    return Exit.OK
+
+
+def _values(assignments: list[str]) -> dict[str, Any] | None:
+    """`priority=2 outbox=last` as TOML values; a word without quotes is text. None (and a complaint) where one is
+    none."""
+    values: dict[str, Any] = {}
+    for assignment in assignments:
+        key, equals, text = assignment.partition("=")
+        if not equals or not key:
+            complain(f"expected key=value, found {assignment!r}")
+            return None
+        try:
+            values[key] = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            values[key] = text
+    return values

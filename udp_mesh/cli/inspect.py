@@ -1,0 +1,64 @@
+"""`status`, `peers`, `topics`, `events`, `metrics`: what is."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+
+from udp_mesh.cli.output import Exit, fields_text, say, say_json, say_json_line
+from udp_mesh.cli.views import Json, peers_view, status_view, topics_view
+from udp_mesh.client.mesh_client import MeshClient
+
+CLEAR = "\x1b[H\x1b[2J"
+
+
+def status(arguments: argparse.Namespace) -> int:
+    return _show(arguments, "status", status_view)
+
+
+def peers(arguments: argparse.Namespace) -> int:
+    return _show(arguments, "peers", lambda reply: peers_view(reply["peers"]))
+
+
+def topics(arguments: argparse.Namespace) -> int:
+    return _show(arguments, "topics", topics_view)
+
+
+def _show(arguments: argparse.Namespace, op: str, view: Callable[[Json], str]) -> int:
+    """Once, or again and again with `--watch`: one screen, or one JSON line, each time."""
+    with MeshClient(arguments.socket) as mesh:
+        while True:
+            reply = mesh.request(op)
+            del reply["id"], reply["ok"]
+            if arguments.watch is None:
+                if arguments.json:
+                    say_json(reply)
+                else:
+                    say(view(reply))
+                return Exit.OK
+            if arguments.json:
+                say_json_line(reply)
+            else:
+                say((CLEAR if sys.stdout.isatty() else "") + view(reply))
+            time.sleep(arguments.watch)
+
+
+def events(arguments: argparse.Namespace) -> int:
+    """Peers that come and go, conflicts, starvation, as they happen."""
+    with MeshClient(arguments.socket) as mesh:
+        mesh.request("events")
+        while True:
+            frame = mesh.next_frame()
+            if frame is not None:
+                fields = frame[0]
+                say_json_line(fields) if arguments.json else say(f"{fields.pop('event')} {fields_text(fields)}")
+
+
+def metrics(arguments: argparse.Namespace) -> int:
+    """The page for Prometheus."""
+    with MeshClient(arguments.socket) as mesh:
+        _, page = mesh.request_frame("metrics")
+        sys.stdout.write(page.decode())
+    return Exit.OK

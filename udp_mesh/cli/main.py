@@ -1,0 +1,241 @@
+"""`udp-mesh`: arguments -> one command -> an exit code."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from udp_mesh import __version__
+from udp_mesh.cli import change, inspect, serve, traffic
+from udp_mesh.cli.output import Exit, complain
+from udp_mesh.client.mesh_client import DEFAULT_SOCKET, MeshError
+from udp_mesh.daemon.configuration import CONDITIONS_TOPIC, DEFAULT_PATH
+
+Command = Callable[[argparse.Namespace], int]
+
+EPILOG = """\
+exit codes: 0 done, 1 refused or no answer, 2 wrong usage, 3 no daemon at the socket,
+4 problems in the configuration, 5 a message was not delivered
+
+examples:
+  udp-mesh check udp-mesh.toml && udp-mesh run udp-mesh.toml
+  udp-mesh status --watch
+  udp-mesh pub status 'ready' --to base --wait
+  udp-mesh echo 'map/*'
+  udp-mesh set topic video priority=9 reliable=false keep_last=1
+"""
+
+FORWARDED = {"report": "udp_mesh.report", "sim": "udp_mesh.sim"}
+"""Commands with arguments of their own: the package's `main(argv)` gets them."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command; returns the process's exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments and arguments[0] in FORWARDED:
+        forwarded: Callable[[list[str]], int] = importlib.import_module(FORWARDED[arguments[0]]).main
+        return forwarded(arguments[1:])
+    parsed = build_parser().parse_args(arguments)
+    command: Command = parsed.command
+    try:
+        return command(parsed)
+    except MeshError as error:
+        complain(str(error))
+        return Exit.UNREACHABLE if error.code == "unreachable" else Exit.FAILED
+    except BrokenPipeError:
+        # The reader of our output has gone: nobody is left to be told.
+        sys.stderr.close()
+        return Exit.FAILED
+    except KeyboardInterrupt:
+        return Exit.OK
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Every command with its help."""
+    parser = argparse.ArgumentParser(
+        prog="udp-mesh",
+        description="Prioritized messages between robots over lossy, breaking links.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"udp-mesh {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    _add_serve(commands)
+    _add_inspect(commands)
+    _add_change(commands)
+    _add_traffic(commands)
+    for name, text in (
+        ("report", "turn a recording into a page of pictures"),
+        ("sim", "run a scenario in the simulator"),
+    ):
+        commands.add_parser(name, help=text, add_help=False)
+    return parser
+
+
+def _command(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    command: Command,
+    help_text: str,
+    *,
+    example: str = "",
+    daemon: bool = True,
+    json: bool = True,
+) -> argparse.ArgumentParser:
+    parser = commands.add_parser(
+        name,
+        help=help_text,
+        description=f"{help_text[:1].upper()}{help_text[1:]}.",
+        epilog=f"example: {example}" if example else None,
+    )
+    parser.set_defaults(command=command)
+    if daemon:
+        parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket (default: %(default)s)")
+    if json:
+        parser.add_argument("--json", action="store_true", help="JSON for scripts")
+    return parser
+
+
+def _add_serve(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    run = _command(
+        commands, "run", serve.run_daemon, "run the daemon", example="udp-mesh run mesh.toml", daemon=False, json=False
+    )
+    run.add_argument("config", type=Path, nargs="?", default=DEFAULT_PATH, help="default: %(default)s")
+    run.add_argument("--log-level", choices=("debug", "info", "warning", "error"), default="info")
+    check = _command(
+        commands, "check", serve.check, "check a configuration", example="udp-mesh check mesh.toml", daemon=False
+    )
+    check.add_argument("config", type=Path, nargs="?", default=DEFAULT_PATH, help="default: %(default)s")
+    keygen = _command(
+        commands,
+        "keygen",
+        serve.keygen,
+        "make a fleet key",
+        example="udp-mesh keygen fleet.key",
+        daemon=False,
+        json=False,
+    )
+    keygen.add_argument("file", type=Path, help="a file that does not exist yet")
+
+
+def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    for name, command, text in (
+        ("status", inspect.status, "show links, peers and counters"),
+        ("peers", inspect.peers, "show the peers and what waits for them"),
+        ("topics", inspect.topics, "show the topics and how they travel"),
+    ):
+        parser = _command(commands, name, command, text, example=f"udp-mesh {name} --watch 2")
+        parser.add_argument(
+            "--watch",
+            type=_positive,
+            nargs="?",
+            const=1.0,
+            metavar="SECONDS",
+            help="again and again (default: every 1 s)",
+        )
+    _command(commands, "events", inspect.events, "print events of peers and topics as they happen")
+    _command(commands, "metrics", inspect.metrics, "print the page for Prometheus", json=False)
+
+
+def _add_change(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    setters = commands.add_parser(
+        "set",
+        help="change the running daemon until its next reload or restart",
+        epilog="example: udp-mesh set window 3",
+    ).add_subparsers(title="what", metavar="WHAT", required=True)
+    topic = _command(
+        setters,
+        "topic",
+        change.set_topic,
+        "add or change a topic",
+        example="udp-mesh set topic map priority=7 outbox=all",
+    )
+    topic.add_argument("topic")
+    topic.add_argument("values", nargs="*", metavar="key=value")
+    window = _command(setters, "window", change.set_window, "set the packets in flight per peer")
+    window.add_argument("window", help='"adaptive", or a number such as 3')
+    rates = _command(setters, "rates", change.set_rates, "set times and thresholds of the protocol")
+    rates.add_argument("values", nargs="+", metavar="key=value", help="as in [rates], such as offline_s=5")
+    neighbour = _command(setters, "neighbour", change.set_neighbour, "add or change a fixed neighbour")
+    neighbour.add_argument("address", help="10.0.0.2, 10.0.0.2:8700 or [fd00::2]:8700")
+    neighbour.add_argument("--name", help="its node name (needed for --legacy)")
+    neighbour.add_argument("--link", help="the link it is reached over")
+    neighbour.add_argument("--legacy", action="store_true", help="it speaks the fielded format")
+    keys = _command(setters, "keys", change.set_keys, "take the keys of a file, the first one seals")
+    keys.add_argument("file", type=Path)
+    droppers = commands.add_parser(
+        "drop",
+        help="remove a topic or neighbour from the running daemon",
+        epilog="example: udp-mesh drop topic video",
+    ).add_subparsers(title="what", metavar="WHAT", required=True)
+    _command(droppers, "topic", change.drop_topic, "forget a topic").add_argument("topic")
+    _command(droppers, "neighbour", change.drop_neighbour, "forget a fixed neighbour").add_argument("address")
+    _command(commands, "reload", change.reload, "read the daemon's configuration again")
+
+
+def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    publish = _command(
+        commands,
+        "pub",
+        traffic.publish,
+        "send a message",
+        example="udp-mesh pub map/diff --file map.bin --to base --wait",
+    )
+    publish.add_argument("topic")
+    publish.add_argument("text", nargs="?", help="the message (default: --file, or standard input)")
+    publish.add_argument("--file", type=Path, help="send this file's bytes (- for standard input)")
+    publish.add_argument("--to", metavar="PEER", help="one peer (default: the topic's destinations, or all)")
+    publish.add_argument("--type", default="", help="the message's type name, carried along")
+    publish.add_argument("--count", type=int, default=1, help="send it so many times")
+    publish.add_argument("--rate", type=_positive, default=1.0, metavar="HZ", help="with --count, so many a second")
+    publish.add_argument(
+        "--wait", type=_positive, nargs="?", const=60.0, metavar="SECONDS", help="wait for the outcome (default: 60 s)"
+    )
+    echo = _command(
+        commands, "echo", traffic.echo, "print messages that arrive", example="udp-mesh echo 'map/*' status"
+    )
+    echo.add_argument("topics", nargs="+", metavar="TOPIC", help=f"names or patterns; {CONDITIONS_TOPIC} too")
+    echo.add_argument("--count", type=int, help="stop after so many")
+    echo.add_argument("--timeout", type=_positive, metavar="SECONDS", help="stop when nothing comes for so long")
+    echo.add_argument("--raw", action="store_true", help="write the payloads' bytes and nothing else")
+    ping = _command(
+        commands, "ping", traffic.ping, "measure round trips to a peer", example="udp-mesh ping base --count 5"
+    )
+    ping.add_argument("peer")
+    ping.add_argument("--count", type=int, default=4)
+    ping.add_argument("--interval", type=_positive, default=1.0, metavar="SECONDS")
+    ping.add_argument("--timeout", type=_positive, default=2.0, metavar="SECONDS")
+    bench = _command(
+        commands, "bench", traffic.bench, "fill the link to a peer and measure", example="udp-mesh bench base"
+    )
+    bench.add_argument("peer")
+    bench.add_argument(
+        "--size", type=int, default=1_000_000, metavar="BYTES", help="per message (default: %(default)s)"
+    )
+    bench.add_argument("--seconds", type=_positive, default=5.0)
+    bench.add_argument(
+        "--timeout", type=_positive, default=60.0, metavar="SECONDS", help="give up when none is delivered"
+    )
+    recorders = commands.add_parser(
+        "record",
+        help="record messages and conditions for `udp-mesh report`",
+        epilog="example: udp-mesh record start run1.jsonl",
+    ).add_subparsers(title="what", metavar="WHAT", required=True)
+    start = _command(recorders, "start", traffic.record_start, "begin a recording")
+    start.add_argument("file", type=Path, help="a file that does not exist yet, written by the daemon")
+    start.add_argument("--payloads", action="store_true", help="with the bytes of received messages")
+    _command(recorders, "stop", traffic.record_stop, "end the recording")
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"expected a positive number, found {text}")
+    return value
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

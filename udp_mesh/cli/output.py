@@ -1,0 +1,94 @@
+"""What a command says and how it ends: lines on standard output, refusals on standard error, exit codes."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+
+
+class Exit(IntEnum):
+    """Exit codes of every command."""
+
+    OK = 0
+    FAILED = 1
+    """The daemon refused, or a peer did not answer."""
+    USAGE = 2
+    UNREACHABLE = 3
+    """No daemon listens at the socket."""
+    CONFIGURATION = 4
+    """The configuration has problems; each is on standard error."""
+    NOT_DELIVERED = 5
+    """A message ended as expired or peer lost."""
+
+
+def say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def say_json(value: object) -> None:
+    say(json.dumps(value, indent=2, ensure_ascii=False))
+
+
+def say_json_line(value: object) -> None:
+    say(json.dumps(value, separators=(",", ":"), ensure_ascii=False))
+
+
+def complain(text: str) -> None:
+    sys.stderr.write(f"udp-mesh: {text}\n")
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Columns as wide as they must be; numbers to the right."""
+    cells = [list(head), *[list(row) for row in rows]]
+    widths = [max(len(row[column]) for row in cells) for column in range(len(head))]
+    numeric = [all(_is_number(row[column]) for row in rows) for column in range(len(head))]
+    return "\n".join(
+        "  ".join(
+            cell.rjust(width) if right else cell.ljust(width)
+            for cell, width, right in zip(row, widths, numeric, strict=True)
+        ).rstrip()
+        for row in cells
+    )
+
+
+def _is_number(cell: str) -> bool:
+    return cell in ("-", "") or cell[0].isdigit()
+
+
+def rate(bits_per_s: float | None) -> str:
+    """`9.41 Mbit/s`."""
+    return "-" if bits_per_s is None else f"{scaled(bits_per_s)}bit/s"
+
+
+def size(count: float) -> str:
+    """`1.50 MB`."""
+    return f"{scaled(count)}B"
+
+
+def scaled(value: float) -> str:
+    for factor, prefix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if value >= factor:
+            return f"{value / factor:.3g} {prefix}"
+    return f"{value:.3g} "
+
+
+def milliseconds(seconds: float | None) -> str:
+    return "-" if seconds is None else f"{seconds * 1000:.3g} ms"
+
+
+def duration(seconds: float | None) -> str:
+    """`1 h 02 min`, `3 min 10 s`, `4.2 s`."""
+    if seconds is None:
+        return "-"
+    if seconds >= 3600:
+        return f"{int(seconds // 3600)} h {int(seconds % 3600 // 60):02d} min"
+    if seconds >= 60:
+        return f"{int(seconds // 60)} min {int(seconds % 60):02d} s"
+    return f"{seconds:.1f} s"
+
+
+def fields_text(fields: Mapping[str, object]) -> str:
+    return " ".join(f"{key}={value}" for key, value in fields.items() if value is not None)

@@ -1,0 +1,82 @@
+"""`run`, `check` and `keygen`: the commands that need no running daemon."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import logging
+import os
+from pathlib import Path
+
+from udp_mesh.cli.output import Exit, complain, say, say_json
+from udp_mesh.crypto import Key
+from udp_mesh.crypto.keys import SECRET_BYTES
+from udp_mesh.daemon.configuration import RESERVED_PREFIX, load
+from udp_mesh.daemon.program import run
+from udp_mesh.daemon.status import plain
+from udp_mesh.daemon.toml_source import ConfigurationError
+
+
+def run_daemon(arguments: argparse.Namespace) -> int:
+    """Runs until it is stopped."""
+    logging.basicConfig(level=arguments.log_level.upper(), format="%(levelname)s %(message)s")
+    try:
+        configuration = load(arguments.config)
+    except ConfigurationError as error:
+        return _report(error)
+    try:
+        asyncio.run(run(configuration))
+    except OSError as error:
+        complain(f"cannot start: {error}")
+        return Exit.FAILED
+    return Exit.OK
+
+
+def check(arguments: argparse.Namespace) -> int:
+    """Reads a configuration and says what is wrong with it, or what it means."""
+    try:
+        configuration = load(arguments.config)
+    except ConfigurationError as error:
+        if arguments.json:
+            say_json({"ok": False, "problems": [plain(problem) for problem in error.problems]})
+            return Exit.CONFIGURATION
+        return _report(error)
+    settings = configuration.settings
+    topics = [topic for topic in settings.topics if not topic.name.startswith(RESERVED_PREFIX)]
+    if arguments.json:
+        say_json(
+            {
+                "ok": True,
+                "name": settings.name,
+                "port": settings.port,
+                "keys": [key.key_id.hex() for key in settings.keys],
+                "unkeyed": settings.unkeyed,
+                "topics": [plain(topic) for topic in topics],
+            }
+        )
+    else:
+        protection = "UNKEYED" if settings.unkeyed else f"{len(settings.keys)} key(s)"
+        say(f"{arguments.config}: good: {settings.name}, port {settings.port}, {len(topics)} topics, {protection}")
+    return Exit.OK
+
+
+def _report(error: ConfigurationError) -> int:
+    for problem in error.problems:
+        complain(str(problem))
+    return Exit.CONFIGURATION
+
+
+def keygen(arguments: argparse.Namespace) -> int:
+    """Makes a fleet key, readable by its owner only; an existing file is never overwritten."""
+    key = Key(os.urandom(SECRET_BYTES))
+    line = f"{key.secret.hex()}  # {key.key_id.hex()}\n"
+    path: Path = arguments.file
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        complain(f"{path}: {error.strerror}")
+        return Exit.FAILED
+    with os.fdopen(descriptor, "w") as file:
+        file.write(line)
+    say(f"{path}: key {key.key_id.hex()}")
+    return Exit.OK

@@ -1,0 +1,131 @@
+"""The daemon's replies -> text for people. Pure."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from udp_mesh.cli.output import duration, milliseconds, rate, size, table
+
+Json = dict[str, Any]
+
+
+def peers_view(peers: list[Json]) -> str:
+    """One line per peer, then one per level that has something waiting."""
+    if not peers:
+        return "no peer heard of yet"
+    rows = [
+        [
+            peer["name"] + (" (fielded)" if peer["legacy"] else ""),
+            "online" if peer["online"] else "OFFLINE",
+            duration(peer["online_for_s"] if peer["online"] else peer["heard_ago_s"]),
+            peer["address"] or "-",
+            peer["link"] or "-",
+            milliseconds(peer["round_trip_s"]),
+            f"{peer['loss'] * 100:.1f} %",
+            rate(peer["sent_bits_per_s"]),
+            rate(peer["received_bits_per_s"]),
+            rate(peer["capacity_bits_per_s"]),
+            str(sum(queue["messages"] for queue in peer["queues"]) + peer["outbox_messages"]),
+        ]
+        for peer in peers
+    ]
+    head = ["peer", "state", "for", "address", "link", "rtt", "loss", "sends", "receives", "capacity", "waiting"]
+    lines = [table(head, rows)]
+    waiting = [
+        [
+            peer["name"],
+            str(queue["priority"]),
+            str(queue["messages"]),
+            size(queue["bytes"]),
+            duration(queue["oldest_s"]),
+            duration(queue["starved_s"]),
+            duration(queue["held_s"]),
+        ]
+        for peer in peers
+        for queue in peer["queues"]
+        if queue["messages"]
+    ]
+    if waiting:
+        lines += ["", table(["waiting for", "priority", "messages", "bytes", "oldest", "starved", "held"], waiting)]
+    return "\n".join(lines)
+
+
+def status_view(status: Json) -> str:
+    """The whole status page."""
+    conditions = status["conditions"]
+    counters = conditions["counters"]
+    protection = "UNKEYED: no protection" if status["unkeyed"] else f"key {' and '.join(status['keys'])}"
+    lines = [
+        f"{conditions['name']}  udp-mesh {status['version']}, wire version {status['wire_version']}, "
+        f"up {duration(status['uptime_s'])}, {protection}, window {status['window']}",
+        "",
+    ]
+    if status["links"]:
+        rows = [
+            [
+                link["name"],
+                link["address"],
+                link["broadcast"] or "neighbours only",
+                str(link["mtu"]),
+                str(link["lost_on_send"]),
+            ]
+            for link in status["links"]
+        ]
+        lines.append(table(["link", "address", "broadcast", "mtu", "unsendable"], rows))
+    else:
+        lines.append("NO LINK: no configured interface is up with an address")
+    lines += [f"link {name} FAILED: {reason}" for name, reason in status["link_failures"].items()]
+    lines += ["", peers_view(conditions["peers"]), ""]
+    lines.append(
+        f"messages: {counters['messages_sent']} sent, {counters['messages_delivered']} delivered, "
+        f"{counters['messages_expired']} expired, {counters['messages_peer_lost']} peer lost, "
+        f"{counters['messages_received']} received; {size(conditions['queued_bytes'])} queued"
+    )
+    lines.append(
+        f"datagrams: {counters['datagrams_sent']} sent, {counters['datagrams_received']} received; fragments: "
+        f"{counters['fragments_retransmitted']} sent again, {counters['duplicates_received']} duplicates"
+    )
+    dropped = {name.removeprefix("dropped_"): n for name, n in counters.items() if name.startswith("dropped_") and n}
+    if dropped:
+        lines.append("dropped: " + ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in dropped.items()))
+    if status["recording"]:
+        lines.append(f"recording to {status['recording']['path']} ({size(status['recording']['bytes'])})")
+    return "\n".join(lines)
+
+
+def topics_view(reply: Json) -> str:
+    """One line per topic, most urgent first."""
+    rows = [
+        [
+            topic["name"],
+            str(topic["priority"]) if topic["configured"] else "-",
+            _how(topic) if topic["configured"] else "not configured here",
+            f"{topic['sent_messages']}",
+            size(topic["sent_bytes"]),
+            f"{topic['received_messages']}",
+            size(topic["received_bytes"]),
+        ]
+        for topic in reply["topics"]
+    ]
+    undeclared = reply["undeclared"]
+    foot = "other topics are refused" if undeclared is None else f"other topics: priority {undeclared['priority']}"
+    if not rows:
+        return f"no topic is configured; {foot}"
+    return table(["topic", "priority", "how", "sent", "", "received", ""], rows) + f"\n{foot}"
+
+
+def _how(topic: Json) -> str:
+    words = ["reliable" if topic["reliable"] else "best effort"]
+    if topic["keep_last"] is not None:
+        words.append(f"last {topic['keep_last']}")
+    if topic["deadline_s"] is not None:
+        words.append(f"within {topic['deadline_s']:g} s")
+    if topic["rate_limit_bytes_per_s"] is not None:
+        words.append(f"at most {size(topic['rate_limit_bytes_per_s'])}/s")
+    if topic["compression"]:
+        words.append("compressed")
+    if topic["outbox"] != "none":
+        words.append(f"outbox {topic['outbox']}" + (" on disk" if topic["outbox_on_disk"] else ""))
+    if topic["destinations"]:
+        words.append("to " + ", ".join(topic["destinations"]))
+    return ", ".join(words)
