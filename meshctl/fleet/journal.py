@@ -10,6 +10,7 @@ from __future__ import annotations
 import getpass
 import json
 import os
+import re
 import socket
 import sqlite3
 import threading
@@ -302,6 +303,16 @@ def owner() -> str:
     except (KeyError, OSError):
         user = str(os.getuid())
     return f"{user}@{socket.gethostname()}"
+
+
+def lock_owner() -> str:
+    """Names this process to the locks on nodes: `user@host:pid:start`, with nothing but letters, digits and @._:+-."""
+    return re.sub(r"[^A-Za-z0-9@._:+-]", "-", f"{owner().partition('@')[0]}@{this_process()}")
+
+
+def is_dead(lock: str) -> bool:
+    """Whether a lock's owner was a process of this machine that has ended: nobody will ever give it back."""
+    return bool(lock) and not process_lives(lock.partition("@")[2])
 
 
 def this_process() -> str:

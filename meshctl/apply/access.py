@@ -1,0 +1,153 @@
+"""How meshctl gets at the nodes of a fleet: where they are, with which keys, over which kept connection.
+
+`Access.open` makes a new connection, which is what proves a changed node reachable; `Access.lease` uses one again.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from ipaddress import IPv4Address
+from pathlib import Path
+from typing import Protocol
+
+from meshctl.device.connection import Credentials, Deadlines, Endpoint
+from meshctl.device.errors import ConnectionLost
+from meshctl.device.ssh import SshConnection, connect
+from meshctl.device.trust import HostKeyPolicy, TrustStore
+from meshctl.errors import InputError
+from meshctl.model import Fleet, Node
+
+
+class Locate(Protocol):
+    """Where a node answers while it has this address: host and port as seen from here."""
+
+    def __call__(self, node: Node, address: IPv4Address) -> tuple[str, int]: ...
+
+
+def as_written(node: Node, address: IPv4Address) -> tuple[str, int]:
+    """The inventory's `ssh.host`, or the address itself."""
+    return node.ssh.host or str(address), node.ssh.port
+
+
+@dataclass(slots=True)
+class Access:
+    """Everything needed to reach any node. Safe for many threads; each connection belongs to one at a time.
+
+    `key_files` come before those the inventory names. `trust` is the file of pins; `policy` judges host keys and may
+    ask about unknown ones, by default the file alone.
+    """
+
+    fleet: Fleet
+    trust: TrustStore
+    key_files: tuple[Path, ...] = ()
+    use_agent: bool = True
+    deadlines: Deadlines = field(default_factory=Deadlines)
+    policy: HostKeyPolicy | None = None
+    locate: Locate = as_written
+    _kept: dict[str, SshConnection] = field(default_factory=dict, repr=False)
+    _jumps: dict[str, SshConnection] = field(default_factory=dict, repr=False)
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+    _jump_lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+
+    def endpoint(self, node: Node, address: IPv4Address | None = None) -> Endpoint:
+        host, port = self.locate(node, address or node.address.ip)
+        return Endpoint(host, port, node.ssh.user, identity=node.name)
+
+    def credentials(self, node: Node) -> Credentials:
+        named = tuple(_key_path(text, self.fleet) for text in node.ssh.key_files)
+        return Credentials(key_files=(*self.key_files, *named), use_agent=self.use_agent)
+
+    def open(
+        self,
+        node: Node,
+        *,
+        endpoint: Endpoint | None = None,
+        policy: HostKeyPolicy | None = None,
+        credentials: Credentials | None = None,
+        deadlines: Deadlines | None = None,
+    ) -> SshConnection:
+        """A new connection, owned by the caller. Raises what `ssh.connect` raises."""
+        return connect(
+            endpoint or self.endpoint(node),
+            credentials=credentials or self.credentials(node),
+            trust=policy or self.policy or self.trust,
+            deadlines=deadlines or self.deadlines,
+            via=self._via(node),
+            release=node.release,
+        )
+
+    def _via(self, node: Node) -> SshConnection | None:
+        if not node.ssh.jump:
+            return None
+        through = self.fleet.nodes.get(node.ssh.jump)
+        if through is None:
+            raise InputError(f"node {node.name}: ssh.jump names {node.ssh.jump!r}, which is no node of the fleet")
+        with self._jump_lock:
+            kept = self._jumps.get(through.name)
+            if kept is None or not kept.is_open:
+                # a jump is one hop: its own jump is not followed
+                kept = self._jumps[through.name] = self.open(replace(through, ssh=replace(through.ssh, jump="")))
+            return kept
+
+    @contextmanager
+    def lease(self, node: Node) -> Iterator[SshConnection]:
+        """The kept connection to a node, or a new one, which is kept afterwards unless it broke."""
+        connection = self.take(node.name) or self.open(node)
+        try:
+            yield connection
+        except ConnectionLost:
+            connection.close()
+            raise
+        except BaseException:
+            self.keep(node.name, connection)
+            raise
+        self.keep(node.name, connection)
+
+    def take(self, name: str) -> SshConnection | None:
+        """The kept connection, if it still stands; the caller owns it now."""
+        with self._lock:
+            kept = self._kept.pop(name, None)
+        if kept is not None and not kept.is_open:
+            kept.close()
+            return None
+        return kept
+
+    def keep(self, name: str, connection: SshConnection) -> None:
+        """Give a connection back for later use."""
+        if not connection.is_open:
+            connection.close()
+            return
+        with self._lock:
+            old = self._kept.get(name)
+            self._kept[name] = connection
+        if old is not None and old is not connection:
+            old.close()
+
+    def drop(self, name: str) -> None:
+        """Close the kept connection to a node."""
+        kept = self.take(name)
+        if kept is not None:
+            kept.close()
+
+    def close(self) -> None:
+        """Close every connection, those through another node first."""
+        with self._lock:
+            every = [*self._kept.values(), *self._jumps.values()]
+            self._kept.clear()
+            self._jumps.clear()
+        for connection in every:
+            connection.close()
+
+    def __enter__(self) -> Access:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+def _key_path(text: str, fleet: Fleet) -> Path:
+    path = Path(text).expanduser()
+    return path if path.is_absolute() else Path(fleet.base) / path

@@ -1,0 +1,142 @@
+"""Whether a change has proven itself: what was seen of the node before and after it -> what is still missing. Pure.
+
+A node may keep its new configuration only when its services took it (`_reload`), its LAN is there (`_lan`), its radios
+are in their cells (`_radios`), the neighbours it had are back (`_neighbours`) and the base can be reached (`_base`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from meshctl.device.observation import Observation
+from meshctl.plan import Wanted
+from meshctl.topology import NEIGHBOUR_FRESH_MS
+from meshctl.uci import Package, Section
+
+# Robots move: of the neighbours a node had, so many have to be heard again.
+NEIGHBOURS_BACK = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Expectation:
+    """What has to be there again. `neighbours` are the MACs heard before, `bases` those of the base's mesh radios;
+    empty when there were none, e.g. on the bench."""
+
+    wireless: Package | None = None
+    network: Package | None = None
+    neighbours: frozenset[str] = frozenset()
+    bases: frozenset[str] = frozenset()
+
+
+def expectation(wanted: Wanted, before: Observation, base_macs: Iterable[str] = ()) -> Expectation:
+    """What this node had and must have again; the base counts only if it was reached through the mesh before."""
+    trees = {file.package.name: file.package for file in wanted.files if file.package is not None}
+    originators = {entry.mac.lower() for entry in before.originators or ()}
+    return Expectation(
+        trees.get("wireless"),
+        trees.get("network"),
+        heard(before),
+        frozenset(mac.lower() for mac in base_macs) & originators,
+    )
+
+
+def heard(seen: Observation, fresh_ms: float = NEIGHBOUR_FRESH_MS) -> frozenset[str]:
+    """The MACs of the mesh neighbours heard lately."""
+    return frozenset(n.mac.lower() for n in seen.neighbours or () if n.last_seen_ms <= fresh_ms)
+
+
+def missing(expected: Expectation, after: Observation, *, since_s: float | None = None) -> tuple[str, ...]:
+    """What is not there yet, each as half a sentence; empty when the change has proven itself.
+
+    `since_s` is how long the change has stood: what was heard before it does not count.
+    """
+    fresh_ms = NEIGHBOUR_FRESH_MS if since_s is None else min(NEIGHBOUR_FRESH_MS, since_s * 1000)
+    return (
+        *_reload(after),
+        *_lan(expected, after),
+        *_radios(expected, after),
+        *_neighbours(expected, after, fresh_ms),
+        *_base(expected, after, fresh_ms),
+    )
+
+
+def _reload(after: Observation) -> tuple[str, ...]:
+    if after.change is None or after.change.state != "applied":
+        return ()
+    status = after.change.reload_status
+    if status is None:
+        return ("its services are still reloading",)
+    return (f"reloading its services failed with status {status}",) if status != 0 else ()
+
+
+def _lan(expected: Expectation, after: Observation) -> tuple[str, ...]:
+    lan = None if expected.network is None else expected.network.section("lan")
+    if lan is None or after.interfaces is None:
+        return ()
+    interface = next((found for found in after.interfaces if found.name == "lan"), None)
+    if interface is None or not interface.up:
+        return ("its LAN is down",)
+    address = lan.get("ipaddr").partition("/")[0]
+    if address and not any(found.partition("/")[0] == address for found in interface.addresses):
+        return (f"its LAN has {', '.join(interface.addresses) or 'no address'}, not {address}",)
+    return _bridge(expected.network, lan.get("device"), after)
+
+
+def _bridge(network: Package | None, device: str, after: Observation) -> tuple[str, ...]:
+    section = None if network is None else _device(network, device)
+    bridge = next((found for found in after.bridges or () if found.name == device), None)
+    if section is None or after.bridges is None:
+        return ()
+    absent = [port for port in section.items("ports") if bridge is None or port not in bridge.ports]
+    return (f"{', '.join(absent)} not in its bridge {device}",) if absent else ()
+
+
+def _device(network: Package, name: str) -> Section | None:
+    return next((section for section in network.of_type("device") if section.get("name") == name), None)
+
+
+def _radios(expected: Expectation, after: Observation) -> tuple[str, ...]:
+    if expected.wireless is None or after.links is None:
+        return ()
+    devices = {section.name: section for section in expected.wireless.of_type("wifi-device")}
+    told = []
+    for iface in expected.wireless.of_type("wifi-iface"):
+        device = devices.get(iface.get("device"))
+        if device is None or "1" in (device.get("disabled", "0"), iface.get("disabled", "0")):
+            continue
+        told += _radio(iface, device.get("channel"), after)
+    return tuple(told)
+
+
+def _radio(iface: Section, channel: str, after: Observation) -> list[str]:
+    name = iface.get("ifname")
+    link = next((found for found in after.links or () if found.ifname == name), None)
+    if link is None:
+        return [f"{name} is not there"]
+    # `up` in netifd does not prove that a cell was joined (openwrt-facts.md section 5)
+    if link.joined is False:
+        return [f"{name} has not joined its cell"]
+    if link.channel is not None and channel.isdigit() and link.channel != int(channel):
+        return [f"{name} is on channel {link.channel}, not {channel}"]
+    bssid = iface.get("bssid").lower()
+    if bssid and link.bssid is not None and link.bssid.lower() != bssid:
+        return [f"{name} is in cell {link.bssid}, not {bssid}"]
+    return []
+
+
+def _neighbours(expected: Expectation, after: Observation, fresh_ms: float) -> tuple[str, ...]:
+    needed = math.ceil(len(expected.neighbours) * NEIGHBOURS_BACK)
+    # by number, not by name: a neighbour may have moved on, another come near
+    found = len(heard(after, fresh_ms))
+    if found >= needed:
+        return ()
+    return (f"it hears {found} mesh neighbour{'s' if found != 1 else ''} of the {len(expected.neighbours)} it had",)
+
+
+def _base(expected: Expectation, after: Observation, fresh_ms: float) -> tuple[str, ...]:
+    if not expected.bases:
+        return ()
+    reached = {entry.mac.lower() for entry in after.originators or () if entry.last_seen_ms <= fresh_ms}
+    return () if expected.bases & reached else ("it has no way to the base",)

@@ -1,0 +1,94 @@
+"""What to do next about a change on a node, from what its dead-man's switch says. Pure.
+
+Whatever was cut (the connection, the node's power, meshctl itself), the switch's state tells the truth, so the driver
+only ever asks and follows: `next_move` has no memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import Enum
+
+from meshctl.device.observation import ChangeStatus
+
+
+class Move(Enum):
+    """START: nothing of ours is there, send it. WAIT: it is on its way. CONFIRM: it has proven itself. ABORT: it never
+    will. KEPT, WENT_BACK: it has ended. FOREIGN: somebody else's change is in the way."""
+
+    START = "start"
+    WAIT = "wait"
+    CONFIRM = "confirm"
+    ABORT = "abort"
+    KEPT = "kept"
+    WENT_BACK = "went back"
+    FOREIGN = "foreign"
+
+
+# Too little of the window left to prove anything more: take it back now instead of waiting for the timer.
+LAST_MOMENT_S = 3.0
+
+
+def next_move(
+    change_id: str,
+    status: ChangeStatus,
+    missing: Sequence[str],
+    *,
+    is_at_new_address: bool,
+    leaving: bool = False,
+) -> Move:
+    """The next move for change `change_id`. `missing` is what has not come back yet (only counts once applied);
+    `is_at_new_address` whether the answer came from where the node shall be; `leaving` that nobody will wait."""
+    if not status.installed:
+        return Move.START
+    if status.change_id == change_id:
+        match status.state:
+            case "staged":
+                return Move.START
+            case "armed":
+                # staged and armed, and the connection broke before it was told when to begin
+                return Move.START
+            case "waiting" | "restoring":
+                return Move.WAIT
+            case "applied":
+                return _applied(status, missing, is_at_new_address=is_at_new_address, leaving=leaving)
+            case _:
+                return Move.WAIT
+    if status.last_id == change_id:
+        return Move.KEPT if status.last_outcome == "confirmed" else Move.WENT_BACK
+    if status.state in ("armed", "waiting", "applied", "restoring"):
+        return Move.FOREIGN
+    return Move.START
+
+
+def _applied(status: ChangeStatus, missing: Sequence[str], *, is_at_new_address: bool, leaving: bool) -> Move:
+    if not missing and is_at_new_address:
+        return Move.CONFIRM
+    failed = status.reload_status not in (None, 0)
+    late = status.left_s is not None and status.left_s < LAST_MOMENT_S
+    return Move.ABORT if failed or late or leaving else Move.WAIT
+
+
+def applied_age_s(status: ChangeStatus) -> float | None:
+    """For how long an applied change has stood, in whole seconds; None when none is applied."""
+    if status.state != "applied" or status.window_s is None or status.left_s is None:
+        return None
+    return max(0.0, status.window_s - status.left_s)
+
+
+# How the switch's own words read to a person.
+REASONS = {
+    "timeout": "it was not confirmed in time",
+    "abort": "it was taken back",
+    "boot": "its power was cut, or it rebooted, before it was confirmed",
+    "guard": "its timer was killed; its second timer took over",
+    "failed": "the files could not be put in place",
+    "moved-on": "somebody changed a file on it meanwhile",
+    "operator": "it was dropped",
+}
+
+
+def why_it_went_back(status: ChangeStatus, missing: Sequence[str]) -> str:
+    """One sentence for an outcome."""
+    reason = REASONS.get(status.last_reason, status.last_reason or "for an unknown reason")
+    return f"{reason}: {'; '.join(missing)}" if missing else reason

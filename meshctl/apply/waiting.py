@@ -1,0 +1,38 @@
+"""Polling without hurry and without waste: short pauses first, longer ones later, an end, and an ear for Ctrl-C."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+from meshctl.fleet import Interrupt
+
+# A virtual or near node answers within the first pause; a far one costs a few connections more.
+FIRST_PAUSE_S, LONGEST_PAUSE_S, GROWTH = 0.2, 2.0, 1.5
+
+
+@dataclass(slots=True)
+class Pace:
+    """`pause` sleeps; `is_over` once `limit_s` have passed since the pace was made."""
+
+    limit_s: float
+    interrupt: Interrupt
+    _pause_s: float = FIRST_PAUSE_S
+    _began: float = field(default_factory=time.monotonic)
+
+    @property
+    def elapsed_s(self) -> float:
+        return time.monotonic() - self._began
+
+    @property
+    def is_over(self) -> bool:
+        return self.elapsed_s >= self.limit_s
+
+    def pause(self) -> None:
+        """Sleep a while, less when somebody wants to leave."""
+        self.interrupt.wait(min(self._pause_s, max(0.0, self.limit_s - self.elapsed_s)))
+        self._pause_s = min(self._pause_s * GROWTH, LONGEST_PAUSE_S)
+
+    def hurry(self) -> None:
+        """Something has changed: look again soon."""
+        self._pause_s = FIRST_PAUSE_S

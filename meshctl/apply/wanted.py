@@ -1,0 +1,55 @@
+"""What the inventory wants of each node, rendered with what only the device knows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from meshctl.device.observation import Observation
+from meshctl.model import Fleet, Node, Secret, SecretRef
+from meshctl.plan import Wanted
+from meshctl.plan.packages import Needs
+from meshctl.plan.seen import packages_seen
+from meshctl.render import DeviceFacts, Templates, render
+from meshctl.resolve import package_needs, resolve
+
+
+@dataclass(frozen=True, slots=True)
+class Renderer:
+    """Renders nodes of one fleet; `secrets` fetches what its references name."""
+
+    fleet: Fleet
+    secrets: Callable[[SecretRef], Secret]
+    templates: Templates
+
+    @classmethod
+    def of(cls, fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> Renderer:
+        return cls(fleet, secrets, Templates.of(fleet))
+
+    def wanted(self, node: Node, seen: Observation | None = None) -> Wanted:
+        """One node's files and packages. Raises InvalidInput for values that cannot be written down."""
+        intent = resolve(self.fleet, node, self.secrets)
+        rendered = render(intent, self.templates, device_facts(seen))
+        return Wanted(
+            node,
+            rendered.files,
+            tuple(secret.reveal() for secret in intent.secrets),
+            Needs(_groups(self.fleet, node, rendered.packages), rendered.removed_packages),
+        )
+
+
+def device_facts(seen: Observation | None) -> DeviceFacts:
+    """What has to be carried over from the device: `system.compat_version`, which sysupgrade compares."""
+    system = None if seen is None else packages_seen(("etc/config/system",), seen)["system"]
+    sections = () if system is None else system.of_type("system")
+    return DeviceFacts(next((text for section in sections if (text := section.get("compat_version"))), ""))
+
+
+def _groups(fleet: Fleet, node: Node, packages: Iterable[str]) -> tuple[tuple[str, ...], ...]:
+    """Each package to install with what would do as well (`batctl-full` for `batctl-default`)."""
+    needs = package_needs(fleet, node)
+    chosen = [
+        next(((name, *(o for o in need.any_of if o != name)) for need in needs if name in need.any_of), (name,))
+        for name in packages
+    ]
+    return tuple(chosen)
