@@ -134,7 +134,11 @@ exec chroot "$root" "$@"
 def dropbear(node: Sandbox, *options: str, port: int | None = None) -> Server:
     """Start dropbear in the node as OpenWrt does: three tries (`-T 3`), blank root password let in (`-B`)."""
     port = port or free_port()
-    keys = [word for path in sorted(node.path("/etc/dropbear").glob("*_host_key")) for word in ("-r", f"/etc/dropbear/{path.name}")]
+    keys = [
+        word
+        for path in sorted(node.path("/etc/dropbear").glob("*_host_key"))
+        for word in ("-r", f"/etc/dropbear/{path.name}")
+    ]
     command = ["/usr/sbin/dropbear", "-F", "-E", "-p", f"127.0.0.1:{port}", "-T", "3", "-B", *keys, *options]
     unshare = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "sh", "-ec", ENTER, "enter", str(node.root)]
     return Server([*unshare, *command], port, node.path("/harness/dropbear.log"))
@@ -155,7 +159,13 @@ def openssh(directory: Path, authorized: Path, *settings: str, host_key_type: st
     (directory / "shadow").chmod(0o600)
     key = directory / "host_key"
     subprocess.run(["ssh-keygen", "-q", "-t", host_key_type, "-N", "", "-f", key], check=True)
-    lines = [f"HostKey {key}", f"AuthorizedKeysFile {authorized}", "ListenAddress 127.0.0.1", "StrictModes no", "UsePAM no"]
+    lines = [
+        f"HostKey {key}",
+        f"AuthorizedKeysFile {authorized}",
+        "ListenAddress 127.0.0.1",
+        "StrictModes no",
+        "UsePAM no",
+    ]
     lines += ["PidFile none", "PermitRootLogin yes", *settings]
     (directory / "sshd_config").write_text("".join(f"{line}\n" for line in lines))
     port = free_port()

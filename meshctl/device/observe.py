@@ -1,0 +1,252 @@
+"""One look at a node: scripts/observe.sh goes there, its sections come back, the parsers make an `Observation` of them.
+
+`observe` is the round trip; `interpret` is pure. A parser never raises: what it cannot read becomes None and a note.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import TypeVar
+
+from meshctl.device.connection import Connection
+from meshctl.device.framing import quoted
+from meshctl.device.observation import (
+    BoardInfo,
+    ChangeStatus,
+    FileInfo,
+    MeshInfo,
+    MeshNeighbour,
+    Observation,
+    Originator,
+    ReleaseInfo,
+    Space,
+    Station,
+    WirelessLink,
+)
+from meshctl.device.parse import batctl, iw, keys, packages, system, ubus
+from meshctl.device.parse.deadman import parse_status
+from meshctl.device.parse.sections import Section, split_sections
+from meshctl.device.scripts import script
+
+T = TypeVar("T")
+
+# A busy ath79 takes about ten seconds for all of it; a lossy path of five hops adds its own.
+OBSERVE_TIMEOUT_S = 90.0
+
+
+def observe(
+    connection: Connection,
+    *,
+    extra_paths: Iterable[str] = (),
+    timeout_s: float = OBSERVE_TIMEOUT_S,
+    clock: Callable[[], float] = time.time,
+) -> Observation:
+    """Everything about the node, in one round trip; `extra_paths` are files to read besides.
+
+    Raises Timeout and ConnectionLost; whatever the node says or does not say is data.
+    """
+    nonce = f"meshctl-{secrets.token_hex(16)}"
+    sent = observation_script(nonce, extra_paths)
+    asked = clock()
+    done = connection.run(sent, timeout_s=timeout_s)
+    return interpret(split_sections(done.stdout_bytes, nonce), asked_at_s=asked, answered_at_s=clock())
+
+
+def observation_script(nonce: str, extra_paths: Iterable[str] = ()) -> str:
+    """observe.sh with its two inputs set. Raises ValueError for a path with blanks or quotes."""
+    paths = tuple(extra_paths)
+    for path in paths:
+        if not path.startswith("/") or quoted(path) != path:
+            raise ValueError(f"{path!r}: expected an absolute path of letters, digits and ._+@%:,-")
+    return f"N={quoted(nonce)}\nEXTRA={quoted(' '.join(paths))}\n{script('observe.sh')}"
+
+
+class _Reader:
+    """Sections by name; collects a note for each that is missing, failed or not understood."""
+
+    def __init__(self, sections: Mapping[str, Section]) -> None:
+        self._sections = sections
+        self.notes: list[str] = []
+        if "done" not in sections:
+            self.notes.append("the observation ended early")
+
+    def read(self, name: str, parse: Callable[[str], T | None], *, required: bool = True) -> T | None:
+        """What `parse` makes of the section, or None; an empty section of a failed tool is not parsed."""
+        section = self._sections.get(name)
+        if section is None:
+            if required:
+                self.notes.append(f"{name}: not told")
+            return None
+        if section.status != 0 and not section.body.strip():
+            if required:
+                self.notes.append(f"{name}: exit status {section.status}")
+            return None
+        value = parse(section.text)
+        if value is None:
+            self.notes.append(f"{name}: not understood: {section.text.strip()[:60]!r}")
+        return value
+
+    def names(self, kind: str) -> list[str]:
+        """The second words of the sections `KIND WORD`."""
+        return [name.split(" ", 1)[1] for name in self._sections if name.startswith(f"{kind} ")]
+
+    def body(self, name: str) -> bytes | None:
+        section = self._sections.get(name)
+        return None if section is None or section.status != 0 else section.body
+
+    def status(self, name: str) -> int | None:
+        section = self._sections.get(name)
+        return None if section is None else section.status
+
+
+def interpret(sections: Mapping[str, Section], *, asked_at_s: float, answered_at_s: float) -> Observation:
+    """The sections of observe.sh as facts; pure, and total: any sections give an Observation."""
+    reader = _Reader(sections)
+    board, release = _board(reader)
+    space = reader.read("df", system.parse_df) or {}
+    links, stations = _wireless(reader)
+    mesh, neighbours, originators = _mesh(reader)
+    macs = reader.read("macs", system.parse_macs)
+    installed = reader.read("packages", packages.parse_packages)
+    return Observation(
+        asked_at_s=asked_at_s,
+        answered_at_s=answered_at_s,
+        release=release,
+        board=board,
+        boot_id=reader.read("boot_id", system.parse_boot_id),
+        uptime_s=reader.read("uptime", system.parse_uptime),
+        clock_s=reader.read("clock", system.parse_clock),
+        memory=reader.read("meminfo", system.parse_meminfo),
+        overlay=_space(space, "/"),
+        tmp=_space(space, "/tmp"),
+        macs=None if macs is None else MappingProxyType(macs),
+        radios=reader.read("ubus.wireless", ubus.parse_wireless),
+        links=links,
+        stations=stations,
+        interfaces=reader.read("ubus.interfaces", ubus.parse_interfaces),
+        bridges=reader.read("bridges", system.parse_bridges),
+        mesh=mesh,
+        neighbours=neighbours,
+        originators=originators,
+        package_tool=reader.read("package_tool", packages.parse_package_tool),
+        packages=None if installed is None else MappingProxyType(installed),
+        uci=_uci(reader),
+        uci_changes=_lines(reader, "uci.changes"),
+        authorized_keys=reader.read("authorized_keys", keys.parse_authorized_keys),
+        host_keys=reader.read("host_keys", keys.parse_host_keys),
+        files=MappingProxyType({path: _file(reader, path) for path in reader.names("mode")}),
+        change=reader.read("deadman", _change),
+        notes=tuple(reader.notes),
+    )
+
+
+def _board(reader: _Reader) -> tuple[BoardInfo | None, ReleaseInfo | None]:
+    told, release = reader.read("ubus.board", ubus.parse_board) or (None, None)
+    if release is None:
+        release = reader.read("openwrt_release", system.parse_openwrt_release)
+    board_name = (reader.read("board_name", str.strip, required=False) or "") or (told.board_name if told else "")
+    if not board_name and told is None:
+        return None, release
+    model = reader.read("model", str.strip, required=False) or ""
+    ports, label = reader.read("board.json", ubus.parse_board_json) or ((), "")
+    board = told or BoardInfo(board_name="")
+    return replace(board, board_name=board_name, model=board.model or model, lan_ports=ports, label_mac=label), release
+
+
+def _space(space: Mapping[str, Space], path: str) -> Space | None:
+    """The file system mounted at `path`, or at / where `path` has none of its own."""
+    return space.get(path) or space.get("/")
+
+
+def _wireless(reader: _Reader) -> tuple[tuple[WirelessLink, ...] | None, tuple[Station, ...] | None]:
+    links = reader.read("iw.dev", iw.parse_iw_dev)
+    if links is None:
+        return None, None
+    joined = tuple(iw.with_link(link, reader.read(f"iw.link {link.ifname}", str) or "") for link in links)
+    stations: list[Station] = []
+    for link in links:
+        stations += reader.read(f"iw.stations {link.ifname}", iw.parse_stations) or ()
+    return joined, tuple(stations)
+
+
+def _mesh(
+    reader: _Reader,
+) -> tuple[MeshInfo | None, tuple[MeshNeighbour, ...] | None, tuple[Originator, ...] | None]:
+    """Of all batman interfaces together; (None, None, None) where there is none."""
+    names = reader.names("batctl.originators_json")
+    if not names:
+        return None, None, None
+    info: MeshInfo | None = None
+    hard: list[str] = []
+    neighbours: list[MeshNeighbour] | None = None
+    originators: list[Originator] | None = None
+    for name in names:
+        as_text = reader.status(f"batctl.originators {name}") is not None
+        if as_text:
+            seen = reader.read(f"batctl.originators {name}", batctl.parse_mesh_header)
+            near = reader.read(f"batctl.neighbors {name}", batctl.parse_neighbours_text)
+            far = reader.read(f"batctl.originators {name}", batctl.parse_originators_text)
+            hard += reader.read(f"batctl.interface {name}", batctl.parse_interfaces_text) or ()
+        else:
+            seen = reader.read(f"batctl.mesh_json {name}", batctl.parse_mesh_json)
+            near = reader.read(f"batctl.neighbors_json {name}", batctl.parse_neighbours_json)
+            far = reader.read(f"batctl.originators_json {name}", batctl.parse_originators_json)
+            hard += reader.read(f"batctl.hardifs_json {name}", batctl.parse_hardifs_json) or ()
+        info = info or seen
+        neighbours = (neighbours or []) + list(near) if near is not None else neighbours
+        originators = (originators or []) + list(far) if far is not None else originators
+    return (
+        None if info is None else replace(info, hard_interfaces=tuple(dict.fromkeys(hard))),
+        None if neighbours is None else tuple(neighbours),
+        None if originators is None else tuple(originators),
+    )
+
+
+def _uci(reader: _Reader) -> Mapping[str, str] | None:
+    if reader.body("config.list") is None:
+        reader.notes.append("config.list: /etc/config cannot be read")
+        return None
+    bodies = {name: reader.body(f"config {name}") for name in reader.names("config")}
+    return MappingProxyType(
+        {name: body.decode("utf-8", "replace") for name, body in bodies.items() if body is not None}
+    )
+
+
+def _lines(reader: _Reader, name: str) -> tuple[str, ...] | None:
+    body = reader.body(name)
+    if body is None:
+        reader.notes.append(f"{name}: exit status {reader.status(name)}")
+        return None
+    return tuple(line for line in body.decode("utf-8", "replace").splitlines() if line.strip())
+
+
+def _file(reader: _Reader, path: str) -> FileInfo | None:
+    """None for what does not exist or is no plain file."""
+    listed, hashed, text = (reader.body(f"{kind} {path}") for kind in ("mode", "hash", "text"))
+    if listed is None or hashed is None or text is None:
+        return None
+    mode = system.parse_mode(listed.decode("utf-8", "replace"))
+    digest = hashed.split()[:1]
+    if mode is None or not digest:
+        reader.notes.append(f"{path}: not understood: {listed[:60]!r}")
+        return None
+    return FileInfo(path=path, mode=mode, sha256=digest[0].decode("ascii", "replace"), text=_as_text(text, digest[0]))
+
+
+def _as_text(body: bytes, digest: bytes) -> str | None:
+    """The text, if it is UTF-8 and whole: a long file was cut by the script, and its hash tells."""
+    if hashlib.sha256(body).hexdigest().encode() != digest:
+        return None
+    try:
+        return body.decode("utf-8")
+    except UnicodeDecodeError:
+        return None
+
+
+def _change(text: str) -> ChangeStatus | None:
+    return ChangeStatus(state="absent", installed=False) if text.strip() == "absent" else parse_status(text)

@@ -1,0 +1,188 @@
+"""OpenWrt's own verbs on a node: its uptime, files, packages, firmware, reload and reboot.
+
+Each takes a `Connection` and runs one short script with absolute paths of the tools that act. What ends the connection
+(reboot, sysupgrade) is started as a process of its own and answered before it strikes.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+
+from meshctl.device.connection import Connection
+from meshctl.device.errors import CommandFailed
+from meshctl.device.framing import quoted
+from meshctl.device.parse.jsontext import mapping, parse_json, truth
+from meshctl.device.parse.system import parse_boot_id, parse_meminfo, parse_uptime
+
+# Unpacking packages into jffs2 takes a minute on the slowest boards.
+PACKAGES_TIMEOUT_S = 300.0
+# `sysupgrade -T` unpacks and hashes the image.
+FIRMWARE_TEST_TIMEOUT_S = 120.0
+# Between the answer and the deed, so that the answer arrives.
+ACT_AFTER_S = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Clocked:
+    """The node's uptime at `at_s` of the observer's monotonic clock, right to within `error_s` on either side."""
+
+    boot_id: str
+    uptime_s: float
+    at_s: float
+    error_s: float
+
+    def uptime_at(self, now_s: float) -> float:
+        """The node's uptime when the observer's monotonic clock says `now_s`."""
+        return self.uptime_s + now_s - self.at_s
+
+
+def measure_uptime(
+    connection: Connection, *, samples: int = 3, monotonic: Callable[[], float] = time.monotonic
+) -> Clocked:
+    """The node's uptime against our clock: the quickest of some round trips bounds the error by half of itself.
+
+    This is what a switch at one moment counts from; the node's wall clock plays no part.
+    """
+    best: Clocked | None = None
+    for _ in range(max(samples, 1)):
+        asked = monotonic()
+        done = connection.run("cat /proc/uptime /proc/sys/kernel/random/boot_id")
+        answered = monotonic()
+        lines = done.check(f"{connection.endpoint.label}: read the uptime").stdout.splitlines()
+        uptime = parse_uptime(lines[0]) if lines else None
+        boot_id = parse_boot_id(lines[1]) if len(lines) > 1 else None
+        if uptime is None or boot_id is None:
+            raise CommandFailed(f"{connection.endpoint.label}: no uptime or boot id in {lines!r}", exit_status=0)
+        seen = Clocked(boot_id, uptime, (asked + answered) / 2, (answered - asked) / 2)
+        best = seen if best is None or seen.error_s < best.error_s else best
+    assert best is not None
+    return best
+
+
+@dataclass(frozen=True, slots=True)
+class FetchedFile:
+    """A file as it is on the node."""
+
+    content: bytes = field(repr=False)
+    mode: int
+
+
+def fetch_files(connection: Connection, paths: Iterable[str]) -> dict[str, FetchedFile]:
+    """The plain files among `paths` (patterns of the shell are expanded on the node), in one round trip."""
+    words = " ".join(path.lstrip("/") for path in paths)
+    if not words or quoted(*words.split()).replace("'", "") != words:
+        raise ValueError(f"expected paths without blanks or quotes, found {words!r}")
+    # a pattern that matches nothing stays as it is, so only what exists is named to tar
+    script = f'cd / || exit 1; set --; for f in {words}; do [ ! -f "$f" ] || set -- "$@" "$f"; done\n'
+    script += 'if [ $# -gt 0 ]; then tar -cf - "$@"; fi'
+    done = connection.run(script).check(f"{connection.endpoint.label}: read files")
+    if not done.stdout_bytes:
+        return {}
+    found: dict[str, FetchedFile] = {}
+    try:
+        with tarfile.open(fileobj=io.BytesIO(done.stdout_bytes)) as archive:
+            for member in archive:
+                file = archive.extractfile(member)
+                if file is not None:
+                    found["/" + member.name.lstrip("/")] = FetchedFile(file.read(), member.mode & 0o7777)
+    except tarfile.TarError as error:
+        raise CommandFailed(
+            f"{connection.endpoint.label}: an archive that cannot be read: {error}", exit_status=0
+        ) from error
+    return found
+
+
+def backup(connection: Connection) -> bytes:
+    """The node's own configuration backup (`sysupgrade -b`), a tar.gz."""
+    script = (
+        "umask 077; mkdir -p /tmp/meshctl; b=/tmp/meshctl/backup.$$\n"
+        '/sbin/sysupgrade -b "$b" >/dev/null && cat "$b"; s=$?; rm -f "$b"; exit $s'
+    )
+    return connection.run(script).check(f"{connection.endpoint.label}: back up").stdout_bytes
+
+
+def install_packages(connection: Connection, package_files: Iterable[str], *, tool: str) -> str:
+    """Install package files that were uploaded, all in one call so that they may need each other; returns the output.
+
+    `tool` is `opkg` or `apk` (`Observation.package_tool`). Needs no network. Raises CommandFailed.
+    """
+    match tool:
+        case "opkg":
+            verb = ["opkg", "install"]
+        case "apk":
+            # files given by path are verified by meshctl's own hash, not by a repository's key
+            verb = ["apk", "add", "--no-network", "--allow-untrusted"]
+        case _:
+            raise ValueError(f"expected opkg or apk, found {tool!r}")
+    done = connection.run(f"{quoted(*verb, *package_files)} 2>&1", timeout_s=PACKAGES_TIMEOUT_S)
+    return done.check(f"{connection.endpoint.label}: install packages").stdout
+
+
+@dataclass(frozen=True, slots=True)
+class FirmwareCheck:
+    """What the node says of an image: `valid` decides, `tests` and `reason` say why."""
+
+    valid: bool
+    reason: str
+    tests: Mapping[str, bool]
+    available_bytes: int | None
+
+
+def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
+    """`sysupgrade -T` and, where procd has it, `validate_firmware_image`, on an image that was uploaded.
+
+    Also drops caches and tells the memory that is then available: sysupgrade itself does not look.
+    """
+    request = quoted(json.dumps({"path": image_path}))
+    script = (
+        "sync; echo 3 2>/dev/null >/proc/sys/vm/drop_caches\n"
+        f'/sbin/sysupgrade -T {quoted(image_path)} >/tmp/sysupgrade.test 2>&1; echo "status $?"\n'
+        "sed 's/^/said /' /tmp/sysupgrade.test; rm -f /tmp/sysupgrade.test\n"
+        f"ubus call system validate_firmware_image {request} 2>/dev/null | tr -d '\\n\\t' | sed 's/^/json /'; echo\n"
+        "cat /proc/meminfo"
+    )
+    done = connection.run(script, timeout_s=FIRMWARE_TEST_TIMEOUT_S)
+    lines = done.check(f"{connection.endpoint.label}: test the firmware").stdout.splitlines()
+    said = [line[5:].strip() for line in lines if line.startswith("said ")]
+    told = mapping(parse_json(next((line[5:] for line in lines if line.startswith("json ")), "")))
+    memory = parse_meminfo(done.stdout)
+    passed = "status 0" in lines and (not told or truth(told.get("valid")))
+    return FirmwareCheck(
+        valid=passed,
+        reason="" if passed else "; ".join(line for line in said if line) or "sysupgrade -T failed",
+        tests={name: truth(value) for name, value in mapping(told.get("tests")).items()},
+        available_bytes=None if memory is None else memory.available,
+    )
+
+
+def start_sysupgrade(connection: Connection, image_path: str, config_path: str) -> None:
+    """Flash the image, keep nothing but what the tar.gz at `config_path` holds (`sysupgrade -n -f`), detached.
+
+    Returns once it is started. The connection will break; only a new boot id, the expected revision and the marker in
+    the flashed configuration prove success.
+    """
+    act = f"exec /sbin/sysupgrade -n -f {quoted(config_path)} {quoted(image_path)} >/tmp/sysupgrade.log 2>&1"
+    _detached(connection, "sysupgrade", act)
+
+
+def reboot(connection: Connection) -> None:
+    """Reboot, detached. A change that is armed and not confirmed is undone by the boot."""
+    _detached(connection, "reboot", "sync; exec /sbin/reboot")
+
+
+def reload_config(connection: Connection) -> None:
+    """`reload_config`: every service whose configuration changed. For a change that may cut us off use `deadman`."""
+    connection.run("/sbin/reload_config").check(f"{connection.endpoint.label}: reload the configuration")
+
+
+def _detached(connection: Connection, name: str, act: str) -> None:
+    # matched by a pid file that is not there: -x alone would find any running shell and start nothing
+    pid_file = f"/tmp/meshctl/{name}.pid"
+    daemon = quoted(f"sleep {ACT_AFTER_S}; {act}")
+    started = f"mkdir -p /tmp/meshctl && rm -f {pid_file} && start-stop-daemon -S -b -m -p {pid_file} -x /bin/sh -- -c {daemon}"
+    connection.run(started).check(f"{connection.endpoint.label}: start {name}")

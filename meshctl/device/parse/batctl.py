@@ -1,0 +1,135 @@
+"""`batctl`: JSON from 2021.1 on (OpenWrt 21.02), text tables before (19.07 has 2019.2)."""
+
+from __future__ import annotations
+
+import re
+from types import MappingProxyType
+
+from meshctl.device.observation import MeshInfo, MeshNeighbour, Originator
+from meshctl.device.parse.jsontext import integer, mapping, maps, parse_json, string, truth
+
+_MAC = r"((?:[0-9a-f]{2}:){5}[0-9a-f]{2})"
+_SEEN = r"(\d{1,9})\.(\d{3})s"
+# ` * 02:..:02    0.320s   (251) 02:..:02 [     mesh0]`; BATMAN_V writes Mbit/s as (       10.4)
+_ORIGINATOR = re.compile(
+    rf"^ ?(\*?) *{_MAC} +{_SEEN} +\( *(\d{{1,9}})(?:\.(\d))?\) +{_MAC} +\[ *(\S+)\]", re.IGNORECASE
+)
+# BATMAN_IV: `    mesh0     02:..:02    0.120s`; BATMAN_V: `02:..:02    0.120s (    10.4) [     mesh0]`
+_NEIGHBOUR_IV = re.compile(rf"^ *(\S+) +{_MAC} +{_SEEN}", re.IGNORECASE)
+_NEIGHBOUR_V = re.compile(rf"^ *{_MAC} +{_SEEN} +\([^)]*\) +\[ *(\S+)\]", re.IGNORECASE)
+_HEADER = re.compile(r"\[B\.A\.T\.M\.A\.N\. adv ([^,]+),.*?(BATMAN_I?V)\)?")
+
+
+def parse_mesh_json(text: str) -> MeshInfo | None:
+    """`mesh_json`: version, algorithm and every setting as text."""
+    told = mapping(parse_json(text))
+    if not string(told.get("version")) and not string(told.get("algo_name")):
+        return None
+    settings = {
+        key: string(value)
+        for key, value in told.items()
+        if key not in {"version", "algo_name"} and isinstance(value, str | int | float)
+    }
+    return MeshInfo(
+        version=string(told.get("version")),
+        algorithm=string(told.get("algo_name")),
+        settings=MappingProxyType(settings),
+    )
+
+
+def parse_hardifs_json(text: str) -> tuple[str, ...] | None:
+    """`hardifs_json`: the names of the hard interfaces."""
+    told = parse_json(text)
+    if not isinstance(told, list):
+        return None
+    return tuple(name for item in maps(told) if (name := string(item.get("hard_ifname"))))
+
+
+def parse_interfaces_text(text: str) -> tuple[str, ...] | None:
+    """`batctl if`: `mesh0: active`."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    if not all(re.fullmatch(r"\S+: \w+", line.strip()) for line in lines):
+        return None
+    return tuple(line.split(":", 1)[0].strip() for line in lines)
+
+
+def parse_neighbours_json(text: str) -> tuple[MeshNeighbour, ...] | None:
+    """`neighbors_json`; `hard_ifname` came with 2021.2 and is empty before."""
+    told = parse_json(text)
+    if not isinstance(told, list):
+        return None
+    return tuple(
+        MeshNeighbour(
+            mac=string(item.get("neigh_address")).lower(),
+            ifname=string(item.get("hard_ifname")),
+            last_seen_ms=integer(item.get("last_seen_msecs")) or 0,
+        )
+        for item in maps(told)
+        if string(item.get("neigh_address"))
+    )
+
+
+def parse_neighbours_text(text: str) -> tuple[MeshNeighbour, ...] | None:
+    """`batctl n`. None when there is not even a header."""
+    if "Neighbor" not in text:
+        return () if not text.strip() else None
+    found = []
+    for line in text.splitlines():
+        if row := _NEIGHBOUR_V.match(line):
+            found.append(MeshNeighbour(row[1].lower(), row[4], _milliseconds(row[2], row[3])))
+        elif row := _NEIGHBOUR_IV.match(line):
+            found.append(MeshNeighbour(row[2].lower(), row[1], _milliseconds(row[3], row[4])))
+    return tuple(found)
+
+
+def parse_originators_json(text: str) -> tuple[Originator, ...] | None:
+    """`originators_json`: `tq` for BATMAN_IV, `throughput` in kbit/s for BATMAN_V; `best` is absent when false."""
+    told = parse_json(text)
+    if not isinstance(told, list):
+        return None
+    return tuple(
+        Originator(
+            mac=string(item.get("orig_address")).lower(),
+            next_hop=string(item.get("neigh_address")).lower(),
+            ifname=string(item.get("hard_ifname")),
+            last_seen_ms=integer(item.get("last_seen_msecs")) or 0,
+            best=truth(item.get("best")),
+            tq=integer(item.get("tq")),
+            throughput_kbit_s=integer(item.get("throughput")),
+        )
+        for item in maps(told)
+        if string(item.get("orig_address"))
+    )
+
+
+def parse_originators_text(text: str) -> tuple[Originator, ...] | None:
+    """`batctl o`. None when there is not even a header."""
+    if "Originator" not in text:
+        return () if not text.strip() else None
+    found = []
+    for line in text.splitlines():
+        if not (row := _ORIGINATOR.match(line)):
+            continue
+        mbit_s = row[6] is not None
+        found.append(
+            Originator(
+                mac=row[2].lower(),
+                next_hop=row[7].lower(),
+                ifname=row[8],
+                last_seen_ms=_milliseconds(row[3], row[4]),
+                best=row[1] == "*",
+                tq=None if mbit_s else int(row[5]),
+                throughput_kbit_s=int(row[5]) * 1000 + int(row[6]) * 100 if mbit_s else None,
+            )
+        )
+    return tuple(found)
+
+
+def parse_mesh_header(text: str) -> MeshInfo | None:
+    """Version and algorithm from the first line of `batctl o`."""
+    found = _HEADER.search(text)
+    return MeshInfo(version=found[1].strip(), algorithm=found[2]) if found else None
+
+
+def _milliseconds(seconds: str, thousandths: str) -> int:
+    return int(seconds) * 1000 + int(thousandths)

@@ -1,0 +1,115 @@
+"""`iw`: `dev`, `dev IF link`, `dev IF station dump` (iw's interface.c, link.c, station.c)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+
+from meshctl.device.observation import Station, WirelessLink
+
+_INTERFACE = re.compile(r"^\s*Interface (\S+)$")
+_CHANNEL = re.compile(r"channel (\d{1,3}) \((\d{3,6})(?:\.\d+)? MHz\)(?:, width: ([^,]+))?")
+_STATION = re.compile(r"^Station ((?:[0-9a-f]{2}:){5}[0-9a-f]{2}) \(on (\S+)\)$", re.IGNORECASE)
+_JOINED = re.compile(r"^(?:Joined IBSS|Connected to) ((?:[0-9a-f]{2}:){5}[0-9a-f]{2})", re.IGNORECASE)
+_ESCAPED = re.compile(rb"\\x([0-9a-fA-F]{2})")
+
+
+def parse_iw_dev(text: str) -> tuple[WirelessLink, ...] | None:
+    """`iw dev`: every wireless interface. None for text that is not iw's."""
+    if text.strip() and not re.search(r"^phy#\d+", text, re.MULTILINE):
+        return None
+    return tuple(_interface(name, lines) for name, lines in _blocks(text, _INTERFACE))
+
+
+def _interface(name: str, lines: list[str]) -> WirelessLink:
+    fields = {words[0]: words[1] for line in lines if len(words := line.strip().split(" ", 1)) == 2}
+    channel = next((found for line in lines if (found := _CHANNEL.search(line))), None)
+    power = re.match(r"-?\d{1,3}(?:\.\d+)?", fields.get("txpower", ""))
+    return WirelessLink(
+        ifname=name,
+        mode=fields.get("type", ""),
+        mac=fields.get("addr", "").lower(),
+        ssid=unescape_ssid(fields["ssid"]) if "ssid" in fields else None,
+        channel=int(channel[1]) if channel else None,
+        frequency_mhz=int(channel[2]) if channel else None,
+        width=(channel[3] or "").strip() if channel else "",
+        tx_power_dbm=float(power[0]) if power else None,
+    )
+
+
+def with_link(link: WirelessLink, text: str) -> WirelessLink:
+    """The interface completed by its `iw dev IF link`: the BSSID, and whether it has joined.
+
+    An IBSS that is `up` may still be searching: then iw says `Not connected.`. It says so for a mesh point always, so
+    there `joined` stays None.
+    """
+    first = text.strip().splitlines()[:1]
+    found = _JOINED.match(first[0]) if first else None
+    if found:
+        return replace(link, bssid=found[1].lower(), joined=True)
+    if first and first[0].startswith("Not connected") and link.mode in {"IBSS", "managed"}:
+        return replace(link, joined=False)
+    return link
+
+
+def parse_stations(text: str) -> tuple[Station, ...] | None:
+    """`iw dev IF station dump`; empty output means no station. None for text that is not iw's."""
+    if text.strip() and not _STATION.match(text.strip().splitlines()[0].strip()):
+        return None
+    return tuple(_station(mac_and_name, lines) for mac_and_name, lines in _blocks(text, _STATION))
+
+
+def _station(heading: str, lines: list[str]) -> Station:
+    match = _STATION.match(heading)
+    mac, name = (match[1].lower(), match[2]) if match else ("", "")
+    fields = {words[0].strip(): words[1] for line in lines if len(words := line.split(":", 1)) == 2}
+    return Station(
+        ifname=name,
+        mac=mac,
+        signal_dbm=_integer(fields.get("signal")),
+        inactive_ms=_integer(fields.get("inactive time")),
+        rx_bytes=_integer(fields.get("rx bytes")),
+        tx_bytes=_integer(fields.get("tx bytes")),
+        tx_packets=_integer(fields.get("tx packets")),
+        tx_retries=_integer(fields.get("tx retries")),
+        tx_failed=_integer(fields.get("tx failed")),
+        tx_mbit_s=_number(fields.get("tx bitrate")),
+        rx_mbit_s=_number(fields.get("rx bitrate")),
+        expected_mbit_s=_number(fields.get("expected throughput")),
+    )
+
+
+def unescape_ssid(text: str) -> str:
+    r"""iw writes bytes it does not print as `\xNN` (print_ssid_escaped in util.c)."""
+    raw = _ESCAPED.sub(lambda match: bytes([int(match[1], 16)]), text.encode("utf-8", "surrogateescape"))
+    return raw.decode("utf-8", "replace")
+
+
+def _blocks(text: str, heading: re.Pattern[str]) -> Iterator[tuple[str, list[str]]]:
+    """Lines grouped below each heading; the heading is its first group if it has one group, else the whole line."""
+    name: str | None = None
+    lines: list[str] = []
+    for line in text.splitlines():
+        found = heading.match(line)
+        if found or line.startswith("phy#"):
+            if name is not None:
+                yield name, lines
+            name = None
+            lines = []
+        if found:
+            name = found[1] if heading.groups == 1 else line
+        elif name is not None:
+            lines.append(line)
+    if name is not None:
+        yield name, lines
+
+
+def _number(text: str | None) -> float | None:
+    found = re.match(r"\s*(-?\d{1,18}(?:\.\d{1,9})?)", text or "")
+    return float(found[1]) if found else None
+
+
+def _integer(text: str | None) -> int | None:
+    number = _number(text)
+    return None if number is None else int(number)

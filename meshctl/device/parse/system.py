@@ -1,0 +1,96 @@
+"""Files and small tools of the system itself: /etc/openwrt_release, /proc/*, df, date, /sys/class/net."""
+
+from __future__ import annotations
+
+import re
+
+from meshctl.device.observation import Bridge, Memory, ReleaseInfo, Space
+
+_ASSIGNMENT = re.compile(r"""^DISTRIB_([A-Z]+)=(['"]?)(.*)\2\s*$""", re.MULTILINE)
+_MEMINFO = re.compile(r"^(\w+):\s+(\d{1,15}) kB$", re.MULTILINE)
+_MAC = re.compile(r"[0-9a-fA-F]{2}(?::[0-9a-fA-F]{2}){5}")
+_BOOT_ID = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+_NUMBER = re.compile(r"\d{1,12}(?:\.\d{1,9})?")
+
+
+def parse_openwrt_release(text: str) -> ReleaseInfo | None:
+    """/etc/openwrt_release: `DISTRIB_RELEASE='19.07.10'` and its neighbours."""
+    values = {match[1]: match[3] for match in _ASSIGNMENT.finditer(text)}
+    if "RELEASE" not in values:
+        return None
+    return ReleaseInfo(
+        distribution=values.get("ID", ""),
+        version=values["RELEASE"],
+        revision=values.get("REVISION", ""),
+        target=values.get("TARGET", ""),
+        description=values.get("DESCRIPTION", ""),
+    )
+
+
+def parse_uptime(text: str) -> float | None:
+    """/proc/uptime: seconds since boot, then idle seconds."""
+    return _first_number(text)
+
+
+def parse_clock(text: str) -> float | None:
+    """`date +%s`."""
+    return _first_number(text)
+
+
+def _first_number(text: str) -> float | None:
+    words = text.split()
+    return float(words[0]) if words and _NUMBER.fullmatch(words[0]) else None
+
+
+def parse_boot_id(text: str) -> str | None:
+    """/proc/sys/kernel/random/boot_id."""
+    return text.strip() if _BOOT_ID.fullmatch(text.strip()) else None
+
+
+def parse_meminfo(text: str) -> Memory | None:
+    """/proc/meminfo, in bytes; a kernel without MemAvailable counts free, buffers and cache."""
+    kib = {match[1]: int(match[2]) for match in _MEMINFO.finditer(text)}
+    if "MemTotal" not in kib or "MemFree" not in kib:
+        return None
+    available = kib.get("MemAvailable", kib["MemFree"] + kib.get("Buffers", 0) + kib.get("Cached", 0))
+    return Memory(total=kib["MemTotal"] << 10, free=kib["MemFree"] << 10, available=available << 10)
+
+
+def parse_df(text: str) -> dict[str, Space] | None:
+    """`df -k PATHS`: mount point -> its space. busybox breaks the row of a long device name in two."""
+    words = text.split()
+    found: dict[str, Space] = {}
+    for index, word in enumerate(words):
+        if index < 4 or index + 1 >= len(words) or not re.fullmatch(r"\d{1,3}%", word):
+            continue
+        total, available = words[index - 3], words[index - 1]
+        if total.isdecimal() and available.isdecimal() and len(total) < 16 and len(available) < 16:
+            path = words[index + 1]
+            found.setdefault(path, Space(path=path, total=int(total) << 10, free=int(available) << 10))
+    return found or None
+
+
+def parse_macs(text: str) -> dict[str, str] | None:
+    """`NAME ADDRESS` lines of observe.sh; interfaces without a hardware address (lo has zeros) keep what they say."""
+    rows = [line.split() for line in text.splitlines()]
+    found = {row[0]: row[1].lower() for row in rows if len(row) == 2 and _MAC.fullmatch(row[1])}
+    return found or None
+
+
+def parse_bridges(text: str) -> tuple[Bridge, ...]:
+    """`NAME PORT...` lines of observe.sh."""
+    rows = [line.split() for line in text.splitlines()]
+    return tuple(Bridge(name=row[0], ports=tuple(row[1:])) for row in rows if row)
+
+
+def parse_mode(text: str) -> int | None:
+    """The permission bits of `ls -ln`'s first column: `-rw-r--r--` is 0o644."""
+    flags = text.split(" ", 1)[0].strip()
+    if not re.fullmatch(r"[-bcdlps][-r][-w][-xsS][-r][-w][-xsS][-r][-w][-xtT][+.@]?", flags):
+        return None
+    bits = 0
+    for flag in flags[1:10]:
+        bits = bits << 1 | (flag not in "-ST")
+    for position, value in ((3, 0o4000), (6, 0o2000), (9, 0o1000)):
+        bits |= value if flags[position] in "sStT" else 0
+    return bits

@@ -1,0 +1,89 @@
+"""`ubus call`: system board, network.wireless status, network.interface dump (procd, netifd)."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+from meshctl.device.observation import BoardInfo, NetInterface, RadioState, ReleaseInfo
+from meshctl.device.parse.jsontext import integer, mapping, maps, parse_json, string, strings, truth
+
+
+def parse_board(text: str) -> tuple[BoardInfo | None, ReleaseInfo | None]:
+    """`system board`: the board, and the release where this procd tells it (19.07's may not)."""
+    told = mapping(parse_json(text))
+    if not told:
+        return None, None
+    board = BoardInfo(
+        board_name=string(told.get("board_name")),
+        model=string(told.get("model")),
+        hostname=string(told.get("hostname")),
+        kernel=string(told.get("kernel")),
+    )
+    release = mapping(told.get("release"))
+    if not string(release.get("version")):
+        return board, None
+    return board, ReleaseInfo(
+        distribution=string(release.get("distribution")),
+        version=string(release.get("version")),
+        revision=string(release.get("revision")),
+        target=string(release.get("target")),
+        description=string(release.get("description")),
+    )
+
+
+def parse_wireless(text: str) -> tuple[RadioState, ...] | None:
+    """`network.wireless status`: an object of radios by name."""
+    told = parse_json(text)
+    if not isinstance(told, dict):
+        return None
+    return tuple(
+        RadioState(
+            name=name,
+            up=truth(radio.get("up")),
+            pending=truth(radio.get("pending")),
+            disabled=truth(radio.get("disabled")),
+            setup_failed=truth(radio.get("retry_setup_failed")),
+            config=MappingProxyType({key: string(value) for key, value in mapping(radio.get("config")).items()}),
+            interfaces=tuple(
+                (string(item.get("section")), string(item.get("ifname"))) for item in maps(radio.get("interfaces"))
+            ),
+        )
+        for name, radio in ((name, mapping(value)) for name, value in told.items())
+        if radio
+    )
+
+
+def parse_interfaces(text: str) -> tuple[NetInterface, ...] | None:
+    """`network.interface dump`: `{"interface": [...]}`."""
+    told = parse_json(text)
+    if not isinstance(told, dict) or not isinstance(told.get("interface"), list):
+        return None
+    return tuple(
+        NetInterface(
+            name=string(item.get("interface")),
+            up=truth(item.get("up")),
+            pending=truth(item.get("pending")),
+            proto=string(item.get("proto")),
+            device=string(item.get("l3_device")) or string(item.get("device")),
+            addresses=tuple(
+                f"{string(address.get('address'))}/{integer(address.get('mask'))}"
+                for address in maps(item.get("ipv4-address"))
+                if string(address.get("address")) and integer(address.get("mask")) is not None
+            ),
+            errors=tuple(string(error.get("code")) for error in maps(item.get("errors"))),
+        )
+        for item in maps(told["interface"])
+    )
+
+
+def parse_board_json(text: str) -> tuple[tuple[str, ...], str] | None:
+    """/etc/board.json: the LAN's ports, and the MAC address printed on the label where the board knows it.
+
+    `ports` where there are several, else `device` (21.02 and later) or `ifname` (19.07).
+    """
+    told = mapping(parse_json(text))
+    if not told:
+        return None
+    lan = mapping(mapping(told.get("network")).get("lan"))
+    ports = next((found for key in ("ports", "device", "ifname") if (found := strings(lan.get(key)))), ())
+    return ports, string(mapping(told.get("system")).get("label_macaddr")).lower()

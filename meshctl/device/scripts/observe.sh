@@ -1,0 +1,100 @@
+# Tells everything meshctl wants to know of a node, in one go. Sent with `N` (a nonce no output can contain) and `EXTRA`
+# (further paths) set before it; prints sections `N begin NAME`, the tool's output as it is, a newline, `N end STATUS`.
+# A tool that is missing or fails gives an empty section with its status; nothing here changes the node.
+
+section() { # NAME COMMAND...
+	printf '%s begin %s\n' "$N" "$1"
+	shift
+	"$@" 2>/dev/null
+	printf '\n%s end %s\n' "$N" $?
+}
+
+macs() { for d in /sys/class/net/*; do echo "${d##*/} $(cat "$d/address")"; done; }
+
+bridges() {
+	for d in /sys/class/net/*/brif; do
+		[ -d "$d" ] || continue
+		name=${d%/brif}
+		ports=''
+		for port in "$d"/*; do [ ! -e "$port" ] || ports="$ports ${port##*/}"; done
+		echo "${name##*/}$ports"
+	done
+}
+
+# opkg and apk are slow on a small processor; their databases say the same
+packages() {
+	if command -v apk >/dev/null; then
+		if [ -f /lib/apk/db/installed ]; then
+			awk '/^P:/ { name = substr($0, 3) } /^V:/ { print name " " substr($0, 3) }' /lib/apk/db/installed
+		else
+			apk list --installed
+		fi
+	elif [ -f /usr/lib/opkg/status ]; then
+		awk '/^Package:/ { name = $2 } /^Version:/ { version = $2 } /^Status:/ { installed = $NF == "installed" }
+			/^$/ { if (name != "" && installed) print name " " version; name = "" }
+			END { if (name != "" && installed) print name " " version }' /usr/lib/opkg/status
+	else
+		opkg list-installed
+	fi
+}
+
+package_tool() { command -v apk || command -v opkg; }
+
+host_keys() { for key in /etc/dropbear/dropbear_*_host_key; do [ ! -f "$key" ] || dropbearkey -y -f "$key"; done; }
+
+# batctl prints JSON from 2021.1 on; older ones print tables
+mesh() { # INTERFACE
+	section "batctl.mesh_json $1" batctl meshif "$1" mesh_json
+	section "batctl.hardifs_json $1" batctl meshif "$1" hardifs_json
+	section "batctl.neighbors_json $1" batctl meshif "$1" neighbors_json
+	section "batctl.originators_json $1" batctl meshif "$1" originators_json
+	batctl meshif "$1" originators_json >/dev/null 2>&1 && return
+	section "batctl.interface $1" batctl -m "$1" if
+	section "batctl.neighbors $1" batctl -m "$1" n
+	section "batctl.originators $1" batctl -m "$1" o
+}
+
+section uptime cat /proc/uptime
+section clock date +%s
+section boot_id cat /proc/sys/kernel/random/boot_id
+section ubus.board ubus call system board
+section openwrt_release cat /etc/openwrt_release
+section board_name cat /tmp/sysinfo/board_name
+section model cat /tmp/sysinfo/model
+section board.json cat /etc/board.json
+section meminfo cat /proc/meminfo
+section df df -k / /tmp
+section macs macs
+section ubus.wireless ubus call network.wireless status
+section ubus.interfaces ubus call network.interface dump
+section iw.dev iw dev
+for dev in $(iw dev 2>/dev/null | awk '$1 == "Interface" { print $2 }'); do
+	section "iw.link $dev" iw dev "$dev" link
+	section "iw.stations $dev" iw dev "$dev" station dump
+done
+for dev in /sys/class/net/bat*; do
+	[ ! -e "$dev" ] || mesh "${dev##*/}"
+done
+section batctl.version batctl -v
+section bridges bridges
+section package_tool package_tool
+section packages packages
+section uci.changes uci changes
+section config.list ls /etc/config
+for conf in /etc/config/*; do
+	[ ! -f "$conf" ] || section "config ${conf##*/}" cat "$conf"
+done
+section authorized_keys cat /etc/dropbear/authorized_keys
+section host_keys host_keys
+for path in $EXTRA; do
+	section "mode $path" ls -lnd "$path"
+	[ ! -f "$path" ] || section "hash $path" sha256sum "$path"
+	# enough for any configuration; a larger file is told by its hash alone
+	[ ! -f "$path" ] || section "text $path" head -c 65536 "$path"
+done
+if [ -x /usr/sbin/meshctl-deadman ]; then
+	section deadman /usr/sbin/meshctl-deadman status
+else
+	section deadman echo absent
+fi
+section done true
