@@ -172,11 +172,11 @@ def _record(value: Why) -> dict[str, Any]:
 
 
 def _row(value: Why, why: bool) -> list[str]:
-    shown = value.value or '""'
+    text = value.value if value.value and value.value.isprintable() else json.dumps(value.value)
     if not why:
-        return [value.key, shown]
+        return [value.key, text]
     place = value.origin.position
-    return [value.key, shown, value.origin.layer, f"{place.file}:{place.line}"]
+    return [value.key, text, value.origin.layer, f"{place.file}:{place.line}"]
 
 
 def _table(rows: Sequence[Sequence[str]], indent: str = "") -> None:

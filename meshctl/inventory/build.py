@@ -25,7 +25,7 @@ from meshctl.inventory.documents import (
 from meshctl.inventory.layers import NodePlan
 from meshctl.inventory.nodes import build_nodes, ssh_settings
 from meshctl.inventory.origins import Origins
-from meshctl.inventory.ranges import BadRange, expand
+from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
 from meshctl.inventory.tree import MappingNode, descend, place_of
 from meshctl.model import (
     ApplyPolicy,
@@ -62,7 +62,7 @@ def build(
     hardware = {name: _hardware(name, item, root) for name, item in document.hardware.items()}
     meshes = {name: _mesh(name, item, root) for name, item in document.meshes.items()}
     diagnostics: list[Diagnostic] = []
-    robots = {name: _robot(name, item, root, diagnostics) for name, item in document.robots.items()}
+    robots = _robots(document, root, diagnostics)
     robot_of: dict[str, str] = {}
     for names in ("nodes", "carries"):
         for robot in robots.values():
@@ -207,29 +207,54 @@ def _secret(document: SecretDocument, base: str) -> SecretRef:
     return SecretRef(SecretKind.AGE, document.age, document.key, document.identity, base)
 
 
-def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: list[Diagnostic]) -> Robot:
-    def names(key: str, patterns: tuple[str, ...]) -> tuple[str, ...]:
-        made: list[str] = []
-        for number, pattern in enumerate(patterns):
-            try:
-                made.extend(expand(pattern))
-            except BadRange as reason:
-                place = place_of(root, ("robots", name, key, number)) or Position(root.file)
-                message = f"not a range such as b[01-12]: {reason}"
-                diagnostics.append(
-                    codes.error(
-                        codes.BAD_RANGE, place, message, path=f"robots.{name}.{key}", found=f"'{shown(pattern)}'"
-                    )
-                )
-        return tuple(made)
+def _robots(document: InventoryDocument, root: MappingNode, diagnostics: list[Diagnostic]) -> dict[str, Robot]:
+    """All robots, up to the first bad list: one line may ask for many names."""
+    robots: dict[str, Robot] = {}
+    count = 0
+    for name, item in document.robots.items():
+        robot = robots[name] = _robot(name, item, root, diagnostics)
+        count += len(robot.nodes) + len(robot.carries)
+        if count > MAX_NAMES:
+            place = place_of(root, ("robots", name)) or Position(root.file)
+            message = f"the robots list more than {MAX_NAMES} nodes"
+            diagnostics.append(codes.error(codes.BAD_RANGE, place, message, path=f"robots.{name}"))
+        if diagnostics:
+            break
+    return robots
 
+
+def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: list[Diagnostic]) -> Robot:
     return Robot(
         name=name,
-        nodes=names("nodes", document.nodes),
+        nodes=_names(("robots", name, "nodes"), document.nodes, root, diagnostics),
         computer=_computer(document.computer) if document.computer is not None else None,
         is_base=document.is_base,
-        carries=names("carries", document.carries),
+        carries=_names(("robots", name, "carries"), document.carries, root, diagnostics),
     )
+
+
+def _names(
+    path: tuple[str, ...], patterns: tuple[str, ...], root: MappingNode, diagnostics: list[Diagnostic]
+) -> tuple[str, ...]:
+    """The nodes that a robot's list names, its ranges expanded."""
+    made: list[str] = []
+    for number, pattern in enumerate(patterns):
+        try:
+            made.extend(expand(pattern))
+            if len(made) > MAX_NAMES:
+                raise BadRange(f"the list makes more than {MAX_NAMES} names")
+        except BadRange as reason:
+            diagnostics.append(
+                codes.error(
+                    codes.BAD_RANGE,
+                    place_of(root, (*path, number)) or Position(root.file),
+                    f"not a range such as b[01-12]: {reason}",
+                    path=".".join(path),
+                    found=f"'{shown(pattern)}'",
+                )
+            )
+            break
+    return tuple(made)
 
 
 def _computer(document: ComputerDocument) -> Computer:

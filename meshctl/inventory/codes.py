@@ -25,6 +25,10 @@ GROUP_CYCLE = "INV033"
 UNKNOWN_HARDWARE = "INV034"
 UNKNOWN_RADIO = "INV035"
 BAD_ADDRESS = "INV036"
+TOO_MANY_ERRORS = "INV099"
+
+# More than a person reads; bounds the time that a file which is no inventory at all can cost.
+MAX_DIAGNOSTICS = 1000
 
 # One line each, for `meshctl lint --explain` and docs/inventory.md.
 MEANINGS = {
@@ -49,6 +53,7 @@ MEANINGS = {
     UNKNOWN_HARDWARE: "A node's hardware is not defined.",
     UNKNOWN_RADIO: "A node sets a radio that its hardware does not have.",
     BAD_ADDRESS: "A node's address cannot be worked out.",
+    TOO_MANY_ERRORS: "There are more errors than are reported.",
 }
 
 
@@ -64,3 +69,8 @@ def error(
 ) -> Diagnostic:
     """An error of the loader; everything it reports is one."""
     return Diagnostic(code, Severity.ERROR, position, message, path, expected, found, hint)
+
+
+def too_many(position: Position) -> Diagnostic:
+    """What stands at the end when not everything is reported."""
+    return error(TOO_MANY_ERRORS, position, f"more than {MAX_DIAGNOSTICS} errors; mend these first")

@@ -199,16 +199,13 @@ class _Composer:
         first = mapping.keys.get(key.text)
         if key.is_plain and key.text == "<<":
             hint = "let nodes share values through `groups` and `defaults`"
-            self.diagnostics.append(
-                codes.error(codes.YAML_FEATURE, position(key), "merge keys are not supported", hint=hint)
-            )
+            self._note(codes.error(codes.YAML_FEATURE, position(key), "merge keys are not supported", hint=hint))
         elif first is not None:
-            self.diagnostics.append(
+            self._note(
                 codes.error(
                     codes.DUPLICATE_KEY,
                     position(key),
-                    f"the key '{shown(key.text)}' stands twice in one mapping",
-                    found=f"the first in line {first.line}",
+                    f"the key '{shown(key.text)}' stands twice in one mapping, first in line {first.line}",
                 )
             )
         else:
@@ -221,7 +218,13 @@ class _Composer:
             self._refuse(event, f"YAML tags are not supported: {shown(event.tag)}", hint=hint)
 
     def _refuse(self, event: yaml.Event, message: str, *, hint: str) -> None:
-        self.diagnostics.append(codes.error(codes.YAML_FEATURE, self._place(event), message, hint=hint))
+        self._note(codes.error(codes.YAML_FEATURE, self._place(event), message, hint=hint))
+
+    def _note(self, diagnostic: Diagnostic) -> None:
+        """Something wrong after which reading goes on, until there is too much of it."""
+        self.diagnostics.append(diagnostic)
+        if len(self.diagnostics) >= codes.MAX_DIAGNOSTICS:
+            self.fail(codes.too_many(diagnostic.position))
 
     def _place(self, event: yaml.Event) -> Position:
         start, _ = _marks(event)

@@ -50,9 +50,11 @@ def _flag(value: object) -> object:
 
 
 def _text(value: object) -> str:
-    if isinstance(value, str):
-        return str(value)
-    raise wrong("text")
+    if not isinstance(value, str):
+        raise wrong("text")
+    if "\0" in value:
+        raise wrong("text without the character NUL")
+    return str(value)
 
 
 def is_name(value: str) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from meshctl.diagnostics import Diagnostic
@@ -30,7 +30,7 @@ class Gathered:
 
 def first_file(path: Path) -> Path:
     """The file to begin with: `path`, or `fleet.yaml` in it when it is a directory."""
-    return path / FIRST_FILE if path.is_dir() else path
+    return path / FIRST_FILE if os.path.isdir(path) else path
 
 
 def gather(path: Path, environ: Mapping[str, str], read: Reader = read_bytes) -> Gathered:
@@ -54,7 +54,9 @@ class _Gathering:
         """One file with everything it includes; `above` are the real paths of the files that led here."""
         source = read_source(path, self.read)
         if not isinstance(source, Source):
-            self._fail(source)
+            is_first_missing = source.code == codes.UNREADABLE and not above
+            hint = "`meshctl init DIR` writes a first inventory" if is_first_missing else ""
+            self._fail(replace(source, hint=source.hint or hint))
             return None
         self.files.append(path)
         composed = compose(source)
@@ -117,6 +119,9 @@ class _Gathering:
     def _target(self, item: Tree, path: Path) -> Path | None:
         """The path that an entry of `include` names; None when it is no text (the format check reports that)."""
         if not isinstance(item, Scalar) or item.is_null:
+            return None
+        if "\0" in item.text:
+            self._fail(codes.error(codes.INCLUDE, position(item), "not a path: it holds the character NUL"))
             return None
         if item.text.startswith("~/"):
             home = self.environ.get("HOME", "")

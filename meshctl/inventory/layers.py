@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from meshctl.diagnostics import Diagnostic, Position
 from meshctl.inventory import codes
 from meshctl.inventory.compose import shown
-from meshctl.inventory.documents import GroupDocument, InventoryDocument, NodeDocument, NodeLayer
+from meshctl.inventory.documents import InventoryDocument, NodeDocument, NodeLayer
 from meshctl.inventory.fields import is_name
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand, is_range
 from meshctl.inventory.suggest import did_you_mean
@@ -76,26 +76,29 @@ class _Laying:
     root: MappingNode
     diagnostics: list[Diagnostic] = field(default_factory=list)
     _groups: dict[str, Layer] = field(default_factory=dict)
-    _stacks: dict[tuple[str, ...], tuple[Layer, ...]] = field(default_factory=dict)
+    _broken: set[str] = field(default_factory=set)
+    _stacks: dict[tuple[str, ...], tuple[Layer, ...] | None] = field(default_factory=dict)
     _joined: dict[tuple[int, ...], tuple[Layer, ...]] = field(default_factory=dict)
 
     def run(self) -> Layered:
         for name, group in self.document.groups.items():
             self._groups[name] = self._layer(f"group {name}", ("groups", name), group)
-        for name in self.document.groups:
-            self._check_group(name)
+        for name, group in self.document.groups.items():
+            for number, parent in enumerate(group.inherits):
+                self._check_known(parent, self._groups[name], "inherits", number)
+        self._find_circles()
         defaults = (self._layer("defaults", ("defaults",), self.document.defaults),)
         plans: dict[str, NodePlan] = {}
-        cyclic = {problem.path for problem in self.diagnostics if problem.code == codes.GROUP_CYCLE}
         for name, entries in self._entries().items():
             own = tuple(entry.layer for entry in entries)
             groups = next(
                 (entry.document.groups for entry in entries if "groups" in entry.document.model_fields_set), ()
             )
-            stack = () if cyclic else self._stack(groups)
-            key = (*map(id, own), *map(id, stack))
-            layers = self._joined.setdefault(key, (*own, *stack, *defaults))
-            plans[name] = NodePlan(name, layers, groups, entries[-1].index)
+            stack = self._stack(groups)
+            if stack is not None:
+                key = (*map(id, own), *map(id, stack))
+                layers = self._joined.setdefault(key, (*own, *stack, *defaults))
+                plans[name] = NodePlan(name, layers, groups, entries[-1].index)
         return Layered(plans, tuple(self.diagnostics))
 
     def _layer(self, title: str, path: tuple[str, ...], document: NodeLayer) -> Layer:
@@ -108,34 +111,32 @@ class _Laying:
             tree = tree.values[part]
         return Layer(title, path, document, tree, place)
 
-    def _check_group(self, name: str) -> None:
-        """Report parents that do not exist, and the circle that `name` is the first of."""
-        layer = self._groups[name]
-        document = self.document.groups[name]
-        for number, parent in enumerate(document.inherits):
-            self._check_known(parent, layer, "inherits", number)
-        trail = [name]
-        seen = {name}
-        pending = [(parent, 1) for parent in reversed(document.inherits)]
-        while pending:
-            parent, depth = pending.pop()
-            del trail[depth:]
-            trail.append(parent)
-            if parent == name:
-                if name == min(trail):
-                    self.diagnostics.append(
-                        codes.error(
-                            codes.GROUP_CYCLE,
-                            layer.place,
-                            f"groups inherit from each other: {' -> '.join(trail)}",
-                            path=f"groups.{name}",
-                        )
-                    )
-                return
-            if parent in seen or parent not in self.document.groups:
-                continue
-            seen.add(parent)
-            pending.extend((above, depth + 1) for above in reversed(self.document.groups[parent].inherits))
+    def _find_circles(self) -> None:
+        """Depth first over the parents, each group once; an edge back to the trail closes a circle."""
+        done: set[str] = set()
+        for first in self._groups:
+            trail: dict[str, None] = {}
+            pending = [(first, False)]
+            while pending:
+                name, is_leaving = pending.pop()
+                if is_leaving:
+                    del trail[name]
+                    done.add(name)
+                elif name in trail:
+                    names = list(trail)
+                    self._report_circle([*names[names.index(name) :], name])
+                elif name not in done and name in self._groups:
+                    trail[name] = None
+                    pending.append((name, True))
+                    pending.extend((parent, False) for parent in reversed(self.document.groups[name].inherits))
+
+    def _report_circle(self, names: list[str]) -> None:
+        self._broken.update(names)
+        layer = self._groups[names[0]]
+        message = f"groups inherit from each other: {' -> '.join(names[:20])}"
+        self.diagnostics.append(
+            codes.error(codes.GROUP_CYCLE, layer.place_of(("inherits",)), message, path=f"groups.{names[0]}.inherits")
+        )
 
     def _check_known(self, name: str, layer: Layer, key: str, number: int) -> None:
         if name in self._groups:
@@ -151,27 +152,28 @@ class _Laying:
             )
         )
 
-    def _stack(self, groups: tuple[str, ...]) -> tuple[Layer, ...]:
-        """The groups' layers, nearest first, each group once, at its farthest place."""
-        known = self._stacks.get(groups)
-        if known is not None:
-            return known
-        ordered: list[str] = []
-        pending = [(name, False) for name in reversed(groups)]
+    def _stack(self, groups: tuple[str, ...]) -> tuple[Layer, ...] | None:
+        """The groups' layers, nearest first, each group once, at its farthest place; None when one of them is not
+        known or stands in a circle, which has been reported."""
+        if groups not in self._stacks:
+            self._stacks[groups] = self._follow(groups)
+        return self._stacks[groups]
+
+    def _follow(self, groups: tuple[str, ...]) -> tuple[Layer, ...] | None:
+        ordered: list[Layer] = []
         seen: set[str] = set()
+        pending = [(name, False) for name in reversed(groups)]
         while pending:
-            name, is_done = pending.pop()
-            if is_done:
-                ordered.append(name)
-            elif name not in seen and name in self._groups:
+            name, is_leaving = pending.pop()
+            if name in self._broken or name not in self._groups:
+                return None
+            if is_leaving:
+                ordered.append(self._groups[name])
+            elif name not in seen:
                 seen.add(name)
                 pending.append((name, True))
-                group = self._groups[name].document
-                assert isinstance(group, GroupDocument)
-                pending.extend((parent, False) for parent in reversed(group.inherits))
-        stack = tuple(self._groups[name] for name in reversed(ordered))
-        self._stacks[groups] = stack
-        return stack
+                pending.extend((parent, False) for parent in reversed(self.document.groups[name].inherits))
+        return tuple(reversed(ordered))
 
     def _entries(self) -> dict[str, list[_Entry]]:
         """Each node's entries, its own before its range's."""

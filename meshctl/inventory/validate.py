@@ -28,6 +28,7 @@ _KINDS = {
     "string_type": "text",
     "string_too_short": "text that is not empty",
 }
+_CONTAINERS = frozenset({"model_type", "dict_type", "list_type", "tuple_type"})
 _BOUNDS = {
     "greater_than_equal": ("at least", "ge"),
     "greater_than": ("more than", "gt"),
@@ -50,7 +51,10 @@ def validate(root: MappingNode) -> Validated:
         return Validated(InventoryDocument.model_validate(plain_data(root)), ())
     except ValidationError as reason:
         errors = reason.errors(include_url=False, include_input=False)
-        return Validated(None, tuple(_diagnostic(root, error) for error in errors))
+        problems = [_diagnostic(root, error) for error in errors[: codes.MAX_DIAGNOSTICS]]
+        if len(errors) > len(problems):
+            problems.append(codes.too_many(problems[-1].position))
+        return Validated(None, tuple(problems))
 
 
 def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
@@ -116,10 +120,10 @@ def _found(root: MappingNode, path: tuple[int | str, ...], kind: str) -> str:
         tree = None if tree is None else child(tree, part)
     if tree is None:
         return ""
-    is_secret = any(part in _SECRET_KEYS for part in path) or kind in ("model_type", "dict_type")
-    if not isinstance(tree, Scalar) or tree.is_null or is_secret:
+    is_secret = any(part in _SECRET_KEYS for part in path)
+    if not isinstance(tree, Scalar) or tree.is_null or is_secret or kind in _CONTAINERS:
         return describe(tree)
-    return f"'{shown(tree.text)}'"
+    return f"'{shown(tree.text)}'" if tree.is_plain else f'"{shown(tree.text)}" in quotes'
 
 
 def _enum_hint(root: MappingNode, path: tuple[int | str, ...], error: ErrorDetails) -> str:
@@ -146,7 +150,7 @@ def _step(kind: Any, part: int | str) -> Any:
                 return field.annotation
         return None
     bare = _bare(kind)
-    arguments = get_args(bare)
+    arguments = [argument for argument in get_args(bare) if argument is not Ellipsis]
     return arguments[-1] if arguments else None
 
 
