@@ -1,0 +1,2 @@
+untrusted comment: signed by key 7ab3865c5c6d1d6c
+RWR6s4ZcXG0dbLcR5Q/QJ19QrrkVoBDHVhytPNlw0I6kVV0ThWRHKEWlXhdOk9UW8MOObAdIEJ3p1+Q1qx/tiTvady3SB5wNUwU=

@@ -1,0 +1,2 @@
+untrusted comment: signed by key 7ab3865c5c6d1d6c
+RWR6s4ZcXG0dbAi0+k0BD6kWiGWTZMxnwaW4IKl8y1B6CkQFgo3r37FtYrztg/q1uV9744DMgfBqrjGbSaldZwgTXRAokdNFSgw=
