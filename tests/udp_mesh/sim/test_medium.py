@@ -1,0 +1,136 @@
+"""The simulated channel keeps to what its docstring says."""
+
+from __future__ import annotations
+
+import random
+
+from udp_mesh.sim.agenda import Agenda
+from udp_mesh.sim.medium import FRAME_BYTES, IP_UDP_BYTES, Channel, Frame, Medium
+from udp_mesh.sim.place import Air, Wall, course
+
+
+class Line:
+    """Stations in a row, each hearing only the next, with one frame loss for all links."""
+
+    def __init__(self, names: str, loss: float = 0.0, **channel: float) -> None:
+        self.agenda = Agenda()
+        self.arrived: list[tuple[float, str, Frame]] = []
+        self.cut: set[frozenset[str]] = set()
+        places = {name: index for index, name in enumerate(names)}
+
+        def lost(a: str, b: str, now: float) -> float:
+            near = abs(places[a] - places[b]) == 1 and frozenset((a, b)) not in self.cut
+            return loss if near else 1.0
+
+        def deliver(station: str, frame: Frame) -> None:
+            self.arrived.append((self.agenda.now, station, frame))
+
+        self.channel = Channel(**channel)  # type: ignore[arg-type]
+        self.medium = Medium(self.agenda, self.channel, names, lost, deliver, random.Random(1))
+
+    @property
+    def stations(self) -> list[str]:
+        return [station for _, station, _ in self.arrived]
+
+
+def test_a_datagram_takes_one_transmission_per_hop() -> None:
+    line = Line("abcd")
+    line.medium.send("a", "d", b"x" * 100)
+    line.agenda.run_until(1.0)
+    assert line.stations == ["d"]
+    assert line.medium.hops("a", "d") == 3
+    assert line.medium.counts.transmissions == 3
+
+
+def test_airtime_is_bytes_over_rate_plus_overhead_per_transmission() -> None:
+    line = Line("ab", rate=8e6, overhead_s=1e-3)
+    line.medium.send("a", "b", bytes(1000))
+    line.agenda.run_until(1.0)
+    assert line.medium.counts.airtime_s == (1000 + IP_UDP_BYTES + FRAME_BYTES) / 1e6 + 1e-3
+
+
+def test_a_broadcast_reaches_everybody_once() -> None:
+    line = Line("abcde")
+    line.medium.send("c", None, b"x")
+    line.agenda.run_until(1.0)
+    assert sorted(line.stations) == ["a", "b", "d", "e"]
+
+
+def test_the_channel_is_shared_so_two_senders_get_half_each() -> None:
+    line = Line("ab", rate=1e6, queue_frames=10_000)
+    for _ in range(500):
+        line.medium.send("a", "b", bytes(1000))
+        line.medium.send("b", "a", bytes(1000))
+    line.agenda.run_until(4.0)
+    assert line.medium.counts.airtime_s <= 4.02
+    to_a, to_b = line.stations.count("a"), line.stations.count("b")
+    assert abs(to_a - to_b) < 0.2 * (to_a + to_b)
+
+
+def test_retries_hide_loss_at_the_price_of_airtime() -> None:
+    clean, lossy = Line("ab", queue_frames=2000), Line("ab", loss=0.5, queue_frames=2000, attempts=20)
+    for line in (clean, lossy):
+        for _ in range(1000):
+            line.medium.send("a", "b", bytes(100))
+        line.agenda.run_until(10.0)
+        assert len(line.arrived) == 1000
+    assert 1.8 < lossy.medium.counts.airtime_s / clean.medium.counts.airtime_s < 2.2
+
+
+def test_a_full_queue_drops_and_counts() -> None:
+    line = Line("ab", queue_frames=10)
+    for _ in range(100):
+        line.medium.send("a", "b", bytes(1000))
+    line.agenda.run_until(1.0)
+    assert len(line.arrived) + line.medium.counts.queue_drops == 100
+    assert line.medium.counts.queue_drops >= 89
+
+
+def test_a_route_is_found_anew_only_after_the_mesh_layers_time() -> None:
+    line = Line("abc", route_s=1.0)
+    line.medium.send("a", "c", b"x")
+    line.agenda.run_until(0.5)
+    line.cut.add(frozenset("bc"))
+    line.medium.send("a", "c", b"x")
+    line.agenda.run_until(0.9)
+    assert line.medium.counts.losses == 1
+    line.agenda.run_until(1.5)
+    line.medium.send("a", "c", b"x")
+    line.agenda.run_until(2.0)
+    assert line.medium.counts.unroutable == 1
+    assert line.stations == ["c"]
+
+
+def test_a_radio_that_is_off_neither_sends_nor_receives_nor_forwards() -> None:
+    line = Line("abc")
+    line.medium.set_on("b", False)
+    line.medium.send("a", "c", b"x")
+    line.medium.send("b", "a", b"x")
+    line.agenda.run_until(1.0)
+    assert line.arrived == []
+
+
+def test_the_same_seed_gives_the_same_run() -> None:
+    def run() -> list[tuple[float, str, int]]:
+        line = Line("abcd", loss=0.3)
+        for number in range(50):
+            line.medium.send("ad"[number % 2], "da"[number % 2], bytes(500))
+        line.agenda.run_until(5.0)
+        return [(at, station, frame.number) for at, station, frame in line.arrived]
+
+    assert run() == run()
+
+
+def test_loss_grows_from_good_to_range_and_rock_stops_all() -> None:
+    air = Air(good_m=50, range_m=100, least_loss=0.1, walls=(Wall((0, 10), (100, 10)),))
+    assert air.loss((0, 0), (20, 0)) == 0.1
+    assert air.loss((0, 0), (75, 0)) == 0.55
+    assert air.loss((0, 0), (100, 0)) == 1.0
+    assert air.loss((10, 0), (10, 20)) == 1.0
+
+
+def test_a_course_is_walked_in_straight_lines() -> None:
+    walked = course([(10, (0, 0)), (20, (100, 50))])
+    assert walked.at(0) == (0, 0)
+    assert walked.at(15) == (50, 25)
+    assert walked.at(99) == (100, 50)

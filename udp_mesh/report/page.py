@@ -1,0 +1,108 @@
+"""One self-contained HTML page from recordings: totals, throughput by topic, connectivity, intervals."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from udp_mesh.report import charts, figures
+from udp_mesh.report.recording import Recording
+
+_STYLE = """
+body{font:15px/1.45 system-ui,sans-serif;max-width:800px;margin:2em auto;padding:0 1em;color:#222}
+svg{width:100%;background:#fff}svg text{font:11px system-ui,sans-serif;fill:#444}.grid{stroke:#e4e4e4}
+table{border-collapse:collapse}td,th{padding:.2em .8em;border-bottom:1px solid #ddd;text-align:right}
+td:first-child,th:first-child{text-align:left}.legend span{margin-right:1.2em}
+.legend i{display:inline-block;width:.9em;height:.9em;margin-right:.4em}
+"""
+# the paper's own distribution, for comparison (section "Performance")
+PAPER_DEVIATION_S = 0.04
+_SHOWN_INTERVALS = 4
+
+
+def page(recordings: Sequence[Recording], title: str) -> str:
+    """The whole page; one section per recording."""
+    body = "".join(_section(recording, len(recordings) > 1) for recording in recordings)
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{escape(title)}</title>'
+        f"<style>{_STYLE}</style><h1>{escape(title)}</h1>{body}</html>\n"
+    )
+
+
+def write_page(recordings: Sequence[Recording], path: Path, title: str) -> None:
+    """Write the page whole or not at all."""
+    unfinished = path.with_name(f".{path.name}.part")
+    unfinished.write_text(page(recordings, title))
+    os.replace(unfinished, path)
+
+
+def _section(recording: Recording, named: bool) -> str:
+    parts = [f"<h2>As seen by {escape(recording.name)}</h2>"] if named else []
+    if recording.problems:
+        parts.append(f"<p>{len(recording.problems)} lines could not be read and were left out.</p>")
+    parts += [_totals(recording), _throughput(recording), _connectivity(recording), _map(recording)]
+    parts += [_intervals(each) for each in figures.intervals(recording)[:_SHOWN_INTERVALS]]
+    return "".join(parts)
+
+
+def _totals(recording: Recording) -> str:
+    _, topics = figures.throughput(recording)
+    rows = "".join(
+        f"<tr><td>{escape(each.topic)}</td><td>{each.priority}</td><td>{each.messages}</td>"
+        f"<td>{each.total_bytes / 1e6:.2f}</td></tr>"
+        for each in topics
+    )
+    total = sum(each.total_bytes for each in topics)
+    return (
+        f"<p>{recording.end_s:.0f} s, {len(recording.arrivals)} messages, {total / 1e6:.1f} MB received.</p>"
+        f"<table><tr><th>topic</th><th>priority</th><th>messages</th><th>MB</th></tr>{rows}</table>"
+    )
+
+
+def _throughput(recording: Recording) -> str:
+    _, topics = figures.throughput(recording)
+    if not topics:
+        return ""
+    layers = {each.topic: [value / 1e6 for value in each.bits_per_s] for each in topics}
+    chart = charts.stacked(layers, recording.end_s, "seconds", "Mbit/s")
+    return f"<h3>Throughput by topic</h3>{charts.legend(list(layers))}{chart}"
+
+
+def _connectivity(recording: Recording) -> str:
+    peers = figures.connections(recording)
+    if not peers:
+        return ""
+    rows = {each.peer: each.spans_s for each in peers}
+    shares = ", ".join(f"{escape(each.peer)} {each.share:.0%}" for each in peers)
+    return (
+        f"<h3>Online</h3>{charts.spans(rows, recording.end_s, 'seconds')}<p>{shares} of the time since first seen.</p>"
+    )
+
+
+def _map(recording: Recording) -> str:
+    """Where each peer was, and whether it was online there."""
+    online = {each.peer: each.spans_s for each in figures.connections(recording)}
+    tracks: dict[str, list[tuple[float, float, bool]]] = {}
+    marks: dict[str, tuple[float, float]] = {}
+    for place in recording.places:
+        if place.at in online:
+            connected = any(start <= place.t <= stop for start, stop in online[place.at])
+            tracks.setdefault(place.at, []).append((place.x, place.y, connected))
+        else:
+            marks[place.at] = (place.x, place.y)
+    if not tracks:
+        return ""
+    return f"<h3>Where the robots were online</h3>{charts.legend(list(tracks))}{charts.paths(tracks, marks)}"
+
+
+def _intervals(each: figures.Intervals) -> str:
+    low, high = 0.5 * each.median_s, 1.5 * each.median_s
+    bars = figures.histogram(each.values_s, low, high)
+    chart = charts.density(bars, low, high, (each.median_s, PAPER_DEVIATION_S * each.median_s), "seconds")
+    return (
+        f"<h3>Time between messages: {escape(each.topic)} from {escape(each.source)}</h3>{chart}"
+        f"<p>Median {each.median_s:.3f} s, standard deviation {each.deviation_s:.4f} s within half to one and a half "
+        f"of it, {each.gaps} gaps outside. The curve is normal, with a deviation of 4 % of the median.</p>"
+    )

@@ -1,0 +1,30 @@
+"""Virtual time: what is to be done when, in order of time and, at one time, of entry."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+
+
+class Agenda:
+    """`now` moves only by `run_until`; everything simulated shares one agenda."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self._entries: list[tuple[float, int, Callable[[], None]]] = []
+        self._count = 0
+
+    def at(self, time_s: float, action: Callable[[], None]) -> None:
+        """Do `action` at `time_s`, or now if that has passed."""
+        self._count += 1
+        heapq.heappush(self._entries, (max(time_s, self.now), self._count, action))
+
+    def after(self, delay_s: float, action: Callable[[], None]) -> None:
+        self.at(self.now + delay_s, action)
+
+    def run_until(self, time_s: float) -> None:
+        """Do everything due up to and at `time_s`; then it is `time_s`."""
+        while self._entries and self._entries[0][0] <= time_s:
+            self.now, _, action = heapq.heappop(self._entries)
+            action()
+        self.now = time_s

@@ -1,0 +1,252 @@
+"""One shared half-duplex radio channel with a layer-2 mesh on it: datagrams in at one station, out at others.
+
+A datagram joins its station's finite queue; the station waits for silence, backs off a random number of slots, and
+sends the frame to the next hop, again and again up to `attempts` times as 802.11 does; every station in earshot keeps
+quiet meanwhile. The next hop queues it in turn. Routes follow the least expected number of transmissions and are
+looked at anew every `route_s`, which stands for the mesh layer's own reconnect time. A broadcast is flooded: each
+station sends it on once, `broadcast_repeats` times, without acknowledgement.
+
+Not modelled: hidden stations, capture, rate adaptation.
+"""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import partial
+
+from udp_mesh.sim.agenda import Agenda
+
+# IP and UDP headers, and what 802.11 and batman-adv add to a frame
+IP_UDP_BYTES = 28
+FRAME_BYTES = 68
+# 802.11n at 2.4 GHz: one slot, and the smallest contention window
+SLOT_S = 9e-6
+CONTENTION_SLOTS = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """`rate` is in bit/s on the air, `overhead_s` per transmission (preamble, spacing, acknowledgement)."""
+
+    rate: float = 20e6
+    overhead_s: float = 100e-6
+    queue_frames: int = 200
+    attempts: int = 8
+    broadcast_repeats: int = 1
+    route_s: float = 1.0
+    hop_delay_s: float = 0.0005
+
+
+@dataclass(slots=True)
+class Frame:
+    """A datagram on its way; `to` None means everybody."""
+
+    number: int
+    source: str
+    to: str | None
+    data: bytes
+
+
+@dataclass(slots=True)
+class Counts:
+    """Of the whole channel since the start."""
+
+    transmissions: int = 0
+    bytes: int = 0
+    airtime_s: float = 0.0
+    queue_drops: int = 0
+    losses: int = 0
+    unroutable: int = 0
+
+
+@dataclass(slots=True)
+class _Station:
+    name: str
+    queue: deque[Frame] = field(default_factory=deque)
+    quiet_until_s: float = 0.0
+    is_waiting: bool = False
+    is_on: bool = True
+    flooded: deque[int] = field(default_factory=lambda: deque(maxlen=512))
+
+
+Loss = Callable[[str, str, float], float]
+"""(station, station, now) -> chance that one frame is lost, 1 where they do not hear each other."""
+Deliver = Callable[[str, Frame], None]
+
+
+class Medium:
+    """The channel of all `stations`; `loss` tells who hears whom, `deliver` takes what arrives for a station."""
+
+    def __init__(
+        self,
+        agenda: Agenda,
+        channel: Channel,
+        stations: Iterable[str],
+        loss: Loss,
+        deliver: Deliver,
+        rng: random.Random,
+    ) -> None:
+        self.counts = Counts()
+        self._agenda = agenda
+        self._channel = channel
+        self._stations = {name: _Station(name) for name in stations}
+        self._loss = loss
+        self._deliver = deliver
+        self._rng = rng
+        self._frames = 0
+        self._routed_s = -1.0
+        self._ways: dict[str, dict[str, str]] = {}
+        self._heard: dict[str, dict[str, float]] = {}
+
+    def set_on(self, station: str, on: bool) -> None:
+        """Switch a station's radio; what it holds is lost when it goes off."""
+        found = self._stations[station]
+        found.is_on = on
+        if not on:
+            found.queue.clear()
+        self._routed_s = -1.0
+
+    def links(self) -> dict[str, dict[str, float]]:
+        """Who hears whom now, and the chance that a frame is lost."""
+        self._look_around()
+        return self._heard
+
+    def hops(self, a: str, b: str) -> int | None:
+        """Transmissions that a datagram takes on today's routes, None where there is no way."""
+        self._look_around()
+        count = 0
+        while a != b:
+            step = self._ways.get(b, {}).get(a)
+            if step is None or count > len(self._stations):
+                return None
+            a, count = step, count + 1
+        return count
+
+    def send(self, source: str, to: str | None, data: bytes) -> None:
+        """Hand over one datagram; a full queue drops it without a word, as a radio does."""
+        self._frames += 1
+        frame = Frame(self._frames, source, to, data)
+        station = self._stations[source]
+        if to is None:
+            station.flooded.append(frame.number)
+        self._enqueue(station, frame)
+
+    def _enqueue(self, station: _Station, frame: Frame) -> None:
+        if not station.is_on:
+            return
+        if len(station.queue) >= self._channel.queue_frames:
+            self.counts.queue_drops += 1
+            return
+        station.queue.append(frame)
+        self._contend(station)
+
+    def _contend(self, station: _Station) -> None:
+        """Try at the next silence, after a random number of slots."""
+        if station.is_waiting or not station.queue:
+            return
+        station.is_waiting = True
+        backoff_s = self._rng.randrange(CONTENTION_SLOTS) * SLOT_S
+        start_s = max(self._agenda.now, station.quiet_until_s) + backoff_s
+        self._agenda.at(start_s, lambda: self._turn(station))
+
+    def _turn(self, station: _Station) -> None:
+        station.is_waiting = False
+        if not station.queue or not station.is_on:
+            return
+        if station.quiet_until_s > self._agenda.now:
+            self._contend(station)
+            return
+        self._look_around()
+        frame = station.queue.popleft()
+        if frame.to is None:
+            self._broadcast(station, frame)
+        else:
+            self._forward(station, frame)
+        self._contend(station)
+
+    def _occupy(self, station: _Station, frame: Frame, times: int) -> float:
+        """The air around a station is taken for `times` transmissions; returns their end."""
+        size = len(frame.data) + IP_UDP_BYTES + FRAME_BYTES
+        took_s = times * (size * 8 / self._channel.rate + self._channel.overhead_s)
+        end_s = self._agenda.now + took_s
+        station.quiet_until_s = end_s
+        for name in self._heard[station.name]:
+            other = self._stations[name]
+            other.quiet_until_s = max(other.quiet_until_s, end_s)
+        self.counts.transmissions += times
+        self.counts.bytes += size * times
+        self.counts.airtime_s += took_s
+        return end_s + self._channel.hop_delay_s
+
+    def _forward(self, station: _Station, frame: Frame) -> None:
+        assert frame.to is not None
+        step = self._ways.get(frame.to, {}).get(station.name)
+        if step is None:
+            self.counts.unroutable += 1
+            return
+        # the link as it is now, which the route may not know yet
+        loss = self._loss(station.name, step, self._agenda.now) if self._stations[step].is_on else 1.0
+        attempts, arrived = 0, False
+        while attempts < self._channel.attempts and not arrived:
+            attempts += 1
+            arrived = self._rng.random() >= loss
+        at_s = self._occupy(station, frame, attempts)
+        if arrived:
+            self._agenda.at(at_s, lambda: self._arrive(self._stations[step], frame))
+        else:
+            self.counts.losses += 1
+
+    def _broadcast(self, station: _Station, frame: Frame) -> None:
+        at_s = self._occupy(station, frame, self._channel.broadcast_repeats)
+        for name, loss in self._heard[station.name].items():
+            if self._rng.random() >= loss**self._channel.broadcast_repeats:
+                other = self._stations[name]
+                self._agenda.at(at_s, partial(self._arrive, other, frame))
+
+    def _arrive(self, station: _Station, frame: Frame) -> None:
+        if not station.is_on:
+            return
+        if frame.to == station.name:
+            self._deliver(station.name, frame)
+        elif frame.to is not None:
+            self._enqueue(station, frame)
+        elif frame.number not in station.flooded:
+            station.flooded.append(frame.number)
+            self._deliver(station.name, frame)
+            if len(self._heard[station.name]) > 1:
+                self._enqueue(station, frame)
+
+    def _look_around(self) -> None:
+        """Measure every link and find the routes anew, at most every `route_s`."""
+        now = self._agenda.now
+        if self._routed_s >= 0 and now - self._routed_s < self._channel.route_s:
+            return
+        self._routed_s = now
+        on = [name for name, station in self._stations.items() if station.is_on]
+        self._heard = {name: {} for name in self._stations}
+        for index, a in enumerate(on):
+            for b in on[index + 1 :]:
+                loss = self._loss(a, b, now)
+                if loss < 1.0:
+                    self._heard[a][b] = self._heard[b][a] = loss
+        self._ways = {to: self._steps_towards(to) for to in on}
+
+    def _steps_towards(self, to: str) -> dict[str, str]:
+        """For every station its next hop on the way of fewest expected transmissions (Dijkstra from the end)."""
+        cost = {to: 0.0}
+        steps: dict[str, str] = {}
+        waiting = [(0.0, to)]
+        while waiting:
+            so_far, name = heapq.heappop(waiting)
+            if so_far > cost[name]:
+                continue
+            for other, loss in self._heard[name].items():
+                through = so_far + 1.0 / (1.0 - loss)
+                if through < cost.get(other, float("inf")):
+                    cost[other], steps[other] = through, name
+                    heapq.heappush(waiting, (through, other))
+        return steps

@@ -1,0 +1,341 @@
+"""A scenario file (YAML) as values: who is there, where they go, what they say, what goes wrong.
+
+`load(path)` -> YAML nodes with their lines -> checked values -> `Scenario`. Every problem is an error that names file
+and line, what was expected and what was found; unknown keys are problems.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from udp_mesh.core.settings import Outbox, Topic
+from udp_mesh.sim.medium import Channel
+from udp_mesh.sim.place import Air, Course, Wall, course, standing
+
+EVERYBODY = "*"
+_PROBLEMS_SHOWN = 20
+_MAX_BYTES = 1 << 20
+
+
+class ScenarioError(ValueError):
+    """A scenario that cannot be used; one line per problem."""
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """Messages of one topic: each of `sources` sends every `period_s` (with a start of its own within the first
+    period) a message of about `size_bytes`, spread by `spread` (0: always the same; else the sigma of a lognormal
+    with that mean), to `destination` (empty: everybody)."""
+
+    topic: str
+    sources: tuple[str, ...]
+    destination: str
+    period_s: float
+    size_bytes: int
+    spread: float = 0.0
+    start_s: float = 0.0
+    stop_s: float = float("inf")
+
+
+@dataclass(frozen=True, slots=True)
+class Incident:
+    """`what` is `off`, `on` (a robot's or relay's radio), `crash`, `restart` (a robot's process), at `at_s`."""
+
+    at_s: float
+    what: str
+    who: str
+
+
+INCIDENTS = ("off", "on", "crash", "restart")
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """`robots` and `relays` map names to their courses; a relay may `appear` later (a beacon that is dropped)."""
+
+    name: str
+    seed: int
+    duration_s: float
+    robots: Mapping[str, Course]
+    relays: Mapping[str, Course]
+    appear_s: Mapping[str, float]
+    channel: Channel
+    air: Air
+    topics: tuple[Topic, ...]
+    flows: tuple[Flow, ...]
+    incidents: tuple[Incident, ...]
+    observer: str
+    window: str | int
+
+
+class _At:
+    """One YAML node with the file's name: typed access, problems collected in `problems`."""
+
+    def __init__(self, node: yaml.Node | None, file: str, what: str, problems: list[str]) -> None:
+        self.node, self.file, self.what, self.problems = node, file, what, problems
+
+    def problem(self, expected: str, found: object = None) -> None:
+        line = 1 if self.node is None else self.node.start_mark.line + 1
+        seen = self._seen() if found is None else repr(found)
+        self.problems.append(f"{self.file}:{line}: {self.what}: expected {expected}, found {seen}")
+
+    def _seen(self) -> str:
+        match self.node:
+            case None:
+                return "nothing"
+            case yaml.ScalarNode():
+                return repr(self.node.value)
+            case yaml.SequenceNode():
+                return "a list"
+        return "a mapping"
+
+    def mapping(self, known: tuple[str, ...] | None) -> dict[str, _At]:
+        """The entries of a mapping; keys that are not `known` (None: any key) are problems."""
+        if self.node is None:
+            return {}
+        if not isinstance(self.node, yaml.MappingNode):
+            self.problem("a mapping")
+            return {}
+        entries: dict[str, _At] = {}
+        for key, value in self.node.value:
+            name = str(key.value) if isinstance(key, yaml.ScalarNode) else ""
+            entry = _At(value, self.file, f"{self.what}.{name}" if self.what else name, self.problems)
+            if known is not None and name not in known:
+                _At(key, self.file, self.what or "scenario", self.problems).problem(f"one of {', '.join(known)}", name)
+            elif name in entries:
+                entry.problem("each key once", name)
+            else:
+                entries[name] = entry
+        return entries
+
+    def items(self) -> Iterator[_At]:
+        if self.node is None:
+            return
+        if not isinstance(self.node, yaml.SequenceNode):
+            self.problem("a list")
+            return
+        for number, child in enumerate(self.node.value):
+            yield _At(child, self.file, f"{self.what}[{number}]", self.problems)
+
+    def text(self, default: str = "", one_of: tuple[str, ...] | None = None) -> str:
+        if self.node is None:
+            return default
+        if not isinstance(self.node, yaml.ScalarNode) or (one_of is not None and self.node.value not in one_of):
+            self.problem("text" if one_of is None else f"one of {', '.join(one_of)}")
+            return default
+        return str(self.node.value)
+
+    def number(self, default: float, least: float = 0.0) -> float:
+        if self.node is None:
+            return default
+        try:
+            value = float(self.node.value) if isinstance(self.node, yaml.ScalarNode) else float("nan")
+        except ValueError:
+            value = float("nan")
+        if not value >= least:
+            self.problem(f"a number of at least {least:g}")
+            return default
+        return value
+
+    def flag(self) -> bool:
+        return self.text("false", ("true", "false")) == "true"
+
+
+def load(path: Path) -> Scenario:
+    """Read a scenario. Raises ScenarioError with every problem found."""
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from error
+    return parse(raw, str(path))
+
+
+def parse(raw: bytes, file: str) -> Scenario:
+    """As `load`, from the file's bytes."""
+    if len(raw) > _MAX_BYTES:
+        raise ScenarioError(f"{file}: expected at most {_MAX_BYTES} bytes, found {len(raw)}")
+    try:
+        text = raw.decode()
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
+            raise ScenarioError(f"{file}: expected no aliases (`*name`)")
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+    except (UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = mark.line + 1 if mark else 1
+        raise ScenarioError(f"{file}:{line}: expected YAML in UTF-8, found {str(error).splitlines()[0]}") from error
+    problems: list[str] = []
+    scenario = _scenario(_At(root, file, "", problems), Path(file).stem)
+    if problems:
+        more = [f"... and {len(problems) - _PROBLEMS_SHOWN} more"] if len(problems) > _PROBLEMS_SHOWN else []
+        raise ScenarioError("\n".join([*problems[:_PROBLEMS_SHOWN], *more]))
+    return scenario
+
+
+_KEYS = (
+    "name", "seed", "duration_s", "observer", "window", "channel", "air", "robots", "relays", "topics", "flows",
+    "incidents",
+)  # fmt: skip
+
+
+def _scenario(at: _At, name: str) -> Scenario:
+    if at.node is None:
+        at.problem("a mapping")
+    keys = at.mapping(_KEYS)
+    nothing = _At(None, at.file, "", at.problems)
+
+    def get(key: str) -> _At:
+        return keys.get(key, nothing)
+
+    robots = {key: _course(value, ()) for key, value in get("robots").mapping(None).items()}
+    relay_entries = get("relays").mapping(None)
+    relays = {key: _course(value, ("appear_s",)) for key, value in relay_entries.items()}
+    appear_s = {}
+    for key, value in relay_entries.items():
+        if isinstance(value.node, yaml.MappingNode):
+            entries = value.mapping(None)
+            if "appear_s" in entries:
+                appear_s[key] = entries["appear_s"].number(0.0)
+    if len(robots) < 2:
+        get("robots").problem("at least two robots", len(robots))
+    topics = tuple(_topic(key, value) for key, value in get("topics").mapping(None).items())
+    topic_names = tuple(topic.name for topic in topics)
+    everybody = (*robots, *relays)
+    window = get("window").text("adaptive")
+    return Scenario(
+        name=get("name").text(name),
+        seed=int(get("seed").number(1)),
+        duration_s=get("duration_s").number(60.0),
+        robots=robots,
+        relays=relays,
+        appear_s=appear_s,
+        channel=_channel(get("channel")),
+        air=_air(get("air")),
+        topics=topics,
+        flows=tuple(_flow(item, topic_names, tuple(robots)) for item in get("flows").items()),
+        incidents=tuple(_incident(item, everybody) for item in get("incidents").items()),
+        observer=get("observer").text(next(iter(robots), ""), tuple(robots)),
+        window="adaptive" if window == "adaptive" else int(get("window").number(3, least=1)),
+    )
+
+
+def _pair(at: _At) -> tuple[float, float]:
+    values = [item.number(0.0, least=-1e6) for item in at.items()]
+    if len(values) != 2:
+        at.problem("[x, y] in metres")
+        return (0.0, 0.0)
+    return (values[0], values[1])
+
+
+def _course(at: _At, more: tuple[str, ...]) -> Course:
+    """`[x, y]`, or `{at: [x, y]}`, or `{path: [[seconds, x, y], ...]}`."""
+    if isinstance(at.node, yaml.SequenceNode):
+        return standing(_pair(at))
+    entries = at.mapping(("at", "path", *more))
+    if "at" in entries:
+        return standing(_pair(entries["at"]))
+    points = []
+    for item in entries["path"].items() if "path" in entries else ():
+        values = [value.number(0.0, least=-1e6) for value in item.items()]
+        if len(values) == 3:
+            points.append((values[0], (values[1], values[2])))
+        else:
+            item.problem("[seconds, x, y]")
+    try:
+        return course(points)
+    except ValueError as error:
+        at.problem("`at: [x, y]` or `path: [[seconds, x, y], ...]` with rising times", str(error))
+        return standing((0.0, 0.0))
+
+
+def _numbers(at: _At, made: Any, whole: tuple[str, ...] = ()) -> dict[str, Any]:
+    known = tuple(item.name for item in fields(made) if item.name != "walls")
+    entries = at.mapping((*known, "walls") if isinstance(made, Air) else known)
+    values: dict[str, Any] = {}
+    for name in known:
+        if name in entries:
+            value = entries[name].number(getattr(made, name))
+            values[name] = int(value) if name in whole else value
+    return values
+
+
+def _channel(at: _At) -> Channel:
+    return Channel(**_numbers(at, Channel(), ("queue_frames", "attempts", "broadcast_repeats")))
+
+
+def _air(at: _At) -> Air:
+    walls = []
+    entries = at.mapping(None)
+    for item in entries["walls"].items() if "walls" in entries else ():
+        parts = item.mapping(("a", "b", "loss"))
+        if "a" in parts and "b" in parts:
+            loss = parts["loss"].number(1.0) if "loss" in parts else 1.0
+            walls.append(Wall(_pair(parts["a"]), _pair(parts["b"]), loss))
+        else:
+            item.problem("a and b, each [x, y]")
+    return Air(**_numbers(at, Air()), walls=tuple(walls))
+
+
+def _topic(name: str, at: _At) -> Topic:
+    keys = (
+        "priority", "reliable", "keep_last", "deadline_s", "rate_limit_bytes_per_s", "compression", "destinations",
+        "outbox", "repair",
+    )  # fmt: skip
+    entries = at.mapping(keys)
+    values: dict[str, Any] = {}
+    for key, entry in entries.items():
+        match key:
+            case "reliable" | "compression" | "repair":
+                values[key] = entry.flag()
+            case "deadline_s":
+                values[key] = entry.number(1.0)
+            case "outbox":
+                values[key] = Outbox(entry.text("none", tuple(kind.value for kind in Outbox)))
+            case "destinations":
+                values[key] = tuple(item.text() for item in entry.items())
+            case _:
+                values[key] = int(entry.number(0))
+    try:
+        return Topic(name, **values)
+    except ValueError as error:
+        at.problem("a topic that can be used", str(error))
+        return Topic("unusable")
+
+
+def _flow(at: _At, topics: tuple[str, ...], robots: tuple[str, ...]) -> Flow:
+    keys = ("topic", "sources", "destination", "period_s", "size_bytes", "spread", "start_s", "stop_s")
+    entries = at.mapping(keys)
+    nothing = _At(None, at.file, at.what, at.problems)
+
+    def get(key: str) -> _At:
+        return entries.get(key, nothing)
+
+    for key in ("topic", "period_s", "size_bytes"):
+        if at.node is not None and key not in entries:
+            at.problem(key, "no such key")
+    sources = tuple(item.text(one_of=robots) for item in get("sources").items()) or robots
+    return Flow(
+        topic=get("topic").text("", topics),
+        sources=sources,
+        destination=get("destination").text("", robots),
+        period_s=get("period_s").number(1.0, least=1e-3),
+        size_bytes=int(get("size_bytes").number(1, least=1)),
+        spread=get("spread").number(0.0),
+        start_s=get("start_s").number(0.0),
+        stop_s=get("stop_s").number(float("inf")),
+    )
+
+
+def _incident(at: _At, everybody: tuple[str, ...]) -> Incident:
+    entries = at.mapping(("at_s", "what", "who"))
+    for key in ("at_s", "what", "who"):
+        if key not in entries:
+            at.problem(key, "no such key")
+            return Incident(0.0, "off", "")
+    return Incident(
+        entries["at_s"].number(0.0), entries["what"].text("off", INCIDENTS), entries["who"].text("", everybody)
+    )

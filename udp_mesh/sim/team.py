@@ -1,0 +1,194 @@
+"""A team of real transport cores on a simulated channel: traffic in, everything that happened out.
+
+`Team` gives each robot a `udp_mesh.core.Node` and joins them by a `Medium`. Whatever touches a node (a datagram, its
+timer, a message of the scenario) is followed by `_settle`: fetch what it wants to send, what it tells, when it wants to
+be woken. What the nodes tell goes to `on_event`; reliable messages are accounted for in `Ledger`.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+from udp_mesh.core.conditions import Conditions
+from udp_mesh.core.events import (
+    Event,
+    MessageDelivered,
+    MessageExpired,
+    MessageId,
+    MessagePeerLost,
+    MessageReceived,
+    Rejected,
+)
+from udp_mesh.core.node import Node
+from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
+from udp_mesh.sim.agenda import Agenda
+from udp_mesh.sim.medium import Channel, Frame, Loss, Medium
+
+LINK = "mesh0"
+BROADCAST = "10.255.255.255"
+# a node's timer may lie in the past when it just acted; virtual time must still move on
+_LEAST_STEP_S = 1e-6
+
+OnEvent = Callable[[float, str, Event], None]
+"""(now, robot, what its node told)."""
+
+
+@dataclass(slots=True)
+class Ledger:
+    """What became of every accepted reliable message: (robot, message, destination) -> its outcomes."""
+
+    accepted: int = 0
+    rejected: int = 0
+    outcomes: dict[tuple[str, int, MessageId, str], list[str]] = field(default_factory=dict)
+
+    def note(self, robot: str, run: int, event: Event) -> None:
+        match event:
+            case MessageDelivered(message_id, peer) | MessagePeerLost(message_id, peer):
+                kind = type(event).__name__
+            case MessageExpired(message_id, peer):
+                kind = type(event).__name__
+            case _:
+                return
+        self.outcomes.setdefault((robot, run, message_id, peer), []).append(kind)
+
+    @property
+    def ended_twice(self) -> list[tuple[str, int, MessageId, str]]:
+        """Messages with more than one outcome for one destination: there must be none."""
+        return [key for key, kinds in self.outcomes.items() if len(kinds) > 1]
+
+    def total(self, kind: type[Event]) -> int:
+        return sum(kinds.count(kind.__name__) for kinds in self.outcomes.values())
+
+
+@dataclass(slots=True)
+class _Member:
+    name: str
+    address: str
+    node: Node
+    link: LinkInfo
+    run: int = 0
+    is_running: bool = True
+    wake_s: float = float("inf")
+
+
+class Team:
+    """`robots` are the settings of each; `relays` forward frames and have no transport of their own."""
+
+    def __init__(
+        self,
+        robots: Mapping[str, Settings],
+        *,
+        relays: Iterable[str] = (),
+        channel: Channel,
+        loss: Loss,
+        seed: int,
+        on_event: OnEvent | None = None,
+    ) -> None:
+        self.agenda = Agenda()
+        self.ledger = Ledger()
+        self._rng = random.Random(seed)
+        self._on_event = on_event or (lambda now, robot, event: None)
+        names = [*robots, *relays]
+        self.medium = Medium(self.agenda, channel, names, loss, self._deliver, random.Random(self._rng.random()))
+        self._addresses: dict[str, str] = {}
+        self._members: dict[str, _Member] = {}
+        for number, (name, settings) in enumerate(robots.items(), 1):
+            address = f"10.0.{number // 250}.{number % 250 + 1}"
+            self._members[name] = self._started(name, address, settings, run=0)
+            self._addresses[address] = name
+        for member in self._members.values():
+            self._settle(member)
+
+    def _started(self, name: str, address: str, settings: Settings, run: int) -> _Member:
+        link = LinkInfo(LINK, LinkKind.BROADCAST, (address, settings.port), (BROADCAST, settings.port))
+        boot_id = self._rng.randbytes(16)
+        node = Node(settings, boot_id=boot_id, rng=random.Random(self._rng.random()), now=self.agenda.now)
+        node.link_up(link, self.agenda.now)
+        return _Member(name, address, node, link, run)
+
+    # ---- what a scenario does
+
+    def send(self, robot: str, topic: str, payload: bytes, destination: str | None = None) -> MessageId | Rejected:
+        """One message now. A robot that is switched off sends nothing: ValueError."""
+        member = self._members[robot]
+        if not member.is_running:
+            raise ValueError(f"{robot} is switched off")
+        result = member.node.send(topic, payload, destination=destination, now=self.agenda.now)
+        if isinstance(result, Rejected):
+            self.ledger.rejected += 1
+        else:
+            self.ledger.accepted += 1
+        self._settle(member)
+        return result
+
+    def is_running(self, robot: str) -> bool:
+        return self._members[robot].is_running
+
+    def crash(self, robot: str) -> None:
+        """The process dies, with everything it held."""
+        self._members[robot].is_running = False
+
+    def restart(self, robot: str, settings: Settings) -> None:
+        """A new run of the same robot."""
+        old = self._members[robot]
+        self._members[robot] = self._started(robot, old.address, settings, old.run + 1)
+        self._settle(self._members[robot])
+
+    def change_address(self, robot: str, address: str) -> None:
+        """The same run is found elsewhere from now on."""
+        member = self._members[robot]
+        self._addresses.pop(member.address, None)
+        self._addresses[address] = robot
+        member.address = address
+        member.link = replace(member.link, address=(address, member.link.address[1]))
+        member.node.link_up(member.link, self.agenda.now)
+        self._settle(member)
+
+    def apply(self, robot: str, settings: Settings) -> list[str]:
+        """Change a running robot's settings."""
+        changes = self._members[robot].node.apply(settings, self.agenda.now)
+        self._settle(self._members[robot])
+        return changes
+
+    def conditions(self, robot: str) -> Conditions:
+        return self._members[robot].node.conditions(self.agenda.now)
+
+    # ---- what follows from it
+
+    def _deliver(self, robot: str, frame: Frame) -> None:
+        member = self._members.get(robot)
+        source = self._members.get(frame.source)
+        if member is None or source is None or not member.is_running:
+            return
+        member.node.receive(frame.data, LINK, (source.address, source.link.address[1]), self.agenda.now)
+        self._settle(member)
+
+    def _settle(self, member: _Member) -> None:
+        now = self.agenda.now
+        while datagrams := member.node.datagrams_to_send(now):
+            for datagram in datagrams:
+                to = None if datagram.destination is None else self._addresses.get(datagram.destination[0])
+                if datagram.destination is None or to is not None:
+                    self.medium.send(member.name, to, bytes(datagram.data))
+        while (event := member.node.next_event()) is not None:
+            self.ledger.note(member.name, member.run, event)
+            self._on_event(now, member.name, event)
+        timer_s = member.node.next_timer()
+        if timer_s is not None and timer_s < member.wake_s:
+            member.wake_s = max(timer_s, now + _LEAST_STEP_S)
+            self.agenda.at(member.wake_s, partial(self._wake, member))
+
+    def _wake(self, member: _Member) -> None:
+        if self.agenda.now < member.wake_s or not member.is_running or self._members[member.name] is not member:
+            return
+        member.wake_s = float("inf")
+        member.node.handle_timer(self.agenda.now)
+        self._settle(member)
+
+
+def received_bytes(event: Event) -> int:
+    """The payload of a message that arrived, 0 for any other event."""
+    return len(event.payload) if isinstance(event, MessageReceived) else 0
