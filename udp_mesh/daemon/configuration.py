@@ -86,7 +86,7 @@ def load(path: Path) -> Configuration:
     key_file, unkeyed = top.text("key_file"), top.boolean("unkeyed", False)
     keys: tuple[Key, ...] = ()
     if key_file is not None and unkeyed:
-        top.report("unkeyed", "either key_file or unkeyed", "both")
+        top.source.report(("unkeyed",), "either key_file or unkeyed", "both")
     if key_file is not None:
         try:
             # Relative to the configuration, so that a bundle can be moved as a whole.
@@ -98,7 +98,9 @@ def load(path: Path) -> Configuration:
                 for problem in error.problems
             ]
     elif not unkeyed:
-        top.report("key_file", "a file with the fleet's key", "none", "unkeyed = true runs without protection")
+        top.source.report(
+            ("key_file",), "a file with the fleet's key", "none", "unkeyed = true runs without protection"
+        )
     return dataclasses.replace(read(top, keys), file=path)
 
 
@@ -197,11 +199,13 @@ def _check_name(table: Table, key: str, name: str, limit_bytes: int) -> None:
 
 def read_topic(name: str, table: Table) -> Topic:
     """How one topic travels: an entry of `[topics]`, or what a command sets. Problems go to the table's source."""
-    size = len(name.encode())
+    size, good_name = len(name.encode()), False
     if name.startswith(RESERVED_PREFIX):
         table.source.report(table.path, f"a topic outside {RESERVED_PREFIX}", name)
     elif not 1 <= size <= MAX_TOPIC_BYTES or not name.isprintable() or any(c.isspace() for c in name):
         table.source.report(table.path, f"a topic of 1 to {MAX_TOPIC_BYTES} bytes without space", name)
+    else:
+        good_name = True
     default = Topic("default")
     topic = Topic(
         name="default",
@@ -220,7 +224,7 @@ def read_topic(name: str, table: Table) -> Topic:
     table.finish()
     if topic.outbox_on_disk and topic.outbox is Outbox.NONE:
         table.report("outbox_on_disk", 'outbox = "last" or "all" beside it', topic.outbox_on_disk)
-    return dataclasses.replace(topic, name=name) if 1 <= size <= MAX_TOPIC_BYTES else topic
+    return dataclasses.replace(topic, name=name) if good_name else topic
 
 
 def _or(value: int | None, default: int) -> int:

@@ -250,7 +250,8 @@ class Table:
         """Reports every key nobody asked for."""
         for key, value in self._values.items():
             if key not in self._known:
-                self.report(key, "a known key", f"{key!r} = {show(value)}", meant(key, self._known))
+                hint = meant(key, self._known)
+                self.source.report((*self.path, key), "a known key", f"{key} = {show(value)}", hint)
 
 
 def meant(found: object, known: Iterable[str]) -> str:

@@ -1,0 +1,66 @@
+"""The local API's frames: any pieces give the frames that were written, any bytes give frames or an error."""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import udp_mesh.client.mesh_client as mesh_client
+from udp_mesh.client.mesh_client import Frame, FrameReader, MeshClient, MeshError, encode_frame
+
+headers = st.dictionaries(st.text(max_size=5), st.one_of(st.integers(), st.text(max_size=5), st.booleans()), max_size=3)
+
+
+@given(st.lists(st.tuples(headers, st.binary(max_size=50)), max_size=5), st.data())
+def test_frames_survive_any_cutting(frames: list[Frame], data: st.DataObject) -> None:
+    stream = b"".join(encode_frame(header, payload) for header, payload in frames)
+    reader, found, place = FrameReader(), list[Frame](), 0
+    while place < len(stream):
+        end = data.draw(st.integers(place + 1, len(stream)))
+        found += reader.feed(stream[place:end])
+        place = end
+    assert found == frames
+
+
+@given(st.binary(max_size=60))
+def test_any_bytes_give_frames_or_an_error(raw: bytes) -> None:
+    try:
+        FrameReader().feed(raw)
+    except MeshError as error:
+        assert error.code == "bad-frame"
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b"\xff\xff\xff\xff\x00\x00\x00\x00",
+        b"\x00\x00\x00\x02\xff\xff\xff\xff",
+        b"\x00\x00\x00\x02\x00\x00\x00\x00[]",
+        b"\x00\x00\x00\x02\x00\x00\x00\x00{x",
+        b"\x00\x00\x00\x02\x00\x00\x00\x00\xff\xfe",
+    ],
+)
+def test_a_length_or_header_that_is_none_is_an_error(raw: bytes) -> None:
+    with pytest.raises(MeshError):
+        FrameReader().feed(raw)
+
+
+def test_no_daemon_is_an_error_that_names_the_socket(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"no udp-mesh daemon at .*mesh.sock: No such file") as caught:
+        MeshClient(str(tmp_path / "mesh.sock"))
+    assert caught.value.code == "unreachable"
+
+
+@pytest.mark.parametrize("path", [Path(mesh_client.__file__), Path(mesh_client.__file__).parents[1] / "__init__.py"])
+def test_the_client_keeps_to_the_syntax_of_python_3_8_and_to_the_standard_library(path: Path) -> None:
+    tree = ast.parse(path.read_text(), feature_version=(3, 8))
+    imported = {
+        name.split(".")[0]
+        for node in tree.body
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for name in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names])
+    }
+    assert imported <= set(sys.stdlib_module_names)

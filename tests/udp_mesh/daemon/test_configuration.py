@@ -1,0 +1,284 @@
+"""The configuration: what it means, and that every mistake is named by its line."""
+
+from pathlib import Path
+
+import pytest
+
+from udp_mesh.core.settings import Neighbour, Outbox, Topic
+from udp_mesh.crypto import Key
+from udp_mesh.daemon.configuration import (
+    RESERVED_TOPICS,
+    Configuration,
+    load,
+    parse_address,
+    read_keys,
+    topic_from_values,
+)
+from udp_mesh.daemon.toml_source import ConfigurationError, locate
+from udp_mesh.links.attachments import EVERY_INTERFACE, LinkWish
+
+FULL = """\
+name = "ugv1"
+port = 8701
+key_file = "fleet.key"
+window = 3
+fragment_bytes = 1200
+
+[topics]
+status = { priority = 0, keep_last = 1 }
+"map/diff" = { priority = 7, outbox = "all", outbox_on_disk = true, compression = true }
+
+[topics.video]
+priority = 9
+reliable = false
+deadline_s = 0.5
+rate_limit_bytes_per_s = 250_000
+destinations = [
+  "base",  # where people look
+]
+
+[undeclared]
+priority = 10
+
+[[links]]
+interface = "wlan*"
+
+[[links]]
+address = "127.0.0.2"
+kind = "neighbours"
+mtu = 1400
+
+[[neighbours]]
+name = "base"
+address = "127.0.0.3"
+
+[[neighbours]]
+name = "old"
+address = "127.0.0.4:8700"
+legacy = true
+link = "127.0.0.2"
+
+[rates]
+offline_s = 5
+
+[limits]
+message_bytes = 1_000_000
+
+[daemon]
+socket = "/run/mesh.sock"
+socket_mode = "0666"
+metrics_address = "127.0.0.1:9871"
+"""
+
+KEY = Key(bytes(range(32)))
+
+
+def write(folder: Path, text: str, keys: str = KEY.secret.hex()) -> Path:
+    (folder / "fleet.key").write_text(keys + "\n")
+    path = folder / "udp-mesh.toml"
+    path.write_text(text)
+    return path
+
+
+def problems(folder: Path, text: str) -> list[str]:
+    with pytest.raises(ConfigurationError) as caught:
+        load(write(folder, text))
+    return [str(problem).removeprefix(str(folder) + "/") for problem in caught.value.problems]
+
+
+def test_every_part_of_the_file_arrives(tmp_path: Path) -> None:
+    configuration = load(write(tmp_path, FULL))
+    settings = configuration.settings
+    assert (settings.name, settings.port, settings.window, settings.fragment_bytes) == ("ugv1", 8701, 3, 1200)
+    assert settings.keys == (KEY,)
+    assert settings.topics == (
+        Topic("status", priority=0, keep_last=1),
+        Topic("map/diff", priority=7, outbox=Outbox.ALL, outbox_on_disk=True, compression=True),
+        Topic(
+            "video",
+            priority=9,
+            reliable=False,
+            deadline_s=0.5,
+            rate_limit_bytes_per_s=250_000,
+            destinations=("base",),
+        ),
+        *RESERVED_TOPICS,
+    )
+    assert settings.undeclared is not None
+    assert settings.undeclared.priority == 10
+    assert settings.neighbours == (
+        Neighbour(("127.0.0.3", 8701), "base"),
+        Neighbour(("127.0.0.4", 8700), "old", "127.0.0.2", legacy=True),
+    )
+    assert settings.rates.offline_s == 5.0
+    assert settings.limits.message_bytes == 1_000_000
+    assert configuration.links == (LinkWish("wlan*"), LinkWish(None, "127.0.0.2", broadcast=False, mtu=1400))
+    assert configuration.daemon.socket_mode == 0o666
+    assert configuration.daemon.metrics_address == ("127.0.0.1", 9871)
+
+
+def test_a_key_file_is_all_that_is_needed(tmp_path: Path) -> None:
+    configuration = load(write(tmp_path, 'key_file = "fleet.key"\n'))
+    assert isinstance(configuration, Configuration)
+    assert configuration.links == EVERY_INTERFACE
+    assert configuration.settings.name
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('name = "a b"', 'udp-mesh.toml:2: name: expected a name of 1 to 63 bytes without space or slash, found "a b"'),
+        ("name = 5", "udp-mesh.toml:2: name: expected a string, found 5"),
+        ("\nprot = 8700", "udp-mesh.toml:3: prot: expected a known key, found prot = 8700 (did you mean 'port'?)"),
+        ("port = 70000", "udp-mesh.toml:2: port: expected an integer from 1 to 65535, found 70000"),
+        ("port = true", "udp-mesh.toml:2: port: expected an integer from 1 to 65535, found true"),
+        ("window = 0", 'udp-mesh.toml:2: window: expected "adaptive" or an integer from 1 to 4096, found 0'),
+        (
+            "[topics]\na = {}\nvideo = { prioriti = 3 }",
+            "udp-mesh.toml:4: topics.video.prioriti: expected a known key, found prioriti = 3 "
+            "(did you mean 'priority'?)",
+        ),
+        (
+            "[topics.video]\n\npriority = 16",
+            "udp-mesh.toml:4: topics.video.priority: expected an integer from 0 to 15, found 16",
+        ),
+        ("[topics]\nvideo = 3", "udp-mesh.toml:3: topics.video: expected a table, found 3"),
+        (
+            '[topics]\nmap = { outbox = "lst" }',
+            'udp-mesh.toml:3: topics.map.outbox: expected "none" or "last" or "all", found "lst" '
+            "(did you mean 'last'?)",
+        ),
+        (
+            "[topics]\nmap = { outbox_on_disk = true }",
+            'udp-mesh.toml:3: topics.map.outbox_on_disk: expected outbox = "last" or "all" beside it, found true',
+        ),
+        ("[[links]]\nmtu = 1500", "udp-mesh.toml:2: links.0: expected either interface or address, found neither"),
+        (
+            '[[links]]\ninterface = "a"\n[[links]]\naddress = "10.0.0"',
+            'udp-mesh.toml:5: links.1.address: expected an IPv4 or IPv6 address, found "10.0.0"',
+        ),
+        ('[[neighbours]]\nname = "b"', "udp-mesh.toml:2: neighbours.0: expected an address, found none"),
+        ("[rates]\noffline_s = -1", "udp-mesh.toml:3: rates.offline_s: expected a number from 0 to 86400, found -1"),
+        (
+            '[daemon]\nsocket_mode = "rw"',
+            'udp-mesh.toml:3: daemon.socket_mode: expected octal permissions such as "0660", found "rw"',
+        ),
+        (
+            '[daemon]\nmetrics_address = "10.0.0.1:9"',
+            "udp-mesh.toml:3: daemon.metrics_address: expected a loopback address with a port (127.0.0.1:9871), "
+            'found "10.0.0.1:9"',
+        ),
+        ("name = ", "udp-mesh.toml:2: expected TOML, found invalid value"),
+        ("unkeyed = true", "udp-mesh.toml:2: unkeyed: expected either key_file or unkeyed, found both"),
+    ],
+)
+def test_a_mistake_is_named_by_file_line_expectation_and_finding(tmp_path: Path, text: str, expected: str) -> None:
+    assert problems(tmp_path, f'key_file = "fleet.key"\n{text}\n') == [expected]
+
+
+def test_every_mistake_is_named_at_once(tmp_path: Path) -> None:
+    found = problems(tmp_path, 'key_file = "fleet.key"\nport = 0\n[topics]\na = { priority = 99 }\nb = { x = 1 }\n')
+    assert [problem.split(":")[1] for problem in found] == ["2", "4", "5"]
+
+
+def test_a_missing_key_is_named_with_the_way_out(tmp_path: Path) -> None:
+    assert problems(tmp_path, 'name = "a"\n') == [
+        "udp-mesh.toml:1: key_file: expected a file with the fleet's key, found none "
+        "(unkeyed = true runs without protection)"
+    ]
+
+
+def test_a_missing_key_file_is_named_at_the_line_that_names_it(tmp_path: Path) -> None:
+    (problem,) = problems(tmp_path, 'name = "a"\nkey_file = "other.key"\n')
+    assert problem.startswith("udp-mesh.toml:2: expected a readable file, found ")
+    assert problem.endswith("other.key: No such file or directory")
+
+
+def test_a_bad_key_is_named_by_its_line_and_never_shown(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.key"
+    path.write_text(f"# the fleet's keys\n{KEY.secret.hex()}\nsecretsecret\n")
+    with pytest.raises(ConfigurationError) as caught:
+        read_keys(path)
+    assert f"{path}:3: expected a key of 32 bytes" in str(caught.value)
+    assert "secretsecret" not in str(caught.value)
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_a_key_file_holds_one_or_two_keys(tmp_path: Path, count: int) -> None:
+    path = tmp_path / "fleet.key"
+    path.write_text(f"{KEY.secret.hex()}\n" * count)
+    with pytest.raises(ConfigurationError, match=f"expected one or two keys, one per line, found {count}"):
+        read_keys(path)
+
+
+def test_a_configuration_that_cannot_be_read_is_one_problem(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="expected a readable file"):
+        load(tmp_path / "missing.toml")
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b'name = "a"\n\xff')
+    with pytest.raises(ConfigurationError, match=r"binary.toml:2: expected UTF-8"):
+        load(binary)
+
+
+def test_a_command_changes_only_the_fields_it_names() -> None:
+    before = Topic("map", priority=7, outbox=Outbox.ALL, destinations=("base",), deadline_s=60.0)
+    after = topic_from_values("map", {"priority": 5}, before)
+    assert after == Topic("map", priority=5, outbox=Outbox.ALL, destinations=("base",), deadline_s=60.0)
+    with pytest.raises(ConfigurationError, match="did you mean 'deadline_s'"):
+        topic_from_values("map", {"deadline": 5}, before)
+
+
+@pytest.mark.parametrize("name", ["", "a b", "~mesh/ping", "x" * 256])
+def test_a_topic_name_that_cannot_travel_is_refused(name: str) -> None:
+    with pytest.raises(ConfigurationError):
+        topic_from_values(name, {}, None)
+
+
+def test_lines_are_found_behind_strings_comments_and_brackets_that_look_like_keys() -> None:
+    text = "\n".join(
+        [
+            'a = """',
+            "b = 1",
+            '"""',
+            "c = [  # d = 1",
+            "  1,",
+            "]",
+            "[x]",
+            '"y.z" = { w = 1 }',
+            "[[t]]",
+            "k = 1",
+            "[[t]]",
+            "k = 2",
+            "[t.inner]",
+            "m.n = 3",
+        ]
+    )
+    assert locate(text) == {
+        ("a",): 1,
+        ("c",): 4,
+        ("x",): 7,
+        ("x", "y.z"): 8,
+        ("t", 0): 9,
+        ("t", 0, "k"): 10,
+        ("t", 1): 11,
+        ("t", 1, "k"): 12,
+        ("t", 1, "inner"): 13,
+        ("t", 1, "inner", "m"): 14,
+        ("t", 1, "inner", "m", "n"): 14,
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("10.0.0.2", ("10.0.0.2", 8700)),
+        ("10.0.0.2:9", ("10.0.0.2", 9)),
+        ("fd00::2", ("fd00::2", 8700)),
+        ("[fd00::2]:9", ("fd00::2", 9)),
+        ("base", None),
+        ("10.0.0.2:x", None),
+        ("10.0.0.2:0", None),
+    ],
+)
+def test_addresses_are_numeric_with_an_optional_port(text: str, address: tuple[str, int] | None) -> None:
+    assert parse_address(text, 8700) == address

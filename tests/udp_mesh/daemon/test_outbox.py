@@ -1,0 +1,90 @@
+"""Messages on disk: what was put is loaded, whatever ended the process."""
+
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from udp_mesh.core.seams import StoredMessage
+from udp_mesh.daemon.outbox import DirectoryStore
+
+
+def message(key: int, payload: bytes = b"payload", remaining_s: float | None = None) -> StoredMessage:
+    return StoredMessage(key, "base", "map/diff", "mesh_msgs/MapDiff", payload, remaining_s)
+
+
+def test_what_was_put_and_not_removed_is_loaded_oldest_first(tmp_path: Path) -> None:
+    store = DirectoryStore(tmp_path / "outbox", 1 << 20)
+    for key in (3, 1, 2):
+        store.put(message(key, bytes([key]) * 1000, remaining_s=key / 3))
+    store.remove(2)
+    store.remove(99)
+    later = DirectoryStore(tmp_path / "outbox", 1 << 20)
+    assert later.load() == [message(1, b"\x01" * 1000, 1 / 3), message(3, b"\x03" * 1000, 1.0)]
+    assert later.bytes == store.bytes
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.booleans(), st.binary(max_size=50)), max_size=12))
+def test_the_directory_equals_a_dictionary(steps: list[tuple[int, bool, bytes]]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        store, expected = DirectoryStore(Path(folder), 1 << 20), dict[int, StoredMessage]()
+        for key, put, payload in steps:
+            if put:
+                store.put(message(key, payload))
+                expected[key] = message(key, payload)
+            else:
+                store.remove(key)
+                expected.pop(key, None)
+        again = DirectoryStore(Path(folder), 1 << 20)
+        assert again.load() == [expected[key] for key in sorted(expected)]
+        assert again.bytes == store.bytes
+
+
+def test_a_full_directory_refuses_and_counts(tmp_path: Path) -> None:
+    store = DirectoryStore(tmp_path, 3000)
+    for key in range(5):
+        store.put(message(key, bytes(1000)))
+    assert store.refused == 3
+    assert len(store.load()) == 2
+
+
+def test_a_damaged_file_is_set_aside_and_the_others_load(tmp_path: Path) -> None:
+    store = DirectoryStore(tmp_path, 1 << 20)
+    for key in (1, 2, 3):
+        store.put(message(key))
+    torn = tmp_path / f"{2:020d}.message"
+    torn.write_bytes(torn.read_bytes()[:-1])
+    (tmp_path / "half.new").write_bytes(b"half")
+    assert [kept.key for kept in DirectoryStore(tmp_path, 1 << 20).load()] == [1, 3]
+    assert torn.with_suffix(".damaged").exists()
+    assert not (tmp_path / "half.new").exists()
+
+
+def test_flushing_skips_what_was_delivered_meanwhile(tmp_path: Path) -> None:
+    store = DirectoryStore(tmp_path, 1 << 20)
+    store.put(message(1))
+    store.put(message(2))
+    paths = store.take_unflushed()
+    store.remove(1)
+    store.flush(paths)
+    assert not store.needs_flush
+
+
+def test_a_message_put_before_sigkill_is_loaded_after(tmp_path: Path) -> None:
+    script = f"""
+import os, signal
+from pathlib import Path
+from udp_mesh.core.seams import StoredMessage
+from udp_mesh.daemon.outbox import DirectoryStore
+store = DirectoryStore(Path({str(tmp_path)!r}), 1 << 20)
+for key in range(20):
+    store.put(StoredMessage(key, "base", "map", "", bytes(5000), None))
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    ended = subprocess.run([sys.executable, "-c", script], check=False)
+    assert ended.returncode == -signal.SIGKILL
+    assert [kept.key for kept in DirectoryStore(tmp_path, 1 << 20).load()] == list(range(20))
