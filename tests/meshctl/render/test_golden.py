@@ -10,7 +10,7 @@ import pytest
 from netjsonconfig.backends.openwrt.parser import OpenWrtParser
 
 from meshctl.model import Fleet
-from meshctl.render import CONFIG_FOLDER, Rendered, render_node
+from meshctl.render import Rendered, render_node
 from meshctl.uci import Package
 from tests.meshctl.render import fleets
 from tests.meshctl.render.golden import FOLDER, cases, render_case

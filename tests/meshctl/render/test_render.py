@@ -1,0 +1,261 @@
+"""Laws of rendering: values arrive unchanged or are refused, secrets stay secret, same input gives same bytes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from meshctl.diagnostics import InvalidInput
+from meshctl.model import MASK, Encryption, Fleet, MeshMode, NodeState, Operators, Secret, SystemSettings
+from meshctl.render import DeviceFacts, Rendered, Templates, UnknownNode, render_fleet, render_node
+from meshctl.uci import dump, parse
+from tests.meshctl.render import fleets
+
+SHARED = Templates.of(fleets.fleet())
+NAME = "husky1-front"
+hostile = st.text(
+    st.one_of(st.sampled_from(" '\"\\\n\t\r;#$`{}%|&é中\0"), st.characters(exclude_categories=["Cs"])), max_size=12
+)
+
+
+def render(fleet: Fleet, key: str = fleets.KEY) -> Rendered:
+    return render_node(fleet, NAME, lambda _: Secret(key), SHARED)
+
+
+def option(rendered: Rendered, package: str, section: str, name: str) -> str:
+    tree = rendered.package(package)
+    assert tree is not None
+    if section.startswith("@"):
+        return tree.sections[tree.keys().index(section)].get(name)
+    found = tree.section(section)
+    assert found is not None
+    return found.get(name)
+
+
+@given(hostile, hostile, hostile, hostile)
+def test_hostile_values_arrive_unchanged_or_are_refused_at_their_place(
+    ssid: str, label: str, path: str, host: str
+) -> None:
+    radio = replace(fleets.node().radios[0], hardware=replace(fleets.RADIO_2G, path=path))
+    fleet = fleets.fleet(
+        fleets.node(label=label, radios=(radio,)),
+        meshes=(fleets.mesh(ssid=ssid),),
+        system=SystemSettings(log_host=host),
+    )
+    try:
+        rendered = render(fleet)
+    except InvalidInput as error:
+        assert {item.position.file for item in error.diagnostics} == {"fleet.yaml"}
+        return
+    assert option(rendered, "wireless", "mesh0", "ssid") == ssid
+    assert option(rendered, "wireless", "radio0", "path") == path
+    assert option(rendered, "system", "@system[0]", "description") == label
+    assert option(rendered, "system", "@system[0]", "log_ip") == host
+    for file in rendered.files:
+        if file.package is not None:
+            assert parse(file.content.decode(), file.path) == file.package
+
+
+@pytest.mark.parametrize(
+    "ssid", ["bob's", '"quoted" \\ back', "four    spaces", "é中", "$(reboot)", "a # b ; c", "'", "\\"]
+)
+def test_awkward_names_reach_the_radio_unchanged(ssid: str) -> None:
+    assert option(render(fleets.fleet(meshes=(fleets.mesh(ssid=ssid),))), "wireless", "mesh0", "ssid") == ssid
+
+
+# each key costs one derivation for the hash
+@settings(max_examples=20)
+@given(st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=8, max_size=63))
+def test_no_text_for_people_shows_the_key(key: str) -> None:
+    rendered = render(fleets.fleet(meshes=(fleets.mesh(encryption=Encryption.PSK2),)), key)
+    wireless = rendered.file("etc/config/wireless")
+    assert wireless is not None
+    assert option(rendered, "wireless", "mesh0", "key") == key
+    assert f"option key '{MASK}'" in wireless.masked
+    assert wireless.mode == 0o600
+    for text in (rendered.masked_text, repr(rendered), rendered.config_hash):
+        # a key of common words or of one letter eight times may be part of other text; its line may not
+        assert f"key '{key}'" not in text
+        assert key in render(fleets.fleet()).masked_text or key not in text
+
+
+def test_the_same_fleet_gives_the_same_bytes() -> None:
+    fleet = fleets.fleet(meshes=(fleets.mesh(encryption=Encryption.PSK2),))
+    assert render(fleet) == render_node(fleet, NAME, lambda _: Secret(fleets.KEY), Templates.of(fleet))
+
+
+def test_the_hash_names_the_configuration_and_its_key() -> None:
+    encrypted = fleets.fleet(meshes=(fleets.mesh(encryption=Encryption.PSK2),))
+    hashes = {
+        render(fleets.fleet()).config_hash,
+        render(encrypted).config_hash,
+        render(encrypted, "another key").config_hash,
+        render(fleets.fleet(fleets.node(label="other"))).config_hash,
+    }
+    assert len(hashes) == 4
+    assert render(encrypted).config_hash in hashes
+
+
+def test_the_device_keeps_its_compat_version_and_the_hash_does_not_know() -> None:
+    fleet = fleets.fleet()
+    plain = render(fleet)
+    kept = render_node(fleet, NAME, fleets.secrets, SHARED, DeviceFacts(compat_version="1.1"))
+    assert option(kept, "system", "@system[0]", "compat_version") == "1.1"
+    assert option(plain, "system", "@system[0]", "compat_version") == ""
+    assert kept.config_hash == plain.config_hash
+
+
+def test_the_marker_tells_fleet_node_and_hash() -> None:
+    rendered = render(fleets.fleet())
+    marker = rendered.file("etc/meshctl/node")
+    assert marker is not None
+    assert marker.content.decode() == f"fleet=test-fleet\nnode={NAME}\nconfig={rendered.config_hash}\n"
+
+
+def test_what_logs_in_is_roots_alone() -> None:
+    keys = render(fleets.fleet()).file("etc/dropbear/authorized_keys")
+    assert keys is not None
+    assert keys.mode == 0o600
+    assert keys.content.decode() == f"{fleets.RSA}\n{fleets.ED25519}\n"
+
+
+def test_a_fleet_renders_its_managed_nodes_in_order() -> None:
+    nodes = [fleets.node(name=name, state=state) for name, state in zip("dcba", NodeState, strict=False)]
+    assert [item.node for item in render_fleet(fleets.fleet(*nodes), fleets.secrets, SHARED)] == ["d", "c", "b"]
+
+
+def test_unknown_and_lost_nodes_are_refused() -> None:
+    fleet = fleets.fleet(fleets.node(state=NodeState.LOST))
+    with pytest.raises(UnknownNode, match="is lost: it has no configuration"):
+        render(fleet)
+    with pytest.raises(UnknownNode, match="expected a node of the fleet, found 'b99'"):
+        render_node(fleet, "b99", fleets.secrets)
+
+
+def test_passwords_are_allowed_only_when_the_inventory_says_so() -> None:
+    open_fleet = fleets.fleet(operators=Operators((), password_login=True))
+    assert option(render(open_fleet), "dropbear", "@dropbear[0]", "PasswordAuth") == "on"
+    assert option(render(fleets.fleet()), "dropbear", "@dropbear[0]", "RootPasswordAuth") == "off"
+
+
+def test_a_radio_without_a_mesh_is_off() -> None:
+    rendered = render(fleets.fleet())
+    assert option(rendered, "wireless", "radio0", "disabled") == "0"
+    assert option(rendered, "wireless", "radio1", "disabled") == "1"
+
+
+def test_an_802_11s_mesh_does_not_forward_itself() -> None:
+    rendered = render(fleets.fleet(meshes=(fleets.mesh(mode=MeshMode.MESH),)))
+    assert option(rendered, "wireless", "mesh0", "mesh_fwding") == "0"
+    assert option(rendered, "wireless", "mesh0", "mesh_id") == "fleet"
+
+
+class TestExtraOptions:
+    """The inventory's own options on top of the templates."""
+
+    @staticmethod
+    def render(extra: dict[str, str]) -> Rendered:
+        return render(fleets.fleet(fleets.node(extra_uci=extra)))
+
+    def test_set_change_and_remove_options(self) -> None:
+        rendered = self.render(
+            {"wireless.radio0.rts": "500", "wireless.radio0.htmode": "HT40", "system.@system[0].ttylogin": ""}
+        )
+        assert option(rendered, "wireless", "radio0", "rts") == "500"
+        assert option(rendered, "wireless", "radio0", "htmode") == "HT40"
+        assert option(rendered, "system", "@system[0]", "ttylogin") == ""
+
+    def test_make_sections_and_packages_in_any_order(self) -> None:
+        rendered = self.render(
+            {"lldpd.config.lldp_class": "4", "lldpd.config": "lldpd", "network.sw.vlan": "1", "network.sw": "switch"}
+        )
+        lldpd = rendered.package("lldpd")
+        assert lldpd is not None
+        assert dump(lldpd) == "\nconfig lldpd 'config'\n\toption lldp_class '4'\n\n"
+        assert option(rendered, "network", "sw", "vlan") == "1"
+
+    @pytest.mark.parametrize(
+        ("extra", "words"),
+        [
+            ({"wireless.radio9.rts": "1"}, "expected a section of wireless (radio0, mesh0, radio1), found 'radio9'"),
+            ({"wireless.radio0": "wifi-iface"}, "expected a section of type 'wifi-device' as rendered"),
+            ({"wireless.x": "wifi iface"}, "section type: expected printable ASCII without spaces"),
+        ],
+    )
+    def test_are_refused_with_their_place(self, extra: dict[str, str], words: str) -> None:
+        with pytest.raises(InvalidInput) as caught:
+            self.render(extra)
+        assert words in str(caught.value)
+        assert str(caught.value).startswith("fleet.yaml:11:3: extra_uci.")
+
+
+class TestTemplates:
+    """Templates of the inventory's own, and what goes wrong in them."""
+
+    @staticmethod
+    def render(folder: Path, text: str, path: str = "common/etc/config/system.j2") -> Rendered:
+        template = folder / "templates" / path
+        template.parent.mkdir(parents=True)
+        template.write_text(text)
+        return render_node(fleets.fleet(base=str(folder)), NAME, fleets.secrets)
+
+    def test_come_before_the_shipped_ones_file_by_file(self, tmp_path: Path) -> None:
+        rendered = self.render(tmp_path, "config system\noption hostname {{ intent.hostname | uci }}\n")
+        assert option(rendered, "system", "@system[0]", "hostname") == NAME
+        assert option(rendered, "system", "@system[0]", "timezone") == ""
+        assert option(rendered, "wireless", "mesh0", "ssid") == "fleet"
+
+    def test_add_files_and_executables(self, tmp_path: Path) -> None:
+        rendered = self.render(tmp_path, "hello {{ intent.node }}\n", "batman-adv/etc/banner.j2")
+        banner = rendered.file("etc/banner")
+        assert banner is not None
+        assert (banner.content, banner.mode, banner.package) == (b"hello husky1-front\n", 0o644, None)
+
+    @pytest.mark.parametrize(
+        ("text", "line", "words"),
+        [
+            (
+                "config system\n\toption hostname {{ intent.hostname }}\n",
+                2,
+                "expected every expression to end in `| uci`",
+            ),
+            ("config system\n\n\toption x {{ intent.nothing | uci }}\n", 3, "has no attribute 'nothing'"),
+            ("config system\n\toption x {{ nothing }}\n", 2, "'nothing' is undefined"),
+            ("config system\n{% if %}\n", 2, "Expected an expression"),
+            ("config system\n\toption x {{ '' | uci }}\n", 2, "found empty text"),
+            ("config system\n\toption x {{ (1 // 0) | uci }}\n", 2, "ZeroDivisionError"),
+            ("config system\n\toption x {{ [] | uci }}\n", 2, "found list"),
+            ("config system\n\toption x {{ ''.__class__ | uci }}\n", 2, "is unsafe"),
+            ("config system\n{% include 'gone.j2' %}\n", 0, "found none named gone.j2"),
+            ("option x 'y'\n", 0, "the rendered text is no UCI: etc/config/system:1:1"),
+        ],
+    )
+    def test_fail_with_their_file_and_line(self, tmp_path: Path, text: str, line: int, words: str) -> None:
+        with pytest.raises(InvalidInput) as caught:
+            self.render(tmp_path, text)
+        (finding,) = caught.value.diagnostics
+        assert finding.position.file.endswith("common/etc/config/system.j2")
+        assert finding.position.line == line
+        assert words in str(finding)
+
+    def test_show_secrets_only_through_their_filter(self, tmp_path: Path) -> None:
+        template = tmp_path / "templates/common/etc/supplicant.j2"
+        template.parent.mkdir(parents=True)
+        template.write_text("{{ intent.secrets[0] }} {{ intent.secrets[0] | reveal }}\n")
+        fleet = fleets.fleet(meshes=(fleets.mesh(encryption=Encryption.PSK2),), base=str(tmp_path))
+        rendered = render_node(fleet, NAME, fleets.secrets)
+        file = rendered.file("etc/supplicant")
+        assert file is not None
+        assert file.content.decode() == f"{MASK} {fleets.KEY}\n"
+        assert (file.masked, file.mode) == (f"{MASK} {MASK}\n", 0o600)
+
+    def test_of_the_operator_must_exist(self, tmp_path: Path) -> None:
+        mesh: Any = fleets.mesh()
+        parts = replace(mesh.operator_parts, templates="none", base=str(tmp_path))
+        with pytest.raises(InvalidInput, match="expected a folder of templates, found none"):
+            render_node(fleets.fleet(meshes=(replace(mesh, operator_parts=parts),)), NAME, fleets.secrets)
