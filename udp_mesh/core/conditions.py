@@ -51,9 +51,9 @@ class PeerConditions:
     outbox_bytes: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Counters:
-    """Totals since the node's start."""
+    """Totals since the node's start. The node counts in its own; a snapshot holds a copy."""
 
     datagrams_sent: int = 0
     bytes_sent: int = 0

@@ -78,7 +78,7 @@ class PeerAddressChanged:
 
 @dataclass(frozen=True, slots=True)
 class NameConflict:
-    """Two running nodes use one name (ours, when `own`). Neither is believed over the other."""
+    """Two running nodes use one name (ours, when `own`). Messages go to the one that appeared last."""
 
     name: str
     first: Address
@@ -137,7 +137,7 @@ class MessageExpired:
 
 @dataclass(frozen=True, slots=True)
 class MessagePeerLost:
-    """The destination stayed silent for `peer_lost_s` (or left) and no outbox keeps the message."""
+    """The destination stayed silent for `peer_lost_s` and no outbox keeps the message."""
 
     message_id: MessageId
     peer: str

@@ -4,10 +4,14 @@ A driver repeats: `receive` what arrived, `handle_timer` when `next_timer` has c
 returns none, then `next_event` until None.
 """
 
+from udp_mesh.core import acceptance, changes, dispatch, survey
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.events import Event, MessageId, Rejected
+from udp_mesh.core.intake import take_datagram
 from udp_mesh.core.seams import Datagram, RandomSource, Store
 from udp_mesh.core.settings import Address, LinkInfo, Settings
+from udp_mesh.core.state import State
+from udp_mesh.wire.limits import BOOT_ID_BYTES
 
 
 class Node:
@@ -17,30 +21,38 @@ class Node:
         self, settings: Settings, *, boot_id: bytes, rng: RandomSource, now: float, store: Store | None = None
     ) -> None:
         """`now` is seconds on any clock that never runs backwards. `store` holds outboxes on disk (None: in memory)."""
-        raise NotImplementedError
+        if len(boot_id) != BOOT_ID_BYTES:
+            raise ValueError(f"boot_id: expected {BOOT_ID_BYTES} bytes, found {len(boot_id)}")
+        self._state = State(settings, boot_id, rng, now, store)
+        changes.restore_outboxes(self._state, now)
+
+    @property
+    def settings(self) -> Settings:
+        """The settings in force."""
+        return self._state.settings
 
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
         """Take in one datagram. Bad bytes are counted and dropped; this never raises because of what was received."""
-        raise NotImplementedError
+        take_datagram(self._state, data, link, source, now)
 
     def datagrams_to_send(self, now: float, *, max_bytes: int | None = None) -> list[Datagram]:
         """The datagrams that leave now, most urgent first, about 64 KiB at most per call (`max_bytes`, if given).
 
         Call again until the list is empty. With `max_bytes` a driver whose socket is full asks for less.
         """
-        raise NotImplementedError
+        return dispatch.collect(self._state, now, max_bytes)
 
     def next_timer(self) -> float | None:
         """When `handle_timer` wants to be called next (None: never). Cheap; may be in the past."""
-        raise NotImplementedError
+        return dispatch.next_timer(self._state)
 
     def handle_timer(self, now: float) -> None:
         """Do what is due at `now`. Calling early or late is harmless."""
-        raise NotImplementedError
+        dispatch.handle_timer(self._state, now)
 
     def next_event(self) -> Event | None:
         """The oldest event not yet fetched."""
-        raise NotImplementedError
+        return self._state.ledger.next_event()
 
     def send(
         self, topic: str, payload: bytes, *, destination: str | None = None, now: float, type_name: str = ""
@@ -50,27 +62,27 @@ class Node:
         Per destination of a reliable topic exactly one outcome event follows. A message to all that fits one datagram
         is broadcast and has no outcome. A peer never heard of is `UNKNOWN_PEER` unless an outbox may hold the message.
         """
-        raise NotImplementedError
+        return acceptance.send(self._state, topic, payload, destination, type_name, now)
 
     def link_up(self, link: LinkInfo, now: float) -> None:
         """A network attachment appeared, or changed its addresses or MTU (same name)."""
-        raise NotImplementedError
+        changes.link_up(self._state, link, now)
 
     def link_down(self, name: str, now: float) -> None:
         """The attachment is gone; peers reached over it are reached over others as they are heard there."""
-        raise NotImplementedError
+        changes.link_down(self._state, name)
 
     def apply(self, settings: Settings, now: float) -> list[str]:
         """Change topics, window, rates, limits, keys and neighbours; returns one line per change made.
 
         Drops no accepted message. A changed name or port raises ValueError: these need a new run.
         """
-        raise NotImplementedError
+        return changes.apply(self._state, settings, now)
 
     def conditions(self, now: float) -> Conditions:
         """A snapshot for the autonomy, the status page and the metrics."""
-        raise NotImplementedError
+        return survey.conditions(self._state, now)
 
     def close(self, now: float) -> None:
         """Say good-bye: fetch the last datagrams and events after it. Reliable messages still open end as expired."""
-        raise NotImplementedError
+        changes.close(self._state, now)

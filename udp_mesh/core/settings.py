@@ -9,21 +9,21 @@ from enum import Enum
 from typing import Literal
 
 from udp_mesh.crypto import Key
+from udp_mesh.wire.limits import MAX_NAME_BYTES, MAX_TOPIC_BYTES, PRIORITY_LEVELS
 
 Address = tuple[str, int]
 """IPv4 or IPv6 host and UDP port."""
 
-PRIORITY_LEVELS = 16
-"""Levels of priority, 0 (most urgent) to 15: four bits on the wire."""
-
 DEFAULT_PORT = 8700
 """UDP port of the fielded system, kept so that one firewall rule serves both."""
 
-MAX_NAME_BYTES = 64
-"""Longest node name in UTF-8: the heartbeat field of the fielded format holds 64."""
 
-MAX_TOPIC_BYTES = 255
-"""Longest topic name in UTF-8: its length travels in one byte."""
+def _check_name(name: str, what: str, limit_bytes: int) -> None:
+    """What the wire accepts as a name; raises ValueError."""
+    if not 0 < len(name.encode()) <= limit_bytes:
+        raise ValueError(f"{what} {name!r}: expected 1 to {limit_bytes} bytes")
+    if not name.isprintable() or any(character.isspace() for character in name):
+        raise ValueError(f"{what} {name!r}: expected no white space and no control characters")
 
 
 class Outbox(Enum):
@@ -70,8 +70,8 @@ class Topic:
     """How messages of one name travel.
 
     `priority` 0 is the most urgent. `keep_last` bounds how many messages of the topic wait for one destination: a newer
-    one replaces the oldest (None: no such bound). `deadline_s` is a message's life from its `send`. `destinations` names
-    the peers a message without a destination goes to (empty: all). `repair` lets receivers ask again for a lost
+    one replaces the oldest (None: no such bound). `deadline_s` is a message's life from its `send`. `destinations`
+    names the peers a message without a destination goes to (empty: all). `repair` lets receivers ask again for a lost
     broadcast.
     """
 
@@ -89,8 +89,7 @@ class Topic:
     repair: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 < len(self.name.encode()) <= MAX_TOPIC_BYTES:
-            raise ValueError(f"topic {self.name!r}: expected a name of 1 to {MAX_TOPIC_BYTES} bytes")
+        _check_name(self.name, "topic", MAX_TOPIC_BYTES)
         if not 0 <= self.priority < PRIORITY_LEVELS:
             raise ValueError(f"topic {self.name}: expected a priority of 0 to 15, found {self.priority}")
         if self.keep_last is not None and self.keep_last < 1:
@@ -130,6 +129,9 @@ class Rates:
     """Between two heartbeats of an idle node (the fielded system's period)."""
     heartbeat_sparse_s: float = 3.0
     """Between two heartbeats where traffic already proves every link; under a third of `offline_s`."""
+    heartbeats_heard_per_s: float = 30.0
+    """In teams so large that more would be heard, everyone's heartbeats grow sparser: discovery then costs a
+    constant."""
     offline_s: float = 10.0
     """Silence after which a peer is reported offline (the fielded system's)."""
     peer_lost_s: float = 60.0
@@ -148,6 +150,10 @@ class Rates:
     """Longest an acknowledgement waits; the sender lowers it to a part of its smallest round trip."""
     pace_quantum_s: float = 0.003
     """Packets of this much time leave together; less costs CPU per wake-up, more costs latency."""
+    broadcast_packets_per_s: float = 400.0
+    """Less urgent broadcasts leave no faster: nothing acknowledges them, so no window can hold them back."""
+    starved_s: float = 5.0
+    """How long a level waits while others are sent before its topic is reported as starved."""
     yield_after_s: float = 0.03
     """How long an urgent message waits here before others are asked to hold back their less urgent traffic."""
     yield_hold_s: float = 0.1
@@ -186,7 +192,8 @@ class Limits:
     repair_bytes: int = 4 << 20
     """Broadcasts kept for repair: an application that broadcasts without end."""
     events: int = 65536
-    """Events not fetched: a driver that stopped reading. The oldest best-effort messages are then dropped and counted."""
+    """Events not fetched: a driver that stopped reading. The oldest best-effort messages are then dropped and
+    counted."""
     topics_per_peer: int = 1024
     """Topic names a peer may announce: a key holder inventing names."""
 
@@ -219,8 +226,9 @@ class Settings:
     limits: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
-        if not 0 < len(self.name.encode()) <= MAX_NAME_BYTES:
-            raise ValueError(f"name {self.name!r}: expected 1 to {MAX_NAME_BYTES} bytes")
+        _check_name(self.name, "name", MAX_NAME_BYTES)
+        if "/" in self.name:
+            raise ValueError(f"name {self.name!r}: expected no slash (names are parts of topic names)")
         if not self.keys and not self.unkeyed:
             raise ValueError("keys: expected a fleet key, or unkeyed=True said explicitly; found neither")
         if self.keys and self.unkeyed:

@@ -1,0 +1,212 @@
+"""Messages in: topic -> destinations -> queues, the broadcast, or an outbox; and their outcomes out.
+
+`send` decides where a message goes; `shelve` and `release_outbox` move messages between a peer's queue and its outbox
+as it goes and comes; `report_ended` turns ends into events.
+"""
+
+from dataclasses import replace
+
+from udp_mesh.core.compression import compress
+from udp_mesh.core.events import (
+    ExpiryReason,
+    MessageDelivered,
+    MessageExpired,
+    MessageId,
+    MessagePeerLost,
+    Rejected,
+    RejectReason,
+)
+from udp_mesh.core.limiter import Gate
+from udp_mesh.core.message import Accepted, Channel, Outgoing
+from udp_mesh.core.outbound import Outcome
+from udp_mesh.core.session import Peer
+from udp_mesh.core.settings import Outbox, Topic
+from udp_mesh.core.state import IP_UDP_BYTES, State
+from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
+from udp_mesh.wire.codec import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
+from udp_mesh.wire.frames import MessageFlag
+from udp_mesh.wire.limits import MAX_TYPE_BYTES
+
+ANNOUNCE_BYTES = 5
+"""Of a topic's announcement besides its two names."""
+
+MOST_CHANNELS = 65_536
+"""Topic numbers are 16 bits."""
+
+
+def send(
+    state: State, topic_name: str, payload: bytes, destination: str | None, type_name: str, now: float
+) -> MessageId | Rejected:
+    """See `Node.send`."""
+    if state.closed:
+        return Rejected(RejectReason.CLOSED, "the node is closed")
+    topic = state.topics.get(topic_name)
+    if topic is None:
+        if state.settings.undeclared is None:
+            return Rejected(RejectReason.UNKNOWN_TOPIC, f"topic {topic_name} is not declared")
+        topic = replace(state.settings.undeclared, name=topic_name)
+    limits = state.settings.limits
+    if len(payload) > limits.message_bytes:
+        return Rejected(RejectReason.TOO_LARGE, f"expected at most {limits.message_bytes} bytes, found {len(payload)}")
+    channel = channel_of(state, topic, type_name)
+    if channel is None:
+        return Rejected(RejectReason.UNKNOWN_TOPIC, "every topic number is taken, or the type's name is too long")
+    if destination is not None:
+        names = [destination]
+    elif topic.destinations:
+        names = [name for name in topic.destinations if name != state.settings.name]
+    else:
+        names = []
+    rejected = _room_for(state, topic, names, len(payload))
+    if rejected is not None:
+        return rejected
+    message_id = MessageId(state.next_message_id)
+    state.next_message_id += 1
+    state.ledger.counters.messages_sent += 1
+    accepted = _accept(message_id, channel, payload, now)
+    if names:
+        for name in names:
+            enqueue(state, name, accepted, now)
+    else:
+        _to_all(state, accepted, now)
+    return message_id
+
+
+def _room_for(state: State, topic: Topic, names: list[str], size_bytes: int) -> Rejected | None:
+    limits = state.settings.limits
+    for name in names or [peer.name for peer in state.roster.online()]:
+        peer = state.roster.peers.get(name)
+        if peer is None:
+            if topic.outbox is Outbox.NONE and name not in topic.destinations:
+                return Rejected(RejectReason.UNKNOWN_PEER, f"{name} was never heard of")
+            if len(state.roster.peers) >= limits.peers:
+                return Rejected(RejectReason.QUEUE_FULL, f"already {limits.peers} peers")
+            continue
+        outbound = peer.outbound
+        if (
+            outbound.queued_bytes + size_bytes > limits.queue_bytes_per_peer
+            or len(outbound.open) >= limits.queue_messages_per_peer
+        ):
+            return Rejected(RejectReason.QUEUE_FULL, f"too much waits for {name}")
+    if not names and state.casts.queued() >= limits.queue_messages_per_peer:
+        return Rejected(RejectReason.QUEUE_FULL, "too many broadcasts wait")
+    return None
+
+
+def channel_of(state: State, topic: Topic, type_name: str) -> Channel | None:
+    """The topic's number on the air with this type; None when there are too many."""
+    channel = state.channels.get((topic.name, type_name))
+    if channel is None:
+        if len(state.channels) >= MOST_CHANNELS or len(type_name.encode()) > MAX_TYPE_BYTES:
+            return None
+        channel = Channel(len(state.channels), topic, topic.name, type_name)
+        state.channels[(topic.name, type_name)] = channel
+    return channel
+
+
+def _accept(message_id: MessageId, channel: Channel, payload: bytes, now: float) -> Accepted:
+    topic = channel.topic
+    flags = MessageFlag.RELIABLE if topic.reliable else MessageFlag(0)
+    packed = compress(payload) if topic.compression else None
+    if packed is not None:
+        flags |= MessageFlag.COMPRESSED
+    deadline = None if topic.deadline_s is None else now + topic.deadline_s
+    return Accepted(message_id, channel, payload, payload if packed is None else packed, flags, now, deadline)
+
+
+def enqueue(state: State, name: str, accepted: Accepted, now: float, store_key: int | None = None) -> None:
+    """One destination's copy: into the queue of a peer in reach, else where the topic's outbox says."""
+    topic = accepted.channel.topic
+    peer = state.roster.peer(name, state.settings)
+    if peer is None or ((not peer.online) and topic.outbox is not Outbox.NONE):
+        for held, reason in state.outboxes.hold(name, accepted, now, store_key):
+            tell_expired(state, name, held.accepted, reason)
+        return
+    message = Outgoing(accepted, topic.priority, reliable=topic.reliable)
+    message.store_key = store_key
+    outbound = peer.outbound
+    outbound.accept(message, now)
+    if peer.lost:
+        outbound.finish(message, Outcome.PEER_LOST)
+    if topic.rate_limit_bytes_per_s is not None and topic.name not in state.gates:
+        state.gates[topic.name] = Gate(topic.rate_limit_bytes_per_s, now)
+    report_ended(state, peer, now)
+    state.ready[peer] = None
+    state.arm(peer)
+
+
+def _to_all(state: State, accepted: Accepted, now: float) -> None:
+    topic = accepted.channel.topic
+    accepted = replace(accepted, flags=accepted.flags | MessageFlag.TO_ALL)
+    fits = state.broadcasts() and _broadcast_bytes(accepted) <= min(link.mtu for link in state.links.values())
+    if fits:
+        state.casts.push(accepted)
+    for peer in list(state.roster.peers.values()):
+        if (peer.online and not fits) or (not peer.online and topic.outbox is not Outbox.NONE):
+            enqueue(state, peer.name, accepted, now)
+
+
+def _broadcast_bytes(accepted: Accepted) -> int:
+    """The IP packet of a broadcast of this message."""
+    channel = accepted.channel
+    names = ANNOUNCE_BYTES + len(channel.name.encode()) + len(channel.type_name.encode())
+    fragment = FRAGMENT_BYTES + HEAD_BYTES + LENGTH_BYTES + len(accepted.body)
+    return IP_UDP_BYTES + SHORT_OVERHEAD_BYTES + names + fragment
+
+
+def shelve(state: State, peer: Peer, now: float) -> None:
+    """The peer went out of reach: move what its outboxes keep out of the queue."""
+    for message in list(peer.outbound.open):
+        if message.accepted.channel.topic.outbox is Outbox.NONE or message.accepted.broadcast_number is not None:
+            continue
+        peer.outbound.withdraw(message)
+        for held, reason in state.outboxes.hold(peer.name, message.accepted, now, message.store_key):
+            tell_expired(state, peer.name, held.accepted, reason)
+
+
+def release_outbox(state: State, peer: Peer, now: float) -> None:
+    """The peer is in reach: what waited for it is queued, oldest first."""
+    for held in state.outboxes.release(peer.name):
+        enqueue(state, peer.name, held.accepted, now, held.store_key)
+
+
+def report_ended(state: State, peer: Peer, now: float) -> None:
+    """Turn the ends of messages to one peer into events."""
+    ended = peer.outbound.ended
+    if not ended:
+        return
+    peer.outbound.ended = []
+    counters = state.ledger.counters
+    for message, outcome in ended:
+        accepted = message.accepted
+        if message.store_key is not None:
+            state.outboxes.settle(message.store_key)
+        if accepted.broadcast_number is not None:
+            continue
+        topic = accepted.channel.name
+        if outcome is Outcome.SENT:
+            continue
+        if outcome is Outcome.DELIVERED:
+            counters.messages_delivered += 1
+            if message.reliable:
+                latency_s = now - accepted.accepted_at
+                state.ledger.tell(MessageDelivered(accepted.message_id, peer.name, topic, latency_s))
+        elif outcome is Outcome.PEER_LOST:
+            counters.messages_peer_lost += 1
+            if message.reliable:
+                state.ledger.tell(MessagePeerLost(accepted.message_id, peer.name, topic))
+        elif isinstance(outcome, ExpiryReason):
+            tell_expired(state, peer.name, accepted, outcome)
+
+
+def tell_expired(state: State, peer: str, accepted: Accepted, reason: ExpiryReason) -> None:
+    """An accepted message was given up."""
+    state.ledger.counters.messages_expired += 1
+    if accepted.flags & MessageFlag.RELIABLE:
+        state.ledger.tell(MessageExpired(accepted.message_id, peer, accepted.channel.name, reason))
+
+
+def expire_held(state: State, now: float) -> None:
+    """Messages in outboxes whose deadline passed."""
+    for peer, held in state.outboxes.expire(now):
+        tell_expired(state, peer, held.accepted, ExpiryReason.DEADLINE)

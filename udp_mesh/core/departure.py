@@ -1,0 +1,310 @@
+"""What leaves for one peer, decided at the last moment: level -> pieces -> frames -> sealed datagrams.
+
+`leave_level` sends from one priority level until it is empty, or the window, the pacing or the room ends. A run of full
+fragments of one message takes the fast path: one pack, one seal and one record per fragment. Everything else (first and
+last fragments, small messages, pieces sent again) is built frame by frame, small pieces together in one datagram.
+"""
+
+import struct
+
+from udp_mesh.core.events import ExpiryReason
+from udp_mesh.core.flight import Mark, Packet
+from udp_mesh.core.limiter import Gate
+from udp_mesh.core.message import Outgoing
+from udp_mesh.core.outbound import Outbound, Outcome
+from udp_mesh.core.scheduler import Run
+from udp_mesh.core.seams import Datagram
+from udp_mesh.core.settings import Address
+from udp_mesh.crypto import LONG_OVERHEAD_BYTES, SHORT_OVERHEAD_BYTES, SendChannel
+from udp_mesh.wire.codec import (
+    FRAGMENT,
+    FRAGMENT_ACK_NOW,
+    FRAGMENT_BYTES,
+    FRAGMENT_WIDE,
+    FRAGMENT_WIDE_BYTES,
+    HEAD_BYTES,
+    LENGTH_BYTES,
+    encode,
+)
+from udp_mesh.wire.frames import Fragment, Frame, MessageHead, TopicAnnounce
+from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM
+
+IP_UDP_BYTES = 28
+"""IPv4 and UDP headers."""
+
+IP6_EXTRA_BYTES = 20
+"""IPv6 headers are larger by this."""
+
+LEAST_ROOM_BYTES = 64
+"""Less room than this in a datagram is not worth looking for another small message."""
+
+MOST_ACK_SPACING = 10
+"""Packets between two that ask for an acknowledgement at once; a third of the window, if that is less."""
+
+_NARROW = struct.Struct(">BIH")
+_WIDE = struct.Struct(">BII")
+_NARROW_POSITIONS = 65_536
+
+
+class Way:
+    """How datagrams reach the peer now: link, address, sealing, sizes."""
+
+    __slots__ = ("address", "channel", "confirmed", "fragment_bytes", "heard_at", "link", "room_bytes")
+
+    def __init__(self, channel: SendChannel) -> None:
+        self.channel = channel
+        self.confirmed = False
+        """The peer has answered in this channel: the short header does."""
+        self.link = ""
+        self.address: Address = ("", 0)
+        self.heard_at = float("-inf")
+        """When the peer was last heard from this address."""
+        self.room_bytes = 0
+        """Frames that fit one datagram."""
+        self.fragment_bytes = 0
+        """Payload of a full fragment."""
+
+    def lead(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
+        """Datagrams go this way from now on; messages already begun keep their fragments where these still fit."""
+        headers = IP_UDP_BYTES + (IP6_EXTRA_BYTES if ":" in address[0] else 0)
+        self.link, self.address = link, address
+        self.room_bytes = mtu - headers - LONG_OVERHEAD_BYTES
+        self.fragment_bytes = min(fragment_bytes, self.room_bytes - FRAGMENT_WIDE_BYTES)
+
+    def seal(self, frames: bytes) -> tuple[int, bytes]:
+        return self.channel.seal(frames) if self.confirmed else self.channel.seal_long(frames)
+
+    @property
+    def overhead_bytes(self) -> int:
+        return SHORT_OVERHEAD_BYTES if self.confirmed else LONG_OVERHEAD_BYTES
+
+
+def leave_level(
+    outbound: Outbound,
+    way: Way,
+    priority: int,
+    now: float,
+    out: list[Datagram],
+    room_bytes: int,
+    gates: dict[str, Gate],
+) -> int:
+    """Let what waits on one level leave, at most about `room_bytes`; returns the bytes that left."""
+    rates = outbound.rates
+    urgent = priority <= rates.urgent_priority
+    window = outbound.window
+    flight = outbound.flight
+    pace = None if urgent else window.packets_per_s()
+    used = 0
+    mark = outbound.mark(now)
+    while used < room_bytes:
+        run = outbound.scheduler.peek(priority)
+        if run is None:
+            break
+        if outbound.silent_since is not None:
+            permitted = outbound.probe_credit
+        else:
+            permitted = int(window.packets) - flight.outstanding
+            if urgent:
+                permitted += rates.urgent_excess_packets
+            else:
+                permitted = min(permitted, outbound.pacer.allowance(now, pace))
+            permitted = max(permitted, outbound.probe_credit)
+        if permitted <= 0:
+            outbound.limited = False
+            if not urgent and outbound.silent_since is None and flight.outstanding < window.packets - 1:
+                outbound.wake_at = outbound.pacer.wake_at(pace)
+            break
+        message = run.message
+        if message.superseded and run.again:
+            outbound.finish(message, ExpiryReason.SUPERSEDED)
+            continue
+        gate = gates.get(message.accepted.channel.name) if gates else None
+        if gate is not None and not gate.open(now):
+            outbound.scheduler.drop_head(run)
+            gate.parked.append((outbound, run))
+            continue
+        if not message.begun:
+            _begin(outbound, way, message)
+            run = Run(message, 0, message.fragments, again=False)
+        before = used
+        if run.position and run.length > 2 and permitted > 1 and gate is None:
+            count = min(run.length - 1, permitted, 1 + (room_bytes - used) // message.fragment_bytes)
+            used += _leave_run(outbound, way, run, count, mark, out)
+        else:
+            count = 1
+            used += _leave_one(outbound, way, run, urgent, mark, out)
+        if gate is not None:
+            gate.spend(used - before)
+        if outbound.probe_credit:
+            outbound.probe_credit = max(0, outbound.probe_credit - count)
+        if not urgent:
+            outbound.pacer.spend(count, now, pace)
+    return used
+
+
+def leave_copies(outbound: Outbound, way: Way, now: float, out: list[Datagram]) -> None:
+    """Second copies of small urgent messages whose time has come and that were not acknowledged meanwhile."""
+    while outbound.copies and outbound.copies[0][0] <= now:
+        _, message, position = outbound.copies.popleft()
+        if message.ended or message.arrived[position] or outbound.silent_since is not None:
+            continue
+        run = Run(message, position, 1, again=True)
+        _leave(
+            outbound, way, [(message, position)], [*_frames(outbound, run, now, ack_now=True)], outbound.mark(now), out
+        )
+
+
+def _begin(outbound: Outbound, way: Way, message: Outgoing) -> None:
+    channel = message.accepted.channel
+    first = way.fragment_bytes - HEAD_BYTES
+    if channel.number not in outbound.announced:
+        first -= 5 + len(channel.name.encode()) + len(channel.type_name.encode())
+        first -= LENGTH_BYTES
+    message.begin(outbound.next_wire_id, way.fragment_bytes, max(1, first))
+    outbound.next_wire_id += 1
+
+
+def _leave_run(outbound: Outbound, way: Way, run: Run, count: int, mark: Mark, out: list[Datagram]) -> int:
+    """The fast path: `count` full fragments in a row, none of them its message's first or last."""
+    message, position = run.message, run.position
+    wire_id = message.wire_id
+    assert wire_id is not None
+    size = message.fragment_bytes
+    offset = message.first_bytes + (position - 1) * size
+    body = memoryview(message.body)
+    seal = way.seal
+    add = outbound.flight.add
+    append = out.append
+    link, address = way.link, way.address
+    spacing = max(2, min(MOST_ACK_SPACING, int(outbound.window.packets / 3)))
+    since = outbound.since_ack_wanted
+    wide = position + count > _NARROW_POSITIONS
+    pack = _WIDE.pack if wide else _NARROW.pack
+    plain = FRAGMENT | FRAGMENT_WIDE if wide else FRAGMENT
+    if wide and position < _NARROW_POSITIONS:
+        count = _NARROW_POSITIONS - position
+        pack, plain = _NARROW.pack, FRAGMENT
+    for place in range(position, position + count):
+        since += 1
+        first = plain
+        if since >= spacing:
+            since = 0
+            first |= FRAGMENT_ACK_NOW
+        number, data = seal(pack(first, wire_id, place) + body[offset : offset + size])
+        offset += size
+        add(number, Packet(mark, message, place))
+        append(Datagram(link, address, data, False))
+    outbound.since_ack_wanted = since
+    sent_bytes = count * (size + FRAGMENT_BYTES + way.overhead_bytes)
+    outbound.sent_packets += count
+    outbound.sent_bytes += sent_bytes + IP_UDP_BYTES * count
+    outbound.scheduler.take(run, count)
+    return sent_bytes
+
+
+def _leave_one(outbound: Outbound, way: Way, run: Run, urgent: bool, mark: Mark, out: list[Datagram]) -> int:
+    """One datagram with the piece of `run` and, if there is room, small pieces behind it on the same level."""
+    now = mark.sent_at
+    message = run.message
+    pieces: list[tuple[Outgoing, int]] = []
+    frames: list[Frame] = []
+    room = way.room_bytes
+    priority = message.priority
+    scheduler = outbound.scheduler
+    again = 0
+    spacing = max(2, min(MOST_ACK_SPACING, int(outbound.window.packets / 3)))
+    outbound.since_ack_wanted += 1
+    next_run: Run | None = run
+    while next_run is not None:
+        message = next_run.message
+        size = _piece_bytes(outbound, next_run)
+        if frames and (size > room or len(frames) >= MAX_FRAMES_PER_DATAGRAM - 2):
+            break
+        again += next_run.again
+        pieces.append((message, next_run.position))
+        scheduler.take(next_run, 1)
+        last = next_run.position == message.fragments - 1
+        ack_now = urgent or outbound.since_ack_wanted >= spacing or (last and scheduler.nothing_waits(priority))
+        frames.extend(_frames(outbound, next_run, now, ack_now=ack_now))
+        if ack_now:
+            outbound.since_ack_wanted = 0
+        room -= size
+        if urgent and message.small and outbound.loss >= outbound.rates.twice_loss:
+            outbound.copies.append((now + outbound.rates.twice_gap_s, message, next_run.position))
+        if not message.reliable and last:
+            outbound.finish(message, Outcome.SENT)
+        if room < LEAST_ROOM_BYTES:
+            break
+        next_run = _next_small(outbound, way, priority, room)
+    outbound.retransmitted += again
+    return _leave(outbound, way, pieces, frames, mark, out, urgent=urgent)
+
+
+def _leave(
+    outbound: Outbound,
+    way: Way,
+    pieces: list[tuple[Outgoing, int]],
+    frames: list[Frame],
+    mark: Mark,
+    out: list[Datagram],
+    *,
+    urgent: bool = True,
+) -> int:
+    number, data = way.seal(encode(frames))
+    (message, position), *more = pieces
+    outbound.flight.add(number, Packet(mark, message, position, tuple(more)))
+    out.append(Datagram(way.link, way.address, data, urgent))
+    outbound.sent_packets += 1
+    outbound.sent_bytes += len(data) + IP_UDP_BYTES
+    return len(data)
+
+
+def _next_small(outbound: Outbound, way: Way, priority: int, room: int) -> Run | None:
+    """The next piece of the level if it is small enough to ride along (ruling out what only the main loop decides)."""
+    run = outbound.scheduler.peek(priority)
+    if run is None or run.message.superseded or run.message.accepted.channel.topic.rate_limit_bytes_per_s is not None:
+        return None
+    if not run.message.begun:
+        if len(run.message.body) > room:
+            return None
+        _begin(outbound, way, run.message)
+        run = Run(run.message, 0, run.message.fragments, again=False)
+    return run if _piece_bytes(outbound, run) <= room else None
+
+
+def _piece_bytes(outbound: Outbound, run: Run) -> int:
+    """Bytes of the frames that carry one piece."""
+    message = run.message
+    start, end = message.span(run.position)
+    size = end - start + FRAGMENT_WIDE_BYTES + LENGTH_BYTES
+    if run.position == 0:
+        size += HEAD_BYTES
+        channel = message.accepted.channel
+        if channel.number not in outbound.announced:
+            size += 5 + len(channel.name.encode()) + len(channel.type_name.encode())
+    return size
+
+
+def _frames(outbound: Outbound, run: Run, now: float, *, ack_now: bool) -> list[Frame]:
+    """The piece as a fragment, with head and, until the peer knows it, the topic's name in front of the first."""
+    message, position = run.message, run.position
+    accepted = message.accepted
+    wire_id = message.wire_id
+    assert wire_id is not None
+    start, end = message.span(position)
+    payload = memoryview(message.body)[start:end]
+    if position:
+        return [Fragment(wire_id, position, payload, None, ack_now)]
+    head = MessageHead(
+        len(message.body),
+        message.fragments,
+        accepted.channel.number,
+        message.priority,
+        accepted.flags,
+        max(0, int((now - accepted.accepted_at) * 1000)),
+    )
+    fragment = Fragment(wire_id, 0, payload, head, ack_now)
+    channel = accepted.channel
+    if channel.number in outbound.announced:
+        return [fragment]
+    return [TopicAnnounce(channel.number, channel.name, channel.type_name), fragment]

@@ -1,0 +1,281 @@
+"""Datagrams out and timers: what leaves now, most urgent first, and when somebody wants attention next.
+
+One call of `collect`: heartbeats already due, what is owed (acknowledgements and small frames), second copies, then
+level by level, casts and peers in turn. A peer from which nothing more can leave drops out of `State.ready` until an
+acknowledgement, a timer or a new message brings it back.
+"""
+
+from heapq import heappop
+
+from udp_mesh.core.acceptance import expire_held, report_ended
+from udp_mesh.core.departure import leave_copies, leave_level
+from udp_mesh.core.discovery import announce
+from udp_mesh.core.presence import housekeep
+from udp_mesh.core.seams import Datagram
+from udp_mesh.core.session import Peer, Session
+from udp_mesh.core.settings import Address, LinkKind
+from udp_mesh.core.state import HOUSEKEEPING_S, State
+from udp_mesh.wire.codec import encode
+from udp_mesh.wire.frames import Cancel, Frame, Heartbeat, Ping
+from udp_mesh.wire.header import VERSION
+from udp_mesh.wire.limits import MAX_IDS
+
+BATCH_BYTES = 65_536
+"""What one call returns at most, about: one system call with segmentation offload."""
+
+INTRODUCE_AGAIN_S = 0.25
+"""Between two introductions to a peer that has not answered one."""
+
+_INFINITY = float("inf")
+
+
+def collect(state: State, now: float, max_bytes: int | None) -> list[Datagram]:
+    """See `Node.datagrams_to_send`."""
+    out: list[Datagram] = []
+    room = BATCH_BYTES if max_bytes is None else min(max_bytes, BATCH_BYTES)
+    if room <= 0:
+        return out
+    if state.outgoing:
+        out.extend(state.outgoing)
+        state.outgoing.clear()
+    if state.owing:
+        sessions = list(state.owing)
+        state.owing.clear()
+        for session in sessions:
+            _leave_owed(state, session, now, out)
+    if state.ready or state.casts.waiting:
+        _leave_levels(state, now, out, room)
+    if out:
+        counters = state.ledger.counters
+        counters.datagrams_sent += len(out)
+        counters.bytes_sent += sum([len(datagram[2]) for datagram in out]) + 28 * len(out)
+    return out
+
+
+def _leave_owed(state: State, session: Session, now: float, out: list[Datagram]) -> None:
+    """Acknowledgement and small frames of one session, together in as few datagrams as they fit."""
+    way = session.way
+    peer = session.peer
+    if not way.link or peer is None:
+        return
+    frames: list[Frame] = []
+    if session.inbound.acks.pending or session.inbound.acks.now_wanted:
+        waiting = state.yielding.waiting_here([other.outbound for other in state.waiting_peers()], now)
+        ack = session.take_ack(now, waiting[:1])
+        if ack is not None:
+            frames.append(ack)
+            state.ledger.counters.acknowledgements_sent += 1
+    frames.extend(session.owed)
+    session.owed.clear()
+    cancelled = peer.outbound.cancelled
+    while cancelled:
+        frames.append(Cancel(tuple(cancelled[:MAX_IDS])))
+        del cancelled[:MAX_IDS]
+    if not way.confirmed and frames and not session.knows_us:
+        frames.insert(0, _introduction(state, session))
+    while frames:
+        count, size = 0, 0
+        while count < len(frames) and count < 32:
+            size += len(encode([frames[count]])) + 2
+            if count and size > way.room_bytes:
+                break
+            count += 1
+        number, data = way.seal(encode(frames[:count]))
+        peer.outbound.flight.add(number, None)
+        out.append(Datagram(way.link, way.address, data, True))
+        del frames[:count]
+
+
+def _introduction(state: State, session: Session) -> Heartbeat:
+    """Who we are, for a peer that may not know this run of ours yet."""
+    settings = state.settings
+    return Heartbeat(
+        settings.name,
+        VERSION,
+        VERSION,
+        0,
+        min(65_535, int(settings.rates.heartbeat_sparse_s * 1000)),
+        0,
+        0,
+        state.to_all.next_number,
+        state.casts.next_number,
+        (session.heard_tag,),
+    )
+
+
+def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> None:
+    allowed = state.yielding.allowed(now)
+    casts = state.casts
+    peers: list[Peer] = []
+    mask = casts.waiting
+    for peer in list(state.ready):
+        outbound = peer.outbound
+        session = peer.session
+        if session is None or not session.way.link:
+            del state.ready[peer]
+            continue
+        if outbound.cancelled and not outbound.scheduler.waiting:
+            state.owe(session)
+        if outbound.copies:
+            leave_copies(outbound, session.way, now, out)
+        if outbound.scheduler.waiting:
+            if not session.way.confirmed and not session.knows_us and now >= session.introduced_at + INTRODUCE_AGAIN_S:
+                session.introduced_at = now
+                number, data = session.way.seal(encode([_introduction(state, session)]))
+                outbound.flight.add(number, None)
+                out.append(Datagram(session.way.link, session.way.address, data, True))
+            peers.append(peer)
+            mask |= outbound.scheduler.waiting
+        else:
+            del state.ready[peer]
+            outbound.limited = True
+            state.arm(peer)
+    held = mask & ~allowed
+    mask &= allowed
+    while mask and room > 0:
+        bit = mask & -mask
+        mask ^= bit
+        priority = bit.bit_length() - 1
+        if casts.waiting & bit:
+            before = len(out)
+            _leave_casts(state, priority, now, out)
+            room -= sum(len(datagram.data) for datagram in out[before:])
+        for peer in peers:
+            outbound = peer.outbound
+            if not outbound.scheduler.waiting & bit:
+                continue
+            session = peer.session
+            assert session is not None
+            used = leave_level(outbound, session.way, priority, now, out, room, state.gates)
+            if used:
+                outbound.served |= bit
+            room -= used
+            if room <= 0:
+                # Whoever used up the room stands behind the others next time.
+                state.ready[peer] = state.ready.pop(peer)
+                break
+    for peer in peers:
+        outbound = peer.outbound
+        if outbound.served:
+            outbound.book_starvation(outbound.served, now)
+            outbound.served = 0
+        if outbound.ended:
+            report_ended(state, peer, now)
+        if room > 0:
+            state.ready.pop(peer, None)
+            outbound.limited = not outbound.scheduler.waiting
+        state.arm(peer)
+        if held & outbound.scheduler.waiting:
+            until = state.yielding.holds_until(now)
+            if until is not None:
+                state.set_timer(peer, until)
+
+
+def _leave_casts(state: State, priority: int, now: float, out: list[Datagram]) -> None:
+    rates = state.settings.rates
+    urgent = priority <= rates.urgent_priority
+    losses = [peer.outbound.loss for peer in state.roster.online()] if urgent else []
+    twice = urgent and bool(losses) and max(losses) >= rates.twice_loss
+    ways: list[tuple[str, Address | None]] = [
+        (link.name, link.broadcast) for link in state.links.values() if link.kind is LinkKind.BROADCAST
+    ]
+    for peer in state.roster.online():
+        session = peer.session
+        if session is None:
+            continue
+        link = state.links.get(session.way.link)
+        if link is not None and link.kind is LinkKind.NEIGHBOURS:
+            ways.append((link.name, session.way.address))
+    state.casts.leave(
+        priority,
+        state.to_all,
+        ways,
+        now,
+        out,
+        packets_per_s=None if urgent else rates.broadcast_packets_per_s,
+        copy_after_s=rates.twice_gap_s if twice else None,
+        kept_limit_bytes=state.settings.limits.repair_bytes,
+    )
+
+
+def next_timer(state: State) -> float | None:
+    """See `Node.next_timer`."""
+    timers = state.timers
+    while timers and timers[0][2].timer_at != timers[0][0]:
+        heappop(timers)
+    at = min(state.housekeeping_at, state.discovery.next_at, state.casts.next_at())
+    if timers and timers[0][0] < at:
+        at = timers[0][0]
+    for gate in state.gates.values():
+        if gate.parked:
+            at = min(at, gate.opens_at())
+    return None if at == _INFINITY or state.closed else at
+
+
+def handle_timer(state: State, now: float) -> None:
+    """See `Node.handle_timer`."""
+    if state.closed:
+        return
+    timers = state.timers
+    while timers and timers[0][0] <= now:
+        at, _, peer = heappop(timers)
+        if peer.timer_at != at:
+            continue
+        peer.timer_at = _INFINITY
+        outbound = peer.outbound
+        outbound.handle_timer(now)
+        report_ended(state, peer, now)
+        session = peer.session
+        if session is not None:
+            due = session.inbound.acks.due_at
+            if due is not None and due <= now:
+                session.inbound.acks.now_wanted = True
+                session.inbound.acks.due_at = None
+                state.owe(session)
+            if outbound.silent_since is not None and outbound.probe_credit and not outbound.scheduler.waiting:
+                session.owe(Ping(state.rng.getrandbits(64)))
+                state.owe(session)
+        state.ready[peer] = None
+        state.arm(peer)
+    if state.discovery.next_at <= now:
+        _send_heartbeats(state, now)
+    for gate in state.gates.values():
+        if gate.parked and gate.open(now):
+            waiting = {outbound for outbound, _ in gate.parked}
+            gate.release()
+            for peer in state.roster.peers.values():
+                if peer.outbound in waiting:
+                    state.ready[peer] = None
+    casts: list[Datagram] = []
+    state.casts.leave_copies(now, casts)
+    state.outgoing.extend(casts)
+    if state.housekeeping_at <= now:
+        state.housekeeping_at = now + HOUSEKEEPING_S
+        housekeep(state, now)
+        expire_held(state, now)
+        _ask_for_repairs(state, now)
+
+
+def _send_heartbeats(state: State, now: float) -> None:
+    sessions = list(state.roster.sessions.values())
+    waiting = state.yielding.waiting_here([peer.outbound for peer in state.waiting_peers()], now)
+    beat = state.discovery.compose(state.settings, sessions, waiting, state.casts.next_number, now)
+    datagrams = announce(beat, state.to_all, state.links.values(), state.settings.neighbours)
+    state.ledger.counters.heartbeats_sent += len(datagrams)
+    state.outgoing.extend(datagrams)
+
+
+def _ask_for_repairs(state: State, now: float) -> None:
+    for boot_id, repairs in state.repairs.items():
+        if repairs.next_at > now:
+            state.housekeeping_at = min(state.housekeeping_at, repairs.next_at)
+            continue
+        session = state.roster.sessions.get(boot_id)
+        asks = repairs.ask(now)
+        state.housekeeping_at = min(state.housekeeping_at, repairs.next_at)
+        if session is None or not asks:
+            continue
+        state.ledger.counters.repairs_asked += len(asks)
+        for ask in asks:
+            session.owe(ask)
+        state.owe(session)

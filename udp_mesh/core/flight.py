@@ -1,0 +1,166 @@
+"""The packets on their way to one peer: sent -> acknowledged or lost.
+
+Packet numbers grow by one and are never used twice, so the packets stand in a queue by number and an acknowledgement's
+bitmap walks it from the front: mostly a run of ones that is taken off in one go. A packet is lost when
+`reorder_packets` later ones arrived; one that arrives after all teaches a larger number.
+"""
+
+from collections import OrderedDict, deque
+from typing import NamedTuple
+
+from udp_mesh.core.message import Outgoing
+
+REORDER_PACKETS = 3
+"""RFC 9002, 6.1.1: fewer calls reordering a loss, more waits longer."""
+
+MOST_REORDER_PACKETS = 64
+"""What learned reordering may reach."""
+
+REMEMBERED_LOST = 256
+"""Packets called lost that an acknowledgement may still correct: those its bitmap covers."""
+
+
+class Mark(NamedTuple):
+    """The state in which a burst of packets was sent, shared by all of them; for round trip and rate samples."""
+
+    sent_at: float
+    delivered: int
+    """Packets acknowledged until then."""
+    delivered_at: float
+    """When the last of those was acknowledged."""
+    delivered_sent_at: float
+    """When the last of those had been sent."""
+    limited: bool
+    """The application, not the window, decided how much was sent."""
+
+
+class Packet(NamedTuple):
+    """One packet on its way, and the pieces of messages in it."""
+
+    mark: Mark
+    message: Outgoing
+    position: int
+    more: tuple[tuple[Outgoing, int], ...] = ()
+
+
+class Flight:
+    """`outstanding` counts the packets neither acknowledged nor lost."""
+
+    __slots__ = ("_lost", "_packets", "base", "outstanding", "reorder_packets", "spurious")
+
+    def __init__(self) -> None:
+        self.base = 0
+        """Number of the packet at the front of the queue."""
+        self._packets: deque[Packet | None] = deque()
+        self.outstanding = 0
+        self.reorder_packets = REORDER_PACKETS
+        self._lost: OrderedDict[int, tuple[Packet, bool]] = OrderedDict()
+        self.spurious = 0
+
+    @property
+    def next_number(self) -> int:
+        return self.base + len(self._packets)
+
+    def add(self, number: int, packet: Packet | None) -> None:
+        """A packet left; None for one that asks for no acknowledgement. Every number of the channel comes, in order."""
+        packets = self._packets
+        if packet is not None:
+            self.outstanding += 1
+        elif not packets:
+            self.base = number + 1
+            return
+        packets.append(packet)
+
+    def acknowledge(self, largest: int, received: int) -> tuple[list[Packet], list[Packet], Packet | None]:
+        """Packets newly acknowledged, packets now lost, and packet `largest` if this is the first word of it.
+
+        `received` as in `AckState`. An acknowledgement of what was never sent says nothing.
+        """
+        packets = self._packets
+        base = self.base
+        count = largest - base + 1
+        acknowledged: list[Packet] = []
+        lost: list[Packet] = []
+        if self._lost and largest < self.next_number:
+            self._correct(largest, received, acknowledged)
+        if count <= 0 or count > len(packets):
+            return acknowledged, lost, None
+        newest = packets[count - 1]
+        ones = (1 << count) - 1
+        if received & ones == ones:
+            take = packets.popleft
+            for _ in range(count):
+                packet = take()
+                if packet is not None:
+                    acknowledged.append(packet)
+            self.base = largest + 1
+            self.outstanding -= len(acknowledged)
+            return acknowledged, lost, newest
+        reorder = self.reorder_packets
+        corrected = len(acknowledged)
+        while count:
+            packet = packets[0]
+            behind = count - 1
+            if packet is not None:
+                if received >> behind & 1:
+                    acknowledged.append(packet)
+                elif behind >= reorder:
+                    lost.append(packet)
+                    self._remember(largest - behind, packet, overtaken=True)
+                else:
+                    break
+            packets.popleft()
+            count -= 1
+        self.base = largest + 1 - count
+        # What stands behind a packet that may still come: at most the reordering distance.
+        for behind in range(count):
+            packet = packets[count - 1 - behind]
+            if packet is not None and received >> behind & 1:
+                acknowledged.append(packet)
+                packets[count - 1 - behind] = None
+        self.outstanding -= len(acknowledged) - corrected + len(lost)
+        return acknowledged, lost, newest
+
+    def give_up(self) -> list[Packet]:
+        """Everything on its way counts as lost (the peer is silent); an acknowledgement may still correct that."""
+        lost = [packet for packet in self._packets if packet is not None]
+        for number, packet in enumerate(self._packets, self.base):
+            if packet is not None:
+                self._remember(number, packet, overtaken=False)
+        self.base += len(self._packets)
+        self._packets.clear()
+        self.outstanding = 0
+        return lost
+
+    def restart(self, number: int) -> list[Packet]:
+        """The peer runs anew: nothing of this was received. Returns what was on its way."""
+        lost = [packet for packet in self._packets if packet is not None]
+        self._packets.clear()
+        self._lost.clear()
+        self.base = number
+        self.outstanding = 0
+        return lost
+
+    def lose_oldest(self) -> list[Packet]:
+        """The oldest packet on its way counts as lost: it is the probe's load."""
+        for place, packet in enumerate(self._packets):
+            if packet is not None:
+                self._packets[place] = None
+                self.outstanding -= 1
+                self._remember(self.base + place, packet, overtaken=False)
+                return [packet]
+        return []
+
+    def _remember(self, number: int, packet: Packet, *, overtaken: bool) -> None:
+        self._lost[number] = (packet, overtaken)
+        if len(self._lost) > REMEMBERED_LOST:
+            self._lost.popitem(last=False)
+
+    def _correct(self, largest: int, received: int, acknowledged: list[Packet]) -> None:
+        late = [number for number in self._lost if number <= largest and received >> (largest - number) & 1]
+        for number in late:
+            packet, overtaken = self._lost.pop(number)
+            acknowledged.append(packet)
+            self.spurious += 1
+            if overtaken:
+                self.reorder_packets = min(MOST_REORDER_PACKETS, self.reorder_packets + 1)

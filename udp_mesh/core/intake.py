@@ -1,0 +1,369 @@
+"""Datagrams in: header -> channel -> opened frames -> effects. Whatever arrives, this returns.
+
+1. A short header's tag finds the channels it may mean; opening one proves who sent it. Replays cost no decryption.
+2. A plain fragment goes straight to the reassembly; other frames are decoded and taken one by one.
+3. A long header introduces a boot: its check is verified before anything is derived or remembered for it.
+"""
+
+import struct
+
+from udp_mesh.core.acceptance import report_ended
+from udp_mesh.core.casts import UNREPAIRED_FROM
+from udp_mesh.core.events import ExpiryReason, KeyMismatch, MessageReceived
+from udp_mesh.core.message import Accepted, Outgoing
+from udp_mesh.core.presence import REPORT_AGAIN_S, follow, greet, heard, leave, prove
+from udp_mesh.core.session import Session
+from udp_mesh.core.settings import Address
+from udp_mesh.core.state import State
+from udp_mesh.crypto import TO_ALL, OpenError, ReceiveChannel, ReplayError, UnknownKeyError, check_long
+from udp_mesh.wire.codec import decode
+from udp_mesh.wire.errors import DecodeError, UnknownVersionError
+from udp_mesh.wire.frames import (
+    Ack,
+    Bye,
+    Cancel,
+    Fragment,
+    Frame,
+    Heartbeat,
+    Nack,
+    Ping,
+    Pong,
+    Refused,
+    RefuseReason,
+    TopicAnnounce,
+)
+from udp_mesh.wire.header import SEAL_TAG_BYTES, SHORT_HEADER_BYTES, Kind, LongHeader, encode_short, parse_header
+
+_SHORT = struct.Struct(">BHI")
+_DATA_BYTE = encode_short(Kind.DATA, 0, 0)[0]
+_BROADCAST_BYTE = encode_short(Kind.BROADCAST, 0, 0)[0]
+_LEAST_BYTES = SHORT_HEADER_BYTES + SEAL_TAG_BYTES
+
+MISMATCHES_REMEMBERED = 256
+"""Addresses whose unknown key was reported: a flood of them must not grow memory."""
+
+
+def take_datagram(state: State, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
+    """See `Node.receive`."""
+    counters = state.ledger.counters
+    size = len(data)
+    counters.datagrams_received += 1
+    counters.bytes_received += size + 28
+    if size < _LEAST_BYTES:
+        counters.dropped_malformed += 1
+        return
+    first = data[0]
+    if first == _DATA_BYTE:
+        _, tag, low = _SHORT.unpack_from(data)
+        for channel, session in state.roster.data_tags.get(tag, ()):
+            try:
+                number, frames = channel.open(data, low)
+            except ReplayError:
+                counters.dropped_replayed += 1
+                return
+            except OpenError:
+                continue
+            _take_data(state, session, number, frames, link, source, now)
+            return
+        counters.dropped_unauthenticated += 1
+    elif first == _BROADCAST_BYTE:
+        _, tag, low = _SHORT.unpack_from(data)
+        for channel, session in state.roster.broadcast_tags.get(tag, ()):
+            try:
+                opened = channel.open(data, low)
+            except ReplayError:
+                counters.dropped_replayed += 1
+                return
+            except OpenError:
+                continue
+            _take_broadcast(state, session, opened.frames, link, source, now)
+            return
+        counters.dropped_unauthenticated += 1
+    else:
+        try:
+            header = parse_header(data)
+            if isinstance(header, LongHeader):
+                _take_long(state, data, header, link, source, now)
+        except UnknownKeyError:
+            counters.dropped_unauthenticated += 1
+            _report_mismatch(state, link, source, now)
+        except ReplayError:
+            counters.dropped_replayed += 1
+        except OpenError:
+            counters.dropped_unauthenticated += 1
+        except UnknownVersionError:
+            counters.dropped_malformed += 1
+        except DecodeError:
+            counters.dropped_malformed += 1
+
+
+def _take_data(
+    state: State, session: Session, number: int, frames: bytes, link: str, source: Address, now: float
+) -> None:
+    """An opened datagram bound to this run of ours: its sender is alive."""
+    way = session.way
+    peer = session.peer
+    session.received_bytes += len(frames) + 51
+    if (
+        peer is not None
+        and peer.online
+        and peer.session is session
+        and source == way.address
+        and link == way.link
+        and peer.outbound.silent_since is None
+    ):
+        session.last_heard = way.heard_at = now
+    else:
+        if not session.proven:
+            prove(state, session, now)
+        heard(state, session, link, source, now)
+        peer = session.peer
+        if peer is None or peer.session is not session:
+            return
+    inbound = session.inbound
+    if inbound.take_plain(frames, number, now):
+        acks = inbound.acks
+        if acks.now_wanted:
+            state.owing[session] = None
+            if inbound.overdue():
+                _cut_ack(state, session, now)
+        elif acks.due_at is not None and acks.due_at < peer.timer_at:
+            state.set_timer(peer, acks.due_at)
+        return
+    try:
+        decoded = decode(frames)
+    except DecodeError:
+        state.ledger.counters.dropped_malformed += 1
+        return
+    _take_frames(state, session, decoded, number, now)
+
+
+def _take_frames(state: State, session: Session, frames: list[Frame], number: int, now: float) -> None:
+    """The frames of a unicast datagram of a peer's session, in order."""
+    inbound = session.inbound
+    peer = session.peer
+    assert peer is not None
+    outbound = peer.outbound
+    wants_ack = ack_now = False
+    kept = True
+    for frame in frames:
+        match frame:
+            case Fragment():
+                wants_ack = True
+                ack_now = ack_now or frame.ack_now
+                kept = inbound.take(frame, now, broadcast=False) and kept
+            case Ack():
+                if frame.largest < session.way.channel.next_number:
+                    session.way.confirmed = session.knows_us = True
+                    outbound.acknowledge(frame, now)
+                    report_ended(state, peer, now)
+                    state.ready[peer] = None
+                if frame.waiting:
+                    state.yielding.heard(frame.waiting, now)
+            case TopicAnnounce():
+                inbound.announce(frame)
+            case Cancel(message_ids, broadcast_ids):
+                _take_cancel(state, session, message_ids, broadcast_ids=broadcast_ids)
+            case Refused():
+                if not frame.broadcast_id:
+                    _take_refusal(state, session, frame)
+                    report_ended(state, peer, now)
+                    state.ready[peer] = None
+            case Nack(message_id):
+                _repair(state, session, message_id, now)
+            case Ping(token):
+                session.owe(Pong(token, 0))
+                state.owe(session)
+            case Bye():
+                leave(state, session, now)
+            case _:
+                # Pongs count as being heard; heartbeats are taken where introductions are.
+                pass
+    _hand_over(state, session, now)
+    if not wants_ack:
+        inbound.acks.saw(number, now)
+    elif kept:
+        inbound.accepted(number, now, ack_now=ack_now)
+        if inbound.acks.now_wanted:
+            state.owe(session)
+    if inbound.refusals:
+        for refusal in inbound.refusals:
+            session.owe(refusal)
+        inbound.refusals.clear()
+        state.owe(session)
+    state.arm(peer)
+
+
+def _cut_ack(state: State, session: Session, now: float) -> None:
+    """Acknowledge in the middle of a large batch: the bitmap must not lose sight of its beginning."""
+    ack = session.take_ack(now, ())
+    if ack is not None:
+        session.owe(ack)
+
+
+def _take_cancel(state: State, session: Session, message_ids: tuple[int, ...], *, broadcast_ids: bool) -> None:
+    if broadcast_ids:
+        repairs = state.repairs.get(session.boot_id)
+        for message_id in message_ids:
+            if repairs is not None:
+                repairs.give_up(message_id)
+        return
+    for message_id in message_ids:
+        session.inbound.unicasts.end(message_id)
+
+
+def _take_refusal(state: State, session: Session, refused: Refused) -> None:
+    peer = session.peer
+    assert peer is not None
+    outbound = peer.outbound
+    message = outbound.by_wire_id(refused.message_id)
+    if message is None:
+        return
+    match refused.reason:
+        case RefuseReason.FORGOTTEN:
+            outbound.send_anew(message)
+        case RefuseReason.NO_MEMORY:
+            # Its packets stay unacknowledged and come again by themselves.
+            return
+        case RefuseReason.TOO_LARGE | RefuseReason.CORRUPT:
+            outbound.finish(message, ExpiryReason.REFUSED)
+
+
+def _repair(state: State, session: Session, number: int, now: float) -> None:
+    """A peer misses a cast: send it for itself, or say that it is gone."""
+    peer = session.peer
+    assert peer is not None
+    accepted = state.casts.repair(number)
+    if accepted is None:
+        session.owe(Cancel((number,), broadcast_ids=True))
+        state.owe(session)
+        return
+    if any(message.accepted.broadcast_number == number for message in peer.outbound.open):
+        return
+    state.ledger.counters.repairs_sent += 1
+    copy = Accepted(
+        accepted.message_id,
+        accepted.channel,
+        accepted.payload,
+        accepted.body,
+        accepted.flags,
+        accepted.accepted_at,
+        accepted.deadline,
+        number,
+    )
+    peer.outbound.accept(Outgoing(copy, accepted.channel.topic.priority, reliable=True), now)
+    state.ready[peer] = None
+
+
+def _hand_over(state: State, session: Session, now: float) -> None:
+    """Whole messages become events."""
+    inbound = session.inbound
+    if not inbound.arrived:
+        return
+    arrived, inbound.arrived = inbound.arrived, []
+    repairs = state.repairs.get(session.boot_id)
+    for message in arrived:
+        number = message.from_broadcast
+        if number is not None and number < UNREPAIRED_FROM and repairs is not None:
+            repairs.received(number, now, inbound.broadcasts.finished)
+            state.housekeeping_at = min(state.housekeeping_at, repairs.next_at)
+        state.ledger.counters.messages_received += 1
+        state.ledger.tell(
+            MessageReceived(
+                session.name, message.topic, message.type_name, message.payload, message.priority, message.to_all
+            )
+        )
+
+
+def _take_broadcast(state: State, session: Session, frames: bytes, link: str, source: Address, now: float) -> None:
+    """An opened datagram to all. Until the sender is proven and its floor known, it may be a recording."""
+    peer = session.peer
+    if peer is None or peer.session is not session or session.boot_id not in state.repairs:
+        state.ledger.counters.dropped_unproven += 1
+        return
+    heard(state, session, link, source, now)
+    try:
+        decoded = decode(frames)
+    except DecodeError:
+        state.ledger.counters.dropped_malformed += 1
+        return
+    for frame in decoded:
+        match frame:
+            case Fragment():
+                session.inbound.take(frame, now, broadcast=True)
+            case TopicAnnounce():
+                session.inbound.announce(frame)
+            case Bye():
+                leave(state, session, now)
+            case _:
+                pass
+    session.inbound.refusals.clear()
+    _hand_over(state, session, now)
+
+
+def _take_long(
+    state: State, data: bytes | memoryview, header: LongHeader, link: str, source: Address, now: float
+) -> None:
+    """A hello or an introduction; raises the decoder's and the cipher's errors."""
+    if header.boot_id == state.boot_id:
+        return
+    key = next((key for key in state.keys if key.key_id == header.key_id), None)
+    if key is None:
+        raise UnknownKeyError(header.key_id)
+    check_long(key, data, header)
+    session = state.roster.sessions.get(header.boot_id)
+    introduced = header.kind is Kind.INTRODUCTION
+    if session is not None:
+        channels = session.data_channels if introduced else session.broadcast_channels
+        channel = next(channel for channel in channels if channel.key == key)
+        number, frames = channel.open_long(data, header)
+        decoded = decode(frames)
+        beat = next((frame for frame in decoded if isinstance(frame, Heartbeat)), None)
+    else:
+        channel = ReceiveChannel(key, header.boot_id, state.boot_id if introduced else TO_ALL)
+        number, frames = channel.open_long(data, header)
+        decoded = decode(frames)
+        beat = next((frame for frame in decoded if isinstance(frame, Heartbeat)), None)
+        if beat is None:
+            # An introduction without a name: its sender believes that we know it. Its heartbeats will tell.
+            state.ledger.counters.dropped_unproven += 1
+            return
+        session = state.roster.stranger(beat.name, header.boot_id, state.keys, state.settings)
+        known = session.data_channels if introduced else session.broadcast_channels
+        next(entry for entry in known if entry.key == key).window.accept(number)
+    if beat is not None and beat.name != session.name:
+        state.ledger.counters.dropped_malformed += 1
+        return
+    if not introduced:
+        if beat is not None:
+            greet(state, session, beat, link, source, now)
+        for frame in decoded:
+            if isinstance(frame, Bye) and session.proven:
+                leave(state, session, now)
+        return
+    if beat is not None and not session.proven:
+        session.learn(beat)
+        follow(state, session, link, source, now)
+        prove(state, session, now)
+    if beat is not None:
+        greet(state, session, beat, link, source, now)
+    if not session.proven or session.peer is None:
+        return
+    heard(state, session, link, source, now)
+    if session.peer.session is not session:
+        return
+    _take_frames(state, session, decoded, number, now)
+    # The sender writes long headers until it is answered.
+    session.inbound.acks.now_wanted = True
+    state.owe(session)
+
+
+def _report_mismatch(state: State, link: str, source: Address, now: float) -> None:
+    reported = state.mismatch_reported
+    if now - reported.get(source, float("-inf")) < REPORT_AGAIN_S:
+        return
+    reported.pop(source, None)
+    while len(reported) >= MISMATCHES_REMEMBERED:
+        del reported[next(iter(reported))]
+    reported[source] = now
+    state.ledger.tell(KeyMismatch(source, link))

@@ -1,0 +1,37 @@
+"""What the node has to tell: events in order, bounded, and counters."""
+
+from collections import deque
+
+from udp_mesh.core.conditions import Counters
+from udp_mesh.core.events import Event, MessageReceived
+
+
+class Ledger:
+    """Events not yet fetched and totals. A driver that stops reading loses the oldest received messages, never
+    outcomes."""
+
+    __slots__ = ("_events", "_limit", "counters")
+
+    def __init__(self, limit: int) -> None:
+        self._events: deque[Event] = deque()
+        self._limit = limit
+        self.counters = Counters()
+
+    def set_limit(self, limit: int) -> None:
+        self._limit = limit
+
+    def tell(self, event: Event) -> None:
+        """Queue an event for the driver."""
+        if len(self._events) >= self._limit:
+            self._drop_one()
+        self._events.append(event)
+
+    def next_event(self) -> Event | None:
+        return self._events.popleft() if self._events else None
+
+    def _drop_one(self) -> None:
+        for place, event in enumerate(self._events):
+            if isinstance(event, MessageReceived):
+                del self._events[place]
+                self.counters.events_dropped += 1
+                return

@@ -1,0 +1,132 @@
+"""One message on its way to one peer: its bytes, which pieces left, which arrived, and how it must end."""
+
+from dataclasses import dataclass
+
+from udp_mesh.core.events import MessageId
+from udp_mesh.core.settings import Topic
+from udp_mesh.wire.frames import MessageFlag
+
+SMALL_FRAGMENTS = 3
+"""Up to this many fragments an urgent message is worth sending twice, and a newer one may replace it even when
+begun."""
+
+
+class Channel:
+    """A topic as this node announces it: its number on the air, its type, and its settings of the moment.
+
+    Replacing `topic` is how a run-time change reaches messages already accepted.
+    """
+
+    __slots__ = ("name", "number", "topic", "type_name")
+
+    def __init__(self, number: int, topic: Topic, name: str, type_name: str) -> None:
+        self.number = number
+        self.topic = topic
+        self.name = name
+        self.type_name = type_name
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """What `Node.send` took on, shared by the copies to every destination."""
+
+    message_id: MessageId
+    channel: Channel
+    payload: bytes
+    """The bytes given to `send`."""
+    body: bytes
+    """The bytes that travel (compressed or not)."""
+    flags: MessageFlag
+    accepted_at: float
+    deadline: float | None
+    broadcast_number: int | None = None
+    """The broadcast message id this is a repair of."""
+
+
+class Outgoing:
+    """The copy for one peer. `wire_id` is None until its first fragment leaves."""
+
+    __slots__ = (
+        "accepted",
+        "arrived",
+        "body",
+        "ended",
+        "first_bytes",
+        "fragment_bytes",
+        "fragments",
+        "missing",
+        "next_position",
+        "priority",
+        "queued_at",
+        "reliable",
+        "store_key",
+        "superseded",
+        "twice",
+        "wire_id",
+    )
+
+    def __init__(self, accepted: Accepted, priority: int, *, reliable: bool) -> None:
+        self.accepted = accepted
+        self.body = accepted.body
+        self.priority = priority
+        self.reliable = reliable
+        self.queued_at = accepted.accepted_at
+        self.store_key: int | None = None
+        self.ended = False
+        self.superseded = False
+        """A newer one replaced it: what is lost of it is not sent again."""
+        self.twice = False
+        self.wire_id: int | None = None
+        self.fragment_bytes = 0
+        self.first_bytes = 0
+        self.fragments = 1
+        self.next_position = 0
+        self.missing = 1
+        """Fragments not known to have arrived."""
+        self.arrived = bytearray()
+        """1 per position that arrived; as long as the message has fragments once it has begun."""
+
+    def begin(self, wire_id: int, fragment_bytes: int, first_bytes: int) -> None:
+        """Cut it into fragments and give it its number. The first carries less, for the head's sake."""
+        self.wire_id = wire_id
+        self.fragment_bytes = fragment_bytes
+        self.first_bytes = first_bytes
+        self.fragments = 1 + max(0, -(-(len(self.body) - first_bytes) // fragment_bytes))
+        self.missing = self.fragments
+        self.arrived = bytearray(self.fragments)
+
+    def span(self, position: int) -> tuple[int, int]:
+        """(start, end) of a fragment within the body."""
+        if position == 0:
+            return 0, min(self.first_bytes, len(self.body))
+        start = self.first_bytes + (position - 1) * self.fragment_bytes
+        return start, min(start + self.fragment_bytes, len(self.body))
+
+    def anew(self) -> "Outgoing":
+        """The same message with nothing of it sent: the peer lost what it had. This one must be marked ended."""
+        copy = Outgoing(self.accepted, self.priority, reliable=self.reliable)
+        copy.store_key = self.store_key
+        return copy
+
+    @property
+    def begun(self) -> bool:
+        return self.wire_id is not None
+
+    @property
+    def small(self) -> bool:
+        """Few fragments; known once it has begun."""
+        return self.fragments <= SMALL_FRAGMENTS
+
+    def arrive(self, position: int) -> bool:
+        """A fragment arrived; True if that was news."""
+        if self.arrived[position]:
+            return False
+        self.arrived[position] = 1
+        self.missing -= 1
+        return True
+
+    def unacknowledged_bytes(self) -> int:
+        """Payload still to arrive, about."""
+        if not self.begun:
+            return len(self.body)
+        return min(len(self.body), self.missing * self.fragment_bytes)

@@ -1,0 +1,26 @@
+"""A rate over the last second, from a running total read now and then."""
+
+
+class Meter:
+    """Feed it totals; it answers the rate over the last whole period of about a second."""
+
+    __slots__ = ("_at", "_rate", "_total")
+
+    PERIOD_S = 1.0
+
+    def __init__(self, now: float) -> None:
+        self._at = now
+        self._total = 0
+        self._rate = 0.0
+
+    def feed(self, total: int, now: float) -> None:
+        """The running total at `now`; call at least every second."""
+        elapsed = now - self._at
+        if elapsed >= self.PERIOD_S:
+            self._rate = (total - self._total) / elapsed
+            self._total = total
+            self._at = now
+
+    def per_s(self, now: float) -> float:
+        """Units per second; zero when nothing was fed for long."""
+        return self._rate if now - self._at < 4 * self.PERIOD_S else 0.0

@@ -1,0 +1,431 @@
+"""Everything on its way to one peer: accepted -> scheduled -> in flight -> delivered, expired or peer lost.
+
+1. `accept` takes a message on; `departure` pulls pieces when datagrams leave and books them here.
+2. `acknowledge` books what arrived, measures round trip, rate and loss, and puts lost pieces back by priority.
+3. `handle_timer` probes when acknowledgements stay away: first one packet; then the peer is *silent*, everything
+   on its way is waiting again, and single probes leave: window and rate model stay as they were.
+4. `heard` ends the silence; `restart` begins anew with a peer that forgot everything.
+5. `finish` gives each message its one outcome.
+"""
+
+from collections import deque
+from collections.abc import Iterable
+from enum import Enum
+from heapq import heappop, heappush
+from typing import NamedTuple
+
+from udp_mesh.core.events import ExpiryReason
+from udp_mesh.core.flight import Flight, Mark, Packet
+from udp_mesh.core.message import Outgoing
+from udp_mesh.core.pacing import Pacer
+from udp_mesh.core.rtt import RoundTrip
+from udp_mesh.core.scheduler import Scheduler
+from udp_mesh.core.settings import Rates, Settings
+from udp_mesh.core.window import AdaptiveWindow, FixedWindow, Window
+from udp_mesh.wire.frames import Ack
+from udp_mesh.wire.limits import PRIORITY_LEVELS
+
+PROBE_SOON_S = 0.05
+"""Between probes in the first second of a silence: most cuts of a moving robot are that short."""
+
+PROBE_S = 0.25
+"""Between probes later on: at most this much is lost when the link returns; four packets a second to a dead peer."""
+
+PROBE_SOON_FOR_S = 1.0
+
+RETURN_BURST_PACKETS = 10
+"""What leaves at once when a silent peer is heard without acknowledging (the way to it may still be cut)."""
+
+LOSS_MEMORY_PACKETS = 128
+"""Packets over which loss is smoothed."""
+
+
+class Outcome(Enum):
+    """How a message ended, besides expiring."""
+
+    DELIVERED = 1
+    SENT = 2
+    """Best effort: it left, no outcome is reported."""
+    PEER_LOST = 3
+
+
+class Ended(NamedTuple):
+    message: Outgoing
+    outcome: Outcome | ExpiryReason
+
+
+class LevelBook:
+    """What is open on one priority level, and how the level fares."""
+
+    __slots__ = ("bytes", "held_s", "messages", "order", "starved_reported", "starved_s", "starved_since")
+
+    def __init__(self) -> None:
+        self.order: deque[Outgoing] = deque()
+        """Messages in the order accepted; ended ones are dropped from its front when somebody looks."""
+        self.messages = 0
+        self.bytes = 0
+        self.starved_s = 0.0
+        self.starved_since: float | None = None
+        self.starved_reported = False
+        self.held_s = 0.0
+
+    def oldest(self) -> Outgoing | None:
+        order = self.order
+        while order and order[0].ended:
+            order.popleft()
+        return order[0] if order else None
+
+
+class Outbound:
+    """The sending half of a session. Times in seconds; `ended` is fetched and cleared by the session."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.trip = RoundTrip()
+        self.window: Window = AdaptiveWindow(self.trip)
+        self.pacer = Pacer(settings.rates.pace_quantum_s)
+        self.flight = Flight()
+        self.scheduler = Scheduler()
+        self.rates: Rates = settings.rates
+        self.open: dict[Outgoing, None] = {}
+        """Messages without an outcome, in the order accepted."""
+        self.levels = [LevelBook() for _ in range(PRIORITY_LEVELS)]
+        self.queued_bytes = 0
+        self.ended: list[Ended] = []
+        self.cancelled: list[int] = []
+        """Wire ids given up after they had begun: the peer may forget them."""
+        self.announced: set[int] = set()
+        """Numbers of topics that the peer knows by name."""
+        self.next_wire_id = 0
+        self.copies: deque[tuple[float, Outgoing, int]] = deque()
+        """(when, message, position) of urgent pieces to be sent a second time."""
+        self.served = 0
+        """Mask of levels from which something left in this round."""
+        self.wake_at = float("inf")
+        """When pacing lets the next quantum leave."""
+        self.silent_since: float | None = None
+        self.timeouts = 0
+        self.probe_credit = 0
+        self.probed_at = float("-inf")
+        self.last_progress = 0.0
+        self.limited = True
+        """The application, not window or pacing, decides how much leaves."""
+        self.since_ack_wanted = 0
+        """Packets sent since the last one that asked for an acknowledgement at once."""
+        self.loss = 0.0
+        self.delivered_packets = 0
+        self.delivered_at = 0.0
+        self.delivered_sent_at = 0.0
+        self.delivered_bytes = 0
+        self.retransmitted = 0
+        self.sent_packets = 0
+        self.sent_bytes = 0
+        self._deadlines: list[tuple[float, int, Outgoing]] = []
+        self._deadline_serial = 0
+        self._kept: dict[str, deque[Outgoing]] = {}
+        """Open messages of topics that keep only the last few."""
+        self.apply(settings)
+
+    def apply(self, settings: Settings) -> None:
+        """New settings; nothing on its way is touched."""
+        self.rates = settings.rates
+        self.pacer = Pacer(settings.rates.pace_quantum_s)
+        if isinstance(settings.window, int):
+            self.window = FixedWindow(settings.window)
+        elif not isinstance(self.window, AdaptiveWindow):
+            self.window = AdaptiveWindow(self.trip)
+
+    # Accepting
+
+    def accept(self, message: Outgoing, now: float) -> None:
+        """Take a message on: it waits on its level."""
+        self.open[message] = None
+        level = self.levels[message.priority]
+        level.messages += 1
+        level.bytes += len(message.body)
+        level.order.append(message)
+        if len(level.order) > 64 + 2 * level.messages:
+            level.order = deque(waiting for waiting in level.order if not waiting.ended)
+        self.queued_bytes += len(message.body)
+        deadline = message.accepted.deadline
+        if deadline is not None:
+            self._deadline_serial += 1
+            heappush(self._deadlines, (deadline, self._deadline_serial, message))
+        keep_last = message.accepted.channel.topic.keep_last
+        if keep_last is not None:
+            self._replace_older(message, keep_last)
+        if not self.flight.outstanding and self.silent_since is None:
+            self.last_progress = now
+        self.scheduler.push(message)
+        if self.silent_since is not None and message.priority <= self.rates.urgent_priority:
+            self.allow_probe(now)
+
+    def _replace_older(self, message: Outgoing, keep_last: int) -> None:
+        kept = self._kept.setdefault(message.accepted.channel.topic.name, deque())
+        while kept and kept[0].ended:
+            kept.popleft()
+        kept.append(message)
+        alive = [older for older in kept if not older.ended and not older.superseded]
+        for older in alive[: max(0, len(alive) - keep_last)]:
+            if not older.begun:
+                self.finish(older, ExpiryReason.SUPERSEDED)
+            elif older.small:
+                # Its pieces may be arriving right now: it ends as what becomes of them.
+                older.superseded = True
+
+    # Acknowledgements
+
+    def acknowledge(self, ack: Ack, now: float) -> None:
+        """Book an acknowledgement of the peer."""
+        flight = self.flight
+        acknowledged, lost, newest = flight.acknowledge(ack.largest, ack.received << 1 | 1)
+        if acknowledged:
+            self.last_progress = now
+            self.timeouts = 0
+            if self.silent_since is not None:
+                self._end_silence()
+            self._book_arrivals(acknowledged)
+            rate: float | None = None
+            count = len(acknowledged)
+            self.delivered_packets += count
+            if newest is not None:
+                mark = newest.mark
+                self.trip.sample(max(1e-5, now - mark.sent_at - ack.delay_us * 1e-6), now)
+                elapsed = max(now - mark.delivered_at, mark.sent_at - mark.delivered_sent_at)
+                if elapsed > 0:
+                    rate = (self.delivered_packets - mark.delivered) / elapsed
+                self.delivered_sent_at = mark.sent_at
+            self.delivered_at = now
+            limited = newest is None or newest.mark.limited
+            self.window.acknowledged(
+                count, ack.largest, flight.next_number, flight.outstanding, rate, limited=limited, now=now
+            )
+        if lost:
+            self._put_back(lost)
+        total = len(acknowledged) + len(lost)
+        if total:
+            self.loss += (len(lost) - self.loss * total) / max(total, LOSS_MEMORY_PACKETS)
+
+    def _book_arrivals(self, packets: Iterable[Packet]) -> None:
+        for packet in packets:
+            _, message, position, more = packet
+            if not position:
+                self.announced.add(message.accepted.channel.number)
+            if not message.ended and not message.arrived[position]:
+                message.arrived[position] = 1
+                message.missing -= 1
+                self.delivered_bytes += message.fragment_bytes
+                if not message.missing:
+                    self.finish(message, Outcome.DELIVERED)
+            for message, position in more:
+                if not position:
+                    self.announced.add(message.accepted.channel.number)
+                if not message.ended and message.arrive(position):
+                    self.delivered_bytes += len(message.body)
+                    if not message.missing:
+                        self.finish(message, Outcome.DELIVERED)
+
+    def _put_back(self, packets: Iterable[Packet]) -> None:
+        """Lost pieces of reliable messages wait again on their level."""
+        for packet in packets:
+            self._put_back_piece(packet.message, packet.position)
+            for message, position in packet.more:
+                self._put_back_piece(message, position)
+
+    def _put_back_piece(self, message: Outgoing, position: int) -> None:
+        if message.ended or not message.reliable or message.arrived[position]:
+            return
+        if message.superseded:
+            self.finish(message, ExpiryReason.SUPERSEDED)
+        else:
+            self.scheduler.push_again(message, position)
+
+    # Silence
+
+    def timer(self) -> float | None:
+        """When `handle_timer` wants to be called for probes, deadlines or second copies. Late answers do no harm."""
+        at: float | None = None
+        if self.silent_since is not None:
+            if self.open or self.flight.outstanding:
+                at = self.probed_at + (
+                    PROBE_SOON_S if self.probed_at - self.silent_since < PROBE_SOON_FOR_S else PROBE_S
+                )
+        elif self.flight.outstanding:
+            at = self.last_progress + self.timeout()
+        if self._deadlines and (at is None or self._deadlines[0][0] < at):
+            at = self._deadlines[0][0]
+        if self.wake_at != float("inf") and (at is None or self.wake_at < at):
+            at = self.wake_at
+        if self.copies and (at is None or self.copies[0][0] < at):
+            at = self.copies[0][0]
+        return at
+
+    def timeout(self) -> float:
+        """Silence after which the oldest packet counts as lost."""
+        return min(PROBE_S, self.trip.timeout(self.rates.ack_delay_s)) if self.timeouts < 2 else PROBE_S
+
+    def handle_timer(self, now: float) -> None:
+        while self._deadlines and self._deadlines[0][0] <= now:
+            message = heappop(self._deadlines)[2]
+            self.finish(message, ExpiryReason.DEADLINE)
+        if self.wake_at <= now:
+            self.wake_at = float("inf")
+        if self.silent_since is not None:
+            every = PROBE_SOON_S if self.probed_at - self.silent_since < PROBE_SOON_FOR_S else PROBE_S
+            if now >= self.probed_at + every and (self.open or self.flight.outstanding):
+                self.allow_probe(now)
+        elif self.flight.outstanding and now >= self.last_progress + self.timeout():
+            self.timeouts += 1
+            self.last_progress = now
+            if self.timeouts == 1:
+                self._put_back(self.flight.lose_oldest())
+                self.probe_credit = 1
+            else:
+                self.silent_since = now
+                self.allow_probe(now)
+
+    def allow_probe(self, now: float) -> None:
+        """The most urgent waiting piece may leave although the peer is silent; not more often than `PROBE_SOON_S`."""
+        if now < self.probed_at + PROBE_SOON_S * 0.99:
+            return
+        self.probed_at = now
+        self.probe_credit = 1
+        self._set_aside()
+
+    def _set_aside(self) -> None:
+        """Everything on its way waits again, urgent messages behind those still to come."""
+        self._put_back(self.flight.give_up())
+        self.scheduler.set_aside(self.rates.urgent_priority)
+
+    def heard(self, now: float) -> None:
+        """Something authentic came from the peer. After a silence a first burst leaves, the rest when it is
+        acknowledged."""
+        if self.silent_since is not None and now >= self.probed_at + PROBE_SOON_S * 0.99:
+            self.allow_probe(now)
+            self.probe_credit = min(RETURN_BURST_PACKETS, int(self.window.packets))
+
+    def _end_silence(self) -> None:
+        self.silent_since = None
+        self.probe_credit = 0
+        self.scheduler.set_aside(self.rates.urgent_priority)
+
+    def reprioritize(self) -> None:
+        """Topics changed their priorities: what waits moves to its new level."""
+        if all(message.priority == message.accepted.channel.topic.priority for message in self.open):
+            return
+        for message in self.open:
+            priority = message.accepted.channel.topic.priority
+            if priority != message.priority:
+                for book, sign in ((self.levels[message.priority], -1), (self.levels[priority], 1)):
+                    book.messages += sign
+                    book.bytes += sign * len(message.body)
+                message.priority = priority
+        for priority, book in enumerate(self.levels):
+            book.order = deque(message for message in self.open if message.priority == priority)
+        self.scheduler.rebuild(list(self.open), pieces=True)
+
+    # Ends
+
+    def restart(self, now: float) -> None:
+        """The peer runs anew (or must be told anew): every open message begins again under new numbers."""
+        self.flight.restart(0)
+        self.announced.clear()
+        self.copies.clear()
+        self.cancelled.clear()
+        self.next_wire_id = 0
+        self.silent_since = None
+        self.timeouts = 0
+        self.probe_credit = 0
+        self.last_progress = now
+        messages = list(self.open)
+        self.open.clear()
+        for message in messages:
+            self._begin_anew(message)
+        self.scheduler.rebuild(list(self.open), pieces=False)
+
+    def send_anew(self, message: Outgoing) -> None:
+        """The peer forgot the pieces it had of this one."""
+        self.announced.discard(message.accepted.channel.number)
+        self.scheduler.push(self._begin_anew(message))
+
+    def _begin_anew(self, message: Outgoing) -> Outgoing:
+        message.ended = True
+        self.open.pop(message, None)
+        copy = message.anew()
+        self.open[copy] = None
+        self.levels[copy.priority].order.append(copy)
+        if copy.accepted.deadline is not None:
+            self._deadline_serial += 1
+            heappush(self._deadlines, (copy.accepted.deadline, self._deadline_serial, copy))
+        kept = self._kept.get(copy.accepted.channel.topic.name)
+        if kept is not None:
+            kept.append(copy)
+        return copy
+
+    def finish(self, message: Outgoing, outcome: Outcome | ExpiryReason) -> None:
+        """The one outcome of a message; later ones are ignored."""
+        if message.ended:
+            return
+        self._remove(message)
+        if message.begun and outcome is not Outcome.DELIVERED and outcome is not Outcome.SENT:
+            self._cancel(message)
+        self.ended.append(Ended(message, outcome))
+
+    def withdraw(self, message: Outgoing) -> None:
+        """The message leaves without an outcome: an outbox keeps it."""
+        if not message.ended:
+            self._remove(message)
+            if message.begun:
+                self._cancel(message)
+
+    def _remove(self, message: Outgoing) -> None:
+        message.ended = True
+        del self.open[message]
+        level = self.levels[message.priority]
+        level.messages -= 1
+        level.bytes -= len(message.body)
+        self.queued_bytes -= len(message.body)
+
+    def _cancel(self, message: Outgoing) -> None:
+        if message.wire_id is not None and message.accepted.broadcast_number is None:
+            self.cancelled.append(message.wire_id)
+
+    def by_wire_id(self, wire_id: int) -> Outgoing | None:
+        """The open message of this number; a search, for the rare answers that name one."""
+        return next((message for message in self.open if message.wire_id == wire_id), None)
+
+    def finish_all(self, outcome: Outcome | ExpiryReason) -> None:
+        for message in list(self.open):
+            self.finish(message, outcome)
+
+    def book_starvation(self, served: int, now: float) -> None:
+        """Levels of the mask `served` sent something; less urgent ones that wait did not."""
+        lowest = served & -served
+        waiting = self.scheduler.waiting & ~(lowest - 1)
+        mask = waiting | served
+        while mask:
+            bit = mask & -mask
+            mask ^= bit
+            book = self.levels[bit.bit_length() - 1]
+            if bit & served:
+                if book.starved_since is not None:
+                    book.starved_s += now - book.starved_since
+                    book.starved_since = None
+                    book.starved_reported = False
+            elif book.starved_since is None:
+                book.starved_since = now
+
+    def oldest_ages(self, last_priority: int, now: float) -> list[tuple[int, float]]:
+        """(priority, age of its oldest open message) of levels up to `last_priority`."""
+        ages = []
+        for priority in range(last_priority + 1):
+            level = self.levels[priority]
+            oldest = level.oldest() if level.messages else None
+            if oldest is not None:
+                ages.append((priority, now - oldest.queued_at))
+        return ages
+
+    def mark(self, now: float) -> Mark:
+        """The state in which the packets of one burst leave."""
+        if not self.flight.outstanding:
+            self.delivered_at = self.delivered_sent_at = self.last_progress = now
+        return Mark(now, self.delivered_packets, self.delivered_at, self.delivered_sent_at, self.limited)

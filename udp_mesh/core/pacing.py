@@ -1,0 +1,36 @@
+"""When the next packets may leave: the window's rate, spent in quanta of a few milliseconds.
+
+A quantum of packets leaves together, then a timer waits for the next: fewer wake-ups than one per packet, and
+segments that offload can batch.
+"""
+
+
+class Pacer:
+    """`free_at` is when the next packet may leave; up to a quantum of unused time may be caught up."""
+
+    __slots__ = ("_quantum_s", "free_at")
+
+    def __init__(self, quantum_s: float) -> None:
+        self._quantum_s = quantum_s
+        self.free_at = 0.0
+
+    def allowance(self, now: float, packets_per_s: float | None) -> int:
+        """How many packets may leave now."""
+        if packets_per_s is None:
+            return 1 << 30
+        start = self.free_at
+        if start > now:
+            return 0
+        start = max(start, now - self._quantum_s)
+        return int((now - start) * packets_per_s) + 1
+
+    def spend(self, count: int, now: float, packets_per_s: float | None) -> None:
+        """`count` packets left."""
+        if packets_per_s is not None:
+            self.free_at = max(self.free_at, now - self._quantum_s) + count / packets_per_s
+
+    def wake_at(self, packets_per_s: float | None) -> float:
+        """When a quantum of packets (at least one) will be free."""
+        if packets_per_s is None:
+            return self.free_at
+        return self.free_at + max(0.0, self._quantum_s - 1.0 / packets_per_s)

@@ -1,0 +1,221 @@
+"""Peers come, move, restart, clash and go: heartbeats and proofs in -> sessions, events, and what becomes of messages.
+
+1. `greet` takes a heartbeat: a stranger is remembered and answered; one that lists us is proven.
+2. `prove` makes a session its name's session: online, or restarted; a retired run that still speaks is a conflict.
+3. `heard` keeps an online peer online and follows it to new addresses.
+4. `housekeep` finds the silent ones: offline, then lost; their messages go to the outbox or end.
+"""
+
+from udp_mesh.core.acceptance import release_outbox, report_ended, shelve
+from udp_mesh.core.casts import Repairs
+from udp_mesh.core.discovery import MISSED_HEARTBEATS
+from udp_mesh.core.events import (
+    Incompatible,
+    NameConflict,
+    PeerAddressChanged,
+    PeerOffline,
+    PeerOnline,
+    PeerRestarted,
+    TopicStarved,
+)
+from udp_mesh.core.outbound import Outcome
+from udp_mesh.core.roster import Arrival
+from udp_mesh.core.session import STALE_PATH_S, Peer, Session
+from udp_mesh.core.settings import Address
+from udp_mesh.core.state import State
+from udp_mesh.wire.frames import Heartbeat
+from udp_mesh.wire.header import VERSION
+from udp_mesh.wire.limits import HEARD_TAG_BYTES
+
+REPORT_AGAIN_S = 60.0
+"""The same conflict, mismatch or incompatibility is reported once in this time."""
+
+
+def greet(state: State, session: Session, beat: Heartbeat, link: str, source: Address, now: float) -> None:
+    """An authentic heartbeat of a session, perhaps a recording until the session is proven."""
+    session.learn(beat)
+    session.last_heard = now
+    if not beat.min_version <= VERSION <= beat.max_version:
+        if now - state.incompatible_reported.get(session.boot_id, float("-inf")) > REPORT_AGAIN_S:
+            state.incompatible_reported[session.boot_id] = now
+            state.ledger.tell(Incompatible(session.name, source, session.versions))
+        return
+    lists_us = state.boot_id[:HEARD_TAG_BYTES] in beat.heard
+    if lists_us:
+        session.knows_us = True
+    if not session.proven:
+        if (link, source) == (session.way.link, session.way.address):
+            session.way.heard_at = now
+        else:
+            follow(state, session, link, source, now)
+        if lists_us:
+            prove(state, session, now)
+    else:
+        heard(state, session, link, source, now)
+    if not (session.proven and session.knows_us):
+        # It does not hear us, or we cannot know yet that it does.
+        state.discovery.answer(session, now)
+    if session.proven and session.peer is not None:
+        repairs = state.repairs.get(session.boot_id)
+        if repairs is None:
+            repairs = state.repairs[session.boot_id] = Repairs(state.rng)
+            for channel in session.broadcast_channels:
+                channel.window.raise_floor(beat.broadcast_number)
+        repairs.counted(beat.broadcast_messages, now, session.inbound.broadcasts.finished)
+        state.housekeeping_at = min(state.housekeeping_at, repairs.next_at)
+        if beat.waiting:
+            state.yielding.heard(beat.waiting, now)
+
+
+def prove(state: State, session: Session, now: float) -> None:
+    """The session has shown that it hears this run of ours."""
+    arrival, peer = state.roster.prove(session, state.settings)
+    path = session.way
+    if arrival is Arrival.OWN_NAME:
+        own = next(iter(state.links.values())).address if state.links else ("", state.settings.port)
+        state.ledger.tell(NameConflict(session.name, own, path.address, own=True))
+        return
+    if peer is None:
+        state.ledger.counters.dropped_over_limit += 1
+        return
+    if arrival is Arrival.RETIRED:
+        return
+    old = peer.session
+    state.roster.replace(peer, session)
+    if old is not None:
+        state.repairs.pop(old.boot_id, None)
+        state.owing.pop(old, None)
+    peer.outbound.restart(now)
+    state.discovery.answer(session, now)
+    if arrival is Arrival.RESTARTED and peer.online:
+        state.ledger.tell(PeerRestarted(peer.name))
+        peer.online_since = now
+    come_online(state, peer, session, now)
+    state.ready[peer] = None
+    state.arm(peer)
+
+
+def come_online(state: State, peer: Peer, session: Session, now: float) -> None:
+    """The peer is there (again)."""
+    peer.left = False
+    peer.lost = False
+    if peer.online:
+        return
+    peer.online = True
+    peer.online_since = now
+    state.ledger.tell(PeerOnline(peer.name, session.way.address, session.way.link))
+    release_outbox(state, peer, now)
+
+
+def heard(state: State, session: Session, link: str, source: Address, now: float) -> None:
+    """Something authentic came from a proven session."""
+    session.last_heard = now
+    way = session.way
+    if source == way.address and link == way.link:
+        way.heard_at = now
+    else:
+        follow(state, session, link, source, now)
+    peer = session.peer
+    if peer is None or peer.session is not session:
+        conflict(state, session, source, now)
+        return
+    if not peer.online:
+        come_online(state, peer, session, now)
+    if peer.outbound.silent_since is not None:
+        peer.outbound.heard(now)
+        state.ready[peer] = None
+
+
+def conflict(state: State, session: Session, source: Address, now: float) -> None:
+    """A run that was replaced by a later one still speaks: two nodes use one name."""
+    peer = session.peer or state.roster.peers.get(session.name)
+    if peer is None or peer.session is None or now - peer.conflict_reported_at < REPORT_AGAIN_S:
+        return
+    if peer.online_since is not None and now - peer.online_since < STALE_PATH_S:
+        # The last packets of a run that ended may come behind the first ones of the next.
+        return
+    peer.conflict_reported_at = now
+    state.ledger.tell(NameConflict(session.name, source, peer.session.way.address, own=False))
+
+
+def follow(state: State, session: Session, link: str, source: Address, now: float) -> None:
+    """The session was heard at an address: use it if it is the only one, or the one in use has gone quiet."""
+    info = state.links.get(link)
+    if info is None:
+        return
+    way = session.way
+    outbound = session.peer.outbound if session.peer is not None else None
+    struggling = outbound is not None and (outbound.timeouts > 0 or outbound.silent_since is not None)
+    first = not way.link
+    if not first and now - way.heard_at < STALE_PATH_S and not struggling and way.link in state.links:
+        return
+    old = way.address
+    before = way.fragment_bytes
+    way.lead(link, source, info.mtu, state.settings.fragment_bytes)
+    way.heard_at = now
+    if not first and session.proven and session.peer is not None:
+        state.ledger.tell(PeerAddressChanged(session.name, old, source, link))
+    if outbound is not None and way.fragment_bytes < before:
+        for message in list(outbound.open):
+            if message.begun and message.fragment_bytes > way.fragment_bytes:
+                outbound.send_anew(message)
+
+
+def leave(state: State, session: Session, now: float) -> None:
+    """The peer said good-bye."""
+    peer = session.peer
+    if peer is None or peer.session is not session or not peer.online:
+        return
+    go_offline(state, peer, now, left=True)
+
+
+def go_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
+    """The peer is out of reach: what its topics' outboxes keep goes there, the rest waits for `peer_lost_s`."""
+    peer.online = False
+    peer.left = left
+    peer.online_since = None
+    state.ledger.tell(PeerOffline(peer.name, left))
+    if peer.outbound.silent_since is None and peer.outbound.flight.outstanding:
+        peer.outbound.silent_since = now
+        peer.outbound.allow_probe(now)
+    shelve(state, peer, now)
+
+
+def housekeep(state: State, now: float) -> None:
+    """The round through all peers."""
+    rates = state.settings.rates
+    for peer in list(state.roster.peers.values()):
+        session = peer.session
+        if session is None:
+            continue
+        quiet_s = now - session.last_heard
+        if peer.online and quiet_s > max(rates.offline_s, MISSED_HEARTBEATS * session.interval_s):
+            go_offline(state, peer, now, left=False)
+        if not peer.online and not peer.lost and quiet_s > rates.peer_lost_s:
+            peer.lost = True
+            peer.outbound.finish_all(Outcome.PEER_LOST)
+            report_ended(state, peer, now)
+        session.inbound.unicasts.purge(now)
+        session.inbound.broadcasts.purge(now)
+        _report_starved(state, peer, now)
+        meters = session.meters
+        meters.sent.feed(peer.outbound.sent_bytes, now)
+        meters.delivered.feed(peer.outbound.delivered_bytes, now)
+        meters.received.feed(session.received_bytes, now)
+    for boot_id, session in list(state.roster.sessions.items()):
+        current = session.peer is not None and session.peer.session is session
+        if not current and now - session.last_heard > rates.offline_s:
+            state.roster.forget(session)
+            state.repairs.pop(boot_id, None)
+            state.incompatible_reported.pop(boot_id, None)
+
+
+def _report_starved(state: State, peer: Peer, now: float) -> None:
+    for book in peer.outbound.levels:
+        since = book.starved_since
+        if since is None or book.starved_reported or now - since < state.settings.rates.starved_s:
+            continue
+        oldest = book.oldest()
+        if oldest is not None:
+            book.starved_reported = True
+            state.ledger.tell(TopicStarved(peer.name, oldest.accepted.channel.name, now - since))

@@ -1,0 +1,52 @@
+"""A set of numbers kept as ranges: which messages of a peer are finished, in little memory however many there were."""
+
+from bisect import bisect_right
+
+
+class RangeSet:
+    """Integers as disjoint, sorted, inclusive ranges. Adding the number after the last one costs no search."""
+
+    __slots__ = ("_firsts", "_lasts")
+
+    def __init__(self) -> None:
+        self._firsts: list[int] = []
+        self._lasts: list[int] = []
+
+    def __contains__(self, number: int) -> bool:
+        place = bisect_right(self._firsts, number) - 1
+        return place >= 0 and number <= self._lasts[place]
+
+    def __len__(self) -> int:
+        """Ranges, not numbers: what the memory cap counts."""
+        return len(self._firsts)
+
+    def add(self, number: int) -> None:
+        firsts, lasts = self._firsts, self._lasts
+        if lasts and number == lasts[-1] + 1:
+            lasts[-1] = number
+            return
+        place = bisect_right(firsts, number)
+        if place and number <= lasts[place - 1]:
+            return
+        joins_left = place > 0 and lasts[place - 1] == number - 1
+        joins_right = place < len(firsts) and firsts[place] == number + 1
+        if joins_left and joins_right:
+            lasts[place - 1] = lasts[place]
+            del firsts[place], lasts[place]
+        elif joins_left:
+            lasts[place - 1] = number
+        elif joins_right:
+            firsts[place] = number
+        else:
+            firsts.insert(place, number)
+            lasts.insert(place, number)
+
+    def ranges(self) -> list[tuple[int, int]]:
+        """(first, last) of each range, ascending."""
+        return list(zip(self._firsts, self._lasts, strict=True))
+
+    def fill_lowest_gap(self) -> None:
+        """Join the two lowest ranges: their gap then counts as contained."""
+        if len(self._firsts) > 1:
+            del self._firsts[1]
+            del self._lasts[0]

@@ -1,0 +1,121 @@
+"""Who is there: sessions by boot id, peers by name, and which session a short header's tag may mean.
+
+A boot heard for the first time is a stranger until it is proven; strangers are few and the oldest goes first. A proven
+session becomes its name's session: the first one, a restart, or a conflict.
+"""
+
+from enum import Enum
+
+from udp_mesh.core.session import Peer, Session
+from udp_mesh.core.settings import Settings
+from udp_mesh.crypto import Key, ReceiveChannel
+
+RETIRED_REMEMBERED = 16
+"""Earlier boots of a name that are never believed again; older recordings would need a key since rotated."""
+
+
+class Arrival(Enum):
+    """What a session's proof means for its name."""
+
+    NEW = 1
+    RESTARTED = 2
+    OWN_NAME = 3
+    RETIRED = 4
+    """An earlier run of the name speaks again: a conflict, if it is alive."""
+    FULL = 5
+
+
+class Roster:
+    """`tags` maps a short header's tag to the channels it may mean, unicast and broadcast apart."""
+
+    __slots__ = ("_limits", "_strangers", "broadcast_tags", "data_tags", "own_boot", "own_name", "peers", "sessions")
+
+    def __init__(self, settings: Settings, own_boot: bytes) -> None:
+        self.own_name = settings.name
+        self.own_boot = own_boot
+        self._limits = settings.limits
+        self.sessions: dict[bytes, Session] = {}
+        self.peers: dict[str, Peer] = {}
+        self._strangers: dict[bytes, None] = {}
+        self.data_tags: dict[int, list[tuple[ReceiveChannel, Session]]] = {}
+        self.broadcast_tags: dict[int, list[tuple[ReceiveChannel, Session]]] = {}
+
+    def apply(self, settings: Settings) -> None:
+        self._limits = settings.limits
+
+    def peer(self, name: str, settings: Settings) -> Peer | None:
+        """The peer of a name, made when first asked for; None when there are too many."""
+        peer = self.peers.get(name)
+        if peer is None and len(self.peers) < self._limits.peers:
+            peer = self.peers[name] = Peer(name, settings)
+        return peer
+
+    def stranger(self, name: str, boot_id: bytes, keys: tuple[Key, ...], settings: Settings) -> Session:
+        """A session for a boot heard for the first time."""
+        while len(self._strangers) >= self._limits.strangers:
+            self.forget(self.sessions[next(iter(self._strangers))])
+        session = Session(name, boot_id, self.own_boot, keys, settings)
+        self.sessions[boot_id] = session
+        self._strangers[boot_id] = None
+        self._enter_tags(session)
+        return session
+
+    def prove(self, session: Session, settings: Settings) -> tuple[Arrival, Peer | None]:
+        """The session is alive. NEW and RESTARTED make it its peer's session; `Peer.session` still holds the old
+        one."""
+        session.proven = True
+        self._strangers.pop(session.boot_id, None)
+        if session.name == self.own_name:
+            return Arrival.OWN_NAME, None
+        peer = self.peer(session.name, settings)
+        if peer is None:
+            self.forget(session)
+            return Arrival.FULL, None
+        if session.boot_id in peer.retired:
+            return Arrival.RETIRED, peer
+        return (Arrival.NEW if peer.session is None else Arrival.RESTARTED), peer
+
+    def replace(self, peer: Peer, session: Session) -> None:
+        """The session is its peer's from now on; the earlier one is retired but still heard, to notice conflicts."""
+        old = peer.session
+        if old is not None:
+            peer.retired[old.boot_id] = None
+            if len(peer.retired) > RETIRED_REMEMBERED:
+                oldest = next(iter(peer.retired))
+                del peer.retired[oldest]
+                if oldest in self.sessions:
+                    self.forget(self.sessions[oldest])
+        peer.session = session
+        session.peer = peer
+
+    def forget(self, session: Session) -> None:
+        """Drop a session and its channels."""
+        self.sessions.pop(session.boot_id, None)
+        self._strangers.pop(session.boot_id, None)
+        for table, channels in (
+            (self.data_tags, session.data_channels),
+            (self.broadcast_tags, session.broadcast_channels),
+        ):
+            for channel in channels:
+                entries = [entry for entry in table.get(channel.tag, []) if entry[1] is not session]
+                if entries:
+                    table[channel.tag] = entries
+                else:
+                    table.pop(channel.tag, None)
+
+    def set_keys(self, keys: tuple[Key, ...]) -> None:
+        """New live keys for every session."""
+        self.data_tags.clear()
+        self.broadcast_tags.clear()
+        for session in self.sessions.values():
+            session.set_keys(self.own_boot, keys)
+            self._enter_tags(session)
+
+    def online(self) -> list[Peer]:
+        return [peer for peer in self.peers.values() if peer.online]
+
+    def _enter_tags(self, session: Session) -> None:
+        for channel in session.data_channels:
+            self.data_tags.setdefault(channel.tag, []).append((channel, session))
+        for channel in session.broadcast_channels:
+            self.broadcast_tags.setdefault(channel.tag, []).append((channel, session))

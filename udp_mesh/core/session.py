@@ -1,0 +1,151 @@
+"""One run of one peer, told from others by its boot id: channels, the way to it, what is owed to it.
+
+heard (a heartbeat, perhaps replayed) -> *proven* (it showed that it hears this run of ours) -> replaced by the peer's
+next run, or gone. Nothing but its heartbeat is believed before it is proven.
+"""
+
+from udp_mesh.core.departure import Way
+from udp_mesh.core.inbound import Inbound
+from udp_mesh.core.meter import Meter
+from udp_mesh.core.outbound import Outbound
+from udp_mesh.core.settings import Settings
+from udp_mesh.crypto import TO_ALL, Key, ReceiveChannel, SendChannel
+from udp_mesh.wire.frames import Ack, Frame, Heartbeat, Waiting
+from udp_mesh.wire.limits import HEARD_TAG_BYTES
+
+STALE_PATH_S = 2.0
+"""A path not heard for this long is left for one that is: two heartbeats."""
+
+OWED_FRAMES = 64
+"""Small frames (pongs, repairs asked for, refusals) waiting to leave to one peer; more is a flood of questions."""
+
+
+class Meters:
+    """Bytes per second of one session."""
+
+    __slots__ = ("delivered", "received", "sent")
+
+    def __init__(self, now: float) -> None:
+        self.sent = Meter(now)
+        self.delivered = Meter(now)
+        self.received = Meter(now)
+
+
+class Peer:
+    """A name: what is on its way to it, whichever run of it listens."""
+
+    __slots__ = (
+        "conflict_reported_at",
+        "left",
+        "legacy",
+        "lost",
+        "name",
+        "online",
+        "online_since",
+        "outbound",
+        "retired",
+        "session",
+        "timer_at",
+    )
+
+    def __init__(self, name: str, settings: Settings) -> None:
+        self.name = name
+        self.outbound = Outbound(settings)
+        self.session: Session | None = None
+        self.online = False
+        self.left = False
+        self.legacy = False
+        self.lost = True
+        """Silent for `peer_lost_s`, or never heard: nothing waits for it but in an outbox."""
+        self.online_since: float | None = None
+        self.conflict_reported_at = float("-inf")
+        self.retired: dict[bytes, None] = {}
+        """Earlier boot ids: never believed again."""
+        self.timer_at = float("inf")
+        """When this peer stands in the node's timer queue."""
+
+
+class Session:
+    """A boot id heard under a name."""
+
+    __slots__ = (
+        "boot_id",
+        "broadcast_channels",
+        "data_channels",
+        "features",
+        "heard_from",
+        "inbound",
+        "interval_s",
+        "introduced_at",
+        "knows_us",
+        "last_heard",
+        "meters",
+        "name",
+        "owed",
+        "peer",
+        "proven",
+        "received_bytes",
+        "repair",
+        "versions",
+        "waiting",
+        "waiting_at",
+        "way",
+    )
+
+    def __init__(self, name: str, boot_id: bytes, own_boot: bytes, keys: tuple[Key, ...], settings: Settings) -> None:
+        self.name = name
+        self.boot_id = boot_id
+        self.peer: Peer | None = None
+        self.proven = False
+        self.knows_us = False
+        """It listed us as heard, or answered us: introductions need no name any more."""
+        self.introduced_at = float("-inf")
+        self.last_heard = float("-inf")
+        self.meters = Meters(0.0)
+        self.received_bytes = 0
+        self.interval_s = settings.rates.heartbeat_s
+        self.versions = (1, 1)
+        self.features = 0
+        self.inbound = Inbound(settings.rates, settings.limits)
+        self.way = Way(SendChannel(keys[0], own_boot, boot_id))
+        self.owed: list[Frame] = []
+        self.waiting: tuple[Waiting, ...] = ()
+        self.waiting_at = float("-inf")
+        self.data_channels: list[ReceiveChannel] = []
+        self.broadcast_channels: list[ReceiveChannel] = []
+        self.set_keys(own_boot, keys)
+
+    @property
+    def heard_tag(self) -> bytes:
+        return self.boot_id[:HEARD_TAG_BYTES]
+
+    def set_keys(self, own_boot: bytes, keys: tuple[Key, ...]) -> None:
+        """The live keys: channels of keys that stay keep their replay windows; packet numbers go on across keys."""
+        data = {channel.key: channel for channel in self.data_channels}
+        broadcast = {channel.key: channel for channel in self.broadcast_channels}
+        self.data_channels = [data.get(key) or ReceiveChannel(key, self.boot_id, own_boot) for key in keys]
+        self.broadcast_channels = [broadcast.get(key) or ReceiveChannel(key, self.boot_id, TO_ALL) for key in keys]
+        channel = self.way.channel
+        if channel.key != keys[0]:
+            self.way.channel = SendChannel(keys[0], own_boot, self.boot_id)
+            self.way.channel.next_number = channel.next_number
+
+    def owe(self, frame: Frame) -> None:
+        """A small frame leaves with the next datagrams."""
+        if len(self.owed) < OWED_FRAMES:
+            self.owed.append(frame)
+
+    def take_ack(self, now: float, waiting: tuple[Waiting, ...]) -> Ack | None:
+        """The acknowledgement to send now, if there is anything to acknowledge; it then counts as sent."""
+        acks = self.inbound.acks
+        if acks.largest < 0:
+            return None
+        delay_us = min((1 << 24) - 1, int(max(0.0, now - acks.arrived_at) * 1e6))
+        acks.sent()
+        return Ack(acks.largest, acks.received >> 1, delay_us, 0, waiting)
+
+    def learn(self, beat: Heartbeat) -> None:
+        """What a heartbeat says about its sender."""
+        self.interval_s = beat.interval_ms / 1000
+        self.versions = (beat.min_version, beat.max_version)
+        self.features = beat.features

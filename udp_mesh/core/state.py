@@ -1,0 +1,98 @@
+"""What the parts of one node share: settings, who is there, what waits, and who has something to send.
+
+The parts, in the order bytes and messages pass them: `intake` (datagrams in), `presence` (peers come and go),
+`acceptance` (messages in), `dispatch` (datagrams out, timers), `survey` (conditions out). Each is functions of this
+state and of `now`.
+"""
+
+from heapq import heappush
+
+from udp_mesh.core.casts import CastQueue, Repairs
+from udp_mesh.core.discovery import Discovery
+from udp_mesh.core.ledger import Ledger
+from udp_mesh.core.limiter import Gate
+from udp_mesh.core.message import Channel
+from udp_mesh.core.outbox import Outboxes
+from udp_mesh.core.roster import Roster
+from udp_mesh.core.seams import Datagram, RandomSource, Store
+from udp_mesh.core.session import Peer, Session
+from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
+from udp_mesh.core.yielding import Yielding
+from udp_mesh.crypto import Key, Keyring, SendChannel
+
+HOUSEKEEPING_S = 0.5
+"""Between two rounds through all peers: offline, purges, starvation."""
+
+IP_UDP_BYTES = 28
+"""IPv4 and UDP headers, counted in wire bytes."""
+
+
+def live_keys(settings: Settings) -> tuple[Key, ...]:
+    """The keys of the settings, or the key everyone knows."""
+    return settings.keys or Keyring.unkeyed().keys
+
+
+class State:
+    """See the module's docstring. Only the parts of a node touch it."""
+
+    def __init__(self, settings: Settings, boot_id: bytes, rng: RandomSource, now: float, store: Store | None) -> None:
+        self.settings = settings
+        self.boot_id = boot_id
+        self.rng = rng
+        self.keys = live_keys(settings)
+        self.links: dict[str, LinkInfo] = {}
+        self.roster = Roster(settings, boot_id)
+        self.ledger = Ledger(settings.limits.events)
+        self.outboxes = Outboxes(store)
+        self.discovery = Discovery(rng, now)
+        self.casts = CastQueue()
+        self.to_all = SendChannel(self.keys[0], boot_id)
+        self.yielding = Yielding(settings.rates, now)
+        self.repairs: dict[bytes, Repairs] = {}
+        """By the sender's boot id."""
+        self.topics: dict[str, Topic] = {topic.name: topic for topic in settings.topics}
+        self.channels: dict[tuple[str, str], Channel] = {}
+        self.gates: dict[str, Gate] = {}
+        self.next_message_id = 1
+        self.ready: dict[Peer, None] = {}
+        """Peers to which something may be able to leave."""
+        self.owing: dict[Session, None] = {}
+        """Sessions that are owed an acknowledgement or small frames now."""
+        self.outgoing: list[Datagram] = []
+        """Datagrams already built: heartbeats, second copies."""
+        self.timers: list[tuple[float, int, Peer]] = []
+        self.timer_serial = 0
+        self.housekeeping_at = now
+        self.mismatch_reported: dict[tuple[str, int], float] = {}
+        self.incompatible_reported: dict[bytes, float] = {}
+        self.closed = False
+
+    def set_timer(self, peer: Peer, at: float) -> None:
+        """The peer wants attention at `at`; an earlier wish stands."""
+        if at < peer.timer_at:
+            peer.timer_at = at
+            self.timer_serial += 1
+            heappush(self.timers, (at, self.timer_serial, peer))
+
+    def arm(self, peer: Peer) -> None:
+        """Bring the peer's timer up to what its halves want now."""
+        at = peer.outbound.timer()
+        if at is not None and at < peer.timer_at:
+            self.set_timer(peer, at)
+        session = peer.session
+        if session is not None:
+            due = session.inbound.acks.due_at
+            if due is not None and due < peer.timer_at:
+                self.set_timer(peer, due)
+
+    def owe(self, session: Session) -> None:
+        """The session has small frames or an acknowledgement to send now."""
+        self.owing[session] = None
+
+    def waiting_peers(self) -> list[Peer]:
+        """Peers with open messages."""
+        return [peer for peer in self.roster.peers.values() if peer.outbound.open and peer.online]
+
+    def broadcasts(self) -> bool:
+        """Whether some link reaches everyone with one datagram."""
+        return any(link.kind is LinkKind.BROADCAST for link in self.links.values())

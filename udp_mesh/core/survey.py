@@ -1,0 +1,86 @@
+"""Conditions out: a snapshot of peers, queues and counters, from what the other parts measured."""
+
+from dataclasses import replace
+
+from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions
+from udp_mesh.core.meter import Meter
+from udp_mesh.core.session import Peer
+from udp_mesh.core.state import State
+
+
+def conditions(state: State, now: float) -> Conditions:
+    """See `Node.conditions`."""
+    peers = tuple(_peer(state, peer, now) for _, peer in sorted(state.roster.peers.items()))
+    counters = state.ledger.counters
+    inbounds = [session.inbound for session in state.roster.sessions.values()]
+    return Conditions(
+        now,
+        state.settings.name,
+        peers,
+        replace(
+            counters,
+            fragments_received=sum(inbound.fragments for inbound in inbounds),
+            duplicates_received=sum(inbound.duplicates for inbound in inbounds),
+            fragments_retransmitted=sum(peer.outbound.retransmitted for peer in state.roster.peers.values()),
+            fragments_sent=sum(peer.outbound.sent_packets for peer in state.roster.peers.values()),
+            dropped_over_limit=counters.dropped_over_limit + sum(inbound.over_limit for inbound in inbounds),
+        ),
+        sum(inbound.partial_bytes for inbound in inbounds),
+        sum(peer.outbound.queued_bytes for peer in state.roster.peers.values()),
+        state.casts.kept_bytes,
+    )
+
+
+def _peer(state: State, peer: Peer, now: float) -> PeerConditions:
+    outbound = peer.outbound
+    session = peer.session
+    held_messages, held_bytes = state.outboxes.count(peer.name)
+    capacity = outbound.window.capacity()
+    fragment_bytes = session.way.fragment_bytes if session is not None else state.settings.fragment_bytes
+    meters = session.meters if session is not None else None
+    return PeerConditions(
+        peer.name,
+        peer.online,
+        peer.legacy,
+        session.way.address if session is not None and session.way.link else None,
+        session.way.link if session is not None and session.way.link else None,
+        peer.online_since,
+        session.last_heard if session is not None else None,
+        outbound.trip.smoothed,
+        outbound.trip.least,
+        outbound.loss,
+        _bits(meters.sent, now) if meters is not None else 0.0,
+        _bits(meters.delivered, now) if meters is not None else 0.0,
+        _bits(meters.received, now) if meters is not None else 0.0,
+        None if capacity is None else capacity * fragment_bytes * 8,
+        outbound.window.packets,
+        outbound.flight.outstanding,
+        outbound.retransmitted,
+        _queues(peer, now),
+        held_messages,
+        held_bytes,
+    )
+
+
+def _queues(peer: Peer, now: float) -> tuple[QueueConditions, ...]:
+    queues = []
+    for priority, book in enumerate(peer.outbound.levels):
+        oldest = book.oldest()
+        starved_s = book.starved_s + (now - book.starved_since if book.starved_since is not None else 0.0)
+        if not book.messages and not starved_s and not book.held_s:
+            continue
+        queues.append(
+            QueueConditions(
+                priority,
+                book.messages,
+                book.bytes,
+                now - oldest.queued_at if oldest is not None else 0.0,
+                starved_s,
+                book.held_s,
+            )
+        )
+    return tuple(queues)
+
+
+def _bits(meter: Meter, now: float) -> float:
+    return 8 * meter.per_s(now)

@@ -1,0 +1,299 @@
+"""How many packets may be on their way to one peer: delay decides, loss does not (radio loss is not congestion).
+
+1. Startup doubles the window once per round trip until the round trip has grown by `QUEUE_S`.
+2. Then, once per round trip: w <- w/2 + (w * least / standing + a) / 2, where a is `QUEUE_S` worth of packets: the
+   window settles where the sender keeps that much queue at the bottleneck, and no more.
+3. w never exceeds twice what the measured delivery rate needs, plus a: a queue too short to be seen as delay is not
+   overrun.
+4. A *drain* lets the queue run empty for one round trip, so that the least round trip is seen again: after
+   `DRAIN_EVERY_S` without having seen it, and as soon as the round trip looks longer than our own queue explains. If
+   it stays long while the queue is empty, the route has changed: the window moves at once to the new round trip times
+   the delivery rate.
+
+The idea of step 2 is that of FAST TCP (Jin, Wei, Low 2004), that of steps 3 and 4 of BBR's bandwidth model (Cardwell
+and others 2016).
+"""
+
+from collections import deque
+from enum import Enum
+from typing import Protocol
+
+from udp_mesh.core.rtt import RoundTrip
+
+QUEUE_S = 0.006
+"""Queue the sender keeps at the bottleneck: covers batched acknowledgements and pacing; adds this much to urgent
+latency."""
+
+LEAST_QUEUE_PACKETS = 3.0
+"""The same at low rates: fewer packets leave the link idle between acknowledgements."""
+
+LEAST_WINDOW = 4.0
+"""Packets: below, a lost packet has too few successors to be noticed without a timeout."""
+
+MOST_WINDOW = 8192.0
+"""Packets: 92 Mbit at 1400 B, more than any link these robots have; bounds the state kept per packet."""
+
+START_WINDOW = 10.0
+"""Packets before anything is known (RFC 6928)."""
+
+LEAST_UPDATE_S = 0.004
+"""On links faster than this round trip the law runs at this pace: single acknowledgements are too noisy there."""
+
+RATE_WINDOW_S = 2.0
+"""How long a measured delivery rate is believed."""
+
+DRAIN_EVERY_S = 1.0
+DRAIN_EVERY_ROUND_TRIPS = 15.0
+"""Between two drains, at least: each costs about a quarter of a round trip of throughput."""
+
+DRAIN_TO = 0.8
+"""Part of the pipe filled while draining."""
+
+SUSPECT_QUEUES = 2.5
+"""Queueing of this many `QUEUE_S` is more than our own window explains."""
+
+SUSPECT_AGAIN_S = 0.3
+"""Between two drains on suspicion, doubled each time one finds nothing."""
+
+
+class Window(Protocol):
+    """Decides how much may be in flight and how fast it leaves."""
+
+    @property
+    def packets(self) -> float:
+        """How many packets may be on their way."""
+        ...
+
+    def packets_per_s(self) -> float | None:
+        """Pacing (None: as fast as the window allows)."""
+        ...
+
+    def acknowledged(
+        self,
+        count: int,
+        largest: int,
+        next_number: int,
+        in_flight: int,
+        rate: float | None,
+        *,
+        limited: bool,
+        now: float,
+    ) -> None:
+        """`count` packets were newly acknowledged, up to number `largest`; `rate` is a delivery rate sample."""
+        ...
+
+    def capacity(self) -> float | None:
+        """Estimated packets/s of the path."""
+        ...
+
+
+class FixedWindow:
+    """A number of packets, whatever happens: the paper's scheme."""
+
+    __slots__ = ("packets",)
+
+    def __init__(self, packets: int) -> None:
+        self.packets = float(packets)
+
+    def packets_per_s(self) -> float | None:
+        return None
+
+    def acknowledged(
+        self,
+        count: int,
+        largest: int,
+        next_number: int,
+        in_flight: int,
+        rate: float | None,
+        *,
+        limited: bool,
+        now: float,
+    ) -> None:
+        return
+
+    def capacity(self) -> float | None:
+        return None
+
+
+class Phase(Enum):
+    STARTUP = 1
+    CRUISE = 2
+    DRAIN = 3
+    """Waiting until little enough is in flight."""
+    HOLD = 4
+    """The queue is empty: waiting for the round trip of a packet sent now."""
+
+
+class AdaptiveWindow:
+    """The law of the module's docstring."""
+
+    __slots__ = (
+        "_drained_at",
+        "_held_least",
+        "_hold_from",
+        "_latest_four",
+        "_rates",
+        "_round_ends",
+        "_saved",
+        "_suspect_every",
+        "_suspected",
+        "_suspicion",
+        "_trip",
+        "_updated_at",
+        "_was_standing",
+        "packets",
+        "phase",
+    )
+
+    def __init__(self, trip: RoundTrip) -> None:
+        self._trip = trip
+        self.packets = START_WINDOW
+        self.phase = Phase.STARTUP
+        self._latest_four: deque[float] = deque(maxlen=4)
+        self._rates: deque[tuple[float, float]] = deque()
+        self._round_ends = 0
+        self._updated_at = 0.0
+        self._drained_at = 0.0
+        self._saved = START_WINDOW
+        self._was_standing = 0.0
+        self._hold_from = 0
+        self._held_least = float("inf")
+        self._suspicion = False
+        self._suspected = 0
+        self._suspect_every = SUSPECT_AGAIN_S
+
+    def capacity(self) -> float | None:
+        return self._rates[0][1] if self._rates else None
+
+    def packets_per_s(self) -> float | None:
+        smoothed = self._trip.smoothed
+        if smoothed is None:
+            return None
+        if self.phase is Phase.STARTUP:
+            return 2.0 * self.packets / smoothed
+        rate = 1.25 * self.packets / smoothed
+        capacity = self.capacity()
+        return rate if capacity is None else min(rate, max(1.2 * capacity, LEAST_WINDOW / smoothed))
+
+    def acknowledged(
+        self,
+        count: int,
+        largest: int,
+        next_number: int,
+        in_flight: int,
+        rate: float | None,
+        *,
+        limited: bool,
+        now: float,
+    ) -> None:
+        trip = self._trip
+        if trip.latest is None or trip.least is None or trip.standing is None:
+            return
+        if rate is not None:
+            self._saw_rate(rate, limited=limited, now=now)
+        self._latest_four.append(trip.latest)
+        if self.phase is Phase.DRAIN:
+            if in_flight <= self.packets:
+                self.phase = Phase.HOLD
+                self._hold_from = next_number
+                self._held_least = float("inf")
+            elif now - self._updated_at > 1.0:
+                self._end_drain(now)
+            return
+        if self.phase is Phase.HOLD:
+            self._held_least = min(self._held_least, trip.latest)
+            if largest >= self._hold_from:
+                self._end_drain(now)
+                self._round_ends = next_number
+            return
+        if self.phase is Phase.STARTUP and min(self._latest_four) - trip.least > QUEUE_S:
+            self.phase = Phase.CRUISE
+            self._drained_at = now
+            self.packets = max(LEAST_WINDOW, self.packets * trip.least / trip.standing)
+        if largest < self._round_ends or now - self._updated_at < max(trip.standing, LEAST_UPDATE_S):
+            return
+        self._round_ends = next_number
+        self._updated_at = now
+        if trip.latest <= trip.least * 1.02 + 0.0005:
+            # The empty path was seen just now: no drain is needed to see it.
+            self._drained_at = now
+        self._update(limited=limited, now=now)
+
+    def _update(self, *, limited: bool, now: float) -> None:
+        least, standing = self._trip.least, self._trip.standing
+        assert least is not None
+        assert standing is not None
+        if self.phase is Phase.STARTUP:
+            if not limited:
+                self.packets = self._bounded(2 * self.packets, least, standing)
+            return
+        since_drain = now - self._drained_at
+        suspect = standing - least > SUSPECT_QUEUES * QUEUE_S + 0.25 * least
+        self._suspected = self._suspected + 1 if suspect else 0
+        if self._suspected >= 2 and since_drain > max(self._suspect_every, 4 * standing):
+            self._begin_drain(now, suspicion=True)
+            return
+        if since_drain > max(DRAIN_EVERY_S, DRAIN_EVERY_ROUND_TRIPS * least):
+            if limited or standing - least < QUEUE_S / 4:
+                self._drained_at = now
+            else:
+                self._begin_drain(now, suspicion=False)
+                return
+        wanted = 0.5 * self.packets + 0.5 * (self.packets * least / standing + self._queue(standing))
+        if wanted < self.packets or not limited:
+            self.packets = self._bounded(min(wanted, 2 * self.packets), least, standing)
+
+    def _queue(self, standing: float) -> float:
+        return max(LEAST_QUEUE_PACKETS, QUEUE_S * self.packets / standing)
+
+    def _bounded(self, packets: float, least: float, standing: float) -> float:
+        capacity = self.capacity()
+        if capacity is not None:
+            packets = min(packets, max(START_WINDOW, 2 * capacity * max(least, LEAST_UPDATE_S) + self._queue(standing)))
+        return min(MOST_WINDOW, max(LEAST_WINDOW, packets))
+
+    def _begin_drain(self, now: float, *, suspicion: bool) -> None:
+        least, standing = self._trip.least, self._trip.standing
+        assert least is not None
+        assert standing is not None
+        self.phase = Phase.DRAIN
+        self._suspicion = suspicion
+        self._saved = self.packets
+        self._was_standing = standing
+        self._updated_at = now
+        self.packets = max(LEAST_WINDOW - 1, DRAIN_TO * self.packets * least / standing)
+
+    def _end_drain(self, now: float) -> None:
+        least = self._trip.least
+        assert least is not None
+        held = self._held_least
+        self.phase = Phase.CRUISE
+        self._drained_at = self._updated_at = now
+        self._suspected = 0
+        throughput = self._saved / self._was_standing
+        if self._suspicion and held > 1.15 * least + QUEUE_S / 3 and held != float("inf"):
+            self._trip.forget_least(held, now)
+            if held > (least + self._was_standing) / 2:
+                # Still long although our queue is gone: the route, not the queue, is longer.
+                throughput = self.capacity() or throughput
+            self._suspect_every = SUSPECT_AGAIN_S
+        elif self._suspicion:
+            self._suspect_every = min(2 * self._suspect_every, DRAIN_EVERY_S * 4)
+        else:
+            self.packets = self._saved
+            return
+        base = min(held, self._was_standing) if held != float("inf") else least
+        self.packets = min(
+            MOST_WINDOW, max(LEAST_WINDOW, throughput * base + max(LEAST_QUEUE_PACKETS, QUEUE_S * throughput))
+        )
+
+    def _saw_rate(self, rate: float, *, limited: bool, now: float) -> None:
+        """Windowed maximum; a rate the application limited says nothing unless it is larger."""
+        rates = self._rates
+        while rates and rates[0][0] < now - RATE_WINDOW_S and not (limited and len(rates) == 1):
+            rates.popleft()
+        if limited and rates and rate < rates[0][1]:
+            return
+        while rates and rates[-1][1] <= rate:
+            rates.pop()
+        rates.append((now, rate))
