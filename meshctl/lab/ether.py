@@ -1,0 +1,164 @@
+"""The links of a running fleet, and what follows from them: each node's tables, and the path to the operator."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from meshctl.errors import InputError
+from meshctl.lab import air
+from meshctl.lab.forward import Shape
+from meshctl.lab.spec import LinkSpec, Medium
+
+if TYPE_CHECKING:
+    from meshctl.lab.supervisor import Supervisor
+
+# recomputing all tables of a big fleet takes a while; at most this share of the time is spent on it
+_BUSY_SHARE = 0.2
+
+
+class Ether:
+    """`changed()` says that a node or a link is different; the tables follow after the fleet's convergence time."""
+
+    def __init__(self, fleet: Supervisor) -> None:
+        self._fleet = fleet
+        self._links = {link.ends: link for link in fleet.spec.links}
+        self._original = dict(self._links)
+        # what `sever`, `link-down` and `slow` do to all links of a node
+        self.severed: set[str] = set()
+        self.slowed: dict[str, dict[str, Any]] = {}
+        self._written: dict[str, str] = {}
+        self._graph: dict[str, list[air.Edge]] = {}
+        self._from_base: dict[str, air.Path] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        self._last_cost_s = 0.0
+        self.condition = asyncio.Condition()
+        self._notices: set[asyncio.Task[None]] = set()
+
+    def changed(self) -> None:
+        """Paths are cut at once; tables, and paths that are new, come after the convergence time."""
+        self._cut()
+        if self._timer is None:
+            wait = max(self._fleet.spec.convergence_s, self._last_cost_s / _BUSY_SHARE)
+            self._timer = asyncio.get_running_loop().call_later(wait, self._converge)
+
+    def links(self) -> list[LinkSpec]:
+        """Every link as it is now, with what was done to its ends."""
+        return [self._hurt(link) for link in self._links.values()]
+
+    def _hurt(self, link: LinkSpec) -> LinkSpec:
+        if link.ends & self.severed:
+            link = replace(link, up=False)
+        for name in link.ends & self.slowed.keys():
+            link = replace(link, **self.slowed[name])
+        return link
+
+    def set_link(self, a: str, b: str, changes: dict[str, Any]) -> None:
+        """Change a link's fields or make the link. Raises InputError for an unknown node or field."""
+        ends = frozenset((a, b))
+        for name in ends:
+            if name not in self._fleet.nodes:
+                raise InputError(f"no node named {name} in this fleet")
+        try:
+            self._links[ends] = replace(self._links.get(ends) or LinkSpec(a, b), **changes)
+        except TypeError as error:
+            raise InputError(f"link {a}-{b}: {error}") from error
+        self.changed()
+
+    def restore(self, ends: frozenset[str] | None = None) -> None:
+        """One link (or all, and all nodes' links) as the fleet's spec has it."""
+        if ends is None:
+            self._links = dict(self._original)
+            self.severed.clear()
+            self.slowed.clear()
+        elif ends in self._original:
+            self._links[ends] = self._original[ends]
+        else:
+            self._links.pop(ends, None)
+        self.changed()
+
+    # -- the way to the operator --
+
+    def way(self, name: str, address: str) -> Shape | None:
+        """What lies between the operator and a node's `address` now; None when nothing does."""
+        state = self._fleet.nodes[name]
+        if not state.is_running:
+            return None
+        if state.plugged and state.effective.holds(address, over="wire"):
+            return Shape()
+        path = self._from_base.get(name)
+        if path is None or not state.effective.holds(address, over="mesh"):
+            return None
+        rates = [link.rate_kbps for link in path.links if link.rate_kbps is not None]
+        arrives = 1.0
+        for link in path.links:
+            arrives *= 1 - link.loss
+        return Shape(
+            sum(link.delay_ms for link in path.links) / 1000, 1 - arrives, min(rates) * 125.0 if rates else None
+        )
+
+    def wire(self, name: str, address: str) -> Shape | None:
+        """The same through the node's bench port alone."""
+        state = self._fleet.nodes[name]
+        if state.is_running and state.plugged and state.effective.holds(address, over="wire"):
+            return Shape()
+        return None
+
+    def reached(self) -> set[str]:
+        """The nodes that a mesh path from the base leads to."""
+        return set(self._from_base)
+
+    # -- computing --
+
+    def _nodes(self) -> dict[str, air.Effective]:
+        return {name: state.effective for name, state in self._fleet.nodes.items() if state.effective.cells}
+
+    def _paths_from_base(self, graph: dict[str, list[air.Edge]]) -> dict[str, air.Path]:
+        found: dict[str, air.Path] = {}
+        for name, state in self._fleet.nodes.items():
+            if state.spec.medium is Medium.BASE and state.plugged and state.effective.bridges_lan_and_mesh:
+                for target, path in air.paths(graph, name).items():
+                    if target not in found or path.tq > found[target].tq:
+                        found[target] = path
+        return found
+
+    def _cut(self) -> None:
+        """Take away what no longer stands; what is new waits for `_converge`."""
+        now = self._paths_from_base(air.edges(self._nodes(), self.links()))
+        self._from_base = {name: path for name, path in now.items() if name in self._from_base}
+        self._tell()
+
+    def _converge(self) -> None:
+        loop = asyncio.get_running_loop()
+        begun = loop.time()
+        self._timer = None
+        nodes = self._nodes()
+        self._graph = air.edges(nodes, self.links())
+        self._from_base = self._paths_from_base(self._graph)
+        for name, state in self._fleet.nodes.items():
+            ways = air.paths(self._graph, name) if name in nodes else {}
+            text = air.heard(name, nodes, self._graph, ways)
+            if self._written.get(name) != text:
+                self._written[name] = text
+                _replace(state.home / "air" / "heard", text)
+        self._last_cost_s = loop.time() - begun
+        self._tell()
+
+    def _tell(self) -> None:
+        self._fleet.doors.refresh()
+
+        async def notify() -> None:
+            async with self.condition:
+                self.condition.notify_all()
+
+        notice = asyncio.ensure_future(notify())
+        self._notices.add(notice)
+        notice.add_done_callback(self._notices.discard)
+
+
+def _replace(path: Path, text: str) -> None:
+    new = path.with_name("heard.new")
+    new.write_text(text, encoding="ascii")
+    new.replace(path)

@@ -1,0 +1,37 @@
+# iw's stand-in, the printing part.
+BEGIN { FS = "\t" }
+function describe(indent, face,    width, type) {
+	type = face[2] == "adhoc" ? "IBSS" : face[2] == "mesh" ? "mesh point" : face[2] == "sta" ? "managed" : "AP"
+	printf "%sifindex %d\n%swdev 0x%x\n%saddr %s\n", indent, face[4] + 7, indent, face[4] * 4294967296 + 2, indent, face[3]
+	if (face[11]) printf "%s%s %s\n", indent, (type == "mesh point" ? "ssid" : "ssid"), face[8]
+	printf "%stype %s\n", indent, type
+	if (indent == "\t") printf "%swiphy %d\n", indent, face[4]
+	if (face[11]) {
+		width = face[7] ~ /40/ ? "40 MHz" : face[7] ~ /80/ ? "80 MHz" : face[7] ~ /20/ ? "20 MHz" : "20 MHz (no HT)"
+		printf "%schannel %d (%d MHz), width: %s, center1: %d MHz\n", indent, face[6], face[5], width, face[5]
+	}
+	printf "%stxpower %.2f dBm\n", indent, face[10]
+}
+FILENAME ~ /iw$/ {
+	n = split($0, face, "\t")
+	if (device == "") {
+		if (face[4] != last || !seen++) printf "phy#%d\n", face[4]
+		last = face[4]
+		printf "\tInterface %s\n", face[1]
+		describe("\t\t", face)
+		next
+	}
+	if (face[1] != device) next
+	found = 1
+	if (verb == "info") { printf "Interface %s\n", device; describe("\t", face) }
+	if (verb == "link") {
+		if (face[11] && face[2] == "adhoc") printf "Joined IBSS %s (on %s)\n\tSSID: %s\n\tfreq: %d\n", face[9], device, face[8], face[5]
+		else print "Not connected."
+	}
+}
+FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" {
+	printf "Station %s (on %s)\n\tinactive time:\t%d ms\n\trx bytes:\t96000\n\trx packets:\t1200\n\ttx bytes:\t88000\n\ttx packets:\t1100\n\ttx retries:\t12\n\ttx failed:\t0\n\trx drop misc:\t0\n", $3, device, $5
+	printf "\tsignal:  \t%d [%d, %d] dBm\n\tsignal avg:\t%d [%d, %d] dBm\n", $4, $4 - 2, $4 - 4, $4, $4 - 2, $4 - 4
+	printf "\ttx bitrate:\t%.1f MBit/s MCS 15 short GI\n\trx bitrate:\t%.1f MBit/s MCS 15 short GI\n\texpected throughput:\t%.2fMbps\n\tauthorized:\tyes\n\tauthenticated:\tyes\n\tassociated:\tyes\n\tconnected time:\t60 seconds\n", $6, $6, $6 * 0.4
+}
+END { if (device != "" && !found) { print "command failed: No such device (-19)" > "/dev/stderr"; exit 237 } }

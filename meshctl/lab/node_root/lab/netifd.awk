@@ -1,0 +1,285 @@
+# netifd's stand-in, the computing part. Input: `uci export network; uci export wireless`.
+#
+# sections -> which radio interfaces come up -> which devices exist -> which interfaces are up
+#   -> run/dump, run/wireless (JSON for ubus), run/iw, run/addresses.new, run/effective, run/sys (a shell script)
+
+/^package / { package = $2; next }
+/^config / {
+	type = $2; name = $3; gsub(/'/, "", name)
+	id = package "." (name == "" ? "@" (++anonymous) : name)
+	order[++sections] = id; kind[id] = package "." type; label[id] = name
+	next
+}
+/^\t(option|list) / {
+	option = $2
+	value = $0; sub(/^\t[a-z]+ [^ ]+ '/, "", value); sub(/'$/, "", value); gsub(/'\\''/, "'", value)
+	if ((id, option) in opt) opt[id, option] = opt[id, option] " " value; else opt[id, option] = value
+	if (!((id, option) in seen)) { seen[id, option] = 1; names[id] = names[id] " " option }
+}
+
+function get(id, option, otherwise) { return (id, option) in opt ? opt[id, option] : otherwise }
+function yes(value) { return value ~ /^(1|on|true|yes|enabled)$/ }
+function json(text) { gsub(/\\/, "\\\\", text); gsub(/"/, "\\\"", text); return "\"" text "\"" }
+function shell(text) { gsub(/'/, "'\\''", text); return "'" text "'" }
+
+function frequency(band, channel) {
+	channel += 0
+	if (band == "2g") return channel >= 1 && channel <= 13 ? 2407 + 5 * channel : 0
+	return channel >= 36 && channel <= 177 ? 5000 + 5 * channel : 0
+}
+
+function prefix(mask,    part, n, i, bits, value) {
+	if (mask ~ /^[0-9]+$/) return mask + 0
+	n = split(mask, part, "."); bits = 0
+	for (i = 1; i <= n; i++) for (value = part[i] + 0; value > 0; value = (value * 2) % 256) bits++
+	return bits
+}
+
+# --- radios ----------------------------------------------------------------------------------------------------------
+
+function board_radios(    n, i, field, list) {
+	n = split(radios, list, " ")
+	for (i = 1; i <= n; i++) {
+		split(list[i], field, ",")
+		phy_of[field[2]] = i - 1; band_of[field[2]] = field[3]; mac_of[field[2]] = field[4]; max_of[field[2]] = field[5]
+	}
+}
+
+# the band the UCI section asks for: `band` from 21.02, `hwmode` before
+function band(id) {
+	if ((id, "band") in opt) return opt[id, "band"]
+	return get(id, "hwmode", "11g") ~ /a/ ? "5g" : "2g"
+}
+
+function default_ifname(mode, phy, count) {
+	if (series == "19.07" || series == "21.02" || series == "22.03") return "wlan" phy (count ? "-" count : "")
+	if (mode == "adhoc") mode = series == "25.12" ? "adhoc" : "ibss"
+	return "phy" phy "-" mode count
+}
+
+function radio_interfaces(    i, id, device, path, phy, channel, freq, mode, ifname, reason, algo, key, count, width) {
+	for (i = 1; i <= sections; i++) if (kind[order[i]] == "wireless.wifi-device") {
+		id = order[i]
+		device = label[id]
+		devices[++ndevices] = device
+		path = get(id, "path", "")
+		radio_path[device] = path
+		if (yes(get(id, "disabled", "0"))) { radio_disabled[device] = 1; continue }
+		if (!(path in phy_of)) { radio_failed[device] = 1; continue }
+		radio_up[device] = 1
+	}
+	for (i = 1; i <= sections; i++) if (kind[order[i]] == "wireless.wifi-iface") {
+		id = order[i]
+		device = get(id, "device", "")
+		if (!(device in radio_path) || yes(get(id, "disabled", "0"))) continue
+		mode = get(id, "mode", "ap")
+		path = radio_path[device]; phy = phy_of[path]
+		count = made[device, mode]++
+		ifname = get(id, "ifname", default_ifname(mode, phy, count))
+		faces[device] = faces[device] " " id
+		if (!(device in radio_up) || mode_down) continue
+		iface_name[id] = ifname
+		exists[ifname] = 1; mac[ifname] = mac_of[path]; is_radio[ifname] = 1
+		split(get(id, "network", ""), wanted, " ")
+		network_of[ifname] = wanted[1]
+		if (mode == "ap" && wanted[1] != "") attach(wanted[1], ifname)
+		freq = band(id_of(device)) == band_of[path] ? frequency(band_of[path], get(id_of(device), "channel", "auto")) : 0
+		algo = get(id, "encryption", "none"); key = get(id, "key", "")
+		sub(/\+.*/, "", algo)
+		if (algo == "none" || algo == "") key = ""
+		# an IBSS cannot choose its channel, and encrypts only with a full supplicant; 25.12 then joins open, silently
+		if (mode == "adhoc" && algo != "none" && series == "25.12") { algo = "none"; key = "" }
+		joined = freq && (algo == "none" || ibss_rsn)
+		width = get(id_of(device), "htmode", "NOHT")
+		iw_line = iw_line ifname "\t" mode "\t" mac[ifname] "\t" phy "\t" freq "\t" get(id_of(device), "channel", "0") "\t" width "\t" \
+			(mode == "mesh" ? get(id, "mesh_id", "") : get(id, "ssid", "OpenWrt")) "\t" get(id, "bssid", "00:00:00:00:00:00") "\t" \
+			power(device, path) "\t" (joined ? 1 : 0) "\t" algo "\t" get(id_of(device), "country", "00") "\n"
+		if (joined && (mode == "adhoc" || mode == "mesh")) {
+			cell[ifname] = device "\t" ifname "\t" mode "\t" freq "\t" \
+				(mode == "mesh" ? get(id, "mesh_id", "") "\t-" : get(id, "ssid", "") "\t" get(id, "bssid", "")) "\t" algo "\t" key "\t" mac[ifname]
+			cells[++ncells] = ifname
+		}
+	}
+}
+
+function id_of(device) { return "wireless." device }
+function power(device, path,    asked) { asked = get(id_of(device), "txpower", max_of[path]) + 0; return asked > max_of[path] ? max_of[path] : asked }
+function attach(network, ifname) { attached[network] = attached[network] " " ifname }
+
+# --- devices and interfaces ------------------------------------------------------------------------------------------
+
+# the bridges, their ports, and the devices that exist at all
+function all_devices(    i, n, id, list, name) {
+	n = split(ports, list, " ")
+	for (i = 1; i <= n; i++) { exists[list[i]] = 1; mac[list[i]] = lan_mac; wired[list[i]] = 1; names_of_ports[list[i]] = 1 }
+	exists["lo"] = 1; mac["lo"] = "00:00:00:00:00:00"
+	# bat0 stands as soon as a hard interface's master is configured and the module is there
+	for (i = 1; i <= sections; i++) {
+		id = order[i]
+		if (kind[id] != "network.interface") continue
+		if (get(id, "proto", "none") == "batadv" && batman) {
+			exists[label[id]] = 1; mac[label[id]] = soft_mac(label[id]); is_soft[label[id]] = 1
+			algorithm[label[id]] = get(id, "routing_algo", "BATMAN_IV")
+		}
+	}
+	for (i = 1; i <= sections; i++) {
+		id = order[i]
+		if (kind[id] == "network.device" && get(id, "type", "") == "bridge") make_bridge(get(id, "name", ""), get(id, "ports", get(id, "ifname", "")))
+		if (kind[id] == "network.interface" && get(id, "type", "") == "bridge") {
+			name = "br-" label[id]
+			make_bridge(name, get(id, "ifname", "") attached[label[id]])
+			device_of[id] = name
+		}
+	}
+}
+
+# its own address, as the kernel draws one at random at each creation
+function soft_mac(name) { return "fe" substr(lan_mac, 3) }
+
+function make_bridge(name, members,    n, i, list) {
+	exists[name] = 1; mac[name] = lan_mac; is_bridge[name] = 1
+	n = split(members, list, " ")
+	for (i = 1; i <= n; i++) if (list[i] in exists) { bridge_ports[name] = bridge_ports[name] " " list[i]; bridge_of[list[i]] = name }
+}
+
+function reaches(device, flag,    n, i, list) {
+	if (flag == "soft" ? device in is_soft : device in wired) return 1
+	n = split(bridge_ports[device], list, " ")
+	for (i = 1; i <= n; i++) if (flag == "soft" ? list[i] in is_soft : list[i] in wired) return 1
+	return 0
+}
+
+function interfaces(    i, id, proto, device, n, list, j, ifname, separator, address, mask, line, errors, up) {
+	dump = "{\n\t\"interface\": ["
+	separator = "\n"
+	for (i = 1; i <= sections; i++) {
+		id = order[i]
+		if (kind[id] != "network.interface") continue
+		proto = get(id, "proto", "none")
+		device = id in device_of ? device_of[id] : get(id, "device", get(id, "ifname", ""))
+		sub(/ .*/, "", device)
+		address = ""; errors = ""; up = 0
+		if (proto == "batadv") { device = label[id]; up = batman ? 1 : 0; if (!up) errors = "NO_PROTO_HANDLER" }
+		else if (proto == "batadv_hardif") {
+			ifname = ""
+			for (j = 1; j <= ncells; j++) if (network_of[cells[j]] == label[id]) ifname = cells[j]
+			if (ifname == "" && device in exists) ifname = device
+			if (!batman) errors = "NO_PROTO_HANDLER"
+			else if (ifname != "" && get(id, "master", "") in is_soft) {
+				up = 1; device = ifname
+				master[ifname] = get(id, "master", "")
+				mtu[ifname] = get(id, "mtu", 1500)
+			}
+		} else if (proto == "static") {
+			up = device in exists
+			address = get(id, "ipaddr", ""); mask = get(id, "netmask", "255.255.255.255")
+			sub(/ .*/, "", address)
+			if (address ~ /\//) { mask = address; sub(/.*\//, "", mask); sub(/\/.*/, "", address) }
+		} else up = device in exists
+		if (yes(get(id, "disabled", "0")) || !(get(id, "auto", "1") ~ /1/) || mode == "down") up = 0
+		if (up && address != "") {
+			printf "%s %s/%s\n", device, address, prefix(mask) > (run "/addresses.new")
+			if (label[id] != "loopback")
+				effective = effective "addr\t" label[id] "\t" device "\t" address "\t" prefix(mask) "\t" reaches(device, "soft") "\t" reaches(device, "wired") "\n"
+		}
+		dump = dump separator "\t\t{\n\t\t\t\"interface\": " json(label[id]) ",\n\t\t\t\"up\": " (up ? "true" : "false") \
+			",\n\t\t\t\"pending\": false,\n\t\t\t\"available\": " (up || errors == "" ? "true" : "false") \
+			",\n\t\t\t\"autostart\": true,\n\t\t\t\"dynamic\": false"
+		if (up) dump = dump ",\n\t\t\t\"uptime\": @" now "@,\n\t\t\t\"l3_device\": " json(device)
+		dump = dump ",\n\t\t\t\"proto\": " json(proto)
+		if (device != "") dump = dump ",\n\t\t\t\"device\": " json(device)
+		if (up) dump = dump ",\n\t\t\t\"metric\": 0,\n\t\t\t\"ipv4-address\": [" (address == "" ? "" : \
+			"\n\t\t\t\t{\n\t\t\t\t\t\"address\": " json(address) ",\n\t\t\t\t\t\"mask\": " prefix(mask) "\n\t\t\t\t}\n\t\t\t") "]"
+		if (errors != "") dump = dump ",\n\t\t\t\"errors\": [\n\t\t\t\t{\n\t\t\t\t\t\"subsystem\": \"interface\",\n\t\t\t\t\t\"code\": " json(errors) "\n\t\t\t\t}\n\t\t\t]"
+		dump = dump "\n\t\t}"
+		separator = ",\n"
+	}
+	print dump "\n\t]\n}" > (run "/dump")
+}
+
+function wireless_status(    i, d, text, n, list, j, id, m, k, o, first) {
+	text = "{"
+	for (i = 1; i <= ndevices; i++) {
+		d = devices[i]
+		text = text (i > 1 ? "," : "") "\n\t" json(d) ": {\n\t\t\"up\": " ((d in radio_up) && !mode_down ? "true" : "false") \
+			",\n\t\t\"pending\": false,\n\t\t\"autostart\": " (d in radio_failed ? "false" : "true") \
+			",\n\t\t\"disabled\": " (d in radio_disabled ? "true" : "false") \
+			",\n\t\t\"retry_setup_failed\": " (d in radio_failed ? "true" : "false") ",\n\t\t\"config\": {"
+		text = text options(id_of(d), "\t\t\t", " ") "\n\t\t},\n\t\t\"interfaces\": ["
+		n = split(faces[d], list, " ")
+		first = 1
+		for (j = 1; j <= n; j++) {
+			id = list[j]
+			text = text (first ? "" : ",") "\n\t\t\t{\n\t\t\t\t\"section\": " json(label[id])
+			first = 0
+			if (id in iface_name) text = text ",\n\t\t\t\t\"ifname\": " json(iface_name[id])
+			text = text ",\n\t\t\t\t\"config\": {" options(id, "\t\t\t\t\t", " device ") "\n\t\t\t\t}\n\t\t\t}"
+		}
+		text = text "\n\t\t]\n\t}"
+	}
+	print text "\n}" > (run "/wireless")
+}
+
+# options of a section as JSON members; netifd types the ones it knows
+function options(id, indent, without,    n, list, k, name, value, text, parts, m, j) {
+	n = split(names[id], list, " ")
+	text = ""
+	for (k = 1; k <= n; k++) {
+		name = list[k]
+		if (index(without, " " name " ") || name == "type") continue
+		value = opt[id, name]
+		if (name == "network") {
+			m = split(value, parts, " "); value = "["
+			for (j = 1; j <= m; j++) value = value (j > 1 ? "," : "") "\n" indent "\t" json(parts[j])
+			value = value "\n" indent "]"
+		}
+		else if (name ~ /^(disabled|hidden|isolate|noscan|mesh_fwding)$/) value = yes(value) ? "true" : "false"
+		else if (name ~ /^(txpower|distance|beacon_int|mcast_rate|rts|frag|txantenna|rxantenna)$/ && value ~ /^[0-9]+$/) value = value + 0
+		else value = json(value)
+		text = text (text == "" ? "" : ",") "\n" indent json(name) ": " value
+	}
+	return text
+}
+
+# --- /sys ------------------------------------------------------------------------------------------------------------
+
+function sys_script(    d, file, port, n, i, list, dir) {
+	file = run "/sys"
+	print "cd /sys/class/net || exit 1" > file
+	# what the last call made and this one does not
+	print "for d in *; do case \" lo " ports " \" in *\" $d \"*) ;; *) [ -e '/tmp/run/netifd/has.'\"$d\" ] || rm -rf \"$d\" ;; esac; done" > (run "/sys.end")
+	close(run "/sys.end")
+	printf "rm -f /tmp/run/netifd/has.*\n" > file
+	for (d in exists) {
+		printf ": >/tmp/run/netifd/has.%s\n", d > file
+		printf "[ -d %s ] || mkdir %s\necho %s >%s/address\necho %s >%s/operstate\necho %s >%s/mtu\necho 1 >%s/carrier\n", \
+			d, d, mac[d], d, (d == "lo" ? "unknown" : "up"), d, (d in mtu ? mtu[d] : (d == "lo" ? 65536 : 1500)), d, d > file
+		if (d in is_bridge) {
+			printf "rm -rf %s/brif; mkdir -p %s/bridge %s/brif\necho 0 >%s/bridge/stp_state\n", d, d, d, d > file
+			n = split(bridge_ports[d], list, " ")
+			for (i = 1; i <= n; i++) printf "mkdir %s/brif/%s\n", d, list[i] > file
+		}
+		if (d in is_radio) printf "mkdir -p %s/wireless %s/phy80211\n", d, d > file
+		if (d in is_soft) printf "mkdir -p /sys/module/batman_adv %s/mesh\n", d > file
+		if (d in bridge_of) printf "rm -f %s/master; ln -s ../%s %s/master\n", d, bridge_of[d], d > file
+		else if (d in master) printf "rm -f %s/master; ln -s ../%s %s/master\n", d, master[d], d > file
+		else printf "rm -f %s/master\n", d > file
+	}
+	print ". /tmp/run/netifd/sys.end" > file
+}
+
+END {
+	mode_down = mode != "up"
+	printf "" > (run "/addresses.new")
+	board_radios()
+	radio_interfaces()
+	all_devices()
+	interfaces()
+	wireless_status()
+	printf "%s", iw_line > (run "/iw")
+	for (i = 1; i <= ncells; i++) {
+		effective = effective "cell\t" cell[cells[i]] "\t" (cells[i] in master ? master[cells[i]] "\t" algorithm[master[cells[i]]] : "-\t-") "\n"
+	}
+	printf "%s", effective > (run "/effective")
+	sys_script()
+}

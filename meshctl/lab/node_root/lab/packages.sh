@@ -1,0 +1,62 @@
+# Packages of a virtual node: the database of the release's tool (opkg or apk), and the programs that come with some.
+# Sourced after /lab/node/firmware/env.
+if [ "$PACKAGE_TOOL" = apk ]; then
+	PACKAGE_DB=/lib/apk/db/installed
+else
+	PACKAGE_DB=/usr/lib/opkg/status
+fi
+PACKAGE_TEXT=
+
+# package_put NAME VERSION: its entry is collected in PACKAGE_TEXT, its programs are put in place
+package_put() {
+	if [ "$PACKAGE_TOOL" = apk ]; then
+		PACKAGE_TEXT="${PACKAGE_TEXT}P:$1
+V:$2
+A:$ARCH
+S:1024
+
+"
+	else
+		PACKAGE_TEXT="${PACKAGE_TEXT}Package: $1
+Version: $2
+Depends: libc
+Status: install user installed
+Architecture: $ARCH
+Installed-Time: 1700000000
+
+"
+	fi
+	case $1 in
+	batctl-*) ln -sf /rom/lab/tools.d/batctl /usr/sbin/batctl ;;
+	iw | iw-full) ln -sf /rom/lab/tools.d/iw /usr/sbin/iw ;;
+	opkg) ln -sf /rom/lab/tools.d/opkg /usr/bin/opkg ;;
+	apk-*) ln -sf /rom/lab/tools.d/apk /usr/bin/apk ;;
+	esac
+}
+
+package_write() {
+	mkdir -p "${PACKAGE_DB%/*}"
+	printf %s "$PACKAGE_TEXT" >>$PACKAGE_DB
+	PACKAGE_TEXT=
+}
+
+# package_drop NAME
+package_drop() {
+	awk -v name="$1" -v field="$([ "$PACKAGE_TOOL" = apk ] && echo P: || echo Package:)" '
+		BEGIN { RS = ""; ORS = "\n\n" }
+		{ split($0, line, "\n"); first = line[1]; sub(field " *", "", first); if (first != name) print }
+	' $PACKAGE_DB >$PACKAGE_DB.new && mv -f $PACKAGE_DB.new $PACKAGE_DB
+	case $1 in
+	batctl-*) rm -f /usr/sbin/batctl ;;
+	iw | iw-full) rm -f /usr/sbin/iw ;;
+	esac
+}
+
+# package_version NAME: prints it, 1 when it is not installed
+package_version() {
+	awk -v name="$1" -v p="$([ "$PACKAGE_TOOL" = apk ] && echo P: || echo Package:)" -v v="$([ "$PACKAGE_TOOL" = apk ] && echo V: || echo Version:)" '
+		index($0, p) == 1 { now = substr($0, length(p) + 1); sub(/^ /, "", now) }
+		index($0, v) == 1 && now == name { found = substr($0, length(v) + 1); sub(/^ /, "", found); print found }
+		END { exit found == "" }
+	' $PACKAGE_DB
+}

@@ -1,0 +1,109 @@
+"""From an inventory to its virtual twin: nodes as factory devices, links as a graph, addresses on this machine.
+
+Every management address a.b.c.d appears as 127.b.c.d, all on one port per fleet; a node's LAN port on the bench is
+127.255.0.N, where N counts the nodes from 1. Both refuse connections unless the node would be reached in the field:
+it holds that address, and a path through the mesh (or a wire) leads there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from ipaddress import IPv4Address
+from pathlib import Path
+
+import yaml
+
+from meshctl.errors import InputError
+from meshctl.lab.spec import FleetSpec, LinkSpec, Medium, NodeSpec, RadioSpec
+from meshctl.model import Fleet, Node, Role
+
+FACTORY_ADDRESS = "192.168.1.1"
+# locally administered, so that no real device has it: two bytes of fleet-wide prefix, then the node, then the radio
+_MAC = "02:4d:{:02x}:{:02x}:00:{:02x}"
+
+
+def loopback_of(address: str) -> str:
+    """Where a management address is reached on this machine: 10.42.0.11 -> 127.42.0.11."""
+    return "127." + str(IPv4Address(address)).split(".", 1)[1]
+
+
+def bench_of(number: int) -> str:
+    """Where the LAN port of the `number`-th node (from 0) is reached: 127.255.0.1, 127.255.0.2, ..."""
+    return f"127.255.{(number + 1) // 256}.{(number + 1) % 256}"
+
+
+def spec_of(fleet: Fleet, *, links: Sequence[LinkSpec] | None = None, nodes: int | None = None) -> FleetSpec:
+    """The virtual twin of an inventory: its first `nodes` managed nodes (all by default), fresh from the box.
+
+    Every node stands on the bench; a node with the role `base` is the one the operator sits at. `links` None: a chain in
+    the inventory's order with a bridge over every second node, which has alternatives and ends.
+    """
+    chosen = tuple(fleet.managed())[:nodes]
+    names = [node.name for node in chosen]
+    wanted = default_links(names) if links is None else [one for one in links if one.a in names and one.b in names]
+    return FleetSpec(
+        name=fleet.name,
+        nodes=tuple(_node_spec(node, number) for number, node in enumerate(chosen)),
+        links=tuple(wanted),
+    )
+
+
+def default_links(names: Sequence[str]) -> list[LinkSpec]:
+    """A chain, and a weaker link past every second node."""
+    chain = [LinkSpec(a, b, tq=250, signal_dbm=-58) for a, b in zip(names, names[1:], strict=False)]
+    past = [LinkSpec(a, b, tq=120, signal_dbm=-79) for a, b in list(zip(names, names[2:], strict=False))[::2]]
+    return chain + past
+
+
+def load_links(path: Path) -> list[LinkSpec]:
+    """Links from a YAML file: a list of `{between: [A, B], tq: 250, signal_dbm: -58, delay_ms: 5, loss: 0.01, ...}`.
+
+    Raises InputError naming the file and the entry.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from error
+    entries = content.get("links") if isinstance(content, dict) else None
+    if not isinstance(entries, list):
+        raise InputError(f"{path}: expected a mapping with the list `links`")
+    return [_link(path, number, entry) for number, entry in enumerate(entries, 1)]
+
+
+def _link(path: Path, number: int, entry: object) -> LinkSpec:
+    match entry:
+        case {"between": [str(a), str(b)], **rest}:
+            try:
+                return LinkSpec(a, b, **rest)
+            except TypeError as error:
+                raise InputError(f"{path}: link {number} ({a}-{b}): {error}") from error
+        case _:
+            raise InputError(f"{path}: link {number}: expected `between: [A, B]`, found {entry!r}")
+
+
+def _node_spec(node: Node, number: int) -> NodeSpec:
+    hardware = node.hardware
+    radios = tuple(
+        RadioSpec(
+            name=radio.name,
+            path=radio.hardware.path,
+            band=radio.hardware.band.value,
+            mac=radio.mac or _MAC.format(number // 256, number % 256, 16 + place),
+            max_tx_power_dbm=radio.hardware.max_drive_dbm,
+        )
+        for place, radio in enumerate(node.radios)
+    )
+    return NodeSpec(
+        name=node.name,
+        board=hardware.board,
+        model=hardware.name,
+        target=hardware.target,
+        release=node.release,
+        packages=tuple(dict.fromkeys((*NodeSpec.__dataclass_fields__["packages"].default, *hardware.packages))),
+        radios=radios,
+        lan_ports=hardware.lan_ports or node.lan_ports,
+        mac=node.mac or _MAC.format(number // 256, number % 256, 0),
+        medium=Medium.BASE if node.role is Role.BASE else Medium.BENCH,
+        overlay_kib=max(1024, hardware.flash_mib * 1024 // 2),
+        memory_kib=hardware.memory_mib * 1024,
+    )
