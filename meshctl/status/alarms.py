@@ -1,0 +1,145 @@
+"""What is wrong with a node that answers: one small function per concern, each gives the alarms it sees.
+
+A node's state decides what is expected of it: a carried beacon need not hear anybody, a deployed one must.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from meshctl.device.observation import Observation
+from meshctl.model import Fleet, Node, NodeState
+from meshctl.plan import NodePlan, Verdict
+from meshctl.status.values import Alarm, Level, Neighbour
+from meshctl.topology import Path
+
+# below this the path loses more than it carries: move a beacon
+WEAK_QUALITY = 0.3
+# below this a reload or an upgrade may be killed by the kernel
+LOW_MEMORY_SHARE = 0.1
+# the dead-man's switch keeps the previous state in flash: about this much with headroom
+LOW_FLASH_BYTES = 256 * 1024
+# radios have no clock of their own and no NTP in a mine: only what breaks logs and certificates matters
+CLOCK_TOLERANCE_S = 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """Everything known about one node that answers."""
+
+    fleet: Fleet
+    node: Node
+    observation: Observation
+    plan: NodePlan | None
+    neighbours: tuple[Neighbour, ...]
+    path: Path | None
+    cuts_off: tuple[str, ...]
+    seconds_since_last_known: float | None
+    """Time between the last look, if any, and this one."""
+    own_lock: str
+
+    @property
+    def must_mesh(self) -> bool:
+        """Whether it should be part of its mesh now: deployed, and not the only one."""
+        others = (n for mesh in self.node.meshes for n in self.fleet.members(mesh) if n.name != self.node.name)
+        return self.node.state is NodeState.DEPLOYED and any(n.state is NodeState.DEPLOYED for n in others)
+
+
+def alarms(seen: Seen) -> tuple[Alarm, ...]:
+    """All alarms of a node, the worst first."""
+    found = [alarm for concern in _CONCERNS for alarm in concern(seen)]
+    return tuple(sorted(found, key=lambda alarm: -alarm.level))
+
+
+def _identity(seen: Seen) -> Iterator[Alarm]:
+    board = seen.observation.board
+    if board is not None and board.board_name and board.board_name != seen.node.hardware.board:
+        yield Alarm(Level.ERROR, "board", f"is a {board.board_name}, the inventory says {seen.node.hardware.board}")
+
+
+def _drift(seen: Seen) -> Iterator[Alarm]:
+    plan = seen.plan
+    if plan is None:
+        return
+    if plan.verdict is Verdict.REFUSED:
+        yield Alarm(Level.ERROR, "refused", plan.reason)
+    if plan.firmware is not None:
+        told = f"{plan.firmware.from_revision or 'unknown'}, the inventory says {plan.firmware.to_revision}"
+        yield Alarm(Level.WARNING, "firmware", f"firmware {told}")
+    if plan.packages is not None:
+        yield Alarm(Level.WARNING, "packages", f"packages missing: {', '.join(plan.packages.install)}")
+    if plan.files:
+        names = ", ".join(change.path.removeprefix("etc/config/") for change in plan.files)
+        yield Alarm(Level.WARNING, "drift", f"configuration differs: {names}")
+
+
+def _radios(seen: Seen) -> Iterator[Alarm]:
+    wanted = {radio.name for radio in seen.node.radios if radio.mesh is not None}
+    for radio in seen.observation.radios or ():
+        if radio.name in wanted and (not radio.up or radio.setup_failed):
+            why = "setup failed" if radio.setup_failed else "disabled" if radio.disabled else "down"
+            yield Alarm(Level.ERROR, "radio", f"{radio.name} is {why}")
+    for link in seen.observation.links or ():
+        if link.mode.upper() == "IBSS" and link.joined is False:
+            yield Alarm(Level.ERROR, "join", f"{link.ifname} has joined no cell")
+
+
+def _mesh(seen: Seen) -> Iterator[Alarm]:
+    if seen.must_mesh and not seen.neighbours:
+        yield Alarm(Level.ERROR, "alone", "hears no other node")
+    elif seen.path is not None and seen.path.hops and seen.path.quality < WEAK_QUALITY:
+        yield Alarm(
+            Level.WARNING, "weak", f"path to the base carries {seen.path.quality:.0%} over {seen.path.hops} hops"
+        )
+    if seen.cuts_off and seen.node.state is NodeState.DEPLOYED:
+        yield Alarm(Level.NOTE, "cut-vertex", f"without it {', '.join(seen.cuts_off)} would be cut off")
+
+
+def _resources(seen: Seen) -> Iterator[Alarm]:
+    memory, flash = seen.observation.memory, seen.observation.overlay
+    if memory is not None and memory.total and memory.available / memory.total < LOW_MEMORY_SHARE:
+        yield Alarm(Level.WARNING, "memory", f"{memory.available / 2**20:.1f} MiB of memory left")
+    if flash is not None and flash.free < LOW_FLASH_BYTES:
+        yield Alarm(Level.WARNING, "flash", f"{flash.free // 1024} KiB of flash left")
+
+
+def _changes(seen: Seen) -> Iterator[Alarm]:
+    change = seen.observation.change
+    if change is not None and change.state not in ("idle", "", "unknown"):
+        left = "" if change.left_s is None else f", {change.left_s:.0f} s left"
+        yield Alarm(Level.WARNING, "change", f"a change by {change.owner or 'somebody'} is {change.state}{left}")
+    if change is not None and change.lock_owner and change.lock_owner != seen.own_lock:
+        yield Alarm(Level.NOTE, "locked", f"locked by {change.lock_owner}")
+    if seen.observation.uci_changes:
+        count = len(seen.observation.uci_changes)
+        yield Alarm(Level.WARNING, "foreign", f"{count} uncommitted UCI change{'s' if count > 1 else ''} by hand")
+
+
+def _time(seen: Seen) -> Iterator[Alarm]:
+    offset_s, uptime_s = seen.observation.clock_offset_s, seen.observation.uptime_s
+    if offset_s is not None and abs(offset_s) > CLOCK_TOLERANCE_S:
+        yield Alarm(Level.NOTE, "clock", f"its clock is off by {duration(abs(offset_s))}")
+    since_s = seen.seconds_since_last_known
+    if uptime_s is not None and since_s is not None and uptime_s < since_s:
+        yield Alarm(Level.NOTE, "rebooted", f"rebooted {duration(uptime_s)} ago")
+
+
+_CONCERNS: tuple[Callable[[Seen], Iterator[Alarm]], ...] = (
+    _identity,
+    _drift,
+    _radios,
+    _mesh,
+    _resources,
+    _changes,
+    _time,
+)
+
+
+def duration(seconds: float) -> str:
+    """`4 s`, `12 min`, `3.5 h`, `2 d`, `3 years`: as short as a table's cell wants it."""
+    for limit, unit_s, unit in ((120, 1, "s"), (7200, 60, "min"), (172800, 3600, "h"), (63072000, 86400, "d")):
+        if seconds < limit:
+            value = seconds / unit_s
+            return f"{value:.1f} {unit}" if unit == "h" and value < 10 else f"{value:.0f} {unit}"
+    return f"{seconds / 31536000:.0f} years"
