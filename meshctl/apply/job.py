@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -19,7 +19,8 @@ from meshctl.plan import NodePlan, Wanted
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """What all nodes of a run share. `owner` names this process to the locks on the nodes."""
+    """What all nodes of a run share. `owner` names this process to the locks on the nodes; `remember` keeps what a
+    node told, for later."""
 
     fleet: Fleet
     access: Access
@@ -27,6 +28,7 @@ class Work:
     observer: Observer
     interrupt: Interrupt
     owner: str
+    remember: Callable[[str, Observation], None] = lambda name, seen: None
     rate_bytes_per_s: float | None = None
 
     def note(self, text: str, node: str = "") -> None:

@@ -36,29 +36,30 @@ def next_move(
     *,
     is_at_new_address: bool,
     leaving: bool = False,
+    is_given_up: bool = False,
 ) -> Move:
     """The next move for change `change_id`. `missing` is what has not come back yet (only counts once applied);
-    `is_at_new_address` whether the answer came from where the node shall be; `leaving` that nobody will wait."""
+    `is_at_new_address` whether the answer came from where the node shall be; `leaving` that nobody will wait;
+    `is_given_up` that the change is not wanted any more, whatever it proves."""
+    start = Move.WENT_BACK if is_given_up else Move.START
     if not status.installed:
-        return Move.START
+        return start
     if status.change_id == change_id:
         match status.state:
-            case "staged":
-                return Move.START
-            case "armed":
-                # staged and armed, and the connection broke before it was told when to begin
-                return Move.START
-            case "waiting" | "restoring":
-                return Move.WAIT
+            case "staged" | "armed":
+                # armed, and the connection broke before it was told when to begin
+                return Move.ABORT if is_given_up else Move.START
             case "applied":
+                if is_given_up:
+                    return Move.ABORT
                 return _applied(status, missing, is_at_new_address=is_at_new_address, leaving=leaving)
             case _:
-                return Move.WAIT
+                return Move.ABORT if is_given_up and status.state == "waiting" else Move.WAIT
     if status.last_id == change_id:
         return Move.KEPT if status.last_outcome == "confirmed" else Move.WENT_BACK
     if status.state in ("armed", "waiting", "applied", "restoring"):
         return Move.FOREIGN
-    return Move.START
+    return start
 
 
 def _applied(status: ChangeStatus, missing: Sequence[str], *, is_at_new_address: bool, leaving: bool) -> Move:

@@ -1,0 +1,166 @@
+"""A change under way on one node: sending it, beginning it, finding the node again, looking, confirming.
+
+`prepare` (install the switch, lock, stage, arm) and `begin` go over the connection at hand; from then on each look is
+over a new connection (`reach`, `look`), and `confirm` opens one of its own. Each verb may be repeated after a cut.
+"""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from dataclasses import dataclass
+
+from meshctl.apply.change import change_of, new_change_id, new_nonce, services_of
+from meshctl.apply.checks import missing
+from meshctl.apply.job import Job
+from meshctl.apply.settle import Move, applied_age_s, next_move
+from meshctl.device import deadman
+from meshctl.device.connection import Endpoint
+from meshctl.device.deadman import Change
+from meshctl.device.errors import NodeRefused
+from meshctl.device.observation import ChangeStatus, Observation
+from meshctl.device.observe import observe
+from meshctl.device.ssh import SshConnection
+from meshctl.errors import NodeError
+from meshctl.model import Secret
+from meshctl.plan import Cut
+
+# A lock outlives its change by this much, for the moves after it.
+LOCK_SLACK_S = 60
+# reload_config returns before netifd has begun: procd gathers events for 1 s, then interfaces go down and come up.
+SETTLE_S = 3.0
+ABSENT = ChangeStatus("absent", installed=False)
+
+
+@dataclass(slots=True)
+class Attempt:
+    """One change. `gaps` is what was still missing when the node was last seen (`last`), `trouble` why it was not."""
+
+    job: Job
+    change: Change
+    nonce: Secret
+    window_s: int
+    old: Endpoint
+    new: Endpoint
+    starts: int = 0
+    gaps: tuple[str, ...] = ()
+    last: Observation | None = None
+    trouble: str = ""
+    # decided against: from now on it is only ever taken back
+    is_given_up: bool = False
+
+    @property
+    def id(self) -> str:
+        return self.change.change_id
+
+    @property
+    def status(self) -> ChangeStatus:
+        """What the node's switch said when it was last seen."""
+        return ABSENT if self.last is None else self.last.change or ABSENT
+
+    @property
+    def settle_s(self) -> float:
+        """How long the change has to stand before what is seen counts as its effect."""
+        return SETTLE_S if self.job.plan.cut > Cut.LOGIN else 0.0
+
+
+def attempt_of(job: Job, old: Endpoint, *, window_s: int | None = None) -> Attempt:
+    """A new change for a node that is reached at `old` now."""
+    services = services_of(job.work.fleet, job.node)
+    return Attempt(
+        job,
+        change_of(new_change_id(), job.plan, job.wanted, job.before, services),
+        new_nonce(),
+        window_s or job.node.confirm_window_s,
+        old,
+        job.work.access.endpoint(job.node),
+    )
+
+
+def prepare(attempt: Attempt, connection: SshConnection) -> None:
+    """Bring the change there and arm it; nothing it touches has changed yet. Raises NodeRefused, NodeError."""
+    job, owner = attempt.job, attempt.job.work.owner
+    attempt.starts += 1
+    with job.step("stage"):
+        _install(job, connection)
+        deadman.lock(connection, owner, ttl_s=attempt.window_s + LOCK_SLACK_S)
+        deadman.stage(
+            connection, owner, attempt.change, rate_bytes_per_s=job.work.rate_bytes_per_s, progress=job.progress
+        )
+    with job.step("arm"):
+        deadman.arm(connection, owner, attempt.id, nonce=attempt.nonce, window_s=attempt.window_s)
+
+
+def _install(job: Job, connection: SshConnection) -> None:
+    """Put the switch there unless this very version already is."""
+    known = job.before.change
+    own = re.search(rb"^VERSION=(\S+)", deadman.installed_files()[deadman.PROGRAM][1], re.MULTILINE)
+    if known is None or not known.installed or own is None or known.version != own[1].decode():
+        deadman.install(connection)
+
+
+def begin(attempt: Attempt, connection: SshConnection, *, at_uptime_s: float | None = None) -> None:
+    """Have the node begin: now, or when its own uptime reaches `at_uptime_s`."""
+    with attempt.job.step("apply"):
+        deadman.apply(connection, attempt.job.work.owner, attempt.id, at_uptime_s=at_uptime_s)
+
+
+def reach(attempt: Attempt) -> SshConnection | None:
+    """A new connection to where the node shall be, or else to where it was."""
+    job = attempt.job
+    for endpoint in dict.fromkeys((attempt.new, attempt.old)):
+        try:
+            return job.work.access.open(job.node, endpoint=endpoint)
+        except NodeError as error:
+            attempt.trouble = str(error)
+    return None
+
+
+def look(attempt: Attempt, connection: SshConnection) -> Move:
+    """Observe the node once and say what is next. Raises Unreachable."""
+    job = attempt.job
+    attempt.last = observe(connection)
+    age_s = applied_age_s(attempt.status)
+    attempt.gaps = missing(job.expected, attempt.last, since_s=age_s)
+    if age_s is not None and age_s < attempt.settle_s:
+        attempt.gaps = (*attempt.gaps, "it has not settled yet")
+    return next_move(
+        attempt.id,
+        attempt.status,
+        attempt.gaps,
+        is_at_new_address=connection.endpoint == attempt.new,
+        leaving=job.work.interrupt.leaving,
+        is_given_up=attempt.is_given_up,
+    )
+
+
+def confirm(attempt: Attempt) -> bool:
+    """Confirm over a connection opened only now: that it lets us in after the change is the proof.
+
+    False when the window had run out on the way. Raises Unreachable.
+    """
+    job = attempt.job
+    connection = job.work.access.open(job.node, endpoint=attempt.new)
+    try:
+        deadman.confirm(connection, attempt.id, nonce=attempt.nonce)
+        release(attempt, connection)
+    except NodeRefused:
+        connection.close()
+        return False
+    except BaseException:
+        connection.close()
+        raise
+    job.work.access.keep(job.name, connection)
+    return True
+
+
+def release(attempt: Attempt, connection: SshConnection) -> None:
+    """Give the lock back; that it cannot be (it runs out by itself) changes nothing about the outcome."""
+    with suppress(NodeError):
+        deadman.unlock(connection, attempt.job.work.owner)
+
+
+def take_back(attempt: Attempt, connection: SshConnection) -> None:
+    """Have the node undo the change now. What the node refuses it will tell in its next status."""
+    with suppress(NodeRefused):
+        deadman.abort(connection, attempt.job.work.owner, attempt.id)

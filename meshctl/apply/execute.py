@@ -1,0 +1,222 @@
+"""Carry out a plan, stage by stage: every node of it ends with exactly one outcome, in the journal as it happens.
+
+`carry_out` runs each stage's nodes together (`_one_node`: packages, then firmware or files), a switch as one. A failed
+canary, a spent failure budget or Ctrl-C stops what has not begun; what is in work comes to its own end.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from meshctl.apply.access import Access
+from meshctl.apply.checks import expectation
+from meshctl.apply.flash import checked_image, flash
+from meshctl.apply.gather import facts_of
+from meshctl.apply.job import Job, Work
+from meshctl.apply.node import configure
+from meshctl.apply.packages import install
+from meshctl.apply.planning import Prepared, base_macs
+from meshctl.apply.switch import switch
+from meshctl.device.observation import Observation
+from meshctl.errors import NodeError
+from meshctl.fleet import (
+    Event,
+    EventKind,
+    FailureBudget,
+    Interrupt,
+    Observer,
+    Outcome,
+    Result,
+    Tee,
+    outcome_of_error,
+    run,
+)
+from meshctl.fleet.journal import Journal, Run
+from meshctl.model import Fleet, NodeState
+from meshctl.plan import NodePlan, Plan, Stage, StageKind, Verdict
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Where and for whom a plan is carried out."""
+
+    fleet: Fleet
+    access: Access
+    journal: Journal
+    run: Run
+    owner: str
+    interrupt: Interrupt
+    observer: Observer
+    rate_bytes_per_s: float | None = None
+
+
+def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
+    """Apply the plan. Raises InputError and InvalidInput before anything is changed: an image or package file that is
+    not what the inventory says."""
+    plan, fleet = prepared.plan, setting.fleet
+    images = {
+        node.hardware.name: checked_image(node.hardware)
+        for node in (fleet.nodes[name] for name, planned in plan.nodes.items() if planned.firmware is not None)
+    }
+    work = Work(
+        fleet,
+        setting.access,
+        setting.run,
+        setting.observer,
+        setting.interrupt,
+        setting.owner,
+        remember=lambda name, seen: setting.journal.remember(fleet.name, name, facts_of(seen), seen.answered_at_s),
+        rate_bytes_per_s=setting.rate_bytes_per_s,
+    )
+    outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _without_work(fleet, made))}
+    for outcome in outcomes.values():
+        _tell(setting, outcome)
+    jobs = _jobs(prepared, work, setting.journal)
+    budget = FailureBudget(fleet.apply.stop_after_failures)
+    stopped = ""
+    for stage in plan.stages:
+        reason = stopped or ("interrupted before its turn" if setting.interrupt.stopping else "")
+        if reason:
+            ended = {name: Outcome(name, Result.PENDING, reason) for name in stage.nodes}
+            for outcome in ended.values():
+                _tell(setting, outcome)
+        else:
+            ended = _stage(stage, jobs, plan, work, setting, budget, images)
+        outcomes.update(ended)
+        if stage.kind is StageKind.CANARY and any(outcome.result.is_failure for outcome in ended.values()):
+            stopped = f"stopped: the canary {stage.nodes[0]} failed"
+        elif budget.spent:
+            stopped = budget.reason
+    return {name: outcomes[name] for name in plan.nodes}
+
+
+def _tell(setting: Setting, outcome: Outcome) -> None:
+    setting.run.finish_node(outcome)
+    setting.observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
+
+
+def _without_work(fleet: Fleet, plan: NodePlan) -> Outcome | None:
+    """The outcome of a node that nothing is done to; None for one that is changed."""
+    match plan.verdict:
+        case Verdict.SAME:
+            return Outcome(plan.node, Result.UNCHANGED)
+        case Verdict.REFUSED:
+            return Outcome(plan.node, Result.REFUSED, plan.reason, hint=plan.hint)
+        case Verdict.AWAY:
+            must_answer = fleet.nodes[plan.node].state is NodeState.DEPLOYED
+            return Outcome(plan.node, Result.UNREACHABLE if must_answer else Result.PENDING, plan.reason)
+        case Verdict.CHANGE:
+            return None
+
+
+def _jobs(prepared: Prepared, work: Work, journal: Journal) -> dict[str, Job]:
+    seen: Mapping[str, Observation] = prepared.seen.observations
+    bases = base_macs(work.fleet, seen, journal.last_known(work.fleet.name))
+    return {
+        name: Job(
+            work,
+            work.fleet.nodes[name],
+            plan,
+            prepared.wanted[name],
+            seen[name],
+            expectation(prepared.wanted[name], seen[name], bases),
+        )
+        for name, plan in prepared.plan.nodes.items()
+        if plan.verdict is Verdict.CHANGE
+    }
+
+
+def _stage(
+    stage: Stage,
+    jobs: Mapping[str, Job],
+    plan: Plan,
+    work: Work,
+    setting: Setting,
+    budget: FailureBudget,
+    images: Mapping[str, Path],
+) -> dict[str, Outcome]:
+    policy = work.fleet.apply
+    observer = Tee((_journaling(setting.run), setting.observer))
+    if stage.kind is StageKind.SWITCH:
+        ended = _switch_stage(stage, jobs, plan, work, observer)
+        for outcome in ended.values():
+            budget.count(outcome)
+        return ended
+    parallel = policy.parallel if stage.kind is StageKind.FREE else len(stage.nodes)
+    return run(
+        stage.nodes,
+        lambda name: _one_node(jobs[name], images),
+        parallel=max(1, parallel),
+        budget=budget,
+        interrupt=setting.interrupt,
+        observer=observer,
+    )
+
+
+def _journaling(journal_run: Run) -> Observer:
+    def write(event: Event) -> None:
+        if event.outcome is not None:
+            journal_run.finish_node(event.outcome)
+
+    return write
+
+
+def _one_node(job: Job, images: Mapping[str, Path]) -> Outcome:
+    """Packages, then firmware or files. NodeError means that nothing (or no more than packages) was changed."""
+    access = job.work.access
+    connection = access.take(job.name) or access.open(job.node)
+    try:
+        if job.plan.packages is not None and job.plan.firmware is None:
+            install(job, connection, job.plan.packages)
+        if job.plan.firmware is None and not job.plan.files:
+            access.keep(job.name, connection)
+            return Outcome(job.name, Result.DONE)
+    except BaseException:
+        connection.close()
+        raise
+    if job.plan.firmware is not None:
+        return flash(job, connection, images[job.node.hardware.name])
+    return configure(job, connection)
+
+
+def _switch_stage(
+    stage: Stage, jobs: Mapping[str, Job], plan: Plan, work: Work, observer: Observer
+) -> dict[str, Outcome]:
+    """Packages first, which cut nothing; then everybody at one moment."""
+    began = time.monotonic()
+    for name in stage.nodes:
+        observer(Event(EventKind.STARTED, name, time.time()))
+    failed = _packages_first(stage, jobs)
+    if failed:
+        reason = f"the switch was called off: {', '.join(failed)} was not ready"
+        ended = {name: failed.get(name) or Outcome(name, Result.PENDING, reason) for name in stage.nodes}
+    else:
+        ended = switch(
+            work,
+            [jobs[name] for name in stage.nodes],
+            quorum=work.fleet.apply.quorum,
+            parallel=work.fleet.apply.parallel,
+            entry=plan.entry,
+        )
+    took_s = round(time.monotonic() - began, 3)
+    told = {name: replace(outcome, duration_s=took_s) for name, outcome in ended.items()}
+    for outcome in told.values():
+        observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
+    return told
+
+
+def _packages_first(stage: Stage, jobs: Mapping[str, Job]) -> dict[str, Outcome]:
+    failed: dict[str, Outcome] = {}
+    for name in stage.nodes:
+        step = jobs[name].plan.packages
+        if step is None:
+            continue
+        try:
+            with jobs[name].work.access.lease(jobs[name].node) as connection:
+                install(jobs[name], connection, step)
+        except NodeError as error:
+            failed[name] = outcome_of_error(name, error)
+    return failed
