@@ -22,11 +22,10 @@ from meshctl.render import (
     NodeChange,
     NodeDifference,
     Rendered,
-    Templates,
     compare_fleets,
     folder_files,
     image_folders,
-    render_node,
+    render_nodes,
     write_folder,
     write_node,
 )
@@ -48,10 +47,8 @@ def render(
     Example: meshctl render 'husky1-*' --out build/
     """
     fleet = load_fleet(inventory, environ=os.environ)
-    secrets = _secrets(fleet)
-    templates = Templates.of(fleet)
     # all of them before anything is written: a fleet is rendered whole or not at all
-    rendered = [render_node(fleet, name, secrets, templates) for name in _chosen(fleet, nodes or [])]
+    rendered = render_nodes(fleet, _chosen(fleet, nodes or []), _secrets(fleet))
     folders = {item.node: write_node(item, out) for item in rendered} if out is not None else {}
     builds = (
         [(item, _write_build(item, imagebuilder)) for item in image_folders(fleet, rendered)] if imagebuilder else []
@@ -92,7 +89,7 @@ def _write_build(folder: ImageFolder, out: Path) -> Path:
 
 
 def _report(
-    rendered: list[Rendered], folders: dict[str, Path], builds: list[tuple[ImageFolder, Path]]
+    rendered: Iterable[Rendered], folders: dict[str, Path], builds: list[tuple[ImageFolder, Path]]
 ) -> dict[str, Any]:
     return {
         "nodes": [

@@ -9,7 +9,7 @@ from meshctl.render.compare import (
     compare_nodes,
 )
 from meshctl.render.imagebuilder import ImageFolder, folder_files, image_folders
-from meshctl.render.node import DeviceFacts, UnknownNode, render, render_fleet, render_node
+from meshctl.render.node import DeviceFacts, UnknownNode, render, render_fleet, render_node, render_nodes
 from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, RenderedFile
 from meshctl.render.templates import Templates
 from meshctl.render.write import write_folder, write_node
@@ -34,6 +34,7 @@ __all__ = [
     "render",
     "render_fleet",
     "render_node",
+    "render_nodes",
     "write_folder",
     "write_node",
 ]

@@ -7,7 +7,7 @@ our UCI parser, and looks the same however its template is laid out.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -37,6 +37,23 @@ def render_fleet(
     """Every managed node in the inventory's order, one at a time. Raises InvalidInput."""
     shared = templates if templates is not None else Templates.of(fleet)
     return (render(resolve(fleet, node, secrets), shared) for node in fleet.managed())
+
+
+def render_nodes(
+    fleet: Fleet, names: Iterable[str], secrets: Callable[[SecretRef], Secret], templates: Templates | None = None
+) -> tuple[Rendered, ...]:
+    """The nodes named, all or none: raises InvalidInput with what is wrong with any of them, each thing once."""
+    shared = templates if templates is not None else Templates.of(fleet)
+    rendered = []
+    problems: dict[Diagnostic, None] = {}
+    for name in names:
+        try:
+            rendered.append(render_node(fleet, name, secrets, shared))
+        except InvalidInput as error:
+            problems.update(dict.fromkeys(error.diagnostics))
+    if problems:
+        raise InvalidInput(problems)
+    return tuple(rendered)
 
 
 def render_node(
