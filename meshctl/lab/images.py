@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Mapping
 
 from meshctl.lab.releases import ARCH, facts, firmware_text
+from meshctl.lab.spec import MESH_PACKAGES
 from meshctl.model import Release
 
 # fwtool: magic, CRC-32 without the final inversion, type (1: metadata), size of payload and trailer
@@ -27,7 +28,7 @@ def firmware_image(
     release: Release,
     *,
     board: str,
-    packages: tuple[str, ...] = ("kmod-batman-adv", "batctl-default", "wpad-openssl"),
+    packages: tuple[str, ...] = MESH_PACKAGES,
     target: str = "ath79/generic",
     compat_version: str = "1.0",
     size_bytes: int = 256 * 1024,

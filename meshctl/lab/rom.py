@@ -19,116 +19,9 @@ from meshctl.lab.errors import LabError
 
 STAND_INS = Path(__file__).resolve().parent / "node_root"
 
-# busybox applets of an OpenWrt image (package/utils/busybox/Config-defaults.in of 19.07 to 24.10), as far as they
-# exist here; what OpenWrt has from other packages or what a stand-in replaces is not among them
-APPLETS = [
-    "[",
-    "[[",
-    "ash",
-    "awk",
-    "basename",
-    "brctl",
-    "bunzip2",
-    "bzcat",
-    "cat",
-    "chgrp",
-    "chmod",
-    "chown",
-    "chroot",
-    "clear",
-    "cmp",
-    "cp",
-    "crond",
-    "crontab",
-    "cut",
-    "dd",
-    "df",
-    "dirname",
-    "dmesg",
-    "du",
-    "echo",
-    "egrep",
-    "env",
-    "expr",
-    "false",
-    "fgrep",
-    "find",
-    "free",
-    "grep",
-    "gunzip",
-    "gzip",
-    "head",
-    "hexdump",
-    "id",
-    "ifconfig",
-    "ip",
-    "kill",
-    "killall",
-    "less",
-    "ln",
-    "login",
-    "ls",
-    "lsmod",
-    "md5sum",
-    "mkdir",
-    "mkfifo",
-    "mknod",
-    "mktemp",
-    "mount",
-    "mv",
-    "nc",
-    "netstat",
-    "nice",
-    "nslookup",
-    "passwd",
-    "pidof",
-    "ping",
-    "ping6",
-    "pivot_root",
-    "printf",
-    "ps",
-    "pwd",
-    "readlink",
-    "renice",
-    "reset",
-    "rm",
-    "rmdir",
-    "route",
-    "sed",
-    "seq",
-    "sh",
-    "sha256sum",
-    "sleep",
-    "sort",
-    "start-stop-daemon",
-    "strings",
-    "switch_root",
-    "sysctl",
-    "tail",
-    "tar",
-    "tee",
-    "test",
-    "time",
-    "top",
-    "touch",
-    "tr",
-    "traceroute",
-    "true",
-    "udhcpc",
-    "umount",
-    "uname",
-    "uniq",
-    "uptime",
-    "vi",
-    "wc",
-    "wget",
-    "which",
-    "xargs",
-    "yes",
-    "zcat",
-]
 # applets that stand-ins replace: the fleet's busybox must not answer to these names
 _REPLACED = frozenset({"date", "sync", "fsync", "reboot", "poweroff", "halt", "logread", "logger", "sh", "ash"})
+_APPLETS = STAND_INS / "lab" / "applets"
 _SEARCH_PATHS = ("/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin")
 
 
@@ -188,9 +81,10 @@ def _install_busybox(busybox: Path, rom: Path) -> None:
         program.parent.mkdir()
     # for the stand-ins themselves
     shutil.copy2(busybox, genuine)
+    applets = _applets()
     if _is_standalone(busybox):
         shell.write_bytes(without_applets(image, names, set(names) - {"ash", "sh"}, keep=("ash", "sh")))
-        keep = tuple(name for name in APPLETS if name not in _REPLACED)
+        keep = tuple(name for name in applets if name not in _REPLACED)
         tools.write_bytes(without_applets(image, names, _REPLACED, keep=keep))
     else:
         shutil.copy2(busybox, shell)
@@ -200,12 +94,17 @@ def _install_busybox(busybox: Path, rom: Path) -> None:
     if _is_standalone(shell):
         raise LabError(f"the shell of {busybox} runs its own applets whatever PATH says", hint="install busybox-static")
     present = set(names)
-    for name in APPLETS:
+    for name in applets:
         use = "shell" if name in ("sh", "ash") else "tools"
         link = rom / "bin" / name
         if name in present and not link.exists() and not any((rom / d / name).exists() for d in ("sbin", "usr/sbin")):
             link.symlink_to(f"/rom/lab/{use}/busybox")
     (rom / "bin" / "busybox").symlink_to("/rom/lab/tools/busybox")
+
+
+def _applets() -> list[str]:
+    lines = _APPLETS.read_text(encoding="utf-8").splitlines()
+    return [name for line in lines if not line.startswith("#") for name in line.split()]
 
 
 def _is_standalone(shell: Path) -> bool:

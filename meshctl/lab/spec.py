@@ -14,6 +14,9 @@ from typing import Any
 from meshctl.errors import InputError
 from meshctl.model import Release
 
+# what an image needs to take part in an encrypted mesh (openwrt-facts.md section 10)
+MESH_PACKAGES = ("kmod-batman-adv", "batctl-default", "wpad-openssl")
+
 
 class Medium(Enum):
     """How the operator's machine is wired to a node's LAN port."""
@@ -53,7 +56,7 @@ class NodeSpec:
     model: str = "Compex WPJ344 (16MB flash)"
     target: str = "ath79/generic"
     release: Release = Release.V23_05
-    packages: tuple[str, ...] = ("kmod-batman-adv", "batctl-default", "wpad-openssl")
+    packages: tuple[str, ...] = MESH_PACKAGES
     radios: tuple[RadioSpec, ...] = (RadioSpec(),)
     lan_ports: tuple[str, ...] = ("eth0",)
     mac: str = ""

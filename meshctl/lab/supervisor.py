@@ -63,8 +63,8 @@ class Supervisor:
         loop.add_reader(self._warden, self._warden_event)
         bell = os.open(self.directory / "bell", os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
         loop.add_reader(bell, self._bell, bell)
-        for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, self.stopping.set)
+        for ending in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(ending, self.stopping.set)
         self.doors.open()
         for number, node in enumerate(self.spec.nodes):
             self._make(number)

@@ -7,14 +7,16 @@ it holds that address, and a path through the mesh (or a wire) leads there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from ipaddress import IPv4Address
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from meshctl.errors import InputError
-from meshctl.lab.spec import FleetSpec, LinkSpec, Medium, NodeSpec, RadioSpec
+from meshctl.lab.spec import MESH_PACKAGES, FleetSpec, LinkSpec, Medium, NodeSpec, RadioSpec
 from meshctl.model import Fleet, Node, Role
 
 FACTORY_ADDRESS = "192.168.1.1"
@@ -35,8 +37,8 @@ def bench_of(number: int) -> str:
 def spec_of(fleet: Fleet, *, links: Sequence[LinkSpec] | None = None, nodes: int | None = None) -> FleetSpec:
     """The virtual twin of an inventory: its first `nodes` managed nodes (all by default), fresh from the box.
 
-    Every node stands on the bench; a node with the role `base` is the one the operator sits at. `links` None: a chain in
-    the inventory's order with a bridge over every second node, which has alternatives and ends.
+    Every node stands on the bench; a node with the role `base` is the one the operator sits at. `links` None: a chain
+    in the inventory's order, and weaker links past every second node, so that there are ends and alternatives.
     """
     chosen = tuple(fleet.managed())[:nodes]
     names = [node.name for node in chosen]
@@ -50,7 +52,7 @@ def spec_of(fleet: Fleet, *, links: Sequence[LinkSpec] | None = None, nodes: int
 
 def default_links(names: Sequence[str]) -> list[LinkSpec]:
     """A chain, and a weaker link past every second node."""
-    chain = [LinkSpec(a, b, tq=250, signal_dbm=-58) for a, b in zip(names, names[1:], strict=False)]
+    chain = [LinkSpec(a, b, tq=250, signal_dbm=-58) for a, b in pairwise(names)]
     past = [LinkSpec(a, b, tq=120, signal_dbm=-79) for a, b in list(zip(names, names[2:], strict=False))[::2]]
     return chain + past
 
@@ -73,8 +75,9 @@ def load_links(path: Path) -> list[LinkSpec]:
 def _link(path: Path, number: int, entry: object) -> LinkSpec:
     match entry:
         case {"between": [str(a), str(b)], **rest}:
+            fields: Mapping[str, Any] = {str(key): value for key, value in rest.items()}
             try:
-                return LinkSpec(a, b, **rest)
+                return LinkSpec(a, b, **fields)
             except TypeError as error:
                 raise InputError(f"{path}: link {number} ({a}-{b}): {error}") from error
         case _:
@@ -99,7 +102,7 @@ def _node_spec(node: Node, number: int) -> NodeSpec:
         model=hardware.name,
         target=hardware.target,
         release=node.release,
-        packages=tuple(dict.fromkeys((*NodeSpec.__dataclass_fields__["packages"].default, *hardware.packages))),
+        packages=tuple(dict.fromkeys((*MESH_PACKAGES, *hardware.packages, *node.packages))),
         radios=radios,
         lan_ports=hardware.lan_ports or node.lan_ports,
         mac=node.mac or _MAC.format(number // 256, number % 256, 0),
