@@ -1,0 +1,44 @@
+"""Real sockets on the loopback for tests."""
+
+import select
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from udp_mesh.links.attachments import Address, Attachment
+from udp_mesh.links.udp import UdpLink
+
+WAIT_S = 60.0
+"""Generous bound of every wait for a real part; passes as soon as the thing is true."""
+
+
+@dataclass(frozen=True)
+class Out:
+    """A datagram to send."""
+
+    data: bytes
+    destination: Address | None
+    urgent: bool = False
+
+
+def free_port() -> int:
+    """A UDP port nobody uses at the moment."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def open_link(host: str, port: int, *, urgent_dscp: int = 0) -> UdpLink:
+    return UdpLink(Attachment(host, "lo", (host, port), None, 65_535), urgent_dscp=urgent_dscp)
+
+
+def receive(link: UdpLink, count: int) -> list[tuple[bytes, Address]]:
+    """Waits until `count` datagrams have arrived."""
+    found: list[tuple[bytes, Address]] = []
+    deliver: Callable[[memoryview, Address], None] = lambda data, source: found.append((bytes(data), source))  # noqa: E731
+    deadline = time.monotonic() + WAIT_S
+    while len(found) < count and time.monotonic() < deadline:
+        select.select([link], [], [], 1.0)
+        link.receive(deliver, 1000)
+    return found

@@ -1,0 +1,155 @@
+"""Real sockets: what is sent arrives, in runs or one by one, and a refusing kernel costs a datagram, not the node."""
+
+import errno
+import socket
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.udp_mesh.links.sockets import Out, free_port, open_link, receive
+from udp_mesh.links.attachments import Attachment
+from udp_mesh.links.udp import MAX_SEGMENTS, UdpLink
+
+ALICE, BOB = "127.0.1.2", "127.0.1.3"
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[UdpLink, UdpLink]]:
+    port = free_port()
+    with closing(open_link(ALICE, port, urgent_dscp=46)) as alice, closing(open_link(BOB, port)) as bob:
+        yield alice, bob
+
+
+def test_a_run_of_equal_datagrams_takes_one_call_and_arrives_in_pieces(pair: tuple[UdpLink, UdpLink]) -> None:
+    alice, bob = pair
+    datagrams = [Out(bytes([n]) * 1400, bob.attachment.address) for n in range(40)] + [
+        Out(b"tail", bob.attachment.address)
+    ]
+    assert alice.send(datagrams) == 41
+    assert alice.system_calls == 1
+    found = receive(bob, 41)
+    assert found == [(datagram.data, alice.attachment.address) for datagram in datagrams]
+    assert bob.system_calls < 41
+
+
+@settings(max_examples=15)
+@given(st.lists(st.tuples(st.sampled_from([1, 100, 1400]), st.booleans()), min_size=1, max_size=30))
+def test_any_mixture_arrives_in_order_with_and_without_segmentation(mixture: list[tuple[int, bool]]) -> None:
+    port = free_port()
+    with closing(open_link(ALICE, port, urgent_dscp=46)) as alice, closing(open_link(BOB, port)) as bob:
+        for segmentation in (True, False):
+            alice.segmentation = segmentation
+            datagrams = [
+                Out(bytes([n]) * size, bob.attachment.address, urgent) for n, (size, urgent) in enumerate(mixture)
+            ]
+            assert alice.send(datagrams) == len(datagrams)
+            found = receive(bob, len(datagrams))
+            assert [data for data, _ in found] == [datagram.data for datagram in datagrams]
+
+
+def test_more_than_a_run_is_cut_at_what_the_kernel_takes(pair: tuple[UdpLink, UdpLink]) -> None:
+    alice, bob = pair
+    assert alice.send([Out(bytes(100), bob.attachment.address)] * (2 * MAX_SEGMENTS + 1)) == 2 * MAX_SEGMENTS + 1
+    assert alice.system_calls == 3
+    assert len(receive(bob, 2 * MAX_SEGMENTS + 1)) == 2 * MAX_SEGMENTS + 1
+
+
+def test_urgent_datagrams_carry_their_class_and_bulk_does_not(pair: tuple[UdpLink, UdpLink]) -> None:
+    alice, _ = pair
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as plain:
+        plain.bind((BOB, 0))
+        plain.settimeout(60)
+        plain.setsockopt(socket.IPPROTO_IP, socket.IP_RECVTOS, 1)
+        to = plain.getsockname()
+        alice.send([Out(b"urgent", to, urgent=True), Out(b"bulk", to)])
+        classes = {}
+        for _ in range(2):
+            data, ancillary, _, _ = plain.recvmsg(100, 100)
+            classes[data] = ancillary[0][2][0] >> 2
+    assert classes == {b"urgent": 46, b"bulk": 0}
+
+
+def test_an_unreachable_destination_costs_its_datagram_only(pair: tuple[UdpLink, UdpLink]) -> None:
+    alice, bob = pair
+    nowhere = ("255.255.255.255", 9)  # this socket may not broadcast
+    assert alice.send([Out(b"a", nowhere), Out(b"b", nowhere), Out(b"c", bob.attachment.address)]) == 3
+    assert alice.datagrams_lost_on_send == 2
+    assert receive(bob, 1) == [(b"c", alice.attachment.address)]
+
+
+def test_a_datagram_too_long_to_send_costs_itself_only(pair: tuple[UdpLink, UdpLink]) -> None:
+    alice, bob = pair
+    assert alice.send([Out(bytes(70_000), bob.attachment.address), Out(b"c", bob.attachment.address)]) == 2
+    assert alice.datagrams_lost_on_send == 1
+    assert receive(bob, 1)[0][0] == b"c"
+
+
+def test_a_broadcast_on_a_link_of_fixed_neighbours_goes_nowhere(pair: tuple[UdpLink, UdpLink]) -> None:
+    alice, _ = pair
+    assert alice.send([Out(b"to all", None)]) == 1
+    assert alice.system_calls == 0
+
+
+def test_a_kernel_without_segmentation_is_noticed_once(
+    pair: tuple[UdpLink, UdpLink], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alice, bob = pair
+    real = alice._socket
+
+    class Refusing:
+        """The socket of a device that cannot segment."""
+
+        def sendmsg(self, *_: object) -> int:
+            raise OSError(errno.EIO, "no segmentation here")
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(real, name)
+
+    monkeypatch.setattr(alice, "_socket", Refusing())
+    assert alice.send([Out(bytes([n]) * 10, bob.attachment.address) for n in range(5)]) == 5
+    assert not alice.segmentation
+    assert [data[0] for data, _ in receive(bob, 5)] == [0, 1, 2, 3, 4]
+
+
+def test_a_full_socket_says_how_much_it_took(pair: tuple[UdpLink, UdpLink], monkeypatch: pytest.MonkeyPatch) -> None:
+    alice, bob = pair
+    real, calls = alice._socket, 0
+
+    class Full:
+        """The socket while its buffer is full."""
+
+        def sendto(self, data: bytes, address: tuple[str, int]) -> int:
+            nonlocal calls
+            calls += 1
+            if calls > 2:
+                raise BlockingIOError
+            return real.sendto(data, address)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(real, name)
+
+    alice.segmentation = False
+    monkeypatch.setattr(alice, "_socket", Full())
+    assert alice.send([Out(bytes([n]), bob.attachment.address) for n in range(5)]) == 2
+    assert [data[0] for data, _ in receive(bob, 2)] == [0, 1]
+
+
+def test_a_port_in_use_is_an_error_and_leaks_nothing() -> None:
+    port = free_port()
+    with closing(open_link(ALICE, port)), pytest.raises(OSError, match="in use"):
+        open_link(ALICE, port)
+
+
+def test_ipv6_neighbours_are_reached() -> None:
+    port = free_port()
+    attachment = Attachment("::1", "lo", ("::1", port), None, 65_535)
+    with closing(UdpLink(attachment, urgent_dscp=46)) as link, socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as far:
+        far.bind(("::1", 0))
+        far.settimeout(60)
+        link.send([Out(b"six", ("::1", far.getsockname()[1]), urgent=True)])
+        assert far.recvfrom(10)[0] == b"six"
+        far.sendto(b"back", ("::1", port))
+        assert receive(link, 1)[0][0] == b"back"
