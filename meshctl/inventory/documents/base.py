@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from meshctl.inventory.fields import Text, wrong
 
@@ -27,7 +27,7 @@ class Document(BaseModel):
 class SecretDocument(Document):
     """Where a secret is: `{env: NAME}`, `{file: PATH, key: NAME}` or `{age: PATH, key: NAME, identity: PATH}`."""
 
-    env: Text = ""
+    env: Text = Field(default="", pattern="^([A-Za-z_][A-Za-z0-9_]*)?$")
     """Name of an environment variable that holds the secret."""
     file: Text = ""
     """A file that holds the secret, outside the repository; relative to the file that names it."""
