@@ -1,14 +1,14 @@
 """A plan as a JSON file, and back: what was agreed on is what is applied, even by another person on another day.
 
-`dump` and `load` are inverse; `moved_on` compares a saved plan with a fresh one and names what differs. The file holds
-masked diffs and salted fingerprints, no secret.
+`dump` and `load` are inverse; `as_agreed` holds a saved plan against a fresh one and leaves what still applies. The
+file holds masked diffs and salted fingerprints, no secret.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from types import MappingProxyType
 from typing import Any
@@ -152,3 +152,31 @@ def moved_on(agreed: NodePlan, now: NodePlan) -> str:
     if now.verdict is Verdict.REFUSED and agreed.verdict is not Verdict.REFUSED:
         return now.reason
     return ""
+
+
+def as_agreed(agreed: Plan, now: Plan) -> Plan:
+    """The agreed plan as it can still be carried out: nodes that moved on are refused, those away now are left out.
+
+    `now` is a fresh plan under the same salt. A switch that not everybody can take part in any more is a refusal.
+    """
+    nodes = {name: _still(old, now.nodes[name]) for name, old in agreed.nodes.items()}
+    stages, refusal = [], agreed.refusal
+    for stage in agreed.stages:
+        ready = tuple(name for name in stage.nodes if nodes[name].verdict is Verdict.CHANGE)
+        if stage.kind is StageKind.SWITCH and len(ready) < len(stage.nodes):
+            absent = ", ".join(sorted(set(stage.nodes) - set(ready)))
+            refusal = f"mesh {stage.mesh} changes its cell together, and {absent} cannot take part as agreed"
+        if ready:
+            stages.append(replace(stage, nodes=ready))
+    return replace(agreed, nodes=MappingProxyType(nodes), stages=tuple(stages), refusal=refusal)
+
+
+def _still(old: NodePlan, now: NodePlan) -> NodePlan:
+    if old.verdict is not Verdict.CHANGE:
+        if now.verdict is not Verdict.CHANGE:
+            return now
+        return replace(now, verdict=Verdict.REFUSED, reason="the plan that was agreed on does nothing to it")
+    if now.verdict is Verdict.AWAY:
+        return now
+    why = moved_on(old, now)
+    return replace(old, verdict=Verdict.REFUSED, reason=why, hint="make a new plan") if why else old

@@ -1,0 +1,161 @@
+"""From a session to a plan on the screen, and from an agreed plan to outcomes and an exit code."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import typer
+
+from meshctl.apply.execute import Setting, carry_out
+from meshctl.apply.planning import Choices, Prepared, prepare
+from meshctl.cli.session import Session, chosen, exit_for, progress_for
+from meshctl.errors import ExitCode, InputError, MeshctlError
+from meshctl.fleet import Outcome, totals
+from meshctl.plan import Plan, Verdict
+
+# Bytes of salt for a plan's fingerprints; RFC 7914 asks for no more.
+SALT_BYTES = 16
+
+
+class Refused(MeshctlError):
+    """A plan that meshctl will not carry out as it stands."""
+
+    exit_code = ExitCode.FINDINGS
+
+
+def choices_of(no_firmware: bool, leave_behind: str, accept_cut: str) -> Choices:
+    return Choices(not no_firmware, _names(leave_behind), _names(accept_cut))
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def prepared_for(opened: Session, nodes: list[str] | None, choices: Choices, salt: bytes | None = None) -> Prepared:
+    with opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)):
+        prepared = prepare(
+            opened.renderer,
+            opened.access,
+            chosen(opened.fleet, nodes),
+            opened.journal,
+            salt=salt or secrets.token_bytes(SALT_BYTES),
+            owner=opened.owner,
+            choices=choices,
+            interrupt=opened.interrupt,
+        )
+    if opened.interrupt.stopping:
+        raise KeyboardInterrupt
+    return prepared
+
+
+def write_text(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def show(plan: Plan, *, brief: bool) -> None:
+    from rich.console import Console
+    from rich.text import Text
+
+    from meshctl.report.plan_text import plan_lines
+
+    console = Console(soft_wrap=True, highlight=False)
+    for line in plan_lines(plan, with_diffs=not brief):
+        console.print(Text(line.text, line.style))
+
+
+def checked(plan: Plan, *, as_json: bool, brief: bool) -> ExitCode:
+    if as_json:
+        told = {name: {"verdict": node.verdict.value, "reason": node.reason} for name, node in plan.nodes.items()}
+        typer.echo(json.dumps({"fleet": plan.fleet, "nodes": told}, indent=1))
+    else:
+        show(plan, brief=brief)
+    if plan.of(Verdict.CHANGE) or plan.of(Verdict.REFUSED):
+        return ExitCode.FINDINGS
+    return ExitCode.UNREACHABLE if plan.of(Verdict.AWAY) else ExitCode.OK
+
+
+def ask_and_carry_out(
+    opened: Session,
+    prepared: Prepared,
+    command: str,
+    choices: Choices,
+    *,
+    yes: bool,
+    as_json: bool,
+    brief: bool,
+    rate: float | None,
+) -> None:
+    from meshctl.report.plan_text import question
+
+    if not as_json:
+        show(prepared.plan, brief=brief)
+    if not prepared.plan.is_empty and not prepared.plan.refusal and not yes:
+        if not sys.stdin.isatty():
+            raise InputError("nobody can be asked here", hint="look at the plan, then run again with --yes")
+        typer.confirm(question(prepared.plan), abort=True)
+    carry_out_plan(opened, prepared, command, choices.with_firmware, as_json=as_json, rate=rate, choices=choices)
+
+
+def carry_out_plan(
+    opened: Session,
+    prepared: Prepared,
+    command: str,
+    with_firmware: bool,
+    *,
+    as_json: bool,
+    rate: float | None,
+    choices: Choices | None = None,
+) -> None:
+    """Apply, journal, tell the totals, exit."""
+    plan = prepared.plan
+    if plan.refusal:
+        raise Refused(plan.refusal, hint=plan.refusal_hint)
+    told = choices or Choices(with_firmware)
+    run = opened.journal.begin(
+        command,
+        fleet=opened.fleet.name,
+        inventory=opened.inventory,
+        nodes=tuple(plan.nodes),
+        plan=json.dumps({"choices": asdict(told), "stages": [asdict(stage) for stage in plan.stages]}),
+    )
+    outcomes: dict[str, Outcome] = {}
+    try:
+        with (
+            progress_for(len(plan.nodes), as_json=as_json) as progress,
+            opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)),
+        ):
+            setting = Setting(
+                opened.fleet,
+                opened.access,
+                opened.journal,
+                run,
+                opened.owner,
+                opened.interrupt,
+                progress,
+                None if rate is None else rate * 1000,
+            )
+            outcomes = carry_out(prepared, setting)
+    finally:
+        run.end(str(totals(outcomes.values())) if outcomes else "could not run")
+    _sum_up(outcomes, run.id, as_json=as_json)
+    raise typer.Exit(exit_for(outcomes.values(), opened.interrupt))
+
+
+def _sum_up(outcomes: dict[str, Outcome], run_id: int, *, as_json: bool) -> None:
+    counted = totals(outcomes.values())
+    if as_json:
+        from meshctl.report.progress import outcome_object
+
+        told = [outcome_object(outcome) for outcome in outcomes.values()]
+        typer.echo(json.dumps({"event": "ended", "run": run_id, "totals": str(counted), "outcomes": told}))
+        return
+    typer.echo(f"run {run_id}: {counted}")
+    if not counted.all_good:
+        typer.echo("`meshctl resume` takes up what is not done", err=True)

@@ -1,0 +1,228 @@
+"""`meshctl plan`, `apply`, `provision`, `resume`, `history`."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from meshctl.apply.planning import Choices
+from meshctl.cli.carry import ask_and_carry_out, carry_out_plan, checked, choices_of, prepared_for, show, write_text
+from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.session import KeyFiles, Lab, Nodes, session
+from meshctl.errors import ExitCode, InputError
+from meshctl.fleet.journal import Journal, RunRecord, default_path
+from meshctl.plan.saved import SavedPlan, as_agreed, dump, load
+
+NoFirmware = Annotated[bool, typer.Option("--no-firmware", help="Leave the firmware as it is.")]
+LeaveBehind = Annotated[
+    str, typer.Option("--leave-behind", help="Nodes (a,b,...; or all) that may stay in the old cell of their mesh.")
+]
+AcceptCut = Annotated[
+    str, typer.Option("--accept-cut", help="Cut vertices (a,b,...; or all) that may be flashed nevertheless.")
+]
+Brief = Annotated[bool, typer.Option("--brief", help="Do not show what changes inside the files.")]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
+Rate = Annotated[float | None, typer.Option("--rate", help="Upload at most so many kilobytes per second to a node.")]
+
+
+def plan(
+    nodes: Nodes = None,
+    inventory: InventoryPath = Path(),
+    out: Annotated[Path | None, typer.Option("--out", help="Save the plan, for `meshctl apply`.")] = None,
+    no_firmware: NoFirmware = False,
+    leave_behind: LeaveBehind = "",
+    accept_cut: AcceptCut = "",
+    brief: Brief = False,
+    as_json: AsJson = False,
+    key: KeyFiles = None,
+    lab: Lab = None,
+) -> None:
+    """Show what provisioning would do to each node, in which order, and why. Changes nothing.
+
+    Example: meshctl plan 'husky1-*' --out plan.json
+    """
+    choices = choices_of(no_firmware, leave_behind, accept_cut)
+    with session(inventory, key_files=key or (), lab=lab) as opened:
+        prepared = prepared_for(opened, nodes, choices)
+        saved = SavedPlan(prepared.plan, prepared.salt, str(inventory), choices.with_firmware)
+        if out is not None:
+            write_text(out, dump(saved))
+        typer.echo(dump(saved), nl=False) if as_json else show(prepared.plan, brief=brief)
+        if prepared.plan.refusal:
+            raise typer.Exit(ExitCode.FINDINGS)
+
+
+def apply(
+    plan_file: Annotated[Path, typer.Argument(help="A plan that `meshctl plan --out` wrote.")],
+    inventory: InventoryPath = Path(),
+    rate: Rate = None,
+    as_json: AsJson = False,
+    key: KeyFiles = None,
+    lab: Lab = None,
+) -> None:
+    """Carry out a saved plan, exactly. Nodes that are not as they were when it was made are refused.
+
+    Example: meshctl apply plan.json
+    """
+    try:
+        text = plan_file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{plan_file}: cannot be read: {error}") from error
+    saved = load(text, str(plan_file))
+    with session(inventory, key_files=key or (), lab=lab) as opened:
+        if saved.plan.fleet != opened.fleet.name:
+            raise InputError(f"{plan_file}: a plan for fleet {saved.plan.fleet}, the inventory is {opened.fleet.name}")
+        fresh = prepared_for(opened, list(saved.plan.nodes), Choices(saved.with_firmware), saved.salt)
+        agreed = replace(fresh, plan=as_agreed(saved.plan, fresh.plan))
+        carry_out_plan(opened, agreed, "apply", saved.with_firmware, as_json=as_json, rate=rate)
+
+
+def provision(
+    nodes: Nodes = None,
+    inventory: InventoryPath = Path(),
+    check: Annotated[bool, typer.Option("--check", help="Change nothing; exit 1 if a node differs.")] = False,
+    yes: Yes = False,
+    no_firmware: NoFirmware = False,
+    leave_behind: LeaveBehind = "",
+    accept_cut: AcceptCut = "",
+    rate: Rate = None,
+    brief: Brief = False,
+    as_json: AsJson = False,
+    key: KeyFiles = None,
+    lab: Lab = None,
+) -> None:
+    """Plan, ask, apply: bring nodes to what the inventory says, and never strand one.
+
+    Example: meshctl provision 'b*' --leave-behind b07
+    """
+    choices = choices_of(no_firmware, leave_behind, accept_cut)
+    with session(inventory, key_files=key or (), lab=lab) as opened:
+        prepared = prepared_for(opened, nodes, choices)
+        if check:
+            raise typer.Exit(checked(prepared.plan, as_json=as_json, brief=brief))
+        ask_and_carry_out(opened, prepared, "provision", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
+
+
+def resume(
+    run: Annotated[int | None, typer.Argument(help="Number of the run; default: the last one that left work.")] = None,
+    inventory: InventoryPath = Path(),
+    yes: Yes = False,
+    rate: Rate = None,
+    brief: Brief = False,
+    as_json: AsJson = False,
+    key: KeyFiles = None,
+    lab: Lab = None,
+) -> None:
+    """Take up the nodes that an earlier run left: those that were off, failed, went back, or were never begun.
+
+    Example: meshctl resume --yes
+    """
+    with session(inventory, key_files=key or (), lab=lab) as opened:
+        record = _to_resume(opened.journal, opened.fleet.name, run)
+        managed = {node.name for node in opened.fleet.managed()}
+        names = [name for name in opened.journal.unfinished(record.id) if name in managed]
+        if not names:
+            typer.echo(f"run {record.id} left nothing to do")
+            return
+        if not as_json:
+            typer.echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")
+        told = json.loads(record.plan).get("choices", {}) if record.plan else {}
+        choices = Choices(
+            bool(told.get("with_firmware", True)),
+            tuple(told.get("leave_behind", ())),
+            tuple(told.get("accept_cuts", ())),
+        )
+        prepared = prepared_for(opened, names, choices)
+        ask_and_carry_out(opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
+
+
+def _to_resume(journal: Journal, fleet: str, run_id: int | None) -> RunRecord:
+    if run_id is not None:
+        record = journal.run(run_id)
+        if record is None or record.fleet != fleet:
+            raise InputError(f"there is no run {run_id} of fleet {fleet}", hint="`meshctl history` lists the runs")
+    else:
+        record = next(iter(journal.runs(fleet=fleet, limit=1)), None)
+        if record is None:
+            raise InputError(f"there is no run of fleet {fleet} to resume", hint="`meshctl provision` begins one")
+    if not record.is_over:
+        raise InputError(f"run {record.id} is still under way ({record.owner})", hint="wait for it, or interrupt it")
+    return record
+
+
+def history(
+    run: Annotated[int | None, typer.Argument(help="Number of a run, to see its nodes and steps.")] = None,
+    node: Annotated[str | None, typer.Option("--node", help="Only the steps of this node.")] = None,
+    limit: Annotated[int, typer.Option("--limit", "-n", help="How many runs to list.")] = 20,
+    as_json: AsJson = False,
+) -> None:
+    """Show earlier runs; with a run's number its nodes, steps, outcomes and durations.
+
+    Example: meshctl history 12 --node b03
+    """
+    with Journal(default_path(os.environ)) as journal:
+        if run is None:
+            _list_runs(journal, limit, as_json=as_json)
+        else:
+            _show_run(journal, run, node, as_json=as_json)
+
+
+def _list_runs(journal: Journal, limit: int, *, as_json: bool) -> None:
+    records = journal.runs(limit=limit)
+    if as_json:
+        typer.echo(json.dumps([_run_object(record) for record in records], indent=1))
+        return
+    for record in records:
+        typer.echo(f"{record.id:>5}  {_moment(record.began_s)}  {record.command:<10} {record.fleet:<16} {record.state}")
+    if not records:
+        typer.echo("no runs yet")
+
+
+def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool) -> None:
+    record = journal.run(run_id)
+    if record is None:
+        raise InputError(f"there is no run {run_id}", hint="`meshctl history` lists the runs")
+    outcomes = [outcome for outcome in journal.outcomes(run_id) if node in (None, outcome.node)]
+    steps = journal.steps(run_id, node)
+    if as_json:
+        told = {
+            **_run_object(record),
+            "outcomes": [{"node": o.node, "result": o.result.value, "reason": o.reason} for o in outcomes],
+            "steps": [
+                {"node": s.node, "step": s.step, "began_s": s.began_s, "duration_s": s.duration_s, "result": s.result}
+                for s in steps
+            ],
+        }
+        typer.echo(json.dumps(told, indent=1))
+        return
+    typer.echo(f"run {record.id}: {record.command} of {record.fleet} by {record.owner}, {_moment(record.began_s)}")
+    typer.echo(f"  {record.inventory}: {record.state}")
+    for outcome in outcomes:
+        typer.echo(f"{outcome}" + (f" ({outcome.duration_s:.1f} s)" if outcome.duration_s else ""))
+        for step in steps:
+            if step.node == outcome.node:
+                took = "cut short" if step.duration_s is None else f"{step.duration_s:.2f} s"
+                typer.echo(f"  {step.step:<10} {took:>10}  {step.result if step.result != 'done' else ''}".rstrip())
+
+
+def _run_object(record: RunRecord) -> dict[str, Any]:
+    return {
+        "run": record.id,
+        "command": record.command,
+        "fleet": record.fleet,
+        "inventory": record.inventory,
+        "owner": record.owner,
+        "began_s": record.began_s,
+        "ended_s": record.ended_s,
+        "state": record.state,
+    }
+
+
+def _moment(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds).astimezone().isoformat(sep=" ", timespec="seconds")
