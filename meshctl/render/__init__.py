@@ -8,6 +8,7 @@ from meshctl.render.compare import (
     compare_fleets,
     compare_nodes,
 )
+from meshctl.render.daemon import daemon_config, daemon_keys
 from meshctl.render.imagebuilder import ImageFolder, folder_files, image_folders
 from meshctl.render.node import DeviceFacts, UnknownNode, render, render_fleet, render_node, render_nodes
 from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, RenderedFile
@@ -29,6 +30,8 @@ __all__ = [
     "compare_files",
     "compare_fleets",
     "compare_nodes",
+    "daemon_config",
+    "daemon_keys",
     "folder_files",
     "image_folders",
     "render",

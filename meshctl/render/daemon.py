@@ -1,0 +1,222 @@
+"""Fleet -> the files of the udp_mesh daemon on one robot's computer: its configuration (TOML) and its key file.
+
+Every robot gets the same topics, because a message's way is decided where it is sent and a broadcast's repair where it
+is received. The daemon speaks on the interface that has the computer's address, and on no other. docs/udp-mesh.md
+describes the format; a test loads what is written here with the daemon's own reader.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+from collections.abc import Callable, Iterator
+
+from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
+from meshctl.errors import InputError
+from meshctl.model import Computer, Fleet, MissingOrigin, Outbox, Robot, Secret, SecretRef, Topic, UdpMesh
+
+# The code of what the daemon would not take (docs/render.md).
+DAEMON = "RND030"
+
+CONFIG_NAME = "udp-mesh.toml"
+KEY_NAME = "fleet.key"
+
+# What the wire and the daemon's reader hold to.
+_MAX_NAME_BYTES = 63
+_MAX_TOPIC_BYTES = 255
+_RESERVED_PREFIX = "~mesh/"
+_MAX_FRAGMENT_BYTES = 8192
+_MAX_WINDOW = 4096
+_MAX_KEYS = 2
+_KEY_BYTES = 32
+# Heartbeats grow this sparse at most, unless the team wants to be told sooner (udp_mesh's default).
+_SPARSE_S = 3.0
+# Silence after which unkept messages end as lost (udp_mesh's default): longer than a tunnel's shadow.
+_PEER_LOST_S = 60.0
+
+
+def daemon_config(fleet: Fleet, robot: str, *, key_name: str = KEY_NAME) -> bytes:
+    """The daemon's configuration on the robot's computer; `key_name` is the key file's path as seen from it.
+
+    Raises InvalidInput for an unknown robot, one without a computer, and every value that the daemon would refuse.
+    """
+    computer = _computer(fleet, robot)
+    problems = [*_check_robot(fleet, robot), *_check_transport(fleet), *_check_topics(fleet)]
+    if problems:
+        raise InvalidInput(problems)
+    transport = fleet.udp_mesh
+    lines = [
+        f"# {robot} of {fleet.name}, written by meshctl: change the inventory, not this file.",
+        f"name = {_text(robot)}",
+        f"port = {transport.port}",
+        f"key_file = {_text(key_name)}" if transport.keys else "unkeyed = true",
+        f"window = {transport.window}" if transport.window is not None else 'window = "adaptive"',
+        f"fragment_bytes = {transport.fragment_bytes}",
+        *_rates(transport),
+        *_links(fleet, robot, computer),
+        *(line for topic in fleet.topics for line in _topic(topic, robot)),
+    ]
+    if transport.metrics_port is not None:
+        # the daemon's metrics are for this machine; whoever collects them comes through SSH or an exporter
+        lines += ["", "[daemon]", f'metrics_address = "127.0.0.1:{transport.metrics_port}"']
+    return "".join(f"{line}\n" for line in lines).encode()
+
+
+def daemon_keys(fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> bytes | None:
+    """The key file, one key a line, the sealing one first; None for a fleet without keys. To be kept at mode 0600.
+
+    Raises InvalidInput, which shows nothing of a key, for one that is none.
+    """
+    lines = []
+    problems = []
+    for index, ref in enumerate(fleet.udp_mesh.keys):
+        path = ("udp_mesh", "keys", str(index))
+        try:
+            text = secrets(ref).reveal().strip()
+        except InputError as error:
+            problems.append(_problem(fleet, path, "", "", message=str(error), hint=error.hint))
+            continue
+        if not _is_key(text):
+            found = f"{len(text)} characters"
+            hint = "make one with `openssl rand -hex 32`"
+            expected = f"a key of {_KEY_BYTES} bytes as 64 hex digits or 44 characters of base64"
+            problems.append(_problem(fleet, path, expected, found, hint=hint))
+        lines.append(f"{text}\n")
+    if problems:
+        raise InvalidInput(problems)
+    return "".join(lines).encode() or None
+
+
+def _is_key(text: str) -> bool:
+    try:
+        raw = bytes.fromhex(text) if len(text) == 2 * _KEY_BYTES else base64.b64decode(text, validate=True)
+    except (ValueError, binascii.Error):
+        return False
+    return len(raw) == _KEY_BYTES
+
+
+def _computer(fleet: Fleet, name: str) -> Computer:
+    robot = fleet.robots.get(name)
+    if robot is None:
+        raise InvalidInput([_problem(fleet, ("robots",), "a robot of the fleet", repr(name))])
+    if robot.computer is None:
+        raise InvalidInput([_problem(fleet, ("robots", name, "computer"), "the robot's computer", "none")])
+    return robot.computer
+
+
+def _check_robot(fleet: Fleet, name: str) -> Iterator[Diagnostic]:
+    """What udp_mesh takes as a peer's name: names are parts of topic names, so no slash."""
+    if not _is_name(name, _MAX_NAME_BYTES) or "/" in name:
+        expected = f"a name of 1 to {_MAX_NAME_BYTES} bytes without space or slash"
+        yield _problem(fleet, ("robots", name), expected, repr(name))
+
+
+def _is_name(text: str, limit_bytes: int) -> bool:
+    size = len(text.encode("utf-8", "surrogatepass"))
+    return 1 <= size <= limit_bytes and text.isprintable() and not any(letter.isspace() for letter in text)
+
+
+def _check_transport(fleet: Fleet) -> Iterator[Diagnostic]:
+    transport = fleet.udp_mesh
+    if transport.fragment_bytes > _MAX_FRAGMENT_BYTES:
+        found = str(transport.fragment_bytes)
+        yield _problem(fleet, ("udp_mesh", "fragment_bytes"), f"at most {_MAX_FRAGMENT_BYTES}", found)
+    if transport.window is not None and not 1 <= transport.window <= _MAX_WINDOW:
+        expected = f"adaptive, or 1 to {_MAX_WINDOW} fragments"
+        yield _problem(fleet, ("udp_mesh", "window"), expected, str(transport.window))
+    if len(transport.keys) > _MAX_KEYS:
+        expected = f"at most {_MAX_KEYS} live keys"
+        yield _problem(fleet, ("udp_mesh", "keys"), expected, str(len(transport.keys)))
+
+
+def _check_topics(fleet: Fleet) -> Iterator[Diagnostic]:
+    for topic in fleet.topics:
+        path = ("topics", topic.name)
+        if not _is_name(topic.name, _MAX_TOPIC_BYTES) or topic.name.startswith(_RESERVED_PREFIX):
+            expected = f"a topic of 1 to {_MAX_TOPIC_BYTES} bytes without space, not below {_RESERVED_PREFIX}"
+            yield _problem(fleet, path, expected, repr(topic.name))
+
+
+def _rates(transport: UdpMesh) -> Iterator[str]:
+    sparse_s = max(transport.heartbeat_s, min(_SPARSE_S, 0.3 * transport.offline_after_s))
+    yield ""
+    yield "[rates]"
+    yield f"heartbeat_s = {_number(transport.heartbeat_s)}"
+    # three heartbeats may be missed before a peer is called offline, however sparse they are
+    yield f"heartbeat_sparse_s = {_number(sparse_s)}"
+    yield f"offline_s = {_number(transport.offline_after_s)}"
+    yield f"peer_lost_s = {_number(max(_PEER_LOST_S, transport.offline_after_s))}"
+
+
+def _links(fleet: Fleet, robot: str, computer: Computer) -> Iterator[str]:
+    kind = "broadcast" if fleet.udp_mesh.broadcast else "neighbours"
+    yield from ("", "[[links]]", f'address = "{computer.address.ip}"', f'kind = "{kind}"')
+    if not fleet.udp_mesh.broadcast:
+        for peer in _others(fleet, robot):
+            if peer.computer is not None:
+                yield from (
+                    "",
+                    "[[neighbours]]",
+                    f"name = {_text(peer.name)}",
+                    f'address = "{peer.computer.address.ip}"',
+                )
+
+
+def _others(fleet: Fleet, robot: str) -> Iterator[Robot]:
+    return (peer for peer in fleet.robots.values() if peer.name != robot)
+
+
+def _topic(topic: Topic, robot: str) -> Iterator[str]:
+    yield from ("", f"[topics.{_text(topic.name)}]")
+    yield f"priority = {topic.priority}"
+    yield f"reliable = {_boolean(topic.reliable)}"
+    destinations = _destinations(topic, robot)
+    if destinations:
+        yield f"destinations = [{', '.join(_text(name) for name in destinations)}]"
+    if topic.keep_last:
+        yield f"keep_last = {topic.keep_last}"
+    if topic.deadline_s is not None:
+        yield f"deadline_s = {_number(topic.deadline_s)}"
+    if topic.rate_limit_bytes_per_s is not None:
+        yield f"rate_limit_bytes_per_s = {topic.rate_limit_bytes_per_s}"
+    if topic.compression:
+        yield "compression = true"
+    if topic.outbox is not Outbox.NONE:
+        yield f'outbox = "{topic.outbox.value}"'
+        yield f"outbox_bytes = {topic.outbox_bytes}"
+        yield f"outbox_on_disk = {_boolean(topic.outbox_on_disk)}"
+    if topic.repair:
+        yield "repair = true"
+
+
+def _destinations(topic: Topic, robot: str) -> tuple[str, ...]:
+    """Whom this robot's messages go to; none means everyone. A topic for this robot alone keeps its name, since it is
+    no broadcast when others send it."""
+    if "all" in topic.destinations:
+        return ()
+    others = tuple(name for name in topic.destinations if name != robot)
+    return others or topic.destinations
+
+
+def _text(value: str) -> str:
+    """A TOML basic string: JSON's escapes, and TOML's for DEL."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _boolean(value: bool) -> str:
+    return "true" if value else "false"
+
+
+def _number(value: float) -> str:
+    return repr(float(value))
+
+
+def _problem(
+    fleet: Fleet, path: tuple[str, ...], expected: str, found: str, *, message: str = "", hint: str = ""
+) -> Diagnostic:
+    try:
+        place = fleet.where(*path).position
+    except MissingOrigin:
+        place = Position(fleet.files[0] if fleet.files else fleet.name)
+    return Diagnostic(DAEMON, Severity.ERROR, place, message, ".".join(path), expected, found, hint)

@@ -1,0 +1,167 @@
+"""What meshctl writes for the daemon, the daemon's own reader loads, and it means what the inventory says."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import replace
+from ipaddress import IPv4Interface
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from meshctl.diagnostics import InvalidInput
+from meshctl.errors import InputError
+from meshctl.model import Computer, Fleet, Outbox, Robot, Secret, SecretKind, SecretRef, Topic, TopicClass, UdpMesh
+from meshctl.render.daemon import daemon_config, daemon_keys
+from tests.meshctl.render import fleets
+from udp_mesh.core import settings as core
+from udp_mesh.daemon.configuration import Configuration, load
+from udp_mesh.links.attachments import LinkWish
+
+NEW, OLD = SecretRef(SecretKind.ENV, "NEW"), SecretRef(SecretKind.ENV, "OLD")
+KEYS = {NEW: "11" * 32, OLD: base64.b64encode(bytes(range(32))).decode()}
+ESTOP = Topic("estop", 0, TopicClass.EMERGENCY_STOP, "std_msgs/Bool")
+MAPS = Topic(
+    "maps/difference",
+    7,
+    TopicClass.MAP,
+    destinations=("base", "spot"),
+    keep_last=3,
+    deadline_s=30,
+    rate_limit_bytes_per_s=50_000,
+    compression=True,
+    outbox=Outbox.ALL,
+    outbox_bytes=2_000_000,
+    outbox_on_disk=True,
+)
+VIDEO = Topic("video", 9, TopicClass.VIDEO, reliable=False, destinations=("base",), repair=True)
+
+
+def fleet(*topics: Topic, robots: tuple[str, ...] = ("base", "spot", "uav"), **transport: Any) -> Fleet:
+    members = {
+        name: Robot(name, (), Computer(IPv4Interface(f"10.42.0.{number}/24")))
+        for number, name in enumerate(robots, 100)
+    }
+    return fleets.fleet(robots=members, topics=topics, udp_mesh=replace(UdpMesh(keys=(NEW, OLD)), **transport))
+
+
+def loaded(source: Fleet, robot: str, folder: Path) -> Configuration:
+    (folder / "udp-mesh.toml").write_bytes(daemon_config(source, robot))
+    keys = daemon_keys(source, lambda ref: Secret(KEYS[ref]))
+    if keys is not None:
+        (folder / "fleet.key").write_bytes(keys)
+    return load(folder / "udp-mesh.toml")
+
+
+def test_the_daemon_loads_what_the_inventory_says(tmp_path: Path) -> None:
+    found = loaded(fleet(ESTOP, MAPS, VIDEO, port=8701, heartbeat_s=0.5, metrics_port=9871), "uav", tmp_path)
+    settings = found.settings
+    assert (settings.name, settings.port, settings.window, settings.fragment_bytes) == ("uav", 8701, "adaptive", 1400)
+    assert [key.secret for key in settings.keys] == [b"\x11" * 32, bytes(range(32))]
+    assert (settings.rates.heartbeat_s, settings.rates.offline_s) == (0.5, 10.0)
+    assert found.links == (LinkWish(None, "10.42.0.102", broadcast=True),)
+    assert found.daemon.metrics_address == ("127.0.0.1", 9871)
+    topics = {topic.name: topic for topic in settings.topics}
+    assert topics["estop"] == core.Topic("estop", 0)
+    assert topics["maps/difference"] == core.Topic(
+        "maps/difference",
+        7,
+        keep_last=3,
+        deadline_s=30,
+        rate_limit_bytes_per_s=50_000,
+        compression=True,
+        destinations=("base", "spot"),
+        outbox=core.Outbox.ALL,
+        outbox_bytes=2_000_000,
+        outbox_on_disk=True,
+    )
+    assert topics["video"] == core.Topic("video", 9, reliable=False, destinations=("base",), repair=True)
+
+
+def test_without_broadcast_every_other_robot_is_a_neighbour(tmp_path: Path) -> None:
+    found = loaded(fleet(broadcast=False, window=3), "base", tmp_path)
+    assert found.settings.window == 3
+    assert found.links == (LinkWish(None, "10.42.0.100", broadcast=False),)
+    assert [(peer.name, peer.address) for peer in found.settings.neighbours] == [
+        ("spot", ("10.42.0.101", 8700)),
+        ("uav", ("10.42.0.102", 8700)),
+    ]
+
+
+def test_a_robot_does_not_send_to_itself_but_never_broadcasts_instead(tmp_path: Path) -> None:
+    topics = {topic.name: topic for topic in loaded(fleet(MAPS, VIDEO), "base", tmp_path).settings.topics}
+    assert topics["maps/difference"].destinations == ("spot",)
+    assert topics["video"].destinations == ("base",)
+
+
+def test_a_fleet_without_keys_says_so(tmp_path: Path) -> None:
+    bench = fleet(keys=())
+    assert daemon_keys(bench, lambda ref: Secret(KEYS[ref])) is None
+    assert loaded(bench, "base", tmp_path).settings.unkeyed
+
+
+@pytest.mark.parametrize(("heartbeat_s", "offline_s"), [(1, 10), (5, 30), (0.1, 1), (2, 600)])
+def test_three_heartbeats_may_be_missed(heartbeat_s: float, offline_s: float, tmp_path: Path) -> None:
+    rates = loaded(fleet(heartbeat_s=heartbeat_s, offline_after_s=offline_s), "base", tmp_path).settings.rates
+    assert rates.heartbeat_s <= rates.heartbeat_sparse_s
+    assert 3 * rates.heartbeat_sparse_s < rates.offline_s <= rates.peer_lost_s
+
+
+@given(st.text(max_size=12), st.text(st.sampled_from("ab é\"\\'\x7f\n/~[].#=中"), max_size=12))
+def test_any_name_is_loaded_unchanged_or_refused_at_its_place(
+    tmp_path_factory: pytest.TempPathFactory, robot: str, topic: str
+) -> None:
+    source = fleet(Topic(topic, 5), robots=(robot,))
+    try:
+        found = loaded(source, robot, tmp_path_factory.getbasetemp())
+    except InvalidInput as error:
+        assert {item.code for item in error.diagnostics} == {"RND030"}
+        return
+    assert found.settings.name == robot
+    assert topic in {item.name for item in found.settings.topics}
+
+
+@pytest.mark.parametrize(
+    ("changes", "path"),
+    [
+        ({"fragment_bytes": 9000}, "udp_mesh.fragment_bytes"),
+        ({"window": 5000}, "udp_mesh.window"),
+        ({"keys": (NEW, OLD, NEW)}, "udp_mesh.keys"),
+    ],
+)
+def test_what_the_daemon_would_refuse_is_refused(changes: dict[str, Any], path: str) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        daemon_config(fleet(**changes), "base")
+    assert [item.path for item in caught.value.diagnostics] == [path]
+
+
+def test_unknown_robots_and_those_without_a_computer_are_refused() -> None:
+    source = fleet()
+    with pytest.raises(InvalidInput, match="expected a robot of the fleet, found 'nobody'"):
+        daemon_config(source, "nobody")
+    bare = replace(source, robots={"spot": Robot("spot", ())})
+    with pytest.raises(InvalidInput, match="expected the robot's computer, found none"):
+        daemon_config(bare, "spot")
+
+
+@pytest.mark.parametrize("key", ["", "short", "zz" * 32, "11" * 31, "é" * 64])
+def test_what_is_no_key_is_refused_unseen(key: str) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        daemon_keys(fleet(keys=(NEW,)), lambda _: Secret(key))
+    assert not key or key not in str(caught.value)
+
+
+def test_a_missing_key_is_refused_at_its_place() -> None:
+    def none(ref: SecretRef) -> Secret:
+        raise InputError(f"secret {ref}: not set")
+
+    with pytest.raises(InvalidInput, match=r"udp_mesh\.keys\.0: secret env:NEW: not set"):
+        daemon_keys(fleet(), none)
+
+
+def test_the_same_inventory_gives_the_same_bytes() -> None:
+    source = fleet(ESTOP, MAPS, VIDEO)
+    assert daemon_config(source, "spot") == daemon_config(source, "spot")
