@@ -24,7 +24,7 @@ from meshctl.device.connection import Completed, Endpoint
 from meshctl.lab import rom
 from meshctl.lab.client import is_running, request
 from meshctl.lab.errors import LabError
-from meshctl.lab.spec import FleetSpec, dump, load
+from meshctl.lab.spec import FleetSpec, Medium, dump, load
 from meshctl.lab.state import Power
 from meshctl.lab.twin import bench_of, loopback_of
 
@@ -123,6 +123,11 @@ class VirtualNode:
 
     def is_up(self) -> bool:
         return self.power is Power.UP
+
+    @property
+    def is_base(self) -> bool:
+        """Whether the operator sits at its LAN."""
+        return self.spec.medium is Medium.BASE
 
     def plug(self, plugged: bool = True) -> None:
         """Plug its LAN port into the operator's machine, or pull it out: then only the mesh leads there."""

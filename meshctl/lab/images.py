@@ -28,14 +28,15 @@ def firmware_image(
     release: Release,
     *,
     board: str,
-    packages: tuple[str, ...] = MESH_PACKAGES,
+    extra: tuple[str, ...] = (),
     target: str = "ath79/generic",
     compat_version: str = "1.0",
     size_bytes: int = 256 * 1024,
     revision: str | None = None,
 ) -> bytes:
-    """An image of `release` for `board` (`vendor,model`), of at least `size_bytes`."""
-    text = firmware_text(release, packages, target)
+    """An image of `release` for `board` (`vendor,model`), of at least `size_bytes`, with what a mesh needs and `extra`
+    baked in."""
+    text = firmware_text(release, (*MESH_PACKAGES, *extra), target)
     if revision is not None:
         text = text.replace(facts(release).revision, revision)
     payload = text.encode() + b"--\n"

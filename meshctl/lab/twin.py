@@ -34,7 +34,9 @@ def bench_of(number: int) -> str:
     return f"127.255.{(number + 1) // 256}.{(number + 1) % 256}"
 
 
-def spec_of(fleet: Fleet, *, links: Sequence[LinkSpec] | None = None, nodes: int | None = None) -> FleetSpec:
+def spec_of(
+    fleet: Fleet, *, links: Sequence[LinkSpec] | None = None, nodes: int | None = None, port: int = 0
+) -> FleetSpec:
     """The virtual twin of an inventory: its first `nodes` managed nodes (all by default), fresh from the box.
 
     Every node stands on the bench; a node with the role `base` is the one the operator sits at. `links` None: a chain
@@ -47,6 +49,7 @@ def spec_of(fleet: Fleet, *, links: Sequence[LinkSpec] | None = None, nodes: int
         name=fleet.name,
         nodes=tuple(_node_spec(node, number) for number, node in enumerate(chosen)),
         links=tuple(wanted),
+        port=port,
     )
 
 

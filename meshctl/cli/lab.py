@@ -1,0 +1,209 @@
+"""`meshctl lab up|down|status|shell|break|mend|link|plug|unplug|image`: a virtual fleet on this machine."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from meshctl.cli.options import AsJson
+from meshctl.errors import InputError
+from meshctl.lab.breaks import BREAKS
+from meshctl.lab.console import run_shell
+from meshctl.lab.copybook import prepare
+from meshctl.lab.fleet import VirtualFleet
+from meshctl.lab.images import firmware_image
+from meshctl.lab.twin import spec_of
+from meshctl.model import Release
+from meshctl.resources import shipped
+
+app = typer.Typer(help="A virtual fleet on this machine.", no_args_is_help=True)
+
+# seconds for one node to boot on a machine that has much else to do, and for the first one to begin
+_BOOT_S = 2.0
+_START_S = 60.0
+
+Directory = Annotated[
+    Path | None,
+    typer.Option("--dir", envvar="MESHCTL_LAB", help="Where the fleet lives; default: $XDG_STATE_HOME/meshctl/lab."),
+]
+Where = Annotated[str, typer.Argument(help="A node (b03) or a link (b01-b02).")]
+
+
+@app.command("up")
+def up(
+    inventory: Annotated[Path | None, typer.Argument(help="The fleet to copy; default: the example lab.")] = None,
+    nodes: Annotated[int | None, typer.Option("--nodes", min=1, help="Only its first N nodes.")] = None,
+    directory: Directory = None,
+    port: Annotated[int, typer.Option("--port", help="TCP port of all its addresses; 0 takes a free one.")] = 0,
+) -> None:
+    """Start a fleet of factory-fresh OpenWrt-like nodes, as the inventory describes them.
+
+    Example: meshctl lab up inventory/lab --nodes 6
+    """
+    place = _directory(directory)
+    copy = prepare(inventory or shipped("inventory") / "lab", place)
+    spec = spec_of(copy.fleet, links=copy.links, nodes=nodes, port=port)
+    fleet = VirtualFleet(spec, place).up(wait_s=_START_S + _BOOT_S * len(spec.nodes))
+    typer.echo(f"{len(spec.nodes)} nodes of {spec.name} are up, each at 192.168.1.1 on its own bench port")
+    typer.echo(f"inventory: {copy.inventory}")
+    typer.echo(f"reach it:  export MESHCTL_LAB={place} MESHCTL_INVENTORY={copy.inventory}")
+    typer.echo(f"by hand:   meshctl lab shell {fleet.spec.names[0]}")
+
+
+@app.command("down")
+def down(directory: Directory = None) -> None:
+    """End the fleet; its directory stays, for a look at flash and logs.
+
+    Example: meshctl lab down
+    """
+    fleet = VirtualFleet.attach(_directory(directory))
+    fleet.down()
+    typer.echo(f"{fleet.spec.name} is down")
+
+
+@app.command("status")
+def status(directory: Directory = None, as_json: AsJson = False) -> None:
+    """Show every node's power, address, way in, and what was broken.
+
+    Example: meshctl lab status --json
+    """
+    state = VirtualFleet.attach(_directory(directory)).status()
+    if as_json:
+        typer.echo(json.dumps(state, indent=2))
+        return
+    typer.echo(f"{state['fleet']}: process {state['pid']}, port {state['port']}")
+    head = ("NODE", "POWER", "RELEASE", "ADDRESS", "PLUGGED", "MESH", "REACHED AT", "BROKEN")
+    rows: list[tuple[str, ...]] = [head]
+    rows += [_row(node) for node in state["nodes"]]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    for row in rows:
+        typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    for link in state["links"]:
+        if not link["up"]:
+            typer.echo(f"link {'-'.join(link['between'])} is down")
+
+
+@app.command("shell")
+def shell(
+    node: Annotated[str, typer.Argument(help="Name of the node.")],
+    command: Annotated[list[str] | None, typer.Argument(help="A command; without it an interactive shell.")] = None,
+    directory: Directory = None,
+) -> None:
+    """Open a node's serial console, which works without its network.
+
+    Example: meshctl lab shell b01 -- uci show network
+    """
+    fleet = VirtualFleet.attach(_directory(directory))
+    raise typer.Exit(run_shell(fleet, fleet.node(node).name, " ".join(command or ())))
+
+
+@app.command("break", help="Break something.\n\n" + "\n\n".join(f"{one.value}: {text}" for one, text in BREAKS.items()))
+def break_(
+    where: Where,
+    what: Annotated[str, typer.Argument(help="What happens to it, some with @STEP: power-cut@7, power-cut@flash.")],
+    directory: Directory = None,
+) -> None:
+    VirtualFleet.attach(_directory(directory)).break_(where, what)
+
+
+@app.command("mend")
+def mend(
+    where: Annotated[str, typer.Argument(help="A node or a link; without it everything.")] = "",
+    directory: Directory = None,
+) -> None:
+    """Undo what was broken: power and links back, flash freed, dead firmware recovered as on a bench.
+
+    Example: meshctl lab mend b03
+    """
+    VirtualFleet.attach(_directory(directory)).mend(where)
+
+
+@app.command("link")
+def link(
+    a: Annotated[str, typer.Argument(help="One node.")],
+    b: Annotated[str, typer.Argument(help="The other.")],
+    up: Annotated[bool | None, typer.Option("--up/--down", help="Whether they hear each other.")] = None,
+    tq: Annotated[int | None, typer.Option("--tq", min=0, max=255, help="Link quality, 255 is perfect.")] = None,
+    delay_ms: Annotated[float | None, typer.Option("--delay", min=0, help="Milliseconds one way.")] = None,
+    loss: Annotated[float | None, typer.Option("--loss", min=0, max=1, help="Share of packets lost, 0 to 1.")] = None,
+    rate_kbps: Annotated[int | None, typer.Option("--rate", min=1, help="Kilobit per second.")] = None,
+    directory: Directory = None,
+) -> None:
+    """Change a link between two nodes, or make one.
+
+    Example: meshctl lab link b01 b02 --delay 40 --loss 0.05
+    """
+    given = {"up": up, "tq": tq, "delay_ms": delay_ms, "loss": loss, "rate_kbps": rate_kbps}
+    changes = {name: value for name, value in given.items() if value is not None}
+    VirtualFleet.attach(_directory(directory)).link(a, b, **changes)
+
+
+@app.command("plug")
+def plug(
+    nodes: Annotated[list[str] | None, typer.Argument(help="Nodes; none: all.")] = None, directory: Directory = None
+) -> None:
+    """Plug nodes' LAN ports into this machine, as on a bench.
+
+    Example: meshctl lab plug b01
+    """
+    _plug(directory, nodes, True)
+
+
+@app.command("unplug")
+def unplug(
+    nodes: Annotated[list[str] | None, typer.Argument(help="Nodes; none: all but the base.")] = None,
+    directory: Directory = None,
+) -> None:
+    """Pull nodes' LAN ports out: from then on only the mesh leads to them.
+
+    Example: meshctl lab unplug
+    """
+    _plug(directory, nodes, False)
+
+
+@app.command("image")
+def image(
+    release: Annotated[Release, typer.Argument(help="Release series, such as 24.10.")],
+    board: Annotated[str, typer.Argument(help="Board name, such as compex,wpj344-16m.")],
+    out: Annotated[Path, typer.Argument(help="The file to write.")],
+    package: Annotated[list[str] | None, typer.Option("--package", help="Baked in beside the mesh's own.")] = None,
+) -> None:
+    """Write a firmware image that virtual nodes can be flashed with, checked as a real one is.
+
+    Example: meshctl lab image 24.10 compex,wpj344-16m wpj344.bin
+    """
+    try:
+        out.write_bytes(firmware_image(release, board=board, extra=tuple(package or ())))
+    except OSError as error:
+        raise InputError(f"{out} cannot be written: {error.strerror}") from error
+
+
+def _plug(directory: Path | None, names: list[str] | None, plugged: bool) -> None:
+    fleet = VirtualFleet.attach(_directory(directory))
+    for node in (fleet.node(name) for name in names) if names else fleet.nodes:
+        if names or plugged or not node.is_base:
+            node.plug(plugged)
+
+
+def _directory(given: Path | None) -> Path:
+    if given is not None:
+        return given
+    home = os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()
+    return Path(home) / "meshctl" / "lab"
+
+
+def _row(node: dict[str, Any]) -> tuple[str, ...]:
+    return (
+        node["name"],
+        node["power"],
+        node["release"],
+        node["address"] or "-",
+        "yes" if node["plugged"] else "no",
+        "yes" if node["in_mesh"] else "no",
+        " ".join(node["reached_at"]) or "-",
+        " ".join(node["breaks"]) or "-",
+    )
