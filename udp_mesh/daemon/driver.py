@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 
@@ -42,7 +43,7 @@ IDLE_TICKS = 4
 """So many ticks without a datagram end it."""
 DRAIN_DATAGRAMS = 256
 """Datagrams read per wake-up before timers and sending get their turn (3 ms of work)."""
-PUMP_BYTES = 1 << 20
+PUMP_BYTES = 1 << 18
 """Bytes sent before the sockets get their turn again."""
 BLOCKED_DATAGRAMS = 256
 """Datagrams that wait for one full socket; more are lost."""
@@ -85,6 +86,7 @@ class Driver:
         self._last_wakeup = 0.0
         self._idle_ticks = 0
         self.closed = False
+        self._wall_offset = self._looked_at = 0.0
         self._now = 0.0
         self._link_name = ""
 
@@ -101,7 +103,7 @@ class Driver:
         """Says good-bye, sends the last datagrams, reports the last events, closes everything."""
         if self.closed:
             return
-        self.node.close(self._clock())
+        self.node.close(self._tell())
         self._transmit_all()
         self._report_events()
         self.closed = True
@@ -121,13 +123,13 @@ class Driver:
         self, topic: str, payload: bytes, *, destination: str | None = None, type_name: str = ""
     ) -> MessageId | Rejected:
         """`Node.send`, now; the datagrams leave in this turn of the loop."""
-        outcome = self.node.send(topic, payload, destination=destination, now=self._clock(), type_name=type_name)
+        outcome = self.node.send(topic, payload, destination=destination, now=self._tell(), type_name=type_name)
         self._pump_soon()
         return outcome
 
     def apply(self, settings: Settings) -> list[str]:
         """`Node.apply`, now. Raises ValueError for a changed name or port."""
-        changes = self.node.apply(settings, self._clock())
+        changes = self.node.apply(settings, self._tell())
         self._pump_soon()
         return changes
 
@@ -138,11 +140,16 @@ class Driver:
         self._pump_soon()
 
     def conditions(self) -> Conditions:
-        return self.node.conditions(self._clock())
+        return self.node.conditions(self._tell())
 
     def now(self) -> float:
         """The clock that conditions and events are told by, in seconds."""
         return self._clock()
+
+    def _tell(self) -> float:
+        """Now, to be told to the core: arrivals seen later count as not before this."""
+        self._now = self._clock()
+        return self._now
 
     # Links
 
@@ -153,7 +160,7 @@ class Driver:
         for link in open_before:
             self._unwatch(link)
         changes = self.hub.refresh()
-        now = self._clock()
+        now = self._tell()
         reopened = {link.attachment.name for link in changes.opened}
         for link in changes.gone:
             name = link.attachment.name
@@ -206,13 +213,26 @@ class Driver:
         self._pump()
 
     def _drain(self, link: UdpLink) -> int:
+        """Hands what waits to the core; afterwards `_now` is the time it was looked at."""
         self.wakeups += 1
-        self._now = self._clock()
+        now = self._clock()
+        # The kernel stamps arrivals by the wall clock; a step of that clock only costs this one turn its precision.
+        self._wall_offset = time.time() - now
+        self._looked_at = now
         self._link_name = link.attachment.name
-        return link.receive(self._deliver, DRAIN_DATAGRAMS)
+        count = link.receive(self._deliver, DRAIN_DATAGRAMS)
+        self._now = max(self._now, now)
+        return count
 
-    def _deliver(self, data: memoryview, source: Address) -> None:
-        self.node.receive(data, self._link_name, source, self._now)
+    def _deliver(self, data: memoryview, source: Address, arrived: float) -> None:
+        # Never before what the core was told already, never after now.
+        at = arrived - self._wall_offset
+        if at < self._now:
+            at = self._now
+        elif at > self._looked_at:
+            at = self._looked_at
+        self._now = at
+        self.node.receive(data, self._link_name, source, at)
 
     def _start_ticking(self) -> None:
         self._ticking = True
@@ -241,7 +261,7 @@ class Driver:
         self._pump_requested = False
         if self.closed:
             return
-        now = self._clock()
+        now = self._tell()
         due = self.node.next_timer()
         if due is not None and due <= now:
             self.node.handle_timer(now)
@@ -276,7 +296,7 @@ class Driver:
         """Sends what may leave now, up to `PUMP_BYTES`; True where there may be more."""
         sent = 0
         while sent < PUMP_BYTES:
-            batch = self.node.datagrams_to_send(self._clock())
+            batch = self.node.datagrams_to_send(self._tell())
             if not batch:
                 return False
             start = 0

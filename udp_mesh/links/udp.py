@@ -13,12 +13,12 @@ import errno
 import socket
 import struct
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 from udp_mesh.links.attachments import Address, Attachment
 
 SOL_UDP, UDP_SEGMENT, UDP_GRO = 17, 103, 104
-SO_BINDTODEVICE, SO_RCVBUFFORCE = 25, 33
+SO_BINDTODEVICE, SO_RCVBUFFORCE, SO_TIMESTAMPNS = 25, 33, 35
 
 MAX_SEGMENTS = 64
 """UDP_MAX_SEGMENTS of older kernels (newer take 128)."""
@@ -30,7 +30,11 @@ SEND_BUFFER_BYTES = 1 << 20
 """Kernel send buffer: a few runs; what waits here is beyond the scheduler's reach, so no more."""
 _DATAGRAM_BYTES = 1 << 16
 _INT = struct.Struct("=i")
-_ANCILLARY_BYTES = socket.CMSG_SPACE(4)
+_TIMESPEC = struct.Struct("@ll")
+_ANCILLARY_BYTES = socket.CMSG_SPACE(4) + socket.CMSG_SPACE(_TIMESPEC.size)
+
+Deliver: TypeAlias = Callable[[memoryview, Address, float], None]
+"""Takes a datagram, its sender, and when the kernel took it in (seconds since 1970, 0.0 where it does not say)."""
 
 _TRANSIENT = frozenset(
     {
@@ -98,6 +102,8 @@ class UdpLink:
         # Without CAP_NET_ADMIN the buffer stays within net.core.rmem_max.
         with contextlib.suppress(PermissionError):
             own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
+        # When a datagram came, not when we found time for it: round trips measure the network, not this machine's load.
+        own.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         # Before Linux 5.0 datagrams come one by one.
         with contextlib.suppress(OSError):
             own.setsockopt(SOL_UDP, UDP_GRO, 1)
@@ -111,7 +117,7 @@ class UdpLink:
     def fileno(self) -> int:
         return self._socket.fileno()
 
-    def receive(self, deliver: Callable[[memoryview, Address], None], limit: int) -> int:
+    def receive(self, deliver: Deliver, limit: int) -> int:
         """Hands up to about `limit` waiting datagrams to `deliver`; returns how many. Our own broadcasts are left out.
 
         The bytes handed over are overwritten by the next call: who keeps them copies them.
@@ -131,16 +137,19 @@ class UdpLink:
             address = (source[0], source[1])
             if address == own:
                 continue
-            segment = size
+            segment, arrived = size, 0.0
             for level, kind, data in ancillary:
                 if level == SOL_UDP and kind == UDP_GRO:
                     segment = _INT.unpack_from(data)[0]
+                elif kind == SO_TIMESTAMPNS:
+                    seconds, nanoseconds = _TIMESPEC.unpack_from(data)
+                    arrived = seconds + nanoseconds * 1e-9
             if size <= segment:
-                deliver(buffer[:size], address)
+                deliver(buffer[:size], address, arrived)
                 count += 1
                 continue
             for start in range(0, size, segment):
-                deliver(buffer[start : min(start + segment, size)], address)
+                deliver(buffer[start : min(start + segment, size)], address, arrived)
                 count += 1
         return count
 

@@ -3,7 +3,6 @@
 import select
 import socket
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from udp_mesh.links.attachments import Address, Attachment
@@ -36,7 +35,11 @@ def open_link(host: str, port: int, *, urgent_dscp: int = 0) -> UdpLink:
 def receive(link: UdpLink, count: int) -> list[tuple[bytes, Address]]:
     """Waits until `count` datagrams have arrived."""
     found: list[tuple[bytes, Address]] = []
-    deliver: Callable[[memoryview, Address], None] = lambda data, source: found.append((bytes(data), source))  # noqa: E731
+
+    def deliver(data: memoryview, source: Address, arrived: float) -> None:
+        assert abs(time.time() - arrived) < WAIT_S
+        found.append((bytes(data), source))
+
     deadline = time.monotonic() + WAIT_S
     while len(found) < count and time.monotonic() < deadline:
         select.select([link], [], [], 1.0)

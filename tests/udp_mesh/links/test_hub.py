@@ -86,8 +86,8 @@ deadline = time.monotonic() + 60
 while not heard and time.monotonic() < deadline:
     hub.links["mesh0"].send([Out()])
     select.select([far.links["far0"]], [], [], 0.2)
-    far.links["far0"].receive(lambda data, source: heard.append((bytes(data), source)), 10)
-    hub.links["mesh0"].receive(lambda data, source: echoed.append(bytes(data)), 10)
+    far.links["far0"].receive(lambda data, source, arrived: heard.append((bytes(data), source)), 10)
+    hub.links["mesh0"].receive(lambda data, source, arrived: echoed.append(bytes(data)), 10)
 assert heard[0] == (b"to all", ("10.7.20.6", 8700)), heard
 assert not echoed
 far.close(); hub.close(); monitor.close()
