@@ -1,0 +1,68 @@
+"""All rules, in the order of their codes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from types import MappingProxyType, ModuleType
+
+from meshctl.lint.rule import Rule
+from meshctl.lint.rules import (
+    access,
+    addresses,
+    bridge,
+    cell,
+    channel,
+    encryption,
+    firmware,
+    hardware,
+    housekeeping,
+    identity,
+    power,
+    references,
+    rendering,
+    routing,
+    secrets,
+    team,
+    topics,
+    traffic,
+)
+
+# the chapters of the documentation, each a module of rules
+CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
+    ("Suppressions and the baseline", housekeeping),
+    ("References", references),
+    ("Identity", identity),
+    ("Addresses", addresses),
+    ("The cell", cell),
+    ("Channel and country", channel),
+    ("Power", power),
+    ("Encryption", encryption),
+    ("Logging in", access),
+    ("Secrets", secrets),
+    ("Routing", routing),
+    ("Bridging", bridge),
+    ("Robots, roles and changes", team),
+    ("Topics", topics),
+    ("Load, ports and timers", traffic),
+    ("Firmware", firmware),
+    ("Hardware and packages", hardware),
+    ("Rendering", rendering),
+)
+
+
+def rules_of(module: ModuleType) -> Iterator[Rule]:
+    """The rules that a module defines, in its order."""
+    return (value for value in vars(module).values() if isinstance(value, Rule))
+
+
+def _all() -> tuple[Rule, ...]:
+    rules = sorted((rule for _, module in CHAPTERS for rule in rules_of(module)), key=lambda rule: rule.code)
+    for first, second in pairwise(rules):
+        if first.code == second.code:
+            raise ValueError(f"two rules have the code {first.code}: {first.name} and {second.name}")
+    return tuple(rules)
+
+
+RULES: tuple[Rule, ...] = _all()
+BY_CODE = MappingProxyType({rule.code: rule for rule in RULES})

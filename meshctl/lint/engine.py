@@ -1,0 +1,79 @@
+"""Fleet and text -> findings: run the rules, place what they saw, say what a whole group shares once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+
+from meshctl.diagnostics import Diagnostic, Position, sorted_diagnostics
+from meshctl.lint.catalog import RULES
+from meshctl.lint.context import LintContext
+from meshctl.lint.grouping import listed
+from meshctl.lint.rule import Finding, Rule
+from meshctl.model import Fleet, MissingOrigin
+
+
+def lint(fleet: Fleet, context: LintContext, rules: Iterable[Rule] = RULES) -> tuple[Diagnostic, ...]:
+    """What the rules find in the fleet, sorted by place. Linear in the size of the fleet."""
+    found = (
+        diagnostic(rule, finding, _position(fleet, finding))
+        for rule in rules
+        if rule.check is not None
+        for finding in rule.check(fleet, context)
+    )
+    return sorted_diagnostics(_merged(found))
+
+
+def lint_texts(sources: Mapping[str, str], rules: Iterable[Rule] = RULES) -> tuple[Diagnostic, ...]:
+    """What the rules find in the files' texts, which need not make a fleet."""
+    found = (
+        diagnostic(rule, finding, finding.position or Position(file))
+        for rule in rules
+        if rule.check_text is not None
+        for file, text in sources.items()
+        for finding in rule.check_text(file, text)
+    )
+    return sorted_diagnostics(found)
+
+
+def diagnostic(rule: Rule, finding: Finding, position: Position) -> Diagnostic:
+    """A finding of `rule` at `position`."""
+    return Diagnostic(
+        code=rule.code,
+        severity=rule.severity,
+        position=position,
+        message=finding.message,
+        path=".".join(finding.path),
+        expected=finding.expected,
+        found=finding.found,
+        hint=finding.hint or rule.mend,
+    )
+
+
+def _position(fleet: Fleet, finding: Finding) -> Position:
+    if finding.position is not None:
+        return finding.position
+    try:
+        return fleet.where(*finding.path).position
+    except MissingOrigin:
+        return Position(fleet.files[0], 1, 1) if fleet.files else Position(fleet.name)
+
+
+def _merged(found: Iterable[Diagnostic]) -> Iterator[Diagnostic]:
+    """Findings that differ in the path alone (a value that a group or a range shares) as one, naming the others."""
+    groups: dict[tuple[str, Position, str, str, str], list[Diagnostic]] = {}
+    for item in found:
+        groups.setdefault((item.code, item.position, item.message, item.expected, item.found), []).append(item)
+    for first, *others in groups.values():
+        names = list(dict.fromkeys(_subject(item.path) for item in others if item.path != first.path))
+        if names:
+            also = f"also {listed(names)}"
+            yield replace(first, message=f"{first.message} ({also})" if first.message else also)
+        else:
+            yield first
+
+
+def _subject(path: str) -> str:
+    """The thing a path speaks of: `b03` in `nodes.b03.radios.radio0`."""
+    parts = path.split(".")
+    return parts[1] if len(parts) > 1 else path

@@ -1,0 +1,65 @@
+"""The one place where lint touches the disk: facts about the files an inventory names, each found out once."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+from meshctl import firmware
+from meshctl.diagnostics import Diagnostic
+from meshctl.model import HardwareProfile
+
+# git answers at once, or hangs on a network file system that is gone
+_GIT_TIMEOUT_S = 10
+
+
+class DiskFiles:
+    """`meshctl.lint.context.Files` on the real file system, with a memory."""
+
+    def __init__(self) -> None:
+        self._firmware: dict[HardwareProfile, tuple[Diagnostic, ...]] = {}
+        self._tracked: dict[Path, bool] = {}
+
+    def size_bytes(self, path: Path) -> int | None:
+        try:
+            return path.stat().st_size if path.is_file() else None
+        except OSError:
+            return None
+
+    def mode(self, path: Path) -> int | None:
+        try:
+            return path.stat().st_mode & 0o7777
+        except OSError:
+            return None
+
+    def in_repository(self, path: Path) -> bool:
+        if path not in self._tracked:
+            self._tracked[path] = _would_be_committed(path)
+        return self._tracked[path]
+
+    def firmware(self, profile: HardwareProfile) -> tuple[Diagnostic, ...]:
+        if profile not in self._firmware:
+            image = firmware.image_path(profile)
+            self._firmware[profile] = () if image is None else firmware.check(image, profile)
+        return self._firmware[profile]
+
+
+def _would_be_committed(path: Path) -> bool:
+    absolute = path.absolute()
+    if not any((parent / ".git").exists() for parent in absolute.parents):
+        return False
+    git = shutil.which("git")
+    if git is None:
+        return True
+    try:
+        ignored = subprocess.run(
+            [git, "-C", str(absolute.parent), "check-ignore", "-q", "--", str(absolute)],
+            check=False,
+            capture_output=True,
+            timeout=_GIT_TIMEOUT_S,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return True
+    # 0: ignored, 1: not, 128: git cannot tell
+    return ignored.returncode != 0

@@ -1,0 +1,31 @@
+"""Group equal things in one pass, so that a rule about collisions costs what the fleet's size costs."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from typing import TypeVar
+
+K = TypeVar("K", bound=Hashable)
+V = TypeVar("V")
+
+# more names than these say nothing more to a reader
+_SHOWN = 4
+
+
+def grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
+    """The values of every key, both in the order of their coming."""
+    groups: dict[K, list[V]] = {}
+    for key, value in pairs:
+        groups.setdefault(key, []).append(value)
+    return groups
+
+
+def repeated(pairs: Iterable[tuple[K, V]]) -> Iterator[tuple[K, list[V]]]:
+    """The keys that came more than once, with their values."""
+    return ((key, values) for key, values in grouped(pairs).items() if len(values) > 1)
+
+
+def listed(names: Sequence[str]) -> str:
+    """`a, b, c`, cut after a few."""
+    shown = ", ".join(names[:_SHOWN])
+    return shown if len(names) <= _SHOWN else f"{shown} and {len(names) - _SHOWN} more"

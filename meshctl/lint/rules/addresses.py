@@ -1,0 +1,365 @@
+"""Addresses and networks: unique, inside their network, reachable (MC201 to MC214)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from ipaddress import IPv4Address, IPv4Network, ip_address
+
+from meshctl.diagnostics import Severity
+from meshctl.lint.context import LintContext
+from meshctl.lint.grouping import grouped, repeated
+from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.model import Backend, Fleet, Mesh, Node
+
+# what every factory-fresh OpenWrt device answers at
+_FACTORY = IPv4Address("192.168.1.1")
+# RFC 1918, and RFC 6598 for carriers
+_PRIVATE = tuple(IPv4Network(text) for text in ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10"))
+# 0/8, loopback, link-local, multicast, reserved: no station has one to itself
+_UNUSABLE = tuple(IPv4Network(text) for text in ("0.0.0.0/8", "127.0.0.0/8", "169.254.0.0/16", "224.0.0.0/3"))
+
+
+def _meshes_of(fleet: Fleet, node: Node) -> list[Mesh]:
+    return [fleet.meshes[name] for name in node.meshes if name in fleet.meshes]
+
+
+@fleet_rule(
+    "MC201",
+    Severity.ERROR,
+    "Two stations have the same address",
+    why="""Both answer ARP and traffic goes to whichever spoke last: a node that comes and goes, and a change that lands
+    on the wrong one.""",
+    mend="Give each node and each computer an address of its own.",
+    failing="nodes: {b01: {address: 10.42.0.1}}",
+    passing="nodes: {b01: {address: 10.42.0.102}}",
+)
+def address_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for address, owners in repeated(_stations(fleet)):
+        (_, first), *later = owners
+        for path, _ in later:
+            yield Finding(path, f"{first} has the same address", "an address of its own", str(address))
+
+
+def _stations(fleet: Fleet) -> Iterator[tuple[IPv4Address, tuple[tuple[str, ...], str]]]:
+    for node in fleet.managed():
+        yield node.address.ip, (("nodes", node.name, "address"), node.name)
+    for robot in fleet.robots.values():
+        if robot.computer is not None:
+            path = ("robots", robot.name, "computer", "address")
+            yield robot.computer.address.ip, (path, f"the computer of {robot.name}")
+
+
+@fleet_rule(
+    "MC202",
+    Severity.ERROR,
+    "A node's address lies outside its mesh's network",
+    why="Its neighbours have no route to it: after the change nobody reaches the node, and it rolls back.",
+    mend="Choose an address from the network of one of its meshes.",
+    failing="nodes: {b01: {address: 10.43.0.7}}",
+    passing="nodes: {b01: {address: 10.42.0.7}}",
+)
+def address_outside(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        networks = [mesh.network for mesh in _meshes_of(fleet, node)]
+        if networks and not any(node.address.ip in network for network in networks):
+            expected = f"an address in {' or '.join(str(network) for network in networks)}"
+            yield Finding(("nodes", node.name, "address"), "not in its mesh's network", expected, str(node.address.ip))
+
+
+@fleet_rule(
+    "MC203",
+    Severity.ERROR,
+    "An address is the network's own or its broadcast address",
+    why="The kernel refuses it or answers nothing sent to it.",
+    mend="Choose an address between the two.",
+    failing="nodes: {b01: {address: 10.42.0.255}}",
+    passing="nodes: {b01: {address: 10.42.0.254}}",
+)
+def address_reserved(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        yield from _reserved(("nodes", node.name, "address"), node.address.ip, node.address.network)
+    for robot in fleet.robots.values():
+        if robot.computer is not None:
+            address = robot.computer.address
+            yield from _reserved(("robots", robot.name, "computer", "address"), address.ip, address.network)
+
+
+def _reserved(path: tuple[str, ...], address: IPv4Address, network: IPv4Network) -> Iterator[Finding]:
+    if network.prefixlen <= 30 and address in (network.network_address, network.broadcast_address):
+        expected = f"an address between {network.network_address} and {network.broadcast_address}"
+        yield Finding(path, "not a station's address", expected, str(address))
+
+
+@fleet_rule(
+    "MC204",
+    Severity.ERROR,
+    "A node's gateway cannot be reached",
+    why="""A gateway outside the node's network is refused by the kernel; a node that is its own gateway sends nothing
+    out.""",
+    mend="Name an address of another station in the same network.",
+    failing="nodes: {b01: {gateway: 10.99.0.1}}",
+    passing="nodes: {b01: {gateway: 10.42.0.254}}",
+)
+def gateway_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        if node.gateway is None:
+            continue
+        if node.gateway == node.address.ip or node.gateway not in node.address.network:
+            expected = f"another station in {node.address.network}"
+            yield Finding(("nodes", node.name, "gateway"), "not reachable from the node", expected, str(node.gateway))
+
+
+@fleet_rule(
+    "MC205",
+    Severity.ERROR,
+    "The networks of two meshes overlap",
+    why="A node in both, or a robot bridging both, has two routes to one address and uses the wrong one half the time.",
+    mend="Give each mesh a network of its own, or both the same (cells of one network share a routing interface).",
+    failing="""
+    meshes:
+      second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.42.0.128/25,
+               encryption: psk2+ccmp, key: {env: MESH_KEY}}
+    nodes:
+      base: {radios: {radio1: {mesh: second}}}
+    """,
+    passing="""
+    meshes:
+      second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
+               encryption: psk2+ccmp, key: {env: MESH_KEY}}
+    nodes:
+      base: {radios: {radio1: {mesh: second}}}
+    """,
+)
+def networks_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    # sorted by first address, a network overlaps the widest one before it or none before it
+    widest: Mesh | None = None
+    for mesh in sorted(fleet.meshes.values(), key=lambda mesh: (mesh.network.network_address, mesh.network.prefixlen)):
+        if widest is not None and mesh.network.overlaps(widest.network) and not _routed_as_one(mesh, widest):
+            message = f"overlaps {widest.network} of mesh {widest.name}"
+            yield Finding(("meshes", mesh.name, "network"), message, "a network of its own", str(mesh.network))
+        if widest is None or mesh.network.broadcast_address > widest.network.broadcast_address:
+            widest = mesh
+
+
+def _routed_as_one(mesh: Mesh, other: Mesh) -> bool:
+    """Two cells under one batman-adv interface, say one in each band: one network is what they are meant to have."""
+    both = mesh.backend is Backend.BATMAN and other.backend is Backend.BATMAN
+    return both and mesh.network == other.network and mesh.batman.routing_algo == other.batman.routing_algo
+
+
+@fleet_rule(
+    "MC206",
+    Severity.WARNING,
+    "The network holds the factory address 192.168.1.1",
+    why="""A device in failsafe, or freshly reset, answers at 192.168.1.1: inside the fleet's network it takes the place
+    of the node that has that address, or is taken for part of the fleet.""",
+    mend="Use another network, such as 10.42.0.0/24.",
+    failing="""
+    meshes: {main: {network: 192.168.1.0/24}}
+    nodes: {base: {address: 192.168.1.2}, husky1-front: {address: 192.168.1.11}, b01: {address: 192.168.1.101}}
+    robots: {base-station: {computer: {address: 192.168.1.100/24}}, husky1: {computer: {address: 192.168.1.110/24}}}
+    """,
+    passing="meshes: {main: {network: 10.42.0.0/24}}",
+)
+def factory_address(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for mesh in fleet.meshes.values():
+        if _FACTORY in mesh.network:
+            path = ("meshes", mesh.name, "network")
+            yield Finding(path, f"holds {_FACTORY}, where factory-fresh devices answer", "another", str(mesh.network))
+
+
+@fleet_rule(
+    "MC207",
+    Severity.WARNING,
+    "The network is not private",
+    why="""Addresses that belong to others on the internet become unreachable from every robot and laptop of the team,
+    and replies leak out of the uplink.""",
+    mend="Use a network of RFC 1918, such as 10.42.0.0/24.",
+    failing="""
+    meshes: {main: {network: 11.42.0.0/24}}
+    nodes: {base: {address: 11.42.0.1}, husky1-front: {address: 11.42.0.11}, b01: {address: 11.42.0.101}}
+    robots: {base-station: {computer: {address: 11.42.0.100/24}}, husky1: {computer: {address: 11.42.0.110/24}}}
+    """,
+    passing="meshes: {main: {network: 10.42.0.0/24}}",
+)
+def network_public(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for mesh in fleet.meshes.values():
+        network = mesh.network
+        if not any(network.subnet_of(private) for private in _PRIVATE) and not _unusable(network):
+            yield Finding(("meshes", mesh.name, "network"), "not a private network", "one of RFC 1918", str(network))
+
+
+@fleet_rule(
+    "MC208",
+    Severity.ERROR,
+    "The network is not for stations",
+    why="Loopback, link-local, multicast and reserved ranges are not routed or not accepted on an interface.",
+    mend="Use a network of RFC 1918, such as 10.42.0.0/24.",
+    failing="""
+    meshes: {main: {network: 127.42.0.0/24}}
+    nodes: {base: {address: 127.42.0.1}, husky1-front: {address: 127.42.0.11}, b01: {address: 127.42.0.101}}
+    robots: {base-station: {computer: {address: 127.42.0.100/24}}, husky1: {computer: {address: 127.42.0.110/24}}}
+    """,
+    passing="meshes: {main: {network: 10.42.0.0/24}}",
+)
+def network_unusable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for mesh in fleet.meshes.values():
+        if _unusable(mesh.network):
+            path = ("meshes", mesh.name, "network")
+            yield Finding(path, "no station may have such addresses", "one of RFC 1918", str(mesh.network))
+
+
+def _unusable(network: IPv4Network) -> bool:
+    return any(network.overlaps(unusable) for unusable in _UNUSABLE)
+
+
+@fleet_rule(
+    "MC209",
+    Severity.ERROR,
+    "A robot's computer is in another network than its radios",
+    why="""The radios bridge the mesh to the computer's switch: there is no router between them, so a computer in
+    another network is cut off from the whole team.""",
+    mend="Give the computer an address in the network of its radios' mesh.",
+    failing="robots: {husky1: {computer: {address: 10.99.0.5/24}}}",
+    passing="robots: {husky1: {computer: {address: 10.42.0.120/24}}}",
+)
+def computer_elsewhere(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        nodes = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
+        networks = dict.fromkeys(mesh.network for node in nodes for mesh in _meshes_of(fleet, node))
+        if robot.computer is not None and networks:
+            address = robot.computer.address.ip
+            if not any(address in network for network in networks):
+                expected = f"an address in {' or '.join(str(network) for network in networks)}"
+                path = ("robots", robot.name, "computer", "address")
+                yield Finding(path, "not in the network of its radios", expected, str(address))
+
+
+@fleet_rule(
+    "MC210",
+    Severity.ERROR,
+    "A computer's prefix length differs from the mesh's",
+    why="""With a longer prefix the computer sends part of the team's traffic to a gateway that does not exist; with a
+    shorter one it answers for stations that are elsewhere.""",
+    mend="Write the computer's address with the prefix length of the mesh's network.",
+    failing="robots: {husky1: {computer: {address: 10.42.0.120/28}}}",
+    passing="robots: {husky1: {computer: {address: 10.42.0.120/24}}}",
+)
+def prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        if robot.computer is None:
+            continue
+        for mesh in fleet.meshes.values():
+            address = robot.computer.address
+            if address.ip in mesh.network and address.network != mesh.network:
+                path = ("robots", robot.name, "computer", "address")
+                expected = f"/{mesh.network.prefixlen} like mesh {mesh.name}"
+                yield Finding(path, "prefix length differs", expected, f"/{address.network.prefixlen}")
+
+
+@fleet_rule(
+    "MC211",
+    Severity.WARNING,
+    "The network has no room for a replacement",
+    why="""When the last address is taken, a spare cannot be brought in beside the node it replaces, and a laptop cannot
+    join to look.""",
+    mend="Use a wider network: a few bits cost nothing.",
+    failing="""
+    meshes: {main: {network: 10.42.0.0/29}}
+    nodes: {base: {address: 10.42.0.1}, husky1-front: {address: 10.42.0.2}, b01: {address: 10.42.0.3}}
+    robots: {base-station: {computer: {address: 10.42.0.4/29}}, husky1: {computer: {address: 10.42.0.5/29}}}
+    """,
+    passing="""
+    meshes: {main: {network: 10.42.0.0/28}}
+    nodes: {base: {address: 10.42.0.1}, husky1-front: {address: 10.42.0.2}, b01: {address: 10.42.0.3}}
+    robots: {base-station: {computer: {address: 10.42.0.4/28}}, husky1: {computer: {address: 10.42.0.5/28}}}
+    """,
+)
+def network_full(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    # one for the spare, one for the operator's laptop
+    reserve = 2
+    taken: dict[str, set[IPv4Address]] = {name: set() for name in fleet.meshes}
+    by_network = grouped((mesh.network, name) for name, mesh in fleet.meshes.items())
+    for address, _ in _stations(fleet):
+        for network, names in by_network.items():
+            if address in network:
+                for name in names:
+                    taken[name].add(address)
+    for name, mesh in fleet.meshes.items():
+        room = mesh.network.num_addresses - 2 - len(taken[name])
+        if len(taken[name]) > 0 and room < reserve:
+            path = ("meshes", name, "network")
+            yield Finding(
+                path, f"{len(taken[name])} addresses are taken", f"room for {reserve} more", f"{max(room, 0)}"
+            )
+
+
+@fleet_rule(
+    "MC212",
+    Severity.WARNING,
+    "Logs are sent where no node can reach",
+    why="The log host lies in no network of the fleet and no node has a gateway: after an accident there is no record.",
+    mend="Name the base station's computer in `system.log_host`, or give the nodes a gateway.",
+    failing="system: {log_host: 192.0.2.9}",
+    passing="system: {log_host: 10.42.0.100}",
+)
+def log_host_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    host = fleet.system.log_host
+    if host and _out_of_reach(fleet, host):
+        yield Finding(("system", "log_host"), "in no network of the fleet", "an address of a mesh's network", host)
+
+
+@fleet_rule(
+    "MC213",
+    Severity.WARNING,
+    "No time server can be reached",
+    why="""Radios have no clock battery. Without a time server in reach their logs start at the build date, and nothing
+    that happened on two nodes can be put in order.""",
+    mend="Run a time server on the base station and name its address.",
+    failing="system: {ntp_servers: [0.openwrt.pool.ntp.org]}",
+    passing="system: {ntp_servers: [10.42.0.100]}",
+)
+def time_server_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    servers = fleet.system.ntp_servers
+    if servers and all(_out_of_reach(fleet, server) for server in servers):
+        expected = "an address of a mesh's network"
+        yield Finding(("system", "ntp_servers"), "in no network of the fleet", expected, ", ".join(servers))
+
+
+def _out_of_reach(fleet: Fleet, host: str) -> bool:
+    if any(node.gateway is not None for node in fleet.managed()):
+        return False
+    try:
+        address = ip_address(host)
+    except ValueError:
+        # a name needs a resolver, which is beyond a gateway as well
+        return True
+    return not any(address in mesh.network for mesh in fleet.meshes.values())
+
+
+@fleet_rule(
+    "MC214",
+    Severity.ERROR,
+    "Two nodes are reached at the same SSH host and port",
+    why="The second node would be changed into the first and back on every run; only the host key stops it.",
+    mend="Leave `ssh.host` out to use the node's own address, or give each node its own forwarded port.",
+    failing="""
+    nodes:
+      base: {ssh: {host: 127.0.0.1, port: 2201}}
+      b01: {ssh: {host: 127.0.0.1, port: 2201}}
+    """,
+    passing="""
+    nodes:
+      base: {ssh: {host: 127.0.0.1, port: 2201}}
+      b01: {ssh: {host: 127.0.0.1, port: 2202}}
+    """,
+)
+def ssh_endpoint_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    # nodes behind different jump hosts may well share a host and port
+    endpoints = (
+        ((node.ssh.host, node.ssh.port, node.ssh.jump), node.name) for node in fleet.managed() if node.ssh.host
+    )
+    for (host, port, _), names in repeated(endpoints):
+        for name in names[1:]:
+            path = ("nodes", name, "ssh", "host")
+            yield Finding(path, f"{names[0]} is reached at the same place", "one of its own", f"{host}:{port}")

@@ -1,0 +1,235 @@
+"""Bridging into the robot's LAN: ports, loops, confirm windows, the firewall (MC521 to MC530)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from meshctl.diagnostics import Severity
+from meshctl.lint.context import LintContext
+from meshctl.lint.grouping import grouped, listed, repeated
+from meshctl.lint.rule import Example, Finding, fleet_rule
+from meshctl.lint.rules.routing import MESHMERIZE, PARTS
+from meshctl.model import Backend, Fleet, Mesh, Node
+
+# the loop avoidance's own resynchronization holds broadcasts up to 30 s; twice that with room for the check itself
+_LOOP_AVOIDANCE_S = 60
+# what is owned by the mesh's side of the bridge
+_NOT_PORTS = ("bat", "mesh", "wlan", "phy", "br-")
+_TWO_RADIOS = """
+nodes: {husky1-rear: {role: robot, address: 10.42.0.12, label: H1R}}
+robots: {husky1: {nodes: [husky1-front, husky1-rear]}}
+"""
+
+
+def _bridged_pairs(fleet: Fleet) -> Iterator[tuple[str, Mesh, list[Node]]]:
+    """Robots with several nodes of one mesh that are bridged onto the robot's switch."""
+    for robot in fleet.robots.values():
+        nodes = [fleet.nodes[name] for name in dict.fromkeys(robot.nodes) if name in fleet.nodes]
+        bridged = [node for node in nodes if node.state.is_managed and node.lan_ports]
+        for mesh, members in grouped((mesh, node) for node in bridged for mesh in node.meshes).items():
+            if len(members) > 1 and mesh in fleet.meshes:
+                yield robot.name, fleet.meshes[mesh], members
+
+
+@fleet_rule(
+    "MC521",
+    Severity.ERROR,
+    "Two radios on one switch without loop avoidance",
+    why="""Both radios bridge the mesh to the same switch: a broadcast goes in at one, out at the other, and round
+    again. Within seconds the storm fills every link of the fleet, not only this robot's.""",
+    mend="Set `batman: {bridge_loop_avoidance: true}` at the mesh, or bridge only one of the radios (`lan_ports: []`).",
+    failing="meshes: {main: {batman: {bridge_loop_avoidance: false}}}" + _TWO_RADIOS,
+    passing="meshes: {main: {batman: {bridge_loop_avoidance: true}}}" + _TWO_RADIOS,
+)
+def loop_without_avoidance(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot, mesh, nodes in _bridged_pairs(fleet):
+        if mesh.backend is Backend.BATMAN and not mesh.batman.bridge_loop_avoidance:
+            names = listed([node.name for node in nodes])
+            path = ("meshes", mesh.name, "batman", "bridge_loop_avoidance")
+            yield Finding(path, f"{names} share the switch of {robot}", "true", "false")
+
+
+@fleet_rule(
+    "MC522",
+    Severity.WARNING,
+    "Two radios on one switch over a back end whose loop avoidance is unknown",
+    why="""meshctl knows batman-adv's loop avoidance only. Over another back end two bridged radios loop unless that
+    back end takes care of it.""",
+    mend="Make sure the back end avoids the loop and suppress this finding, or bridge only one of the radios.",
+    failing=Example(MESHMERIZE + _TWO_RADIOS, files=PARTS),
+    passing=Example(MESHMERIZE, files=PARTS),
+)
+def loop_over_other_back_end(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot, mesh, nodes in _bridged_pairs(fleet):
+        if mesh.backend is not Backend.BATMAN:
+            names = listed([node.name for node in nodes])
+            message = f"{names} share the switch of {robot}"
+            yield Finding(
+                ("meshes", mesh.name, "backend"), message, "batman-adv, or one bridged radio", mesh.backend.value
+            )
+
+
+@fleet_rule(
+    "MC523",
+    Severity.ERROR,
+    "The confirm window is too short for loop avoidance",
+    why="""After a change the loop avoidance can hold broadcasts for 30 seconds while its nodes agree anew. The operator
+    cannot confirm in that time, and a good change is rolled back.""",
+    mend="Set `confirm_window_s` above 60.",
+    failing="hardware: {rocket: {confirm_window_s: 45}}",
+    passing="hardware: {rocket: {confirm_window_s: 120}}",
+)
+def confirm_window_short(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        avoiding = any(_avoids_loops(fleet, mesh) for mesh in node.meshes)
+        if avoiding and node.lan_ports and node.confirm_window_s <= _LOOP_AVOIDANCE_S:
+            path = ("nodes", node.name, "confirm_window_s")
+            if node.confirm_window_s == node.hardware.confirm_window_s:
+                path = ("hardware", node.hardware.name, "confirm_window_s")
+            expected = f"more than {_LOOP_AVOIDANCE_S} s"
+            yield Finding(path, "loop avoidance may need that long", expected, f"{node.confirm_window_s} s")
+
+
+def _avoids_loops(fleet: Fleet, name: str) -> bool:
+    mesh = fleet.meshes.get(name)
+    return mesh is not None and mesh.backend is Backend.BATMAN and mesh.batman.bridge_loop_avoidance
+
+
+@fleet_rule(
+    "MC524",
+    Severity.WARNING,
+    "The confirm window is very long",
+    why="Until it ends, a node that was cut off by a bad change stays cut off.",
+    mend="Keep it below ten minutes.",
+    failing="hardware: {rocket: {confirm_window_s: 1800}}",
+    passing="hardware: {rocket: {confirm_window_s: 300}}",
+)
+def confirm_window_long(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        if node.confirm_window_s > 600:
+            path = ("nodes", node.name, "confirm_window_s")
+            if node.confirm_window_s == node.hardware.confirm_window_s:
+                path = ("hardware", node.hardware.name, "confirm_window_s")
+            found = f"{node.confirm_window_s} s"
+            yield Finding(path, "a bad change lasts that long", "at most 600 s", found)
+
+
+@fleet_rule(
+    "MC525",
+    Severity.ERROR,
+    "A bridge port is listed twice",
+    why="netifd adds the port once and fails the second time; on 19.07 the bridge may come up without it.",
+    mend="List each port once.",
+    failing="hardware: {rocket: {lan_ports: [eth0, eth0]}}",
+    passing="hardware: {rocket: {lan_ports: [eth0, eth1]}}",
+)
+def port_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for place, ports in _port_lists(fleet):
+        for port, indexes in repeated((port, index) for index, port in enumerate(ports)):
+            yield Finding((*place, str(indexes[1])), "stands twice", "each port once", port)
+
+
+def _port_lists(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
+    for profile in fleet.hardware.values():
+        yield ("hardware", profile.name, "lan_ports"), profile.lan_ports
+    for node in fleet.nodes.values():
+        if node.lan_ports != node.hardware.lan_ports:
+            yield ("nodes", node.name, "lan_ports"), node.lan_ports
+
+
+@fleet_rule(
+    "MC526",
+    Severity.ERROR,
+    "A bridge port belongs to the mesh",
+    why="""meshctl bridges the routing interface itself. A radio interface in the bridge as well carries every frame
+    twice, past the routing: a loop that no loop avoidance sees.""",
+    mend="List wired ports only, as in the device's /etc/board.json.",
+    failing="hardware: {rocket: {lan_ports: [eth0, bat0]}}",
+    passing="hardware: {rocket: {lan_ports: [eth0]}}",
+)
+def port_of_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for place, ports in _port_lists(fleet):
+        for index, port in enumerate(ports):
+            if port.startswith(_NOT_PORTS) or port == "lo":
+                yield Finding((*place, str(index)), "not a wired port", "a port such as eth0 or lan1", port)
+
+
+@fleet_rule(
+    "MC527",
+    Severity.ERROR,
+    "A bridge port and a VLAN of it are both bridged",
+    why="eth0 carries eth0.1: with both in the bridge, frames of the VLAN come in twice and go round.",
+    mend="List the VLANs, or the port.",
+    failing="hardware: {rocket: {lan_ports: [eth0, eth0.1]}}",
+    passing="hardware: {rocket: {lan_ports: [eth0.1, eth0.2]}}",
+)
+def port_and_vlan(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for place, ports in _port_lists(fleet):
+        for index, port in enumerate(ports):
+            parent, dot, _ = port.partition(".")
+            if dot and parent in ports:
+                yield Finding((*place, str(index)), f"{parent} is bridged as well", "one of the two", port)
+
+
+@fleet_rule(
+    "MC528",
+    Severity.ERROR,
+    "A robot's radio has no wired port",
+    why="Nothing joins the mesh with the robot's switch: the radio is on the air, and its computer hears nothing.",
+    mend="Name the ports of /etc/board.json in `lan_ports`.",
+    failing="nodes: {husky1-front: {lan_ports: []}}",
+    passing="nodes: {husky1-front: {lan_ports: [eth0]}}",
+)
+def robot_without_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        nodes = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
+        if robot.computer is not None and nodes and not any(node.lan_ports for node in nodes):
+            path = ("nodes", nodes[0].name, "lan_ports")
+            yield Finding(path, f"the computer of {robot.name} is cut off", "at least one port", "none")
+
+
+@fleet_rule(
+    "MC529",
+    Severity.ERROR,
+    "Extra UCI text changes the firewall where input is rejected",
+    why="""From 23.05 the stock firewall rejects what no zone allows. meshctl renders a zone that lets the management
+    network in; text behind it that sets defaults, zones or policies of its own can shut the operator out, and the
+    dead-man's switch with him.""",
+    mend="Leave the firewall to meshctl, or bring a template of the whole package.",
+    failing="""
+    nodes: {b01: {extra_uci: {firewall: "config defaults\\n\\toption input 'REJECT'\\n"}}}
+    """,
+    passing="""
+    nodes: {b01: {extra_uci: {system: "config led\\n\\toption name 'mesh'\\n"}}}
+    """,
+)
+def extra_firewall(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        for name in node.extra_uci:
+            if name.partition(".")[0] == "firewall" and node.release.rejects_input_by_default:
+                path = ("nodes", node.name, "extra_uci", name)
+                message = f"OpenWrt {node.release} rejects what no zone allows"
+                yield Finding(path, message, "the zone that meshctl renders", name)
+
+
+@fleet_rule(
+    "MC530",
+    Severity.WARNING,
+    "Extra UCI text changes what lint has checked",
+    why="""Text behind the rendered wireless or network package can change channel, power, addresses and bridges after
+    every check here has passed: the cell may split, or a limit be broken, unseen.""",
+    mend="Use the inventory's own keys; they are checked.",
+    failing="""
+    nodes: {b01: {extra_uci: {wireless: "config wifi-device 'radio0'\\n\\toption channel '13'\\n"}}}
+    """,
+    passing="""
+    nodes: {b01: {extra_uci: {system: "config led\\n\\toption name 'mesh'\\n"}}}
+    """,
+)
+def extra_checked(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        for name in node.extra_uci:
+            package = name.partition(".")[0]
+            if package in ("wireless", "network", "dropbear"):
+                path = ("nodes", node.name, "extra_uci", name)
+                yield Finding(path, f"changes {package} behind the checks", "keys of the inventory", name)

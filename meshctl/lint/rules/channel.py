@@ -1,0 +1,346 @@
+"""The channel: legal in the country, usable in the mesh's mode, at its width (MC321 to MC333)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from meshctl.diagnostics import Severity
+from meshctl.lint.context import LintContext
+from meshctl.lint.rule import Example, Finding, fleet_rule
+from meshctl.model import Band, Fleet, Mesh, MeshMode, Release
+from meshctl.regdb import CHANNELS, Country, Flag, Verdict, judge, legal_channels, occupied, width_mhz
+from meshctl.regdb.legality import primary
+
+# what keeps a station from starting a cell on its own
+_SILENT = Flag.DFS | Flag.NO_IR
+
+
+def _shown(channels: tuple[int, ...]) -> str:
+    """`one of 1-11`, `one of 36, 40, 44, 48`."""
+    if not channels:
+        return "another band"
+    run = range(channels[0], channels[-1] + 1)
+    return (
+        f"one of {channels[0]}-{channels[-1]}" if channels == tuple(run) else f"one of {', '.join(map(str, channels))}"
+    )
+
+
+def _country(fleet: Fleet, context: LintContext) -> Country | None:
+    return context.regdb.country(fleet.country)
+
+
+def _channels(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, Country, Verdict]]:
+    """Every mesh whose channel exists, with the country's verdict on its first 20 MHz."""
+    country = _country(fleet, context)
+    if country is None:
+        return
+    for mesh in fleet.meshes.values():
+        if mesh.channel in CHANNELS[mesh.band]:
+            yield mesh, country, judge(country, primary(mesh.band, mesh.channel))
+
+
+def _wide(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, Country, Verdict, int]]:
+    """The meshes wider than 20 MHz whose first 20 MHz are in order, with the verdict on all of it and its width."""
+    for mesh, country, verdict in _channels(fleet, context):
+        if not verdict.covered or mesh.htmode not in _known_htmodes(mesh.band):
+            continue
+        span = occupied(mesh.band, mesh.channel, mesh.htmode)
+        if span is not None and span.width_mhz > 20:
+            yield mesh, country, judge(country, span), span.width_mhz
+
+
+def _known_htmodes(band: Band) -> tuple[str, ...]:
+    common = ("NOHT", "HT20", "HT40", "HT40+", "HT40-", "HE20", "HE40", "EHT20", "EHT40")
+    wide = ("VHT20", "VHT40", "VHT80", "VHT160", "HE80", "HE160", "EHT80", "EHT160")
+    return common if band is Band.G2 else common + wide
+
+
+@fleet_rule(
+    "MC321",
+    Severity.ERROR,
+    "The country is not in the regulatory database",
+    why="""The kernel falls back to the rules of the world, where most channels may not be used to start a cell: radios
+    come up weak or not at all.""",
+    mend="Write the ISO 3166-1 code of the country you transmit in.",
+    failing="country: XX",
+    passing="country: CA",
+)
+def country_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    if _country(fleet, context) is None:
+        yield Finding(("country",), "not in the regulatory database", "a country such as US or DE", fleet.country)
+
+
+@fleet_rule(
+    "MC322",
+    Severity.ERROR,
+    "The band has no such channel",
+    why="A channel number of the other band, or of none: the interface does not come up.",
+    mend="Choose a channel of the mesh's band.",
+    failing="meshes: {main: {channel: 36}}",
+    passing="meshes: {main: {channel: 11}}",
+)
+def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    country = _country(fleet, context)
+    for mesh in fleet.meshes.values():
+        if mesh.channel not in CHANNELS[mesh.band]:
+            legal = legal_channels(country, mesh.band, "HT20", forbidden=_SILENT) if country else CHANNELS[mesh.band]
+            path = ("meshes", mesh.name, "channel")
+            yield Finding(path, f"no channel of {mesh.band.value}", _shown(legal), str(mesh.channel))
+
+
+@fleet_rule(
+    "MC323",
+    Severity.ERROR,
+    "The channel is not legal in the country",
+    why="""The kernel disables it there: the radio does not start. Forcing it with another country code is an offence,
+    and disturbs whoever has the frequency.""",
+    mend="Choose a channel that the country allows.",
+    failing="meshes: {main: {channel: 13}}",
+    passing="""
+    country: CA
+    meshes: {main: {channel: 13}}
+    """,
+)
+def channel_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for mesh, country, verdict in _channels(fleet, context):
+        if not verdict.covered:
+            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_SILENT))
+            path = ("meshes", mesh.name, "channel")
+            yield Finding(path, "not allowed", f"{legal} (country {country.alpha2})", str(mesh.channel))
+
+
+@fleet_rule(
+    "MC324",
+    Severity.ERROR,
+    "The channel needs radar detection, which ad-hoc mode cannot do",
+    why="""On DFS channels one station must watch for radar and move the others away. An ad-hoc cell has no such
+    station: mac80211 refuses to join.""",
+    mend="Choose a channel without DFS.",
+    failing="""
+    meshes: {main: {band: 5g, channel: 52}}
+    defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+    """,
+    passing="""
+    meshes: {main: {band: 5g, channel: 149}}
+    defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+    """,
+)
+def channel_needs_radar_detection(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    yield from _radar(fleet, context, MeshMode.ADHOC, "needs radar detection")
+
+
+@fleet_rule(
+    "MC325",
+    Severity.WARNING,
+    "The channel must be left when a radar is heard",
+    why="""In 802.11s mode DFS channels work, but the radio is silent for a minute or more before it may start, and a
+    radar (or what sounds like one) takes the whole cell off the air in the middle of a run.""",
+    mend="Choose a channel without DFS.",
+    failing="""
+    meshes: {main: {band: 5g, channel: 52, mode: mesh, encryption: sae}}
+    defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+    """,
+    passing="""
+    meshes: {main: {band: 5g, channel: 149, mode: mesh, encryption: sae}}
+    defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+    """,
+)
+def channel_may_be_lost(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    yield from _radar(fleet, context, MeshMode.MESH, "must be left when a radar is heard")
+
+
+def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> Iterator[Finding]:
+    for mesh, country, verdict in _channels(fleet, context):
+        if mesh.mode is mode and verdict.covered and Flag.DFS in verdict.flags:
+            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_SILENT))
+            path = ("meshes", mesh.name, "channel")
+            yield Finding(path, message, f"{legal} (country {country.alpha2})", f"{mesh.channel} (DFS)")
+
+
+@fleet_rule(
+    "MC326",
+    Severity.ERROR,
+    "No station may start a cell on the channel",
+    why="""The country marks the channel no-IR: a station may answer there, never speak first. A mesh of such stations
+    stays silent for ever.""",
+    mend="Choose a channel without this restriction.",
+    failing="""
+    meshes: {main: {band: 5g, channel: 173}}
+    defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+    """,
+    passing="""
+    meshes: {main: {band: 5g, channel: 149}}
+    defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+    """,
+)
+def channel_passive(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for mesh, country, verdict in _channels(fleet, context):
+        if verdict.covered and Flag.NO_IR in verdict.flags and Flag.DFS not in verdict.flags:
+            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_SILENT))
+            path = ("meshes", mesh.name, "channel")
+            expected = f"{legal} (country {country.alpha2})"
+            yield Finding(path, "nobody may speak first there", expected, f"{mesh.channel} (no-IR)")
+
+
+@fleet_rule(
+    "MC327",
+    Severity.ERROR,
+    "The channel does not exist at this width",
+    why="""The secondary channel would lie outside the band: the driver refuses, or the radio comes up narrower than its
+    neighbours and does not hear them.""",
+    mend="Take HT20, or a channel that has room on that side.",
+    failing="""
+    meshes: {main: {band: 5g, channel: 36, htmode: HT40-}}
+    defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+    """,
+    passing="""
+    meshes: {main: {band: 5g, channel: 36, htmode: HT40+}}
+    defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+    """,
+)
+def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for mesh, country, verdict in _channels(fleet, context):
+        if not verdict.covered or mesh.htmode not in _known_htmodes(mesh.band):
+            continue
+        if occupied(mesh.band, mesh.channel, mesh.htmode) is None:
+            legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_SILENT)
+            expected = f"a channel {_shown(legal)}" if legal else "a narrower htmode"
+            path = ("meshes", mesh.name, "htmode")
+            yield Finding(path, f"no room beside channel {mesh.channel}", expected, mesh.htmode)
+
+
+@fleet_rule(
+    "MC328",
+    Severity.ERROR,
+    "The channel is too wide for the country",
+    why="""Part of the bonded channel lies where the country forbids it, or needs radar detection, or allows only
+    narrower ones: the kernel refuses it, or narrows it on this node alone.""",
+    mend="Take HT20, or another channel.",
+    failing="""
+    meshes: {main: {band: 5g, channel: 36, htmode: VHT160}}
+    defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+    """,
+    passing="""
+    meshes: {main: {band: 5g, channel: 36, htmode: VHT80}}
+    defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+    """,
+)
+def width_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for mesh, country, verdict, width in _wide(fleet, context):
+        silent = verdict.flags & _SILENT if verdict.covered else Flag(0)
+        own = judge(country, primary(mesh.band, mesh.channel)).flags & _SILENT
+        if verdict.allows(width) and (not silent or own):
+            continue
+        legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_SILENT)
+        expected = f"a channel {_shown(legal)} (country {country.alpha2})" if legal else "a narrower htmode"
+        path = ("meshes", mesh.name, "htmode")
+        yield Finding(path, f"channel {mesh.channel} may not be {width} MHz wide", expected, mesh.htmode)
+
+
+@fleet_rule(
+    "MC329",
+    Severity.ERROR,
+    "The htmode is not one of the band",
+    why="""OpenWrt ignores an htmode it does not know and the radio falls to the rates of 802.11g: a tenth of the
+    throughput, and nobody is told.""",
+    mend="Use HT20, or HT40, VHT20, VHT40, VHT80 at 5 GHz where the hardware has them.",
+    failing="meshes: {main: {htmode: VHT80}}",
+    passing="meshes: {main: {htmode: HT20}}",
+)
+def htmode_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for mesh in fleet.meshes.values():
+        known = _known_htmodes(mesh.band)
+        if mesh.htmode not in known or mesh.htmode == "NOHT":
+            path = ("meshes", mesh.name, "htmode")
+            wanted = f"one of {', '.join(mode for mode in known if mode != 'NOHT')}"
+            yield Finding(path, f"not an htmode of {mesh.band.value}", wanted, mesh.htmode)
+
+
+@fleet_rule(
+    "MC330",
+    Severity.ERROR,
+    "OpenWrt 25.12 drops HT40+ and HT40- in ad-hoc mode",
+    why="""25.12's scripts know only HT20 and HT40 for ad-hoc cells; with a sign behind them the radio joins without HT,
+    at a tenth of the throughput, beside neighbours that use it.""",
+    mend="Write HT40, or HT20.",
+    failing=Example(
+        """
+        hardware: {rocket: {release: "25.12"}}
+        meshes: {main: {channel: 149, band: 5g, htmode: HT40+, encryption: none, key: <removed>}}
+        defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+        """,
+        also=("MC408",),
+    ),
+    passing=Example(
+        """
+        hardware: {rocket: {release: "25.12"}}
+        meshes: {main: {channel: 149, band: 5g, htmode: HT40, encryption: none, key: <removed>}}
+        defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+        """,
+        also=("MC408",),
+    ),
+)
+def htmode_sign_on_25_12(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    new = {mesh for node in fleet.managed() if node.release >= Release.V25_12 for mesh in node.meshes}
+    for mesh in fleet.meshes.values():
+        if mesh.name in new and mesh.mode is MeshMode.ADHOC and mesh.htmode in ("HT40+", "HT40-"):
+            path = ("meshes", mesh.name, "htmode")
+            yield Finding(path, "falls to no HT on OpenWrt 25.12", "HT40 or HT20", mesh.htmode)
+
+
+@fleet_rule(
+    "MC331",
+    Severity.WARNING,
+    "40 MHz at 2.4 GHz",
+    why="""It takes half of a band that has room for three cells, doubles the noise that is let in, and collides with
+    every hotspot and every robot's own Wi-Fi. On long links it is slower than HT20.""",
+    mend="Use HT20 at 2.4 GHz.",
+    failing="meshes: {main: {htmode: HT40}}",
+    passing="meshes: {main: {htmode: HT20}}",
+)
+def wide_at_2g(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for mesh in fleet.meshes.values():
+        if mesh.band is Band.G2 and mesh.htmode in _known_htmodes(Band.G2) and width_mhz(mesh.htmode) > 20:
+            yield Finding(("meshes", mesh.name, "htmode"), "takes half the band", "HT20", mesh.htmode)
+
+
+@fleet_rule(
+    "MC332",
+    Severity.NOTE,
+    "The channel is none of 1, 6, 11",
+    why="""Everybody else's cells are on 1, 6 and 11. One in between is disturbed by two of them and can take turns with
+    neither.""",
+    mend="Use 1, 6 or 11 (5, 9 and 13 also fit together where 13 is allowed).",
+    failing="meshes: {main: {channel: 4}}",
+    passing="meshes: {main: {channel: 11}}",
+)
+def channel_between(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for mesh, _, verdict in _channels(fleet, context):
+        if mesh.band is Band.G2 and verdict.covered and mesh.channel not in (1, 5, 6, 9, 11, 13):
+            found = f"{mesh.channel}"
+            yield Finding(("meshes", mesh.name, "channel"), "lies between the usual cells", "one of 1, 6, 11", found)
+
+
+@fleet_rule(
+    "MC333",
+    Severity.WARNING,
+    "The channel is for indoor use",
+    why="The country allows it inside buildings only. A mine or a cave may count as one; the staging area does not.",
+    mend="Choose a channel without this restriction if any radio works outdoors.",
+    failing="""
+    country: DE
+    meshes: {main: {band: 5g, channel: 36}}
+    defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main, tx_power_dbm: 17}}}
+    """,
+    passing="""
+    country: US
+    meshes: {main: {band: 5g, channel: 36}}
+    defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main, tx_power_dbm: 17}}}
+    """,
+)
+def channel_indoor(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for mesh, country, verdict in _channels(fleet, context):
+        if verdict.covered and Flag.NO_OUTDOOR in verdict.flags and not verdict.flags & _SILENT:
+            outdoor = legal_channels(country, mesh.band, "HT20", forbidden=_SILENT | Flag.NO_OUTDOOR)
+            expected = f"{_shown(outdoor)} (country {country.alpha2})"
+            yield Finding(("meshes", mesh.name, "channel"), "for indoor use only", expected, str(mesh.channel))

@@ -1,0 +1,220 @@
+"""Encryption of the radio link against mode, release and supplicant (MC401 to MC410)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from meshctl.diagnostics import Severity
+from meshctl.lint.context import LintContext
+from meshctl.lint.grouping import grouped, listed
+from meshctl.lint.rule import Example, Finding, fleet_rule
+from meshctl.model import Encryption, Fleet, Mesh, MeshMode, Node, Release
+from meshctl.resolve import FULL_SUPPLICANTS, supplicant_need
+
+# a passphrase shorter than this is found by trying: the handshake can be recorded by anyone in reach
+_SAFE_PASSPHRASE_LETTERS = 16
+
+
+def _members(fleet: Fleet) -> Iterator[tuple[Node, Mesh]]:
+    for node in fleet.managed():
+        for name in node.meshes:
+            if name in fleet.meshes:
+                yield node, fleet.meshes[name]
+
+
+@fleet_rule(
+    "MC401",
+    Severity.ERROR,
+    "An encrypted ad-hoc cell on OpenWrt 25.12 is open",
+    why="""25.12's wifi script looks for the cipher before it is set, so an ad-hoc cell with a key is joined without
+    one. Everything looks right: the configuration says psk2, the node is in the mesh, and anybody else can be, too.""",
+    mend="Use `mode: mesh` with `encryption: sae`, an earlier release, or write `encryption: none` and mean it.",
+    failing="""hardware: {rocket: {release: "25.12"}}""",
+    passing="""
+    hardware: {rocket: {release: "25.12"}}
+    meshes: {main: {mode: mesh, encryption: sae}}
+    """,
+)
+def encrypted_adhoc_on_25_12(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    trapped = grouped(
+        (mesh.name, node.name)
+        for node, mesh in _members(fleet)
+        if mesh.mode is MeshMode.ADHOC and mesh.encryption is Encryption.PSK2 and node.release >= Release.V25_12
+    )
+    for name, nodes in trapped.items():
+        message = f"joined open, silently, by nodes on 25.12: {listed(nodes)}"
+        yield Finding(
+            ("meshes", name, "encryption"), message, "none, or mode mesh with sae", "psk2+ccmp in ad-hoc mode"
+        )
+
+
+@fleet_rule(
+    "MC402",
+    Severity.ERROR,
+    "An encrypted mesh has no key",
+    why="The supplicant does not start without a key and the radio stays out of the mesh.",
+    mend="Say where the key is: `key: {env: MESH_KEY}`.",
+    failing="meshes: {main: {key: <removed>}}",
+    passing="meshes: {main: {key: {env: MESH_KEY}}}",
+)
+def key_missing(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for mesh in fleet.meshes.values():
+        if mesh.encryption is not Encryption.NONE and mesh.key is None:
+            path = ("meshes", mesh.name, "encryption")
+            yield Finding(path, f"{mesh.encryption.value} needs a key", "a reference in `key`", "none")
+
+
+@fleet_rule(
+    "MC403",
+    Severity.WARNING,
+    "A key is given but the mesh is not encrypted",
+    why="Whoever wrote the key believed the mesh was closed. It is open.",
+    mend="Set `encryption`, or take the key away.",
+    failing="meshes: {main: {encryption: none}}",
+    passing="meshes: {main: {encryption: psk2+ccmp}}",
+)
+def key_unused(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for mesh in fleet.meshes.values():
+        if mesh.encryption is Encryption.NONE and mesh.key is not None:
+            expected = "psk2+ccmp or sae with the key, or no key"
+            yield Finding(("meshes", mesh.name, "key"), "the key is not used", expected, "encryption: none")
+
+
+@fleet_rule(
+    "MC404",
+    Severity.ERROR,
+    "SAE does not exist in ad-hoc mode",
+    why="The supplicant has no SAE for ad-hoc cells; the interface does not come up.",
+    mend="Use psk2+ccmp, or `mode: mesh`.",
+    failing="meshes: {main: {encryption: sae}}",
+    passing="meshes: {main: {encryption: sae, mode: mesh}}",
+)
+def sae_in_adhoc(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for mesh in fleet.meshes.values():
+        if mesh.mode is MeshMode.ADHOC and mesh.encryption is Encryption.SAE:
+            yield Finding(("meshes", mesh.name, "encryption"), "not in ad-hoc mode", "psk2+ccmp or none", "sae")
+
+
+@fleet_rule(
+    "MC405",
+    Severity.ERROR,
+    "WPA2 passphrases do not exist in 802.11s mode",
+    why="802.11s encrypts with SAE only; with psk2 the supplicant starts an open mesh or none at all.",
+    mend="Use `encryption: sae`.",
+    failing="meshes: {main: {mode: mesh}}",
+    passing="meshes: {main: {mode: mesh, encryption: sae}}",
+)
+def psk_in_mesh_mode(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for mesh in fleet.meshes.values():
+        if mesh.mode is MeshMode.MESH and mesh.encryption is Encryption.PSK2:
+            yield Finding(("meshes", mesh.name, "encryption"), "not in 802.11s mode", "sae or none", "psk2+ccmp")
+
+
+@fleet_rule(
+    "MC406",
+    Severity.ERROR,
+    "The supplicant cannot encrypt a mesh",
+    why="""`wpad-basic*` and `wpad-mini` are built without IBSS_RSN and without SAE: the radio never joins, and the log
+    says only that the configuration is invalid.""",
+    mend="Replace it by a full one: `wpad-mesh-mbedtls`, `wpad-openssl` or another of `wpad-*` without basic or mini.",
+    failing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-basic-mbedtls]}}",
+    passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-mesh-mbedtls]}}",
+)
+def supplicant_too_small(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node, mesh in _members(fleet):
+        need = supplicant_need(mesh, node.release)
+        named = (*node.hardware.packages, *node.packages)
+        small = [name for name in named if name.startswith(("wpad-basic", "wpad-mini"))]
+        if need is None or not small or any(name in FULL_SUPPLICANTS for name in named):
+            continue
+        path = packages_path(node, small[0])
+        yield Finding(path, f"cannot encrypt mesh {mesh.name}", f"one of {listed(need.any_of)}", small[0])
+
+
+def packages_path(node: Node, package: str) -> tuple[str, ...]:
+    """Where `package` is named: at the node, or at its hardware."""
+    if package in node.packages:
+        return ("nodes", node.name, "packages", str(node.packages.index(package)))
+    if package in node.hardware.packages:
+        return ("hardware", node.hardware.name, "packages", str(node.hardware.packages.index(package)))
+    return ("hardware", node.hardware.name, "packages")
+
+
+@fleet_rule(
+    "MC407",
+    Severity.ERROR,
+    "Two supplicants in one image",
+    why="The packages hold the same files: the ImageBuilder stops, or the one installed last wins.",
+    mend="Keep one of them.",
+    failing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, wpad-mbedtls]}}",
+    passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl]}}",
+)
+def two_supplicants(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        named = [name for name in dict.fromkeys((*node.hardware.packages, *node.packages)) if name.startswith("wpad")]
+        if len(named) > 1:
+            yield Finding(packages_path(node, named[1]), f"conflicts with {named[0]}", "one supplicant", listed(named))
+
+
+@fleet_rule(
+    "MC408",
+    Severity.NOTE,
+    "The mesh is open",
+    why="""Anyone in reach can join the mesh, reach every node's SSH, and spoil the routing with false originator
+    messages. udp_mesh seals what robots say, but not the mesh below it.""",
+    mend="Set `encryption: psk2+ccmp` (ad-hoc, up to 24.10) or `mode: mesh` with `sae`; or suppress it with a reason.",
+    failing="meshes: {main: {encryption: none, key: <removed>}}",
+    passing="meshes: {main: {encryption: psk2+ccmp}}",
+)
+def mesh_open(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for mesh in fleet.meshes.values():
+        if mesh.encryption is Encryption.NONE and mesh.key is None:
+            path = ("meshes", mesh.name, "encryption")
+            yield Finding(path, "anyone in reach can join", "psk2+ccmp, or sae in 802.11s mode", "none")
+
+
+@fleet_rule(
+    "MC409",
+    Severity.ERROR,
+    "The mesh's passphrase is not allowed",
+    why="""WPA takes 8 to 63 printable ASCII characters, or 64 hexadecimal digits: with anything else the supplicant
+    refuses its configuration on every node at once.""",
+    mend="Make a new one: `openssl rand -base64 24`.",
+    failing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "short"}),
+    passing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "cedar-lantern-93-quarry"}),
+)
+def passphrase_not_allowed(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for mesh, value in _passphrases(fleet, context):
+        if not _is_passphrase(value):
+            expected = "8 to 63 printable ASCII characters, or 64 hexadecimal digits"
+            yield Finding(("meshes", mesh.name, "key"), "no passphrase", expected, f"{len(value)} characters")
+
+
+def _passphrases(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, str]]:
+    for mesh in fleet.meshes.values():
+        secret = context.secret(mesh.key) if mesh.key is not None and mesh.encryption is not Encryption.NONE else None
+        if secret is not None:
+            yield mesh, secret.reveal()
+
+
+def _is_passphrase(value: str) -> bool:
+    if len(value) == 64:
+        return all(letter in "0123456789abcdefABCDEF" for letter in value)
+    return 8 <= len(value) <= 63 and value.isascii() and value.isprintable()
+
+
+@fleet_rule(
+    "MC410",
+    Severity.WARNING,
+    "The mesh's passphrase is short",
+    why="""The handshake can be recorded by anyone in reach and tried at leisure, billions of guesses a second: a
+    passphrase of a word and a year lasts minutes.""",
+    mend="Make a new one of at least 16 characters: `openssl rand -base64 24`.",
+    failing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "husky2021"}),
+    passing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "cedar-lantern-93-quarry"}),
+)
+def passphrase_short(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for mesh, value in _passphrases(fleet, context):
+        if _is_passphrase(value) and len(value) < _SAFE_PASSPHRASE_LETTERS:
+            expected = f"at least {_SAFE_PASSPHRASE_LETTERS} characters"
+            yield Finding(("meshes", mesh.name, "key"), "can be found by trying", expected, f"{len(value)} characters")

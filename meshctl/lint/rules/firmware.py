@@ -1,0 +1,236 @@
+"""Firmware images against what the inventory says of them, read from the images themselves (MC801 to MC811)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from meshctl import firmware
+from meshctl.diagnostics import Severity
+from meshctl.firmware.check import (
+    BAD_SIGNATURE,
+    DAMAGED,
+    NO_METADATA,
+    UNREADABLE,
+    WRONG_BOARD,
+    WRONG_HASH,
+    WRONG_RELEASE,
+    WRONG_REVISION,
+)
+from meshctl.lint.context import LintContext
+from meshctl.lint.rule import Example, Finding, fleet_rule
+from meshctl.model import Fleet, HardwareProfile, PackageTool
+
+_METADATA = 'image for {"supported_devices":["%s"],"version":{"version":"%s","revision":"%s","target":"ath79/generic"}}'
+ROCKET_IMAGE = _METADATA % ("ubnt,rocket-m", "24.10.2", "r28739-d9340319c6")
+_BULLET = _METADATA % ("ubnt,bullet-m-xw", "24.10.2", "r28739-d9340319c6")
+_OLD = _METADATA % ("ubnt,rocket-m", "23.05.5", "r24106-10cc5fcd00")
+_IMAGE = "hardware: {rocket: {firmware: {image: rocket.bin, sha256: <sha256 of rocket.bin>}}}"
+_OTHER_HASH = "0123456789abcdef0123456789abcdef0123456789abcdef0123456789abcdef"
+# what stays free on the flash for the configuration and packages (two erase blocks of 64 KiB and the boot loader)
+_FLASH_RESERVE_KIB = 512
+
+
+def _profiles(fleet: Fleet) -> Iterator[HardwareProfile]:
+    """The profiles with an image that some managed node has."""
+    used = {node.hardware.name for node in fleet.managed()}
+    return (profile for profile in fleet.hardware.values() if profile.firmware.image and profile.name in used)
+
+
+def _found(fleet: Fleet, context: LintContext, code: str, *key: str) -> Iterator[Finding]:
+    """The image check's own findings of one kind, at the profile's place."""
+    for profile in _profiles(fleet):
+        for item in context.files.firmware(profile):
+            if item.code == code:
+                path = ("hardware", profile.name, "firmware", *(key or ("image",)))
+                message = f"{Path(item.position.file).name}: {item.message}" if item.message else item.position.file
+                yield Finding(path, message, item.expected, item.found, item.hint)
+
+
+@fleet_rule(
+    "MC801",
+    Severity.ERROR,
+    "A firmware image is missing",
+    why="It is found out in the field, where there is no internet to fetch it from.",
+    mend="Bring the image, or mend the path: it is relative to the file that names it.",
+    failing="hardware: {rocket: {firmware: {image: absent.bin, sha256: HASH}}}".replace("HASH", _OTHER_HASH),
+    passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
+)
+def image_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    yield from _found(fleet, context, UNREADABLE)
+
+
+@fleet_rule(
+    "MC802",
+    Severity.ERROR,
+    "A firmware image is not the one that was written down",
+    why="""Cut off by a full disk, replaced by a newer build, or tampered with: whichever it is, nobody tested this
+    file.""",
+    mend="Fetch the image again; if it was replaced on purpose, write its new SHA-256 down.",
+    failing=Example(
+        f"hardware: {{rocket: {{firmware: {{image: rocket.bin, sha256: {_OTHER_HASH}}}}}}}",
+        files={"rocket.bin": ROCKET_IMAGE},
+    ),
+    passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
+)
+def image_wrong_hash(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    yield from _found(fleet, context, WRONG_HASH, "sha256")
+
+
+@fleet_rule(
+    "MC803",
+    Severity.ERROR,
+    "A firmware image is damaged",
+    why="Its own checksum does not fit its contents: sysupgrade would refuse it, at best.",
+    mend="Fetch the image again.",
+    failing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE.replace("image for", "damaged image for")}),
+    passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
+)
+def image_damaged(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    yield from _found(fleet, context, DAMAGED)
+
+
+@fleet_rule(
+    "MC804",
+    Severity.ERROR,
+    "A firmware image says nothing of its board",
+    why="""Without metadata sysupgrade refuses the image (ath79 requires it), and nothing tells whether it is for this
+    board. A factory image is the usual case: it is for the maker's own boot loader.""",
+    mend="Use the image with `sysupgrade` in its name.",
+    failing=Example(_IMAGE, files={"rocket.bin": "a factory image"}),
+    passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
+)
+def image_without_metadata(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    yield from _found(fleet, context, NO_METADATA)
+
+
+@fleet_rule(
+    "MC805",
+    Severity.ERROR,
+    "A firmware image is for another board",
+    why="Forced onto the wrong board it leaves a device that only a serial cable revives.",
+    mend="Use the image of this profile, or mend the profile's `board` and `target`.",
+    failing=Example(_IMAGE, files={"rocket.bin": _BULLET}),
+    passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
+)
+def image_wrong_board(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    yield from _found(fleet, context, WRONG_BOARD)
+
+
+@fleet_rule(
+    "MC806",
+    Severity.ERROR,
+    "A firmware image is of another release than the profile",
+    why="""The configuration is rendered for the profile's release: on another one, bridges, radios or the firewall come
+    up differently, or not at all.""",
+    mend="Set the profile's `release` to the image's.",
+    failing=Example(_IMAGE, files={"rocket.bin": _OLD}),
+    passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
+)
+def image_wrong_release(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    yield from _found(fleet, context, WRONG_RELEASE)
+
+
+@fleet_rule(
+    "MC807",
+    Severity.ERROR,
+    "A firmware image is of another revision than written down",
+    why="""After a flash a node must report this revision to count as done: with another in the image, every flash ends
+    as failed.""",
+    mend="Write the revision that the image carries.",
+    failing=Example(
+        _IMAGE.replace("image: rocket.bin", "image: rocket.bin, revision: r24106"), files={"rocket.bin": ROCKET_IMAGE}
+    ),
+    passing=Example(
+        _IMAGE.replace("image: rocket.bin", "image: rocket.bin, revision: r28739"), files={"rocket.bin": ROCKET_IMAGE}
+    ),
+)
+def image_wrong_revision(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    yield from _found(fleet, context, WRONG_REVISION, "revision")
+
+
+@fleet_rule(
+    "MC808",
+    Severity.ERROR,
+    "A firmware image's signature does not hold",
+    why="""The profile names a key that must have signed the image, and it did not, or the signature or the key is
+    missing. OpenWrt itself does not check it.""",
+    mend="Put the release's sha256sums and sha256sums.sig (or the image's own .sig) beside the image.",
+    failing=Example(
+        _IMAGE.replace("image: rocket.bin", "image: rocket.bin, usign_key: absent.pub"),
+        files={"rocket.bin": ROCKET_IMAGE},
+    ),
+    passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
+)
+def image_signature(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    yield from _found(fleet, context, BAD_SIGNATURE, "usign_key")
+
+
+@fleet_rule(
+    "MC809",
+    Severity.WARNING,
+    "A firmware image has no hash",
+    why="Any file of that name would be flashed, also half of one.",
+    mend="Write its SHA-256 down: `sha256sum IMAGE`.",
+    failing=Example("hardware: {rocket: {firmware: {image: rocket.bin}}}", files={"rocket.bin": ROCKET_IMAGE}),
+    passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
+)
+def image_without_hash(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in _profiles(fleet):
+        if not profile.firmware.sha256:
+            path = ("hardware", profile.name, "firmware")
+            yield Finding(path, "any file of that name would be flashed", "`sha256`", "none")
+
+
+@fleet_rule(
+    "MC810",
+    Severity.ERROR,
+    "A firmware image does not fit the flash",
+    why="sysupgrade writes it until the flash ends: the device does not boot again.",
+    mend="Use a smaller image, or mend the profile's `flash_mib`.",
+    failing=Example(
+        _IMAGE.replace("rocket: {", "rocket: {flash_mib: 4, "), files={"rocket.bin": "4 MiB " + ROCKET_IMAGE}
+    ),
+    passing=Example(_IMAGE.replace("rocket: {", "rocket: {flash_mib: 4, "), files={"rocket.bin": ROCKET_IMAGE}),
+)
+def image_too_large(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for profile in _profiles(fleet):
+        path = firmware.image_path(profile)
+        size = context.files.size_bytes(path) if path is not None else None
+        room_kib = profile.flash_mib * 1024 - _FLASH_RESERVE_KIB
+        if size is not None and size > room_kib * 1024:
+            place = ("hardware", profile.name, "firmware", "image")
+            expected = f"at most {room_kib} KiB ({profile.flash_mib} MiB less {_FLASH_RESERVE_KIB} KiB)"
+            yield Finding(place, "larger than the flash", expected, f"{-(-size // 1024)} KiB")
+
+
+@fleet_rule(
+    "MC811",
+    Severity.ERROR,
+    "A package file is missing, or of the wrong kind",
+    why="""opkg (up to 24.10) installs .ipk files, apk (from 25.12) .apk files; with the wrong one, or none, the back
+    end is not installed and the node comes up without a mesh.""",
+    mend="Bring the file, built for this release.",
+    failing=Example("hardware: {rocket: {package_files: [tool.apk]}}", files={"tool.apk": "a package"}),
+    passing=Example("hardware: {rocket: {package_files: [tool.ipk]}}", files={"tool.ipk": "a package"}),
+)
+def package_file_wrong(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for place, base, names, profile in _package_files(fleet):
+        suffix = ".apk" if profile.release.package_tool is PackageTool.APK else ".ipk"
+        for index, name in enumerate(names):
+            if not name.endswith(suffix):
+                message = f"OpenWrt {profile.release} does not install it"
+                yield Finding((*place, str(index)), message, f"a file with {suffix}", name)
+            elif context.files.size_bytes(Path(base, name)) is None:
+                yield Finding((*place, str(index)), "no such file", "a package file", name)
+
+
+def _package_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], str, tuple[str, ...], HardwareProfile]]:
+    for profile in fleet.hardware.values():
+        yield ("hardware", profile.name, "package_files"), fleet.base, profile.package_files, profile
+    for mesh in fleet.meshes.values():
+        parts = mesh.operator_parts
+        member = next((node for node in fleet.members(mesh.name)), None) if parts.package_files else None
+        if member is not None:
+            place = ("meshes", mesh.name, "operator_parts", "package_files")
+            yield place, parts.base or fleet.base, parts.package_files, member.hardware

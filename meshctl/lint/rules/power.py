@@ -1,0 +1,295 @@
+"""Transmit power: what the box can, what the country allows, whether neighbours can answer (MC341 to MC350)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from meshctl.diagnostics import Severity
+from meshctl.lint.context import LintContext
+from meshctl.lint.grouping import grouped
+from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.model import AntennaKind, Fleet, Mesh, Node, Radio
+from meshctl.regdb import CHANNELS, judge
+from meshctl.regdb.legality import primary
+
+# 47 CFR 15.247(b)(3), (b)(4), and the same in RSS-247 5.4(d): digital modulation at 2400-2483.5 and 5725-5850 MHz
+_CONDUCTED_LIMIT_DBM = 30.0
+_FREE_GAIN_DBI = 6.0
+_CONDUCTED_COUNTRIES = frozenset({"US", "AS", "CA", "GU", "MP", "PR", "VI"})
+_CONDUCTED_BANDS_MHZ = ((2400.0, 2483.5), (5725.0, 5850.0))
+# levels are whole dBm and databases round to tenths of a mW
+_ROUNDING_DB = 0.05
+# a link whose ends differ by more than this loses its acknowledgements long before its data
+_ASYMMETRY_DB = 10.0
+# 46 dBm are 40 W: no radio of a robot; 500 or 1000 are milliwatts
+_LARGEST_RATED_DBM = 40.0
+
+
+def _dbm(value: float) -> str:
+    return f"{value:g}"
+
+
+def power_sum(radio: Radio) -> str:
+    """The conducted power as a sum: `27 drive + 6 amplifier, at most 30 rated - 1 cable`."""
+    hardware = radio.hardware
+    driven = radio.tx_power_dbm + hardware.amplifier_gain_db
+    text = f"{radio.tx_power_dbm} drive"
+    if hardware.amplifier_gain_db:
+        text += f" + {_dbm(hardware.amplifier_gain_db)} amplifier"
+    if driven > hardware.rated_power_dbm:
+        text += f", at most {_dbm(hardware.rated_power_dbm)} rated"
+    if hardware.cable_loss_db:
+        text += f" - {_dbm(hardware.cable_loss_db)} cable"
+    return text
+
+
+def _transmitting(fleet: Fleet) -> Iterator[tuple[Node, Radio, Mesh]]:
+    for node in fleet.managed():
+        for radio in node.radios:
+            mesh = fleet.meshes.get(radio.mesh or "")
+            if mesh is not None and mesh.channel in CHANNELS[mesh.band]:
+                yield node, radio, mesh
+
+
+def _has_conducted_limit(fleet: Fleet, mesh: Mesh) -> bool:
+    span = primary(mesh.band, mesh.channel)
+    return fleet.country in _CONDUCTED_COUNTRIES and any(
+        low <= span.low_mhz and span.high_mhz <= high for low, high in _CONDUCTED_BANDS_MHZ
+    )
+
+
+def _at(node: Node, radio: Radio) -> tuple[str, ...]:
+    return ("nodes", node.name, "radios", radio.name, "tx_power_dbm")
+
+
+@fleet_rule(
+    "MC341",
+    Severity.ERROR,
+    "The radiated power is above the country's limit",
+    why="""The limit counts what leaves the antenna: drive level, amplifier, less the cable, plus the antenna's gain.
+    The kernel clamps only what it knows, the drive level, so an amplifier or a large antenna breaks the law unseen.""",
+    mend="Lower `tx_power_dbm` by what the sum is too high.",
+    failing="country: DE",
+    passing="""
+    country: DE
+    defaults: {radios: {radio0: {tx_power_dbm: 15}}}
+    """,
+)
+def eirp_above_country(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    country = context.regdb.country(fleet.country)
+    if country is None:
+        return
+    limits = {
+        mesh.name: judge(country, primary(mesh.band, mesh.channel))
+        for mesh in fleet.meshes.values()
+        if mesh.channel in CHANNELS[mesh.band] and not _has_conducted_limit(fleet, mesh)
+    }
+    for node, radio, mesh in _transmitting(fleet):
+        verdict = limits.get(mesh.name)
+        if verdict is None or not verdict.covered or radio.eirp_dbm <= verdict.max_eirp_dbm + _ROUNDING_DB:
+            continue
+        total = (
+            f"{power_sum(radio)} + {_dbm(radio.hardware.antenna_gain_dbi)} antenna = {_dbm(radio.eirp_dbm)} dBm EIRP"
+        )
+        excess = radio.eirp_dbm - verdict.max_eirp_dbm
+        expected = f"at most {_dbm(verdict.max_eirp_dbm)} dBm EIRP (country {country.alpha2}, channel {mesh.channel})"
+        yield Finding(_at(node, radio), f"{_dbm(round(excess, 2))} dB too much", expected, total)
+
+
+@fleet_rule(
+    "MC342",
+    Severity.ERROR,
+    "The conducted power is above the FCC's limit",
+    why="""At 2.4 and 5.8 GHz 47 CFR 15.247 allows 1 W (30 dBm) into the antenna, and 1 dB less for each dBi of antenna
+    gain above 6; so 2 W hardware may not be driven to its rating, and 1 W hardware not with a large sector antenna.""",
+    mend="Lower `tx_power_dbm` by what the sum is too high, or use an antenna of less gain.",
+    failing="""
+    hardware: {rocket: {radios: {radio0: {rated_power_dbm: 33, amplifier_gain_db: 6, max_drive_dbm: 27}}}}
+    defaults: {radios: {radio0: {tx_power_dbm: 27}}}
+    """,
+    passing="""
+    hardware: {rocket: {radios: {radio0: {rated_power_dbm: 33, amplifier_gain_db: 6, max_drive_dbm: 27}}}}
+    defaults: {radios: {radio0: {tx_power_dbm: 24}}}
+    """,
+)
+def conducted_above_fcc(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    limited = {mesh.name for mesh in fleet.meshes.values() if _is_limited(fleet, mesh)}
+    for node, radio, mesh in _transmitting(fleet):
+        gain = radio.hardware.antenna_gain_dbi
+        excess_gain = max(gain - _FREE_GAIN_DBI, 0.0)
+        limit = _CONDUCTED_LIMIT_DBM - excess_gain
+        if mesh.name not in limited or radio.conducted_dbm <= limit + _ROUNDING_DB:
+            continue
+        excess = radio.conducted_dbm - limit
+        allowed = f"at most {_dbm(limit)} dBm conducted"
+        if excess_gain:
+            allowed += f" (30 less {_dbm(excess_gain)} for an antenna of {_dbm(gain)} dBi)"
+        total = f"{power_sum(radio)} = {_dbm(radio.conducted_dbm)} dBm"
+        yield Finding(
+            _at(node, radio), f"{_dbm(round(excess, 2))} dB too much (country {fleet.country})", allowed, total
+        )
+
+
+def _is_limited(fleet: Fleet, mesh: Mesh) -> bool:
+    return mesh.channel in CHANNELS[mesh.band] and _has_conducted_limit(fleet, mesh)
+
+
+@fleet_rule(
+    "MC343",
+    Severity.ERROR,
+    "The drive level is above what the driver offers",
+    why="The driver takes its own highest level and says nothing: the link budget on paper is not the one on the air.",
+    mend="Lower `tx_power_dbm` to the profile's `max_drive_dbm`.",
+    failing="nodes: {b01: {radios: {radio0: {tx_power_dbm: 29}}}}",
+    passing="nodes: {b01: {radios: {radio0: {tx_power_dbm: 25}}}}",
+)
+def drive_above_driver(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node, radio, _ in _transmitting(fleet):
+        if radio.tx_power_dbm > radio.hardware.max_drive_dbm:
+            expected = f"at most {radio.hardware.max_drive_dbm} (hardware {node.hardware.name})"
+            yield Finding(_at(node, radio), "the driver offers less", expected, str(radio.tx_power_dbm))
+
+
+@fleet_rule(
+    "MC344",
+    Severity.WARNING,
+    "The amplifier is driven beyond its rating",
+    why="""An amplifier past its rating distorts: high rates fail first, neighbouring channels are disturbed, and it may
+    not live long. A 2 W stage behind a full 1 W drive is the usual case.""",
+    mend="Lower `tx_power_dbm` until drive and amplifier together reach the rating.",
+    failing="""
+    hardware: {rocket: {radios: {radio0: {rated_power_dbm: 30, amplifier_gain_db: 10}}}}
+    defaults: {radios: {radio0: {tx_power_dbm: 24}}}
+    """,
+    passing="""
+    hardware: {rocket: {radios: {radio0: {rated_power_dbm: 30, amplifier_gain_db: 10}}}}
+    defaults: {radios: {radio0: {tx_power_dbm: 20}}}
+    """,
+)
+def amplifier_overdriven(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node, radio, _ in _transmitting(fleet):
+        hardware = radio.hardware
+        driven = radio.tx_power_dbm + hardware.amplifier_gain_db
+        if radio.tx_power_dbm <= hardware.max_drive_dbm and driven > hardware.rated_power_dbm + _ROUNDING_DB:
+            found = f"{radio.tx_power_dbm} drive + {_dbm(hardware.amplifier_gain_db)} amplifier = {_dbm(driven)} dBm"
+            expected = f"at most {_dbm(hardware.rated_power_dbm)} dBm (hardware {node.hardware.name})"
+            yield Finding(_at(node, radio), "more than the box is rated for", expected, found)
+
+
+@fleet_rule(
+    "MC345",
+    Severity.WARNING,
+    "The hardware cannot reach its rated power",
+    why="""The profile promises a class (1 W, 2 W) that its own numbers do not add up to: either the amplifier is
+    missing from the profile, and every sum above is too low, or the rating is.""",
+    mend="Mend `rated_power_dbm`, `max_drive_dbm` or `amplifier_gain_db` from the data sheet.",
+    failing="hardware: {rocket: {radios: {radio0: {rated_power_dbm: 33}}}}",
+    passing="hardware: {rocket: {radios: {radio0: {rated_power_dbm: 28}}}}",
+)
+def rating_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in fleet.hardware.values():
+        for radio in profile.radios:
+            most = radio.max_drive_dbm + radio.amplifier_gain_db
+            if most + 1 < radio.rated_power_dbm <= _LARGEST_RATED_DBM:
+                path = ("hardware", profile.name, "radios", radio.name, "rated_power_dbm")
+                found = f"{radio.max_drive_dbm} drive + {_dbm(radio.amplifier_gain_db)} amplifier = {_dbm(most)} dBm"
+                expected = f"a sum that reaches {_dbm(radio.rated_power_dbm)} dBm"
+                yield Finding(path, "drive and amplifier fall short", expected, found)
+
+
+@fleet_rule(
+    "MC346",
+    Severity.ERROR,
+    "A rated power looks like milliwatts",
+    why="""Powers are in dBm: 1 W is 30, 2 W is 33. A number far above means that every check on power compares with
+    nonsense.""",
+    mend="Write dBm: 10 times the logarithm of the milliwatts (1000 mW is 30 dBm).",
+    failing="hardware: {rocket: {radios: {radio0: {rated_power_dbm: 50}}}}",
+    passing="hardware: {rocket: {radios: {radio0: {rated_power_dbm: 28}}}}",
+)
+def rating_in_milliwatts(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in fleet.hardware.values():
+        for radio in profile.radios:
+            if radio.rated_power_dbm > _LARGEST_RATED_DBM:
+                path = ("hardware", profile.name, "radios", radio.name, "rated_power_dbm")
+                yield Finding(path, "not a power in dBm", "at most 40", _dbm(radio.rated_power_dbm))
+
+
+@fleet_rule(
+    "MC347",
+    Severity.WARNING,
+    "A directional antenna without gain",
+    why="""A sector, panel or dish that gains nothing is a profile filled in by halves: the radiated power is
+    understated by ten and more dB, and lint cannot see a breach of the limit.""",
+    mend="Write the antenna's gain from its data sheet in `antenna_gain_dbi`.",
+    failing="hardware: {rocket: {radios: {radio0: {antenna: sector, antenna_gain_dbi: 0, beamwidth_deg: 120}}}}",
+    passing="hardware: {rocket: {radios: {radio0: {antenna: sector, antenna_gain_dbi: 5, beamwidth_deg: 120}}}}",
+)
+def directional_without_gain(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in fleet.hardware.values():
+        for radio in profile.radios:
+            if radio.antenna is not AntennaKind.OMNI and radio.antenna_gain_dbi < 3:
+                path = ("hardware", profile.name, "radios", radio.name, "antenna_gain_dbi")
+                found = f"{_dbm(radio.antenna_gain_dbi)} dBi"
+                yield Finding(path, f"a {radio.antenna.value} has more gain", "at least 3 dBi", found)
+
+
+@fleet_rule(
+    "MC348",
+    Severity.WARNING,
+    "Antenna kind and beamwidth contradict each other",
+    why="""Coverage and the placing of beacons are judged by these two; an omni of 90 degrees, or a sector all around,
+    is one of them copied from another profile.""",
+    mend="Give an omni 360 degrees, and a directional antenna the width of its beam.",
+    failing="hardware: {rocket: {radios: {radio0: {antenna: sector, beamwidth_deg: 360}}}}",
+    passing="hardware: {rocket: {radios: {radio0: {antenna: sector, beamwidth_deg: 90}}}}",
+)
+def beamwidth_contradicts(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in fleet.hardware.values():
+        for radio in profile.radios:
+            if (radio.antenna is AntennaKind.OMNI) != (radio.beamwidth_deg == 360):
+                path = ("hardware", profile.name, "radios", radio.name, "beamwidth_deg")
+                expected = "360" if radio.antenna is AntennaKind.OMNI else "less than 360"
+                yield Finding(path, f"the antenna is a {radio.antenna.value}", expected, str(radio.beamwidth_deg))
+
+
+@fleet_rule(
+    "MC349",
+    Severity.WARNING,
+    "A node is heard where it cannot be answered",
+    why="""The strong radio's frames arrive, the weak one's acknowledgements do not: the strong node sends everything
+    again and again, and the link looks good in one direction only.""",
+    mend="Bring the powers of the mesh's radios within 10 dB of each other.",
+    failing="nodes: {b01: {radios: {radio0: {tx_power_dbm: 10}}}}",
+    passing="nodes: {b01: {radios: {radio0: {tx_power_dbm: 20}}}}",
+)
+def powers_far_apart(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    by_mesh = grouped((mesh.name, (node, radio)) for node, radio, mesh in _transmitting(fleet))
+    for name, members in by_mesh.items():
+        strongest, strong = max(members, key=lambda member: member[1].conducted_dbm)
+        for node, radio in members:
+            if strong.conducted_dbm - radio.conducted_dbm > _ASYMMETRY_DB:
+                expected = f"at least {_dbm(strong.conducted_dbm - _ASYMMETRY_DB)} dBm conducted"
+                message = f"{strongest.name} in mesh {name} sends with {_dbm(strong.conducted_dbm)} dBm"
+                found = f"{_dbm(radio.conducted_dbm)} dBm"
+                yield Finding(_at(node, radio), message, expected, found)
+
+
+@fleet_rule(
+    "MC350",
+    Severity.ERROR,
+    "Two radios of a profile have the same device path",
+    why="""The path is how a node finds its radio again after a reboot: with one path twice, both sections configure the
+    same radio and the other stays off.""",
+    mend="Read the paths off a device: `uci get wireless.radio0.path`.",
+    failing="hardware: {rocket: {radios: {radio1: {path: pci0000:00/0000:00:00.0}}}}",
+    passing="hardware: {rocket: {radios: {radio1: {path: pci0000:00/0000:00:01.0}}}}",
+)
+def radio_path_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in fleet.hardware.values():
+        seen: dict[str, str] = {}
+        for radio in profile.radios:
+            first = seen.setdefault(radio.path, radio.name)
+            if first != radio.name:
+                path = ("hardware", profile.name, "radios", radio.name, "path")
+                yield Finding(path, f"{first} has the same path", "a path of its own", radio.path)

@@ -1,0 +1,199 @@
+"""Names that must stand for something: meshes, robots, nodes, jump hosts (MC101 to MC109)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from difflib import get_close_matches
+
+from meshctl.diagnostics import Severity
+from meshctl.lint.context import LintContext
+from meshctl.lint.grouping import listed
+from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.model import Fleet
+
+
+def known(names: Iterable[str], wrong: str) -> tuple[str, str]:
+    """What was expected, and the hint, for a name that none of `names` is."""
+    choices = sorted(names)
+    near = get_close_matches(wrong, choices, 1)
+    return (
+        f"one of {listed(choices)}" if choices else "none, there are none",
+        f"did you mean {near[0]}?" if near else "",
+    )
+
+
+@fleet_rule(
+    "MC101",
+    Severity.ERROR,
+    "A radio joins a mesh that does not exist",
+    why="The radio would be rendered without a cell: the node comes up with no radio and cannot be reached.",
+    mend="Name a mesh of `meshes`, or write `mesh: null` to leave the radio off.",
+    failing="nodes: {b01: {radios: {radio0: {mesh: mian}}}}",
+    passing="nodes: {b01: {radios: {radio0: {mesh: main}}}}",
+)
+def unknown_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.nodes.values():
+        for radio in node.radios:
+            if radio.mesh is not None and radio.mesh not in fleet.meshes:
+                expected, hint = known(fleet.meshes, radio.mesh)
+                path = ("nodes", node.name, "radios", radio.name, "mesh")
+                yield Finding(path, "no such mesh", expected, radio.mesh, hint)
+
+
+@fleet_rule(
+    "MC102",
+    Severity.ERROR,
+    "A node rides on a robot that does not exist",
+    why="Status, plans and the loop check work by robot; a node of an unknown robot belongs to none of them.",
+    mend="Name a robot of `robots`.",
+    failing="nodes: {b01: {robot: husky9}}",
+    passing="nodes: {b01: {robot: husky1}}",
+)
+def unknown_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.nodes.values():
+        if node.robot and node.robot not in fleet.robots:
+            expected, hint = known(fleet.robots, node.robot)
+            yield Finding(("nodes", node.name, "robot"), "no such robot", expected, node.robot, hint)
+
+
+@fleet_rule(
+    "MC103",
+    Severity.ERROR,
+    "A robot lists a node that does not exist",
+    why="The robot's radio cannot be configured, and its place in the mesh is unknown.",
+    mend="Add the node to `nodes`, or mend the name.",
+    failing="robots: {husky1: {nodes: [husky1-front, husky1-raer]}}",
+    passing="robots: {husky1: {nodes: [husky1-front]}}",
+)
+def unknown_node_of_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        for index, name in enumerate(robot.nodes):
+            if name not in fleet.nodes:
+                _, hint = known(fleet.nodes, name)
+                path = ("robots", robot.name, "nodes", str(index))
+                yield Finding(path, "no such node", "a name of `nodes`", name, hint)
+
+
+@fleet_rule(
+    "MC104",
+    Severity.ERROR,
+    "A robot carries a node that does not exist",
+    why="The operator would look for a beacon that nobody packed, or pack one that nothing configures.",
+    mend="Add the beacon to `nodes`, or mend the name.",
+    failing="robots: {husky1: {carries: [b01, b0l]}}",
+    passing="robots: {husky1: {carries: [b01]}}",
+)
+def unknown_carried_node(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        for index, name in enumerate(robot.carries):
+            if name not in fleet.nodes:
+                _, hint = known(fleet.nodes, name)
+                path = ("robots", robot.name, "carries", str(index))
+                yield Finding(path, "no such node", "a name of `nodes`", name, hint)
+
+
+@fleet_rule(
+    "MC105",
+    Severity.ERROR,
+    "The way to a node goes through one that does not exist",
+    why="Every command that needs this node fails before it starts.",
+    mend="Name a node in `ssh.jump`, or take the line away to reach the node directly.",
+    failing="nodes: {b01: {ssh: {jump: bsae}}}",
+    passing="nodes: {b01: {ssh: {jump: base}}}",
+)
+def unknown_jump(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.nodes.values():
+        if node.ssh.jump and node.ssh.jump not in fleet.nodes:
+            _, hint = known(fleet.nodes, node.ssh.jump)
+            path = ("nodes", node.name, "ssh", "jump")
+            yield Finding(path, "no such node", "a name of `nodes`", node.ssh.jump, hint)
+
+
+@fleet_rule(
+    "MC106",
+    Severity.ERROR,
+    "The way to a node leads back to itself",
+    why="A jump through nodes that jump through each other never arrives.",
+    mend="Let one of the nodes on the circle be reached directly.",
+    failing="""
+    nodes:
+      b01: {ssh: {jump: base}}
+      base: {ssh: {jump: b01}}
+    """,
+    passing="nodes: {b01: {ssh: {jump: base}}}",
+)
+def jump_circle(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    arrives: dict[str, bool] = {}
+    for node in fleet.nodes.values():
+        way: list[str] = []
+        name = node.name
+        while name in fleet.nodes and name not in arrives and name not in way:
+            way.append(name)
+            name = fleet.nodes[name].ssh.jump
+        closes = name in way
+        fine = not closes and arrives.get(name, True)
+        if closes:
+            circle = [*way[way.index(name) :], name]
+            path = ("nodes", name, "ssh", "jump")
+            yield Finding(path, "the jumps go in a circle", "a node reached directly at the end", " -> ".join(circle))
+        arrives.update(dict.fromkeys(way, fine))
+
+
+@fleet_rule(
+    "MC107",
+    Severity.WARNING,
+    "A mesh has no members",
+    why="A mesh that nobody joins is a forgotten edit: a name that nodes were meant to use, or one that was left.",
+    mend="Let radios join it, or remove it.",
+    failing="""
+    meshes:
+      second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
+               encryption: psk2+ccmp, key: {env: MESH_KEY}}
+    nodes:
+      base: {radios: {radio0: {mesh: main}}}
+      husky1-front: {radios: {radio0: {mesh: main}}}
+      b01: {radios: {radio0: {mesh: main}}}
+    """,
+    passing="meshes: {main: {channel: 11}}",
+)
+def empty_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    joined = {mesh for node in fleet.managed() for mesh in node.meshes}
+    for name in fleet.meshes:
+        if name not in joined:
+            yield Finding(("meshes", name), "no managed node joins this mesh", "at least one radio", "none")
+
+
+@fleet_rule(
+    "MC108",
+    Severity.WARNING,
+    "A managed node joins no mesh",
+    why="A node whose radios are all off is reached by cable only, and carries nothing.",
+    mend="Give one of its radios a mesh, or set its state to `retired`.",
+    failing="nodes: {b01: {radios: {radio0: {mesh: null}}}}",
+    passing="nodes: {b01: {radios: {radio0: {mesh: main}}}}",
+)
+def node_without_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        if not node.meshes:
+            yield Finding(("nodes", node.name), "no radio joins a mesh", "at least one", "none")
+
+
+@fleet_rule(
+    "MC109",
+    Severity.NOTE,
+    "A hardware profile is used by no node",
+    why="Unused profiles age unseen: their firmware and hashes go stale and nothing checks them.",
+    mend="Remove the profile, or give it to the nodes that were meant to use it.",
+    failing="""
+    hardware:
+      bullet: {board: "ubnt,bullet-m-xw", profile: ubnt_bullet-m-xw, target: ath79/generic, release: "24.10",
+               lan_ports: [eth0], recovery: Hold reset at power-on,
+               radios: {radio0: {path: platform/ahb/18100000.wmac, band: 2g, rated_power_dbm: 27, max_drive_dbm: 27}}}
+    """,
+    passing="hardware: {rocket: {memory_mib: 64}}",
+)
+def unused_hardware(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    used = {node.hardware.name for node in fleet.nodes.values()}
+    for name in fleet.hardware:
+        if name not in used:
+            yield Finding(("hardware", name), "no node uses this profile")

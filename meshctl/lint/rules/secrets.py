@@ -1,0 +1,238 @@
+"""Where secrets are and how strong: never in the inventory, never in the repository (MC441 to MC449)."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from meshctl.diagnostics import Position, Severity
+from meshctl.lint.context import LintContext
+from meshctl.lint.grouping import repeated
+from meshctl.lint.rule import Example, Finding, fleet_rule, text_rule
+from meshctl.model import Fleet, SecretKind, SecretRef
+
+# what udp_mesh takes (udp_mesh/crypto/keys.py)
+_KEY_BYTES = 32
+_SAFE_MODE_MASK = 0o077
+_TRANSPORT_KEY = "b4f8e7f0c3a94c21a1d2d9a0f5c36e7722d1b6c8e3f04a5b9c7d8e1f2a3b4c5d"
+
+_MATERIAL = (
+    (re.compile(r"-----BEGIN [A-Z0-9 ]*PRIVATE KEY-----"), "a private key"),
+    (re.compile(r"AGE-SECRET-KEY-1[0-9A-Z]{20,}"), "an age identity"),
+    (re.compile(r"untrusted comment: (?:OpenWrt )?(?:secret|private) key", re.IGNORECASE), "a usign secret key"),
+    # a long run of hex or base64 behind a key whose name says what it is
+    (
+        re.compile(
+            r"(?i)\b(?:psk|passphrase|password|passwd|secret|wpa_key|mesh_key|udp_mesh_key)\b[\"']?\s*[:=]\s*[\"']?[^\s\"'{}\[\],#]{8,}"
+        ),
+        "what looks like a secret",
+    ),
+)
+
+
+def secret_refs(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SecretRef]]:
+    """Every reference of the inventory with its place."""
+    for mesh in fleet.meshes.values():
+        if mesh.key is not None:
+            yield ("meshes", mesh.name, "key"), mesh.key
+    for index, key in enumerate(fleet.udp_mesh.keys):
+        yield ("udp_mesh", "keys", str(index)), key
+
+
+def _path(fleet: Fleet, where: str, base: str) -> Path:
+    return Path(base or fleet.base or ".", Path(where).expanduser())
+
+
+def _secret_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], Path, str]]:
+    """Files that hold secrets in the clear: secret files, age identities, private SSH keys."""
+    for path, ref in secret_refs(fleet):
+        match ref.kind:
+            case SecretKind.FILE:
+                yield (*path, "file"), _path(fleet, ref.where, ref.base), "the secret"
+            case SecretKind.AGE if ref.identity:
+                yield (*path, "identity"), _path(fleet, ref.identity, ref.base), "the age identity"
+            case SecretKind.AGE | SecretKind.ENV:
+                pass
+    # nodes of a group share one list: judge each file once
+    seen: set[str] = set()
+    for node in fleet.nodes.values():
+        for index, file in enumerate(node.ssh.key_files):
+            if file not in seen:
+                seen.add(file)
+                place = ("nodes", node.name, "ssh", "key_files", str(index))
+                yield place, _path(fleet, file, fleet.base), "the private key"
+
+
+@text_rule(
+    "MC441",
+    Severity.ERROR,
+    "Key material stands in the inventory",
+    why="""The inventory is kept in git, copied to laptops and pasted into chats: a key that ever stood in it is public,
+    also after it was removed.""",
+    mend="Refer to it instead (`{env: NAME}`, `{file: ...}` or `{age: ...}`), and make a new key.",
+    failing="system: {log_host: 10.42.0.100}  # psk: 5f4dcc3b5aa765d61d8327deb882cf99",
+    passing="system: {log_host: 10.42.0.100}  # the key is in the vault",
+)
+def key_material(file: str, text: str) -> Iterator[Finding]:
+    for number, line in enumerate(text.splitlines(), 1):
+        for pattern, what in _MATERIAL:
+            match = pattern.search(line)
+            if match is not None:
+                place = Position(file, number, match.start() + 1)
+                yield Finding((), f"{what} stands in the file", "a reference to it", position=place)
+                break
+
+
+@fleet_rule(
+    "MC442",
+    Severity.ERROR,
+    "A file with a secret can be read by others",
+    why="Everybody with a login on the operator's machine, and every program that runs there, has the fleet's key.",
+    mend="`chmod 600` the file.",
+    failing=Example(
+        "udp_mesh: {keys: [{file: mode-0644.key}]}",
+        files={"mode-0644.key": _TRANSPORT_KEY},
+    ),
+    passing=Example(
+        "udp_mesh: {keys: [{file: mode-0600.key}]}",
+        files={"mode-0600.key": _TRANSPORT_KEY},
+    ),
+)
+def secret_readable(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for place, path, what in _secret_files(fleet):
+        mode = context.files.mode(path)
+        if mode is not None and mode & _SAFE_MODE_MASK:
+            yield Finding(place, f"others can read {what}", "mode 0600", f"{path} with mode {mode:04o}")
+
+
+@fleet_rule(
+    "MC443",
+    Severity.ERROR,
+    "A file with a secret lies inside the repository",
+    why="The next `git add .` publishes it.",
+    mend="Move it out of the repository, list it in .gitignore, or encrypt it with age.",
+    failing=Example(
+        "udp_mesh: {keys: [{file: fleet.key}]}",
+        files={".git/HEAD": "ref: refs/heads/main", "fleet.key": _TRANSPORT_KEY},
+    ),
+    passing=Example(
+        "udp_mesh: {keys: [{file: fleet.key}]}",
+        files={"fleet.key": _TRANSPORT_KEY},
+    ),
+)
+def secret_in_repository(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for place, path, what in _secret_files(fleet):
+        if context.files.mode(path) is not None and context.files.in_repository(path):
+            yield Finding(place, f"{what} would be committed", "a place outside the repository", str(path))
+
+
+@fleet_rule(
+    "MC444",
+    Severity.ERROR,
+    "A file that a secret refers to is missing",
+    why="Nothing can be rendered on this machine; it is better to learn it now than at the field's edge.",
+    mend="Bring the file, or mend the path: it is relative to the file that names it.",
+    failing="udp_mesh: {keys: [{age: absent.age, key: udp_mesh}]}",
+    passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}]}",
+)
+def secret_file_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for place, ref in secret_refs(fleet):
+        if ref.kind is SecretKind.AGE and context.files.mode(_path(fleet, ref.where, ref.base)) is None:
+            yield Finding((*place, "age"), "no such file", "a file encrypted with age", ref.where)
+
+
+@fleet_rule(
+    "MC445",
+    Severity.ERROR,
+    "The transport's key is not a key",
+    why="""udp_mesh takes 32 random bytes, as 64 hexadecimal digits or in base64, and refuses to start with anything
+    else. A word or a short key would be found by trying: a few seconds of recorded traffic are enough to try
+    against.""",
+    mend="Make a new one: `openssl rand -hex 32`.",
+    failing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": "husky2021"}),
+    passing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": _TRANSPORT_KEY}),
+)
+def transport_key_invalid(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for index, ref in enumerate(fleet.udp_mesh.keys):
+        secret = context.secret(ref)
+        if secret is not None and not _is_transport_key(secret.reveal().strip()):
+            expected = f"{_KEY_BYTES} bytes: {2 * _KEY_BYTES} hexadecimal digits, or base64"
+            found = f"{len(secret.reveal().strip())} characters"
+            yield Finding(("udp_mesh", "keys", str(index)), "no key", expected, found)
+
+
+def _is_transport_key(text: str) -> bool:
+    try:
+        if len(text) == 2 * _KEY_BYTES:
+            return len(bytes.fromhex(text)) == _KEY_BYTES
+        return len(base64.b64decode(text, validate=True)) == _KEY_BYTES
+    except ValueError:
+        return False
+
+
+@fleet_rule(
+    "MC446",
+    Severity.ERROR,
+    "The transport has no key",
+    why="Without a fleet key anyone in reach can send an emergency stop, or lift one.",
+    mend="Say where the key is: `udp_mesh: {keys: [{env: UDP_MESH_KEY}]}`.",
+    failing="udp_mesh: {keys: []}",
+    passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}]}",
+)
+def transport_key_missing(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    computers = any(robot.computer is not None for robot in fleet.robots.values())
+    if computers and fleet.topics and not fleet.udp_mesh.keys:
+        yield Finding(("udp_mesh",), "messages would go unsealed", "a reference in `keys`", "none")
+
+
+@fleet_rule(
+    "MC447",
+    Severity.WARNING,
+    "One secret is used for two things",
+    why="""The Wi-Fi passphrase is on every radio, in flash, and in the hands of whoever finds a lost beacon. If it is
+    the transport's key as well, a lost beacon opens everything.""",
+    mend="Use a secret of its own for each.",
+    failing=Example("udp_mesh: {keys: [{env: MESH_KEY}]}", environment={"MESH_KEY": _TRANSPORT_KEY}),
+    passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}]}",
+)
+def secret_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    mesh_keys = {(ref.kind, ref.where, ref.key): place for place, ref in secret_refs(fleet) if place[0] == "meshes"}
+    for index, ref in enumerate(fleet.udp_mesh.keys):
+        place = mesh_keys.get((ref.kind, ref.where, ref.key))
+        if place is not None:
+            message = f"also the key of {place[0]}.{place[1]}"
+            yield Finding(("udp_mesh", "keys", str(index)), message, "a secret of its own", str(ref))
+
+
+@fleet_rule(
+    "MC448",
+    Severity.WARNING,
+    "One transport key is listed twice",
+    why="Two live keys are for a change of keys: the old beside the new. The same one twice rotates nothing.",
+    mend="List the new key first and the old one behind it; take the old one out when all robots have the new.",
+    failing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: UDP_MESH_KEY}]}",
+    passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: UDP_MESH_OLD_KEY}]}",
+)
+def transport_key_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    marks = (((ref.kind, ref.where, ref.key), index) for index, ref in enumerate(fleet.udp_mesh.keys))
+    for (_, where, _), indexes in repeated(marks):
+        for index in indexes[1:]:
+            yield Finding(("udp_mesh", "keys", str(index)), "the same key stands above", "another key", where)
+
+
+@fleet_rule(
+    "MC449",
+    Severity.ERROR,
+    "More than two transport keys are live",
+    why="""udp_mesh holds two keys: the one it seals with and the one before. A third is never tried, and robots that
+    still use it fall silent.""",
+    mend="Finish the change of keys: leave the new one and at most one old one.",
+    failing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: SECOND}, {env: THIRD}]}",
+    passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: SECOND}]}",
+)
+def too_many_transport_keys(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    if len(fleet.udp_mesh.keys) > 2:
+        found = str(len(fleet.udp_mesh.keys))
+        yield Finding(("udp_mesh", "keys", "2"), "never tried", "at most two keys", found)

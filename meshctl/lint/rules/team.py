@@ -1,0 +1,372 @@
+"""Robots, roles and reach: who rides where, whether every mesh reaches the base, how carefully it is changed
+(MC601 to MC617)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from meshctl.diagnostics import Severity
+from meshctl.lint.context import LintContext
+from meshctl.lint.grouping import grouped, listed, repeated
+from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.model import Fleet, NodeState, Role
+
+
+@fleet_rule(
+    "MC601",
+    Severity.ERROR,
+    "A mesh has no route to the base",
+    why="""Its nodes talk to each other and to nobody who could stop them: no node, and no robot with radios in several
+    meshes, joins it to the mesh of the base station.""",
+    mend="Give the base a radio in this mesh, or a robot radios in both.",
+    failing="""
+    meshes:
+      second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 2g, channel: 11, network: 10.43.0.0/24,
+               encryption: psk2+ccmp, key: {env: MESH_KEY}}
+    nodes:
+      base: {radios: {radio0: {mesh: main}}}
+      husky1-front: {radios: {radio0: {mesh: main}}}
+      b01: {address: 10.43.0.101, radios: {radio0: {mesh: second}}}
+    """,
+    passing="""
+    meshes:
+      second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 2g, channel: 11, network: 10.43.0.0/24,
+               encryption: psk2+ccmp, key: {env: MESH_KEY}}
+    nodes:
+      base: {radios: {radio0: {mesh: main}}}
+      husky1-front: {radios: {radio0: {mesh: main}}}
+      b01: {address: 10.43.0.101, radios: {radio0: {mesh: second}}}
+      base2: {role: base, address: 10.43.0.1, radios: {radio0: {mesh: second}}}
+    robots: {base-station: {nodes: [base, base2]}}
+    """,
+)
+def mesh_cut_off(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    reached = _reached_from_base(fleet)
+    if not reached:
+        return
+    for name in fleet.meshes:
+        members = [node.name for node in fleet.members(name)]
+        if members and name not in reached:
+            path = ("meshes", name)
+            message = f"{len(members)} nodes ({listed(members)}) cannot reach the base"
+            yield Finding(path, message, f"a radio in {listed(sorted(reached))} as well", "none")
+
+
+def _reached_from_base(fleet: Fleet) -> set[str]:
+    """The meshes that the base stands in, and those joined to them by a node or a robot in both."""
+    start = {
+        mesh
+        for node in fleet.managed()
+        if node.role is Role.BASE or (node.robot in fleet.robots and fleet.robots[node.robot].is_base)
+        for mesh in node.meshes
+    }
+    joints: list[set[str]] = [set(node.meshes) for node in fleet.managed() if len(node.meshes) > 1]
+    for robot in fleet.robots.values():
+        nodes = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
+        joints.append({mesh for node in nodes if node.state.is_managed for mesh in node.meshes})
+    reached = start
+    # each pass adds a mesh or ends: at most as many passes as there are meshes
+    while more := {mesh for joint in joints if joint & reached for mesh in joint} - reached:
+        reached = reached | more
+    return reached
+
+
+@fleet_rule(
+    "MC602",
+    Severity.ERROR,
+    "The fleet has no base",
+    why="""Plans order nodes by their distance from the operator, and keep the way to them open until the last. Without
+    a base there is no such order.""",
+    mend="Give the operator's radio `role: base`.",
+    failing="""
+    nodes: {base: {role: robot}}
+    robots: {base-station: {is_base: false}}
+    """,
+    passing="nodes: {base: {role: base}}",
+)
+def no_base(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    managed = list(fleet.managed())
+    if managed and not any(node.role is Role.BASE for node in managed):
+        yield Finding(("nodes",), "no node is the operator's", "a node with `role: base`", "none")
+
+
+@fleet_rule(
+    "MC603",
+    Severity.WARNING,
+    "The mesh has too few beacons",
+    why="The chain will not reach as deep as planned, and there is none to spare for one that falls on its antenna.",
+    mend="Add beacons, mark repaired ones as `carried`, or lower `min_beacons`.",
+    failing="meshes: {main: {min_beacons: 3}}",
+    passing="meshes: {main: {min_beacons: 1}}",
+)
+def too_few_beacons(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    ready = grouped(
+        (mesh, node.name)
+        for node in fleet.managed()
+        if node.role is Role.BEACON and node.state is not NodeState.SPARE
+        for mesh in node.meshes
+    )
+    for mesh in fleet.meshes.values():
+        count = len(ready.get(mesh.name, []))
+        if count < mesh.min_beacons:
+            path = ("meshes", mesh.name, "min_beacons")
+            yield Finding(path, "too few beacons", f"at least {mesh.min_beacons}", f"{count} carried or deployed")
+
+
+@fleet_rule(
+    "MC604",
+    Severity.ERROR,
+    "Two robots are the base station",
+    why="udp_mesh sends what is for the base to one peer; with two, half of the reports go to the wrong one.",
+    mend="Set `is_base: true` at one robot only.",
+    failing="robots: {husky1: {is_base: true}}",
+    passing="robots: {husky1: {is_base: false}}",
+)
+def two_bases(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    bases = [robot.name for robot in fleet.robots.values() if robot.is_base]
+    for name in bases[1:]:
+        yield Finding(("robots", name, "is_base"), f"{bases[0]} is the base as well", "one base", listed(bases))
+
+
+@fleet_rule(
+    "MC605",
+    Severity.ERROR,
+    "Two robots claim one node",
+    why="A radio rides on one robot: the loop check, the order of changes and the status page of both would be wrong.",
+    mend="Leave the node with the robot it is mounted on.",
+    failing="robots: {base-station: {nodes: [base, husky1-front]}}",
+    passing="robots: {base-station: {nodes: [base]}}",
+)
+def node_of_two_robots(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    claims = (
+        (name, (robot.name, key, str(index)))
+        for robot in fleet.robots.values()
+        for key, names in (("nodes", robot.nodes), ("carries", robot.carries))
+        for index, name in enumerate(names)
+    )
+    for name, claimed in repeated(claims):
+        for robot, key, index in claimed[1:]:
+            message = f"{name} is claimed by {claimed[0][0]} already"
+            yield Finding(("robots", robot, key, index), message, "one robot for each node", name)
+
+
+@fleet_rule(
+    "MC606",
+    Severity.ERROR,
+    "A node and a robot disagree about who rides where",
+    why="""The node says it rides on one robot, another robot lists it: one of the two lines was not changed when the
+    radio was moved.""",
+    mend="Say it in one place: leave `robot` out at the node, or mend the robot's list.",
+    failing="nodes: {husky1-front: {robot: base-station}}",
+    passing="nodes: {husky1-front: {robot: husky1}}",
+)
+def robot_disagrees(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        for name in dict.fromkeys((*robot.nodes, *robot.carries)):
+            node = fleet.nodes.get(name)
+            if node is not None and node.robot and node.robot != robot.name and node.robot in fleet.robots:
+                listing = fleet.robots[node.robot]
+                if name not in listing.nodes and name not in listing.carries:
+                    path = ("nodes", name, "robot")
+                    yield Finding(path, f"{robot.name} lists the node", robot.name, node.robot)
+
+
+@fleet_rule(
+    "MC607",
+    Severity.WARNING,
+    "A robot carries what is no beacon",
+    why="What a robot carries is dropped. A base radio or another robot's radio in its list is a slip.",
+    mend="List beacons under `carries`, and mounted radios under `nodes`.",
+    failing="""
+    nodes: {extra: {role: robot, address: 10.42.0.60, robot: husky1}}
+    robots: {husky1: {carries: [b01, extra]}}
+    """,
+    passing="robots: {husky1: {carries: [b01]}}",
+)
+def carries_no_beacon(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        for index, name in enumerate(robot.carries):
+            node = fleet.nodes.get(name)
+            if node is not None and node.role is not Role.BEACON:
+                path = ("robots", robot.name, "carries", str(index))
+                yield Finding(path, f"{name} is not dropped", "a node with role beacon", node.role.value)
+
+
+@fleet_rule(
+    "MC608",
+    Severity.WARNING,
+    "A carried beacon is on no robot",
+    why="""A beacon that is `carried` may be off and raises no alarm. If no robot carries it, it is in nobody's rack,
+    and will be missed when it is wanted.""",
+    mend="List it under a robot's `carries`, or set its state to `spare`.",
+    failing="nodes: {b02: {role: beacon, state: carried, address: 10.42.0.102}}",
+    passing="""
+    nodes: {b02: {role: beacon, state: carried, address: 10.42.0.102}}
+    robots: {husky1: {carries: [b01, b02]}}
+    """,
+)
+def carried_by_nobody(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    carried = {name for robot in fleet.robots.values() for name in robot.carries}
+    for node in fleet.nodes.values():
+        is_carried = node.state is NodeState.CARRIED and node.role is Role.BEACON
+        if is_carried and fleet.robots and node.name not in carried and node.robot not in fleet.robots:
+            yield Finding(("nodes", node.name), "no robot carries it", "a robot that lists it", "none")
+
+
+@fleet_rule(
+    "MC609",
+    Severity.ERROR,
+    "A robot has no radio",
+    why="Without a managed node it hears nobody, and nobody can stop it.",
+    mend="List its radio under `nodes`; a lost one does not count.",
+    failing="""
+    nodes: {husky1-front: {state: lost}}
+    """,
+    passing="nodes: {husky1-front: {state: carried}}",
+)
+def robot_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        known = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
+        if len(known) == len(robot.nodes) and not any(node.state.is_managed for node in known):
+            found = listed([f"{node.name} ({node.state.value})" for node in known]) or "none"
+            yield Finding(("robots", robot.name), "no radio is in use", "at least one managed node", found)
+
+
+@fleet_rule(
+    "MC610",
+    Severity.WARNING,
+    "A radio of a robot rides on none",
+    why="""A node with `role: robot` moves, and with it everything behind it; without its robot, lint cannot see loops,
+    nor plans whom a change cuts off.""",
+    mend="List it under the robot's `nodes`, or give it another role.",
+    failing="nodes: {stray: {role: robot, address: 10.42.0.77}}",
+    passing="""
+    nodes: {stray: {role: robot, address: 10.42.0.77}}
+    robots: {husky1: {nodes: [husky1-front, stray]}}
+    """,
+)
+def robot_radio_without_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        if node.role is Role.ROBOT and not node.robot and fleet.robots:
+            yield Finding(("nodes", node.name), "rides on no robot", "a robot that lists it", "none")
+
+
+@fleet_rule(
+    "MC611",
+    Severity.WARNING,
+    "The base is not deployed",
+    why="Everything is reached through the base. As `carried` or `spare` it may be off, and status would not alarm.",
+    mend="Set its state to `deployed`.",
+    failing="nodes: {base: {state: spare}}",
+    passing="nodes: {base: {state: deployed}}",
+)
+def base_not_deployed(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    bases = [node for node in fleet.managed() if node.role is Role.BASE]
+    if bases and not any(node.state is NodeState.DEPLOYED for node in bases):
+        path = ("nodes", bases[0].name, "state")
+        yield Finding(path, "the way to all others", "deployed", bases[0].state.value)
+
+
+@fleet_rule(
+    "MC612",
+    Severity.ERROR,
+    "A way leads through a node that is not in use",
+    why="The jump host is lost, retired or still in its box: the node behind it cannot be reached.",
+    mend="Jump through a node that is deployed.",
+    failing="""
+    nodes:
+      old: {role: beacon, state: lost, address: 10.42.0.66}
+      b01: {ssh: {jump: old}}
+    """,
+    passing="nodes: {b01: {ssh: {jump: base}}}",
+)
+def jump_not_in_use(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    idle = (NodeState.LOST, NodeState.RETIRED, NodeState.SPARE)
+    for node in fleet.managed():
+        jump = fleet.nodes.get(node.ssh.jump)
+        if jump is not None and jump.state in idle:
+            path = ("nodes", node.name, "ssh", "jump")
+            yield Finding(path, f"{jump.name} is not in use", "a deployed node", jump.state.value)
+
+
+@fleet_rule(
+    "MC613",
+    Severity.WARNING,
+    "Most of a mesh may be changed at once",
+    why="With more than half of the nodes down together, a bad change takes the mesh and the way to mend it.",
+    mend="Lower `apply.max_down`: one at a time is safe, a fifth of the mesh is usual.",
+    failing="apply: {max_down: 3}",
+    passing="apply: {max_down: 1}",
+)
+def max_down_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    sizes = grouped((mesh, node.name) for node in fleet.managed() for mesh in node.meshes)
+    smallest = min((len(names) for names in sizes.values()), default=0)
+    if smallest > 1 and fleet.apply.max_down > max(smallest // 2, 1):
+        expected = f"at most {max(smallest // 2, 1)}"
+        found = f"{fleet.apply.max_down} of {smallest} nodes"
+        yield Finding(("apply", "max_down"), "a bad change takes most of a mesh", expected, found)
+
+
+@fleet_rule(
+    "MC614",
+    Severity.WARNING,
+    "Many nodes are changed without trying one first",
+    why="Without a canary the first node that shows a mistake is one of many that have it.",
+    mend="Set `apply.canary: true`.",
+    failing="apply: {canary: false}",
+    passing="apply: {canary: true}",
+)
+def no_canary(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    if not fleet.apply.canary and sum(1 for _ in fleet.managed()) > 1:
+        yield Finding(("apply", "canary"), "a mistake reaches many nodes at once", "true", "false")
+
+
+@fleet_rule(
+    "MC615",
+    Severity.WARNING,
+    "The quorum is below one half",
+    why="""A change of the whole cell is kept when the quorum forms again. Below a half, a split mesh counts as success,
+    and both parts may keep different configurations.""",
+    mend="Set `apply.quorum` to 0.6 or more.",
+    failing="apply: {quorum: 0.4}",
+    passing="apply: {quorum: 0.8}",
+)
+def quorum_low(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    if fleet.apply.quorum <= 0.5:
+        expected, found = "more than 0.5", f"{fleet.apply.quorum:g}"
+        yield Finding(("apply", "quorum"), "a split mesh would count as success", expected, found)
+
+
+@fleet_rule(
+    "MC616",
+    Severity.WARNING,
+    "A run goes on after many failures",
+    why="The second node that fails the same way says what the tenth would: by then ten have to be mended by hand.",
+    mend="Set `apply.stop_after_failures` to 1 or 2.",
+    failing="apply: {stop_after_failures: 10}",
+    passing="apply: {stop_after_failures: 2}",
+)
+def stops_late(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    if fleet.apply.stop_after_failures > 5:
+        found = str(fleet.apply.stop_after_failures)
+        yield Finding(("apply", "stop_after_failures"), "many nodes fail before it stops", "at most 5", found)
+
+
+@fleet_rule(
+    "MC617",
+    Severity.WARNING,
+    "A robot that sends or gets messages has no computer",
+    why="""udp_mesh runs on the robot's computer: a topic that names a robot without one is never sent, or never
+    arrives.""",
+    mend="Give the robot a `computer`, or take it out of the topic.",
+    failing="robots: {husky1: {computer: <removed>}}",
+    passing="robots: {husky1: {computer: {python: python3}}}",
+)
+def peer_without_computer(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for topic in fleet.topics:
+        for key, names in (("sources", topic.sources), ("destinations", topic.destinations)):
+            for index, name in enumerate(names):
+                robot = fleet.robots.get(name)
+                if robot is not None and robot.computer is None:
+                    path = ("topics", topic.name, key, str(index))
+                    yield Finding(path, f"{name} runs no udp_mesh", "a robot with a computer", name)
