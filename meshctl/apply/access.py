@@ -47,6 +47,8 @@ class Access:
     deadlines: Deadlines = field(default_factory=Deadlines)
     policy: HostKeyPolicy | None = None
     locate: Locate = as_written
+    # devices on the bench, by node: they answer there, and let in whoever comes
+    newcomers: dict[str, Endpoint] = field(default_factory=dict)
     _kept: dict[str, SshConnection] = field(default_factory=dict, repr=False)
     _jumps: dict[str, SshConnection] = field(default_factory=dict, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
@@ -56,9 +58,12 @@ class Access:
         host, port = self.locate(node, address or node.address.ip)
         return Endpoint(host, port, node.ssh.user, identity=node.name)
 
-    def credentials(self, node: Node) -> Credentials:
+    def credentials(self, node: Node, endpoint: Endpoint | None = None) -> Credentials:
+        """What we log in with: keys, and on the bench alone no password. At a node's own address only a key proves
+        that the operators have not locked themselves out."""
         named = tuple(_key_path(text, self.fleet) for text in node.ssh.key_files)
-        return Credentials(key_files=(*self.key_files, *named), use_agent=self.use_agent)
+        is_new = endpoint is not None and endpoint == self.newcomers.get(node.name)
+        return Credentials(key_files=(*self.key_files, *named), use_agent=self.use_agent, empty_password=is_new)
 
     def open(
         self,
@@ -70,9 +75,10 @@ class Access:
         deadlines: Deadlines | None = None,
     ) -> SshConnection:
         """A new connection, owned by the caller. Raises what `ssh.connect` raises."""
+        where = endpoint or self.endpoint(node)
         return connect(
-            endpoint or self.endpoint(node),
-            credentials=credentials or self.credentials(node),
+            where,
+            credentials=credentials or self.credentials(node, where),
             trust=policy or self.policy or self.trust,
             deadlines=deadlines or self.deadlines,
             via=self._via(node),

@@ -8,6 +8,7 @@ asks the node what is, and does what is next.
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 
 from meshctl.apply.attempt import Attempt, attempt_of, begin, confirm, look, prepare, reach, release, take_back
 from meshctl.apply.job import Job
@@ -29,7 +30,8 @@ def configure(job: Job, connection: SshConnection) -> Outcome:
 
     Raises NodeError only when nothing was changed on the node.
     """
-    attempt = attempt_of(job, connection.endpoint)
+    # a device that was met on the bench is known by its name from now on
+    attempt = attempt_of(job, replace(connection.endpoint, identity=job.name))
     try:
         prepare(attempt, connection)
         begin(attempt, connection)

@@ -123,7 +123,9 @@ def carry_out_plan(
         fleet=opened.fleet.name,
         inventory=opened.inventory,
         nodes=tuple(plan.nodes),
-        plan=json.dumps({"choices": asdict(told), "stages": [asdict(stage) for stage in plan.stages]}),
+        plan=json.dumps(
+            {"choices": asdict(told), "stages": [[stage.kind.value, *stage.nodes] for stage in plan.stages]}
+        ),
     )
     outcomes: dict[str, Outcome] = {}
     try:

@@ -52,9 +52,9 @@ def _network(before: Package | None, after: Package | None) -> list[Effect]:
         return [Effect("network", Cut.MESH, "network changes")]
     old, new = _by_key(before), _by_key(after)
     differing = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-    involved = [section for key in differing for section in (old.get(key), new.get(key)) if section is not None]
+    was_there = [section for key in differing if (section := old.get(key)) is not None]
     told = []
-    if any(section.get("proto") in ("batadv", "batadv_hardif") for section in involved):
+    if any(section.get("proto") in ("batadv", "batadv_hardif") for section in was_there):
         # any option of bat0 destroys and recreates it (openwrt-facts.md section 1)
         told.append(Effect("network", Cut.MESH, "bat0 is made anew"))
     address = _address(old.get("lan")), _address(new.get("lan"))

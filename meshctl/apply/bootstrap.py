@@ -1,0 +1,208 @@
+"""Take factory devices into the fleet: they all answer at 192.168.1.1, with no password and nobody's keys.
+
+`bootstrap`: for each place where one device answers (a port of the bench, an interface), connect, look, find out which
+node it is (`identify`, pure), refuse the wrong one, pin its host key, and then provision it like any other node: the
+change goes there over the bench, is confirmed over its new address, and undone if that never answers.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from meshctl.apply.access import Access
+from meshctl.apply.gather import Seen, observe_cleared
+from meshctl.apply.planning import Choices, Prepared, assemble, other_paths
+from meshctl.apply.wanted import Renderer
+from meshctl.device.connection import Endpoint
+from meshctl.device.observation import Observation
+from meshctl.device.ssh import SshConnection, connect
+from meshctl.device.trust import HostKey, TrustStore
+from meshctl.errors import InputError, NodeError
+from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
+from meshctl.fleet.journal import LastKnown
+from meshctl.model import Fleet, Node
+
+FACTORY_ADDRESS = "192.168.1.1"
+
+
+@dataclass(frozen=True, slots=True)
+class BenchPlace:
+    """Where one device answers; `node` is whom the operator says it is, empty when the device has to tell."""
+
+    host: str = FACTORY_ADDRESS
+    port: int = 22
+    node: str = ""
+
+    def __str__(self) -> str:
+        where = self.host if self.port == 22 else f"{self.host}:{self.port}"
+        return f"{self.node} at {where}" if self.node else where
+
+
+class Recorder:
+    """Believes any host key, and keeps it: on the bench a cable is the proof, and the key is pinned right after."""
+
+    def __init__(self) -> None:
+        self.key: HostKey | None = None
+
+    def known(self, endpoint: Endpoint) -> tuple[HostKey, ...]:
+        return ()
+
+    def check(self, endpoint: Endpoint, key: HostKey) -> None:
+        self.key = key
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A device on the bench: which node it is, what it told, its host key."""
+
+    place: BenchPlace
+    node: Node
+    seen: Observation
+    key: HostKey
+
+
+def find_node(fleet: Fleet, word: str) -> Node:
+    """The managed node that a name, label, serial number or MAC means. Raises InputError when none or several do."""
+    folded = word.lower()
+    found = [
+        node
+        for node in fleet.managed()
+        if folded in {node.name.lower(), node.label.lower(), node.serial.lower(), node.mac.lower()} - {""}
+        or any(radio.mac.lower() == folded for radio in node.radios if radio.mac)
+    ]
+    if len(found) != 1:
+        names = ", ".join(node.name for node in found)
+        raise InputError(
+            f"{word!r} means {names if found else 'no node of the fleet'}",
+            hint="give a node's name, label, serial number or MAC",
+        )
+    return found[0]
+
+
+def identify(fleet: Fleet, seen: Observation, said: str, taken: Iterable[str] = ()) -> Node:
+    """Which node this device is. Its MACs decide; where the inventory knows none, the operator's word does.
+
+    Raises NodeError for a device that is not the one it is said to be, or that nothing identifies.
+    """
+    macs = {mac.lower() for mac in (seen.macs or {}).values()}
+    if seen.board is not None and seen.board.label_mac:
+        macs.add(seen.board.label_mac.lower())
+    by_mac = [node for node in fleet.managed() if _macs(node) & macs]
+    shown = ", ".join(sorted(macs)) or "none"
+    if len(by_mac) > 1:
+        raise NodeError(f"its MACs ({shown}) belong to several nodes: {', '.join(node.name for node in by_mac)}")
+    if said:
+        node = find_node(fleet, said)
+        if by_mac and by_mac[0].name != node.name:
+            raise NodeError(f"wrong device: said to be {node.name}, its MAC is that of {by_mac[0].name}")
+        if _macs(node) and not by_mac:
+            expected = ", ".join(sorted(_macs(node)))
+            raise NodeError(f"wrong device: {node.name} has {expected}, this one has {shown}")
+    elif by_mac:
+        node = by_mac[0]
+    else:
+        raise NodeError(
+            f"nothing tells which node it is: no node of the inventory has one of its MACs ({shown})",
+            hint="say it (`meshctl bootstrap NODE`), or write its MAC into the inventory",
+        )
+    if node.name in set(taken):
+        raise NodeError(f"{node.name} was found at another place already")
+    return node
+
+
+def _macs(node: Node) -> set[str]:
+    return {mac.lower() for mac in (node.mac, *(radio.mac for radio in node.radios)) if mac}
+
+
+@dataclass(frozen=True, slots=True)
+class Arrivals:
+    """`found`: node -> device. `outcomes`: what came of the places where nothing could be taken in."""
+
+    found: Mapping[str, Found]
+    outcomes: tuple[Outcome, ...]
+
+
+def look_around(
+    renderer: Renderer,
+    access: Access,
+    trust: TrustStore,
+    places: Sequence[BenchPlace],
+    *,
+    parallel: int,
+    replace_keys: bool = False,
+    interrupt: Interrupt | None = None,
+    observer: Observer = silent,
+) -> Arrivals:
+    """See who is where. Host keys are pinned, connections kept with `access` under the nodes' names."""
+    found: dict[str, Found] = {}
+    lock = threading.Lock()
+    signal = interrupt or Interrupt()
+    by_name = {str(place): place for place in places}
+
+    def meet(name: str) -> Outcome:
+        place = by_name[name]
+        recorder = Recorder()
+        connection = _connect(access, renderer.fleet, place, recorder)
+        try:
+            with lock:
+                taken = tuple(found)
+            seen = observe_cleared(connection, _paths(renderer, place), signal)
+            node = identify(renderer.fleet, seen, place.node, taken)
+            assert recorder.key is not None
+            _pin(trust, node.name, recorder.key, replace_keys=replace_keys)
+        except BaseException:
+            connection.close()
+            raise
+        with lock:
+            found[node.name] = Found(place, node, seen, recorder.key)
+            access.newcomers[node.name] = replace(connection.endpoint, identity=node.name)
+        access.keep(node.name, connection)
+        return Outcome(name, Result.DONE)
+
+    ended = run(by_name, meet, parallel=parallel, interrupt=signal, observer=observer)
+    return Arrivals(found, tuple(outcome for outcome in ended.values() if not outcome.result.is_good))
+
+
+def _connect(access: Access, fleet: Fleet, place: BenchPlace, recorder: Recorder) -> SshConnection:
+    """Log in with no password, or with the fleet's keys where an earlier attempt has come half way."""
+    some = next(fleet.managed())
+    credentials = replace(access.credentials(some), empty_password=True)
+    endpoint = Endpoint(place.host, place.port)
+    release = find_node(fleet, place.node).release if place.node else None
+    return connect(endpoint, credentials=credentials, trust=recorder, deadlines=access.deadlines, release=release)
+
+
+def _paths(renderer: Renderer, place: BenchPlace) -> tuple[str, ...]:
+    """The files to look at; which node it is may not be known yet, and the paths are much the same for all."""
+    fleet = renderer.fleet
+    node = find_node(fleet, place.node) if place.node else next(fleet.managed())
+    return other_paths(renderer.wanted(node))
+
+
+def _pin(trust: TrustStore, name: str, key: HostKey, *, replace_keys: bool) -> None:
+    pinned = trust.pinned(name)
+    if key in pinned:
+        return
+    if pinned and not replace_keys:
+        raise NodeError(
+            f"{name} is pinned with another host key ({pinned[0].fingerprint}), this device shows {key.fingerprint}",
+            hint="if the device was reset or is a new one, run again with --replace-key",
+        )
+    trust.replace(name, key)
+
+
+def plan_arrivals(
+    renderer: Renderer,
+    arrivals: Arrivals,
+    known: Mapping[str, LastKnown],
+    *,
+    salt: bytes,
+    owner: str,
+    choices: Choices | None = None,
+) -> Prepared:
+    """The plan that provisions the devices that were found."""
+    first = {name: renderer.wanted(item.node) for name, item in arrivals.found.items()}
+    seen = Seen({name: item.seen for name, item in arrivals.found.items()}, {})
+    return assemble(renderer, first, seen, known, salt=salt, owner=owner, choices=choices or Choices())

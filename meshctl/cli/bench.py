@@ -1,0 +1,120 @@
+"""`meshctl bootstrap` and `meshctl replace`: devices on the bench."""
+
+from __future__ import annotations
+
+import secrets
+from dataclasses import replace as with_changes
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from meshctl.apply.bootstrap import BenchPlace, find_node, look_around, plan_arrivals
+from meshctl.cli.carry import SALT_BYTES, ask_and_carry_out, choices_of
+from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
+from meshctl.cli.session import KeyFiles, Lab, Session, session
+from meshctl.errors import ExitCode, InputError
+from meshctl.fleet import Outcome
+from meshctl.report.progress import outcome_text
+
+At = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--at", help="Where a device answers, HOST or HOST:PORT, e.g. fe80::1%eth2; one for each NODE, in their order."
+    ),
+]
+
+
+def bootstrap(
+    nodes: Annotated[
+        list[str] | None,
+        typer.Argument(help="Whom to expect: name, label, serial number or MAC; default: whoever answers, by its MAC."),
+    ] = None,
+    at: At = None,
+    inventory: InventoryPath = Path(),
+    replace_key: Annotated[bool, typer.Option("--replace-key", help="Take a device whose host key is new.")] = False,
+    yes: Yes = False,
+    no_firmware: NoFirmware = False,
+    rate: Rate = None,
+    brief: Brief = True,
+    as_json: AsJson = False,
+    key: KeyFiles = None,
+    lab: Lab = None,
+) -> None:
+    """Take factory devices (root without a password at 192.168.1.1) into the fleet: identify, set keys, provision.
+
+    Example: meshctl bootstrap b03 b04 --at fe80::1%eth1 --at fe80::1%eth2
+    """
+    choices = choices_of(no_firmware, "", "")
+    with session(inventory, key_files=key or (), lab=lab) as opened:
+        places = _places(opened, nodes or [], at or [])
+        with opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)):
+            arrivals = look_around(
+                opened.renderer,
+                opened.access,
+                opened.trust,
+                places,
+                parallel=opened.fleet.apply.parallel,
+                replace_keys=replace_key,
+                interrupt=opened.interrupt,
+            )
+        for outcome in arrivals.outcomes:
+            _complain(outcome)
+        if not as_json:
+            for name, item in arrivals.found.items():
+                typer.echo(f"{name}: found at {item.place.host}, host key {item.key.fingerprint}")
+        if not arrivals.found:
+            raise typer.Exit(ExitCode.UNREACHABLE if arrivals.outcomes else ExitCode.OK)
+        prepared = plan_arrivals(
+            opened.renderer,
+            arrivals,
+            opened.journal.last_known(opened.fleet.name),
+            salt=secrets.token_bytes(SALT_BYTES),
+            owner=opened.owner,
+            choices=with_changes(choices),
+        )
+        try:
+            ask_and_carry_out(opened, prepared, "bootstrap", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
+        except typer.Exit as ended:
+            if arrivals.outcomes and ended.exit_code == ExitCode.OK:
+                raise typer.Exit(ExitCode.FINDINGS) from None
+            raise
+
+
+def _complain(outcome: Outcome) -> None:
+    typer.echo(f"{outcome_text(outcome)}", err=True)
+    if outcome.hint:
+        typer.echo(f"  hint: {outcome.hint}", err=True)
+
+
+def _places(opened: Session, words: list[str], at: list[str]) -> list[BenchPlace]:
+    """Who is expected where."""
+    if opened.lab is not None and not at:
+        known = set(opened.lab.spec.names)
+        names = [find_node(opened.fleet, word).name for word in words]
+        names = names or [node.name for node in opened.fleet.managed() if node.name in known]
+        ends = {name: opened.lab.node(name).bench for name in names}
+        return [BenchPlace(end.host, end.port, name) for name, end in ends.items()]
+    expected = [find_node(opened.fleet, word).name for word in words]
+    if not at:
+        if len(expected) > 1:
+            raise InputError(
+                f"{len(expected)} nodes cannot all answer at one address",
+                hint="one at a time, or say where each is: --at fe80::1%eth1 --at fe80::1%eth2",
+            )
+        return [BenchPlace(node=expected[0] if expected else "")]
+    if expected and len(expected) != len(at):
+        raise InputError(f"{len(expected)} nodes and {len(at)} places: expected as many --at as nodes")
+    names = expected or [""] * len(at)
+    return [_place(text, name) for text, name in zip(at, names, strict=True)]
+
+
+def _place(text: str, name: str) -> BenchPlace:
+    """`HOST`, `HOST:PORT` or `[v6]:PORT`; a bare IPv6 address holds colons of its own."""
+    host, colon, port = text.rpartition(":")
+    if not colon or (text.count(":") > 1 and not text.startswith("[")):
+        return BenchPlace(text, node=name)
+    if not port.isdigit() or not 0 < int(port) < 65536:
+        raise InputError(f"--at {text}: expected HOST or HOST:PORT")
+    return BenchPlace(host.strip("[]"), int(port), name)
