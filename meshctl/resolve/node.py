@@ -207,6 +207,7 @@ def _refuse(fleet: Fleet, node: Node, intent: Intent, refusals: Refusals) -> Non
         place = ("hardware", node.hardware.name, "radios", radio.name)
         refusals.section(place, radio.name)
         refusals.text((*place, "path"), radio.path, is_required=True)
+        refusals.tx_power((*path, "radios", radio.name, "tx_power_dbm"), radio.tx_power_dbm, intent.release)
     refusals.text(("system", "timezone"), fleet.system.timezone, is_required=True)
     refusals.text(("system", "zonename"), fleet.system.zonename)
     refusals.text(("system", "log_host"), fleet.system.log_host)

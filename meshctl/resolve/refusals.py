@@ -86,6 +86,12 @@ class Refusals:
         if not _DEVICE.fullmatch(value):
             self.add(VALUE, path, "a network device's name of at most 15 characters", repr(value))
 
+    def tx_power(self, path: tuple[str, ...], value: int, release: Release) -> None:
+        """A drive level that the radio's scripts set, and do not take for none at all."""
+        if release >= Release.V25_12 and value == 0:
+            message = f"OpenWrt {release} takes 0 for no limit, and sends as strongly as it may"
+            self.add(VALUE, path, "another number", "0", message=message)
+
     def mesh(self, mesh: Mesh, release: Release) -> None:
         """A mesh's name on air, its cell, and whether this release can join it."""
         path = ("meshes", mesh.name)

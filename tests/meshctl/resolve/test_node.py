@@ -147,6 +147,14 @@ def test_the_newest_release_takes_no_encrypted_cell_and_no_quote_in_its_name() -
     assert intent(fleets.fleet(fleets.node(Release.V24_10), meshes=(fleets.mesh(ssid="bob's"),))).node
 
 
+def test_the_newest_release_is_never_asked_for_no_power_which_it_takes_for_full_power() -> None:
+    quiet = (Radio(fleets.RADIO_2G, "main", 0),)
+    assert refusals(fleets.fleet(fleets.node(Release.V25_12, radios=quiet))) == [
+        "nodes.husky1-front.radios.radio0.tx_power_dbm RND001"
+    ]
+    assert intent(fleets.fleet(fleets.node(Release.V24_10, radios=quiet))).radios[0].tx_power_dbm == 0
+
+
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
