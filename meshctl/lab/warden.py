@@ -43,6 +43,7 @@ class _Running:
     pid: int
     pidfd: int
     network: int
+    deny_setgroups: bool
 
 
 class Warden:
@@ -52,7 +53,6 @@ class Warden:
         self._channel = channel
         self._selector = selectors.DefaultSelector()
         self._nodes: dict[str, _Running] = {}
-        self._host_network = os.open("/proc/self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
 
     def serve(self) -> None:
         self._selector.register(self._channel, selectors.EVENT_READ, None)
@@ -107,7 +107,7 @@ class Warden:
             os.close(descriptor)
         pidfd = os.pidfd_open(pid)
         network = os.open(f"/proc/{pid}/ns/net", os.O_RDONLY | os.O_CLOEXEC)
-        self._nodes[container.name] = _Running(pid, pidfd, network)
+        self._nodes[container.name] = _Running(pid, pidfd, network, container.deny_setgroups)
         self._selector.register(pidfd, selectors.EVENT_READ, lambda: self._ended(container.name, report))
         self._tell({"event": "started", "node": container.name, "pid": pid})
 
@@ -138,7 +138,7 @@ class Warden:
             return
         pid = os.fork()
         if pid == 0:
-            _enter_and_run(running.pid, request["command"], descriptors)
+            _enter_and_run(running, request["command"], descriptors)
         pidfd = os.pidfd_open(pid)
 
         def done() -> None:
@@ -157,14 +157,14 @@ def _readable(descriptor: int) -> bool:
     return bool(select.select([descriptor], [], [], 0)[0])
 
 
-def _enter_and_run(node_pid: int, command: str, descriptors: Sequence[int]) -> None:
+def _enter_and_run(node: _Running, command: str, descriptors: Sequence[int]) -> None:
     """In a forked child: enter the node, run `command` in its shell, pass on its exit status."""
     try:
         ns.die_with_parent()
-        spaces = [(os.open(f"/proc/{node_pid}/ns/{kind}", os.O_RDONLY), flag) for kind, flag in _SPACES]
-        pid_space = os.open(f"/proc/{node_pid}/ns/pid", os.O_RDONLY)
+        spaces = [(os.open(f"/proc/{node.pid}/ns/{kind}", os.O_RDONLY), flag) for kind, flag in _SPACES]
+        pid_space = os.open(f"/proc/{node.pid}/ns/pid", os.O_RDONLY)
         with contextlib.suppress(FileNotFoundError):
-            time_space = os.open(f"/proc/{node_pid}/ns/time_for_children", os.O_RDONLY)
+            time_space = os.open(f"/proc/{node.pid}/ns/time_for_children", os.O_RDONLY)
             ns.setns(time_space, ns.CLONE_NEWTIME)
         ns.setns(pid_space, ns.CLONE_NEWPID)
         pid = os.fork()
@@ -174,6 +174,9 @@ def _enter_and_run(node_pid: int, command: str, descriptors: Sequence[int]) -> N
             os._exit(code if code >= 0 else 128 - code)
         for descriptor, flag in spaces:
             ns.setns(descriptor, flag)
+        if node.deny_setgroups:
+            # it may restart the SSH server
+            ns.accept_setgroups()
         os.chdir("/")
         os.setsid()
         for number, descriptor in enumerate(descriptors):
