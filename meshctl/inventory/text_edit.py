@@ -22,7 +22,7 @@ def replace_value(text: str, old: Tree, value: Value, key: Scalar | None) -> str
     if key is None:
         return f"{text[: old.start]}{flow(value)}{text[end:]}"
     # A block stands below its key: the new value joins the key's line, before a comment there.
-    colon = text.index(":", key.end) + 1
+    colon = _after_colon(text, key)
     return f"{text[:colon]} {flow(value)}{text[colon : _line_end(text, colon)]}{text[end:]}"
 
 
@@ -73,12 +73,12 @@ def remove_entry(text: str, mapping: MappingNode, key: str) -> str:
     if len(mapping.keys) == 1:
         return _empty(text, mapping, written, end)
     start = text.rfind("\n", 0, written.start) + 1
-    stop = _line_end(text, end)
-    if stop < len(text):
-        stop += len(_newline(text)) if text.startswith(_newline(text), stop) else 1
-    is_first = next(iter(mapping.keys)) == key
-    if _is_blank_at(text, stop) and stop < len(text) and (is_first or _is_blank_before(text, start)):
-        stop = text.index("\n", stop) + 1
+    stop = _next_line(text, end)
+    is_apart = _is_blank_before(text, start)
+    if stop >= len(text) and is_apart:
+        start = text.rfind("\n", 0, start - 1) + 1
+    elif _is_blank_at(text, stop) and (is_apart or next(iter(mapping.keys)) == key):
+        stop = _next_line(text, stop)
     return text[:start] + text[stop:]
 
 
@@ -89,7 +89,7 @@ def content_end(text: str, tree: Tree) -> int:
             key = next(reversed(tree.keys))
             below = tree.values[key]
             if isinstance(below, Scalar) and below.start == below.end:
-                return text.index(":", tree.keys[key].end) + 1
+                return _after_colon(text, tree.keys[key])
             tree = below
         else:
             tree = tree.items[-1]
@@ -127,7 +127,7 @@ def _empty(text: str, mapping: MappingNode, written: Scalar, end: int) -> str:
 def _has_gaps(text: str, mapping: MappingNode) -> bool:
     """Whether the entries are set apart by blank lines."""
     starts = [key.start for key in mapping.keys.values()]
-    return len(starts) > 1 and any(_is_blank_before(text, _block_start(text, start)) for start in starts[1:])
+    return len(starts) > 1 and all(_is_blank_before(text, _block_start(text, start)) for start in starts[1:])
 
 
 def _block_start(text: str, start: int) -> int:
@@ -156,6 +156,16 @@ def _line_end(text: str, at: int) -> int:
     if end < 0:
         return len(text)
     return end - 1 if text[end - 1] == "\r" and end > at else end
+
+
+def _next_line(text: str, at: int) -> int:
+    """The offset of the next line's begin, or the text's end."""
+    return text.find("\n", at) + 1 or len(text)
+
+
+def _after_colon(text: str, key: Scalar) -> int:
+    """Behind the colon of a key, or behind the key when it has none (`? key`)."""
+    return text.find(":", key.end) + 1 or key.end
 
 
 def _newline(text: str) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import yaml
-from jsonschema import Draft202012Validator
+from jsonschema import Draft202012Validator  # type: ignore[import-untyped]
 
 from meshctl.inventory.json_schema import json_schema
 from tests.meshctl.inventory.inventories import SHIPPED, load_text
