@@ -64,7 +64,14 @@ class _Refused(Exception):
 class _OpenSection:
     type: str
     name: str | None
-    options: dict[str, Value] = field(default_factory=dict)
+    # lists grow in place, so that long ones cost no more than their length
+    options: dict[str, str | list[str]] = field(default_factory=dict)
+
+    def closed(self) -> Section:
+        options: dict[str, Value] = {
+            name: value if isinstance(value, str) else tuple(value) for name, value in self.options.items()
+        }
+        return Section(self.type, self.name, options)
 
 
 @dataclass(slots=True)
@@ -84,8 +91,7 @@ class _Builder:
 
     def packages(self) -> tuple[Package, ...]:
         return tuple(
-            Package(package.name, tuple(Section(s.type, s.name, s.options) for s in package.sections))
-            for package in self._packages
+            Package(package.name, tuple(section.closed() for section in package.sections)) for package in self._packages
         )
 
     def package(self, name: str) -> None:
@@ -125,8 +131,11 @@ class _Builder:
 
     def list_item(self, name: str, value: str) -> None:
         section = self._require_section()
-        before = section.options.get(name, ())
-        section.options[name] = (*((before,) if isinstance(before, str) else before), value)
+        before = section.options.setdefault(name, [])
+        if isinstance(before, str):
+            section.options[name] = [before, value]
+        else:
+            before.append(value)
 
     def _require_section(self) -> _OpenSection:
         if self._section is None:
