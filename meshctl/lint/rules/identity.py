@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import repeated
+from meshctl.lint.grouping import listed, repeated
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Node, NodeState
 
@@ -80,7 +80,7 @@ def names_by_case(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "Two nodes have the same MAC address",
     why="""The MAC is how bootstrap knows one factory device from another and how status joins what radios hear to
     names; two alike in one cell also break the mesh itself.""",
-    mend="Read the MAC off the device's label, or run `meshctl trust` against it.",
+    mend="Read the MAC off the device's label.",
     failing="""
     nodes:
       base: {mac: "00:15:6d:aa:00:01"}
@@ -190,23 +190,33 @@ def serial_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC118",
     Severity.NOTE,
-    "A deployed node has no physical identity",
+    "Deployed nodes have no physical identity",
     why="""On the bench all devices answer at 192.168.1.1. Only a MAC or a serial number keeps bootstrap and `replace`
-    from writing this node's identity onto another box.""",
-    mend="Write down `mac` or `serial`; `meshctl trust` reads the MAC off the running node.",
+    from writing one node's identity onto another box.""",
+    mend="Write down `mac` or `serial` from the sticker.",
     failing="nodes: {base: {mac: <removed>}}",
     passing="""nodes: {base: {serial: "UB-1234"}}""",
 )
 def no_physical_identity(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for node in fleet.nodes.values():
-        if node.state is NodeState.DEPLOYED and not (node.mac or node.serial or any(r.mac for r in node.radios)):
-            yield Finding(("nodes", node.name), "nothing ties the node to a device", "`mac` or `serial`", "neither")
+    bare = [
+        node.name
+        for node in _deployed(fleet)
+        if not (node.mac or node.serial or any(radio.mac for radio in node.radios))
+    ]
+    if bare:
+        yield Finding(
+            ("nodes", bare[0]), "nothing ties them to a device", "`mac` or `serial`", f"neither for {listed(bare)}"
+        )
+
+
+def _deployed(fleet: Fleet) -> Iterator[Node]:
+    return (node for node in fleet.nodes.values() if node.state is NodeState.DEPLOYED)
 
 
 @fleet_rule(
     "MC119",
     Severity.NOTE,
-    "A deployed node's host key is not pinned",
+    "Host keys of deployed nodes are not pinned",
     why="Whoever answers first at the address is believed. meshctl refuses to change a node it cannot recognise.",
     mend="Run `meshctl trust NODE` once, on the bench, where nobody can stand between.",
     failing="nodes: {base: {host_keys: <removed>}}",
@@ -216,9 +226,10 @@ def no_physical_identity(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     """,
 )
 def host_key_not_pinned(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for node in fleet.nodes.values():
-        if node.state is NodeState.DEPLOYED and not node.host_keys:
-            yield Finding(("nodes", node.name), "no host key is pinned", "`host_keys`", "none")
+    strangers = [node.name for node in _deployed(fleet) if not node.host_keys]
+    if strangers:
+        found = f"none for {listed(strangers)}"
+        yield Finding(("nodes", strangers[0]), "any device is believed", "`host_keys`", found)
 
 
 @fleet_rule(

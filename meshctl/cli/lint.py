@@ -1,0 +1,154 @@
+"""`meshctl lint`: check inventories, report in the wanted format, exit 0 (clean), 1 (findings) or 2 (could not run)."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from meshctl.diagnostics import Severity, sorted_diagnostics
+from meshctl.errors import ExitCode, InputError
+from meshctl.inventory.codes import MEANINGS
+from meshctl.lint import BY_CODE, RULES, Examined, Rule, examine
+from meshctl.lint import baseline as baselines
+from meshctl.lint.pages import page
+from meshctl.regdb import load
+from meshctl.report.findings import FORMATS, Findings
+
+
+class Format(StrEnum):
+    """How findings are written."""
+
+    TEXT = "text"
+    JSON = "json"
+    SARIF = "sarif"
+    JUNIT = "junit"
+    GITHUB = "github"
+
+
+class Threshold(StrEnum):
+    """The least severity that makes the exit status 1."""
+
+    ERROR = "error"
+    WARNING = "warning"
+    NOTE = "note"
+
+
+def lint(
+    paths: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Inventories: YAML files or directories. Default: $MESHCTL_INVENTORY or here."),
+    ] = None,
+    format: Annotated[Format, typer.Option("--format", "-f", help="How to write the findings.")] = Format.TEXT,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write to this file.")] = None,
+    select: Annotated[
+        list[str] | None, typer.Option(help="Only rules whose code starts so: MC3, or MC342,MC343.")
+    ] = None,
+    ignore: Annotated[list[str] | None, typer.Option(help="Leave out rules whose code starts so.")] = None,
+    fail_on: Annotated[Threshold, typer.Option(help="Exit with 1 from this severity on.")] = Threshold.WARNING,
+    baseline: Annotated[Path | None, typer.Option(help="Findings listed in this file do not count.")] = None,
+    write_baseline: Annotated[
+        bool, typer.Option("--write-baseline", help="Write what is found now to the baseline file.")
+    ] = False,
+    regdb: Annotated[
+        Path | None, typer.Option(help="Regulatory database. Default: this machine's, else the one shipped.")
+    ] = None,
+    explain: Annotated[str | None, typer.Option(help="Print the page of one rule.", metavar="CODE")] = None,
+    list_rules: Annotated[bool, typer.Option("--list", help="List all rules.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="The same as --format json.")] = False,
+) -> None:
+    """Check inventories across all layers.
+
+    Exit status: 0 clean, 1 findings, 2 could not run. Notes alone do not count, unless --fail-on note.
+
+    Example: meshctl lint inventory/ --format sarif --output lint.sarif
+    """
+    if explain is not None:
+        typer.echo(_explained(explain), nl=False)
+        return
+    if list_rules:
+        for rule in RULES:
+            typer.echo(f"{rule.code}  {rule.severity.value:<7}  {rule.title}")
+        return
+    if write_baseline and baseline is None:
+        raise InputError("--write-baseline needs --baseline FILE, the file to write")
+    rules = chosen(select or (), ignore or ())
+    database = load(regdb)
+    targets = list(paths or [Path(os.environ.get("MESHCTL_INVENTORY") or ".")])
+    examined = [examine(path, database, os.environ, rules) for path in targets]
+    findings = gathered(examined)
+    if write_baseline and baseline is not None:
+        _write(baseline, baselines.dump(item for item in findings.diagnostics if item.code in BY_CODE))
+        typer.echo(f"{len(findings.diagnostics)} findings written to {baseline}", err=True)
+        return
+    if baseline is not None:
+        findings = _without_known(findings, baseline, rules)
+    report = FORMATS["json" if json else format.value](findings)
+    if output is not None:
+        _write(output, report)
+    else:
+        sys.stdout.write(report)
+    if not all(item.is_readable for item in examined):
+        raise typer.Exit(int(ExitCode.COULD_NOT_RUN))
+    least = Severity(fail_on.value).rank
+    if any(item.severity.rank <= least for item in findings.diagnostics):
+        raise typer.Exit(int(ExitCode.FINDINGS))
+
+
+def chosen(select: Iterable[str], ignore: Iterable[str]) -> tuple[Rule, ...]:
+    """The rules whose code starts with a selected prefix (all without one) and with no ignored one.
+
+    Prefixes may be joined by commas. Raises InputError for one that no rule has.
+    """
+    wanted, unwanted = _prefixes(select), _prefixes(ignore)
+    return tuple(
+        rule
+        for rule in RULES
+        if (not wanted or rule.code.startswith(wanted)) and not (unwanted and rule.code.startswith(unwanted))
+    )
+
+
+def _prefixes(given: Iterable[str]) -> tuple[str, ...]:
+    prefixes = tuple(part.strip().upper() for text in given for part in text.split(",") if part.strip())
+    for prefix in prefixes:
+        if not any(rule.code.startswith(prefix) for rule in RULES):
+            raise InputError(f"expected the start of a rule's code, found {prefix}", hint="`meshctl lint --list`")
+    return prefixes
+
+
+def gathered(examined: Iterable[Examined]) -> Findings:
+    """What several inventories gave, as one; a file that two of them include is reported once."""
+    parts = list(examined)
+    sources = {file: text for part in parts for file, text in part.sources.items()}
+    diagnostics = dict.fromkeys(item for part in parts for item in part.diagnostics)
+    excused = dict.fromkeys(item for part in parts for item in part.excused)
+    return Findings(sorted_diagnostics(diagnostics), sources, tuple(excused), files=tuple(sources))
+
+
+def _without_known(findings: Findings, path: Path, rules: Iterable[Rule]) -> Findings:
+    entries = baselines.read(path)
+    compared = baselines.compare(findings.diagnostics, entries, path, (rule.code for rule in rules))
+    reported = sorted_diagnostics((*compared.new, *compared.stale))
+    return Findings(reported, findings.sources, findings.excused, compared.known, findings.files)
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _explained(code: str) -> str:
+    wanted = code.strip().upper()
+    if wanted in MEANINGS:
+        return f"# {wanted}\n\n{MEANINGS[wanted]}\n"
+    rule = BY_CODE.get(wanted)
+    if rule is None:
+        raise InputError(f"expected a rule's code such as MC342, found {code}", hint="`meshctl lint --list` shows all")
+    return page(rule)

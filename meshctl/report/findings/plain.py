@@ -1,0 +1,41 @@
+"""Findings for people: place, severity, message, code; the line with a caret; how to mend it; a summary."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from meshctl.diagnostics import Diagnostic, Severity
+from meshctl.report.findings.document import Findings, counted, printable, shown_line
+
+
+def text(findings: Findings) -> str:
+    """Plain text without colours, one block for each finding; ends with a line end."""
+    lines = findings.lines()
+    blocks = ["\n".join(_block(item, lines)) for item in findings.diagnostics]
+    return "\n".join([*blocks, _summary(findings)]) + "\n"
+
+
+def _block(item: Diagnostic, lines: dict[str, list[str]]) -> Iterator[str]:
+    yield f"{item.position}: {item.severity.value}: {printable(item.text)} [{item.code}]"
+    line = shown_line(lines, item.position)
+    if line:
+        number = str(item.position.line)
+        yield f"  {number} | {printable(line)}"
+        if item.position.column:
+            # a tab before the column keeps its width under the caret
+            before = "".join("\t" if letter == "\t" else " " for letter in line[: item.position.column - 1])
+            yield f"  {' ' * len(number)} | {before}^"
+    if item.hint:
+        yield f"  = {printable(item.hint)}"
+
+
+def _summary(findings: Findings) -> str:
+    count = findings.count()
+    kinds = [counted(count[severity], severity.value) for severity in Severity if count[severity]]
+    aside = []
+    if findings.excused:
+        aside.append(f"{len(findings.excused)} suppressed")
+    if findings.known:
+        aside.append(f"{len(findings.known)} in the baseline")
+    looked_at = counted(len(findings.files), "file")
+    return f"{', '.join(kinds) or 'nothing found'} in {looked_at}" + (f" ({', '.join(aside)})" if aside else "")

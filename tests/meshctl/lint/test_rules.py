@@ -1,0 +1,33 @@
+"""Every rule's examples do what its page says."""
+
+from pathlib import Path
+
+import pytest
+
+from meshctl.lint import RULES, Example, Rule, examine
+from meshctl.lint.example import environment, write
+from meshctl.lint.rules.housekeeping import STALE_BASELINE
+from meshctl.regdb import SHIPPED, load
+
+_REGDB = load(SHIPPED)
+# needs a baseline, see test_baseline.py
+_CHECKED = [rule for rule in RULES if rule is not STALE_BASELINE]
+
+
+def _codes(example: Example, directory: Path) -> set[str]:
+    path = write(example, directory)
+    return {item.code for item in examine(path, _REGDB, environment(example)).diagnostics}
+
+
+@pytest.mark.parametrize("rule", _CHECKED, ids=lambda rule: rule.code)
+def test_the_failing_example_yields_exactly_its_code(rule: Rule, tmp_path: Path) -> None:
+    assert _codes(rule.failing, tmp_path) == {rule.code, *rule.failing.also}
+
+
+@pytest.mark.parametrize("rule", _CHECKED, ids=lambda rule: rule.code)
+def test_the_passing_example_yields_nothing(rule: Rule, tmp_path: Path) -> None:
+    assert _codes(rule.passing, tmp_path) == set(rule.passing.also)
+
+
+def test_the_base_inventory_has_nothing_to_report(tmp_path: Path) -> None:
+    assert _codes(Example("apply: {canary: true}"), tmp_path) == set()
