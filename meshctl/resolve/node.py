@@ -20,6 +20,8 @@ from meshctl.resolve.packages import package_plan
 from meshctl.resolve.refusals import COMBINATION, RECONNECT, SECRET, Refusals
 
 BRIDGE = "br-lan"
+# dropbear's own default
+SSH_PORT = 22
 
 
 def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) -> Intent:
@@ -51,7 +53,7 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
         radios=radios,
         batman=_batman(meshes, masters, intervals),
         lan=_lan(node, primary, masters, radios),
-        login=Login(node.ssh.port, fleet.operators.password_login, fleet.operators.ssh_keys),
+        login=Login(_ssh_port(node), fleet.operators.password_login, fleet.operators.ssh_keys),
         system=fleet.system,
         backend=primary.backend if primary is not None else Backend.BATMAN,
         operator_parts=primary.operator_parts if primary is not None else OperatorParts(),
@@ -189,6 +191,11 @@ def _lan(node: Node, primary: Mesh | None, masters: dict[str, str], radios: tupl
                 pass
     mtu = primary.lan_mtu if primary is not None else 1500
     return Lan(BRIDGE, tuple(dict.fromkeys(ports)), node.address, node.gateway, mtu)
+
+
+def _ssh_port(node: Node) -> int:
+    """Where dropbear listens: the port we log in at, unless that is the port of a host in front of the node."""
+    return SSH_PORT if node.ssh.host else node.ssh.port
 
 
 def _refuse(fleet: Fleet, node: Node, intent: Intent, refusals: Refusals) -> None:

@@ -22,6 +22,7 @@ from meshctl.model import (
     Release,
     Secret,
     SecretRef,
+    SshSettings,
     SystemSettings,
 )
 from meshctl.resolve import Intent, resolve
@@ -199,6 +200,13 @@ def test_nobody_is_locked_out(release: Release, keys: tuple[str, ...]) -> None:
     fleet = fleets.fleet(fleets.node(release), operators=Operators(keys))
     assert refusals(fleet) == ["operators.ssh_keys RND003"]
     assert intent(replace(fleet, operators=Operators(keys, password_login=True))).login.is_password_allowed
+
+
+@pytest.mark.parametrize(
+    ("ssh", "port"), [(SshSettings(), 22), (SshSettings(port=2222), 2222), (SshSettings(host="gate", port=10022), 22)]
+)
+def test_dropbear_listens_where_we_log_in_unless_another_host_stands_in_front(ssh: SshSettings, port: int) -> None:
+    assert intent(fleets.fleet(fleets.node(ssh=ssh))).login.port == port
 
 
 def test_keys_of_more_than_a_line_are_refused() -> None:
