@@ -20,8 +20,10 @@ from meshctl.plan.objections import objection
 from meshctl.plan.packages import NO_NEEDS, Needs, package_step
 from meshctl.plan.seen import file_info, fingerprint_texts, is_meshed, packages_seen, parsed, text_of
 from meshctl.plan.values import Cut, Effect, FileChange, NodePlan, Verdict
-from meshctl.render import RenderedFile
+from meshctl.render import MARKER_PATH, RenderedFile
 from meshctl.uci import Package
+
+PUBLIC_FILES = (MARKER_PATH, "etc/dropbear/authorized_keys")
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +112,8 @@ def _file_change(file: RenderedFile, seen: Observation) -> FileChange | None:
         return None
     if live == content:
         return FileChange(file.path, "changed", f"mode {info.mode:04o} -> {file.mode:04o}\n")
-    # what stands there now may hold secrets of a kind that nobody can tell: only UCI and keys are shown
-    old = live if live is not None and file.path.endswith("authorized_keys") else "(not shown)\n"
+    # what stands there now may hold secrets of a kind that nobody can tell: only what is public by nature is shown
+    old = live if live is not None and file.path in PUBLIC_FILES else "(not shown)\n"
     return FileChange(file.path, "changed", _diff(file.path, old, file.masked))
 
 
