@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import os
 import secrets
-from dataclasses import replace as with_changes
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from meshctl.apply.bootstrap import BenchPlace, find_node, look_around, plan_arrivals
+from meshctl.apply.bootstrap import BenchPlace, Found, find_node, look_around, plan_arrivals
+from meshctl.apply.replace import give_up, identity_edits, succeed
 from meshctl.cli.carry import SALT_BYTES, ask_and_carry_out, choices_of
 from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
 from meshctl.cli.session import KeyFiles, Lab, Session, session
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome
+from meshctl.inventory.edit import Editor, save, set_node
+from meshctl.model import Node, NodeState
 from meshctl.report.progress import outcome_text
+
+# Stands for a device that is in no inventory yet.
+BENCH = "bench"
 
 At = Annotated[
     list[str] | None,
@@ -72,7 +78,7 @@ def bootstrap(
             opened.journal.last_known(opened.fleet.name),
             salt=secrets.token_bytes(SALT_BYTES),
             owner=opened.owner,
-            choices=with_changes(choices),
+            choices=choices,
         )
         try:
             ask_and_carry_out(opened, prepared, "bootstrap", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
@@ -118,3 +124,80 @@ def _place(text: str, name: str) -> BenchPlace:
     if not port.isdigit() or not 0 < int(port) < 65536:
         raise InputError(f"--at {text}: expected HOST or HOST:PORT")
     return BenchPlace(host.strip("[]"), int(port), name)
+
+
+def replace(
+    old: Annotated[str, typer.Argument(help="The node whose device is dead or gone.")],
+    new: Annotated[str, typer.Argument(help="A spare of the inventory; `bench` for a device that is in none.")],
+    at: Annotated[
+        str, typer.Option("--at", help="Where the new device answers, if not at its own address: HOST or HOST:PORT.")
+    ] = "",
+    inventory: InventoryPath = Path(),
+    yes: Yes = False,
+    no_firmware: NoFirmware = False,
+    rate: Rate = None,
+    as_json: AsJson = False,
+    key: KeyFiles = None,
+    lab: Lab = None,
+) -> None:
+    """Give a dead node's identity to a spare: same name, address and role; the inventory learns its MAC and label.
+
+    Example: meshctl replace husky1-b03 spare2
+    """
+    choices = choices_of(no_firmware, "", "")
+    with session(inventory, key_files=key or (), lab=lab) as opened:
+        node = find_node(opened.fleet, old)
+        spare = None if new == BENCH else find_node(opened.fleet, new)
+        if spare is not None and (spare.name == node.name or spare.state is not NodeState.SPARE):
+            raise InputError(f"{spare.name} is {spare.state.value}: expected a spare", hint="`meshctl inventory state`")
+        place = _place(at, node.name) if at else BenchPlace(node=node.name) if spare is None else None
+        with opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)):
+            successor = succeed(
+                opened.renderer,
+                opened.access,
+                opened.trust,
+                node,
+                spare=spare,
+                place=place,
+                interrupt=opened.interrupt,
+            )
+        status = int(ExitCode.FINDINGS)
+        try:
+            prepared = plan_arrivals(
+                opened.renderer,
+                successor.arrivals,
+                opened.journal.last_known(opened.fleet.name),
+                salt=secrets.token_bytes(SALT_BYTES),
+                owner=opened.owner,
+                choices=choices,
+            )
+            ask_and_carry_out(opened, prepared, "replace", choices, yes=yes, as_json=as_json, brief=True, rate=rate)
+        except typer.Exit as ended:
+            status = ended.exit_code
+        finally:
+            if status != ExitCode.OK:
+                give_up(opened.trust, node, successor)
+        if status == ExitCode.OK:
+            _write_identity(inventory, node, spare, successor.arrivals.found[node.name])
+            if spare is not None:
+                opened.trust.forget(spare.name)
+        raise typer.Exit(status)
+
+
+def _write_identity(inventory: Path, node: Node, spare: Node | None, found: Found) -> None:
+    mine, theirs = identity_edits(node, spare, found.seen)
+    editor = Editor.open(inventory, environ=os.environ)
+    # the spare's entry first: two nodes with one MAC would be refused
+    if spare is not None:
+        set_node(editor, spare.name, dict(theirs))
+        for word in ("mac", "serial", "label"):
+            if editor.has(("nodes", spare.name, word)):
+                editor.remove(("nodes", spare.name, word))
+    if mine:
+        set_node(editor, node.name, dict(mine))
+    if node.host_keys:
+        set_node(editor, node.name, {"host_keys": [found.key.text]})
+    changes = editor.changes()
+    for change in changes:
+        typer.echo(change.diff(), nl=False)
+    save(changes)

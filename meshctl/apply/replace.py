@@ -1,0 +1,110 @@
+"""Give a node's identity to another device: same name, address, role and place in the fleet, other hardware.
+
+The old node is dead or gone; the new device is a spare that meshctl knows, or one on the bench. Its host key is pinned
+for the old name, the old node's configuration goes there as any other change, and the inventory learns the new MAC,
+serial number and label (`identity_edits`, pure). If the change fails, pins and inventory stay as they were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from meshctl.apply.access import Access
+from meshctl.apply.bootstrap import Arrivals, BenchPlace, Found, Recorder
+from meshctl.apply.gather import observe_cleared
+from meshctl.apply.planning import other_paths
+from meshctl.apply.wanted import Renderer
+from meshctl.device.connection import Endpoint
+from meshctl.device.observation import Observation
+from meshctl.device.ssh import connect
+from meshctl.device.trust import HostKey, TrustStore
+from meshctl.errors import InputError, NodeError
+from meshctl.fleet import Interrupt
+from meshctl.model import Node, NodeState
+
+
+@dataclass(frozen=True, slots=True)
+class Successor:
+    """The device that takes over: `spare` is its node in the inventory, None for a stranger on the bench."""
+
+    arrivals: Arrivals
+    spare: Node | None
+    old_pins: tuple[HostKey, ...]
+
+
+def succeed(
+    renderer: Renderer,
+    access: Access,
+    trust: TrustStore,
+    old: Node,
+    *,
+    spare: Node | None,
+    place: BenchPlace | None,
+    interrupt: Interrupt,
+) -> Successor:
+    """Meet the new device and pin its key under the old node's name.
+
+    Raises NodeError when the old node still answers as itself, or the new device does not.
+    """
+    _must_be_silent(access, old)
+    recorder = Recorder()
+    if place is not None:
+        endpoint = Endpoint(place.host, place.port)
+        credentials = replace(access.credentials(old), empty_password=True)
+        connection = connect(
+            endpoint, credentials=credentials, trust=recorder, deadlines=access.deadlines, release=old.release
+        )
+        key = recorder.key
+    elif spare is not None:
+        # known by name, so its own pin has to fit
+        connection = access.open(spare)
+        key = connection.host_key
+    else:
+        raise InputError("expected a spare of the inventory, or a place on the bench")
+    try:
+        seen = observe_cleared(connection, other_paths(renderer.wanted(old)), interrupt)
+        if key is None:
+            raise NodeError(f"{connection.endpoint.label}: showed no host key")
+    except BaseException:
+        connection.close()
+        raise
+    pins = trust.pinned(old.name)
+    trust.replace(old.name, key)
+    access.newcomers[old.name] = replace(connection.endpoint, identity=old.name)
+    access.keep(old.name, connection)
+    where = place or BenchPlace(connection.endpoint.host, connection.endpoint.port, old.name)
+    return Successor(Arrivals({old.name: Found(where, old, seen, key)}, ()), spare, pins)
+
+
+def _must_be_silent(access: Access, old: Node) -> None:
+    """Two devices with one address and one name would fight: the old one has to be off."""
+    try:
+        access.open(old).close()
+    except NodeError:
+        return
+    raise NodeError(
+        f"{old.name} still answers at {access.endpoint(old).address}: two nodes with one address would fight",
+        hint="switch the old one off first",
+    )
+
+
+def give_up(trust: TrustStore, old: Node, successor: Successor) -> None:
+    """The change failed: believe what was believed before."""
+    trust.replace(old.name, *successor.old_pins)
+
+
+def identity_edits(old: Node, spare: Node | None, seen: Observation) -> tuple[Mapping[str, str], Mapping[str, str]]:
+    """What the inventory shall say afterwards: of the old node's entry, and of the spare's (empty for none).
+
+    Only keys that the inventory uses are written: a fleet that identifies nodes by label need not know MACs.
+    """
+    mine: dict[str, str] = {}
+    label_mac = seen.board.label_mac if seen.board is not None else ""
+    mac = (spare.mac if spare is not None else "") or label_mac
+    if mac and (old.mac or (spare is not None and spare.mac)):
+        mine["mac"] = mac
+    if spare is not None:
+        mine.update({key: value for key, value in (("serial", spare.serial), ("label", spare.label)) if value})
+    theirs = {"state": NodeState.RETIRED.value} if spare is not None else {}
+    return mine, theirs
