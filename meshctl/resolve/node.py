@@ -203,6 +203,7 @@ def _refuse(fleet: Fleet, node: Node, intent: Intent, refusals: Refusals) -> Non
     path = ("nodes", node.name)
     refusals.text(path, intent.node)
     refusals.text(("fleet",), intent.fleet)
+    refusals.word(("country",), fleet.country)
     refusals.hostname((*path, "hostname"), intent.hostname)
     refusals.text((*path, "label"), intent.label)
     for key, value in intent.extra_uci.items():

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 
 from meshctl.diagnostics import Diagnostic, Position, Severity
-from meshctl.model import Encryption, Fleet, Mesh, MeshMode, MissingOrigin, Release, Secret
+from meshctl.model import Backend, Encryption, Fleet, Mesh, MeshMode, MissingOrigin, Release, Secret
 
 # The codes of this package, each with what it means (docs/render.md).
 VALUE = "RND001"
@@ -22,6 +22,7 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _HOSTNAME = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(?<!-)")
 # the package's name is the name of a file; a section may be addressed as `@TYPE[INDEX]`
 _UCI_KEY = re.compile(r"[A-Za-z0-9_-]+\.([A-Za-z0-9_]+|@[A-Za-z0-9_-]+\[\d+\])(\.[A-Za-z0-9_]+)?")
+_WORD = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_+-]*")
 _SECTION = re.compile(r"[A-Za-z0-9_]+")
 _MAC = re.compile(r"[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}")
 # IFNAMSIZ is 16 with the terminator; 19.07 joins a bridge's ports with spaces
@@ -71,6 +72,11 @@ class Refusals:
         if not _UCI_KEY.fullmatch(value):
             self.add(VALUE, path, "PACKAGE.SECTION.OPTION or PACKAGE.SECTION", repr(value))
 
+    def word(self, path: tuple[str, ...], value: str) -> None:
+        """A word from a fixed list that the node's scripts put into commands unquoted."""
+        if not _WORD.fullmatch(value):
+            self.add(VALUE, path, "a word of letters, digits, _, + and -", repr(value))
+
     def section(self, path: tuple[str, ...], value: str) -> None:
         """The name of a UCI section."""
         if not _SECTION.fullmatch(value):
@@ -96,6 +102,10 @@ class Refusals:
         """A mesh's name on air, its cell, and whether this release can join it."""
         path = ("meshes", mesh.name)
         self._ssid((*path, "ssid"), mesh.ssid, release)
+        self.word((*path, "htmode"), mesh.htmode)
+        if mesh.backend is Backend.BATMAN:
+            self.word((*path, "batman", "routing_algo"), mesh.batman.routing_algo)
+            self.word((*path, "batman", "gw_mode"), mesh.batman.gw_mode)
         if mesh.mode is MeshMode.ADHOC and not _MAC.fullmatch(mesh.bssid):
             self.add(VALUE, (*path, "bssid"), "six pairs of hex digits, as in 02:ca:fe:00:00:01", repr(mesh.bssid))
         match (mesh.mode, mesh.encryption):

@@ -111,6 +111,9 @@ def test_a_secret_that_is_not_there_is_refused_at_its_place() -> None:
         ({"ssid": "é" * 17}, "meshes.main.ssid RND001"),
         ({"ssid": "two\nlines"}, "meshes.main.ssid RND001"),
         ({"bssid": "02:ca"}, "meshes.main.bssid RND001"),
+        ({"htmode": "HT20; reboot"}, "meshes.main.htmode RND001"),
+        ({"batman": Batman(routing_algo="BATMAN IV")}, "meshes.main.batman.routing_algo RND001"),
+        ({"batman": Batman(gw_mode="$(reboot)")}, "meshes.main.batman.gw_mode RND001"),
         ({"encryption": Encryption.SAE}, "meshes.main.encryption RND002"),
         ({"encryption": Encryption.PSK2, "mode": MeshMode.MESH}, "meshes.main.encryption RND002"),
         ({"encryption": Encryption.PSK2, "key": None}, "meshes.main.key RND002"),
@@ -207,6 +210,10 @@ def test_nobody_is_locked_out(release: Release, keys: tuple[str, ...]) -> None:
 )
 def test_dropbear_listens_where_we_log_in_unless_another_host_stands_in_front(ssh: SshSettings, port: int) -> None:
     assert intent(fleets.fleet(fleets.node(ssh=ssh))).login.port == port
+
+
+def test_a_country_that_is_no_word_is_refused() -> None:
+    assert refusals(fleets.fleet(country="U S")) == ["country RND001"]
 
 
 def test_keys_of_more_than_a_line_are_refused() -> None:
