@@ -13,7 +13,7 @@ import io
 import re
 import shlex
 import tarfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from meshctl.device.connection import Completed, Connection
@@ -31,6 +31,7 @@ INIT_LINK = "/etc/rc.d/S05meshctl-deadman"
 BUNDLE_DIRECTORY = "/tmp/meshctl"
 
 _PATH = re.compile(r"(?:/[A-Za-z0-9._+@-]+){2,}")
+_LINK_TARGET = re.compile(r"\.\./init\.d/[A-Za-z0-9._+@-]+")
 _WORD = re.compile(r"[A-Za-z0-9][A-Za-z0-9@._:+-]*")
 
 
@@ -46,15 +47,19 @@ class NewFile:
 class Change:
     """What is to change on a node.
 
-    `files` are written, `removed` deleted, `covered` only kept and restored (what `reload` itself changes, such as the
-    links of an enabled service). `expected` gives the SHA-256 a touched path must have now, or None for absent; the
-    node refuses the change when it finds something else. `reload` is POSIX sh; its exit status should tell whether it
-    worked, because after a restore a failing reload makes the node reboot.
+    `files` are written, `links` (path below /etc/rc.d -> target) made, `removed` deleted, `covered` only kept and
+    restored (what services write themselves when reloaded). `expected` gives the SHA-256 a touched path must have now,
+    or None for absent; the node refuses the change when it finds something else.
+
+    `reload` is POSIX sh. It runs after the change and, if need be, after the way back, so it must bring the services in
+    line with whatever files are there and change none itself. Its exit status should tell whether it worked: where it
+    fails after a restore, the node reboots.
     """
 
     change_id: str
     files: Mapping[str, NewFile]
     reload: str
+    links: Mapping[str, str] = field(default_factory=dict)
     removed: tuple[str, ...] = ()
     covered: tuple[str, ...] = ()
     expected: Mapping[str, str | None] = field(default_factory=dict)
@@ -65,22 +70,27 @@ def bundle(change: Change) -> bytes:
 
     A manifest line is `KIND MODE SHA256 EXPECTED PATH`. Raises ValueError for a path the node would refuse.
     """
-    touched = [*change.files, *change.removed, *change.covered]
+    touched = [*change.files, *change.links, *change.removed, *change.covered]
     for path in touched:
         if not _PATH.fullmatch(path) or any(part in {".", ".."} for part in path.split("/")):
             raise ValueError(f"{path!r}: expected an absolute path of at least two parts, letters, digits and ._+@-")
+    for path, target in change.links.items():
+        if not path.startswith("/etc/rc.d/") or not _LINK_TARGET.fullmatch(target):
+            raise ValueError(f"{path!r} -> {target!r}: expected a link from /etc/rc.d to ../init.d")
     if len(set(touched)) != len(touched):
         raise ValueError(f"change {change.change_id}: a path is named twice")
     lines = [
         f"file {new.mode:04o} {hashlib.sha256(new.content).hexdigest()} {_expected(change, path)} {path}"
         for path, new in change.files.items()
     ]
+    lines += [f"link - {target} {_expected(change, path)} {path}" for path, target in change.links.items()]
     lines += [f"remove - - {_expected(change, path)} {path}" for path in change.removed]
     lines += [f"cover - - {_expected(change, path)} {path}" for path in change.covered]
-    members = [
-        ("manifest", "".join(f"{line}\n" for line in lines).encode(), 0o600),
-        ("reload", (change.reload.rstrip("\n") + "\n").encode(), 0o600),
-        *((f"new{path}", new.content, new.mode) for path, new in sorted(change.files.items())),
+    members: list[TarMember] = [
+        TarMember("manifest", "".join(f"{line}\n" for line in lines).encode(), 0o600),
+        TarMember("reload", (change.reload.rstrip("\n") + "\n").encode(), 0o600),
+        *(TarMember(f"new{path}", new.content, new.mode) for path, new in sorted(change.files.items())),
+        *(TarMember(f"new{path}", link_to=target) for path, target in sorted(change.links.items())),
     ]
     return gzip.compress(tar_of(members), mtime=0)
 
@@ -91,15 +101,28 @@ def _expected(change: Change, path: str) -> str:
     return change.expected[path] or "absent"
 
 
-def tar_of(members: list[tuple[str, bytes, int]]) -> bytes:
-    """An uncompressed tar of (name, content, mode), owned by root, without times, in the order given."""
+@dataclass(frozen=True, slots=True)
+class TarMember:
+    """A file, or a symbolic link when `link_to` is given."""
+
+    name: str
+    content: bytes = field(default=b"", repr=False)
+    mode: int = 0o644
+    link_to: str = ""
+
+
+def tar_of(members: Iterable[TarMember]) -> bytes:
+    """An uncompressed tar owned by root, without times, in the order given: the same members give the same bytes."""
     out = io.BytesIO()
     with tarfile.open(fileobj=out, mode="w", format=tarfile.USTAR_FORMAT) as tar:
-        for name, content, mode in members:
-            info = tarfile.TarInfo(name)
-            info.size = len(content)
-            info.mode = mode
-            tar.addfile(info, io.BytesIO(content))
+        for member in members:
+            info = tarfile.TarInfo(member.name)
+            info.mode = member.mode
+            if member.link_to:
+                info.type, info.linkname, info.mode = tarfile.SYMTYPE, member.link_to, 0o777
+            else:
+                info.size = len(member.content)
+            tar.addfile(info, io.BytesIO(member.content))
     return out.getvalue()
 
 
@@ -108,7 +131,7 @@ def install(connection: Connection) -> None:
     for path, (mode, content) in installed_files().items():
         upload(connection, content, path, mode=mode)
     link = f"../init.d/{INIT_SCRIPT.rsplit('/', 1)[1]}"
-    connection.run(f"mkdir -p {INIT_LINK.rsplit('/', 1)[0]} && ln -sfn {link} {INIT_LINK} && sync").check(
+    connection.run(f"mkdir -p {INIT_LINK.rsplit('/', 1)[0]} && ln -sfn {link} {INIT_LINK} && /bin/sync").check(
         f"{connection.endpoint.label}: enable the boot hook"
     )
 

@@ -140,7 +140,7 @@ def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
     """
     request = quoted(json.dumps({"path": image_path}))
     script = (
-        "sync; echo 3 2>/dev/null >/proc/sys/vm/drop_caches\n"
+        "/bin/sync; echo 3 2>/dev/null >/proc/sys/vm/drop_caches\n"
         f'/sbin/sysupgrade -T {quoted(image_path)} >/tmp/sysupgrade.test 2>&1; echo "status $?"\n'
         "sed 's/^/said /' /tmp/sysupgrade.test; rm -f /tmp/sysupgrade.test\n"
         f"ubus call system validate_firmware_image {request} 2>/dev/null | tr -d '\\n\\t' | sed 's/^/json /'; echo\n"
@@ -172,7 +172,7 @@ def start_sysupgrade(connection: Connection, image_path: str, config_path: str) 
 
 def reboot(connection: Connection) -> None:
     """Reboot, detached. A change that is armed and not confirmed is undone by the boot."""
-    _detached(connection, "reboot", "sync; exec /sbin/reboot")
+    _detached(connection, "reboot", "/bin/sync; exec /sbin/reboot")
 
 
 def reload_config(connection: Connection) -> None:
@@ -184,5 +184,6 @@ def _detached(connection: Connection, name: str, act: str) -> None:
     # matched by a pid file that is not there: -x alone would find any running shell and start nothing
     pid_file = f"/tmp/meshctl/{name}.pid"
     daemon = quoted(f"sleep {ACT_AFTER_S}; {act}")
-    started = f"mkdir -p /tmp/meshctl && rm -f {pid_file} && start-stop-daemon -S -b -m -p {pid_file} -x /bin/sh -- -c {daemon}"
+    start = f"start-stop-daemon -S -b -m -p {pid_file} -x /bin/sh -- -c {daemon}"
+    started = f"mkdir -p /tmp/meshctl && rm -f {pid_file} && {start}"
     connection.run(started).check(f"{connection.endpoint.label}: start {name}")

@@ -213,7 +213,7 @@ _FINISH = """\
 p={partial} t={target}
 [ -f "$p" ] || : >"$p"
 [ "$(sha256sum <"$p")" = "{sha256}  -" ] || {{ echo damaged; exit 0; }}
-chmod {mode:o} "$p" && sync && mv -f "$p" "$t" && sync && echo placed
+chmod {mode:o} "$p" && /bin/sync && mv -f "$p" "$t" && /bin/sync && echo placed
 """
 
 

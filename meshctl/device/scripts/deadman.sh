@@ -18,6 +18,9 @@ GUARD_GRACE_CS=3000        # the second timer fires 30 s after the first should 
 START_LIMIT_CS=1500        # a loaded radio starts a process within 15 s, or something is wrong with it
 RELOAD_LIMIT_CS=12000      # a reload of the restored state that takes over 120 s is stuck; then reboot
 
+# by its path: a busybox that prefers its own applets would leave no way to stand in for it
+sync() { /bin/sync; }
+
 refuse() { echo "refused $1 $2"; exit 3; }
 
 # NOW: centiseconds of uptime. The wall clock may be off by years or jump; this one only counts.
@@ -164,8 +167,8 @@ check_space() { # BUNDLE
 check_path() {
 	case $1 in
 	*[!A-Za-z0-9._/+@-]* | *//* | */../* | */./* | */. | */.. | */) refuse bad-path "$1" ;;
-	/etc/meshctl/* | /tmp/* | /var/* | /dev/* | /proc/* | /sys/*) refuse bad-path "$1 is not kept in flash, or is ours" ;;
-	/*/*) [ -L "$1" ] || [ ! -d "$1" ] || refuse bad-path "$1 is a directory" ;;
+	/etc/meshctl/change* | /etc/meshctl/last* | /tmp/* | /var/* | /dev/* | /proc/* | /sys/*) refuse bad-path "$1 is not kept in flash, or is ours" ;;
+	/*/*) [ ! -d "$1" ] || refuse bad-path "$1 is a directory" ;;
 	*) refuse bad-path "$1" ;;
 	esac
 }
@@ -192,8 +195,11 @@ keep_previous() { # DIRECTORY PATH
 }
 
 check_new() { # DIRECTORY: every new file is there, whole
-	while read -r kind _ sha _ path; do
-		[ "$kind" != file ] || [ "$(hash_of "$1/new$path" 2>/dev/null)" = "$sha" ] || return 1
+	while read -r kind _ is _ path; do
+		case $kind in
+		file) [ "$(hash_of "$1/new$path" 2>/dev/null)" = "$is" ] ;;
+		link) [ "$(readlink "$1/new$path")" = "$is" ] ;;
+		esac || return 1
 	done <"$1/manifest"
 }
 
@@ -235,6 +241,8 @@ stage() { # OWNER ID BUNDLE
 	check_new "$w" || drop "$w" flash-full "what was unpacked is not what was sent"
 	while read -r kind mode _ expected path; do
 		(check_path "$path") || { rm -rf "$w" && exit 3; }
+		# a link that led to a directory would let a later mv put its file in there
+		case $kind$path in link/etc/rc.d/* | file/* | remove/* | cover/*) ;; *) drop "$w" bad-path "$kind $path" ;; esac
 		[ "$kind" != file ] || chmod "$mode" "$w/new$path" || drop "$w" bad-bundle "mode $mode of $path"
 		was_as_expected "$expected" "$path" || drop "$w" moved-on "$path is not what the plan saw"
 		keep_previous "$w" "$path" >>"$w/previous" || drop "$w" flash-full "could not keep $path"
@@ -294,18 +302,20 @@ apply() { # OWNER ID now | in SECONDS | at UPTIME_SECONDS
 	until [ -e "$TIMER/due" ]; do
 		# should it start after all, it finds the abort and changes nothing
 		now && [ $NOW -lt $limit ] || { : >"$TIMER/abort" && refuse no-watcher "the timer did not start in time"; }
-		nap
+		doze
 	done
 	echo "ok state=waiting id=$ID due_uptime_s=$(as_seconds $due)"
 }
 
-# where sleep knows no fractions, this returns at once and its callers spin
+# where sleep knows no fractions, nap returns at once and its caller spins, which the last stretch of a countdown may
 nap() { sleep 0.05 2>/dev/null || :; }
+
+doze() { sleep 0.2 2>/dev/null || sleep 1; }
 
 put_new() {
 	while read -r kind _ _ _ path; do
 		case $kind in
-		file) mkdir -p "${path%/*}" && mv -f "$CHANGE/new$path" "$path" ;;
+		file | link) mkdir -p "${path%/*}" && mv -f "$CHANGE/new$path" "$path" ;;
 		remove) rm -f "$path" ;;
 		esac || return 1
 	done <"$CHANGE/manifest"
@@ -364,7 +374,7 @@ restore() {
 	reload "$RUN/restored"
 	now
 	limit=$((NOW + RELOAD_LIMIT_CS))
-	until [ -e "$RUN/reloaded" ] || { now && [ $NOW -ge $limit ]; }; do sleep 1; done
+	until [ -e "$RUN/reloaded" ] || { now && [ $NOW -ge $limit ]; }; do doze; done
 	read -r status 2>/dev/null <"$RUN/reloaded"
 	# the boot path is the one that is known to bring the restored state up
 	[ "$status" = 0 ] || /sbin/reboot
