@@ -51,7 +51,7 @@ def build_nodes(
 
     `robot_of` names the robot that lists a node, for nodes that do not name it themselves.
     """
-    building = _Building(hardware, meshes)
+    building = _Building(hardware, meshes, _only_meshes(meshes))
     nodes: dict[str, Node] = {}
     for plan in plans.values():
         node = building.node(plan, robot_of.get(plan.name, ""))
@@ -90,6 +90,7 @@ def _written(document: SshLayer | RadioLayer) -> dict[str, Any]:
 class _Building:
     hardware: Mapping[str, HardwareProfile]
     meshes: Mapping[str, Mesh]
+    only_mesh: Mapping[Band, str]
     diagnostics: list[Diagnostic] = field(default_factory=list)
     _templates: dict[tuple[Layer, ...], _Template | None] = field(default_factory=dict)
     _counts: Counter[Layer] = field(default_factory=Counter)
@@ -194,18 +195,13 @@ class _Building:
         return tuple(
             Radio(
                 hardware=radio,
-                mesh=settings["mesh"] if "mesh" in settings else self._only_mesh(radio.band),
+                mesh=settings["mesh"] if "mesh" in settings else self.only_mesh.get(radio.band),
                 tx_power_dbm=settings.get("tx_power_dbm", radio.max_drive_dbm),
                 mac=settings.get("mac", ""),
             )
             for radio in profile.radios
             for settings in (written.get(radio.name, {}),)
         )
-
-    def _only_mesh(self, band: Band) -> str | None:
-        """The mesh of a band, when the fleet has exactly one there."""
-        names = [mesh.name for mesh in self.meshes.values() if mesh.band is band]
-        return names[0] if len(names) == 1 else None
 
     def _address(self, plan: NodePlan, template: _Template, index_of: Mapping[Layer, int]) -> IPv4Interface | None:
         value, layer = template.address, template.address_layer
@@ -241,6 +237,12 @@ class _Building:
         )
         if diagnostic not in self.diagnostics[-8:]:
             self.diagnostics.append(diagnostic)
+
+
+def _only_meshes(meshes: Mapping[str, Mesh]) -> dict[Band, str]:
+    """The bands with exactly one mesh, which radios join that name none."""
+    counts = Counter(mesh.band for mesh in meshes.values())
+    return {mesh.band: mesh.name for mesh in meshes.values() if counts[mesh.band] == 1}
 
 
 def ssh_settings(values: Mapping[str, Any], *, user: str) -> SshSettings:
