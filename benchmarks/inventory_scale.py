@@ -2,7 +2,8 @@
 
 For each size an inventory is written with every node spelled out (address, MAC, serial, label; 50 nodes to a mesh),
 and each step is timed on it in a process of its own, so that sizes do not share caches or memory. A step's time is
-processor time, the best of several runs; the growth is its time per node beside the smallest fleet's of at least a hundred nodes.
+processor time, the best of several runs; the growth is its time per node beside the smallest fleet's of at least a
+hundred nodes.
 """
 
 from __future__ import annotations
@@ -164,9 +165,8 @@ def main() -> None:
         for result in results:
             print(json.dumps(asdict(result)))
     else:
-        print(
-            f"Python {platform.python_version()}, {platform.machine()}, processor seconds on one core\n\n{table(results)}"
-        )
+        print(f"Python {platform.python_version()}, {platform.machine()}, processor seconds on one core\n")
+        print(table(results))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,54 @@
+"""docs/inventory.md says what the code does."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from meshctl.inventory import include, source
+from meshctl.inventory.codes import MAX_DIAGNOSTICS, MEANINGS
+from meshctl.inventory.compose import MAX_DEPTH, MAX_VALUES
+from meshctl.inventory.documents import InventoryDocument
+from meshctl.inventory.ranges import MAX_NAMES
+from meshctl.model import NodeState
+from tests.meshctl.inventory.inventories import HEAD, SHIPPED, load_text
+
+_TEXT = (SHIPPED.parent / "docs" / "inventory.md").read_text()
+
+
+def _examples() -> list[str]:
+    return re.findall(r"```yaml\n(.*?)```", _TEXT, re.DOTALL)
+
+
+def test_every_code_stands_in_the_table() -> None:
+    rows = dict(re.findall(r"^\| (INV\d{3}) \| (.*) \|$", _TEXT, re.MULTILINE))
+    assert rows == MEANINGS
+
+
+def test_every_section_and_state_is_named() -> None:
+    for name in (*InventoryDocument.model_fields, *(state.value for state in NodeState)):
+        assert f"`{name}`" in _TEXT, name
+
+
+def test_the_limits_are_those_of_the_code() -> None:
+    limits = (
+        f"{source.MAX_FILE_BYTES // 2**20} MiB a file, {include.MAX_FILES} files, {MAX_VALUES:,} values",
+        f"{MAX_DEPTH} levels, {MAX_NAMES:,} nodes, {MAX_DIAGNOSTICS:,} reported errors",
+    )
+    flat = " ".join(_TEXT.split())
+    assert all(limit in flat for limit in limits)
+
+
+def test_the_nodes_of_the_example_load(tmp_path: Path) -> None:
+    loaded = load_text(tmp_path, HEAD + _examples()[0])
+    assert loaded.fleet is not None, loaded.diagnostics
+    assert loaded.fleet.nodes["husky1-b03"].state is NodeState.LOST
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_each_reference_of_the_example_loads(number: int, tmp_path: Path) -> None:
+    reference = _examples()[1].splitlines()[number].partition(": ")[2]
+    loaded = load_text(tmp_path, f"{HEAD}udp_mesh:\n  keys:\n  - {reference}\n")
+    assert loaded.fleet is not None, loaded.diagnostics
