@@ -68,9 +68,15 @@ class Templates:
 
     @classmethod
     def of(cls, fleet: Fleet) -> Templates:
-        """The inventory's own folder `templates`, when it has one, before the shipped templates."""
+        """The inventory's own folder `templates`, when it has one, before the shipped templates.
+
+        Raises InvalidInput for a folder in it that no back end has the name of: its templates would count for nothing.
+        """
         own = Path(fleet.base) / "templates"
-        return cls((own, shipped("templates")) if fleet.base and own.is_dir() else (shipped("templates"),))
+        if not fleet.base or not own.is_dir():
+            return cls((shipped("templates"),))
+        _refuse_strays(own, fleet)
+        return cls((own, shipped("templates")))
 
     def files(self, backend: Backend, parts: OperatorParts) -> tuple[TemplateFile, ...]:
         """The templates that make files for a back end, sorted by path. Raises InvalidInput when parts are missing."""
@@ -85,6 +91,20 @@ class Templates:
         if key not in self._sets:
             self._sets[key] = _TemplateSet(self._folders, backend, parts)
         return self._sets[key]
+
+
+def _refuse_strays(own: Path, fleet: Fleet) -> None:
+    known = {COMMON, *(backend.value for backend in Backend)}
+    parts = [mesh.operator_parts for mesh in fleet.meshes.values()]
+    elsewhere = {(Path(item.base) / item.templates).resolve() for item in parts if item.templates}
+    expected = ", ".join(sorted(known))
+    strays = [
+        Diagnostic(NO_TEMPLATE, Severity.ERROR, Position(str(folder)), "", "", f"one of {expected}", folder.name)
+        for folder in sorted(own.iterdir())
+        if folder.is_dir() and folder.name not in known and folder.resolve() not in elsewhere
+    ]
+    if strays:
+        raise InvalidInput(strays)
 
 
 class _TemplateSet:

@@ -48,7 +48,7 @@ def package_needs(fleet: Fleet, node: Node) -> tuple[Need, ...]:
 
 
 def _backend_needs(mesh: Mesh) -> tuple[Need, ...]:
-    tools = (Need(("iw",), "meshctl reads the radio's links with it"),)
+    tools = (Need(("iw", "iw-full"), "meshctl reads the radio's links with it"),)
     match mesh.backend:
         case Backend.BATMAN:
             return (

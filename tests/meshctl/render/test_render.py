@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from meshctl.diagnostics import InvalidInput
-from meshctl.model import MASK, Encryption, Fleet, MeshMode, NodeState, Operators, Secret, SystemSettings
+from meshctl.model import MASK, Encryption, Fleet, MeshMode, NodeState, OperatorParts, Operators, Secret, SystemSettings
 from meshctl.render import DeviceFacts, Rendered, Templates, UnknownNode, render_fleet, render_node
 from meshctl.uci import dump, parse
 from tests.meshctl.render import fleets
@@ -253,6 +253,16 @@ class TestTemplates:
         assert file is not None
         assert file.content.decode() == f"{MASK} {fleets.KEY}\n"
         assert (file.masked, file.mode) == (f"{MASK} {MASK}\n", 0o600)
+
+    def test_in_a_folder_that_nothing_reads_are_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(InvalidInput, match="expected one of batman-adv, common, meshmerize, found batman_adv"):
+            self.render(tmp_path, "config system\n", "batman_adv/etc/config/system.j2")
+
+    def test_of_the_operator_may_stand_beside_the_others(self, tmp_path: Path) -> None:
+        (tmp_path / "templates/ours").mkdir(parents=True)
+        parts = OperatorParts(templates="templates/ours", base=str(tmp_path))
+        fleet = fleets.fleet(meshes=(fleets.mesh(operator_parts=parts),), base=str(tmp_path))
+        assert render_node(fleet, NAME, fleets.secrets).package("network")
 
     def test_of_the_operator_must_exist(self, tmp_path: Path) -> None:
         mesh: Any = fleets.mesh()
