@@ -170,8 +170,9 @@ class Team:
         now = self.agenda.now
         while datagrams := member.node.datagrams_to_send(now):
             for datagram in datagrams:
+                to_all = datagram.destination is None or datagram.destination[0] == BROADCAST
                 to = None if datagram.destination is None else self._addresses.get(datagram.destination[0])
-                if datagram.destination is None or to is not None:
+                if to_all or to is not None:
                     self.medium.send(member.name, to, bytes(datagram.data))
         while (event := member.node.next_event()) is not None:
             self.ledger.note(member.name, member.run, event)
