@@ -57,13 +57,34 @@ def _events(text: str) -> Iterator[yaml.Event]:
 
 def _syntax_error(source: Source, reason: yaml.MarkedYAMLError) -> Diagnostic:
     mark = reason.problem_mark or reason.context_mark
-    place = Position(source.file) if mark is None else Position(source.file, mark.line + 1, mark.column + 1)
-    hint = ""
-    lines = source.text.splitlines()
-    if mark is not None and mark.line < len(lines) and "\t" in lines[mark.line][: mark.column + 1]:
-        hint = "YAML is indented with spaces, never with tabs"
+    place = Position(source.file)
+    if mark is not None:
+        # libyaml counts a line more when the text ends without a newline.
+        last = source.text.count("\n")
+        beyond = mark.line > last
+        column = len(source.text) - source.text.rfind("\n") - 1 if beyond else mark.column
+        place = Position(source.file, min(mark.line, last) + 1, column + 1)
     context = f" {reason.context}" if reason.context else ""
-    return codes.error(codes.YAML_SYNTAX, place, f"not valid YAML{context}: {reason.problem}", hint=hint)
+    return codes.error(
+        codes.YAML_SYNTAX, place, f"not valid YAML{context}: {reason.problem}", hint=_hint(source, place)
+    )
+
+
+def _hint(source: Source, place: Position) -> str:
+    """What the usual slips look like to YAML's grammar."""
+    lines = source.text.splitlines()
+    if not 0 < place.line <= len(lines):
+        return ""
+    before = lines[place.line - 1][: place.column]
+    if "\t" in before:
+        return "YAML is indented with spaces, never with tabs"
+    if "{" in before and "[" in before:
+        return 'inside braces a range needs quotes: {"b[01-12]": ...}'
+    if before.endswith(":") and before.count(": ") > 0:
+        return "quote a value that holds a colon and a space"
+    if before.endswith(("@", "`", "%")):
+        return f"quote a value that begins with {before[-1]}"
+    return ""
 
 
 class _Mark(Protocol):

@@ -15,7 +15,7 @@ from meshctl.inventory.documents import InventoryDocument, NodeDocument, NodeLay
 from meshctl.inventory.fields import is_name
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand, is_range
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.inventory.tree import MappingNode, Tree, key_position, place_of, position
+from meshctl.inventory.tree import MappingNode, Tree, descend, place_of, position
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,14 +102,11 @@ class _Laying:
         return Layered(plans, tuple(self.diagnostics))
 
     def _layer(self, title: str, path: tuple[str, ...], document: NodeLayer) -> Layer:
-        tree: Tree = self.root
-        place = position(self.root)
-        for part in path:
-            if not isinstance(tree, MappingNode) or part not in tree.values:
-                break
-            place = key_position(tree, part)
-            tree = tree.values[part]
-        return Layer(title, path, document, tree, place)
+        tree = descend(self.root, path)
+        if tree is None:
+            # `defaults` that nobody wrote.
+            tree = MappingNode(self.root.file, self.root.line, self.root.column, 0, 0, is_flow=True)
+        return Layer(title, path, document, tree, place_of(self.root, path) or position(self.root))
 
     def _find_circles(self) -> None:
         """Depth first over the parents, each group once; an edge back to the trail closes a circle."""
