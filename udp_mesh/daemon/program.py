@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import asyncio
+import faulthandler
 import gc
 import logging
 import os
@@ -73,6 +74,8 @@ async def _serve(service: Service, notifier: Notifier) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     loop.add_signal_handler(signal.SIGHUP, _reload, service, notifier)
+    # A daemon that hangs on a robot far away: SIGUSR1 writes where to its log.
+    faulthandler.register(signal.SIGUSR1)
     gc.collect()
     gc.freeze()
     gc.set_threshold(*GC_THRESHOLDS)

@@ -1,0 +1,235 @@
+"""Two real daemons: messages, changes at run time, metrics, recording, and hostile local programs."""
+
+import json
+import shutil
+import socket
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.udp_mesh.daemon.processes import RunningDaemon, collect, outcomes, poll, two_daemons
+from tests.udp_mesh.links.sockets import WAIT_S, free_port
+from udp_mesh.client import MeshClient, MeshError, mesh_client
+from udp_mesh.client.mesh_client import encode_frame
+from udp_mesh.daemon.configuration import CONDITIONS_TOPIC
+
+Pair = tuple[RunningDaemon, RunningDaemon]
+
+pytestmark = pytest.mark.xdist_group("udp_mesh_daemons")
+
+
+@pytest.fixture(scope="module")
+def pair() -> Iterator[Pair]:
+    with two_daemons() as daemons:
+        yield daemons
+
+
+def test_messages_arrive_as_they_were_sent_and_their_end_is_told(pair: Pair) -> None:
+    alice, bob = pair
+    big = bytes(range(256)) * 12_000
+    with alice.client() as sender, bob.client() as receiver:
+        receiver.subscribe("status", "map")
+        numbers = [
+            sender.publish("status", b"ready", to="bob", type="std_msgs/String", notify=True),
+            sender.publish("map", big, to="bob", notify=True),
+            sender.publish("status", b"", to="bob", notify=True),
+        ]
+        found = sorted(collect(receiver, 3), key=lambda message: len(message.payload))
+        ends = outcomes(sender, 3)
+    assert [message.payload for message in found] == [b"", b"ready", big]
+    assert found[1]._replace(payload=b"") == ("alice", "status", "std_msgs/String", b"", 0, False)
+    assert ends == dict.fromkeys(numbers, "delivered")
+
+
+def test_a_program_of_its_own_with_the_client_copied_alone_talks_both_ways(pair: Pair, tmp_path: Path) -> None:
+    alice, bob = pair
+    shutil.copy(mesh_client.__file__, tmp_path / "mesh_client.py")
+    script = f"""
+from mesh_client import MeshClient
+with MeshClient({str(bob.socket)!r}) as mesh:
+    mesh.subscribe("status")
+    print("subscribed", flush=True)
+    for message in mesh.messages({WAIT_S}):
+        mesh.publish("status", message.payload.upper(), to=message.source)
+        break
+"""
+    program = subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path, stdout=subprocess.PIPE, env={})
+    with program, alice.client() as client:
+        assert program.stdout is not None
+        assert program.stdout.readline() == b"subscribed\n"
+        client.subscribe("status")
+        client.publish("status", b"echo this", to="bob")
+        assert collect(client, 1)[0].payload == b"ECHO THIS"
+        assert program.wait(WAIT_S) == 0
+
+
+@pytest.mark.parametrize(
+    ("op", "fields", "code"),
+    [
+        ("publish", {"topic": "unknown", "to": "bob"}, "unknown-topic"),
+        ("publish", {"topic": "status", "to": "nobody"}, "unknown-peer"),
+        ("publish", {"topic": "~mesh/ping", "to": "bob"}, "reserved-topic"),
+        ("publish", {"topic": 5}, "bad-request"),
+        ("publish", {"topic": "status", "to": "bob", "type": 5}, "bad-request"),
+        ("subscribe", {"topics": "status"}, "bad-request"),
+        ("dance", {}, "unknown-op"),
+        ("set-topic", {"topic": "status", "values": {"priority": 99}}, "bad-configuration"),
+        ("set-topic", {"topic": "status", "values": []}, "bad-request"),
+        ("set-window", {"window": 0}, "bad-request"),
+        ("set-rates", {"values": {"offline_s": "soon"}}, "bad-configuration"),
+        ("set-neighbour", {"address": "base"}, "bad-request"),
+        ("set-neighbour", {"address": "127.0.3.9", "legacy": True}, "bad-request"),
+        ("drop-neighbour", {"address": "127.0.3.9"}, "unknown-neighbour"),
+        ("drop-topic", {"topic": "unknown"}, "unknown-topic"),
+        ("set-keys", {"file": "/nowhere/fleet.key"}, "bad-configuration"),
+        ("record-stop", {}, "not-recording"),
+        ("record-start", {"path": "/nowhere/run.jsonl"}, "cannot-record"),
+        ("ping", {"peer": "nobody"}, "unknown-peer"),
+        ("ping", {"peer": "bob", "timeout_s": -1}, "bad-request"),
+    ],
+)
+def test_a_request_that_cannot_be_met_is_refused_with_a_word_and_a_reason(
+    pair: Pair, op: str, fields: dict[str, Any], code: str
+) -> None:
+    with pair[0].client() as client:
+        with pytest.raises(MeshError) as caught:
+            client.request(op, **fields)
+        assert caught.value.code == code
+        assert str(caught.value)
+        client.request("peers")
+
+
+@pytest.mark.parametrize(
+    "raw", [b"\xff" * 100, encode_frame({})[:-1] + b"x", b"GET / HTTP/1.1\r\n\r\n", encode_frame({"op": "publish"}) * 3]
+)
+def test_a_program_that_sends_anything_disturbs_nobody(pair: Pair, raw: bytes) -> None:
+    with socket.socket(socket.AF_UNIX) as hostile:
+        hostile.connect(str(pair[0].socket))
+        hostile.sendall(raw)
+        hostile.shutdown(socket.SHUT_WR)
+        hostile.settimeout(WAIT_S)
+        while hostile.recv(1000):
+            continue
+    with pair[0].client() as client:
+        client.request("peers")
+
+
+def test_a_subscriber_that_does_not_read_loses_messages_and_is_told_how_many(pair: Pair) -> None:
+    alice, bob = pair
+    payload = bytes(1_000_000)
+    with alice.client() as sender, bob.client() as lazy:
+        lazy.subscribe("map")
+        for _ in range(3):
+            for _ in range(20):
+                sender.publish("map", payload, to="bob", notify=True)
+            outcomes(sender, 20)
+        received = dropped = 0
+        while received + dropped < 60:
+            frame = lazy.next_frame(WAIT_S)
+            assert frame is not None
+            received += frame[0]["event"] == "message"
+            dropped += frame[0].get("messages", 0)
+        assert dropped > 0
+        assert received >= 32
+
+
+def test_topics_are_added_changed_and_dropped_while_messages_flow(pair: Pair) -> None:
+    alice, bob = pair
+    with alice.client() as sender, bob.client() as receiver:
+        receiver.subscribe("map", "extra")
+        numbers = [sender.publish("map", bytes([n]) * 50_000, to="bob", notify=True) for n in range(10)]
+        assert sender.request("set-topic", topic="extra", values={"priority": 1})["changes"]
+        numbers.append(sender.publish("extra", b"new", to="bob", notify=True))
+        assert sender.request("set-topic", topic="map", values={"priority": 2})["changes"]
+        sender.request("set-window", window=3)
+        sender.request("set-rates", values={"ack_delay_s": 0.005})
+        sender.request("drop-topic", topic="extra")
+        sender.request("set-window", window="adaptive")
+        assert set(outcomes(sender, 11).values()) == {"delivered"}
+        assert len(collect(receiver, 11)) == 11
+        with pytest.raises(MeshError, match="unknown topic"):
+            sender.publish("extra", b"gone", to="bob")
+        names = {topic["name"]: topic for topic in sender.request("topics")["topics"]}
+        assert names["map"]["priority"] == 2
+        assert not names["extra"]["configured"]
+        sender.request("reload")
+        names = {topic["name"]: topic for topic in sender.request("topics")["topics"]}
+        assert names["map"]["priority"] == 7
+
+
+def test_the_conditions_are_a_topic_for_local_programs(pair: Pair) -> None:
+    with pair[0].client() as client:
+        client.subscribe(CONDITIONS_TOPIC)
+        frame = client.next_frame(WAIT_S)
+        assert frame is not None
+        assert frame[0]["event"] == "conditions"
+        assert [peer["name"] for peer in frame[0]["conditions"]["peers"]] == ["bob"]
+
+
+def test_status_tells_links_keys_and_peers_and_never_a_secret(pair: Pair) -> None:
+    with pair[0].client() as client:
+        status = client.request("status")
+    assert status["links"][0]["address"].startswith("127.0.3.1:")
+    assert not status["unkeyed"]
+    assert status["conditions"]["peers"][0]["online"]
+    assert "00112233" not in json.dumps(status)
+
+
+def test_a_ping_goes_through_both_daemons(pair: Pair) -> None:
+    with pair[0].client() as client:
+        assert 0 < client.request("ping", peer="bob", timeout_s=WAIT_S)["round_trip_s"] < WAIT_S
+
+
+def test_a_recording_holds_what_was_sent_received_and_measured(pair: Pair, tmp_path: Path) -> None:
+    alice, bob = pair
+    sent_file, received_file = tmp_path / "alice.jsonl", tmp_path / "bob.jsonl"
+    with alice.client() as sender, bob.client() as receiver:
+        receiver.subscribe("status")
+        sender.request("record-start", path=str(sent_file))
+        receiver.request("record-start", path=str(received_file), payloads=True)
+        with pytest.raises(MeshError, match="already recording"):
+            sender.request("record-start", path=str(tmp_path / "second.jsonl"))
+        number = sender.publish("status", b"recorded", to="bob", notify=True)
+        outcomes(sender, 1)
+        collect(receiver, 1)
+        assert sender.request("record-stop")["lines"] >= 4
+        receiver.request("record-stop")
+    sent = [json.loads(line) for line in sent_file.read_text().splitlines()]
+    received = [json.loads(line) for line in received_file.read_text().splitlines()]
+    assert sent[0]["recording"] == 1
+    assert sent[0]["node"] == "alice"
+    assert any(line.get("kind") == "sent" and line["message"] == number and line["bytes"] == 8 for line in sent)
+    assert any(line.get("kind") == "message-delivered" and line["message_id"] == number for line in sent)
+    arrived = next(line for line in received if line.get("kind") == "received")
+    assert (arrived["source"], arrived["topic"], arrived["priority"]) == ("alice", "status", 0)
+    assert arrived["payload"] == "cmVjb3JkZWQ="
+    assert [line["t"] for line in received[1:]] == sorted(line["t"] for line in received[1:])
+    assert sum(line.get("kind") == "conditions" for line in sent) >= 2
+
+
+def test_prometheus_reads_metrics_over_tcp_and_over_the_local_socket() -> None:
+    port = free_port()
+    with two_daemons(alice_more=f'metrics_address = "127.0.0.1:{port}"') as (alice, _):
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=WAIT_S) as answer:
+            page = answer.read().decode()
+        with alice.client() as client:
+            _, local = client.request_frame("metrics")
+    for text in (page, local.decode()):
+        assert 'udp_mesh_peer_online{peer="bob"} 1' in text
+        assert "# TYPE udp_mesh_datagrams_sent_total counter" in text
+
+
+def test_an_idle_client_does_not_hold_up_the_others(pair: Pair) -> None:
+    alice, _ = pair
+    idle = [MeshClient(str(alice.socket)) for _ in range(20)]
+    try:
+        with alice.client() as client:
+            poll(lambda: client.request("peers")["peers"] != [], "an answer")
+    finally:
+        for client in idle:
+            client.close()
