@@ -180,7 +180,7 @@ def _handshake(
                     raise _OnlySha1(str(error)) from error
                 raise IncompatibleServer(f"{endpoint.label}: {error}") from error
             except paramiko.SSHException as error:
-                if "protocol version" in str(error) or "SSH banner" in str(error):
+                if any(word in str(error) for word in ("protocol version", "SSH banner", "codec can't decode")):
                     raise IncompatibleServer(f"{endpoint.label}: what answers there does not speak SSH") from error
                 raise
         remote = transport.get_remote_server_key()
@@ -253,6 +253,11 @@ class SshConnection(Connection):
     def host_key(self) -> HostKey:
         key = self._transport.get_remote_server_key()
         return HostKey(key.get_name(), key.asbytes())
+
+    @property
+    def host_key_algorithm(self) -> str:
+        """The signature the server proved itself with: `ssh-ed25519`, `rsa-sha2-256`, or `ssh-rsa` for SHA-1."""
+        return str(self._transport.host_key_type)
 
     def tunnel(self, target: Endpoint) -> paramiko.Channel:
         """A TCP stream from this node to `target` (direct-tcpip, RFC 4254 section 7.2)."""

@@ -209,16 +209,19 @@ def _paced(data: bytes, rate_bytes_per_s: float, sleep: Callable[[float], None])
         sleep(len(piece) / rate_bytes_per_s)
 
 
+# A leftover writer may have added to the end; where bytes are missing instead, the hash tells.
 _FINISH = """\
 p={partial} t={target}
-[ -f "$p" ] || : >"$p"
+dd if=/dev/null of="$p" bs=1 seek={size} 2>/dev/null || exit 1
 [ "$(sha256sum <"$p")" = "{sha256}  -" ] || {{ echo damaged; exit 0; }}
 chmod {mode:o} "$p" && /bin/sync && mv -f "$p" "$t" && /bin/sync && echo placed
 """
 
 
 def _put_in_place(connection: Connection, partial: str, path: str, content: Content, mode: int) -> bool:
-    script = _FINISH.format(partial=quoted(partial), target=quoted(path), sha256=content.sha256, mode=mode)
+    script = _FINISH.format(
+        partial=quoted(partial), target=quoted(path), size=content.size, sha256=content.sha256, mode=mode
+    )
     answer = connection.run(script, timeout_s=_PATIENCE_S * 2).check(
         f"{connection.endpoint.label}: put {path} in place"
     )

@@ -1,7 +1,8 @@
 """A node small enough to be cut to pieces: a root of its own with the real busybox ash, entered by mount namespace.
 
-`Sandbox` makes the root (stand-ins only for `uci`, which here greps, `sync`, which does nothing, and `reboot`, which writes a line); `run` enters
-it. Its flash is `etc/`, its RAM `tmp/`; `reboot()` empties the RAM and changes the boot id, as a power cut does.
+`Sandbox` makes the root; stand-ins are only `uci`, which here greps, `sync`, which does nothing, and `reboot`, which
+writes a line. `run` enters it. Its flash is `etc/`, its RAM `tmp/`; `reboot()` empties the RAM and changes the boot id,
+as a power cut does.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import uuid
+from contextlib import suppress
 from pathlib import Path
 
 from meshctl.device.scripts import script
@@ -92,12 +94,19 @@ class Sandbox:
     def close(self) -> None:
         """End what still runs in the node: forget the change, which ends its timers, and stop what does not heed it."""
         shutil.rmtree(self.path("/etc/meshctl"), ignore_errors=True)
+        for number in self.processes():
+            with suppress(ProcessLookupError):
+                os.kill(number, signal.SIGKILL)
+
+    def processes(self) -> list[int]:
+        """What runs in the node now."""
+        found = []
         for process in Path("/proc").iterdir():
-            try:
+            # what ends meanwhile, or is another user's, cannot be looked at
+            with suppress(OSError):
                 if process.name.isdecimal() and os.readlink(process / "root") == str(self.root.resolve()):
-                    os.kill(int(process.name), signal.SIGKILL)
-            except OSError:
-                continue  # it ended meanwhile, or is not ours to look at
+                    found.append(int(process.name))
+        return found
 
     def argv(self, *command: str) -> list[str]:
         unshare = ["unshare", "--mount"] if os.geteuid() == 0 else ["unshare", "--mount", "--user", "--map-root-user"]

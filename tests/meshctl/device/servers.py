@@ -51,11 +51,13 @@ def listening(port: int) -> bool:
 class Server:
     """A process that listens on `port`; `stop()` ends it and all it started."""
 
-    def __init__(self, argv: list[str], port: int, log: Path) -> None:
+    def __init__(self, argv: list[str], port: int, log: Path, environment: dict[str, str] | None = None) -> None:
         self.port = port
         self._log = log
         with log.open("wb") as output:
-            self._process = subprocess.Popen(argv, stdout=output, stderr=output, stdin=subprocess.DEVNULL)
+            self._process = subprocess.Popen(
+                argv, stdout=output, stderr=output, stdin=subprocess.DEVNULL, env=environment
+            )
         try:
             eventually(lambda: self._process.poll() is not None or listening(port))
             if self._process.poll() is not None:
@@ -125,14 +127,18 @@ root=$1; shift
 mount --bind "$root" "$root"
 mount -t proc proc "$root/proc"
 mount --rbind /dev "$root/dev"
+[ -z "$TMP_KIB" ] || mount -t tmpfs -o "size=${TMP_KIB}k" tmpfs "$root/tmp"
 mount --bind "$root/harness/boot_id" "$root/proc/sys/kernel/random/boot_id"
 cd "$root"
 exec chroot "$root" "$@"
 """
 
 
-def dropbear(node: Sandbox, *options: str, port: int | None = None) -> Server:
-    """Start dropbear in the node as OpenWrt does: three tries (`-T 3`), blank root password let in (`-B`)."""
+def dropbear(node: Sandbox, *options: str, port: int | None = None, tmp_kib: int | None = None) -> Server:
+    """Start dropbear in the node as OpenWrt does: three tries (`-T 3`), blank root password let in (`-B`).
+
+    With `tmp_kib` the node has that much RAM for /tmp, and forgets it when the server ends.
+    """
     port = port or free_port()
     keys = [
         word
@@ -141,7 +147,8 @@ def dropbear(node: Sandbox, *options: str, port: int | None = None) -> Server:
     ]
     command = ["/usr/sbin/dropbear", "-F", "-E", "-p", f"127.0.0.1:{port}", "-T", "3", "-B", *keys, *options]
     unshare = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "sh", "-ec", ENTER, "enter", str(node.root)]
-    return Server([*unshare, *command], port, node.path("/harness/dropbear.log"))
+    environment = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "TMP_KIB": "" if tmp_kib is None else str(tmp_kib)}
+    return Server([*unshare, *command], port, node.path("/harness/dropbear.log"), environment)
 
 
 OPENSSH = r"""
@@ -158,7 +165,7 @@ def openssh(directory: Path, authorized: Path, *settings: str, host_key_type: st
     (directory / "shadow").write_text("root:*:0:0:99999:7:::\n")
     (directory / "shadow").chmod(0o600)
     key = directory / "host_key"
-    subprocess.run(["ssh-keygen", "-q", "-t", host_key_type, "-N", "", "-f", key], check=True)
+    make_key(key, host_key_type)
     lines = [
         f"HostKey {key}",
         f"AuthorizedKeysFile {authorized}",
@@ -175,8 +182,15 @@ def openssh(directory: Path, authorized: Path, *settings: str, host_key_type: st
 
 def keypair(path: Path, key_type: str = "ed25519", *, passphrase: str = "") -> Path:
     """A new key pair of OpenSSH's; returns the private file, the public one has `.pub` appended."""
-    subprocess.run(["ssh-keygen", "-q", "-t", key_type, "-N", passphrase, "-C", path.name, "-f", path], check=True)
+    make_key(path, key_type, passphrase=passphrase)
     return path
+
+
+def make_key(path: Path, key_type: str, *, passphrase: str = "") -> None:
+    # 2048 bits are what dropbear makes; more would only cost time
+    size = ["-b", "2048"] if key_type == "rsa" else []
+    words = ["ssh-keygen", "-q", "-t", key_type, *size, "-N", passphrase, "-C", path.name, "-f", str(path)]
+    subprocess.run(words, check=True)
 
 
 def public(path: Path) -> Path:

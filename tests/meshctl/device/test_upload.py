@@ -1,0 +1,204 @@
+"""Uploads over a real dropbear: whole, resumed, damaged on the way, too large, paced."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import pytest
+
+from meshctl.device.connection import Completed, Connection, Credentials, Deadlines, Endpoint
+from meshctl.device.errors import ChannelClosed, ConnectionLost, UploadFailed
+from meshctl.device.ssh import SshConnection, connect
+from meshctl.device.trust import TrustStore
+from meshctl.device.upload import CHUNK_BYTES, Progress, upload
+from meshctl.errors import InputError
+from tests.meshctl.device.sandbox import Sandbox
+from tests.meshctl.device.servers import Server, authorize, dropbear, give_dropbear, host_key, keypair, public
+
+TARGET = "/tmp/firmware/image.bin"
+PATIENT = Deadlines(connect_s=60, handshake_s=120, auth_s=120, channel_s=120, run_s=120)
+
+
+@pytest.fixture
+def server(node: Sandbox, tmp_path: Path) -> Iterator[Server]:
+    give_dropbear(node, root_password="!")
+    authorize(node, public(keypair(tmp_path / "operator")))
+    with dropbear(node) as running:
+        yield running
+
+
+def log_in(server: Server, node: Sandbox, tmp_path: Path) -> SshConnection:
+    trust = TrustStore(tmp_path / "pins")
+    trust.replace("b03", host_key(node))
+    ours = Credentials(key_files=(tmp_path / "operator",), use_agent=False)
+    return connect(server.endpoint(), credentials=ours, trust=trust, deadlines=PATIENT)
+
+
+@pytest.fixture
+def connection(server: Server, node: Sandbox, tmp_path: Path) -> Iterator[SshConnection]:
+    with log_in(server, node, tmp_path) as connected:
+        yield connected
+
+
+def leftovers(node: Sandbox) -> list[str]:
+    return sorted(path.name for path in node.path(TARGET).parent.glob(".*"))
+
+
+@pytest.mark.parametrize("size", [0, 1, CHUNK_BYTES - 1, CHUNK_BYTES, 3 * CHUNK_BYTES + 17])
+def test_what_arrives_is_what_was_sent_with_its_mode(connection: SshConnection, node: Sandbox, size: int) -> None:
+    data = os.urandom(size)
+    told: list[Progress] = []
+    done = upload(connection, data, TARGET, mode=0o600, progress=told.append)
+    assert node.path(TARGET).read_bytes() == data
+    assert node.path(TARGET).stat().st_mode & 0o777 == 0o600
+    assert (done.sha256, done.sent, done.kept) == (hashlib.sha256(data).hexdigest(), size, 0)
+    assert [step.verified for step in told] == sorted({0, *(step.verified for step in told)})
+    assert told[-1] == Progress(size, size)
+    assert leftovers(node) == []
+
+
+def test_a_file_is_read_from_disk_and_a_second_upload_sends_nothing(
+    connection: SshConnection, node: Sandbox, tmp_path: Path
+) -> None:
+    source = tmp_path / "image"
+    source.write_bytes(os.urandom(CHUNK_BYTES + 5))
+    assert upload(connection, source, TARGET).sent == CHUNK_BYTES + 5
+    again = upload(connection, source, TARGET)
+    assert (again.sent, again.kept) == (0, CHUNK_BYTES + 5)
+    with pytest.raises(InputError, match="no-such-image"):
+        upload(connection, tmp_path / "no-such-image", TARGET)
+
+
+class CutAfter(Connection):
+    """A connection whose server is killed once `chunks` chunks have been confirmed, in the middle of the next."""
+
+    def __init__(self, connection: SshConnection, server: Server, chunks: int) -> None:
+        self._connection = connection
+        self._server = server
+        self._left = chunks
+
+    @property
+    def endpoint(self) -> Endpoint:
+        return self._connection.endpoint
+
+    def run(self, script: str, *, stdin: bytes | Iterable[bytes] = b"", timeout_s: float | None = None) -> Completed:
+        data = stdin if isinstance(stdin, bytes) else b"".join(stdin)
+        if data and self._left == 0:
+            return self._connection.run(script, stdin=self._half(data), timeout_s=timeout_s)
+        self._left -= 1 if data else 0
+        return self._connection.run(script, stdin=data, timeout_s=timeout_s)
+
+    def _half(self, data: bytes) -> Iterator[bytes]:
+        yield data[: len(data) // 2]
+        self._server.stop()
+        yield data[len(data) // 2 :]
+
+    def close(self) -> None:
+        self._connection.close()
+
+
+def test_an_upload_goes_on_after_every_cut_from_what_was_verified(node: Sandbox, tmp_path: Path) -> None:
+    give_dropbear(node, root_password="!")
+    authorize(node, public(keypair(tmp_path / "operator")))
+    data = os.urandom(5 * CHUNK_BYTES + 99)
+    for chunks in (2, 1, 0):
+        with dropbear(node) as server, log_in(server, node, tmp_path) as connected:
+            cutting = CutAfter(connected, server, chunks)
+            with pytest.raises((ConnectionLost, ChannelClosed)):
+                upload(cutting, data, TARGET)
+        assert not node.path(TARGET).exists()
+    with dropbear(node) as server, log_in(server, node, tmp_path) as connected:
+        done = upload(connected, data, TARGET)
+    assert node.path(TARGET).read_bytes() == data
+    assert (done.kept, done.sent) == (3 * CHUNK_BYTES, 2 * CHUNK_BYTES + 99)
+    assert leftovers(node) == []
+
+
+def test_a_damaged_part_is_found_by_its_hash_and_sent_again(connection: SshConnection, node: Sandbox) -> None:
+    data = os.urandom(3 * CHUNK_BYTES)
+    name = f".image.bin.{hashlib.sha256(data).hexdigest()[:16]}.part"
+    rotten = bytearray(data)
+    rotten[CHUNK_BYTES + 7] ^= 1
+    node.put(f"/tmp/firmware/{name}", bytes(rotten))
+    done = upload(connection, data, TARGET)
+    assert node.path(TARGET).read_bytes() == data
+    assert (done.kept, done.sent) == (CHUNK_BYTES, 2 * CHUNK_BYTES)
+
+
+def test_parts_of_other_contents_are_neither_used_nor_left_behind(connection: SshConnection, node: Sandbox) -> None:
+    node.put("/tmp/firmware/.image.bin.0123456789abcdef.part", b"x" * CHUNK_BYTES)
+    upload(connection, b"small", TARGET)
+    assert node.path(TARGET).read_bytes() == b"small"
+    assert leftovers(node) == []
+
+
+def test_a_partial_file_longer_than_the_content_is_cut_to_it(connection: SshConnection, node: Sandbox) -> None:
+    data = os.urandom(CHUNK_BYTES)
+    name = f".image.bin.{hashlib.sha256(data).hexdigest()[:16]}.part"
+    node.put(f"/tmp/firmware/{name}", data + b"left by a writer of a cut connection")
+    upload(connection, data, TARGET)
+    assert node.path(TARGET).read_bytes() == data
+
+
+class Spoiling(Connection):
+    """A connection that changes a byte of every chunk."""
+
+    def __init__(self, connection: SshConnection, times: int) -> None:
+        self._connection = connection
+        self._times = times
+
+    @property
+    def endpoint(self) -> Endpoint:
+        return self._connection.endpoint
+
+    def run(self, script: str, *, stdin: bytes | Iterable[bytes] = b"", timeout_s: float | None = None) -> Completed:
+        data = bytearray(stdin if isinstance(stdin, bytes) else b"".join(stdin))
+        if data and self._times:
+            self._times -= 1
+            data[0] ^= 1
+        return self._connection.run(script, stdin=bytes(data), timeout_s=timeout_s)
+
+    def close(self) -> None:
+        self._connection.close()
+
+
+def test_bytes_that_change_on_the_way_are_noticed_and_never_put_in_place(
+    connection: SshConnection, node: Sandbox
+) -> None:
+    data = os.urandom(2 * CHUNK_BYTES)
+    upload(Spoiling(connection, 1), data, TARGET)
+    assert node.path(TARGET).read_bytes() == data
+    node.path(TARGET).unlink()
+    with pytest.raises(UploadFailed, match="not those sent"):
+        upload(Spoiling(connection, 1000), data, TARGET)
+    assert not node.path(TARGET).exists()
+
+
+def test_what_does_not_fit_is_refused_before_a_byte_is_sent(node: Sandbox, tmp_path: Path) -> None:
+    give_dropbear(node, root_password="!")
+    authorize(node, public(keypair(tmp_path / "operator")))
+    told: list[Progress] = []
+    with dropbear(node, tmp_kib=1024) as server, log_in(server, node, tmp_path) as connected:
+        with pytest.raises(UploadFailed, match=r"needs 2049 KiB, 10[0-9][0-9] KiB are free"):
+            upload(connected, os.urandom(2 << 20), TARGET, progress=told.append)
+        upload(connected, os.urandom(700 << 10), TARGET)
+        assert connected.run(f"wc -c <{TARGET}").stdout == f"{700 << 10}\n"
+    assert told == []
+
+
+def test_a_rate_is_held_by_pausing_for_what_was_sent(connection: SshConnection, node: Sandbox) -> None:
+    pauses: list[float] = []
+    data = os.urandom(CHUNK_BYTES + 1000)
+    upload(connection, data, TARGET, rate_bytes_per_s=50_000, sleep=pauses.append)
+    assert node.path(TARGET).read_bytes() == data
+    assert sum(pauses) == pytest.approx(len(data) / 50_000)
+    assert max(pauses) <= 0.1
+
+
+def test_a_path_that_names_no_file_is_a_mistake_of_ours(connection: SshConnection) -> None:
+    for path in ("relative", "/", "/tmp/.."):
+        with pytest.raises(ValueError, match="absolute path"):
+            upload(connection, b"x", path)
