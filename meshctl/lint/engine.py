@@ -15,12 +15,17 @@ from meshctl.model import Fleet, MissingOrigin
 
 def lint(fleet: Fleet, context: LintContext, rules: Iterable[Rule] = RULES) -> tuple[Diagnostic, ...]:
     """What the rules find in the fleet, sorted by place. Linear in the size of the fleet."""
-    found = (
-        diagnostic(rule, finding, _position(fleet, finding))
-        for rule in rules
-        if rule.check is not None
-        for finding in rule.check(fleet, context)
-    )
+    found: list[Diagnostic] = []
+    spoken: set[Position] = set()
+    # fallbacks last, so that they know where others have spoken
+    for rule in sorted(rules, key=lambda rule: rule.is_fallback):
+        if rule.check is None:
+            continue
+        items = [diagnostic(rule, finding, _position(fleet, finding)) for finding in rule.check(fleet, context)]
+        if rule.is_fallback:
+            items = [item for item in items if item.position not in spoken]
+        found.extend(items)
+        spoken.update(item.position for item in items)
     return sorted_diagnostics(_merged(found))
 
 

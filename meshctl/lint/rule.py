@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from meshctl.diagnostics import Position, Severity
 from meshctl.lint.context import LintContext
@@ -52,7 +52,7 @@ class Example:
 @dataclass(frozen=True, slots=True)
 class Rule:
     """`why` says what goes wrong in the field, `mend` what to do; exactly one of the checks is set, or none for what
-    the engine itself reports (suppressions, the baseline)."""
+    the engine itself reports (suppressions, the baseline). A fallback is silent where another rule has spoken."""
 
     code: str
     severity: Severity
@@ -64,6 +64,7 @@ class Rule:
     check: FleetCheck | None = None
     check_text: TextCheck | None = None
     name: str = field(default="", kw_only=True)
+    is_fallback: bool = field(default=False, kw_only=True)
 
 
 def fleet_rule(
@@ -75,11 +76,13 @@ def fleet_rule(
     mend: str,
     failing: str | Example,
     passing: str | Example,
+    is_fallback: bool = False,
 ) -> Callable[[FleetCheck], Rule]:
     """Make the decorated function, which reads a fleet, a rule."""
 
     def decorate(check: FleetCheck) -> Rule:
-        return _rule(code, severity, title, why, mend, failing, passing, name=_slug(check), check=check)
+        made = _rule(code, severity, title, why, mend, failing, passing, name=_slug(check), check=check)
+        return replace(made, is_fallback=is_fallback)
 
     return decorate
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from ipaddress import IPv4Address, IPv4Network, ip_address
+from ipaddress import IPv4Address, IPv4Interface, IPv4Network, ip_address
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
@@ -77,17 +77,20 @@ def address_outside(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def address_reserved(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
-        yield from _reserved(("nodes", node.name, "address"), node.address.ip, node.address.network)
+        yield from _reserved(("nodes", node.name, "address"), node.address)
     for robot in fleet.robots.values():
         if robot.computer is not None:
-            address = robot.computer.address
-            yield from _reserved(("robots", robot.name, "computer", "address"), address.ip, address.network)
+            yield from _reserved(("robots", robot.name, "computer", "address"), robot.computer.address)
 
 
-def _reserved(path: tuple[str, ...], address: IPv4Address, network: IPv4Network) -> Iterator[Finding]:
-    if network.prefixlen <= 30 and address in (network.network_address, network.broadcast_address):
+def _reserved(path: tuple[str, ...], address: IPv4Interface) -> Iterator[Finding]:
+    # by arithmetic: ipaddress takes longer over a network's two ends than all other rules over the node
+    host_bits = 32 - address.network.prefixlen
+    ends = (0, (1 << host_bits) - 1)
+    if host_bits >= 2 and int(address.ip) & ends[1] in ends:
+        network = address.network
         expected = f"an address between {network.network_address} and {network.broadcast_address}"
-        yield Finding(path, "not a station's address", expected, str(address))
+        yield Finding(path, "not a station's address", expected, str(address.ip))
 
 
 @fleet_rule(

@@ -1,4 +1,4 @@
-"""Bridging into the robot's LAN: ports, loops, confirm windows, the firewall (MC521 to MC530)."""
+"""Bridging into the robot's LAN: ports, loops, confirm windows, the firewall (MC521 to MC529)."""
 
 from __future__ import annotations
 
@@ -15,6 +15,54 @@ from meshctl.model import Backend, Fleet, Mesh, Node
 _LOOP_AVOIDANCE_S = 60
 # what is owned by the mesh's side of the bridge
 _NOT_PORTS = ("bat", "mesh", "wlan", "phy", "br-")
+# options that the inventory has keys for, by package
+_CHECKED = {
+    "wireless": frozenset(
+        [
+            "channel",
+            "htmode",
+            "band",
+            "hwmode",
+            "country",
+            "txpower",
+            "distance",
+            "disabled",
+            "path",
+            "ssid",
+            "bssid",
+            "mode",
+            "encryption",
+            "key",
+            "mcast_rate",
+            "beacon_int",
+            "mesh_id",
+            "mesh_fwding",
+            "network",
+            "ifname",
+        ]
+    ),
+    "network": frozenset(
+        [
+            "ipaddr",
+            "netmask",
+            "gateway",
+            "ports",
+            "ifname",
+            "device",
+            "proto",
+            "mtu",
+            "master",
+            "routing_algo",
+            "bridge_loop_avoidance",
+            "orig_interval",
+            "hop_penalty",
+            "gw_mode",
+            "fragmentation",
+        ]
+    ),
+    "dropbear": frozenset(["Port", "PasswordAuth", "RootPasswordAuth", "RootLogin", "Interface", "enable"]),
+    "system": frozenset(["hostname", "log_ip", "log_port", "timezone", "zonename"]),
+}
 _TWO_RADIOS = """
 nodes: {husky1-rear: {role: robot, address: 10.42.0.12, label: H1R}}
 robots: {husky1: {nodes: [husky1-front, husky1-rear]}}
@@ -190,46 +238,18 @@ def robot_without_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
 
 @fleet_rule(
     "MC529",
-    Severity.ERROR,
-    "Extra UCI text changes the firewall where input is rejected",
-    why="""From 23.05 the stock firewall rejects what no zone allows. meshctl renders a zone that lets the management
-    network in; text behind it that sets defaults, zones or policies of its own can shut the operator out, and the
-    dead-man's switch with him.""",
-    mend="Leave the firewall to meshctl, or bring a template of the whole package.",
-    failing="""
-    nodes: {b01: {extra_uci: {firewall: "config defaults\\n\\toption input 'REJECT'\\n"}}}
-    """,
-    passing="""
-    nodes: {b01: {extra_uci: {system: "config led\\n\\toption name 'mesh'\\n"}}}
-    """,
-)
-def extra_firewall(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for node in fleet.managed():
-        for name in node.extra_uci:
-            if name.partition(".")[0] == "firewall" and node.release.rejects_input_by_default:
-                path = ("nodes", node.name, "extra_uci", name)
-                message = f"OpenWrt {node.release} rejects what no zone allows"
-                yield Finding(path, message, "the zone that meshctl renders", name)
-
-
-@fleet_rule(
-    "MC530",
     Severity.WARNING,
-    "Extra UCI text changes what lint has checked",
-    why="""Text behind the rendered wireless or network package can change channel, power, addresses and bridges after
-    every check here has passed: the cell may split, or a limit be broken, unseen.""",
-    mend="Use the inventory's own keys; they are checked.",
-    failing="""
-    nodes: {b01: {extra_uci: {wireless: "config wifi-device 'radio0'\\n\\toption channel '13'\\n"}}}
-    """,
-    passing="""
-    nodes: {b01: {extra_uci: {system: "config led\\n\\toption name 'mesh'\\n"}}}
-    """,
+    "An extra UCI option changes what lint has checked",
+    why="""Options set behind the templates can change channel, power, addresses and bridges after every check here has
+    passed: the cell may split, a limit be broken, a node be lost, unseen.""",
+    mend="Use the inventory's own key for it: that one is checked.",
+    failing="nodes: {b01: {extra_uci: {wireless.radio0.channel: '13'}}}",
+    passing="nodes: {b01: {extra_uci: {wireless.radio0.rts: '500'}}}",
 )
 def extra_checked(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
-        for name in node.extra_uci:
-            package = name.partition(".")[0]
-            if package in ("wireless", "network", "dropbear"):
-                path = ("nodes", node.name, "extra_uci", name)
-                yield Finding(path, f"changes {package} behind the checks", "keys of the inventory", name)
+        for key in node.extra_uci:
+            package, _, rest = key.partition(".")
+            if rest.rpartition(".")[2] in _CHECKED.get(package, ()):
+                path = ("nodes", node.name, "extra_uci", key)
+                yield Finding(path, "set behind the checks", "the inventory's own key", key)

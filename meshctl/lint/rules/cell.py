@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import pairwise
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
@@ -130,11 +129,17 @@ def cells_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if span is not None:
             spans.append((span, mesh))
     spans.sort(key=lambda pair: pair[0].low_mhz)
-    for (low_span, low), (high_span, high) in pairwise(spans):
-        if low_span.overlaps(high_span) and (low.ssid, low.channel) != (high.ssid, high.channel):
-            message = f"overlaps mesh {low.name} on {low_span.low_mhz}-{low_span.high_mhz} MHz"
-            found = f"{high_span.low_mhz}-{high_span.high_mhz} MHz"
-            yield Finding(("meshes", high.name, "channel"), message, "a channel apart", found)
+    if not spans:
+        return
+    # sorted by lower edge, a cell overlaps the one that reaches highest so far or none
+    reaching, first = spans[0]
+    for span, mesh in spans[1:]:
+        if span.overlaps(reaching) and (mesh.ssid, mesh.channel) != (first.ssid, first.channel):
+            message = f"overlaps mesh {first.name} on {reaching.low_mhz}-{reaching.high_mhz} MHz"
+            found = f"{span.low_mhz}-{span.high_mhz} MHz"
+            yield Finding(("meshes", mesh.name, "channel"), message, "a channel apart", found)
+        if span.high_mhz > reaching.high_mhz:
+            reaching, first = span, mesh
 
 
 @fleet_rule(

@@ -60,7 +60,7 @@ def encrypted_adhoc_on_25_12(fleet: Fleet, _context: LintContext) -> Iterator[Fi
 def key_missing(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in fleet.meshes.values():
         if mesh.encryption is not Encryption.NONE and mesh.key is None:
-            path = ("meshes", mesh.name, "encryption")
+            path = ("meshes", mesh.name, "key")
             yield Finding(path, f"{mesh.encryption.value} needs a key", "a reference in `key`", "none")
 
 
@@ -185,9 +185,15 @@ def mesh_open(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def passphrase_not_allowed(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, value in _passphrases(fleet, context):
-        if not _is_passphrase(value):
+        path = ("meshes", mesh.name, "key")
+        if mesh.encryption is Encryption.PSK2 and not _is_passphrase(value):
             expected = "8 to 63 printable ASCII characters, or 64 hexadecimal digits"
-            yield Finding(("meshes", mesh.name, "key"), "no passphrase", expected, f"{len(value)} characters")
+            yield Finding(path, "no passphrase", expected, f"{len(value)} characters")
+        elif mesh.encryption is Encryption.SAE and not (1 <= len(value) <= 128 and value.isprintable()):
+            yield Finding(path, "no passphrase", "1 to 128 characters on one line", f"{len(value)} characters")
+        elif "'" in value and any(node.release >= Release.V25_12 for node in fleet.members(mesh.name)):
+            # as in an SSID, see MC310
+            yield Finding(path, "breaks on OpenWrt 25.12", "no apostrophe", "one")
 
 
 def _passphrases(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, str]]:
@@ -215,6 +221,8 @@ def _is_passphrase(value: str) -> bool:
 )
 def passphrase_short(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, value in _passphrases(fleet, context):
-        if _is_passphrase(value) and len(value) < _SAFE_PASSPHRASE_LETTERS:
+        # SAE's handshake cannot be tried against later
+        is_tried = mesh.encryption is Encryption.PSK2 and _is_passphrase(value)
+        if is_tried and len(value) < _SAFE_PASSPHRASE_LETTERS:
             expected = f"at least {_SAFE_PASSPHRASE_LETTERS} characters"
             yield Finding(("meshes", mesh.name, "key"), "can be found by trying", expected, f"{len(value)} characters")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from pathlib import PurePath
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
@@ -77,9 +78,9 @@ def image_lacks_packages(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         if not profile.firmware.image or not all(name in fleet.meshes for name in node.meshes):
             continue
         named = {*profile.packages, *node.packages}
-        brought = " ".join(profile.package_files)
+        brought = [PurePath(file).name for file in profile.package_files]
         for need in package_needs(fleet, node):
-            if not named.intersection(need.any_of) and not any(name in brought for name in need.any_of):
+            if not named.intersection(need.any_of) and not any(file.startswith(need.any_of) for file in brought):
                 path = ("hardware", profile.name, "packages")
                 yield Finding(path, need.reason, f"one of {listed(need.any_of)}", "none of them")
 

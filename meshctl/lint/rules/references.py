@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from difflib import get_close_matches
+from functools import lru_cache
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
@@ -11,15 +12,33 @@ from meshctl.lint.grouping import listed
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet
 
+# comparing a name with more than these takes longer than a person would wait
+_COMPARED = 500
+_SHOWN_JUMPS = 8
+
 
 def known(names: Iterable[str], wrong: str) -> tuple[str, str]:
     """What was expected, and the hint, for a name that none of `names` is."""
-    choices = sorted(names)
-    near = get_close_matches(wrong, choices, 1)
-    return (
-        f"one of {listed(choices)}" if choices else "none, there are none",
-        f"did you mean {near[0]}?" if near else "",
-    )
+    choices = tuple(sorted(names))
+    near = _nearest(choices, wrong)
+    return f"one of {listed(choices)}" if choices else "none, there are none", f"did you mean {near}?" if near else ""
+
+
+@lru_cache(maxsize=256)
+def _nearest(choices: tuple[str, ...], wrong: str) -> str:
+    if len(choices) > _COMPARED:
+        return ""
+    return next(iter(get_close_matches(wrong, choices, 1)), "")
+
+
+def _unknown(fleet: Fleet, path: tuple[str, ...], names: Sequence[str]) -> Iterator[Finding]:
+    """One finding for all of a list's names that no node has."""
+    wrong = [name for name in names if name not in fleet.nodes]
+    if wrong:
+        _, hint = known(fleet.nodes, wrong[0])
+        yield Finding(
+            path, "no such node" if len(wrong) == 1 else "no such nodes", "names of `nodes`", listed(wrong), hint
+        )
 
 
 @fleet_rule(
@@ -67,11 +86,7 @@ def unknown_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def unknown_node_of_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot in fleet.robots.values():
-        for index, name in enumerate(robot.nodes):
-            if name not in fleet.nodes:
-                _, hint = known(fleet.nodes, name)
-                path = ("robots", robot.name, "nodes", str(index))
-                yield Finding(path, "no such node", "a name of `nodes`", name, hint)
+        yield from _unknown(fleet, ("robots", robot.name, "nodes"), robot.nodes)
 
 
 @fleet_rule(
@@ -85,11 +100,7 @@ def unknown_node_of_robot(fleet: Fleet, _context: LintContext) -> Iterator[Findi
 )
 def unknown_carried_node(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot in fleet.robots.values():
-        for index, name in enumerate(robot.carries):
-            if name not in fleet.nodes:
-                _, hint = known(fleet.nodes, name)
-                path = ("robots", robot.name, "carries", str(index))
-                yield Finding(path, "no such node", "a name of `nodes`", name, hint)
+        yield from _unknown(fleet, ("robots", robot.name, "carries"), robot.carries)
 
 
 @fleet_rule(
@@ -123,20 +134,20 @@ def unknown_jump(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="nodes: {b01: {ssh: {jump: base}}}",
 )
 def jump_circle(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    arrives: dict[str, bool] = {}
+    settled: set[str] = set()
     for node in fleet.nodes.values():
-        way: list[str] = []
+        way: dict[str, None] = {}
         name = node.name
-        while name in fleet.nodes and name not in arrives and name not in way:
-            way.append(name)
+        while name in fleet.nodes and name not in settled and name not in way:
+            way[name] = None
             name = fleet.nodes[name].ssh.jump
-        closes = name in way
-        fine = not closes and arrives.get(name, True)
-        if closes:
-            circle = [*way[way.index(name) :], name]
+        if name in way:
+            names = list(way)
+            circle = [*names[names.index(name) :], name]
+            found = " -> ".join(circle[:_SHOWN_JUMPS]) + (" -> ..." if len(circle) > _SHOWN_JUMPS else "")
             path = ("nodes", name, "ssh", "jump")
-            yield Finding(path, "the jumps go in a circle", "a node reached directly at the end", " -> ".join(circle))
-        arrives.update(dict.fromkeys(way, fine))
+            yield Finding(path, "the jumps go in a circle", "a node reached directly at the end", found)
+        settled.update(way)
 
 
 @fleet_rule(

@@ -1,21 +1,23 @@
-"""Whether every kind of node can be rendered at all: templates (MC901)."""
+"""Whether every kind of node renders: templates, the firewall that results, values (MC901 to MC903)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
 
+from meshctl import uci
 from meshctl.diagnostics import InvalidInput, Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Fleet, Node, Secret, SecretRef
-from meshctl.render import Templates, render
+from meshctl.render import Rendered, Templates, render
+from meshctl.render.extra import EXTRA
 from meshctl.render.templates import NO_TEMPLATE, NOT_UCI, TEMPLATE
 from meshctl.resolve import resolve
 
 # stands for every secret: it is allowed as a passphrase, and never leaves this module
 _PLACEHOLDER = Secret("placeholder-for-lint")
-_TEMPLATE_CODES = (TEMPLATE, NOT_UCI, NO_TEMPLATE)
+_TEMPLATE_CODES = (TEMPLATE, NOT_UCI, NO_TEMPLATE, EXTRA)
 
 
 def _placeholder(_ref: SecretRef) -> Secret:
@@ -23,20 +25,15 @@ def _placeholder(_ref: SecretRef) -> Secret:
 
 
 def _kinds(fleet: Fleet) -> Iterator[Node]:
-    """One managed node of every kind that the operator's own text goes into; nodes that differ in nothing but name and
-    address render alike, and meshctl's own templates are tested with it."""
-    own_templates = (Path(fleet.base) / "templates").is_dir()
+    """One managed node of every kind: nodes that differ in nothing but name and address render alike."""
     seen = set()
     for node in fleet.managed():
         if not all(name in fleet.meshes for name in node.meshes):
             continue
-        if not (own_templates or node.extra_uci or any(fleet.meshes[m].operator_parts.templates for m in node.meshes)):
-            continue
         kind = (
             node.hardware.name,
             node.release,
-            node.role,
-            tuple(radio.mesh for radio in node.radios),
+            tuple((radio.mesh, radio.tx_power_dbm) for radio in node.radios),
             node.lan_ports,
             tuple(node.extra_uci.items()),
             node.gateway is None,
@@ -44,6 +41,12 @@ def _kinds(fleet: Fleet) -> Iterator[Node]:
         if kind not in seen:
             seen.add(kind)
             yield node
+
+
+def _holds_own_text(fleet: Fleet, node: Node) -> bool:
+    """Whether the operator's own text goes into its files: meshctl's own templates are tested with meshctl."""
+    own_templates = (Path(fleet.base) / "templates").is_dir()
+    return own_templates or bool(node.extra_uci) or any(fleet.meshes[m].operator_parts.templates for m in node.meshes)
 
 
 @fleet_rule(
@@ -61,18 +64,86 @@ def _kinds(fleet: Fleet) -> Iterator[Node]:
     ),
 )
 def template_fails(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    templates = Templates.of(fleet)
     seen = set()
+    for _, outcome in _rendered(fleet):
+        if isinstance(outcome, Rendered):
+            continue
+        for item in outcome.diagnostics:
+            if item.code in _TEMPLATE_CODES and (item.position, item.message) not in seen:
+                seen.add((item.position, item.message))
+                yield Finding((), item.message, item.expected, item.found, item.hint, item.position)
+
+
+@fleet_rule(
+    "MC902",
+    Severity.ERROR,
+    "The management network is in no firewall zone that lets it in",
+    why="""From 23.05 OpenWrt rejects what no zone allows, and meshctl's own template does so on every release. It
+    renders a zone for the management network; a template of your own, or extra text behind it, that leaves the zone out
+    or closes it shuts the operator out.""",
+    mend="Keep a zone with `list network 'lan'` and `option input 'ACCEPT'` in the firewall package.",
+    failing="nodes: {b01: {extra_uci: {firewall.management.input: REJECT}}}",
+    passing="nodes: {b01: {extra_uci: {firewall.management.masq: '1'}}}",
+)
+def management_shut_out(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node, outcome in _rendered(fleet):
+        if not isinstance(outcome, Rendered):
+            continue
+        for file in outcome.files:
+            if file.package is not None and file.package.name == "firewall" and not _lets_in(file.package):
+                extra = next((("extra_uci", key) for key in node.extra_uci if key.startswith("firewall.")), ())
+                expected = "a zone of network lan with input ACCEPT"
+                yield Finding(("nodes", node.name, *extra), "nobody could log in any more", expected, "none")
+
+
+def _lets_in(firewall: uci.Package) -> bool:
+    for section in firewall.sections:
+        is_open = section.get("input").upper() == "ACCEPT"
+        if is_open and section.type == "zone" and "lan" in section.get("network").split():
+            return True
+        if is_open and section.type == "defaults":
+            return True
+    return False
+
+
+def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Rendered | InvalidInput]]:
+    """Every kind of node with its files, or with what keeps them from being rendered."""
+    templates = Templates.of(fleet)
     for node in _kinds(fleet):
+        if not _holds_own_text(fleet, node):
+            continue
         try:
             intent = resolve(fleet, node, _placeholder)
         except InvalidInput:
             # values that cannot be written down have rules of their own
             continue
         try:
-            render(intent, templates)
+            outcome: Rendered | InvalidInput = render(intent, templates)
+        except InvalidInput as error:
+            outcome = error
+        yield node, outcome
+
+
+@fleet_rule(
+    "MC903",
+    Severity.ERROR,
+    "A value cannot be written into the node's files",
+    why="""UCI holds any text, but the programs behind it do not: netifd's scripts put values into shell commands, the
+    supplicant reads lines. `meshctl render` refuses such a value; here it is found with all the others. Where a rule of
+    its own speaks of the same place, this one is silent.""",
+    mend="Write the value as it is expected.",
+    failing="nodes: {b01: {extra_uci: {'wireless.radio0 .rts': '500'}}}",
+    passing="nodes: {b01: {extra_uci: {wireless.radio0.rts: '500'}}}",
+    is_fallback=True,
+)
+def value_unwritable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    seen = set()
+    for node in _kinds(fleet):
+        try:
+            resolve(fleet, node, _placeholder)
         except InvalidInput as error:
             for item in error.diagnostics:
-                if item.code in _TEMPLATE_CODES and (item.position, item.message) not in seen:
-                    seen.add((item.position, item.message))
-                    yield Finding((), item.message, item.expected, item.found, item.hint, item.position)
+                if (item.position, item.path) not in seen:
+                    seen.add((item.position, item.path))
+                    path = tuple(item.path.split("."))
+                    yield Finding(path, item.message, item.expected, item.found, item.hint, item.position)

@@ -9,7 +9,7 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import grouped, listed
 from meshctl.lint.rule import Example, Finding, fleet_rule
-from meshctl.model import Backend, Fleet, Mesh
+from meshctl.model import Backend, Fleet, Mesh, NodeState
 from meshctl.resolve import MEASURED_HEAL_S, UnreachableTarget, batman_intervals, heal_s, originator_airtime
 
 # batman-adv's header around a full Ethernet frame (openwrt-facts: 1500 + 32)
@@ -44,11 +44,13 @@ def _batman_meshes(fleet: Fleet) -> Iterator[Mesh]:
     mend="Ask for a longer `reconnect_s`, raise `mcast_rate_kbps`, keep `aggregated_ogms` on, or split the mesh.",
     failing="""
     meshes: {main: {reconnect_s: 0.6}}
-    nodes: {"c[01-60]": {address: {from: 10.42.0.121}}}
+    nodes: {"c[01-60]": {state: carried, address: {from: 10.42.0.121}}}
+    robots: {husky1: {carries: ["c[01-60]", b01]}}
     """,
     passing="""
     meshes: {main: {reconnect_s: 5}}
-    nodes: {"c[01-20]": {address: {from: 10.42.0.121}}}
+    nodes: {"c[01-20]": {state: carried, address: {from: 10.42.0.121}}}
+    robots: {husky1: {carries: ["c[01-20]", b01]}}
     """,
 )
 def originators_eat_channel(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
@@ -64,11 +66,13 @@ def originators_eat_channel(fleet: Fleet, _context: LintContext) -> Iterator[Fin
     mend="Ask for a longer `reconnect_s`, raise `mcast_rate_kbps`, or keep `aggregated_ogms` on.",
     failing="""
     meshes: {main: {reconnect_s: 5}}
-    nodes: {"c[01-40]": {address: {from: 10.42.0.121}}}
+    nodes: {"c[01-40]": {state: carried, address: {from: 10.42.0.121}}}
+    robots: {husky1: {carries: ["c[01-40]", b01]}}
     """,
     passing="""
     meshes: {main: {reconnect_s: 5}}
-    nodes: {"c[01-20]": {address: {from: 10.42.0.121}}}
+    nodes: {"c[01-20]": {state: carried, address: {from: 10.42.0.121}}}
+    robots: {husky1: {carries: ["c[01-20]", b01]}}
     """,
 )
 def originators_take_much(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
@@ -76,7 +80,8 @@ def originators_take_much(fleet: Fleet, _context: LintContext) -> Iterator[Findi
 
 
 def _airtime(fleet: Fleet, least: float, most: float) -> Iterator[Finding]:
-    members = grouped((mesh, node) for node in fleet.managed() for mesh in node.meshes)
+    on_air = (node for node in fleet.managed() if node.state is not NodeState.SPARE)
+    members = grouped((mesh, node.name) for node in on_air for mesh in node.meshes)
     for mesh in _batman_meshes(fleet):
         nodes = len(members.get(mesh.name, []))
         try:

@@ -59,7 +59,7 @@ def _secret_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], Path, str]]:
     seen: set[str] = set()
     for node in fleet.nodes.values():
         for index, file in enumerate(node.ssh.key_files):
-            if file not in seen:
+            if file not in seen and not file.endswith(".pub"):
                 seen.add(file)
                 place = ("nodes", node.name, "ssh", "key_files", str(index))
                 yield place, _path(fleet, file, fleet.base), "the private key"
@@ -131,9 +131,10 @@ def secret_in_repository(fleet: Fleet, context: LintContext) -> Iterator[Finding
 @fleet_rule(
     "MC444",
     Severity.ERROR,
-    "A file that a secret refers to is missing",
-    why="Nothing can be rendered on this machine; it is better to learn it now than at the field's edge.",
-    mend="Bring the file, or mend the path: it is relative to the file that names it.",
+    "An encrypted file that a secret refers to is missing",
+    why="""An encrypted file is meant to travel with the inventory. Without it nobody can render anything, and it is
+    better to learn that now than in the field.""",
+    mend="Commit the file, or mend the path: it is relative to the file that names it.",
     failing="udp_mesh: {keys: [{age: absent.age, key: udp_mesh}]}",
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}]}",
 )

@@ -64,10 +64,16 @@ def _reached_from_base(fleet: Fleet) -> set[str]:
     for robot in fleet.robots.values():
         nodes = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
         joints.append({mesh for node in nodes if node.state.is_managed for mesh in node.meshes})
-    reached = start
-    # each pass adds a mesh or ends: at most as many passes as there are meshes
-    while more := {mesh for joint in joints if joint & reached for mesh in joint} - reached:
-        reached = reached | more
+    joints_of = grouped((mesh, joint) for joint in joints for mesh in joint)
+    reached: set[str] = set()
+    waiting = list(start)
+    while waiting:
+        mesh = waiting.pop()
+        if mesh not in reached:
+            reached.add(mesh)
+            # a joint leads on once, whichever of its meshes is reached first
+            for joint in joints_of.pop(mesh, []):
+                waiting.extend(joint - reached)
     return reached
 
 
@@ -139,15 +145,15 @@ def two_bases(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def node_of_two_robots(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     claims = (
-        (name, (robot.name, key, str(index)))
+        (name, (robot.name, key))
         for robot in fleet.robots.values()
         for key, names in (("nodes", robot.nodes), ("carries", robot.carries))
-        for index, name in enumerate(names)
+        for name in names
     )
-    for name, claimed in repeated(claims):
-        for robot, key, index in claimed[1:]:
-            message = f"{name} is claimed by {claimed[0][0]} already"
-            yield Finding(("robots", robot, key, index), message, "one robot for each node", name)
+    for name, ((first, _), *others) in repeated(claims):
+        for robot, key in others:
+            message = f"{name} is claimed by {first} already"
+            yield Finding(("robots", robot, key), message, "one robot for each node", name)
 
 
 @fleet_rule(
@@ -185,10 +191,10 @@ def robot_disagrees(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def carries_no_beacon(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot in fleet.robots.values():
-        for index, name in enumerate(robot.carries):
+        for name in robot.carries:
             node = fleet.nodes.get(name)
             if node is not None and node.role is not Role.BEACON:
-                path = ("robots", robot.name, "carries", str(index))
+                path = ("robots", robot.name, "carries")
                 yield Finding(path, f"{name} is not dropped", "a node with role beacon", node.role.value)
 
 

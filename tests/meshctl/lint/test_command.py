@@ -1,0 +1,130 @@
+"""`meshctl lint` as a user meets it: arguments, files, exit status."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from meshctl.cli.main import main
+from meshctl.lint.example import BASE, ENVIRONMENT
+from meshctl.lint.pages import page
+from meshctl.lint.rules.power import conducted_above_fcc
+
+_FAULTY = BASE + "apply: {canary: false, quorum: 0.2}\n"
+
+
+@pytest.fixture(autouse=True)
+def _secrets(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name, value in ENVIRONMENT.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.delenv("MESHCTL_INVENTORY", raising=False)
+    monkeypatch.chdir(tmp_path)
+
+
+def _lint(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["lint", *arguments])
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+def _file(name: str, text: str) -> str:
+    Path(name).write_text(text, encoding="utf-8")
+    return name
+
+
+def test_a_clean_inventory_exits_with_0(capsys: pytest.CaptureFixture[str]) -> None:
+    assert _lint(_file("clean.yaml", BASE)) == 0
+    assert capsys.readouterr().out == "nothing found in 1 file\n"
+
+
+def test_findings_exit_with_1_and_name_their_places(capsys: pytest.CaptureFixture[str]) -> None:
+    assert _lint(_file("faulty.yaml", _FAULTY)) == 1
+    out = capsys.readouterr().out
+    assert f"faulty.yaml:{_FAULTY.count(chr(10))}:17: warning: apply.canary" in out
+    assert out.endswith("2 warnings in 1 file\n")
+
+
+def test_an_inventory_that_does_not_load_is_a_finding() -> None:
+    assert _lint(_file("wrong.yaml", BASE.replace("channel: 6", "channel: six"))) == 1
+    assert _lint(_file("broken.yaml", "a: [")) == 1
+
+
+def test_what_cannot_be_read_exits_with_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert _lint("absent.yaml") == 2
+    assert "absent.yaml: error: cannot be read" in capsys.readouterr().out
+    assert _lint(_file("clean.yaml", BASE), "--regdb", "absent.db") == 2
+    assert _lint("clean.yaml", "--select", "MC9999") == 2
+    assert _lint("clean.yaml", "--explain", "nonsense") == 2
+    assert _lint("clean.yaml", "--baseline", "absent.json") == 2
+    assert _lint("clean.yaml", "--write-baseline") == 2
+    assert _lint("clean.yaml", "--output", "absent/report.txt") == 2
+    err = capsys.readouterr().err
+    assert "Traceback" not in err
+    assert "absent.db: cannot be read" in err
+
+
+def test_the_default_is_the_variable_and_then_the_directory(monkeypatch: pytest.MonkeyPatch) -> None:
+    _file("fleet.yaml", BASE)
+    assert _lint() == 0
+    monkeypatch.setenv("MESHCTL_INVENTORY", _file("other.yaml", _FAULTY))
+    assert _lint() == 1
+
+
+def test_severities_below_the_threshold_do_not_count() -> None:
+    note = _file("note.yaml", BASE.replace("    mac: 00:15:6d:00:00:01\n", ""))
+    assert _lint(note) == 0
+    assert _lint(note, "--fail-on", "note") == 1
+    assert _lint(_file("faulty.yaml", _FAULTY), "--fail-on", "error") == 0
+
+
+def test_rules_are_chosen_by_the_start_of_their_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    faulty = _file("faulty.yaml", _FAULTY)
+    assert _lint(faulty, "--select", "MC615") == 1
+    assert "MC614" not in capsys.readouterr().out
+    assert _lint(faulty, "--select", "MC1,MC2") == 0
+    assert _lint(faulty, "--ignore", "MC614", "--ignore", "MC615") == 0
+    suppressed = _FAULTY.rstrip() + "  # meshctl: ignore MC614, MC615 -- bench\n"
+    # a rule that did not run leaves its comments alone
+    assert _lint(_file("suppressed.yaml", suppressed), "--select", "MC614,MC002") == 0
+
+
+def test_several_inventories_are_reported_together(capsys: pytest.CaptureFixture[str]) -> None:
+    assert _lint(_file("faulty.yaml", _FAULTY), _file("clean.yaml", BASE), "faulty.yaml", "--format", "json") == 1
+    document = json.loads(capsys.readouterr().out)
+    assert document["summary"]["files"] == ["faulty.yaml", "clean.yaml"]
+    assert document["summary"]["warning"] == 2
+
+
+def test_a_baseline_makes_only_new_findings_count(capsys: pytest.CaptureFixture[str]) -> None:
+    faulty = _file("faulty.yaml", _FAULTY)
+    assert _lint(faulty, "--baseline", "known.json", "--write-baseline") == 0
+    assert _lint(faulty, "--baseline", "known.json") == 0
+    assert "(2 in the baseline)" in capsys.readouterr().out
+    worse = _FAULTY.replace("quorum: 0.2", "quorum: 0.2, stop_after_failures: 9")
+    assert _lint(_file("faulty.yaml", worse), "--baseline", "known.json") == 1
+    assert "1 warning in 1 file (2 in the baseline)" in capsys.readouterr().out
+    assert _lint(_file("faulty.yaml", BASE), "--baseline", "known.json") == 0
+    assert capsys.readouterr().out.count("[MC004]") == 2
+
+
+@pytest.mark.parametrize("form", ["text", "json", "sarif", "junit", "github"])
+def test_every_format_goes_to_a_file_as_well(form: str, capsys: pytest.CaptureFixture[str]) -> None:
+    faulty = _file("faulty.yaml", _FAULTY)
+    assert _lint(faulty, "--format", form) == 1
+    printed = capsys.readouterr().out
+    assert _lint(faulty, "--format", form, "--output", "report") == 1
+    assert Path("report").read_text(encoding="utf-8") == printed
+    assert capsys.readouterr().out == ""
+
+
+def test_explain_prints_the_rules_page(capsys: pytest.CaptureFixture[str]) -> None:
+    assert _lint("--explain", "mc342") == 0
+    assert capsys.readouterr().out == page(conducted_above_fcc)
+    assert _lint("--explain", "INV020") == 0
+    assert "INV020" in capsys.readouterr().out
+
+
+def test_list_names_every_rule(capsys: pytest.CaptureFixture[str]) -> None:
+    assert _lint("--list") == 0
+    assert "MC342  error    The conducted power is above the FCC's limit\n" in capsys.readouterr().out

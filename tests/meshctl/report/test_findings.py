@@ -1,0 +1,191 @@
+"""Findings in every format: the same findings, well formed, escaped."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from meshctl.diagnostics import Diagnostic, Position, Severity
+from meshctl.lint import Suppressed
+from meshctl.report.findings import FORMATS, Findings, github, junit, sarif, text
+from meshctl.report.findings import json as as_json
+
+_CHANNEL = Diagnostic(
+    "MC323",
+    Severity.ERROR,
+    Position("inventory/fleet.yaml", 2, 20),
+    "not allowed",
+    "meshes.main.channel",
+    "one of 1-11 (country US)",
+    "13",
+    "Choose a channel that the country allows.",
+)
+_UNREADABLE = Diagnostic("INV001", Severity.ERROR, Position("absent.yaml"), "cannot be read: No such file")
+_NOTE = Diagnostic("MC408", Severity.NOTE, Position("inventory/fleet.yaml", 3, 1), "anyone in reach can join")
+_SOURCES = {"inventory/fleet.yaml": "meshes:\n  main: {\tchannel: 13}\nlast: 1\n"}
+_FINDINGS = Findings(
+    (_CHANNEL, _NOTE),
+    _SOURCES,
+    excused=(Suppressed(_NOTE, "the radios of the competition stay open"),),
+    known=(_CHANNEL,),
+    files=("inventory/fleet.yaml",),
+)
+_NOTHING = Findings((), {"fleet.yaml": "a: 1\n"}, files=("fleet.yaml",))
+
+
+def test_text_shows_the_line_with_a_caret_the_remedy_and_a_summary() -> None:
+    assert text(_FINDINGS) == (
+        "inventory/fleet.yaml:2:20: error: meshes.main.channel: not allowed: expected one of 1-11 (country US),"
+        " found 13 [MC323]\n"
+        "  2 |   main: {\tchannel: 13}\n"
+        "    |          \t         ^\n"
+        "  = Choose a channel that the country allows.\n"
+        "inventory/fleet.yaml:3:1: note: anyone in reach can join [MC408]\n"
+        "  3 | last: 1\n"
+        "    | ^\n"
+        "1 error, 1 note in 1 file (1 suppressed, 1 in the baseline)\n"
+    )
+    assert text(_NOTHING) == "nothing found in 1 file\n"
+
+
+def test_text_leaves_out_lines_that_are_unknown_or_endless() -> None:
+    endless = Findings((_CHANNEL,), {"inventory/fleet.yaml": "a\n" + "x" * 5000})
+    assert "xxx" not in text(endless)
+    assert text(Findings((_UNREADABLE,))).startswith("absent.yaml: error: cannot be read")
+
+
+def test_text_cannot_move_the_terminals_cursor() -> None:
+    bad = Diagnostic("MC111", Severity.ERROR, Position("f.yaml", 1, 1), "", "nodes.b", "", "\x1b[2J\r")
+    assert "\x1b" not in text(Findings((bad,), {"f.yaml": "\x1b[31mred"}))
+
+
+def test_json_holds_everything_a_script_needs() -> None:
+    document = json.loads(as_json(_FINDINGS))
+    assert document["version"] == 1
+    first = document["findings"][0]
+    assert (first["code"], first["severity"], first["line"], first["column"]) == ("MC323", "error", 2, 20)
+    assert (first["path"], first["expected"], first["found"]) == (
+        "meshes.main.channel",
+        "one of 1-11 (country US)",
+        "13",
+    )
+    assert re.fullmatch("[0-9a-f]{32}", first["fingerprint"])
+    assert document["suppressed"][0]["reason"] == "the radios of the competition stay open"
+    assert document["summary"] == {
+        "error": 1,
+        "warning": 0,
+        "note": 1,
+        "suppressed": 1,
+        "baseline": 1,
+        "files": ["inventory/fleet.yaml"],
+    }
+
+
+def _check_sarif(log: dict[str, Any]) -> None:
+    """What the schema of SARIF 2.1.0 requires of the objects used here."""
+    assert log["version"] == "2.1.0"
+    assert log["$schema"].startswith("https://")
+    for run in log["runs"]:
+        driver = run["tool"]["driver"]
+        assert driver["name"]
+        rules = driver["rules"]
+        assert len({rule["id"] for rule in rules}) == len(rules)
+        for rule in rules:
+            assert rule["shortDescription"]["text"]
+            assert rule["defaultConfiguration"]["level"] in ("none", "note", "warning", "error")
+        assert run["columnKind"] in ("utf16CodeUnits", "unicodeCodePoints")
+        for result in run["results"]:
+            assert result["message"]["text"]
+            assert result["level"] in ("none", "note", "warning", "error")
+            assert rules[result["ruleIndex"]]["id"] == result["ruleId"]
+            assert result.get("baselineState", "new") in ("new", "unchanged", "updated", "absent")
+            assert all(isinstance(value, str) for value in result["partialFingerprints"].values())
+            for suppression in result.get("suppressions", []):
+                assert suppression["kind"] in ("inSource", "external")
+            for location in result["locations"]:
+                physical = location["physicalLocation"]
+                assert re.fullmatch(r"[A-Za-z0-9\-._~:/?#@!$&'()*+,;=%]+", physical["artifactLocation"]["uri"])
+                region = physical.get("region", {"startLine": 1})
+                assert region["startLine"] >= 1
+                assert region.get("startColumn", 1) >= 1
+
+
+def test_sarif_has_the_required_structure_and_all_that_was_found() -> None:
+    log = json.loads(sarif(_FINDINGS))
+    _check_sarif(log)
+    (run,) = log["runs"]
+    assert [result["ruleId"] for result in run["results"]] == ["MC323", "MC408", "MC408", "MC323"]
+    assert run["results"][0]["locations"][0]["physicalLocation"] == {
+        "artifactLocation": {"uri": "inventory/fleet.yaml", "uriBaseId": "%SRCROOT%"},
+        "region": {"startLine": 2, "startColumn": 20},
+    }
+    assert run["results"][2]["suppressions"][0]["justification"] == "the radios of the competition stay open"
+    assert run["results"][3]["baselineState"] == "unchanged"
+    _check_sarif(json.loads(sarif(_NOTHING)))
+    _check_sarif(json.loads(sarif(Findings((_UNREADABLE,)))))
+
+
+def test_sarif_names_files_relative_to_the_working_directory_or_absolutely(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def uri(file: str) -> str:
+        item = Diagnostic("MC323", Severity.ERROR, Position(file, 1, 1), "x")
+        result = json.loads(sarif(Findings((item,))))["runs"][0]["results"][0]
+        return str(result["locations"][0]["physicalLocation"]["artifactLocation"]["uri"])
+
+    assert uri(str(tmp_path / "a b" / "ü.yaml")) == "a%20b/%C3%BC.yaml"
+    assert uri("/elsewhere/f.yaml") == "file:///elsewhere/f.yaml"
+
+
+def test_junit_counts_errors_and_warnings_as_failures() -> None:
+    root = ElementTree.fromstring(junit(_FINDINGS).encode())
+    assert (root.tag, root.get("tests"), root.get("failures")) == ("testsuites", "2", "1")
+    (suite,) = root
+    assert (suite.get("name"), suite.get("tests"), suite.get("failures")) == ("inventory/fleet.yaml", "2", "1")
+    failed, noted = suite
+    failure = failed.find("failure")
+    assert failure is not None
+    assert failure.get("type") == "error"
+    assert "expected one of 1-11" in (failure.text or "")
+    assert failed.get("line") == "2"
+    assert noted.find("failure") is None
+
+
+def test_junit_has_a_passed_case_for_a_clean_file() -> None:
+    root = ElementTree.fromstring(junit(_NOTHING).encode())
+    (case,) = root.iter("testcase")
+    assert (case.get("classname"), len(case)) == ("fleet.yaml", 0)
+
+
+def test_github_escapes_what_would_start_another_command() -> None:
+    bad = Diagnostic("MC111", Severity.WARNING, Position("a,b:c%.yaml", 1, 2), "50 %\n::stop-commands::x", hint="so")
+    assert github(Findings((bad,))) == (
+        "::warning file=a%2Cb%3Ac%25.yaml,line=1,col=2,title=meshctl MC111::50 %25%0A::stop-commands::x%0Aso\n"
+    )
+    assert github(_NOTHING) == ""
+    assert github(Findings((_NOTE,))).startswith("::notice file=")
+
+
+_WORDS = st.text(max_size=30)
+
+
+@given(_WORDS, _WORDS, _WORDS, st.integers(0, 5), st.integers(0, 200))
+def test_no_text_breaks_any_format(message: str, found: str, file: str, line: int, column: int) -> None:
+    item = Diagnostic("MC111", Severity.ERROR, Position(file or "f", line, column), message, "nodes.b", "x", found)
+    findings = Findings((item,), {item.position.file: found}, files=(item.position.file,))
+    assert text(findings).count("[MC111]") >= 1
+    assert json.loads(as_json(findings))["findings"][0]["found"] == found
+    _check_sarif(json.loads(sarif(findings)))
+    ElementTree.fromstring(junit(findings).encode("utf-8"))
+    assert github(findings).count("\n") == 1
+
+
+def test_the_formats_are_named_as_on_the_command_line() -> None:
+    assert list(FORMATS) == ["text", "json", "sarif", "junit", "github"]
