@@ -127,7 +127,8 @@ def leave_level(
             _begin(outbound, way, message)
             run = Run(message, 0, message.fragments, again=False)
         before = used
-        if run.position and run.length > 2 and permitted > 1 and gate is None:
+        is_plain = gate is None and message.accepted.broadcast_number is None
+        if run.position and run.length > 2 and permitted > 1 and is_plain:
             count = min(run.length - 1, permitted, 1 + (room_bytes - used) // message.fragment_bytes)
             used += _leave_run(outbound, way, run, count, mark, out)
         else:
@@ -160,6 +161,11 @@ def _begin(outbound: Outbound, way: Way, message: Outgoing) -> None:
     if channel.number not in outbound.announced:
         first -= 5 + len(channel.name.encode()) + len(channel.type_name.encode())
         first -= LENGTH_BYTES
+    cast_number = message.accepted.broadcast_number
+    if cast_number is not None:
+        # the copy of a lost cast keeps its number, or the receiver would take it for another message
+        message.begin(cast_number, way.fragment_bytes, max(1, first))
+        return
     message.begin(outbound.next_wire_id, way.fragment_bytes, max(1, first))
     outbound.next_wire_id += 1
 
@@ -291,10 +297,11 @@ def _frames(outbound: Outbound, run: Run, now: float, *, ack_now: bool) -> list[
     accepted = message.accepted
     wire_id = message.wire_id
     assert wire_id is not None
+    is_cast = accepted.broadcast_number is not None
     start, end = message.span(position)
     payload = memoryview(message.body)[start:end]
     if position:
-        return [Fragment(wire_id, position, payload, None, ack_now)]
+        return [Fragment(wire_id, position, payload, None, ack_now, is_cast)]
     head = MessageHead(
         len(message.body),
         message.fragments,
@@ -303,7 +310,7 @@ def _frames(outbound: Outbound, run: Run, now: float, *, ack_now: bool) -> list[
         accepted.flags,
         max(0, int((now - accepted.accepted_at) * 1000)),
     )
-    fragment = Fragment(wire_id, 0, payload, head, ack_now)
+    fragment = Fragment(wire_id, 0, payload, head, ack_now, is_cast)
     channel = accepted.channel
     if channel.number in outbound.announced:
         return [fragment]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from udp_mesh.core.events import MessageDelivered, MessageExpired, MessagePeerLost, Rejected
+from udp_mesh.core.events import MessageDelivered, MessageExpired, MessagePeerLost, MessageReceived, Rejected
 from udp_mesh.core.settings import Settings, Topic
 from udp_mesh.sim.command import find
 from udp_mesh.sim.medium import Channel
@@ -52,6 +52,26 @@ def test_an_urgent_message_overtakes_a_map_under_way() -> None:
     made.send("a", "estop", b"stop", "b")
     made.agenda.run_until(30.0)
     assert arrivals == ["estop", "map"]
+
+
+def test_a_repaired_broadcast_reaches_everybody_exactly_once() -> None:
+    arrivals: list[tuple[str, bytes]] = []
+    topics = (Topic("estop", priority=0, repair=True, deadline_s=10),)
+
+    def note(now: float, robot: str, event: object) -> None:
+        if isinstance(event, MessageReceived):
+            arrivals.append((robot, event.payload))
+
+    made = Team(
+        {name: Settings(name, unkeyed=True, topics=topics) for name in "abcd"},
+        channel=Channel(), loss=lambda a, b, now: 0.3, seed=3, on_event=note,
+    )  # fmt: skip
+    made.agenda.run_until(5.0)
+    for number in range(20):
+        made.send("a", "estop", bytes([number]))
+        made.agenda.run_until(5.0 * (number + 2))
+    made.agenda.run_until(130.0)
+    assert sorted(arrivals) == sorted((robot, bytes([number])) for robot in "bcd" for number in range(20))
 
 
 def test_a_crash_in_the_middle_of_a_transfer_is_survived() -> None:
