@@ -94,9 +94,14 @@ class Sandbox:
     def close(self) -> None:
         """End what still runs in the node: forget the change, which ends its timers, and stop what does not heed it."""
         shutil.rmtree(self.path("/etc/meshctl"), ignore_errors=True)
-        for number in self.processes():
-            with suppress(ProcessLookupError):
-                os.kill(number, signal.SIGKILL)
+        self.close_processes()
+
+    def close_processes(self) -> None:
+        """End everything that runs in the node, as a power cut does."""
+        while running := self.processes():
+            for number in running:
+                with suppress(ProcessLookupError):
+                    os.kill(number, signal.SIGKILL)
 
     def processes(self) -> list[int]:
         """What runs in the node now."""

@@ -1,0 +1,441 @@
+"""What the dead-man's switch does and what it refuses, verb by verb, on the real busybox ash."""
+
+from __future__ import annotations
+
+import gzip
+import re
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from meshctl.device.deadman import Change, NewFile, TarMember, bundle, tar_of
+from meshctl.device.parse.deadman import parse_status
+from meshctl.device.scripts import script
+from tests.meshctl.device.changes import (
+    BEFORE,
+    BUNDLE,
+    NONCE,
+    NONCE_HASH,
+    OWNER,
+    change,
+    is_after,
+    is_before,
+    live,
+    prepare,
+)
+from tests.meshctl.device.sandbox import Sandbox
+from tests.meshctl.device.servers import eventually
+
+LONG = "100000"
+OTHER = "bob@base:run-1"
+
+
+def staged(node: Sandbox, wanted: Change | None = None) -> None:
+    prepare(node, wanted)
+    assert node.deadman("lock", OWNER, LONG) == f"ok lock_owner={OWNER}"
+    assert node.deadman("stage", OWNER, "c1", BUNDLE) == "ok state=staged id=c1"
+
+
+def armed(node: Sandbox, window_s: str = LONG, wanted: Change | None = None) -> None:
+    staged(node, wanted)
+    assert node.deadman("arm", OWNER, "c1", NONCE_HASH, window_s) == "ok state=armed id=c1"
+
+
+def applied(node: Sandbox, window_s: str = LONG, wanted: Change | None = None) -> None:
+    armed(node, window_s, wanted)
+    assert node.deadman("apply", OWNER, "c1", "now").startswith("ok state=waiting id=c1")
+    eventually(lambda: state(node) in {"applied", "idle"})
+
+
+def state(node: Sandbox) -> str:
+    status = parse_status(node.deadman("status"))
+    assert status is not None
+    return status.state
+
+
+def last(node: Sandbox) -> tuple[str, str, str]:
+    status = parse_status(node.deadman("status"))
+    assert status is not None
+    return status.last_id, status.last_outcome, status.last_reason
+
+
+def refusal(answer: str) -> str:
+    words = answer.split()
+    assert words[0] == "refused", answer
+    return words[1]
+
+
+def test_a_confirmed_change_stays_and_the_services_run_with_it(node: Sandbox) -> None:
+    applied(node)
+    assert is_after(node.path("/etc"))
+    assert node.deadman("confirm", "c1", NONCE) == "ok state=idle id=c1 outcome=confirmed"
+    eventually(lambda: not node.processes())
+    assert is_after(node.path("/etc"))
+    assert "10.42.0.13" in (node.text("/harness/running") or "")
+    assert last(node) == ("c1", "confirmed", "operator")
+    assert not node.path("/etc/meshctl/change").exists()
+    node.reboot()
+    node.deadman("boot")
+    assert is_after(node.path("/etc"))
+
+
+def test_an_unconfirmed_change_is_taken_back_and_the_services_reloaded(node: Sandbox) -> None:
+    applied(node, window_s="1")
+    eventually(lambda: state(node) == "idle" and not node.processes())
+    assert is_before(node.path("/etc"))
+    assert "192.168.1.1" in (node.text("/harness/running") or "")
+    assert last(node) == ("c1", "restored", "timeout")
+    assert refusal(node.deadman("confirm", "c1", NONCE)) == "restored"
+
+
+def test_a_change_survives_no_reboot_unconfirmed(node: Sandbox) -> None:
+    applied(node)
+    node.close_processes()
+    node.reboot()
+    node.run("/bin/sh", "-c", ". /etc/init.d/meshctl-deadman; boot")
+    assert is_before(node.path("/etc"))
+    assert last(node) == ("c1", "restored", "boot")
+    assert node.path("/tmp/meshctl").exists()
+
+
+def test_the_boot_hook_runs_before_everything_that_reads_what_it_restores() -> None:
+    hook = script("deadman.init")
+    assert hook.startswith("#!/bin/sh /etc/rc.common\n")
+    start = re.search(r"^START=(\d+)$", hook, re.MULTILINE)
+    assert start is not None
+    # procd runs /etc/rc.d/S* in the order of their names: boot, system, log, dropbear, network
+    assert f"S{start[1]}meshctl-deadman" < min("S10boot", "S10system", "S12log", "S19dropbear", "S20network")
+
+
+def test_only_the_right_nonce_confirms_and_only_once_the_change_is_there(node: Sandbox) -> None:
+    armed(node)
+    assert refusal(node.deadman("confirm", "c1", NONCE)) == "not-applied"
+    node.deadman("apply", OWNER, "c1", "now")
+    eventually(lambda: state(node) == "applied")
+    assert refusal(node.deadman("confirm", "c1", "guess")) == "wrong-nonce"
+    assert refusal(node.deadman("confirm", "c2", NONCE)) == "wrong-state"
+    assert node.deadman("confirm", "c1", NONCE).startswith("ok")
+    assert node.deadman("confirm", "c1", NONCE) == "ok state=idle id=c1 outcome=confirmed"
+    assert refusal(node.deadman("confirm", "c1", "guess")) == "wrong-state"
+
+
+def test_the_nonce_itself_never_reaches_the_flash_before_it_is_said(node: Sandbox) -> None:
+    applied(node)
+    for path in node.path("/etc").rglob("*"):
+        if path.is_file() and not path.is_symlink():
+            assert NONCE not in path.read_text(errors="replace")
+
+
+def test_an_applied_change_is_taken_back_at_once_when_asked(node: Sandbox) -> None:
+    applied(node)
+    assert node.deadman("abort", OWNER, "c1").startswith("ok")
+    eventually(lambda: state(node) == "idle" and not node.processes())
+    assert is_before(node.path("/etc"))
+    assert last(node) == ("c1", "restored", "abort")
+    assert "192.168.1.1" in (node.text("/harness/running") or "")
+
+
+def test_staging_and_arming_change_nothing_and_are_undone_by_abort(node: Sandbox) -> None:
+    staged(node)
+    assert is_before(node.path("/etc"))
+    assert node.deadman("abort", OWNER, "c1") == "ok state=idle id=c1"
+    assert node.deadman("stage", OWNER, "c1", BUNDLE).startswith("ok")
+    assert node.deadman("arm", OWNER, "c1", NONCE_HASH, LONG).startswith("ok")
+    assert is_before(node.path("/etc"))
+    assert node.deadman("abort", OWNER, "c1") == "ok state=idle id=c1"
+    assert is_before(node.path("/etc"))
+    assert node.text("/harness/running") is None
+
+
+def test_every_verb_may_be_repeated_when_its_answer_was_lost(node: Sandbox) -> None:
+    staged(node)
+    assert node.deadman("stage", OWNER, "c1", BUNDLE).startswith("ok")
+    assert node.deadman("arm", OWNER, "c1", NONCE_HASH, LONG).startswith("ok")
+    assert node.deadman("arm", OWNER, "c1", NONCE_HASH, LONG).startswith("ok")
+    assert node.deadman("apply", OWNER, "c1", "now").startswith("ok")
+    assert refusal(node.deadman("apply", OWNER, "c1", "now")) == "busy"
+
+
+def test_a_newer_stage_takes_the_place_of_one_that_was_not_armed(node: Sandbox) -> None:
+    staged(node)
+    node.put(BUNDLE, bundle(change("c2")))
+    assert node.deadman("stage", OWNER, "c2", BUNDLE) == "ok state=staged id=c2"
+    assert refusal(node.deadman("arm", OWNER, "c1", NONCE_HASH, LONG)) == "wrong-state"
+    assert node.deadman("arm", OWNER, "c2", NONCE_HASH, LONG).startswith("ok")
+    assert refusal(node.deadman("stage", OWNER, "c1", BUNDLE)) == "busy"
+
+
+def test_two_operators_cannot_cross(node: Sandbox) -> None:
+    prepare(node)
+    assert refusal(node.deadman("stage", OWNER, "c1", BUNDLE)) == "not-locked"
+    assert node.deadman("lock", OWNER, LONG).startswith("ok")
+    assert refusal(node.deadman("lock", OTHER, LONG)) == "locked"
+    assert refusal(node.deadman("stage", OTHER, "c1", BUNDLE)) == "locked"
+    assert node.deadman("unlock", OTHER) == "ok"
+    assert refusal(node.deadman("lock", OTHER, LONG)) == "locked"
+    assert node.deadman("lock", OWNER, LONG).startswith("ok")
+    assert node.deadman("unlock", OWNER) == "ok"
+    assert node.deadman("lock", OTHER, LONG).startswith("ok")
+
+
+def test_an_armed_change_belongs_to_its_owner_even_after_the_lock_ran_out(node: Sandbox) -> None:
+    armed(node)
+    node.deadman("unlock", OWNER)
+    assert node.deadman("lock", OTHER, LONG).startswith("ok")
+    assert refusal(node.deadman("stage", OTHER, "c2", BUNDLE)) == "busy"
+    assert refusal(node.deadman("apply", OTHER, "c1", "now")) == "wrong-state"
+    # but whoever holds the lock may end what its owner left behind
+    assert node.deadman("abort", OTHER, "c1").startswith("ok")
+
+
+def test_a_lock_runs_out_by_itself_and_with_a_reboot(node: Sandbox) -> None:
+    assert node.deadman("lock", OWNER, "1").startswith("ok")
+    eventually(lambda: node.deadman("lock", OTHER, LONG).startswith("ok"))
+    boot_id = node.text("/harness/boot_id")
+    node.put("/harness/boot_id", "11111111-2222-3333-4444-555555555555\n")
+    assert node.deadman("lock", OWNER, LONG).startswith("ok"), f"a lock of boot {boot_id} counts no more"
+
+
+def test_of_many_who_grab_the_lock_at_once_exactly_one_gets_it(node: Sandbox) -> None:
+    owners = [f"operator-{n}" for n in range(12)]
+    for _ in range(3):
+        with ThreadPoolExecutor(len(owners)) as pool:
+            answers = list(pool.map(lambda owner: node.deadman("lock", owner, LONG), owners))
+        winners = [owner for owner, answer in zip(owners, answers, strict=True) if answer.startswith("ok")]
+        assert len(winners) == 1, answers
+        assert f"lock_owner={winners[0]} " in node.deadman("status")
+        node.deadman("unlock", winners[0])
+
+
+def test_foreign_uncommitted_changes_are_refused_before_anything_happens(node: Sandbox) -> None:
+    prepare(node)
+    node.deadman("lock", OWNER, LONG)
+    node.put("/tmp/.uci/delta", "network.lan.ipaddr='10.0.0.9'\n")
+    answer = node.deadman("stage", OWNER, "c1", BUNDLE)
+    assert refusal(answer) == "foreign-changes"
+    assert "network.lan.ipaddr='10.0.0.9'" in answer
+    assert not node.path("/etc/meshctl/change").exists()
+    node.path("/tmp/.uci/delta").unlink()
+    node.deadman("stage", OWNER, "c1", BUNDLE)
+    node.put("/tmp/.uci/delta", "wireless.radio0.channel='1'\n")
+    assert refusal(node.deadman("arm", OWNER, "c1", NONCE_HASH, LONG)) == "foreign-changes"
+
+
+def test_a_file_that_is_not_what_the_plan_saw_is_refused(node: Sandbox) -> None:
+    prepare(node)
+    node.deadman("lock", OWNER, LONG)
+    for path, text in (("/etc/config/network", "edited\n"), ("/etc/new/place/of.conf", "made by hand\n")):
+        node.put(path, text)
+        answer = node.deadman("stage", OWNER, "c1", BUNDLE)
+        assert refusal(answer) == "moved-on"
+        assert path in answer
+        node.path("/etc/config/network").write_text(BEFORE["/etc/config/network"][0])
+    assert not node.path("/etc/meshctl/change").exists()
+
+
+def test_an_edit_between_stage_and_arm_is_refused(node: Sandbox) -> None:
+    staged(node)
+    node.put("/etc/config/network", "edited\n")
+    assert refusal(node.deadman("arm", OWNER, "c1", NONCE_HASH, LONG)) == "moved-on"
+
+
+def test_an_edit_during_the_countdown_is_kept_and_the_change_dropped(node: Sandbox) -> None:
+    armed(node)
+    assert node.deadman("apply", OWNER, "c1", "in", "3").startswith("ok")
+    node.put("/etc/config/network", "edited in the last moment\n")
+    eventually(lambda: state(node) == "idle" and not node.processes())
+    assert node.text("/etc/config/network") == "edited in the last moment\n"
+    assert live(node.path("/etc")).items() >= {k: v for k, v in BEFORE.items() if k != "/etc/config/network"}.items()
+    assert last(node) == ("c1", "refused", "moved-on")
+
+
+def test_the_switch_waits_for_its_moment_and_can_be_called_off_until_then(node: Sandbox) -> None:
+    armed(node)
+    answer = node.deadman("apply", OWNER, "c1", "in", "1000.5")
+    status = parse_status(node.deadman("status"))
+    assert status is not None
+    assert status.state == "waiting"
+    assert answer.endswith(f"due_uptime_s={status.due_uptime_s:.2f}")
+    assert is_before(node.path("/etc"))
+    node.deadman("abort", OWNER, "c1")
+    eventually(lambda: state(node) == "idle" and not node.processes())
+    assert is_before(node.path("/etc"))
+    assert node.text("/harness/running") is None
+
+
+def test_a_moment_is_named_by_the_nodes_own_uptime(node: Sandbox) -> None:
+    armed(node)
+    uptime = float((node.run("/bin/busybox", "cat", "/proc/uptime").stdout).split()[0])
+    assert refusal(node.deadman("apply", OWNER, "c1", "at", f"{uptime - 5:.2f}")) == "too-late"
+    assert is_before(node.path("/etc"))
+    due = f"{uptime + 2.25:.2f}"
+    answer = node.deadman("apply", OWNER, "c1", "at", due)
+    if not answer.startswith("refused too-late"):
+        assert answer == f"ok state=waiting id=c1 due_uptime_s={due}"
+        eventually(lambda: state(node) == "applied")
+
+
+def test_a_reload_that_hangs_does_not_hold_up_the_way_back(node: Sandbox) -> None:
+    hangs = change(reload="grep -q 192.168.1.1 /etc/config/network && echo back >>/harness/running || sleep 100000")
+    applied(node, window_s="1", wanted=hangs)
+    eventually(lambda: node.text("/harness/running") == "back\n")
+    assert is_before(node.path("/etc"))
+
+
+def test_when_the_restored_state_cannot_be_reloaded_the_node_reboots_into_it(node: Sandbox) -> None:
+    applied(node, window_s="1", wanted=change(reload="exit 1"))
+    eventually(lambda: node.text("/harness/reboots") == "reboot\n")
+    assert is_before(node.path("/etc"))
+    assert not node.path("/etc/meshctl/change").exists()
+
+
+def test_the_second_timer_acts_when_the_first_was_killed(node: Sandbox) -> None:
+    applied(node)
+    pid = (node.text("/tmp/meshctl/change-c1/watch.pid") or "").strip()
+    assert node.run("/bin/sh", "-c", f"kill -9 {pid}").returncode == 0
+    eventually(lambda: state(node) == "orphaned")
+    assert node.deadman("abort", OWNER, "c1").startswith("ok")
+    eventually(lambda: state(node) == "idle")
+    assert is_before(node.path("/etc"))
+
+
+def test_without_the_boot_hook_nothing_is_armed(node: Sandbox) -> None:
+    staged(node)
+    node.path("/etc/rc.d/S05meshctl-deadman").unlink()
+    assert refusal(node.deadman("arm", OWNER, "c1", NONCE_HASH, LONG)) == "not-enabled"
+
+
+def test_uci_that_the_node_cannot_read_is_refused(node: Sandbox) -> None:
+    prepare(node)
+    broken = Change("c1", {"/etc/config/wireless": NewFile(b"BROKEN")}, "true")
+    node.put(BUNDLE, bundle(broken))
+    node.deadman("lock", OWNER, LONG)
+    answer = node.deadman("stage", OWNER, "c1", BUNDLE)
+    assert refusal(answer) == "bad-uci"
+    assert answer.endswith("wireless")
+    assert not list(node.path("/etc/meshctl").glob("change*"))
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/tmp/x",
+        "/etc",
+        "/etc/meshctl/last",
+        "/etc/../tmp/x",
+        "/etc//x",
+        "/etc/./x",
+        "/etc/config",
+        "etc/x",
+        "/proc/x/y",
+    ],
+)
+def test_a_path_that_is_not_a_file_in_flash_is_refused_by_the_node_itself(node: Sandbox, path: str) -> None:
+    prepare(node)
+    node.deadman("lock", OWNER, LONG)
+    manifest = f"remove - - - {path}\n".encode()
+    node.put(BUNDLE, gzip.compress(tar_of([TarMember("manifest", manifest), TarMember("reload", b"true\n")])))
+    assert refusal(node.deadman("stage", OWNER, "c1", BUNDLE)) == "bad-path"
+    assert is_before(node.path("/etc"))
+    assert not list(node.path("/etc/meshctl").glob("change*"))
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "missing", "other"])
+def test_a_damaged_bundle_is_refused(node: Sandbox, damage: str) -> None:
+    prepare(node)
+    node.deadman("lock", OWNER, LONG)
+    whole = bundle(change())
+    other = gzip.compress(tar_of([TarMember("manifest", b"file 0644 00 - /etc/a/b\n"), TarMember("reload", b"")]))
+    node.put(BUNDLE, {"cut": whole[:-40], "empty": b"", "missing": b"", "other": other}[damage])
+    if damage == "missing":
+        node.path(BUNDLE).unlink()
+    assert refusal(node.deadman("stage", OWNER, "c1", BUNDLE)) in {"bad-bundle", "flash-full"}
+    assert is_before(node.path("/etc"))
+    assert not list(node.path("/etc/meshctl").glob("change*"))
+
+
+@pytest.mark.parametrize(
+    "words", [("fly",), (), ("lock", "a b", "1"), ("lock", "a", "-1"), ("lock", "", "1"), ("lock",)]
+)
+def test_a_call_that_makes_no_sense_is_refused(node: Sandbox, words: tuple[str, ...]) -> None:
+    assert refusal(node.deadman(*words)) == "usage"
+
+
+FULL = """\
+cp -a /etc /tmp/etc
+mount -t tmpfs -o size={size}k tmpfs /etc
+cp -a /tmp/etc/. /etc
+/usr/sbin/meshctl-deadman lock {owner} 1000 >/dev/null
+{script}
+cp -a /etc/. /tmp/after
+"""
+
+
+def on_small_flash(node: Sandbox, size_kib: int, steps: str) -> str:
+    """Run `steps` with /etc on a file system of that size; what is then in it is kept in /tmp/after."""
+    node.path("/tmp/after").mkdir()
+    done = node.run("/bin/sh", "-c", FULL.format(size=size_kib, owner=OWNER, script=steps))
+    return done.stdout.strip()
+
+
+def test_a_full_flash_is_noticed_before_anything_changes(node: Sandbox) -> None:
+    prepare(node)
+    answer = on_small_flash(node, 96, f"/usr/sbin/meshctl-deadman stage {OWNER} c1 {BUNDLE}")
+    assert refusal(answer) == "flash-full"
+    assert re.search(r"needs \d+ KiB of flash, \d+ KiB are free", answer)
+    assert is_before(node.path("/tmp/after"))
+    assert not (node.path("/tmp/after") / "meshctl/change").exists()
+
+
+def test_a_flash_that_fills_up_later_does_not_stop_the_way_back(node: Sandbox) -> None:
+    prepare(node)
+    answer = on_small_flash(
+        node,
+        1024,
+        f"""
+        d=/usr/sbin/meshctl-deadman
+        $d stage {OWNER} c1 {BUNDLE} && $d arm {OWNER} c1 {NONCE_HASH} 0
+        mkdir -p /tmp/meshctl/change-c1
+        sed 's/^put_previous() {{/&\\nfill/' $d >/tmp/filled
+        echo 'fill() {{ cat /dev/zero >/etc/filler 2>/dev/null; df -k /etc >/tmp/df; }}' >/tmp/start
+        cat /tmp/start /tmp/filled >/tmp/full.sh
+        sh /tmp/full.sh watch c1 0
+        awk 'END {{ print "free", $(NF - 2) }}' /tmp/df
+        rm -f /etc/filler
+        """,
+    )
+    assert "ok state=armed id=c1" in answer
+    assert "free 0" in answer
+    assert is_before(node.path("/tmp/after"))
+
+
+def test_the_same_change_gives_the_same_bundle_and_mistakes_are_told_before_it_travels() -> None:
+    assert bundle(change()) == bundle(change())
+    for files in (
+        {"/x": NewFile(b"")},
+        {"/etc/a b": NewFile(b"")},
+        {"/etc/../x": NewFile(b"")},
+        {"etc/x": NewFile(b"")},
+    ):
+        with pytest.raises(ValueError, match="absolute path"):
+            bundle(Change("c", files, "true"))
+    with pytest.raises(ValueError, match="named twice"):
+        bundle(Change("c", {"/etc/a/b": NewFile(b"")}, "true", removed=("/etc/a/b",)))
+    with pytest.raises(ValueError, match=r"\.\./init\.d"):
+        bundle(Change("c", {}, "true", links={"/etc/a/b": "/tmp"}))
+
+
+# Applets that OpenWrt's busybox leaves out (package/utils/busybox/Config-defaults.in).
+ABSENT = """
+    base64 blkid chrt cksum comm diff fold hostname install ionice mountpoint nohup nproc nsenter od paste realpath
+    renice rev setsid sha1sum sha512sum shuf split stat stty tac timeout truncate tty unlink unshare usleep xxd
+"""
+
+
+@pytest.mark.parametrize("name", ["deadman.sh", "observe.sh", "deadman.init"])
+def test_the_scripts_use_no_tool_that_openwrt_leaves_out(name: str) -> None:
+    code = re.sub(r"^\s*#.*$", "", script(name), flags=re.MULTILINE)
+    called = set(
+        re.findall(r"(?:^\s*|[|;&({`]\s*|\b(?:if|then|do|else|until|while|!)\s+)([a-z][a-z0-9_-]*)", code, re.M)
+    )
+    assert not called & set(ABSENT.split())
