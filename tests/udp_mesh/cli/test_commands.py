@@ -1,0 +1,243 @@
+"""The command line against real daemons: what scripts rely on is exit codes and JSON."""
+
+import json
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.udp_mesh.daemon.processes import RunningDaemon, collect, two_daemons
+from tests.udp_mesh.links.sockets import WAIT_S
+from udp_mesh.cli.main import build_parser, main
+from udp_mesh.cli.output import Exit
+from udp_mesh.client.mesh_client import FrameReader, encode_frame
+from udp_mesh.crypto import Key
+from udp_mesh.daemon.configuration import read_keys
+
+Pair = tuple[RunningDaemon, RunningDaemon]
+Run = Callable[..., tuple[int, str, str]]
+
+pytestmark = pytest.mark.xdist_group("udp_mesh_cli")
+
+
+@pytest.fixture(scope="module")
+def pair() -> Iterator[Pair]:
+    with two_daemons() as daemons:
+        yield daemons
+
+
+@pytest.fixture
+def run(pair: Pair, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs a command on alice; returns its exit code, output and complaints."""
+
+    def run_command(*words: str) -> tuple[int, str, str]:
+        code = main([*words, "--socket", str(pair[0].socket)])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run_command
+
+
+@pytest.mark.parametrize("command", ["status", "peers", "topics"])
+def test_what_is_can_be_read_by_people_and_by_scripts(run: Run, command: str) -> None:
+    code, text, _ = run(command)
+    assert code == Exit.OK
+    assert ("bob" if command != "topics" else "map") in text
+    code, text, _ = run(command, "--json")
+    assert code == Exit.OK
+    assert isinstance(json.loads(text), dict)
+
+
+def test_a_message_is_sent_and_its_outcome_decides_the_exit_code(run: Run, pair: Pair) -> None:
+    with pair[1].client() as receiver:
+        receiver.subscribe("status")
+        code, text, _ = run("pub", "status", "hello", "--to", "bob", "--type", "text", "--wait", str(WAIT_S), "--json")
+        assert code == Exit.OK
+        assert json.loads(text)["outcome"] == "delivered"
+        assert collect(receiver, 1)[0].payload == b"hello"
+
+
+def test_a_file_is_sent_several_times(run: Run, pair: Pair, tmp_path: Path) -> None:
+    (tmp_path / "map.bin").write_bytes(b"\x00map")
+    with pair[1].client() as receiver:
+        receiver.subscribe("map")
+        words = ["pub", "map", "--file", str(tmp_path / "map.bin"), "--to", "bob", "--count", "3", "--rate", "100"]
+        assert run(*words)[0] == Exit.OK
+        assert [message.payload for message in collect(receiver, 3)] == [b"\x00map"] * 3
+    code, _, complaint = run("pub", "map", "--file", str(tmp_path / "missing"))
+    assert code == Exit.FAILED
+    assert "missing: No such file" in complaint
+
+
+def test_an_undeliverable_message_has_an_exit_code_of_its_own(run: Run) -> None:
+    assert run("set", "topic", "brief", "deadline_s=0.05", "rate_limit_bytes_per_s=1000")[0] == Exit.OK
+    code, text, _ = run("pub", "brief", "x" * 900, "--to", "bob", "--count", "4", "--rate", "1000", "--wait")
+    assert code == Exit.NOT_DELIVERED
+    assert "expired bob" in text
+
+
+@pytest.mark.parametrize("form", [[], ["--json"], ["--raw"]])
+def test_arriving_messages_are_printed(pair: Pair, capsysbinary: pytest.CaptureFixture[bytes], form: list[str]) -> None:
+    alice, bob = pair
+
+    def send() -> None:
+        with bob.client() as client:
+            # The subscription may come a moment later than the first of these.
+            while not done.wait(0.1):
+                client.publish("status", b"ready", to="alice")
+
+    done = threading.Event()
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        words = ["echo", "status", "--count", "1", "--timeout", str(WAIT_S), "--socket", str(alice.socket), *form]
+        assert main(words) == Exit.OK
+    finally:
+        done.set()
+        sender.join()
+    text = capsysbinary.readouterr().out
+    if form == ["--raw"]:
+        assert text == b"ready"
+    elif form:
+        assert json.loads(text)["payload"] == "cmVhZHk="
+    else:
+        assert text == b"bob status p0 5 B  ready\n"
+
+
+def test_silence_ends_an_echo_with_a_timeout(run: Run) -> None:
+    assert run("echo", "nothing", "--timeout", "0.05")[0] == Exit.FAILED
+
+
+def test_a_peer_answers_a_ping_and_a_stranger_does_not(run: Run) -> None:
+    code, text, _ = run("ping", "bob", "--count", "2", "--interval", "0.01", "--timeout", "50", "--json")
+    assert code == Exit.OK
+    assert all(json.loads(line)["round_trip_s"] > 0 for line in text.splitlines())
+    assert "2 of 2 answered" in run("ping", "bob", "--count", "2", "--interval", "0.01", "--timeout", "50")[1]
+    code, text, _ = run("ping", "nobody", "--count", "1")
+    assert code == Exit.FAILED
+    assert "nobody" in text
+
+
+def test_a_benchmark_says_what_arrived(run: Run) -> None:
+    code, text, _ = run("bench", "bob", "--seconds", "0.3", "--size", "200000", "--json")
+    assert code == Exit.OK
+    result = json.loads(text)
+    assert result["delivered"] == result["messages"] > 0
+    assert result["bits_per_s"] > 0
+
+
+def test_what_is_set_shows_and_what_is_dropped_is_gone(run: Run) -> None:
+    assert run("set", "topic", "video", "priority=10", "outbox=last", 'destinations=["bob"]')[0] == Exit.OK
+    topics: dict[str, Any] = {topic["name"]: topic for topic in json.loads(run("topics", "--json")[1])["topics"]}
+    assert (topics["video"]["priority"], topics["video"]["outbox"]) == (10, "last")
+    assert topics["video"]["keep_last"] == 2
+    assert run("drop", "topic", "video")[0] == Exit.OK
+    assert "video" not in run("topics")[1]
+    assert run("drop", "topic", "video")[0] == Exit.FAILED
+    assert len(json.loads(run("set", "window", "3", "--json")[1])["changes"]) == 1
+    assert run("set", "rates", "offline_s=4", "heartbeat_s=0.3")[0] == Exit.OK
+    assert run("set", "neighbour", "127.0.3.9", "--name", "base")[0] == Exit.OK
+    assert run("drop", "neighbour", "127.0.3.9")[0] == Exit.OK
+    assert run("reload")[0] == Exit.OK
+    assert run("reload")[1] == "nothing to change\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "complaint"),
+    [
+        (["set", "topic", "map", "priority"], Exit.USAGE, "expected key=value, found 'priority'"),
+        (["set", "topic", "map", "prioriti=3"], Exit.FAILED, "did you mean 'priority'?"),
+        (["set", "window", "many"], Exit.FAILED, 'expected "adaptive" or 1 to 4096'),
+        (["pub", "unknown", "x"], Exit.FAILED, "unknown topic"),
+    ],
+)
+def test_a_mistake_is_explained_in_one_line(run: Run, words: list[str], code: int, complaint: str) -> None:
+    found, _, text = run(*words)
+    assert found == code
+    assert complaint in text
+    assert text.count("\n") == 1
+
+
+def test_a_recording_is_started_and_stopped(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "run.jsonl"
+    assert run("record", "start", str(path))[0] == Exit.OK
+    code, text, _ = run("record", "stop", "--json")
+    assert code == Exit.OK
+    assert json.loads(text)["path"] == str(path)
+    assert run("record", "start", str(path))[0] == Exit.FAILED
+
+
+def test_metrics_are_printed(run: Run) -> None:
+    assert "udp_mesh_peer_online" in run("metrics")[1]
+
+
+def test_no_daemon_has_an_exit_code_of_its_own(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["status", "--socket", str(tmp_path / "none.sock")]) == Exit.UNREACHABLE
+    assert "no udp-mesh daemon at" in capsys.readouterr().err
+
+
+def test_a_key_is_made_once_for_its_owner_only(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "fleet.key"
+    assert main(["keygen", str(path)]) == Exit.OK
+    (key,) = read_keys(path)
+    assert isinstance(key, Key)
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert key.secret.hex() not in capsys.readouterr().out
+    assert main(["keygen", str(path)]) == Exit.FAILED
+
+
+def test_a_configuration_is_checked_for_people_and_for_scripts(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    main(["keygen", str(tmp_path / "fleet.key")])
+    path = tmp_path / "mesh.toml"
+    path.write_text('name = "ugv1"\nkey_file = "fleet.key"\n[topics]\nvideo = { priority = 9 }\n')
+    capsys.readouterr()
+    assert main(["check", str(path)]) == Exit.OK
+    assert f"{path}: good: ugv1, port 8700, 1 topics, 1 key(s)" in capsys.readouterr().out
+    assert main(["check", str(path), "--json"]) == Exit.OK
+    assert json.loads(capsys.readouterr().out)["topics"][0]["name"] == "video"
+    path.write_text('key_file = "fleet.key"\nport = 0\nwindo = 3\n')
+    assert main(["check", str(path)]) == Exit.CONFIGURATION
+    assert capsys.readouterr().err.count(f"{path}:") == 2
+    assert main(["check", str(path), "--json"]) == Exit.CONFIGURATION
+    assert [problem["line"] for problem in json.loads(capsys.readouterr().out)["problems"]] == [2, 3]
+    assert main(["run", str(path)]) == Exit.CONFIGURATION
+
+
+def test_every_command_has_help(capsys: pytest.CaptureFixture[str]) -> None:
+    build_parser().print_help()
+    text = capsys.readouterr().out
+    commands = ["run", "check", "keygen", "status", "peers", "topics", "events", "metrics", "set", "drop", "reload"]
+    for command in [*commands, "pub", "echo", "ping", "bench", "record", "report", "sim"]:
+        assert f"\n    {command} " in text
+    with pytest.raises(SystemExit) as caught:
+        main(["pub", "--help"])
+    assert caught.value.code == 0
+    with pytest.raises(SystemExit) as caught:
+        main(["dance"])
+    assert caught.value.code == Exit.USAGE
+
+
+def test_events_are_printed_until_the_daemon_ends(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """A stand-in for a daemon that ends right after one event: the command says so and exits."""
+    path = tmp_path / "s"
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+        def serve() -> None:
+            connection, _ = listener.accept()
+            with connection:
+                (request,) = FrameReader().feed(connection.recv(1000))
+                reply = encode_frame({"id": request[0]["id"], "ok": True})
+                connection.sendall(reply + encode_frame({"event": "peer-online", "peer": "bob"}))
+
+        server = threading.Thread(target=serve)
+        server.start()
+        assert main(["events", "--socket", str(path)]) == Exit.UNREACHABLE
+        server.join()
+    assert capsys.readouterr().out == "peer-online peer=bob\n"

@@ -1,0 +1,175 @@
+"""Daemons killed, restarted, reloaded in the middle of transfers: what was accepted is delivered or its end is told."""
+
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from tests.udp_mesh.daemon.processes import (
+    KEY,
+    OTHER_KEY,
+    RunningDaemon,
+    collect,
+    configuration,
+    outcomes,
+    poll,
+    two_daemons,
+    wait_online,
+)
+from tests.udp_mesh.links.sockets import WAIT_S, free_port
+from udp_mesh.client import MeshError
+
+pytestmark = pytest.mark.xdist_group("udp_mesh_kills")
+
+ARTIFACT = bytes(range(251)) * 20_000
+"""5 MB: long enough in flight to be killed in the middle."""
+
+
+def test_a_receiver_killed_in_the_middle_gets_the_message_after_its_restart() -> None:
+    with two_daemons() as (alice, bob), alice.client() as sender:
+        numbers = [sender.publish("map", ARTIFACT, to="bob", notify=True) for _ in range(4)]
+        bob.kill()
+        bob.start()
+        with bob.client() as receiver:
+            receiver.subscribe("map")
+            ends = outcomes(sender, 4)
+            assert ends == dict.fromkeys(numbers, "delivered")
+            # The first ones may have been delivered before the kill; the last one cannot have been.
+            assert collect(receiver, 1)[0].payload == ARTIFACT
+
+
+def test_what_waited_on_disk_when_the_sender_was_killed_is_delivered_after_its_restart() -> None:
+    topics = 'log = { priority = 8, outbox = "all", outbox_on_disk = true }'
+    with two_daemons(topics) as (alice, bob):
+        bob.stop()
+        wait_online(alice, "bob", online=False)
+        with alice.client() as sender:
+            for number in range(10):
+                sender.publish("log", b"entry %d" % number, to="bob")
+        alice.kill()
+        with bob, bob.client() as receiver:
+            receiver.subscribe("log")
+            alice.start()
+            entries = {message.payload for message in collect(receiver, 10)}
+    assert entries == {b"entry %d" % number for number in range(10)}
+
+
+def test_a_reload_under_load_drops_nothing() -> None:
+    with two_daemons() as (alice, bob), alice.client() as sender, bob.client() as receiver, alice.client() as operator:
+        receiver.subscribe("map", "extra")
+        text = alice.file.read_text()
+        numbers = []
+        for turn in range(10):
+            numbers += [sender.publish("map", bytes([turn]) * 60_000, to="bob", notify=True) for _ in range(4)]
+            alice.write(text.replace("[topics]", f"[topics]\nextra = {{ priority = {turn} }}"))
+            if turn % 2:
+                alice.signal(signal.SIGHUP)
+            else:
+                assert any("extra" in change for change in operator.request("reload")["changes"])
+        numbers.append(sender.publish("extra", b"new topic", to="bob", notify=True))
+        assert outcomes(sender, len(numbers)) == dict.fromkeys(numbers, "delivered")
+        assert len(collect(receiver, len(numbers))) == 41
+
+
+def test_a_reload_of_a_broken_file_changes_nothing_and_names_the_line() -> None:
+    with two_daemons() as (alice, _), alice.client() as operator:
+        before = operator.request("topics")["topics"]
+        text = alice.file.read_text()
+        alice.write(text.replace("priority = 7", "priority = 77"))
+        with pytest.raises(MeshError, match=r"alice.toml:\d+: topics.map.priority: expected an integer from 0 to 15"):
+            operator.request("reload")
+        alice.signal(signal.SIGHUP)
+        poll(lambda: "reload-refused" in alice.log.read_text(), "the refusal is logged")
+        assert operator.request("topics")["topics"] == before
+        alice.write(text.replace('name = "alice"', 'name = "carol"'))
+        assert operator.request("reload")["changes"] == ["name: takes effect with the next start"]
+
+
+def test_keys_are_rotated_through_two_live_keys_without_losing_a_message() -> None:
+    with two_daemons() as (alice, bob), alice.client() as sender, bob.client() as receiver:
+        receiver.subscribe("map")
+        numbers = []
+        for keys in ((KEY, OTHER_KEY), (OTHER_KEY, KEY), (OTHER_KEY,)):
+            for daemon in (alice, bob):
+                (daemon.folder / f"{daemon.name}.key").write_text("\n".join(keys))
+                numbers += [sender.publish("map", bytes(100_000), to="bob", notify=True) for _ in range(3)]
+                with daemon.client() as operator:
+                    assert operator.request("reload")["changes"]
+                    assert len(operator.request("status")["keys"]) == len(keys)
+        assert outcomes(sender, len(numbers)) == dict.fromkeys(numbers, "delivered")
+        assert len(collect(receiver, len(numbers))) == len(numbers)
+
+
+def test_nodes_with_different_keys_say_so_and_exchange_nothing() -> None:
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
+        folder, port = Path(path), free_port()
+        alice = RunningDaemon(folder, "alice", configuration(folder, "alice", 1, [2], port))
+        mallory = RunningDaemon(folder, "mallory", configuration(folder, "mallory", 2, [1], port, keys=(OTHER_KEY,)))
+        with alice, mallory:
+            poll(lambda: "key-mismatch address=127.0.3.2" in alice.log.read_text(), "the foreign key is reported")
+            with alice.client() as client:
+                assert client.request("peers")["peers"] == []
+
+
+def test_systemd_hears_of_readiness_life_reload_and_the_end() -> None:
+    with (
+        tempfile.TemporaryDirectory(prefix="udp-mesh-") as path,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd,
+    ):
+        folder = Path(path)
+        systemd.bind(str(folder / "notify"))
+        systemd.settimeout(WAIT_S)
+        alice = RunningDaemon(folder, "alice", configuration(folder, "alice", 1, [2], free_port()))
+        alice.environment = {"NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "200000"}
+
+        def hear(word: str) -> str:
+            while True:
+                text = systemd.recv(1000).decode()
+                if text.startswith(word):
+                    return text
+
+        with alice:
+            assert "alice: 0 of 0 peers online" in hear("READY=1")
+            hear("WATCHDOG=1")
+            hear("WATCHDOG=1")
+            alice.signal(signal.SIGHUP)
+            hear("RELOADING=1")
+            hear("READY=1")
+            assert alice.stop() == 0
+        hear("STOPPING=1")
+        assert not alice.socket.exists()
+        assert "Traceback" not in alice.log.read_text()
+
+
+def test_a_second_daemon_does_not_take_the_firsts_socket_or_port() -> None:
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
+        folder = Path(path)
+        first = RunningDaemon(folder, "alice", configuration(folder, "alice", 1, [2], free_port()))
+        with first:
+            second = subprocess.run(
+                [sys.executable, "-m", "udp_mesh.cli.main", "run", str(first.file)],
+                check=False,
+                capture_output=True,
+                text=True,
+                timeout=WAIT_S,
+            )
+            assert second.returncode == 1
+            assert f"cannot start: another daemon answers at {first.socket}" in second.stderr
+            assert "Traceback" not in second.stderr
+            with first.client() as client:
+                client.request("peers")
+
+
+def test_a_socket_left_by_a_killed_daemon_is_replaced() -> None:
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
+        folder = Path(path)
+        daemon = RunningDaemon(folder, "alice", configuration(folder, "alice", 1, [2], free_port()))
+        with daemon:
+            daemon.kill()
+            assert daemon.socket.exists()
+            daemon.start()
+            assert daemon.stop() == 0

@@ -1,0 +1,110 @@
+"""The transport inside a program: two nodes on one loop, over real sockets."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from tests.udp_mesh.links.sockets import WAIT_S, free_port
+from udp_mesh import Key, LinkWish, Neighbour, Node, SendRefusedError, Settings, Topic
+from udp_mesh.core.events import MessageDelivered, MessageExpired, PeerOffline, PeerOnline
+from udp_mesh.core.settings import Rates
+
+KEY = Key(bytes(range(32)))
+TOPICS = (Topic("status", priority=0), Topic("map", priority=7), Topic("short", deadline_s=0.2))
+
+
+def make(name: str, own: int, other: int, port: int) -> Node:
+    settings = Settings(
+        name=name,
+        port=port,
+        keys=(KEY,),
+        topics=TOPICS,
+        neighbours=(Neighbour((f"127.0.4.{other}", port)),),
+        rates=Rates(heartbeat_s=0.2, heartbeat_sparse_s=0.2, offline_s=1.0),
+    )
+    return Node(settings, links=(LinkWish(address=f"127.0.4.{own}", broadcast=False),))
+
+
+async def online(node: Node, peer: str) -> None:
+    async for event in node.events():
+        if isinstance(event, PeerOnline) and event.peer == peer:
+            return
+
+
+def run(body: Callable[[Node, Node], Coroutine[Any, Any, None]]) -> None:
+    """Runs `body` with two nodes that know each other, within a generous time."""
+
+    async def main() -> None:
+        port = free_port()
+        async with asyncio.timeout(WAIT_S), make("alice", 1, 2, port) as alice, make("bob", 2, 1, port) as bob:
+            await asyncio.gather(online(alice, "bob"), online(bob, "alice"))
+            await body(alice, bob)
+
+    asyncio.run(main())
+
+
+def test_a_message_is_delivered_and_its_sender_waits_for_that() -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        payload = bytes(3_000_000)
+        outcome = await alice.deliver("map", payload, to="bob", type_name="bytes")
+        assert isinstance(outcome, MessageDelivered)
+        message = await anext(bob.messages())
+        assert (message.source, message.topic, message.type_name, message.priority) == ("alice", "map", "bytes", 7)
+        assert message.payload == payload
+
+    run(body)
+
+
+def test_a_message_to_all_reaches_the_peer() -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        await alice.send("status", b"to all")
+        message = await anext(bob.messages())
+        assert (message.payload, message.broadcast) == (b"to all", True)
+
+    run(body)
+
+
+def test_a_refused_message_raises_with_the_reason() -> None:
+    async def body(alice: Node, _: Node) -> None:
+        with pytest.raises(SendRefusedError, match="unknown topic"):
+            await alice.send("unknown", b"", to="bob")
+        with pytest.raises(SendRefusedError, match="unknown peer"):
+            await alice.send("status", b"", to="nobody")
+
+    run(body)
+
+
+def test_leaving_is_told_at_once_and_a_message_to_who_left_expires() -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        await bob.__aexit__(None, None, None)
+        async for event in alice.events():
+            if isinstance(event, PeerOffline):
+                assert event.left
+                break
+        assert isinstance(await alice.deliver("short", b"late", to="bob"), MessageExpired)
+        assert [message async for message in bob.messages()] == []
+
+    run(body)
+
+
+def test_settings_change_while_it_runs() -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        settings = alice.driver.node.settings
+        assert alice.apply(replace(settings, topics=(*settings.topics, Topic("extra", priority=1))))
+        await alice.send("extra", b"new", to="bob")
+        assert (await anext(bob.messages())).topic == "extra"
+        with pytest.raises(ValueError, match="name"):
+            alice.apply(replace(settings, name="carol"))
+        (peer,) = alice.conditions().peers
+        assert peer.online
+
+    run(body)
+
+
+def test_a_node_outside_its_block_says_so() -> None:
+    node = make("alice", 1, 2, 9)
+    with pytest.raises(RuntimeError, match="async with"):
+        node.conditions()
