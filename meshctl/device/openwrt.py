@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import tarfile
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -23,6 +24,7 @@ from meshctl.device.parse.system import parse_boot_id, parse_meminfo, parse_upti
 PACKAGES_TIMEOUT_S = 300.0
 # `sysupgrade -T` unpacks and hashes the image.
 FIRMWARE_TEST_TIMEOUT_S = 120.0
+_PATTERN = re.compile(r"/[A-Za-z0-9._/+@*?-]+")
 # Between the answer and the deed, so that the answer arrives.
 ACT_AFTER_S = 1
 
@@ -74,9 +76,11 @@ class FetchedFile:
 
 def fetch_files(connection: Connection, paths: Iterable[str]) -> dict[str, FetchedFile]:
     """The plain files among `paths` (patterns of the shell are expanded on the node), in one round trip."""
-    words = " ".join(path.lstrip("/") for path in paths)
-    if not words or quoted(*words.split()).replace("'", "") != words:
-        raise ValueError(f"expected paths without blanks or quotes, found {words!r}")
+    wanted = tuple(paths)
+    for path in wanted:
+        if not _PATTERN.fullmatch(path):
+            raise ValueError(f"{path!r}: expected an absolute path without blanks or quotes")
+    words = " ".join(path.lstrip("/") for path in wanted)
     # a pattern that matches nothing stays as it is, so only what exists is named to tar
     script = f'cd / || exit 1; set --; for f in {words}; do [ ! -f "$f" ] || set -- "$@" "$f"; done\n'
     script += 'if [ $# -gt 0 ]; then tar -cf - "$@"; fi'

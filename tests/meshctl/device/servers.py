@@ -16,8 +16,9 @@ from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
-from meshctl.device.connection import Endpoint
-from meshctl.device.trust import HostKey, parse_key
+from meshctl.device.connection import Credentials, Deadlines, Endpoint
+from meshctl.device.ssh import SshConnection, connect
+from meshctl.device.trust import HostKey, TrustStore, parse_key
 from tests.meshctl.device.sandbox import Sandbox
 
 # Generous on purpose: a busy machine may be slow, and a test passes as soon as the thing is true.
@@ -178,6 +179,26 @@ def openssh(directory: Path, authorized: Path, *settings: str, host_key_type: st
     port = free_port()
     unshare = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "sh", "-ec", OPENSSH, "sshd"]
     return Server([*unshare, str(directory), str(port)], port, directory / "sshd.log")
+
+
+# No wait of a healthy server comes near these on the busiest machine; tests of deadlines set their own.
+PATIENT = Deadlines(connect_s=60, handshake_s=120, auth_s=120, channel_s=120, run_s=120)
+
+
+def ready(node: Sandbox, directory: Path) -> Path:
+    """Give the node dropbear, a locked password and a new key pair's public part; returns the private file."""
+    key = keypair(directory / "operator")
+    give_dropbear(node, root_password="!")
+    authorize(node, public(key))
+    return key
+
+
+def log_in(server: Server, node: Sandbox, directory: Path) -> SshConnection:
+    """A connection with the key of `ready`, trusting the node's present host key."""
+    trust = TrustStore(directory / "pins")
+    trust.replace("b03", host_key(node))
+    ours = Credentials(key_files=(directory / "operator",), use_agent=False)
+    return connect(server.endpoint(), credentials=ours, trust=trust, deadlines=PATIENT)
 
 
 def keypair(path: Path, key_type: str = "ed25519", *, passphrase: str = "") -> Path:

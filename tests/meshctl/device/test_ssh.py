@@ -29,6 +29,7 @@ from meshctl.errors import InputError
 from meshctl.model import Release, Secret
 from tests.meshctl.device.sandbox import Sandbox
 from tests.meshctl.device.servers import (
+    PATIENT,
     Server,
     authorize,
     dropbear,
@@ -42,34 +43,24 @@ from tests.meshctl.device.servers import (
     public,
 )
 
-# No wait of a healthy server comes near these on the busiest machine; the tests of deadlines set their own.
-PATIENT = Deadlines(connect_s=60, handshake_s=120, auth_s=120, channel_s=120, run_s=120)
-
 
 @pytest.fixture
-def key(tmp_path: Path) -> Path:
+def key(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """Our key: the one the server lets in, where the test has a server."""
+    if "server" in request.fixturenames:
+        request.getfixturevalue("server")
+        return tmp_path / "operator"
     return keypair(tmp_path / "operator")
 
 
 @pytest.fixture
-def trust(tmp_path: Path) -> TrustStore:
-    return TrustStore(tmp_path / "known_hosts")
-
-
-@pytest.fixture
-def server(node: Sandbox, key: Path, trust: TrustStore) -> Iterator[Server]:
-    """A dropbear that knows our key and whose key we know."""
-    give_dropbear(node, root_password="!")
-    authorize(node, public(key))
-    trust.add("b03", host_key(node))
-    with dropbear(node) as running:
-        yield running
-
-
-@pytest.fixture
-def connection(server: Server, key: Path, trust: TrustStore) -> Iterator[SshConnection]:
-    with connect(server.endpoint(), credentials=only(key), trust=trust, deadlines=PATIENT) as connected:
-        yield connected
+def trust(tmp_path: Path, node: Sandbox, request: pytest.FixtureRequest) -> TrustStore:
+    """Our pins: the server's key is among them, where the test has a server."""
+    store = TrustStore(tmp_path / "known_hosts")
+    if "server" in request.fixturenames:
+        request.getfixturevalue("server")
+        store.add("b03", host_key(node))
+    return store
 
 
 def only(*keys: Path) -> Credentials:

@@ -9,38 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from meshctl.device.connection import Completed, Connection, Credentials, Deadlines, Endpoint
+from meshctl.device.connection import Completed, Connection, Endpoint
 from meshctl.device.errors import ChannelClosed, ConnectionLost, UploadFailed
-from meshctl.device.ssh import SshConnection, connect
-from meshctl.device.trust import TrustStore
+from meshctl.device.ssh import SshConnection
 from meshctl.device.upload import CHUNK_BYTES, Progress, upload
 from meshctl.errors import InputError
 from tests.meshctl.device.sandbox import Sandbox
-from tests.meshctl.device.servers import Server, authorize, dropbear, give_dropbear, host_key, keypair, public
+from tests.meshctl.device.servers import Server, dropbear, log_in, ready
 
 TARGET = "/tmp/firmware/image.bin"
-PATIENT = Deadlines(connect_s=60, handshake_s=120, auth_s=120, channel_s=120, run_s=120)
-
-
-@pytest.fixture
-def server(node: Sandbox, tmp_path: Path) -> Iterator[Server]:
-    give_dropbear(node, root_password="!")
-    authorize(node, public(keypair(tmp_path / "operator")))
-    with dropbear(node) as running:
-        yield running
-
-
-def log_in(server: Server, node: Sandbox, tmp_path: Path) -> SshConnection:
-    trust = TrustStore(tmp_path / "pins")
-    trust.replace("b03", host_key(node))
-    ours = Credentials(key_files=(tmp_path / "operator",), use_agent=False)
-    return connect(server.endpoint(), credentials=ours, trust=trust, deadlines=PATIENT)
-
-
-@pytest.fixture
-def connection(server: Server, node: Sandbox, tmp_path: Path) -> Iterator[SshConnection]:
-    with log_in(server, node, tmp_path) as connected:
-        yield connected
 
 
 def leftovers(node: Sandbox) -> list[str]:
@@ -101,8 +78,7 @@ class CutAfter(Connection):
 
 
 def test_an_upload_goes_on_after_every_cut_from_what_was_verified(node: Sandbox, tmp_path: Path) -> None:
-    give_dropbear(node, root_password="!")
-    authorize(node, public(keypair(tmp_path / "operator")))
+    ready(node, tmp_path)
     data = os.urandom(5 * CHUNK_BYTES + 99)
     for chunks in (2, 1, 0):
         with dropbear(node) as server, log_in(server, node, tmp_path) as connected:
@@ -178,8 +154,7 @@ def test_bytes_that_change_on_the_way_are_noticed_and_never_put_in_place(
 
 
 def test_what_does_not_fit_is_refused_before_a_byte_is_sent(node: Sandbox, tmp_path: Path) -> None:
-    give_dropbear(node, root_password="!")
-    authorize(node, public(keypair(tmp_path / "operator")))
+    ready(node, tmp_path)
     told: list[Progress] = []
     with dropbear(node, tmp_kib=1024) as server, log_in(server, node, tmp_path) as connected:
         with pytest.raises(UploadFailed, match=r"needs 2049 KiB, 10[0-9][0-9] KiB are free"):

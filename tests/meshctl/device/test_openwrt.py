@@ -1,0 +1,207 @@
+"""The Python verbs over a real dropbear and ash; OpenWrt's own tools are stand-ins that note how they were called."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from meshctl.device import deadman, openwrt
+from meshctl.device.connection import Connection
+from meshctl.device.deadman import Change, NewFile
+from meshctl.device.errors import CommandFailed, NodeRefused
+from meshctl.device.observe import observe
+from meshctl.device.ssh import SshConnection
+from meshctl.model import Secret
+from tests.meshctl.device.changes import change, is_after, is_before, prepare
+from tests.meshctl.device.sandbox import Sandbox
+from tests.meshctl.device.servers import Server, eventually, log_in
+
+OWNER = "alice@laptop:run-7"
+NONCE = Secret("0f1e2d3c4b5a69788796a5b4c3d2e1f0")
+
+NOTING = """#!/bin/sh
+echo "${0##*/} $*" >>/harness/calls
+"""
+SYSUPGRADE = (
+    NOTING
+    + """
+case $1 in
+-b) echo backup >"$2" ;;
+-T) if grep -q good "$2"; then exit 0; else echo "Device x not supported by this image"; exit 1; fi ;;
+esac
+"""
+)
+UBUS = (
+    NOTING
+    + """
+[ "$3" = validate_firmware_image ] || exit 4
+echo '{'
+echo '	"tests": { "fwtool_signature": true, "fwtool_device_match": true },'
+echo '	"valid": true, "forceable": true, "allow_backup": true'
+echo '}'
+"""
+)
+
+
+def calls(node: Sandbox) -> list[str]:
+    return (node.text("/harness/calls") or "").splitlines()
+
+
+def test_a_change_from_installation_to_confirmation(
+    connection: SshConnection, server: Server, node: Sandbox, tmp_path: Path
+) -> None:
+    for path in (deadman.PROGRAM, deadman.INIT_SCRIPT, deadman.INIT_LINK):
+        node.path(path).unlink()
+    assert not deadman.status(connection).installed
+    deadman.install(connection)
+    assert deadman.status(connection).state == "idle"
+    prepare(node)
+    deadman.lock(connection, OWNER, ttl_s=1000)
+    deadman.stage(connection, OWNER, change())
+    assert not node.path("/tmp/meshctl/c1.tgz").exists()
+    assert is_before(node.path("/etc"))
+    deadman.arm(connection, OWNER, "c1", nonce=NONCE, window_s=10000)
+    due = deadman.apply(connection, OWNER, "c1", in_s=0.1)
+    assert due > 0
+    connection.close()
+    with log_in(server, node, tmp_path) as again:
+        eventually(lambda: deadman.status(again).state == "applied")
+        seen = observe(again).change
+        assert seen is not None
+        assert (seen.state, seen.change_id, seen.owner, seen.window_s) == ("applied", "c1", OWNER, 10000)
+        with pytest.raises(NodeRefused) as caught:
+            deadman.confirm(again, "c1", nonce=Secret("another"))
+        assert caught.value.code == "wrong-nonce"
+        deadman.confirm(again, "c1", nonce=NONCE)
+        deadman.confirm(again, "c1", nonce=NONCE)
+        deadman.unlock(again, OWNER)
+        status = deadman.status(again)
+    assert (status.last_id, status.last_outcome, status.lock_owner) == ("c1", "confirmed", "")
+    assert is_after(node.path("/etc"))
+
+
+def test_an_applied_change_outlives_the_connection_that_started_it_and_is_undone_by_itself(
+    connection: SshConnection, server: Server, node: Sandbox, tmp_path: Path
+) -> None:
+    prepare(node)
+    deadman.lock(connection, OWNER, ttl_s=1000)
+    deadman.stage(connection, OWNER, change())
+    deadman.arm(connection, OWNER, "c1", nonce=NONCE, window_s=1)
+    deadman.apply(connection, OWNER, "c1")
+    connection.close()
+    with log_in(server, node, tmp_path) as again:
+        eventually(lambda: deadman.status(again).last_reason == "timeout")
+        assert deadman.status(again).last_outcome == "restored"
+    assert is_before(node.path("/etc"))
+
+
+def test_a_refusal_carries_its_code_and_its_reason(connection: SshConnection, node: Sandbox) -> None:
+    prepare(node)
+    with pytest.raises(NodeRefused, match="take the lock first") as caught:
+        deadman.stage(connection, OWNER, change())
+    assert caught.value.code == "not-locked"
+    deadman.lock(connection, OWNER, ttl_s=1000)
+    with pytest.raises(NodeRefused, match=f"held by {OWNER}") as caught:
+        deadman.lock(connection, "bob@base", ttl_s=1000)
+    assert caught.value.code == "locked"
+    deadman.stage(connection, OWNER, change())
+    deadman.abort(connection, OWNER, "c1")
+    assert deadman.status(connection).last_outcome == "aborted"
+
+
+def test_a_switch_that_is_missing_or_broken_is_said_so(connection: SshConnection, node: Sandbox) -> None:
+    node.put(deadman.PROGRAM, "#!/bin/sh\necho what\n", 0o755)
+    with pytest.raises(CommandFailed, match="answered lock with 'what'"):
+        deadman.lock(connection, OWNER, ttl_s=1)
+    with pytest.raises(CommandFailed, match="answered status"):
+        deadman.status(connection)
+    node.path(deadman.PROGRAM).unlink()
+    with pytest.raises(CommandFailed, match="not found"):
+        deadman.lock(connection, OWNER, ttl_s=1)
+    with pytest.raises(ValueError, match="expected letters"):
+        deadman.lock(connection, "two words", ttl_s=1)
+    with pytest.raises(ValueError, match="not both"):
+        deadman.apply(connection, OWNER, "c1", in_s=1, at_uptime_s=1)
+
+
+def test_a_change_of_many_kilobytes_arrives_whole(connection: SshConnection, node: Sandbox) -> None:
+    content = bytes(range(256)) * 2048
+    deadman.lock(connection, OWNER, ttl_s=1000)
+    deadman.stage(connection, OWNER, Change("big", {"/etc/big/file": NewFile(content, 0o600)}, "true"))
+    assert node.path("/etc/meshctl/change/new/etc/big/file").read_bytes() == content
+
+
+def test_uptime_is_measured_against_our_clock_with_a_bound(connection: SshConnection, node: Sandbox) -> None:
+    seen = openwrt.measure_uptime(connection)
+    assert seen.boot_id == (node.text("/harness/boot_id") or "").strip()
+    assert seen.error_s > 0
+    assert seen.uptime_at(seen.at_s + 10) == pytest.approx(seen.uptime_s + 10)
+
+
+def test_files_come_back_with_their_bytes_and_modes(connection: SshConnection, node: Sandbox) -> None:
+    node.put("/etc/dropbear/dropbear_rsa_host_key", bytes(range(256)), 0o600)
+    found = openwrt.fetch_files(connection, ["/etc/dropbear/dropbear_*_host_key", "/etc/passwd", "/etc/nowhere"])
+    assert set(found) == {
+        "/etc/dropbear/dropbear_ed25519_host_key",
+        "/etc/dropbear/dropbear_rsa_host_key",
+        "/etc/passwd",
+    }
+    assert found["/etc/dropbear/dropbear_rsa_host_key"].content == bytes(range(256))
+    assert found["/etc/dropbear/dropbear_rsa_host_key"].mode == 0o600
+    assert openwrt.fetch_files(connection, ["/etc/nowhere"]) == {}
+    with pytest.raises(ValueError, match="without blanks"):
+        openwrt.fetch_files(connection, ["/etc/a b; reboot"])
+
+
+def test_a_backup_is_sysupgrades_own(connection: SshConnection, node: Sandbox) -> None:
+    node.put("/sbin/sysupgrade", SYSUPGRADE, 0o755)
+    assert openwrt.backup(connection) == b"backup\n"
+    assert list(node.path("/tmp/meshctl").glob("backup*")) == []
+
+
+def test_an_image_is_judged_by_sysupgrade_and_by_procd(connection: SshConnection, node: Sandbox) -> None:
+    node.put("/sbin/sysupgrade", SYSUPGRADE, 0o755)
+    node.put("/tmp/good.bin", "good")
+    node.put("/tmp/bad.bin", "wrong board")
+    bad = openwrt.check_firmware(connection, "/tmp/bad.bin")
+    assert (bad.valid, bad.reason) == (False, "Device x not supported by this image")
+    assert bad.available_bytes is not None
+    without_procd = openwrt.check_firmware(connection, "/tmp/good.bin")
+    assert (without_procd.valid, without_procd.tests) == (True, {})
+    node.put("/bin/ubus", UBUS, 0o755)
+    good = openwrt.check_firmware(connection, "/tmp/good.bin")
+    assert (good.valid, good.reason) == (True, "")
+    assert good.tests == {"fwtool_signature": True, "fwtool_device_match": True}
+    node.put("/bin/ubus", UBUS.replace('"valid": true', '"valid": false'), 0o755)
+    assert not openwrt.check_firmware(connection, "/tmp/good.bin").valid
+
+
+def test_what_ends_the_connection_is_answered_first(connection: Connection, node: Sandbox) -> None:
+    node.put("/sbin/sysupgrade", SYSUPGRADE, 0o755)
+    openwrt.start_sysupgrade(connection, "/tmp/image.bin", "/tmp/config.tgz")
+    eventually(lambda: calls(node) == ["sysupgrade -n -f /tmp/config.tgz /tmp/image.bin"])
+    openwrt.reboot(connection)
+    eventually(lambda: node.text("/harness/reboots") == "reboot\n")
+
+
+@pytest.mark.parametrize(
+    ("tool", "call"), [("opkg", "opkg install"), ("apk", "apk add --no-network --allow-untrusted")]
+)
+def test_packages_are_installed_from_files_in_one_call(
+    connection: SshConnection, node: Sandbox, tool: str, call: str
+) -> None:
+    node.put(f"/usr/bin/{tool}", NOTING + "[ ! -f /tmp/fail ] || { echo ' * no space left' >&2; exit 255; }", 0o755)
+    openwrt.install_packages(connection, ["/tmp/a.pkg", "/tmp/b c.pkg"], tool=tool)
+    assert calls(node) == [f"{call} /tmp/a.pkg /tmp/b c.pkg"]
+    node.put("/tmp/fail", "")
+    with pytest.raises(CommandFailed, match="no space left"):
+        openwrt.install_packages(connection, ["/tmp/a.pkg"], tool=tool)
+    with pytest.raises(ValueError, match="expected opkg or apk"):
+        openwrt.install_packages(connection, ["/tmp/a.pkg"], tool="dpkg")
+
+
+def test_reload_config_is_called_by_its_path(connection: SshConnection, node: Sandbox) -> None:
+    node.put("/sbin/reload_config", NOTING, 0o755)
+    openwrt.reload_config(connection)
+    assert calls(node) == ["reload_config "]
