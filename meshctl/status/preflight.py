@@ -64,15 +64,18 @@ def _robots_answer(fleet: Fleet, status: FleetStatus) -> Check:
 
 
 def _beacons_answer(fleet: Fleet, status: FleetStatus) -> Check:
-    """Beacons in their racks should be switched on once before the run; those never seen are a no-go."""
+    """Those in a rack must have been seen once, those deployed must answer now."""
     beacons = [
         node
         for node in status.nodes
         if node.node.role is Role.BEACON and node.node.state in (NodeState.CARRIED, NodeState.DEPLOYED)
     ]
     unknown = [node for node in beacons if node.age_s is None]
+    missed = [node for node in beacons if node.health is Health.UNREACHABLE and node not in unknown]
+    told = [f"never seen: {_listed(unknown)}"] if unknown else []
+    told += [_listed(missed, _silence)] if missed else []
     good = f"{len(beacons)} beacon{'s' if len(beacons) != 1 else ''} known"
-    return Check("beacons", not unknown, f"never seen: {_listed(unknown)}" if unknown else good)
+    return Check("beacons", not told, "; ".join(told) or good)
 
 
 def _silence(node: NodeStatus) -> str:
