@@ -18,7 +18,7 @@ from meshctl.inventory.json_schema import json_schema
 from meshctl.inventory.load import load_fleet
 from meshctl.inventory.starter import write_starter
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.model import Fleet, Node, NodeState
+from meshctl.model import Fleet, Node, NodeState, Role
 
 app = typer.Typer(help="Show what the inventory says and why.", no_args_is_help=True)
 
@@ -61,13 +61,23 @@ def schema(
 
 
 @app.command("list")
-def list_nodes(inventory: InventoryPath = Path(), as_json: AsJson = False) -> None:
-    """List all nodes with role, state, address, mesh and robot.
+def list_nodes(
+    inventory: InventoryPath = Path(),
+    role: Annotated[Role | None, typer.Option("--role", help="Only nodes of this role.")] = None,
+    state: Annotated[NodeState | None, typer.Option("--state", help="Only nodes in this state.")] = None,
+    robot: Annotated[str, typer.Option("--robot", help="Only nodes that this robot carries.")] = "",
+    as_json: AsJson = False,
+) -> None:
+    """List nodes with role, state, address, mesh and robot.
 
-    Example: meshctl inventory list -i inventory/subt-final
+    Example: meshctl inventory list -i inventory/subt-final --robot husky1 --state carried
     """
     fleet = load_fleet(inventory, environ=os.environ)
-    rows = [_summary(node) for node in fleet.nodes.values()]
+    rows = [
+        _summary(node)
+        for node in fleet.nodes.values()
+        if role in (None, node.role) and state in (None, node.state) and robot in ("", node.robot)
+    ]
     if as_json:
         typer.echo(json.dumps({"fleet": fleet.name, "nodes": rows}, indent=2))
         return
@@ -97,7 +107,7 @@ def show(
 
 
 @app.command("state")
-def state(
+def change_state(
     node: Annotated[str, typer.Argument(help="Name of the node.")],
     new: Annotated[NodeState, typer.Argument(help="Its new state.")],
     inventory: InventoryPath = Path(),

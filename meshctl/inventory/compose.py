@@ -7,6 +7,7 @@ text, several documents. Everything but a syntax error is reported together.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -23,6 +24,8 @@ MAX_DEPTH = 32
 # 10,000 nodes with 20 values each are 200,000. Bounds memory (about 300 bytes a value) and alias bombs.
 MAX_VALUES = 1_000_000
 
+# The parser stops at the bracket of a name such as b[01-12] in flow style.
+_RANGE_IN_BRACES = re.compile(r"[{,]\s*[\w.-]+\[$")
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -78,7 +81,7 @@ def _hint(source: Source, place: Position) -> str:
     before = lines[place.line - 1][: place.column]
     if "\t" in before:
         return "YAML is indented with spaces, never with tabs"
-    if "{" in before and "[" in before:
+    if _RANGE_IN_BRACES.search(before):
         return 'inside braces a range needs quotes: {"b[01-12]": ...}'
     if before.endswith(":") and before.count(": ") > 0:
         return "quote a value that holds a colon and a space"

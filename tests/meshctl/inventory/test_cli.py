@@ -77,6 +77,14 @@ def test_list_shows_every_node_as_text_and_json() -> None:
     assert data["nodes"][0]["meshes"] == ["main"]
 
 
+def test_list_shows_the_nodes_asked_for() -> None:
+    carried = ("inventory", "list", "-i", SHIPPED / "subt-final", "--robot", "husky2", "--state", "carried", "--json")
+    names = [row["name"] for row in json.loads(_meshctl(*carried).stdout)["nodes"]]
+    assert names == [f"husky2-b{number:02}" for number in range(1, 7)]
+    bases = json.loads(_meshctl("inventory", "list", "-i", SHIPPED / "subt-final", "--role", "base", "--json").stdout)
+    assert [row["name"] for row in bases["nodes"]] == ["base"]
+
+
 def test_show_why_names_value_layer_file_and_line() -> None:
     lines = _meshctl("inventory", "show", "husky1-b03", "--why", "-i", SHIPPED / "subt-final").stdout.splitlines()
     power = next(line for line in lines if "tx_power_dbm" in line)

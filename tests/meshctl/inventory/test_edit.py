@@ -333,3 +333,65 @@ def test_any_run_of_state_changes_keeps_every_comment_and_ends_in_the_last(
     assert {name: fleet.nodes[name].state for name in dict(steps)} == dict(steps)
     before = (SHIPPED / "subt-final" / "fleet.yaml").read_text()
     assert _comments((target / "fleet.yaml").read_text()) == _comments(before)
+
+
+_ENTRIES = [
+    "  a:\n    label: x\n    packages:\n      - p   # why\n      - q\n",
+    "  b: {label: y, mac: 02:00:00:00:00:00}\n",
+    "  c:\n",
+    "  d: {\n    label: z, # c\n  }\n",
+    "  ? e\n",
+    "  ? f\n  :\n    label: q\n",
+    "  g[1-3]: {}\n",
+    "  'h' : {label: a}\n",
+    "  i: &n {label: w}\n  j: *n\n",
+    "  k:\n    label: |\n      text\n\n",
+    "  l:\n    label: >+\n      text\n\n\n",
+    "  m: {packages: [a, b,], }\n",
+    "  # between\n",
+    "\n",
+    "  n:\n    label: 'it''s'\n    # tail\n",
+    "  o:\n    label: two\n      lines\n    state: lost\n",
+]
+_STEPS = st.tuples(
+    st.sampled_from(["a", "b", "c", "d", "e", "f", "g1", "h", "i", "j", "k", "l", "m", "n", "o", "new"]),
+    st.sampled_from(["label", "packages", "state", "-label", "-packages", "-"]),
+)
+
+
+@given(
+    entries=st.lists(st.sampled_from(_ENTRIES), unique=True, min_size=1, max_size=8),
+    steps=st.lists(_STEPS, min_size=1, max_size=5),
+    tail=st.sampled_from(["", "\n  ", "topics: {}\n"]),
+)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_edit_of_any_layout_is_made_as_meant_or_refused(
+    entries: list[str], steps: list[tuple[str, str]], tail: str, tmp_path: Path
+) -> None:
+    head = HEAD + "defaults: {hardware: rocket, address: 10.42.0.1}\nnodes:\n"
+    (tmp_path / "fleet.yaml").write_text(head + "".join(entries) + tail)
+    editor = Editor.open(tmp_path)
+    meant = dict(load_fleet(tmp_path).nodes)
+    new: dict[str, Value] = {"label": "n: w", "packages": ["r"], "state": "spare"}
+    for node, what in steps:
+        before = editor.changes()
+        try:
+            if what == "-":
+                editor.remove(("nodes", node))
+            elif what.startswith("-"):
+                editor.remove(("nodes", node, what[1:]))
+            else:
+                set_node(editor, node, {what: new[what]})
+        except InputError:
+            assert editor.changes() == before
+            continue
+        _saved(editor)
+        editor = Editor.open(tmp_path)
+        after = load_fleet(tmp_path).nodes
+        # Nothing but the one node may differ.
+        assert {name: after[name] for name in after if name != node} == {
+            name: meant[name] for name in meant if name != node
+        }
+        if not what.startswith("-"):
+            assert getattr(after[node], what) in ("n: w", ("r",), NodeState.SPARE)
+        meant = dict(after)
