@@ -20,6 +20,10 @@ from meshctl.render.templates import NOT_UCI, TemplateFile, Templates
 from meshctl.resolve import Intent, resolve
 
 
+# A WEP key has 5 letters; what is shorter, such as the index in wireless' `key '1'`, is no secret.
+_SHORTEST_SECRET = 5
+
+
 @dataclass(frozen=True, slots=True)
 class DeviceFacts:
     """What only the device knows and its new configuration keeps: system.compat_version, which sysupgrade reads."""
@@ -127,11 +131,20 @@ def _parsed(file: TemplateFile, text: str) -> uci.Package:
 
 
 def _file(path: str, text: str, mode: int, secrets: tuple[Secret, ...], package: uci.Package | None) -> RenderedFile:
-    inside = tuple(secret for secret in secrets if replace_secrets(text, (secret,), lambda _: MASK) != text)
+    known = dict.fromkeys((*secrets, *(_written_secrets(package) if package is not None else ())))
+    inside = tuple(secret for secret in known if replace_secrets(text, (secret,), lambda _: MASK) != text)
     masked = replace_secrets(text, inside, lambda _: MASK)
     # keys that log in, and keys of the mesh, are root's business alone
     is_private = bool(inside) or path.startswith("etc/dropbear/")
     return RenderedFile(path, mode & 0o700 if is_private else mode, text.encode(), masked, inside, package)
+
+
+def _written_secrets(package: uci.Package) -> Iterator[Secret]:
+    """Keys and passwords that came as plain text, from `extra_uci` or an operator's template: hidden all the same."""
+    for section in package.sections:
+        for name in section.options:
+            if uci.is_secret_option(name):
+                yield from (Secret(item) for item in section.items(name) if len(item) >= _SHORTEST_SECRET)
 
 
 def _config_hash(files: list[RenderedFile]) -> str:

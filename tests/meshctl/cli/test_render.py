@@ -48,7 +48,9 @@ nodes:
 @pytest.fixture
 def inventory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("MESH_KEY", KEY)
-    monkeypatch.delenv("MESHCTL_INVENTORY", raising=False)
+    # a hook of git that runs the tests sets the last three
+    for name in ("MESHCTL_INVENTORY", "GIT_DIR", "GIT_INDEX_FILE", "GIT_WORK_TREE"):
+        monkeypatch.delenv(name, raising=False)
     folder = tmp_path / "fleet"
     folder.mkdir()
     (folder / "fleet.yaml").write_text(INVENTORY)
@@ -179,7 +181,7 @@ class TestRevisions:
 
     @staticmethod
     def git(folder: Path, *arguments: str) -> str:
-        identity = ["-c", "user.name=t", "-c", "user.email=t@example.org"]
+        identity = ["-c", "user.name=t", "-c", "user.email=t@example.org", "-c", "commit.gpgsign=false"]
         done = subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True, text=True)
         return done.stdout
 

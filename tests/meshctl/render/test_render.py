@@ -181,6 +181,14 @@ class TestExtraOptions:
         assert dump(lldpd) == "\nconfig lldpd 'config'\n\toption lldp_class '4'\n\n"
         assert option(rendered, "network", "sw", "vlan") == "1"
 
+    def test_hide_a_password_written_in_plain_text(self) -> None:
+        rendered = self.render({"wireless.mesh0.sae_password": "open sesame", "wireless.mesh0.key1": "1"})
+        wireless = rendered.file("etc/config/wireless")
+        assert wireless is not None
+        assert (option(rendered, "wireless", "mesh0", "sae_password"), wireless.mode) == ("open sesame", 0o600)
+        assert "open sesame" not in rendered.masked_text
+        assert "option key1 '1'" in rendered.masked_text
+
     @pytest.mark.parametrize(
         ("extra", "words"),
         [
