@@ -19,7 +19,6 @@ from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, Render
 from meshctl.render.templates import NOT_UCI, TemplateFile, Templates
 from meshctl.resolve import Intent, resolve
 
-
 # A WEP key has 5 letters; what is shorter, such as the index in wireless' `key '1'`, is no secret.
 _SHORTEST_SECRET = 5
 
