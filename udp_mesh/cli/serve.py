@@ -52,6 +52,14 @@ def check(arguments: argparse.Namespace) -> int:
                 "keys": [key.key_id.hex() for key in settings.keys],
                 "unkeyed": settings.unkeyed,
                 "topics": [plain(topic) for topic in topics],
+                "window": settings.window,
+                "fragment_bytes": settings.fragment_bytes,
+                "undeclared": plain(settings.undeclared),
+                "neighbours": plain(settings.neighbours),
+                "links": plain(configuration.links),
+                "rates": plain(settings.rates),
+                "limits": plain(settings.limits),
+                "daemon": plain(configuration.daemon),
             }
         )
     else:
