@@ -41,6 +41,9 @@ LEAST_ROOM_BYTES = 64
 MOST_ACK_SPACING = 10
 """Packets between two that ask for an acknowledgement at once; a third of the window, if that is less."""
 
+ACK_SPACING = 0.25
+"""Part of the window between two packets that ask for an acknowledgement at once."""
+
 _NARROW = struct.Struct(">BIH")
 _WIDE = struct.Struct(">BII")
 _NARROW_POSITIONS = 65_536
@@ -182,7 +185,7 @@ def _leave_run(outbound: Outbound, way: Way, run: Run, count: int, mark: Mark, o
     add = outbound.flight.add
     append = out.append
     link, address = way.link, way.address
-    spacing = max(2, min(MOST_ACK_SPACING, int(outbound.window.packets / 3)))
+    spacing = max(2, min(MOST_ACK_SPACING, int(outbound.window.packets * ACK_SPACING)))
     since = outbound.since_ack_wanted
     wide = position + count > _NARROW_POSITIONS
     pack = _WIDE.pack if wide else _NARROW.pack
@@ -218,7 +221,7 @@ def _leave_one(outbound: Outbound, way: Way, run: Run, urgent: bool, mark: Mark,
     priority = message.priority
     scheduler = outbound.scheduler
     again = 0
-    spacing = max(2, min(MOST_ACK_SPACING, int(outbound.window.packets / 3)))
+    spacing = max(2, min(MOST_ACK_SPACING, int(outbound.window.packets * ACK_SPACING)))
     outbound.since_ack_wanted += 1
     next_run: Run | None = run
     while next_run is not None:

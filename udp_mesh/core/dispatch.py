@@ -217,11 +217,13 @@ def handle_timer(state: State, now: float) -> None:
     if state.closed:
         return
     timers = state.timers
+    due_peers: list[Peer] = []
     while timers and timers[0][0] <= now:
         at, _, peer = heappop(timers)
-        if peer.timer_at != at:
-            continue
-        peer.timer_at = _INFINITY
+        if peer.timer_at == at:
+            peer.timer_at = _INFINITY
+            due_peers.append(peer)
+    for peer in due_peers:
         outbound = peer.outbound
         outbound.handle_timer(now)
         report_ended(state, peer, now)

@@ -141,15 +141,30 @@ class Flight:
         self.outstanding = 0
         return lost
 
-    def lose_oldest(self) -> list[Packet]:
-        """The oldest packet on its way counts as lost: it is the probe's load."""
-        for place, packet in enumerate(self._packets):
+    def oldest_sent_at(self) -> float:
+        """When the first packet still on its way left; only meaningful while something is."""
+        packets = self._packets
+        while packets and packets[0] is None:
+            packets.popleft()
+            self.base += 1
+        front = packets[0] if packets else None
+        return front.mark.sent_at if front is not None else float("inf")
+
+    def lose_before(self, sent_before: float) -> list[Packet]:
+        """Packets sent before that time count as lost."""
+        packets = self._packets
+        lost = []
+        while packets:
+            packet = packets[0]
             if packet is not None:
-                self._packets[place] = None
-                self.outstanding -= 1
-                self._remember(self.base + place, packet, overtaken=False)
-                return [packet]
-        return []
+                if packet.mark.sent_at > sent_before + 1e-9:
+                    break
+                lost.append(packet)
+                self._remember(self.base, packet, overtaken=False)
+            packets.popleft()
+            self.base += 1
+        self.outstanding -= len(lost)
+        return lost
 
     def _remember(self, number: int, packet: Packet, *, overtaken: bool) -> None:
         self._lost[number] = (packet, overtaken)

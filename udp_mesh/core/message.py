@@ -90,7 +90,7 @@ class Outgoing:
         """Cut it into fragments and give it its number. The first carries less, for the head's sake."""
         self.wire_id = wire_id
         self.fragment_bytes = fragment_bytes
-        self.first_bytes = first_bytes
+        self.first_bytes = min(first_bytes, len(self.body))
         self.fragments = 1 + max(0, -(-(len(self.body) - first_bytes) // fragment_bytes))
         self.missing = self.fragments
         self.arrived = bytearray(self.fragments)

@@ -33,6 +33,17 @@ PROBE_S = 0.25
 
 PROBE_SOON_FOR_S = 1.0
 
+SILENT_AFTER_TIMEOUTS = 3
+SILENT_AFTER_S = 0.15
+"""Without any acknowledgement for both of these the peer is silent. Until then packets are replaced as they time out, at the
+pace of the window: a burst of losses then costs little more than its own length."""
+
+QUIET_S = 0.02
+"""Acknowledgements must stay away at least this long before packets time out: twice what they are held back."""
+
+EXPIRE_EVERY_S = 0.005
+"""Between two looks for packets that timed out."""
+
 RETURN_BURST_PACKETS = 10
 """What leaves at once when a silent peer is heard without acknowledging (the way to it may still be cut)."""
 
@@ -103,7 +114,11 @@ class Outbound:
         self.wake_at = float("inf")
         """When pacing lets the next quantum leave."""
         self.silent_since: float | None = None
-        self.timeouts = 0
+        self.struggling = False
+        """Acknowledgements stay away: packets are taken for lost by their age."""
+        self.overdue: list[Packet] = []
+        """Packets that timed out and are neither known to have arrived nor sent again."""
+        self.expired_at = float("-inf")
         self.probe_credit = 0
         self.probed_at = float("-inf")
         self.last_progress = 0.0
@@ -180,10 +195,12 @@ class Outbound:
         acknowledged, lost, newest = flight.acknowledge(ack.largest, ack.received << 1 | 1)
         if acknowledged:
             self.last_progress = now
-            self.timeouts = 0
+            self.struggling = False
             if self.silent_since is not None:
                 self._end_silence()
             self._book_arrivals(acknowledged)
+            if self.overdue:
+                self._settle_overdue()
             rate: float | None = None
             count = len(acknowledged)
             self.delivered_packets += count
@@ -213,7 +230,7 @@ class Outbound:
             if not message.ended and not message.arrived[position]:
                 message.arrived[position] = 1
                 message.missing -= 1
-                self.delivered_bytes += message.fragment_bytes
+                self.delivered_bytes += message.fragment_bytes if position else message.first_bytes
                 if not message.missing:
                     self.finish(message, Outcome.DELIVERED)
             for message, position in more:
@@ -246,11 +263,9 @@ class Outbound:
         at: float | None = None
         if self.silent_since is not None:
             if self.open or self.flight.outstanding:
-                at = self.probed_at + (
-                    PROBE_SOON_S if self.probed_at - self.silent_since < PROBE_SOON_FOR_S else PROBE_S
-                )
+                at = self.probed_at + self._probe_every(self.silent_since)
         elif self.flight.outstanding:
-            at = self.last_progress + self.timeout()
+            at = self._expiry_at()
         if self._deadlines and (at is None or self._deadlines[0][0] < at):
             at = self._deadlines[0][0]
         if self.wake_at != float("inf") and (at is None or self.wake_at < at):
@@ -261,7 +276,7 @@ class Outbound:
 
     def timeout(self) -> float:
         """Silence after which the oldest packet counts as lost."""
-        return min(PROBE_S, self.trip.timeout(self.rates.ack_delay_s)) if self.timeouts < 2 else PROBE_S
+        return min(PROBE_S, self.trip.timeout(self.rates.ack_delay_s))
 
     def handle_timer(self, now: float) -> None:
         while self._deadlines and self._deadlines[0][0] <= now:
@@ -270,18 +285,45 @@ class Outbound:
         if self.wake_at <= now:
             self.wake_at = float("inf")
         if self.silent_since is not None:
-            every = PROBE_SOON_S if self.probed_at - self.silent_since < PROBE_SOON_FOR_S else PROBE_S
-            if now >= self.probed_at + every and (self.open or self.flight.outstanding):
+            if now >= self.probed_at + self._probe_every(self.silent_since) and (self.open or self.flight.outstanding):
                 self.allow_probe(now)
-        elif self.flight.outstanding and now >= self.last_progress + self.timeout():
-            self.timeouts += 1
-            self.last_progress = now
-            if self.timeouts == 1:
-                self._put_back(self.flight.lose_oldest())
-                self.probe_credit = 1
-            else:
+        elif self.flight.outstanding:
+            timeout = self.timeout()
+            if now >= self.last_progress + max(SILENT_AFTER_TIMEOUTS * timeout, SILENT_AFTER_S):
                 self.silent_since = now
                 self.allow_probe(now)
+            elif now >= self._expiry_at():
+                self.expired_at = now
+                self._expire(now - timeout)
+
+    def _expiry_at(self) -> float:
+        """When to look for packets whose acknowledgement is overdue."""
+        oldest = self.flight.oldest_sent_at()
+        timeout = self.timeout()
+        quiet = self.last_progress + max(QUIET_S, timeout / 2)
+        return max(quiet, oldest + timeout, self.expired_at + EXPIRE_EVERY_S)
+
+    def _expire(self, sent_before: float) -> None:
+        """Packets sent until then are no longer counted as on their way, so that others may leave.
+
+        Whether they, or only their acknowledgements, were lost the next acknowledgement will tell: until then urgent
+        pieces are sent again, others only if nothing else waits.
+        """
+        self.struggling = True
+        for packet in self.flight.lose_before(sent_before):
+            if packet.message.priority <= self.rates.urgent_priority:
+                self._put_back((packet,))
+            else:
+                self.overdue.append(packet)
+        if self.overdue and not self.scheduler.waiting:
+            self._settle_overdue()
+
+    def _settle_overdue(self) -> None:
+        overdue, self.overdue = self.overdue, []
+        self._put_back(overdue)
+
+    def _probe_every(self, silent_since: float) -> float:
+        return PROBE_SOON_S if self.probed_at - silent_since < PROBE_SOON_FOR_S else PROBE_S
 
     def allow_probe(self, now: float) -> None:
         """The most urgent waiting piece may leave although the peer is silent; not more often than `PROBE_SOON_S`."""
@@ -293,6 +335,7 @@ class Outbound:
 
     def _set_aside(self) -> None:
         """Everything on its way waits again, urgent messages behind those still to come."""
+        self._settle_overdue()
         self._put_back(self.flight.give_up())
         self.scheduler.set_aside(self.rates.urgent_priority)
 
@@ -328,12 +371,13 @@ class Outbound:
     def restart(self, now: float) -> None:
         """The peer runs anew (or must be told anew): every open message begins again under new numbers."""
         self.flight.restart(0)
+        self.overdue.clear()
         self.announced.clear()
         self.copies.clear()
         self.cancelled.clear()
         self.next_wire_id = 0
         self.silent_since = None
-        self.timeouts = 0
+        self.struggling = False
         self.probe_credit = 0
         self.last_progress = now
         messages = list(self.open)
@@ -390,8 +434,9 @@ class Outbound:
             self.cancelled.append(message.wire_id)
 
     def by_wire_id(self, wire_id: int) -> Outgoing | None:
-        """The open message of this number; a search, for the rare answers that name one."""
-        return next((message for message in self.open if message.wire_id == wire_id), None)
+        """The open message of this number (copies of casts are numbered apart); a search, for rare answers."""
+        own = (message for message in self.open if message.accepted.broadcast_number is None)
+        return next((message for message in own if message.wire_id == wire_id), None)
 
     def finish_all(self, outcome: Outcome | ExpiryReason) -> None:
         for message in list(self.open):

@@ -145,7 +145,7 @@ def follow(state: State, session: Session, link: str, source: Address, now: floa
         return
     way = session.way
     outbound = session.peer.outbound if session.peer is not None else None
-    struggling = outbound is not None and (outbound.timeouts > 0 or outbound.silent_since is not None)
+    struggling = outbound is not None and (outbound.struggling or outbound.silent_since is not None)
     first = not way.link
     if not first and now - way.heard_at < STALE_PATH_S and not struggling and way.link in state.links:
         return

@@ -49,6 +49,12 @@ DRAIN_EVERY_ROUND_TRIPS = 15.0
 DRAIN_TO = 0.8
 """Part of the pipe filled while draining."""
 
+GROWTH = 1.25
+"""Growth per round trip while the window is used up and yet no queue is seen: the link has become faster."""
+
+GROWTH = 1.25
+"""Growth per round trip while the window is used up and yet no queue is seen: the link has become faster."""
+
 SUSPECT_QUEUES = 2.5
 """Queueing of this many `QUEUE_S` is more than our own window explains."""
 
@@ -192,6 +198,9 @@ class AdaptiveWindow:
         if rate is not None:
             self._saw_rate(rate, limited=limited, now=now)
         self._latest_four.append(trip.latest)
+        if limited and len(self._latest_four) == 4 and min(self._latest_four) > 1.15 * trip.least + QUEUE_S:
+            # So little was on its way that none of this is our queue: the path itself is longer now.
+            trip.forget_least(min(self._latest_four), now)
         if self.phase is Phase.DRAIN:
             if in_flight <= self.packets:
                 self.phase = Phase.HOLD
@@ -239,6 +248,9 @@ class AdaptiveWindow:
             else:
                 self._begin_drain(now, suspicion=False)
                 return
+        if standing - least < QUEUE_S / 4 and not limited and since_drain > 2 * standing:
+            self.packets = self._bounded(GROWTH * self.packets, least, standing)
+            return
         wanted = 0.5 * self.packets + 0.5 * (self.packets * least / standing + self._queue(standing))
         if wanted < self.packets or not limited:
             self.packets = self._bounded(min(wanted, 2 * self.packets), least, standing)
