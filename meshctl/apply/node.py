@@ -91,15 +91,15 @@ def _move(attempt: Attempt, connection: SshConnection) -> Outcome | None:
         case Move.FOREIGN:
             status = attempt.status
             return Outcome(name, Result.REFUSED, f"a change of {status.owner} is {status.state} on it")
-        case Move.START:
-            return _start_again(attempt, connection)
+        case Move.START | Move.BEGIN as move:
+            return _go_on(attempt, connection, move)
         case Move.WAIT:
             pass
     return None
 
 
-def _start_again(attempt: Attempt, connection: SshConnection) -> Outcome | None:
-    """The node has nothing of ours that would begin by itself: send it again, a few times."""
+def _go_on(attempt: Attempt, connection: SshConnection, move: Move) -> Outcome | None:
+    """The node has nothing of ours that would begin by itself: send what is missing again, a few times."""
     name = attempt.job.name
     if attempt.starts >= STARTS:
         with suppress(NodeError):
@@ -107,9 +107,13 @@ def _start_again(attempt: Attempt, connection: SshConnection) -> Outcome | None:
         release(attempt, connection)
         return Outcome(name, Result.FAILED, f"its link breaks before the change is there: {attempt.trouble}")
     try:
-        prepare(attempt, connection)
+        if move is Move.START:
+            prepare(attempt, connection)
+        else:
+            attempt.starts += 1
         begin(attempt, connection)
     except NodeRefused as refusal:
+        take_back(attempt, connection)
         release(attempt, connection)
         return Outcome(name, Result.REFUSED, str(refusal), hint=refusal.hint)
     return None

@@ -13,10 +13,12 @@ from meshctl.device.observation import ChangeStatus
 
 
 class Move(Enum):
-    """START: nothing of ours is there, send it. WAIT: it is on its way. CONFIRM: it has proven itself. ABORT: it never
-    will. KEPT, WENT_BACK: it has ended. FOREIGN: somebody else's change is in the way."""
+    """START: nothing of ours is armed, send it. BEGIN: it is armed and waits for the word. WAIT: it is on its way.
+    CONFIRM: it has proven itself. ABORT: it never will. KEPT, WENT_BACK: it has ended. FOREIGN: somebody else's change
+    is in the way."""
 
     START = "start"
+    BEGIN = "begin"
     WAIT = "wait"
     CONFIRM = "confirm"
     ABORT = "abort"
@@ -46,9 +48,10 @@ def next_move(
         return start
     if status.change_id == change_id:
         match status.state:
-            case "staged" | "armed":
-                # armed, and the connection broke before it was told when to begin
+            case "staged":
                 return Move.ABORT if is_given_up else Move.START
+            case "armed":
+                return Move.ABORT if is_given_up else Move.BEGIN
             case "applied":
                 if is_given_up:
                     return Move.ABORT

@@ -87,6 +87,7 @@ def running(
             f"/{file.path}", file.mode, hashlib.sha256(file.content).hexdigest(), file.content.decode()
         )
         for file in want.files
+        if file.package is None
     }
     seen = Observation(
         asked_at_s=1000.0,

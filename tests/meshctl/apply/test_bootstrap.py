@@ -1,0 +1,71 @@
+"""Laws of identity: a device is taken for a node only when its MACs, or the operator's word and no MAC, say so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import MappingProxyType
+
+import pytest
+
+from meshctl.apply.bootstrap import find_node, identify
+from meshctl.apply.replace import identity_edits
+from meshctl.device.observation import BoardInfo, Observation
+from meshctl.errors import InputError, NodeError
+from meshctl.model import Fleet, NodeState
+from tests.meshctl.plan.support import factory, fleet
+
+MAC = "02:4d:00:00:00:01"
+
+
+def labelled() -> Fleet:
+    """b01 has a MAC, a label and a serial number; b02 and the others nothing."""
+    team = fleet()
+    b01 = replace(team.nodes["b01"], mac=MAC, label="H1-1", serial="SN1")
+    return replace(team, nodes=MappingProxyType({**team.nodes, "b01": b01}))
+
+
+def device(*macs: str) -> Observation:
+    return replace(factory(fleet(), "b01"), macs={f"eth{index}": mac for index, mac in enumerate(macs)})
+
+
+@pytest.mark.parametrize("word", ["b01", "B01", "h1-1", "sn1", MAC.upper()])
+def test_a_node_is_found_by_name_label_serial_or_mac(word: str) -> None:
+    assert find_node(labelled(), word).name == "b01"
+
+
+@pytest.mark.parametrize("word", ["b99", "", "02:00:00:00:00:99"])
+def test_what_means_no_node_is_refused(word: str) -> None:
+    with pytest.raises(InputError, match="no node of the fleet"):
+        find_node(labelled(), word)
+
+
+def test_a_mac_tells_who_it_is() -> None:
+    assert identify(labelled(), device(MAC.upper()), "").name == "b01"
+    label = replace(device(), board=BoardInfo("compex,wpj344-16m", label_mac=MAC))
+    assert identify(labelled(), label, "").name == "b01"
+
+
+def test_a_device_that_nobody_knows_needs_the_operators_word() -> None:
+    with pytest.raises(NodeError, match="nothing tells which node it is"):
+        identify(labelled(), device("02:00:00:00:00:42"), "")
+    assert identify(labelled(), device("02:00:00:00:00:42"), "b02").name == "b02"
+
+
+def test_the_wrong_device_is_refused_whatever_the_operator_says() -> None:
+    with pytest.raises(NodeError, match="said to be b02, its MAC is that of b01"):
+        identify(labelled(), device(MAC), "b02")
+    with pytest.raises(NodeError, match="b01 has 02:4d:00:00:00:01, this one has 02:00:00:00:00:42"):
+        identify(labelled(), device("02:00:00:00:00:42"), "b01")
+
+
+def test_one_node_is_not_found_twice() -> None:
+    with pytest.raises(NodeError, match="found at another place already"):
+        identify(labelled(), device(MAC), "", taken=["b01"])
+
+
+def test_a_spare_hands_over_its_mac_label_and_serial_and_retires() -> None:
+    team = labelled()
+    spare = replace(team.nodes["b02"], mac="02:4d:00:00:00:02", label="S1", state=NodeState.SPARE)
+    mine, theirs = identity_edits(team.nodes["b01"], spare, device("02:4d:00:00:00:02"))
+    assert mine == {"mac": "02:4d:00:00:00:02", "label": "S1"}
+    assert theirs == {"state": "retired"}

@@ -1,0 +1,83 @@
+"""Laws of a backup: it reads back as it was, says what it is of, and nothing else is taken for one."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import io
+import tarfile
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from meshctl.apply.keep import Backup, lacking_packages, objection_to, read_backup, with_info
+from meshctl.device.observation import BoardInfo
+from meshctl.errors import InputError
+from tests.meshctl.plan.support import fleet, running
+
+INFO = {"node": "b01", "board": "compex,wpj344-16m", "revision": "r1", "taken_s": 12.5, "packages": ["iw", "wpad"]}
+
+
+def archive(*members: tuple[str, bytes]) -> bytes:
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w:gz") as tar:
+        for name, content in members:
+            entry = tarfile.TarInfo(name)
+            entry.size, entry.mode = len(content), 0o600
+            tar.addfile(entry, io.BytesIO(content))
+    return out.getvalue()
+
+
+def saved(*members: tuple[str, bytes]) -> Backup:
+    return read_backup(with_info(archive(("etc/config/network", b"config x\n"), *members), INFO), "b.tgz")
+
+
+def test_a_backup_reads_back_with_what_it_was_taken_from() -> None:
+    backup = saved(("etc/dropbear/authorized_keys", b"key"))
+    assert (backup.node, backup.board, backup.taken_s, backup.packages) == ("b01", INFO["board"], 12.5, ("iw", "wpad"))
+    assert {path: new.content for path, new in backup.files.items()} == {
+        "/etc/config/network": b"config x\n",
+        "/etc/dropbear/authorized_keys": b"key",
+    }
+    assert backup.files["/etc/config/network"].mode == 0o600
+
+
+@pytest.mark.parametrize("path", ["../../etc/passwd", "etc/../../x", "tmp/x/y", "etc/meshctl/change/armed", "a b/c"])
+def test_paths_that_must_not_be_written_are_left_out(path: str) -> None:
+    assert set(saved((path, b"x")).files) == {"/etc/config/network"}
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "expected a tar.gz archive"),
+        (b"not gzip at all", "expected a tar.gz archive"),
+        (gzip.compress(b"no tar"), "expected a tar.gz archive"),
+        (archive(("etc/config/network", b"x")), "no meshctl-backup.json in it"),
+        (with_info(archive(("etc/passwd", b"x")), INFO), "no configuration in it"),
+        (archive(("meshctl-backup.json", b"["), ("etc/config/x", b"")), "meshctl-backup.json is damaged"),
+        (archive(("meshctl-backup.json", b"[]"), ("etc/config/x", b"")), "expected an object"),
+    ],
+)
+def test_what_is_no_backup_is_refused_with_its_file(data: bytes, message: str) -> None:
+    with pytest.raises(InputError, match=r"^b\.tgz: ") as caught:
+        read_backup(data, "b.tgz")
+    assert message in str(caught.value)
+
+
+@given(st.binary(max_size=200), st.integers(0, 400))
+def test_damaged_bytes_give_an_error_or_a_backup_and_nothing_else(noise: bytes, at: int) -> None:
+    data = bytearray(with_info(archive(("etc/config/network", b"config x\n")), INFO))
+    data[at : at + len(noise)] = noise
+    with contextlib.suppress(InputError):
+        read_backup(bytes(data), "b.tgz")
+
+
+def test_a_backup_goes_onto_its_own_node_and_board_only() -> None:
+    seen = running(fleet(), "b01")
+    assert objection_to(saved(), "b01", seen) == ""
+    assert "the backup is of b01, not of b02" in objection_to(saved(), "b02", seen)
+    assert "is ubnt,rocket-m" in objection_to(saved(), "b01", replace(seen, board=BoardInfo("ubnt,rocket-m")))
+    assert lacking_packages(saved(), replace(seen, packages={"iw": "1"})) == ("wpad",)

@@ -1,0 +1,118 @@
+"""The kill matrix: strike at a chosen step, then see that nothing is stranded and a resume finishes the job.
+
+`strike_nodes` cuts power or links of each node at its own step during one run; `strike_meshctl` kills meshctl itself
+when it has said so many words. Both return one `Case` per node.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from tests.meshctl.proof.rig import Ended, Rig
+
+# After its window a node puts its files back and reloads.
+SLACK_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One node struck once. `outcome` is what the struck run said, `state` what was on the node's flash afterwards,
+    `reachable` whether meshctl could see it then, `resumed` whether a resume brought it to the new state."""
+
+    verb: str
+    kind: str
+    step: str
+    node: str
+    outcome: str
+    state: str
+    reachable: bool
+    resumed: bool
+
+    @property
+    def holds(self) -> bool:
+        return self.state in ("old", "new") and self.reachable and self.resumed
+
+    def object(self) -> dict[str, Any]:
+        return {**asdict(self), "holds": self.holds}
+
+
+def strike_nodes(
+    rig: Rig, steps: Mapping[str, str], kind: str, *, old: str, new: str, verb: str = "apply"
+) -> list[Case]:
+    """`steps`: node -> the n-th external command, or words of one. `kind` is `power-cut` or `sever`."""
+    for name, step in steps.items():
+        rig.fleet.break_(name, f"{kind}@{step}")
+    with rig.start("provision", new, "--yes", "--json") as process, ThreadPoolExecutor(1) as reader:
+        talk = reader.submit(process.communicate)
+        _mend_when_undone(rig, set(steps), talk)
+        out, err = talk.result()
+    run = Ended(process.returncode, out, err)
+    for name in steps:
+        rig.fleet.mend(name)
+    return _afterwards(rig, {name: (kind, step) for name, step in steps.items()}, run, old=old, new=new, verb=verb)
+
+
+def _mend_when_undone(rig: Rig, names: set[str], talk: Future[tuple[str, str]]) -> None:
+    """Give severed nodes their links back once their windows have run out, so that meshctl sees what became of them."""
+    severed: dict[str, float] = {}
+    while not talk.done():
+        for node in rig.fleet.status()["nodes"]:
+            name = node["name"]
+            if name in names and not node["plugged"]:
+                began = severed.setdefault(name, time.monotonic())
+                if time.monotonic() - began > rig.window_s + SLACK_S:
+                    rig.fleet.mend(name)
+                    names.discard(name)
+        wait([talk], timeout=0.5)
+
+
+def strike_meshctl(rig: Rig, words: int, *, old: str, new: str, verb: str = "apply") -> list[Case]:
+    """Kill meshctl (SIGKILL) once it has told `words` events; fewer events in all mean that it ended by itself."""
+    said: list[str] = []
+    with rig.start("provision", new, "--yes", "--json") as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            said.append(line)
+            if len(said) >= words:
+                process.send_signal(signal.SIGKILL)
+                break
+        rest, err = process.communicate()
+    run = Ended(process.returncode, "".join(said) + rest, err)
+    struck = {name: ("kill meshctl", _last_word(run, name)) for name in rig.names}
+    return _afterwards(rig, struck, run, old=old, new=new, verb=verb)
+
+
+def _last_word(run: Ended, name: str) -> str:
+    told = [event for event in run.events if event.get("node") == name]
+    return str(told[-1].get("text") or told[-1]["event"]) if told else "before it"
+
+
+def _afterwards(
+    rig: Rig, struck: Mapping[str, tuple[str, str]], run: Ended, *, old: str, new: str, verb: str
+) -> list[Case]:
+    rig.wait_all_up()
+    # whoever is still under its dead-man's switch is let come to rest: looking clears what a dead meshctl left
+    seen = rig.meshctl("provision", new, "--check", "--json")
+    verdicts = seen.verdicts
+    states = {name: rig.state_of(name, old, new) for name in struck}
+    resumed = rig.meshctl("resume", new, "--yes", "--json")
+    if resumed.code != 0 and not resumed.results:
+        raise AssertionError(f"resume could not run: {resumed.err}")
+    return [
+        Case(
+            verb,
+            kind,
+            step,
+            name,
+            run.results.get(name, "killed"),
+            states[name],
+            verdicts.get(name) in ("same", "change"),
+            rig.state_of(name, old, new) == "new",
+        )
+        for name, (kind, step) in struck.items()
+    ]

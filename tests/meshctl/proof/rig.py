@@ -1,0 +1,225 @@
+"""A virtual fleet, two inventories to go back and forth between, and meshctl as a process that can be killed.
+
+`Rig.up` starts the nodes and takes them into the fleet; `meshctl` runs a command to its end, `start` begins one;
+`state_of` reads a node's flash and says whether it is wholly `old`, wholly `new`, or `mixed`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+import tarfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from meshctl.inventory import load_fleet
+from meshctl.lab.fleet import VirtualFleet
+from meshctl.lab.spec import FleetSpec, LinkSpec, Medium, NodeSpec
+from meshctl.model import Secret, SecretRef
+from meshctl.render import DeviceFacts, render_node
+from meshctl.uci import parse
+
+# Far above what any command needs on a busy machine; a hang ends here.
+COMMAND_LIMIT_S = 600.0
+INVENTORY = """\
+meshctl: 1
+fleet: proof
+country: US
+operators:
+  ssh_keys: ["{key}"]
+system: {{log_size_kib: {log_size}}}
+apply: {{max_down: {count}, canary: false, stop_after_failures: 100000, parallel: {parallel}}}
+hardware:
+  box:
+    board: compex,wpj344-16m
+    profile: compex_wpj344-16m
+    target: ath79/generic
+    release: "23.05"
+    lan_ports: [eth0]
+    confirm_window_s: {window_s}
+    radios:
+      radio0: {{path: platform/ahb/18100000.wmac, band: 2g, rated_power_dbm: 30, max_drive_dbm: 27}}
+{firmware}
+meshes:
+  main:
+    ssid: proof
+    bssid: 02:ca:fe:00:00:01
+    band: 2g
+    channel: {channel}
+    distance_m: {distance}
+    network: 10.42.0.0/16
+    batman: {{hop_penalty: {penalty}}}
+defaults: {{hardware: box, state: deployed}}
+nodes:
+  base: {{role: base, address: 10.42.0.1}}
+  n[001-{count:03}]: {{role: beacon, address: {{from: 10.42.1.1}}}}
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """What a meshctl process said: its exit code and, of `--json`, one object per line."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.out.splitlines() if line.startswith("{")]
+
+    @property
+    def results(self) -> dict[str, str]:
+        """Node -> result."""
+        ended = [event for event in self.events if event.get("event") == "ended"]
+        return {item["node"]: item["result"] for item in ended[-1]["outcomes"]} if ended else {}
+
+    @property
+    def verdicts(self) -> dict[str, str]:
+        """Node -> verdict, of `provision --check --json`."""
+        return {name: item["verdict"] for name, item in json.loads(self.out)["nodes"].items()}
+
+
+@dataclass(slots=True)
+class Rig:
+    """A base and `count` nodes around it, every one also wired to the bench."""
+
+    directory: Path
+    count: int
+    window_s: int = 10
+    parallel: int = 8
+    firmware: Mapping[str, str] = field(default_factory=dict)
+    fleet: VirtualFleet = field(init=False)
+
+    def __enter__(self) -> Self:
+        self.directory.mkdir(parents=True, exist_ok=True)
+        private = Ed25519PrivateKey.generate()
+        self._key.write_bytes(
+            private.private_bytes(
+                serialization.Encoding.PEM, serialization.PrivateFormat.OpenSSH, serialization.NoEncryption()
+            )
+        )
+        self._key.chmod(0o600)
+        public = private.public_key().public_bytes(serialization.Encoding.OpenSSH, serialization.PublicFormat.OpenSSH)
+        for number, variant in enumerate(VARIANTS):
+            text = INVENTORY.format(
+                key=public.decode() + " proof",
+                count=self.count,
+                window_s=self.window_s,
+                parallel=self.parallel,
+                firmware=self.firmware.get(variant, ""),
+                log_size=64 + number,
+                channel=SPLIT_CHANNELS[number] if variant == "split" else 6,
+                distance=1000 + number,
+                penalty=30 + number,
+            )
+            self.inventory(variant).write_text(text, encoding="utf-8")
+        names = ["base", *self.names]
+        nodes = tuple(
+            NodeSpec(name, medium=Medium.BASE if name == "base" else Medium.BENCH, host_key_types=("ed25519",))
+            for name in names
+        )
+        links = tuple(LinkSpec("base", name) for name in self.names)
+        self.fleet = VirtualFleet(FleetSpec("proof", nodes, links), self.directory / "lab").up(
+            wait_s=60.0 + 5.0 * self.count
+        )
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.fleet.down()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(f"n{number:03}" for number in range(1, self.count + 1))
+
+    @property
+    def _key(self) -> Path:
+        return self.directory / "key"
+
+    def inventory(self, variant: str) -> Path:
+        return self.directory / f"{variant}.yaml"
+
+    @property
+    def environ(self) -> dict[str, str]:
+        root = str(Path(__file__).resolve().parents[3])
+        return {
+            **os.environ,
+            "XDG_STATE_HOME": str(self.directory / "state"),
+            "MESHCTL_LAB": str(self.fleet.directory),
+            "PYTHONPATH": root,
+            "SSH_AUTH_SOCK": "",
+        }
+
+    def start(self, command: str, variant: str, *words: str) -> subprocess.Popen[str]:
+        """Begin a command on inventory `variant`."""
+        arguments = [sys.executable, "-m", "meshctl", command, *words, "-i", str(self.inventory(variant))]
+        arguments += ["--key", str(self._key)]
+        return subprocess.Popen(
+            arguments,
+            env=self.environ,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def meshctl(self, command: str, variant: str, *words: str) -> Ended:
+        """Run a command to its end."""
+        with self.start(command, variant, *words) as process:
+            out, err = process.communicate(timeout=COMMAND_LIMIT_S)
+            return Ended(process.returncode, out, err)
+
+    def take_in(self, variant: str) -> Ended:
+        """Bootstrap every node with inventory `variant`."""
+        return self.meshctl("bootstrap", variant, "--yes", "--json")
+
+    def rendered(self, variant: str, name: str, facts: DeviceFacts) -> dict[str, bytes]:
+        """The files that inventory `variant` wants of a node, without the leading slash."""
+        found = render_node(load_fleet(self.inventory(variant)), name, _no_secret, device_facts=facts)
+        return {file.path: file.content for file in found.files}
+
+    def state_of(self, name: str, old: str, new: str) -> str:
+        """`old`, `new`, or `mixed` with the paths that are neither here nor there."""
+        there = dict(self._files(name))
+        system = parse(there.get("etc/config/system", b"").decode(), "system")
+        compat = next((text for section in system.sections if (text := section.get("compat_version"))), "")
+        before = self.rendered(old, name, DeviceFacts(compat))
+        after = self.rendered(new, name, DeviceFacts(compat))
+        differing = [path for path in after if before.get(path) != after[path]]
+        if all(there.get(path) == after[path] for path in differing):
+            return "new"
+        if all(there.get(path) == before[path] for path in differing):
+            return "old"
+        return "mixed: " + ", ".join(path for path in differing if there.get(path) != before[path])
+
+    def _files(self, name: str) -> Iterator[tuple[str, bytes]]:
+        done = self.fleet.node(name).exec("cd / && tar -cf - etc/config etc/dropbear etc/meshctl/node")
+        with tarfile.open(fileobj=io.BytesIO(done.stdout_bytes)) as tar:
+            for member in tar:
+                stream = tar.extractfile(member)
+                if stream is not None:
+                    yield member.name, stream.read()
+
+    def wait_all_up(self) -> None:
+        for name in ("base", *self.names):
+            self.fleet.node(name).wait_up(wait_s=120.0)
+
+
+# a, b: another distance, hop penalty and log size; split: another channel
+VARIANTS = ("a", "b", "split")
+SPLIT_CHANNELS = (6, 6, 11)
+
+
+def _no_secret(ref: SecretRef) -> Secret:
+    raise AssertionError(f"no secret is in these inventories: {ref}")
