@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import stat
 import subprocess
 from pathlib import Path
 
@@ -15,23 +17,22 @@ _GIT_TIMEOUT_S = 10
 
 
 class DiskFiles:
-    """`meshctl.lint.context.Files` on the real file system, with a memory."""
+    """`meshctl.lint.context.Files` on the real file system, with a memory.
+
+    A name that no file can have (one with a NUL, a ValueError to Python) is a file that is not there.
+    """
 
     def __init__(self) -> None:
         self._firmware: dict[HardwareProfile, tuple[Diagnostic, ...]] = {}
         self._tracked: dict[Path, bool] = {}
 
     def size_bytes(self, path: Path) -> int | None:
-        try:
-            return path.stat().st_size if path.is_file() else None
-        except OSError:
-            return None
+        found = _status(path)
+        return None if found is None else found.st_size
 
     def mode(self, path: Path) -> int | None:
-        try:
-            return path.stat().st_mode & 0o7777
-        except OSError:
-            return None
+        found = _status(path)
+        return None if found is None else stat.S_IMODE(found.st_mode)
 
     def in_repository(self, path: Path) -> bool:
         if path not in self._tracked:
@@ -43,6 +44,15 @@ class DiskFiles:
             image = firmware.image_path(profile)
             self._firmware[profile] = () if image is None else firmware.check(image, profile)
         return self._firmware[profile]
+
+
+def _status(path: Path) -> os.stat_result | None:
+    """The status of a regular file, None for anything else."""
+    try:
+        found = path.stat()
+    except (OSError, ValueError):
+        return None
+    return found if stat.S_ISREG(found.st_mode) else None
 
 
 def _would_be_committed(path: Path) -> bool:

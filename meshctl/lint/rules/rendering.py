@@ -17,6 +17,8 @@ from meshctl.resolve import resolve
 
 # stands for every secret: it is allowed as a passphrase, and never leaves this module
 _PLACEHOLDER = Secret("placeholder-for-lint")
+# a path from the inventory can be as long as the file
+_SHOWN_LETTERS = 200
 _TEMPLATE_CODES = (TEMPLATE, NOT_UCI, NO_TEMPLATE, EXTRA)
 
 
@@ -68,6 +70,10 @@ def template_fails(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for _, outcome in _rendered(fleet):
         if isinstance(outcome, Rendered):
             continue
+        if isinstance(outcome, OSError):
+            found = f"{outcome.filename or 'it'}: {outcome.strerror}"[:_SHOWN_LETTERS]
+            yield Finding(("meshes",), "templates cannot be read", "a folder of templates", found)
+            return
         for item in outcome.diagnostics:
             if item.code in _TEMPLATE_CODES and (item.position, item.message) not in seen:
                 seen.add((item.position, item.message))
@@ -106,7 +112,7 @@ def _lets_in(firewall: uci.Package) -> bool:
     return False
 
 
-def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Rendered | InvalidInput]]:
+def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Rendered | InvalidInput | OSError]]:
     """Every kind of node with its files, or with what keeps them from being rendered."""
     templates = Templates.of(fleet)
     for node in _kinds(fleet):
@@ -118,8 +124,8 @@ def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Rendered | InvalidInput]]:
             # values that cannot be written down have rules of their own
             continue
         try:
-            outcome: Rendered | InvalidInput = render(intent, templates)
-        except InvalidInput as error:
+            outcome: Rendered | InvalidInput | OSError = render(intent, templates)
+        except (InvalidInput, OSError) as error:
             outcome = error
         yield node, outcome
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import os.path
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,7 +43,8 @@ def secret_refs(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SecretRef]]:
 
 
 def _path(fleet: Fleet, where: str, base: str) -> Path:
-    return Path(base or fleet.base or ".", Path(where).expanduser())
+    # not Path.expanduser, which raises for a user that does not exist
+    return Path(base or fleet.base or ".", os.path.expanduser(where))
 
 
 def _secret_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], Path, str]]:
