@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
-from meshctl.diagnostics import Diagnostic, Position, Severity
+from meshctl.diagnostics import Diagnostic, Position
 from meshctl.errors import InputError
 from meshctl.lint.engine import diagnostic
 from meshctl.lint.rule import Finding
@@ -96,8 +96,3 @@ def compare(
             finding = Finding((), f"{code} is no longer found", "", about)
             stale.append(diagnostic(STALE_BASELINE, finding, Position(str(path))))
     return Compared(tuple(new), tuple(known), tuple(stale))
-
-
-def counts(diagnostics: Iterable[Diagnostic]) -> Counter[Severity]:
-    """How many findings there are of each severity."""
-    return Counter(item.severity for item in diagnostics)

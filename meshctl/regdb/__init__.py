@@ -7,7 +7,7 @@ channel of a width against them.
 from meshctl.regdb.binary import RegdbError, decode
 from meshctl.regdb.channels import CHANNELS, Span, center_mhz, channel_at, occupied, width_mhz
 from meshctl.regdb.file import SHIPPED, SYSTEM, load
-from meshctl.regdb.legality import Verdict, judge, legal_channels
+from meshctl.regdb.legality import Verdict, judge, legal_channels, primary
 from meshctl.regdb.values import Country, DfsRegion, Flag, Regdb, Rule
 
 __all__ = [
@@ -29,5 +29,6 @@ __all__ = [
     "legal_channels",
     "load",
     "occupied",
+    "primary",
     "width_mhz",
 ]

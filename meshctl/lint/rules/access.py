@@ -133,7 +133,8 @@ def no_rsa_for_19_07(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC426",
     Severity.WARNING,
     "An operator's key is weak",
-    why="DSA keys and RSA keys below 2048 bits are refused by current OpenSSH, and can be broken.",
+    why="""Current OpenSSH refuses DSA keys, and RSA keys below 2048 bits are no longer held to be safe (NIST SP
+    800-57).""",
     mend="Make a new one: `ssh-keygen -t ed25519`.",
     failing=f"operators: {{ssh_keys: ['{_ALICE}', '{_rsa_key(1024)} bob']}}",
     passing=f"operators: {{ssh_keys: ['{_ALICE}']}}",

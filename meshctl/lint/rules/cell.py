@@ -113,8 +113,8 @@ def cell_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC305",
     Severity.WARNING,
     "Two meshes overlap in frequency",
-    why="""Cells on overlapping channels take air time from each other and cannot even take turns properly: both run at
-    less than half.""",
+    why="""Cells on overlapping channels take air time from each other and cannot take turns as they would on one
+    channel: each hears the other as noise.""",
     mend="Use channels that lie apart: 1, 6 and 11 at 2.4 GHz, or another band.",
     failing=_second("other", "02:ca:fe:00:00:02", 9),
     passing=_second("other", "02:ca:fe:00:00:02", 11),
@@ -263,8 +263,8 @@ def releases_mixed(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC312",
     Severity.WARNING,
     "Ad-hoc mode on OpenWrt 19.07",
-    why="""On 19.07 ath9k's ad-hoc mode stops passing traffic under batman-adv after a while; it is on record with
-    several community networks.""",
+    why="""Trouble of ath9k's ad-hoc mode under batman-adv is on record for 19.07 (lime-packages#855): nodes that stay
+    in the cell and pass no traffic.""",
     mend="Move these nodes to a newer release, or set `mode: mesh`.",
     failing=Example(
         f"""

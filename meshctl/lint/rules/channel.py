@@ -8,8 +8,7 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Band, Fleet, Mesh, MeshMode, Release
-from meshctl.regdb import CHANNELS, Country, Flag, Verdict, judge, legal_channels, occupied, width_mhz
-from meshctl.regdb.legality import primary
+from meshctl.regdb import CHANNELS, Country, Flag, Verdict, judge, legal_channels, occupied, primary, width_mhz
 
 # what keeps a station from starting a cell on its own
 _SILENT = Flag.DFS | Flag.NO_IR
@@ -241,7 +240,7 @@ def width_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "MC329",
     Severity.ERROR,
     "The htmode is not one of the band",
-    why="""OpenWrt ignores an htmode it does not know and the radio falls to the rates of 802.11g: a tenth of the
+    why="""OpenWrt ignores an htmode it does not know and the radio falls to the rates of 802.11g: less than half the
     throughput, and nobody is told.""",
     mend="Use HT20, or HT40, VHT20, VHT40, VHT80 at 5 GHz where the hardware has them.",
     failing="meshes: {main: {htmode: VHT80}}",
@@ -261,7 +260,7 @@ def htmode_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "OpenWrt 25.12 drops HT40+ and HT40- in ad-hoc mode",
     why="""25.12's scripts know only HT20 and HT40 for ad-hoc cells; with a sign behind them the radio joins without HT,
-    at a tenth of the throughput, beside neighbours that use it.""",
+    at less than half the throughput, beside neighbours that use it.""",
     mend="Write HT40, or HT20.",
     failing=Example(
         """

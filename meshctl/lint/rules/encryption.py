@@ -114,8 +114,8 @@ def psk_in_mesh_mode(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC406",
     Severity.ERROR,
     "The supplicant cannot encrypt a mesh",
-    why="""`wpad-basic*` and `wpad-mini` are built without IBSS_RSN and without SAE: the radio never joins, and the log
-    says only that the configuration is invalid.""",
+    why="""`wpad-basic*` and `wpad-mini` are built without IBSS_RSN and without encrypted 802.11s: the radio never
+    joins.""",
     mend="Replace it by a full one: `wpad-mesh-mbedtls`, `wpad-openssl` or another of `wpad-*` without basic or mini.",
     failing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-basic-mbedtls]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-mesh-mbedtls]}}",
@@ -213,7 +213,7 @@ def _is_passphrase(value: str) -> bool:
     "MC410",
     Severity.WARNING,
     "The mesh's passphrase is short",
-    why="""The handshake can be recorded by anyone in reach and tried at leisure, billions of guesses a second: a
+    why="""The handshake can be recorded by anyone in reach and tried at leisure, millions of guesses a second: a
     passphrase of a word and a year lasts minutes.""",
     mend="Make a new one of at least 16 characters: `openssl rand -base64 24`.",
     failing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "husky2021"}),

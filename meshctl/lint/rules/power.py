@@ -9,8 +9,7 @@ from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import grouped
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import AntennaKind, Fleet, Mesh, Node, Radio
-from meshctl.regdb import CHANNELS, judge
-from meshctl.regdb.legality import primary
+from meshctl.regdb import CHANNELS, judge, primary
 
 # 47 CFR 15.247(b)(3), (b)(4), and the same in RSS-247 5.4(d): digital modulation at 2400-2483.5 and 5725-5850 MHz
 _CONDUCTED_LIMIT_DBM = 30.0
@@ -123,13 +122,10 @@ def conducted_above_fcc(fleet: Fleet, _context: LintContext) -> Iterator[Finding
         if mesh.name not in limited or radio.conducted_dbm <= limit + _ROUNDING_DB:
             continue
         excess = radio.conducted_dbm - limit
-        allowed = f"at most {_dbm(limit)} dBm conducted"
-        if excess_gain:
-            allowed += f" (30 less {_dbm(excess_gain)} for an antenna of {_dbm(gain)} dBi)"
+        less = f": 30 less {_dbm(excess_gain)} for an antenna of {_dbm(gain)} dBi" if excess_gain else ""
+        allowed = f"at most {_dbm(limit)} dBm conducted (country {fleet.country}{less})"
         total = f"{power_sum(radio)} = {_dbm(radio.conducted_dbm)} dBm"
-        yield Finding(
-            _at(node, radio), f"{_dbm(round(excess, 2))} dB too much (country {fleet.country})", allowed, total
-        )
+        yield Finding(_at(node, radio), f"{_dbm(round(excess, 2))} dB too much", allowed, total)
 
 
 def _is_limited(fleet: Fleet, mesh: Mesh) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import os.path
 import re
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from pathlib import Path
 
 from meshctl.diagnostics import Position, Severity
@@ -23,7 +23,9 @@ _MATERIAL = (
     (re.compile(r"-----BEGIN [A-Z0-9 ]*PRIVATE KEY-----"), "a private key"),
     (re.compile(r"AGE-SECRET-KEY-1[0-9A-Z]{20,}"), "an age identity"),
     (re.compile(r"untrusted comment: (?:OpenWrt )?(?:secret|private) key", re.IGNORECASE), "a usign secret key"),
-    # a long run of hex or base64 behind a key whose name says what it is
+    # a key of 32 bytes where a reference should stand
+    (re.compile(r"(?i)\bkeys?\b[\"']?\s*:\s*\[?\s*[\"']?(?:[0-9a-f]{64}\b|[a-z0-9+/]{43}=)"), "a key"),
+    # a word behind a name that says what it is
     (
         re.compile(
             r"(?i)\b(?:psk|passphrase|password|passwd|secret|wpa_key|mesh_key|udp_mesh_key)\b[\"']?\s*[:=]\s*[\"']?[^\s\"'{}\[\],#]{8,}"
@@ -200,13 +202,19 @@ def transport_key_missing(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     failing=Example("udp_mesh: {keys: [{env: MESH_KEY}]}", environment={"MESH_KEY": _TRANSPORT_KEY}),
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}]}",
 )
-def secret_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    mesh_keys = {(ref.kind, ref.where, ref.key): place for place, ref in secret_refs(fleet) if place[0] == "meshes"}
+def secret_shared(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    mesh_keys = {_mark(context, ref): place for place, ref in secret_refs(fleet) if place[0] == "meshes"}
     for index, ref in enumerate(fleet.udp_mesh.keys):
-        place = mesh_keys.get((ref.kind, ref.where, ref.key))
+        place = mesh_keys.get(_mark(context, ref))
         if place is not None:
             message = f"also the key of {place[0]}.{place[1]}"
             yield Finding(("udp_mesh", "keys", str(index)), message, "a secret of its own", str(ref))
+
+
+def _mark(context: LintContext, ref: SecretRef) -> Hashable:
+    """What two references to one secret share: its value where that is at hand, else where it is."""
+    secret = context.secret(ref)
+    return (ref.kind, ref.where, ref.key) if secret is None else secret
 
 
 @fleet_rule(
@@ -218,11 +226,12 @@ def secret_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     failing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: UDP_MESH_KEY}]}",
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: UDP_MESH_OLD_KEY}]}",
 )
-def transport_key_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    marks = (((ref.kind, ref.where, ref.key), index) for index, ref in enumerate(fleet.udp_mesh.keys))
-    for (_, where, _), indexes in repeated(marks):
+def transport_key_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    marks = ((_mark(context, ref), index) for index, ref in enumerate(fleet.udp_mesh.keys))
+    for _, indexes in repeated(marks):
         for index in indexes[1:]:
-            yield Finding(("udp_mesh", "keys", str(index)), "the same key stands above", "another key", where)
+            found = str(fleet.udp_mesh.keys[index])
+            yield Finding(("udp_mesh", "keys", str(index)), "the same key stands above", "another key", found)
 
 
 @fleet_rule(

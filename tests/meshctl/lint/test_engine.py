@@ -45,14 +45,14 @@ def test_the_power_sum_is_shown(tmp_path: Path) -> None:
     example = BY_CODE["MC342"].failing
     (finding,) = examine(write(example, tmp_path), _REGDB, environment(example)).diagnostics
     assert finding.found == "27 drive + 6 amplifier = 33 dBm"
-    assert finding.expected == "at most 30 dBm conducted"
+    assert finding.expected == "at most 30 dBm conducted (country US)"
     assert "3 dB too much" in finding.message
 
 
 def test_each_dbi_above_six_takes_a_db_from_the_fccs_watt(tmp_path: Path) -> None:
     found = _found("{hardware: {rocket: {radios: {radio0: {antenna_gain_dbi: 9, cable_loss_db: 0.5}}}}}", tmp_path)
     (finding,) = (item for item in found if item.code == "MC342")
-    assert finding.expected == "at most 27 dBm conducted (30 less 3 for an antenna of 9 dBi)"
+    assert finding.expected == "at most 27 dBm conducted (country US: 30 less 3 for an antenna of 9 dBi)"
     assert finding.found == "28 drive - 0.5 cable = 27.5 dBm"
 
 
@@ -87,6 +87,28 @@ def test_key_material_is_found_even_when_no_fleet_loads(tmp_path: Path) -> None:
     examined = examine(path, _REGDB, {})
     assert [(item.code, item.position.line) for item in examined.diagnostics if item.code == "MC441"] == [("MC441", 3)]
     assert any(item.code.startswith("INV") for item in examined.diagnostics)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "  keys: [b4f8e7f0c3a94c21a1d2d9a0f5c36e7722d1b6c8e3f04a5b9c7d8e1f2a3b4c5d]",
+        "  key: 'tPjn8MOpTCGh0tmg9cNudyLRtsjj8EpbnH2OHyo7TF0='",
+        "# AGE-SECRET-KEY-1QQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQ",
+        "wpa_key=correcthorse",
+    ],
+)
+def test_a_key_on_any_line_is_found_and_not_repeated(line: str, tmp_path: Path) -> None:
+    path = tmp_path / "fleet.yaml"
+    path.write_text(f"meshctl: 1\n{line}\n", encoding="utf-8")
+    found = [item for item in examine(path, _REGDB, {}).diagnostics if item.code == "MC441"]
+    assert [item.position.line for item in found] == [2]
+    assert not any(word in str(found) for word in ("b4f8e7", "tPjn8M", "1QQQQQ", "correcthorse"))
+
+
+def test_a_hash_is_no_key(tmp_path: Path) -> None:
+    example = BY_CODE["MC801"].passing
+    assert examine(write(example, tmp_path), _REGDB, environment(example)).diagnostics == ()
 
 
 def test_references_to_secrets_are_not_taken_for_secrets(tmp_path: Path) -> None:
