@@ -76,7 +76,7 @@ class InvalidInput(InputError):
 
     def __init__(self, diagnostics: Iterable[Diagnostic]) -> None:
         self.diagnostics = sorted_diagnostics(diagnostics)
-        super().__init__("\n".join(str(item) for item in self.diagnostics))
+        super().__init__("\n".join(f"{item}\n  = {item.hint}" if item.hint else str(item) for item in self.diagnostics))
 
 
 def sorted_diagnostics(diagnostics: Iterable[Diagnostic]) -> tuple[Diagnostic, ...]:
