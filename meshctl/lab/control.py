@@ -9,11 +9,13 @@ import asyncio
 import contextlib
 import json
 import os
+import re
 import socket
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from meshctl.errors import MeshctlError
+from meshctl.lab.state import NodeState
 from meshctl.lab.warden import MESSAGE_BYTES
 
 if TYPE_CHECKING:
@@ -113,7 +115,7 @@ class _Operations:
                 "reason": state.reason,
                 "pid": max(state.pid, 0),
                 "boots": state.boots,
-                "release": state.spec.release.value,
+                "release": _release(state),
                 "address": _address(state.effective.addresses),
                 "plugged": state.plugged,
                 "in_mesh": name in reached,
@@ -169,6 +171,13 @@ class _Operations:
 
     def down(self) -> None:
         self._fleet.stopping.set()
+
+
+def _release(state: NodeState) -> str:
+    """What is in its flash chip, which a flash changes."""
+    text = (state.home / "firmware" / "env").read_text(encoding="utf-8", errors="replace")
+    found = re.search(r"^VERSION='([^']*)'", text, re.MULTILINE)
+    return found[1] if found else "-"
 
 
 def _address(addresses: Any) -> str | None:

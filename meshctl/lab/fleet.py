@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -139,7 +140,11 @@ class VirtualNode:
 
     def steps(self) -> tuple[str, ...]:
         """The external commands since `record_steps()`, in order; the n-th (from 1) is what `power-cut@n` strikes."""
-        return tuple(self.exec("cat /tmp/lab/steps.log").check(f"{self.name}: read its steps").stdout.splitlines())
+        return tuple(
+            self.exec("/rom/lab/genuine/busybox cat /tmp/lab/steps.log")
+            .check(f"{self.name}: read its steps")
+            .stdout.splitlines()
+        )
 
 
 class VirtualFleet:
@@ -149,6 +154,7 @@ class VirtualFleet:
         self.spec = spec
         self.directory = directory.resolve()
         self._port = spec.port
+        self._process: subprocess.Popen[bytes] | None = None
 
     @classmethod
     def attach(cls, directory: Path) -> Self:
@@ -182,8 +188,8 @@ class VirtualFleet:
             process.terminate()
             process.wait()
             raise
-        # it goes on by itself; Popen need not warn about it
-        process.returncode = 0
+        self._process = process
+        weakref.finalize(self, _let_go, process)
         return self
 
     def _make_directory(self) -> None:
@@ -239,6 +245,8 @@ class VirtualFleet:
                 time.sleep(_POLL_S)
         finally:
             os.close(watched)
+        if self._process is not None:
+            self._process.wait()
 
     # -- nodes, addresses, links --
 
@@ -306,6 +314,12 @@ def wait_for(condition: Callable[[], bool], what: str, wait_s: float) -> None:
         if time.monotonic() > deadline:
             raise LabError(f"waited {wait_s:g} s for {what}")
         time.sleep(_POLL_S)
+
+
+def _let_go(process: subprocess.Popen[bytes]) -> None:
+    """The supervisor outlives whoever started it: Popen need not warn about that."""
+    if process.returncode is None:
+        process.returncode = 0
 
 
 def _has_ended(pidfd: int) -> bool:

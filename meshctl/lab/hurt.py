@@ -130,10 +130,11 @@ class Hurt:
         if state.is_running:
             write_meminfo(self._fleet.container(state), available_kib=state.spec.memory_kib * 3 // 5)
             board = shlex.quote(state.spec.board)
+            # synced only where the flash was filled: mending is not to save what somebody is working on
             await self.console(
                 state,
-                f"rm -f {' '.join(_FILLERS)} /tmp/lab/fatal; uci -q revert system; sync; "
-                f"echo {board} >/tmp/sysinfo/board_name",
+                f"PATH=/bin:/sbin; rm -f {_FILLERS[1]} /tmp/lab/fatal; uci -q revert system; "
+                f"[ ! -e {_FILLERS[0]} ] || {{ rm -f {_FILLERS[0]}; sync; }}; echo {board} >/tmp/sysinfo/board_name",
             )
         elif state.power is Power.DEAD:
             # what a technician does with TFTP and a cable
@@ -178,6 +179,7 @@ class Hurt:
         await self.console(
             state,
             f"""
+            PATH=/bin:/sbin
             rm -rf /tmp/lab/steps /tmp/lab/steps.log /tmp/lab/fatal /tmp/lab/go
             mkfifo /tmp/lab/go
             : >/tmp/lab/steps.log

@@ -8,20 +8,13 @@ from __future__ import annotations
 
 import gzip
 import io
-import json
-import struct
 import tarfile
-import zlib
 from collections.abc import Mapping
 
+from meshctl.firmware.trailer import append_metadata
 from meshctl.lab.releases import ARCH, facts, firmware_text
 from meshctl.lab.spec import MESH_PACKAGES
 from meshctl.model import Release
-
-# fwtool: magic, CRC-32 without the final inversion, type (1: metadata), size of payload and trailer
-_TRAILER = struct.Struct(">IIB3xI")
-_MAGIC = 0x46577830
-_METADATA = 1
 
 
 def firmware_image(
@@ -53,14 +46,7 @@ def firmware_image(
             "board": board.replace(",", "_"),
         },
     }
-    return with_metadata(payload.ljust(size_bytes, b"\xff"), metadata)
-
-
-def with_metadata(image: bytes, metadata: Mapping[str, object]) -> bytes:
-    """`image` with fwtool's metadata trailer."""
-    body = image + bytes(8) + json.dumps(metadata).encode()
-    size = len(body) - len(image) + _TRAILER.size
-    return body + _TRAILER.pack(_MAGIC, zlib.crc32(body) ^ 0xFFFFFFFF, _METADATA, size)
+    return append_metadata(payload.ljust(size_bytes, b"\xff"), metadata)
 
 
 def opkg_package(

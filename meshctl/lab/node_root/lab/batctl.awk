@@ -7,7 +7,7 @@ FILENAME ~ /heard$/ && $1 == "O" && $2 in index_of { origin[++o] = $3; o_face[o]
 function metric(tq) { return algorithm == "BATMAN_V" ? "\"throughput\":" int(tq * 100000 / 255) : "\"tq\":" tq }
 function face(name) { return "\"hard_ifindex\":" index_of[name] (series == "21.02" ? "" : ",\"hard_ifname\":\"" name "\"") }
 function header() {
-	printf "[B.A.T.M.A.N. adv %s, MainIF/MAC: %s/%s (%s/%s %s)]\n", version, faces[1], address[faces[1]], soft, "fe" substr(address[faces[1]], 3), algorithm
+	printf "[B.A.T.M.A.N. adv %s, MainIF/MAC: %s/%s (%s/%s %s)]\n", version, faces[1], address[faces[1]], soft, own, algorithm
 }
 END {
 	if (algorithm == "") algorithm = "BATMAN_IV"
@@ -26,7 +26,7 @@ END {
 		for (i = 1; i <= nfaces; i++) printf "%s{%s,\"active\":true}", (i > 1 ? "," : ""), face(faces[i])
 		print "]"
 	} else if (verb == "mesh_json") {
-		printf "{\"version\":\"%s\",\"algo_name\":\"%s\",\"mesh_ifindex\":6,\"mesh_ifname\":\"%s\",\"mesh_address\":\"%s\"", version, algorithm, soft, "fe" substr(address[faces[1]], 3)
+		printf "{\"version\":\"%s\",\"algo_name\":\"%s\",\"mesh_ifindex\":6,\"mesh_ifname\":\"%s\",\"mesh_address\":\"%s\"", version, algorithm, soft, own
 		if (nfaces) printf ",%s", face(faces[1])
 		printf ",\"aggregated_ogms_enabled\":true,\"ap_isolation_enabled\":false,\"bonding_enabled\":false"
 		option("bridge_loop_avoidance", "bridge_loop_avoidance_enabled", 1); option("distributed_arp_table", "distributed_arp_table_enabled", 1)

@@ -1,4 +1,4 @@
-# netifd's stand-in, the computing part. Input: `uci export network; uci export wireless`.
+# netifd's stand-in, the computing part. Input: `uci export network; uci export wireless; uci export firewall`.
 #
 # sections -> which radio interfaces come up -> which devices exist -> which interfaces are up
 #   -> run/dump, run/wireless (JSON for ubus), run/iw, run/addresses.new, run/effective, run/sys (a shell script)
@@ -149,6 +149,19 @@ function reaches(device, flag,    n, i, list) {
 	return 0
 }
 
+# whether the firewall lets SSH to this network's address in: its zone's input, else the defaults' (REJECT from 23.05)
+function admitted(network,    i, id, n, list, j, verdict) {
+	verdict = "ACCEPT"
+	for (i = 1; i <= sections; i++) if (kind[order[i]] == "firewall.defaults") verdict = get(order[i], "input", "REJECT")
+	for (i = 1; i <= sections; i++) {
+		id = order[i]
+		if (kind[id] != "firewall.zone") continue
+		n = split(get(id, "network", ""), list, " ")
+		for (j = 1; j <= n; j++) if (list[j] == network) return get(id, "input", verdict) == "ACCEPT"
+	}
+	return verdict == "ACCEPT"
+}
+
 function interfaces(    i, id, proto, device, n, list, j, ifname, separator, address, mask, line, errors, up) {
 	dump = "{\n\t\"interface\": ["
 	separator = "\n"
@@ -179,7 +192,7 @@ function interfaces(    i, id, proto, device, n, list, j, ifname, separator, add
 		if (yes(get(id, "disabled", "0")) || !(get(id, "auto", "1") ~ /1/) || mode == "down") up = 0
 		if (up && address != "") {
 			printf "%s %s/%s\n", device, address, prefix(mask) > (run "/addresses.new")
-			if (label[id] != "loopback")
+			if (label[id] != "loopback" && admitted(label[id]))
 				effective = effective "addr\t" label[id] "\t" device "\t" address "\t" prefix(mask) "\t" reaches(device, "soft") "\t" reaches(device, "wired") "\n"
 		}
 		dump = dump separator "\t\t{\n\t\t\t\"interface\": " json(label[id]) ",\n\t\t\t\"up\": " (up ? "true" : "false") \
