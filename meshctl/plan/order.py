@@ -48,7 +48,8 @@ def stages_of(
 def _together(plans: Sequence[NodePlan], policy: ApplyPolicy, reason: str) -> tuple[Stage, ...]:
     """All at once (the executor bounds how many are in work), after one of them alone."""
     names = [plan.node for plan in plans]
-    if policy.canary and len(names) > 1:
+    # devices fresh from their box have nothing to lose, and undo themselves like all others
+    if policy.canary and len(names) > 1 and any(plan.has_cell for plan in plans):
         first = Stage(StageKind.CANARY, (names[0],), f"first alone, to see it work; {reason}")
         return (first, Stage(StageKind.FREE, tuple(names[1:]), reason))
     return (Stage(StageKind.FREE, tuple(names), reason),) if names else ()

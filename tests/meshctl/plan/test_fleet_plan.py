@@ -88,10 +88,21 @@ def test_flashing_a_cut_vertex_has_to_be_acknowledged() -> None:
     assert fleet_plan(team, todo, line, now_s=0.0, accept_cuts=["b01"]).refusal == ""
 
 
-def test_factory_devices_are_all_taken_at_once_after_one_canary() -> None:
+def test_factory_devices_are_all_taken_at_once_since_they_have_nothing_to_lose() -> None:
     team = fleet(canary=True)
     plan = fleet_plan(team, plans(team, {name: factory(team, name) for name in TEAM}), graph(), now_s=0.0)
-    assert [(stage.kind, len(stage.nodes)) for stage in plan.stages] == [(StageKind.CANARY, 1), (StageKind.FREE, 5)]
+    assert [(stage.kind, len(stage.nodes)) for stage in plan.stages] == [(StageKind.FREE, 6)]
+
+
+def test_nodes_off_the_mesh_that_were_in_one_have_a_canary() -> None:
+    new = fleet(canary=True, max_down=2)
+    seen = {}
+    for name in TEAM[:3]:
+        observation = running(fleet(), name, neighbours=())
+        assert observation.uci is not None
+        seen[name] = replace(observation, uci={**observation.uci, "dhcp": ""})
+    plan = fleet_plan(new, plans(new, seen), graph(), now_s=0.0)
+    assert [(stage.kind, len(stage.nodes)) for stage in plan.stages] == [(StageKind.CANARY, 1), (StageKind.FREE, 2)]
 
 
 def test_a_right_fleet_has_an_empty_plan() -> None:
