@@ -29,6 +29,8 @@ INIT_SCRIPT = "/etc/init.d/meshctl-deadman"
 INIT_LINK = "/etc/rc.d/S05meshctl-deadman"
 # The bundle waits in RAM: it is copied into flash by `stage`, and a reboot may forget it.
 BUNDLE_DIRECTORY = "/tmp/meshctl"
+# Unpacking, copying and syncing into a jffs2 that has to erase blocks first can take a minute.
+STAGE_TIMEOUT_S = 180.0
 
 _PATH = re.compile(r"(?:/[A-Za-z0-9._+@-]+){2,}")
 _LINK_TARGET = re.compile(r"\.\./init\.d/[A-Za-z0-9._+@-]+")
@@ -180,7 +182,7 @@ def stage(
     path = f"{BUNDLE_DIRECTORY}/{change.change_id}.tgz"
     upload(connection, bundle(change), path, mode=0o600, rate_bytes_per_s=rate_bytes_per_s, progress=progress)
     try:
-        _verb(connection, "stage", owner, change.change_id, path)
+        _verb(connection, "stage", owner, change.change_id, path, timeout_s=STAGE_TIMEOUT_S)
     finally:
         connection.run(f"rm -f {shlex.quote(path)}")
 
@@ -222,11 +224,11 @@ def abort(connection: Connection, owner: str, change_id: str) -> None:
     _verb(connection, "abort", owner, change_id)
 
 
-def _verb(connection: Connection, verb: str, *words: str) -> dict[str, str]:
+def _verb(connection: Connection, verb: str, *words: str, timeout_s: float | None = None) -> dict[str, str]:
     for word in words:
         if not _WORD.fullmatch(word) and not word.startswith("/"):
             raise ValueError(f"{verb}: expected letters, digits and @._:+-, found {word!r}")
-    done = connection.run(shlex.join([PROGRAM, verb, *words]))
+    done = connection.run(shlex.join([PROGRAM, verb, *words]), timeout_s=timeout_s)
     answer = parse_answer(done.stdout)
     if answer.ok:
         return answer.values

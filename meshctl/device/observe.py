@@ -183,6 +183,7 @@ def _mesh(
         return None, None, None
     info: MeshInfo | None = None
     hard: list[str] = []
+    known = reader.read("macs", system.parse_indexes, required=False) or {}
     neighbours: list[MeshNeighbour] | None = None
     originators: list[Originator] | None = None
     for name in names:
@@ -194,9 +195,13 @@ def _mesh(
             hard += reader.read(f"batctl.interface {name}", batctl.parse_interfaces_text) or ()
         else:
             seen = reader.read(f"batctl.mesh_json {name}", batctl.parse_mesh_json)
-            near = reader.read(f"batctl.neighbors_json {name}", batctl.parse_neighbours_json)
-            far = reader.read(f"batctl.originators_json {name}", batctl.parse_originators_json)
-            hard += reader.read(f"batctl.hardifs_json {name}", batctl.parse_hardifs_json) or ()
+            near = reader.read(f"batctl.neighbors_json {name}", lambda text: batctl.parse_neighbours_json(text, known))
+            far = reader.read(
+                f"batctl.originators_json {name}", lambda text: batctl.parse_originators_json(text, known)
+            )
+            hard += (
+                reader.read(f"batctl.hardifs_json {name}", lambda text: batctl.parse_hardifs_json(text, known)) or ()
+            )
         info = info or seen
         neighbours = (neighbours or []) + list(near) if near is not None else neighbours
         originators = (originators or []) + list(far) if far is not None else originators

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from types import MappingProxyType
 
 from meshctl.device.observation import MeshInfo, MeshNeighbour, Originator
@@ -14,8 +15,8 @@ _SEEN = r"(\d{1,9})\.(\d{3})s"
 _ORIGINATOR = re.compile(
     rf"^ ?(\*?) *{_MAC} +{_SEEN} +\( *(\d{{1,9}})(?:\.(\d))?\) +{_MAC} +\[ *(\S+)\]", re.IGNORECASE
 )
-# BATMAN_IV: `    mesh0     02:..:02    0.120s`; BATMAN_V: `02:..:02    0.120s (    10.4) [     mesh0]`
-_NEIGHBOUR_IV = re.compile(rf"^ *(\S+) +{_MAC} +{_SEEN}", re.IGNORECASE)
+# BATMAN_IV: `        mesh0<tab>  02:..:02    0.120s`; BATMAN_V: `02:..:02    0.120s (    10.4) [     mesh0]`
+_NEIGHBOUR_IV = re.compile(rf"^ *(\S+)\s+{_MAC} +{_SEEN}", re.IGNORECASE)
 _NEIGHBOUR_V = re.compile(rf"^ *{_MAC} +{_SEEN} +\([^)]*\) +\[ *(\S+)\]", re.IGNORECASE)
 _HEADER = re.compile(r"\[B\.A\.T\.M\.A\.N\. adv ([^,]+),.*?(BATMAN_I?V)\)?")
 
@@ -37,12 +38,18 @@ def parse_mesh_json(text: str) -> MeshInfo | None:
     )
 
 
-def parse_hardifs_json(text: str) -> tuple[str, ...] | None:
+def parse_hardifs_json(text: str, names: Mapping[int, str]) -> tuple[str, ...] | None:
     """`hardifs_json`: the names of the hard interfaces."""
     told = parse_json(text)
     if not isinstance(told, list):
         return None
-    return tuple(name for item in maps(told) if (name := string(item.get("hard_ifname"))))
+    return tuple(name for item in maps(told) if (name := _interface(item, names)))
+
+
+def _interface(item: Mapping[str, object], names: Mapping[int, str]) -> str:
+    """`hard_ifname` came with batctl 2021.2; before (21.02) only the index is told, which `names` translates."""
+    index = integer(item.get("hard_ifindex"))
+    return string(item.get("hard_ifname")) or ("" if index is None else names.get(index, ""))
 
 
 def parse_interfaces_text(text: str) -> tuple[str, ...] | None:
@@ -53,15 +60,15 @@ def parse_interfaces_text(text: str) -> tuple[str, ...] | None:
     return tuple(line.split(":", 1)[0].strip() for line in lines)
 
 
-def parse_neighbours_json(text: str) -> tuple[MeshNeighbour, ...] | None:
-    """`neighbors_json`; `hard_ifname` came with 2021.2 and is empty before."""
+def parse_neighbours_json(text: str, names: Mapping[int, str]) -> tuple[MeshNeighbour, ...] | None:
+    """`neighbors_json`."""
     told = parse_json(text)
     if not isinstance(told, list):
         return None
     return tuple(
         MeshNeighbour(
             mac=string(item.get("neigh_address")).lower(),
-            ifname=string(item.get("hard_ifname")),
+            ifname=_interface(item, names),
             last_seen_ms=integer(item.get("last_seen_msecs")) or 0,
         )
         for item in maps(told)
@@ -82,7 +89,7 @@ def parse_neighbours_text(text: str) -> tuple[MeshNeighbour, ...] | None:
     return tuple(found)
 
 
-def parse_originators_json(text: str) -> tuple[Originator, ...] | None:
+def parse_originators_json(text: str, names: Mapping[int, str]) -> tuple[Originator, ...] | None:
     """`originators_json`: `tq` for BATMAN_IV, `throughput` in kbit/s for BATMAN_V; `best` is absent when false."""
     told = parse_json(text)
     if not isinstance(told, list):
@@ -91,7 +98,7 @@ def parse_originators_json(text: str) -> tuple[Originator, ...] | None:
         Originator(
             mac=string(item.get("orig_address")).lower(),
             next_hop=string(item.get("neigh_address")).lower(),
-            ifname=string(item.get("hard_ifname")),
+            ifname=_interface(item, names),
             last_seen_ms=integer(item.get("last_seen_msecs")) or 0,
             best=truth(item.get("best")),
             tq=integer(item.get("tq")),

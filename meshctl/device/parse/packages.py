@@ -6,7 +6,7 @@ import re
 
 # apk: `batctl-full-2025.4-r1 mips_24kc {feeds/batctl} (GPL-2.0-only) [installed]`; a version starts with a digit
 _APK = re.compile(r"^(\S+?)-(\d\S*) \S+ \{.*\[installed\]")
-_PLAIN = re.compile(r"^(\S+)(?: -)? (\S+)$")
+_PLAIN = re.compile(r"^([A-Za-z0-9][\w.+-]*)(?: -)? (\S*\d\S*)$")
 
 
 def parse_packages(text: str) -> dict[str, str] | None:

@@ -71,10 +71,16 @@ def parse_df(text: str) -> dict[str, Space] | None:
 
 
 def parse_macs(text: str) -> dict[str, str] | None:
-    """`NAME ADDRESS` lines of observe.sh; interfaces without a hardware address (lo has zeros) keep what they say."""
+    """`NAME ADDRESS INDEX` lines of observe.sh as name -> address; an interface without one is left out."""
     rows = [line.split() for line in text.splitlines()]
-    found = {row[0]: row[1].lower() for row in rows if len(row) == 2 and _MAC.fullmatch(row[1])}
+    found = {row[0]: row[1].lower() for row in rows if len(row) == 3 and _MAC.fullmatch(row[1])}
     return found or None
+
+
+def parse_indexes(text: str) -> dict[int, str]:
+    """The same lines as interface index -> name."""
+    rows = [line.split() for line in text.splitlines()]
+    return {int(row[2]): row[0] for row in rows if len(row) == 3 and row[2].isdecimal() and len(row[2]) < 10}
 
 
 def parse_bridges(text: str) -> tuple[Bridge, ...]:

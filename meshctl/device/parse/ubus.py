@@ -8,11 +8,11 @@ from meshctl.device.observation import BoardInfo, NetInterface, RadioState, Rele
 from meshctl.device.parse.jsontext import integer, mapping, maps, parse_json, string, strings, truth
 
 
-def parse_board(text: str) -> tuple[BoardInfo | None, ReleaseInfo | None]:
+def parse_board(text: str) -> tuple[BoardInfo, ReleaseInfo | None] | None:
     """`system board`: the board, and the release where this procd tells it (19.07's may not)."""
     told = mapping(parse_json(text))
     if not told:
-        return None, None
+        return None
     board = BoardInfo(
         board_name=string(told.get("board_name")),
         model=string(told.get("model")),

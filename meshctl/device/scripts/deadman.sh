@@ -252,9 +252,10 @@ stage() { # OWNER ID BUNDLE
 		[ ! -f "$conf" ] || uci -c "$w/new/etc/config" show "${conf##*/}" >/dev/null 2>&1 ||
 			drop "$w" bad-uci "uci cannot read the new ${conf##*/}"
 	done
-	echo "$2 $1 - 0" | put "$w/staged.$2" || drop "$w" flash-full "could not write the marker"
-	mv "$w" "$CHANGE" || drop "$w" flash-full "could not put the stage in place"
-	sync
+	echo "$2 $1 - 0" | put "$w/ready" || drop "$w" flash-full "could not write the marker"
+	# only this last rename makes it a stage: where a directory cannot be renamed, mv copies, and may be cut short
+	{ mv "$w" "$CHANGE" && sync && mv "$CHANGE/ready" "$CHANGE/staged.$2" && sync; } ||
+		drop "$w" flash-full "could not put the stage in place"
 	echo "ok state=staged id=$2"
 }
 

@@ -9,7 +9,11 @@ section() { # NAME COMMAND...
 	printf '\n%s end %s\n' "$N" $?
 }
 
-macs() { for d in /sys/class/net/*; do echo "${d##*/} $(cat "$d/address")"; done; }
+macs() {
+	for d in /sys/class/net/*; do
+		[ ! -f "$d/address" ] || echo "${d##*/} $(cat "$d/address") $(cat "$d/ifindex")"
+	done
+}
 
 bridges() {
 	for d in /sys/class/net/*/brif; do
@@ -39,6 +43,8 @@ packages() {
 }
 
 package_tool() { command -v apk || command -v opkg; }
+
+authorized_keys() { [ ! -f /etc/dropbear/authorized_keys ] || cat /etc/dropbear/authorized_keys; }
 
 host_keys() { for key in /etc/dropbear/dropbear_*_host_key; do [ ! -f "$key" ] || dropbearkey -y -f "$key"; done; }
 
@@ -84,7 +90,7 @@ section config.list ls /etc/config
 for conf in /etc/config/*; do
 	[ ! -f "$conf" ] || section "config ${conf##*/}" cat "$conf"
 done
-section authorized_keys cat /etc/dropbear/authorized_keys
+section authorized_keys authorized_keys
 section host_keys host_keys
 for path in $EXTRA; do
 	section "mode $path" ls -lnd "$path"

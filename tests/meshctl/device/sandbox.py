@@ -38,10 +38,17 @@ root=$1; shift
 mount --bind "$root" "$root"
 mount --rbind /proc "$root/proc"
 mount --rbind /dev "$root/dev"
+mount --rbind /sys "$root/sys"
 mount --bind "$root/harness/boot_id" "$root/proc/sys/kernel/random/boot_id"
 cd "$root"
 exec chroot "$root" "$@"
 """
+
+
+DIRECTORIES = (
+    *("bin", "sbin", "usr/sbin", "tmp", "proc", "sys", "dev", "harness"),
+    *("etc/config", "etc/init.d", "etc/rc.d"),
+)
 
 
 class Sandbox:
@@ -49,18 +56,7 @@ class Sandbox:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        for directory in (
-            "bin",
-            "sbin",
-            "usr/sbin",
-            "etc/config",
-            "etc/init.d",
-            "etc/rc.d",
-            "tmp",
-            "proc",
-            "dev",
-            "harness",
-        ):
+        for directory in DIRECTORIES:
             (root / directory).mkdir(parents=True)
         shutil.copy2(BUSYBOX, root / "bin/busybox")
         (root / "bin/sh").symlink_to("busybox")

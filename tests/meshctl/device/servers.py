@@ -128,6 +128,7 @@ root=$1; shift
 mount --bind "$root" "$root"
 mount -t proc proc "$root/proc"
 mount --rbind /dev "$root/dev"
+mount --rbind /sys "$root/sys"
 [ -z "$TMP_KIB" ] || mount -t tmpfs -o "size=${TMP_KIB}k" tmpfs "$root/tmp"
 mount --bind "$root/harness/boot_id" "$root/proc/sys/kernel/random/boot_id"
 cd "$root"

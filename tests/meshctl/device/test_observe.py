@@ -1,0 +1,299 @@
+"""What a node tells, as facts: recorded outputs of every release, the real script on a real ash, and any other text.
+
+The cases in recorded/ were composed after the tools' sources (docs/facts/openwrt-facts.md, section 5), not captured.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from meshctl.device.observation import Observation
+from meshctl.device.observe import interpret, observation_script, observe
+from meshctl.device.parse import batctl, iw, keys, packages, system, ubus
+from meshctl.device.parse.deadman import parse_answer, parse_status
+from meshctl.device.parse.sections import Section, split_sections
+from meshctl.device.ssh import SshConnection
+from meshctl.model import RELEASES
+from tests.meshctl.device.sandbox import Sandbox
+from tests.meshctl.device.servers import host_key
+
+RECORDED = Path(__file__).parent / "recorded"
+CASES = sorted(RECORDED.glob("*/*"))
+
+
+def observed(case: Path) -> Observation:
+    sections = split_sections((case / "observe.out").read_bytes(), "NONCE")
+    return interpret(sections, asked_at_s=1785311990.0, answered_at_s=1785311994.0)
+
+
+def as_json(value: object) -> object:
+    """Dataclasses and mappings as JSON writes them."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: as_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): as_json(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [as_json(item) for item in value]
+    return value
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: "/".join(case.parts[-2:]))
+def test_a_recorded_node_gives_exactly_the_expected_facts(case: Path) -> None:
+    assert as_json(observed(case)) == json.loads((case / "expected.json").read_text())
+
+
+def test_every_supported_release_is_recorded() -> None:
+    assert {case.parent.name for case in CASES} == {release.value for release in RELEASES}
+
+
+@pytest.mark.parametrize("release", [release.value for release in RELEASES])
+def test_the_facts_a_plan_needs_are_there_for_every_release(release: str) -> None:
+    seen = observed(RECORDED / release / "mesh")
+    assert seen.notes == ()
+    assert seen.release is not None
+    assert seen.release.version.startswith(release)
+    assert seen.board is not None
+    assert seen.board.board_name
+    assert seen.board.lan_ports
+    assert seen.mesh is not None
+    assert seen.mesh.hard_interfaces == ("mesh0",)
+    assert seen.neighbours is not None
+    assert {neighbour.ifname for neighbour in seen.neighbours} == {"mesh0"}
+    assert seen.originators is not None
+    assert [path.best for path in seen.originators].count(True) == 3
+    assert seen.links is not None
+    assert seen.links[0].joined
+    assert seen.packages is not None
+    assert "batctl-full" in seen.packages
+    assert seen.host_keys
+    assert seen.clock_offset_s == 8.0
+    assert seen.uptime_error_s == 2.0
+
+
+def test_a_node_that_tells_nothing_is_observed_as_nothing_with_a_note_for_each_fact() -> None:
+    seen = interpret({}, asked_at_s=0.0, answered_at_s=1.0)
+    told = as_json(seen)
+    assert isinstance(told, dict)
+    assert {name for name, value in told.items() if value is not None} == {
+        "asked_at_s",
+        "answered_at_s",
+        "files",
+        "notes",
+    }
+    assert "the observation ended early" in seen.notes
+    assert len(seen.notes) > 10
+
+
+@given(st.integers(0, 60_000))
+def test_an_answer_cut_anywhere_is_still_an_observation(at: int) -> None:
+    whole = (RECORDED / "24.10" / "mesh" / "observe.out").read_bytes()
+    seen = interpret(split_sections(whole[:at], "NONCE"), asked_at_s=0.0, answered_at_s=0.0)
+    if at < len(whole) - 10:
+        assert "the observation ended early" in seen.notes
+
+
+PARSERS = [
+    ubus.parse_board,
+    ubus.parse_wireless,
+    ubus.parse_interfaces,
+    ubus.parse_board_json,
+    system.parse_openwrt_release,
+    system.parse_uptime,
+    system.parse_clock,
+    system.parse_boot_id,
+    system.parse_meminfo,
+    system.parse_df,
+    system.parse_macs,
+    system.parse_indexes,
+    system.parse_bridges,
+    system.parse_mode,
+    iw.parse_iw_dev,
+    iw.parse_stations,
+    batctl.parse_mesh_json,
+    batctl.parse_mesh_header,
+    batctl.parse_interfaces_text,
+    batctl.parse_neighbours_text,
+    batctl.parse_originators_text,
+    lambda text: batctl.parse_hardifs_json(text, {}),
+    lambda text: batctl.parse_neighbours_json(text, {}),
+    lambda text: batctl.parse_originators_json(text, {}),
+    packages.parse_packages,
+    packages.parse_package_tool,
+    keys.parse_authorized_keys,
+    keys.parse_host_keys,
+    parse_status,
+    parse_answer,
+]
+
+SECTIONS = [split_sections((case / "observe.out").read_bytes(), "NONCE") for case in CASES]
+SAMPLES = [section.text for sections in SECTIONS for section in sections.values()]
+NAMES = sorted({name for sections in SECTIONS for name in sections})
+KEYS = ["interface", "config", "interfaces", "release", "network", "lan", "hard_ifindex", "tq", "best", "ipv4-address"]
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(KEYS), inner, max_size=4),
+    max_leaves=12,
+)
+spoiled = st.builds(
+    lambda text, at, instead: text[:at] + instead + text[at + 1 :],
+    st.sampled_from(SAMPLES),
+    st.integers(0, 2000),
+    st.text(max_size=4),
+)
+
+
+@given(st.one_of(st.text(), json_values.map(json.dumps), spoiled))
+def test_no_text_makes_any_parser_raise(text: str) -> None:
+    for parse in PARSERS:
+        parse(text)
+    for link in iw.parse_iw_dev(text) or ():
+        iw.with_link(link, text)
+
+
+@given(st.dictionaries(st.sampled_from(NAMES), st.builds(Section, st.binary(max_size=80), st.integers(-1, 255))))
+def test_any_sections_at_all_give_an_observation(sections: dict[str, Section]) -> None:
+    assert interpret(sections, asked_at_s=0.0, answered_at_s=0.0).asked_at_s == 0.0
+
+
+@given(st.lists(st.binary(max_size=30).filter(lambda body: b"NONCE" not in body), max_size=5))
+def test_sections_keep_every_byte(bodies: list[bytes]) -> None:
+    output = b"".join(b"NONCE begin s%d\n%s\nNONCE end %d\n" % (n, body, n) for n, body in enumerate(bodies))
+    assert split_sections(output, "NONCE") == {f"s{n}": Section(body, n) for n, body in enumerate(bodies)}
+
+
+def test_a_section_that_another_one_pretends_to_be_needs_the_nonce() -> None:
+    output = b"NONCE begin config x\nother begin authorized_keys\nevil\nother end 0\n\nNONCE end 0\n"
+    assert list(split_sections(output, "NONCE")) == ["config x"]
+
+
+def test_the_script_runs_on_the_real_ash_and_tells_what_is_there(connection: SshConnection, node: Sandbox) -> None:
+    node.put("/etc/config/network", "config interface 'lan'\n\toption ipaddr '192.168.1.1'\n\n")
+    node.put("/etc/config/odd", b"\xff\xfe no text")
+    node.put("/etc/openwrt_release", "DISTRIB_ID='OpenWrt'\nDISTRIB_RELEASE='24.10.5'\nDISTRIB_REVISION='r1'\n")
+    node.put("/tmp/sysinfo/board_name", "ubnt,rocket-m\n")
+    node.put("/usr/lib/opkg/status", OPKG_STATUS)
+    node.put("/usr/bin/opkg", "#!/bin/sh\nexit 1\n", 0o755)
+    node.put("/tmp/.uci/delta", "network.lan.ipaddr='10.0.0.9'\n")
+    node.put("/etc/secret.bin", bytes(range(256)), 0o600)
+    node.put("/etc/large", "x" * 70_000)
+    paths = ["/etc/secret.bin", "/etc/large", "/etc/nowhere", "/etc/init.d/meshctl-deadman"]
+    seen = observe(connection, extra_paths=paths)
+    assert seen.boot_id == (node.text("/harness/boot_id") or "").strip()
+    assert seen.uptime_s is not None
+    assert seen.release is not None
+    assert seen.release.version == "24.10.5"
+    assert seen.board is not None
+    assert seen.board.board_name == "ubnt,rocket-m"
+    assert seen.uci is not None
+    assert set(seen.uci) == {"network", "odd"}
+    assert seen.uci["network"] == "config interface 'lan'\n\toption ipaddr '192.168.1.1'\n\n"
+    assert seen.uci_changes == ("network.lan.ipaddr='10.0.0.9'",)
+    assert seen.package_tool == "opkg"
+    assert seen.packages == {"base-files": "1650-r1", "iw": "6.9-r1"}
+    assert seen.memory is not None
+    assert seen.macs is not None
+    assert "lo" in seen.macs
+    assert seen.authorized_keys is not None
+    assert len(seen.authorized_keys) == 1
+    assert seen.mesh is None
+    assert seen.change is not None
+    assert (seen.change.state, seen.change.version) == ("idle", "1")
+    secret, large, nowhere, init = (seen.files[path] for path in paths)
+    assert secret is not None
+    assert (secret.mode, secret.text) == (0o600, None)
+    assert large is not None
+    assert (large.text, len(large.sha256)) == (None, 64)
+    assert nowhere is None
+    assert init is not None
+    assert init.text is not None
+    assert init.text.startswith("#!/bin/sh /etc/rc.common")
+    assert seen.asked_at_s <= seen.answered_at_s
+
+
+OPKG_STATUS = """\
+Package: base-files
+Version: 1650-r1
+Depends: libc
+Status: install user installed
+Architecture: mips_24kc
+
+Package: gone
+Version: 1
+Status: deinstall ok not-installed
+
+Package: iw
+Version: 6.9-r1
+Status: install user installed
+Auto-Installed: yes
+"""
+
+
+def test_an_apk_database_is_read_by_the_script(connection: SshConnection, node: Sandbox) -> None:
+    node.put("/usr/bin/apk", "#!/bin/sh\nexit 1\n", 0o755)
+    node.put("/lib/apk/db/installed", "C:Q1x\nP:batctl-full\nV:2025.4-r1\nA:mips_24kc\n\nP:iw\nV:6.17-r1\n\n")
+    seen = observe(connection)
+    assert seen.package_tool == "apk"
+    assert seen.packages == {"batctl-full": "2025.4-r1", "iw": "6.17-r1"}
+
+
+def test_host_keys_are_fingerprinted_as_a_client_sees_them(connection: SshConnection, node: Sandbox) -> None:
+    line = node.text("/etc/dropbear/ed25519.pub") or ""
+    node.put("/usr/bin/dropbearkey", f"#!/bin/sh\necho Public key portion is:\necho '{line.strip()}'\n", 0o755)
+    seen = observe(connection)
+    assert seen.host_keys is not None
+    assert [known.fingerprint for known in seen.host_keys] == [host_key(node).fingerprint]
+
+
+def test_a_path_that_the_shell_would_split_is_refused() -> None:
+    for path in ("/etc/a b", "/etc/$(reboot)", "relative", "/etc/a;b"):
+        with pytest.raises(ValueError, match="absolute path"):
+            observation_script("nonce", [path])
+
+
+@pytest.mark.parametrize(
+    ("listed", "mode"),
+    [
+        ("-rw-r--r--    1 0        0    5 Jan  1 00:00 /x", 0o644),
+        ("-rwsr-x--t    1 0        0    5 Jan  1 00:00 /x", 0o5751),
+        ("lrwxrwxrwx    1 0        0    5 Jan  1 00:00 /x -> y", 0o777),
+        ("-rw------S", None),
+        ("", None),
+    ],
+)
+def test_modes_are_read_from_ls(listed: str, mode: int | None) -> None:
+    assert system.parse_mode(listed) == mode
+
+
+def test_apks_own_list_is_understood_too() -> None:
+    text = (
+        "batctl-full-2025.4-r1 mips_24kc {feeds/routing/batctl} (GPL-2.0-only) [installed]\n"
+        "libubox20240329-2024.03.29~eb9bcb64-r1 mips_24kc {libubox} (ISC) [installed]\n"
+    )
+    assert packages.parse_packages(text) == {
+        "batctl-full": "2025.4-r1",
+        "libubox20240329": "2024.03.29~eb9bcb64-r1",
+    }
+
+
+def test_batman_v_tables_give_throughput() -> None:
+    text = (
+        "[B.A.T.M.A.N. adv 2019.2-openwrt-9, MainIF/MAC: mesh0/02:00:00:00:00:01 (bat0/66:00:00:00:00:01 BATMAN_V)]\n"
+        "   Originator        last-seen ( throughput)  Nexthop           [outgoingIF]\n"
+        " * 02:00:00:00:00:02    0.460s (       10.4)  02:00:00:00:00:02 [     mesh0]\n"
+    )
+    (path,) = batctl.parse_originators_text(text) or ()
+    assert (path.throughput_kbit_s, path.tq, path.best, path.last_seen_ms) == (10_400, None, True, 460)
+    near = (
+        "         Neighbor   last-seen      speed           IF\n"
+        "02:00:00:00:00:02    0.460s (       10.4) [     mesh0]\n"
+    )
+    (neighbour,) = batctl.parse_neighbours_text(near) or ()
+    assert (neighbour.mac, neighbour.ifname, neighbour.last_seen_ms) == ("02:00:00:00:00:02", "mesh0", 460)
