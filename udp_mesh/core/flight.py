@@ -86,6 +86,7 @@ class Flight:
         if count <= 0 or count > len(packets):
             return acknowledged, lost, None
         newest = packets[count - 1]
+        corrected = len(acknowledged)
         ones = (1 << count) - 1
         if received & ones == ones:
             take = packets.popleft
@@ -94,10 +95,9 @@ class Flight:
                 if packet is not None:
                     acknowledged.append(packet)
             self.base = largest + 1
-            self.outstanding -= len(acknowledged)
+            self.outstanding -= len(acknowledged) - corrected
             return acknowledged, lost, newest
         reorder = self.reorder_packets
-        corrected = len(acknowledged)
         while count:
             packet = packets[0]
             behind = count - 1

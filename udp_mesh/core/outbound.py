@@ -194,6 +194,8 @@ class Outbound:
         flight = self.flight
         acknowledged, lost, newest = flight.acknowledge(ack.largest, ack.received << 1 | 1)
         if acknowledged:
+            # What was acknowledged late, all at once, says nothing about the rate of the link.
+            after_silence = self.struggling or self.silent_since is not None
             self.last_progress = now
             self.struggling = False
             if self.silent_since is not None:
@@ -208,13 +210,20 @@ class Outbound:
                 mark = newest.mark
                 self.trip.sample(max(1e-5, now - mark.sent_at - ack.delay_us * 1e-6), now)
                 elapsed = max(now - mark.delivered_at, mark.sent_at - mark.delivered_sent_at)
-                if elapsed > 0:
+                if elapsed > 0 and not after_silence:
                     rate = (self.delivered_packets - mark.delivered) / elapsed
                 self.delivered_sent_at = mark.sent_at
             self.delivered_at = now
             limited = newest is None or newest.mark.limited
             self.window.acknowledged(
-                count, ack.largest, flight.next_number, flight.outstanding, rate, limited=limited, now=now
+                count,
+                ack.largest,
+                flight.next_number,
+                flight.outstanding,
+                rate,
+                limited=limited,
+                loss=self.loss,
+                now=now,
             )
         if lost:
             self._put_back(lost)
@@ -471,6 +480,6 @@ class Outbound:
 
     def mark(self, now: float) -> Mark:
         """The state in which the packets of one burst leave."""
-        if not self.flight.outstanding:
+        if not self.flight.outstanding and not self.struggling and self.silent_since is None:
             self.delivered_at = self.delivered_sent_at = self.last_progress = now
         return Mark(now, self.delivered_packets, self.delivered_at, self.delivered_sent_at, self.limited)

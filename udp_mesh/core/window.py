@@ -1,6 +1,6 @@
 """How many packets may be on their way to one peer: delay decides, loss does not (radio loss is not congestion).
 
-1. Startup doubles the window once per round trip until the round trip has grown by `QUEUE_S`.
+1. Startup doubles the window once per round trip until the round trip has grown by `START_QUEUE_S`.
 2. Then, once per round trip: w <- w/2 + (w * least / standing + a) / 2, where a is `QUEUE_S` worth of packets: the
    window settles where the sender keeps that much queue at the bottleneck, and no more.
 3. w never exceeds twice what the measured delivery rate needs, plus a: a queue too short to be seen as delay is not
@@ -20,11 +20,14 @@ from typing import Protocol
 
 from udp_mesh.core.rtt import RoundTrip
 
-QUEUE_S = 0.006
+QUEUE_S = 0.004
 """Queue the sender keeps at the bottleneck: covers batched acknowledgements and pacing; adds this much to urgent
 latency."""
 
-LEAST_QUEUE_PACKETS = 3.0
+START_QUEUE_S = 0.006
+"""Growth of the round trip that ends the startup: more than the scatter of a radio, less than an urgent message's slack."""
+
+LEAST_QUEUE_PACKETS = 2.0
 """The same at low rates: fewer packets leave the link idle between acknowledgements."""
 
 LEAST_WINDOW = 4.0
@@ -32,6 +35,18 @@ LEAST_WINDOW = 4.0
 
 MOST_WINDOW = 8192.0
 """Packets: 92 Mbit at 1400 B, more than any link these robots have; bounds the state kept per packet."""
+
+PACE_GAIN = 1.25
+"""The window, not the pacing, limits what is on its way: pacing only spreads it."""
+
+CAPACITY_GAIN = 1.05
+"""Pacing above the measured rate by this much notices when the link becomes faster, without building a queue."""
+
+LOSS_GAIN = 0.3
+"""And by this much of the loss: its estimate scatters, and too slow a pace costs throughput."""
+
+MOST_LOSS = 0.5
+"""The measured rate is that of deliveries; what is lost comes on top, up to this share of what is sent."""
 
 START_WINDOW = 10.0
 """Packets before anything is known (RFC 6928)."""
@@ -55,8 +70,11 @@ GROWTH = 1.25
 GROWTH = 1.25
 """Growth per round trip while the window is used up and yet no queue is seen: the link has become faster."""
 
-SUSPECT_QUEUES = 2.5
-"""Queueing of this many `QUEUE_S` is more than our own window explains."""
+GROW_AFTER_ROUNDS = 3
+"""Round trips without a queue before growth: two happen by themselves around the law's balance."""
+
+SUSPECT_QUEUE_S = 0.015
+"""Queueing of this much is more than our own window explains."""
 
 SUSPECT_AGAIN_S = 0.3
 """Between two drains on suspicion, doubled each time one finds nothing."""
@@ -83,6 +101,7 @@ class Window(Protocol):
         rate: float | None,
         *,
         limited: bool,
+        loss: float,
         now: float,
     ) -> None:
         """`count` packets were newly acknowledged, up to number `largest`; `rate` is a delivery rate sample."""
@@ -113,6 +132,7 @@ class FixedWindow:
         rate: float | None,
         *,
         limited: bool,
+        loss: float,
         now: float,
     ) -> None:
         return
@@ -135,9 +155,13 @@ class AdaptiveWindow:
 
     __slots__ = (
         "_drained_at",
+        "_empty_rounds",
+        "_grow_from",
+        "_growing",
         "_held_least",
         "_hold_from",
         "_latest_four",
+        "_loss",
         "_rates",
         "_round_ends",
         "_saved",
@@ -160,6 +184,10 @@ class AdaptiveWindow:
         self._round_ends = 0
         self._updated_at = 0.0
         self._drained_at = 0.0
+        self._empty_rounds = 0
+        self._grow_from = 0.0
+        self._growing = False
+        self._loss = 0.0
         self._saved = START_WINDOW
         self._was_standing = 0.0
         self._hold_from = 0
@@ -177,9 +205,17 @@ class AdaptiveWindow:
             return None
         if self.phase is Phase.STARTUP:
             return 2.0 * self.packets / smoothed
-        rate = 1.25 * self.packets / smoothed
+        rate = PACE_GAIN * self.packets / smoothed
         capacity = self.capacity()
-        return rate if capacity is None else min(rate, max(1.2 * capacity, LEAST_WINDOW / smoothed))
+        return (
+            rate
+            if capacity is None or self._growing
+            else min(rate, max(self._paced(capacity), LEAST_WINDOW / smoothed))
+        )
+
+    def _paced(self, capacity: float) -> float:
+        loss = min(self._loss, MOST_LOSS)
+        return capacity * (CAPACITY_GAIN + LOSS_GAIN * loss) / (1 - loss)
 
     def acknowledged(
         self,
@@ -190,15 +226,17 @@ class AdaptiveWindow:
         rate: float | None,
         *,
         limited: bool,
+        loss: float,
         now: float,
     ) -> None:
         trip = self._trip
         if trip.latest is None or trip.least is None or trip.standing is None:
             return
+        self._loss = loss
         if rate is not None:
             self._saw_rate(rate, limited=limited, now=now)
         self._latest_four.append(trip.latest)
-        if limited and len(self._latest_four) == 4 and min(self._latest_four) > 1.15 * trip.least + QUEUE_S:
+        if limited and len(self._latest_four) == 4 and min(self._latest_four) > 1.15 * trip.least + START_QUEUE_S:
             # So little was on its way that none of this is our queue: the path itself is longer now.
             trip.forget_least(min(self._latest_four), now)
         if self.phase is Phase.DRAIN:
@@ -215,7 +253,7 @@ class AdaptiveWindow:
                 self._end_drain(now)
                 self._round_ends = next_number
             return
-        if self.phase is Phase.STARTUP and min(self._latest_four) - trip.least > QUEUE_S:
+        if self.phase is Phase.STARTUP and min(self._latest_four) - trip.least > START_QUEUE_S:
             self.phase = Phase.CRUISE
             self._drained_at = now
             self.packets = max(LEAST_WINDOW, self.packets * trip.least / trip.standing)
@@ -237,7 +275,7 @@ class AdaptiveWindow:
                 self.packets = self._bounded(2 * self.packets, least, standing)
             return
         since_drain = now - self._drained_at
-        suspect = standing - least > SUSPECT_QUEUES * QUEUE_S + 0.25 * least
+        suspect = standing - least > SUSPECT_QUEUE_S + 0.25 * least
         self._suspected = self._suspected + 1 if suspect else 0
         if self._suspected >= 2 and since_drain > max(self._suspect_every, 4 * standing):
             self._begin_drain(now, suspicion=True)
@@ -248,15 +286,21 @@ class AdaptiveWindow:
             else:
                 self._begin_drain(now, suspicion=False)
                 return
-        if standing - least < QUEUE_S / 4 and not limited and since_drain > 2 * standing:
+        empty = standing - least < QUEUE_S / 4 and not limited and now >= self._grow_from
+        self._empty_rounds = self._empty_rounds + 1 if empty else 0
+        if self._empty_rounds >= GROW_AFTER_ROUNDS:
             self.packets = self._bounded(GROWTH * self.packets, least, standing)
+            self._growing = True
             return
+        self._growing = False
         wanted = 0.5 * self.packets + 0.5 * (self.packets * least / standing + self._queue(standing))
         if wanted < self.packets or not limited:
             self.packets = self._bounded(min(wanted, 2 * self.packets), least, standing)
 
     def _queue(self, standing: float) -> float:
-        return max(LEAST_QUEUE_PACKETS, QUEUE_S * self.packets / standing)
+        # Losses leave holes in the queue as well as in what arrives.
+        queue_s = QUEUE_S * (1 + 3 * min(self._loss, MOST_LOSS))
+        return max(LEAST_QUEUE_PACKETS, queue_s * self.packets / standing)
 
     def _bounded(self, packets: float, least: float, standing: float) -> float:
         capacity = self.capacity()
@@ -281,9 +325,11 @@ class AdaptiveWindow:
         held = self._held_least
         self.phase = Phase.CRUISE
         self._drained_at = self._updated_at = now
+        # The queue is empty because of the drain: no reason to grow for the next round trips.
+        self._grow_from = now + 3 * self._was_standing
         self._suspected = 0
         throughput = self._saved / self._was_standing
-        if self._suspicion and held > 1.15 * least + QUEUE_S / 3 and held != float("inf"):
+        if self._suspicion and held > 1.15 * least + START_QUEUE_S / 3 and held != float("inf"):
             self._trip.forget_least(held, now)
             if held > (least + self._was_standing) / 2:
                 # Still long although our queue is gone: the route, not the queue, is longer.
