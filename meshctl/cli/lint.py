@@ -17,7 +17,7 @@ from meshctl.inventory.codes import MEANINGS
 from meshctl.lint import BY_CODE, RULES, Examined, Rule, examine
 from meshctl.lint import baseline as baselines
 from meshctl.lint.pages import page
-from meshctl.regdb import load
+from meshctl.regdb import SHIPPED, load, shipped_version
 from meshctl.report.findings import FORMATS, Findings
 
 
@@ -79,6 +79,8 @@ def lint(
         raise InputError("--write-baseline needs --baseline FILE, the file to write")
     rules = chosen(select or (), ignore or ())
     database = load(regdb)
+    if regdb is None and database.source == str(SHIPPED):
+        typer.echo(f"note: no regulatory database on this machine, using the shipped {shipped_version()}", err=True)
     targets = list(paths or [Path(os.environ.get("MESHCTL_INVENTORY") or ".")])
     examined = [examine(path, database, os.environ, rules) for path in targets]
     findings = gathered(examined)

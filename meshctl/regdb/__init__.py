@@ -6,7 +6,7 @@ channel of a width against them.
 
 from meshctl.regdb.binary import RegdbError, decode
 from meshctl.regdb.channels import CHANNELS, Span, center_mhz, channel_at, occupied, width_mhz
-from meshctl.regdb.file import SHIPPED, SYSTEM, load
+from meshctl.regdb.file import SHIPPED, SYSTEM, load, shipped_version
 from meshctl.regdb.legality import Verdict, judge, legal_channels, primary
 from meshctl.regdb.values import Country, DfsRegion, Flag, Regdb, Rule
 
@@ -30,5 +30,6 @@ __all__ = [
     "load",
     "occupied",
     "primary",
+    "shipped_version",
     "width_mhz",
 ]

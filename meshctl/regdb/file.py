@@ -15,6 +15,11 @@ SYSTEM = Path("/lib/firmware/regulatory.db")
 SHIPPED = Path(__file__).with_name("regulatory.db")
 
 
+def shipped_version() -> str:
+    """Where the shipped copy comes from: the package and its version."""
+    return SHIPPED.with_name("regulatory.db.version").read_text(encoding="utf-8").strip()
+
+
 def load(path: Path | None = None) -> Regdb:
     """The database at `path`; by default the machine's, or the shipped one where the machine has none.
 

@@ -27,10 +27,13 @@ def sarif(findings: Findings) -> str:
     everything = [*findings.diagnostics, *(item.diagnostic for item in findings.excused), *findings.known]
     codes = sorted({item.code for item in everything})
     index = {code: number for number, code in enumerate(codes)}
-    results = [_result(item, index) for item in findings.diagnostics]
+    # section 3.27.24: a state on one result asks for a state on all
+    state = {"baselineState": "new"} if findings.known else {}
+    results = [{**_result(item, index), **state} for item in findings.diagnostics]
     results += [
         {
             **_result(item.diagnostic, index),
+            **state,
             "suppressions": [{"kind": "inSource", "status": "accepted", "justification": item.reason}],
         }
         for item in findings.excused

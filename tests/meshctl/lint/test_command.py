@@ -9,6 +9,7 @@ from meshctl.cli.main import main
 from meshctl.lint.example import BASE, ENVIRONMENT
 from meshctl.lint.pages import page
 from meshctl.lint.rules.power import conducted_above_fcc
+from meshctl.regdb import SHIPPED
 
 _FAULTY = BASE + "apply: {canary: false, quorum: 0.2}\n"
 
@@ -128,3 +129,13 @@ def test_explain_prints_the_rules_page(capsys: pytest.CaptureFixture[str]) -> No
 def test_list_names_every_rule(capsys: pytest.CaptureFixture[str]) -> None:
     assert _lint("--list") == 0
     assert "MC342  error    The conducted power is above the FCC's limit\n" in capsys.readouterr().out
+
+
+def test_a_machine_without_a_regulatory_database_is_told_so(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("meshctl.regdb.file.SYSTEM", Path("absent.db"))
+    assert _lint(_file("clean.yaml", BASE)) == 0
+    assert "using the shipped wireless-regdb " in capsys.readouterr().err
+    assert _lint("clean.yaml", "--regdb", str(SHIPPED)) == 0
+    assert capsys.readouterr().err == ""

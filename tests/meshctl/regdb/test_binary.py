@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshctl.regdb import SHIPPED, DfsRegion, Flag, RegdbError, Rule, decode, load
+from meshctl.regdb import SHIPPED, DfsRegion, Flag, RegdbError, Rule, decode, load, shipped_version
 
 _DATA = SHIPPED.read_bytes()
 
@@ -62,6 +62,10 @@ def test_any_bytes_give_a_database_or_a_regdb_error(offset: int, patch: bytes, e
     damaged = (_DATA[:offset] + patch + _DATA[offset + len(patch) :])[: max(end, offset)]
     with contextlib.suppress(RegdbError):
         assert decode(damaged, "fuzzed").source == "fuzzed"
+
+
+def test_the_shipped_database_says_where_it_comes_from() -> None:
+    assert shipped_version().startswith("wireless-regdb ")
 
 
 def test_an_unreadable_path_is_named(tmp_path: Path) -> None:
