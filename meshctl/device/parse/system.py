@@ -73,7 +73,7 @@ def parse_df(text: str) -> dict[str, Space] | None:
 def parse_macs(text: str) -> dict[str, str] | None:
     """`NAME ADDRESS INDEX` lines of observe.sh as name -> address; an interface without one is left out."""
     rows = [line.split() for line in text.splitlines()]
-    found = {row[0]: row[1].lower() for row in rows if len(row) == 3 and _MAC.fullmatch(row[1])}
+    found = {row[0]: row[1].lower() for row in rows if len(row) in (2, 3) and _MAC.fullmatch(row[1])}
     return found or None
 
 
