@@ -22,6 +22,9 @@ class Files(Protocol):
     def mode(self, path: Path) -> int | None:
         """The permission bits."""
 
+    def text(self, path: Path) -> str | None:
+        """The whole file; a replacement character stands for what is not UTF-8."""
+
     def in_repository(self, path: Path) -> bool:
         """Whether git would take the file into a repository: inside a work tree, and not ignored."""
 

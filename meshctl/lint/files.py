@@ -12,6 +12,8 @@ from meshctl import firmware
 from meshctl.diagnostics import Diagnostic
 from meshctl.model import HardwareProfile
 
+# ten thousand pinned keys take some 4 MB
+_MAX_TEXT_BYTES = 16 * 1024 * 1024
 # git answers at once, or hangs on a network file system that is gone
 _GIT_TIMEOUT_S = 10
 
@@ -33,6 +35,15 @@ class DiskFiles:
     def mode(self, path: Path) -> int | None:
         found = _status(path)
         return None if found is None else stat.S_IMODE(found.st_mode)
+
+    def text(self, path: Path) -> str | None:
+        size = self.size_bytes(path)
+        if size is None or size > _MAX_TEXT_BYTES:
+            return None
+        try:
+            return path.read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            return None
 
     def in_repository(self, path: Path) -> bool:
         if path not in self._tracked:

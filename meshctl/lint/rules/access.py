@@ -1,4 +1,4 @@
-"""Who may log in: operators' keys, host keys, passwords (MC421 to MC430)."""
+"""Who may log in: operators' keys, host keys, passwords (MC421 to MC431)."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ import base64
 import struct
 from collections.abc import Iterator
 
+from meshctl.device.trust import parse_pins
 from meshctl.diagnostics import Severity
+from meshctl.errors import InputError
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import listed, repeated
 from meshctl.lint.rule import Example, Finding, fleet_rule
+from meshctl.lint.rules.identity import known_hosts_path
 from meshctl.lint.sshkey import BadKey, PublicKey, parse_public_key
 from meshctl.model import Fleet
 
@@ -222,3 +225,21 @@ def computer_as_root(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if robot.computer is not None and robot.computer.ssh.user == "root":
             path = ("robots", robot.name, "computer", "ssh", "user")
             yield Finding(path, "more than is needed", "the robot's own user", "root")
+
+
+@fleet_rule(
+    "MC431",
+    Severity.ERROR,
+    "The file of pinned host keys cannot be read",
+    why="""Every command that logs in stops at its first line that is no pin: nothing can be changed or looked at until
+    it is mended.""",
+    mend="Mend the line, or remove it and run `meshctl trust` for its node.",
+    failing=Example("operators: {known_hosts: known_hosts}", files={"known_hosts": "base ssh-ed25519 AAAA"}),
+    passing=Example("operators: {known_hosts: known_hosts}", files={"known_hosts": f"base {_ALICE}"}),
+)
+def known_hosts_invalid(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    text = context.files.text(known_hosts_path(fleet))
+    try:
+        parse_pins(text or "", source=fleet.operators.known_hosts)
+    except InputError as error:
+        yield Finding(("operators", "known_hosts"), str(error), "lines of NAME TYPE BASE64")

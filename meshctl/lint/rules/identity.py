@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os.path
 import re
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 
+from meshctl.device.trust import Pin, parse_pins
 from meshctl.diagnostics import Severity
+from meshctl.errors import InputError
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import listed, repeated
-from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Fleet, Node, NodeState
 
 # one label of a host name: RFC 1123 section 2.1 and RFC 952, at most 63 octets (RFC 1035 section 2.3.4)
@@ -148,15 +152,24 @@ def is_device_mac(mac: str) -> bool:
       b01: {host_keys: ["ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f"]}
     """,
 )
-def host_key_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    marks = (
-        (" ".join(key.split()[:2]), node) for node in fleet.nodes.values() for key in dict.fromkeys(node.host_keys)
-    )
-    for key, nodes in repeated(marks):
-        first, *later = dict.fromkeys(node.name for node in nodes)
+def host_key_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    # a key may stand both in the inventory and in known_hosts: each node counts once
+    for key, nodes in repeated(dict.fromkeys(_host_keys(fleet, context))):
+        first, *later = nodes
         for name in later:
             found = f"{key[:24]}...{key[-8:]}"
             yield Finding(("nodes", name, "host_keys"), f"{first} has the same host key", "a key of its own", found)
+
+
+def _host_keys(fleet: Fleet, context: LintContext) -> Iterator[tuple[str, str]]:
+    """Every pinned key as `TYPE BASE64`, with the node it is pinned for."""
+    for node in fleet.nodes.values():
+        for key in node.host_keys:
+            yield " ".join(key.split()[:2]), node.name
+    for pin in _pins(fleet, context) or ():
+        for name in pin.names:
+            if name in fleet.nodes and not pin.marker:
+                yield pin.key.text, name
 
 
 @fleet_rule(
@@ -220,16 +233,43 @@ def _deployed(fleet: Fleet) -> Iterator[Node]:
     why="Whoever answers first at the address is believed. meshctl refuses to change a node it cannot recognise.",
     mend="Run `meshctl trust NODE` once, on the bench, where nobody can stand between.",
     failing="nodes: {base: {host_keys: <removed>}}",
-    passing="""
-    nodes:
-      base: {host_keys: ["ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f"]}
-    """,
+    passing=Example(
+        "nodes: {base: {host_keys: <removed>}}",
+        files={"known_hosts": "base ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8A"},
+    ),
 )
-def host_key_not_pinned(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    strangers = [node.name for node in _deployed(fleet) if not node.host_keys]
-    if strangers:
+def host_key_not_pinned(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    pinned = _pinned_names(fleet, context)
+    strangers = [node.name for node in _deployed(fleet) if not node.host_keys and node.name not in pinned]
+    if strangers and _HASHED not in pinned:
         found = f"none for {listed(strangers)}"
-        yield Finding(("nodes", strangers[0]), "any device is believed", "`host_keys`", found)
+        expected = f"`host_keys`, or lines in {fleet.operators.known_hosts}"
+        yield Finding(("nodes", strangers[0]), "any device is believed", expected, found)
+
+
+# stands for names that known_hosts holds as hashes only: any node may be among them
+_HASHED = "|1|"
+
+
+def _pinned_names(fleet: Fleet, context: LintContext) -> set[str]:
+    pins = _pins(fleet, context)
+    if pins is None:
+        return {_HASHED}
+    names = (name for pin in pins if not pin.marker for name in pin.names)
+    return {_HASHED if name.startswith(_HASHED) else name for name in names}
+
+
+def _pins(fleet: Fleet, context: LintContext) -> tuple[Pin, ...] | None:
+    """The lines of the fleet's known_hosts, None when it cannot be read (a rule of its own says why)."""
+    try:
+        return parse_pins(context.files.text(known_hosts_path(fleet)) or "")
+    except InputError:
+        return None
+
+
+def known_hosts_path(fleet: Fleet) -> Path:
+    """Where the fleet's pinned host keys are: beside the inventory, unless the path is absolute."""
+    return Path(fleet.base or ".", os.path.expanduser(fleet.operators.known_hosts))
 
 
 @fleet_rule(

@@ -170,3 +170,12 @@ def test_the_work_grows_linearly_with_the_fleet(tmp_path: Path) -> None:
 
 def test_the_rules_are_many_and_their_codes_unique() -> None:
     assert len({rule.code for rule in RULES}) == len(RULES) > 150
+
+
+def test_a_host_key_pinned_twice_is_found_across_inventory_and_known_hosts(tmp_path: Path) -> None:
+    key = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8A"
+    example = Example(
+        "operators: {known_hosts: pins}", files={"pins": f"base {key}\nb01,other {key}\n@revoked b02 {key}\n"}
+    )
+    (finding,) = examine(write(example, tmp_path), _REGDB, environment(example)).diagnostics
+    assert (finding.code, finding.path) == ("MC115", "nodes.b01.host_keys")
