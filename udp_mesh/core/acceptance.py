@@ -142,7 +142,7 @@ def _to_all(state: State, accepted: Accepted, now: float) -> None:
     if fits:
         state.casts.push(accepted)
     for peer in list(state.roster.peers.values()):
-        if (peer.online and not fits) or (not peer.online and topic.outbox is not Outbox.NONE):
+        if (peer.online and (not fits or peer.legacy)) or (not peer.online and topic.outbox is not Outbox.NONE):
             enqueue(state, peer.name, accepted, now)
 
 

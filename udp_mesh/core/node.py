@@ -8,9 +8,11 @@ from udp_mesh.core import acceptance, changes, dispatch, survey
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.events import Event, MessageId, Rejected
 from udp_mesh.core.intake import take_datagram
+from udp_mesh.core.legacy_peers import LegacyPeers
 from udp_mesh.core.seams import Datagram, RandomSource, Store
 from udp_mesh.core.settings import Address, LinkInfo, Settings
 from udp_mesh.core.state import State
+from udp_mesh.wire.header import MARK
 from udp_mesh.wire.limits import BOOT_ID_BYTES
 
 
@@ -24,6 +26,7 @@ class Node:
         if len(boot_id) != BOOT_ID_BYTES:
             raise ValueError(f"boot_id: expected {BOOT_ID_BYTES} bytes, found {len(boot_id)}")
         self._state = State(settings, boot_id, rng, now, store)
+        self._legacy = LegacyPeers(self._state)
         changes.restore_outboxes(self._state, now)
 
     @property
@@ -33,22 +36,33 @@ class Node:
 
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
         """Take in one datagram. Bad bytes are counted and dropped; this never raises because of what was received."""
-        take_datagram(self._state, data, link, source, now)
+        if self._legacy and len(data) and data[0] < MARK:
+            self._legacy.receive(data, link, source, now)
+        else:
+            take_datagram(self._state, data, link, source, now)
 
     def datagrams_to_send(self, now: float, *, max_bytes: int | None = None) -> list[Datagram]:
         """The datagrams that leave now, most urgent first, about 64 KiB at most per call (`max_bytes`, if given).
 
         Call again until the list is empty. With `max_bytes` a driver whose socket is full asks for less.
         """
-        return dispatch.collect(self._state, now, max_bytes)
+        out = dispatch.collect(self._state, now, max_bytes)
+        if self._legacy:
+            self._legacy.leave(now, out)
+        return out
 
     def next_timer(self) -> float | None:
         """When `handle_timer` wants to be called next (None: never). Cheap; may be in the past."""
-        return dispatch.next_timer(self._state)
+        at = dispatch.next_timer(self._state)
+        if self._legacy and at is not None:
+            return min(at, self._legacy.next_at())
+        return at
 
     def handle_timer(self, now: float) -> None:
         """Do what is due at `now`. Calling early or late is harmless."""
         dispatch.handle_timer(self._state, now)
+        if self._legacy:
+            self._legacy.handle_timer(now)
 
     def next_event(self) -> Event | None:
         """The oldest event not yet fetched."""
@@ -77,7 +91,9 @@ class Node:
 
         Drops no accepted message. A changed name or port raises ValueError: these need a new run.
         """
-        return changes.apply(self._state, settings, now)
+        lines = changes.apply(self._state, settings, now)
+        self._legacy.apply()
+        return lines
 
     def conditions(self, now: float) -> Conditions:
         """A snapshot for the autonomy, the status page and the metrics."""

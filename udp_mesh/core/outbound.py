@@ -35,8 +35,8 @@ PROBE_SOON_FOR_S = 1.0
 
 SILENT_AFTER_TIMEOUTS = 3
 SILENT_AFTER_S = 0.15
-"""Without any acknowledgement for both of these the peer is silent. Until then packets are replaced as they time out, at the
-pace of the window: a burst of losses then costs little more than its own length."""
+"""Without any acknowledgement for both of these the peer is silent. Until then packets are replaced as they time out,
+at the pace of the window: a burst of losses then costs little more than its own length."""
 
 QUIET_S = 0.02
 """Acknowledgements must stay away at least this long before packets time out: twice what they are held back."""

@@ -25,7 +25,8 @@ QUEUE_S = 0.004
 latency."""
 
 START_QUEUE_S = 0.006
-"""Growth of the round trip that ends the startup: more than the scatter of a radio, less than an urgent message's slack."""
+"""Growth of the round trip that ends the startup: more than the scatter of a radio, less than an urgent message's
+slack."""
 
 LEAST_QUEUE_PACKETS = 2.0
 """The same at low rates: fewer packets leave the link idle between acknowledgements."""

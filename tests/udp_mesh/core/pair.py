@@ -1,6 +1,7 @@
 """Nodes in memory under a virtual clock: whole sessions as transcripts, lossy links as deterministic models.
 
-`pair()` makes two nodes that have met. `roundtrip()` carries everything both ways at once; `drop()` loses what would leave.
+`pair()` makes two nodes that have met. `roundtrip()` carries everything both ways at once; `drop()` loses what would
+leave.
 `World` runs any number of nodes over modelled links (`Pipe`: rate, delay, finite queue, loss) for a virtual time.
 """
 
@@ -113,7 +114,7 @@ class World:
                 self.now = end
                 return until is not None and until()
             self.now = at
-            touched = {}
+            touched: dict[str, None] = {}
             while self._queue and self._queue[0][0] <= at:
                 _, _, source, target, data = heapq.heappop(self._queue)
                 if target in self.nodes:

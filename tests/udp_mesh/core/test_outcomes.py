@@ -1,0 +1,153 @@
+"""Every accepted reliable message ends, per destination, in exactly one of delivered, expired, peer lost; and a delivered
+one arrived, once per run of its receiver."""
+
+import random
+from collections import Counter
+
+import pytest
+
+from tests.udp_mesh.core.pair import Pipe, World, pair, settings
+from udp_mesh.core.events import (
+    ExpiryReason,
+    MessageDelivered,
+    MessageExpired,
+    MessagePeerLost,
+    MessageReceived,
+    PeerRestarted,
+)
+from udp_mesh.core.settings import Rates, Topic
+
+TOPICS = (
+    Topic("urgent", priority=0),
+    Topic("status", priority=4, keep_last=2),
+    Topic("pose", priority=2, keep_last=1, deadline_s=0.5),
+    Topic("map", priority=9, compression=True),
+    Topic("limited", priority=7, rate_limit_bytes_per_s=40_000),
+)
+QUICK = Rates(offline_s=3.0, peer_lost_s=6.0)
+
+
+def outcomes(world: World, name: str) -> Counter[tuple[int, str]]:
+    ends: Counter[tuple[int, str]] = Counter()
+    for _, event in world.events[name]:
+        if isinstance(event, MessageDelivered | MessageExpired | MessagePeerLost):
+            ends[(event.message_id, event.peer)] += 1
+    return ends
+
+
+def soak(seed: int, seconds: float) -> World:
+    """Three nodes, loss, partitions, restarts of the receiver, bursts of every topic; then quiet."""
+    world = World(seed=seed)
+    dice = random.Random(seed)
+    for name in ("a", "b", "c"):
+        world.add(settings(name, *TOPICS, rates=QUICK))
+    for pipe in world.pipes.values():
+        pipe.loss = dice.choice((0.0, 0.05, 0.2))
+        pipe.rate_bits_per_s = dice.choice((1e6, 4e6, 20e6))
+        pipe.delay_s = dice.choice((0.001, 0.01, 0.05))
+    world.run(1.5)
+    end = world.now + seconds
+    sent: dict[tuple[int, str], str] = {}
+    while world.now < end:
+        topic = dice.choice(TOPICS).name
+        target = dice.choice(("b", "c"))
+        size = dice.choice((0, 1, 100, 1399, 1400, 1401, 9_000, 60_000))
+        result = world.send("a", topic, dice.randbytes(size // 2) + bytes(size - size // 2), target)
+        if isinstance(result, int):
+            sent[(result, target)] = topic
+        world.run(dice.choice((0.001, 0.01, 0.05, 0.2)))
+        chance = dice.random()
+        if chance < 0.02:
+            for (source, sink), pipe in world.pipes.items():
+                if "c" in (source, sink):
+                    pipe.up = not pipe.up
+        elif chance < 0.025:
+            world.add(settings("b", *TOPICS, rates=QUICK))
+    for pipe in world.pipes.values():
+        pipe.up = True
+    world.run(60.0, until=lambda: not world.nodes["a"].conditions(world.now).queued_bytes)
+    world.run(8.0)
+    ends = outcomes(world, "a")
+    assert set(ends) == set(sent), seed
+    assert set(ends.values()) == {1}, seed
+    return world
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_every_reliable_message_has_one_outcome_whatever_happens_to_link_and_peers(seed: int) -> None:
+    soak(seed, 12.0)
+
+
+@pytest.mark.proof
+@pytest.mark.parametrize("seed", range(100, 130))
+def test_every_reliable_message_has_one_outcome_over_long_soaks(seed: int) -> None:
+    soak(seed, 600.0)
+
+
+def test_what_is_delivered_arrived_once_and_whole() -> None:
+    world = World(seed=5)
+    world.add(settings("a"))
+    world.add(settings("b"))
+    world.run(1.5)
+    for pipe in world.pipes.values():
+        pipe.loss = 0.3
+    payloads = [bytes([number]) * (number * 97) for number in range(120)]
+    for payload in payloads:
+        world.send("a", "any", payload, "b")
+        world.run(0.02)
+    assert world.run(60.0, until=lambda: len(world.told("a", MessageDelivered)) == len(payloads))
+    received = [event.payload for event in world.told("b", MessageReceived) if isinstance(event, MessageReceived)]
+    assert sorted(received) == sorted(payloads)
+
+
+def test_a_message_past_its_deadline_expires_and_says_so() -> None:
+    both = pair(Topic("t", deadline_s=0.1))
+    both.a.send("t", b"late", destination="b", now=both.now)
+    for _ in range(30):
+        both.drop(both.a)
+        both.now += 0.01
+    ends = [event for event in both.events(both.a) if isinstance(event, MessageExpired)]
+    assert [end.reason for end in ends] == [ExpiryReason.DEADLINE]
+    both.roundtrip(times=20)
+    assert not any(isinstance(event, MessageReceived) for event in both.events(both.b))
+
+
+def test_of_a_topic_that_keeps_the_last_only_the_newest_waits() -> None:
+    both = pair(Topic("pose", keep_last=1))
+    ids = [both.a.send("pose", bytes([number]), destination="b", now=both.now) for number in range(5)]
+    both.roundtrip(times=10)
+    received = [event.payload for event in both.events(both.b) if isinstance(event, MessageReceived)]
+    assert received == [bytes([4])]
+    ends = [event for event in both.events(both.a) if isinstance(event, MessageExpired | MessageDelivered)]
+    assert [type(end) for end in ends] == [MessageExpired] * 4 + [MessageDelivered]
+    assert [end.message_id for end in ends] == ids
+
+
+def test_a_peer_that_stays_silent_is_lost_and_its_messages_with_it() -> None:
+    world = World()
+    world.add(settings("a", rates=QUICK))
+    world.add(settings("b", rates=QUICK))
+    world.run(1.5)
+    for pipe in world.pipes.values():
+        pipe.up = False
+    world.send("a", "any", b"x" * 5000, "b")
+    world.run(4.0)
+    assert not world.told("a", MessagePeerLost)
+    assert world.run(6.0, until=lambda: bool(world.told("a", MessagePeerLost)))
+    assert not outcomes(world, "a") - Counter({(1, "b"): 1})
+
+
+def test_a_receiver_that_restarts_in_the_middle_gets_the_whole_message_in_its_new_run() -> None:
+    world = World()
+    for name in ("a", "b"):
+        world.add(settings(name))
+    world.pipes[("a", "b")] = Pipe(rate_bits_per_s=4e6)
+    world.run(1.5)
+    payload = random.Random(1).randbytes(1_000_000)
+    world.send("a", "any", payload, "b")
+    world.run(0.8)
+    world.add(settings("b"))
+    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.told("a", PeerRestarted)
+    received = [event for event in world.told("b", MessageReceived) if isinstance(event, MessageReceived)]
+    assert [event.payload for event in received] == [payload]

@@ -1,0 +1,180 @@
+"""Peers that speak the fielded format, each named by configuration: both directions, priorities kept.
+
+A datagram of that format is taken only from a configured address, and only under the configured name: what it claims
+about itself is not authenticated. Heartbeats, offline after silence, queues and outcomes are as for other peers.
+"""
+
+from udp_mesh.core.acceptance import release_outbox, report_ended, shelve
+from udp_mesh.core.events import MessageReceived, PeerOffline, PeerOnline
+from udp_mesh.core.legacy_receive import LegacyReassembly
+from udp_mesh.core.legacy_send import LegacySender
+from udp_mesh.core.outbound import Outcome
+from udp_mesh.core.seams import Datagram
+from udp_mesh.core.session import Peer
+from udp_mesh.core.settings import Address, LinkInfo, Neighbour, Settings
+from udp_mesh.core.state import State
+from udp_mesh.wire.errors import DecodeError
+from udp_mesh.wire.legacy import (
+    Host,
+    LegacyAck,
+    LegacyPayload,
+    PriorityMeshData,
+    decode_legacy,
+    encode_legacy,
+)
+from udp_mesh.wire.limits import PRIORITY_LEVELS
+
+LEGACY_HEARTBEAT_S = 1.0
+"""The fielded period; its receivers report a peer offline after ten."""
+
+
+class LegacyPeer:
+    """One fielded peer."""
+
+    __slots__ = ("address", "broadcasts", "last_heard", "link", "neighbour", "peer", "sender", "unicasts")
+
+    def __init__(self, neighbour: Neighbour, peer: Peer, settings: Settings) -> None:
+        self.neighbour = neighbour
+        self.peer = peer
+        self.address = neighbour.address
+        self.link = neighbour.link or ""
+        self.sender = LegacySender(peer.outbound, settings.name)
+        self.unicasts = LegacyReassembly(settings.limits)
+        self.broadcasts = LegacyReassembly(settings.limits)
+        self.last_heard = float("-inf")
+
+
+class LegacyPeers:
+    """All of them, by host address. `next_at` is when something is due."""
+
+    __slots__ = ("_by_host", "_heartbeat_at", "_state")
+
+    def __init__(self, state: State) -> None:
+        self._state = state
+        self._by_host: dict[str, LegacyPeer] = {}
+        self._heartbeat_at = float("-inf")
+        self.apply()
+
+    def apply(self) -> None:
+        """Follow the settings' neighbours; peers that stay keep everything."""
+        wanted = {neighbour.address[0]: neighbour for neighbour in self._state.settings.neighbours if neighbour.legacy}
+        for host in list(self._by_host):
+            if host not in wanted or self._by_host[host].neighbour != wanted[host]:
+                gone = self._by_host.pop(host)
+                gone.peer.legacy = False
+        for host, neighbour in wanted.items():
+            if host not in self._by_host and neighbour.name is not None:
+                peer = self._state.roster.peer(neighbour.name, self._state.settings)
+                if peer is not None:
+                    peer.legacy = True
+                    peer.lost = False
+                    self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings)
+
+    def __len__(self) -> int:
+        return len(self._by_host)
+
+    def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
+        """One datagram without our mark: the fielded format from a configured address, or nothing of ours."""
+        counters = self._state.ledger.counters
+        legacy = self._by_host.get(source[0])
+        if legacy is None:
+            counters.dropped_unauthenticated += 1
+            return
+        try:
+            datagram = decode_legacy(data)
+            self._heard(legacy, link, source, now)
+            match datagram:
+                case Host():
+                    pass
+                case LegacyAck(sequence, position):
+                    legacy.sender.acknowledge(sequence, position, now)
+                    report_ended(self._state, legacy.peer, now)
+                case LegacyPayload():
+                    self._take(legacy, datagram, link, source, now)
+        except DecodeError:
+            counters.dropped_malformed += 1
+
+    def _heard(self, legacy: LegacyPeer, link: str, source: Address, now: float) -> None:
+        legacy.last_heard = now
+        legacy.link = link
+        legacy.address = source
+        legacy.sender.heard()
+        peer = legacy.peer
+        peer.lost = False
+        if not peer.online:
+            peer.online = True
+            peer.online_since = now
+            self._state.ledger.tell(PeerOnline(peer.name, source, link))
+            release_outbox(self._state, peer, now)
+
+    def _take(self, legacy: LegacyPeer, piece: LegacyPayload, link: str, source: Address, now: float) -> None:
+        reassembly = legacy.unicasts if piece.wants_ack else legacy.broadcasts
+        message: PriorityMeshData | None = None
+        keep = True
+        try:
+            keep, message = reassembly.add(piece, now)
+        finally:
+            if keep and piece.wants_ack:
+                data = encode_legacy(LegacyAck(piece.sequence, piece.position))
+                self._state.outgoing.append(Datagram(link, source, data, True))
+        if message is not None:
+            self._state.ledger.counters.messages_received += 1
+            priority = min(message.priority, PRIORITY_LEVELS - 1)
+            self._state.ledger.tell(
+                MessageReceived(
+                    legacy.peer.name,
+                    message.topic,
+                    message.type_name,
+                    message.data,
+                    priority,
+                    not piece.wants_ack,
+                )
+            )
+
+    def leave(self, now: float, out: list[Datagram]) -> None:
+        """Fragments that may leave now."""
+        for legacy in self._by_host.values():
+            if legacy.link and (legacy.peer.outbound.open or legacy.sender.timer() is not None):
+                legacy.sender.leave(legacy.link, legacy.address, now, out)
+                report_ended(self._state, legacy.peer, now)
+
+    def next_at(self) -> float:
+        """When `handle_timer` wants to be called."""
+        if not self._by_host:
+            return float("inf")
+        at = self._heartbeat_at
+        for legacy in self._by_host.values():
+            due = legacy.sender.timer()
+            if due is not None and legacy.link:
+                at = min(at, due)
+        return at
+
+    def handle_timer(self, now: float) -> None:
+        """Heartbeats, silences and purges, once a second."""
+        if not self._by_host or now < self._heartbeat_at:
+            return
+        self._heartbeat_at = now + LEGACY_HEARTBEAT_S
+        state = self._state
+        rates = state.settings.rates
+        for legacy in self._by_host.values():
+            peer = legacy.peer
+            quiet_s = now - legacy.last_heard
+            if peer.online and quiet_s > rates.offline_s:
+                peer.online = False
+                peer.online_since = None
+                state.ledger.tell(PeerOffline(peer.name, left=False))
+                shelve(state, peer, now)
+            if not peer.online and not peer.lost and quiet_s > rates.peer_lost_s:
+                peer.lost = True
+                peer.outbound.finish_all(Outcome.PEER_LOST)
+                report_ended(state, peer, now)
+            legacy.unicasts.purge(now)
+            legacy.broadcasts.purge(now)
+            for link in self._links(legacy):
+                host = encode_legacy(Host(state.settings.name, link.address[0]))
+                state.outgoing.append(Datagram(link.name, legacy.neighbour.address, host, True))
+
+    def _links(self, legacy: LegacyPeer) -> list[LinkInfo]:
+        links = list(self._state.links.values())
+        named = [link for link in links if link.name == (legacy.neighbour.link or legacy.link)]
+        return named or links

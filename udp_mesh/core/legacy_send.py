@@ -1,0 +1,174 @@
+"""Messages to one peer of the fielded format: pieces in priority order, a window of three, resent until acknowledged.
+
+The fielded receiver acknowledges every fragment at once; the fielded sender never resent one. Here a fragment is sent
+again when its acknowledgement is overdue by the measured round trip, and a silent peer is probed with single
+fragments.
+"""
+
+from dataclasses import dataclass
+
+from udp_mesh.core.message import Outgoing
+from udp_mesh.core.outbound import PROBE_S, PROBE_SOON_S, Outbound, Outcome
+from udp_mesh.core.seams import Datagram
+from udp_mesh.core.settings import Address
+from udp_mesh.wire.legacy import LegacyPayload, PriorityMeshData, encode_legacy, encode_mesh_data, fragment_legacy
+from udp_mesh.wire.limits import MAX_LEGACY_FRAGMENT_BYTES, PRIORITY_LEVELS
+
+LEGACY_WINDOW = 3
+"""Fragments in flight to a fielded peer: its own choice, above which its radios were seen to interfere."""
+
+LAST_SEQUENCE = 0x7FFF
+"""Unicast sequence numbers run from 1 to this, then from 1 again."""
+
+TRIES_BEFORE_SILENT = 3
+"""Tries of one fragment after which only single probes leave."""
+
+
+@dataclass(slots=True)
+class _Leg:
+    """One fragment on its way."""
+
+    message: Outgoing
+    position: int
+    sent_at: float
+    tries: int
+
+
+class LegacySender:
+    """The sending half for one fielded peer; queues and outcomes are those of its `Outbound`."""
+
+    __slots__ = ("_fragments", "_legs", "_own_name", "_sequence", "_sequences", "_stamp", "outbound", "silent")
+
+    def __init__(self, outbound: Outbound, own_name: str) -> None:
+        self.outbound = outbound
+        self.silent = False
+        self._own_name = own_name
+        self._sequence = 0
+        self._stamp = 0
+        self._legs: dict[tuple[int, int], _Leg] = {}
+        self._sequences: dict[int, Outgoing] = {}
+        self._fragments: dict[Outgoing, tuple[int, list[bytes]]] = {}
+
+    def leave(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
+        """What may leave now: overdue fragments first by age, then new ones, most urgent first."""
+        self._forget_ended()
+        self._resend(link, address, now, out)
+        outbound = self.outbound
+        scheduler = outbound.scheduler
+        for priority in range(PRIORITY_LEVELS):
+            urgent = priority <= outbound.rates.urgent_priority
+            window = LEGACY_WINDOW + (outbound.rates.urgent_excess_packets if urgent else 0)
+            while scheduler.waiting >> priority & 1 and not self.silent and len(self._legs) < window:
+                run = scheduler.peek(priority)
+                if run is None:
+                    break
+                message = run.message
+                if not message.begun and not self._begin(message, now):
+                    scheduler.drop_head(run)
+                    continue
+                run = scheduler.peek(priority)
+                assert run is not None
+                scheduler.take(run, 1)
+                self._send(message, run.position, 1, link, address, now, out)
+                if not message.reliable and run.position == message.fragments - 1 and message.missing == 0:
+                    outbound.finish(message, Outcome.SENT)
+
+    def acknowledge(self, sequence: int, position: int, now: float) -> None:
+        """The peer has this fragment; unknown ones are ignored."""
+        leg = self._legs.pop((sequence, position), None)
+        self.silent = False
+        if leg is None:
+            return
+        if leg.tries == 1:
+            # Karn: which try a later acknowledgement answers is unknown.
+            self.outbound.trip.sample(max(1e-5, now - leg.sent_at), now)
+        message = leg.message
+        if not message.ended and message.arrive(position) and not message.missing:
+            self.outbound.finish(message, Outcome.DELIVERED)
+        self.outbound.delivered_packets += 1
+        self.outbound.delivered_at = now
+
+    def heard(self) -> None:
+        """Anything from the peer ends its silence: everything on its way is due at once."""
+        if self.silent:
+            self.silent = False
+            for leg in self._legs.values():
+                leg.sent_at = float("-inf")
+                leg.tries = 1
+
+    def timer(self) -> float | None:
+        """When the next fragment is overdue."""
+        if not self._legs:
+            return None
+        return min(leg.sent_at + self._patience(leg) for leg in self._legs.values())
+
+    def _patience(self, leg: _Leg) -> float:
+        timeout = max(PROBE_SOON_S / 2, self.outbound.trip.timeout(0.0))
+        return min(PROBE_S, timeout * (1 << min(leg.tries - 1, 3)))
+
+    def _resend(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
+        due = [entry for entry in self._legs.values() if now >= entry.sent_at + self._patience(entry)]
+        due.sort(key=lambda leg: leg.message.priority)
+        for leg in due:
+            if leg.tries >= TRIES_BEFORE_SILENT and not self.silent:
+                self.silent = True
+            self._send(leg.message, leg.position, leg.tries + 1, link, address, now, out)
+            self.outbound.retransmitted += 1
+            if self.silent:
+                # One probe; the others wait until it is answered.
+                for other in due:
+                    if other is not leg:
+                        other.sent_at = now
+                break
+
+    def _begin(self, message: Outgoing, now: float) -> bool:
+        """Serialize, cut and number; False if the format cannot carry it (it then ends as refused)."""
+        accepted = message.accepted
+        self._stamp = (self._stamp + 1) & 0xFFFFFFFF
+        channel = accepted.channel
+        seconds = int(now)
+        data = PriorityMeshData(
+            self._own_name,
+            channel.type_name,
+            message.priority,
+            channel.name,
+            accepted.payload,
+            self._stamp,
+            seconds & 0xFFFFFFFF,
+            int((now - seconds) * 1e9),
+        )
+        body = encode_mesh_data(data)
+        fragments = fragment_legacy(body)
+        sequence = self._next_sequence()
+        message.begin(sequence, MAX_LEGACY_FRAGMENT_BYTES, MAX_LEGACY_FRAGMENT_BYTES)
+        message.fragments = message.missing = len(fragments)
+        message.arrived = bytearray(len(fragments))
+        self._sequences[sequence] = message
+        self._fragments[message] = (sequence, fragments)
+        return True
+
+    def _next_sequence(self) -> int:
+        """The next number after the wrap not in use: a new message never meets an old one's pieces."""
+        while True:
+            self._sequence = self._sequence % LAST_SEQUENCE + 1
+            if self._sequence not in self._sequences:
+                return self._sequence
+
+    def _send(
+        self, message: Outgoing, position: int, tries: int, link: str, address: Address, now: float, out: list[Datagram]
+    ) -> None:
+        sequence, fragments = self._fragments[message]
+        self._legs[(sequence, position)] = _Leg(message, position, now, tries)
+        payload = LegacyPayload(sequence, position, len(fragments), fragments[position], wants_ack=True)
+        data = encode_legacy(payload)
+        urgent = message.priority <= self.outbound.rates.urgent_priority
+        out.append(Datagram(link, address, data, urgent))
+        self.outbound.sent_packets += 1
+        self.outbound.sent_bytes += len(data) + 28
+
+    def _forget_ended(self) -> None:
+        for message in [message for message in self._fragments if message.ended]:
+            sequence, fragments = self._fragments.pop(message)
+            del self._sequences[sequence]
+            for position in range(len(fragments)):
+                self._legs.pop((sequence, position), None)
