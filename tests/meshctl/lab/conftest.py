@@ -85,15 +85,11 @@ def node(fleet: VirtualFleet) -> Iterator[VirtualNode]:
     """A node fresh from its box, and fresh again afterwards."""
     box = fleet.node("box")
     box.wait_up()
-    first = box.flash_path
     yield box
     fleet.mend("box")
     box.wait_up()
-    if box.flash_path == first:
-        restore(box)
-    else:
-        box.exec("cd /lab/node/flash && rm -rf current copy.* sysupgrade.tgz").check("erase flash")
-        box.power_cut()
+    box.exec("cd /lab/node/flash && rm -rf current copy.* sysupgrade.tgz").check("erase flash")
+    box.power_cut()
 
 
 def unplug(fleet: VirtualFleet) -> None:
