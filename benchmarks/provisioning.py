@@ -1,0 +1,164 @@
+"""Time and processor time per node: `meshctl provision` against the same files pushed by ansible-core.
+
+`python -m benchmarks.provisioning [--nodes 10,50,200] [--results FILE]` starts a virtual fleet of each size, takes it
+in, and then changes every node twice: from configuration `a` to `b` by meshctl, and from `b` back to `a` by ansible's `raw`
+and `script` modules (dropbear has no SFTP and the nodes have no Python). Both use as many connections at once, and
+neither waits for one node before the next. What they do is not the same: ansible writes the files, reloads and looks
+that they are there; meshctl also observes first, keeps the previous state under a dead-man's switch, proves the node
+reachable by a new connection, checks its mesh, and confirms. The nodes run on the same machine, so wall time is theirs
+too; processor time is the tool's own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from meshctl.lab.fleet import VirtualFleet
+from meshctl.render import DeviceFacts
+from tests.meshctl.proof.rig import Rig
+
+RESULTS = Path(__file__).with_name("results") / "provisioning.jsonl"
+FORKS = 8
+PLAYBOOK = """\
+- hosts: all
+  gather_facts: false
+  tasks:
+    - raw: cat /etc/openwrt_release
+    - script: "{{ inventory_hostname }}.sh"
+    - raw: test "$(sha256sum </etc/config/wireless)" = "{{ wireless_sha256 }}  -"
+"""
+
+
+def ran(command: Sequence[str], environ: Mapping[str, str]) -> dict[str, float]:
+    """Run to its end; seconds of wall and processor time, of the process and all that it waited for."""
+    began = time.monotonic()
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(command, env=dict(environ), stdin=subprocess.DEVNULL, stdout=output, stderr=output)
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            output.seek(0)
+            raise RuntimeError(f"{command[0]} ended with {process.returncode}:\n{output.read().decode()[-3000:]}")
+    return {"seconds": time.monotonic() - began, "cpu_s": used.ru_utime + used.ru_stime}
+
+
+def by_meshctl(rig: Rig, variant: str) -> dict[str, float]:
+    command = [sys.executable, "-m", "meshctl", "provision", "--yes", "--json", "-i", str(rig.inventory(variant))]
+    return ran([*command, "--key", str(rig.directory / "key")], rig.environ)
+
+
+def by_ansible(rig: Rig, variant: str) -> dict[str, float]:
+    """The same files, by a script per node, as an operator would write it."""
+    place = rig.directory / "ansible"
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir()
+    hosts = {}
+    for name in ("base", *rig.names):
+        endpoint = rig.fleet.endpoint(_address(rig.fleet, name))
+        files = rig.rendered(variant, name, DeviceFacts(""))
+        (place / f"{name}.sh").write_text(script(files))
+        hosts[name] = {
+            "ansible_host": endpoint.host,
+            "ansible_port": endpoint.port,
+            "wireless_sha256": _sha256(files["etc/config/wireless"]),
+        }
+    (place / "hosts.json").write_text(json.dumps({"all": {"hosts": hosts}}))
+    (place / "play.yaml").write_text(PLAYBOOK)
+    environ = {
+        **rig.environ,
+        "ANSIBLE_HOST_KEY_CHECKING": "False",
+        "ANSIBLE_PIPELINING": "True",
+        "ANSIBLE_SSH_TRANSFER_METHOD": "piped",
+        "ANSIBLE_SSH_USETTY": "False",
+        "ANSIBLE_REMOTE_USER": "root",
+        "ANSIBLE_PRIVATE_KEY_FILE": str(rig.directory / "key"),
+        "ANSIBLE_SSH_ARGS": "-o ControlMaster=auto -o ControlPersist=30s -o UserKnownHostsFile=/dev/null",
+        "ANSIBLE_HOME": str(place / "home"),
+        "LC_ALL": "C.UTF-8",
+    }
+    program = Path(sys.executable).with_name("ansible-playbook")
+    command = [str(program), "-i", str(place / "hosts.json"), "--forks", str(FORKS), str(place / "play.yaml")]
+    return ran(command, environ)
+
+
+def script(files: Mapping[str, bytes]) -> str:
+    """A shell script that writes these files and has OpenWrt reload what changed."""
+    lines = ["#!/bin/sh", "set -e"]
+    for path, content in sorted(files.items()):
+        target = shlex.quote(f"/{path}")
+        lines.append(f"mkdir -p {shlex.quote('/' + str(Path(path).parent))}")
+        lines.append(f"printf %s {shlex.quote(content.decode())} >{target}.new && mv {target}.new {target}")
+    return "\n".join([*lines, "sync", "reload_config"]) + "\n"
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _address(fleet: VirtualFleet, name: str) -> str:
+    address = fleet.node(name).address
+    if address is None:
+        raise RuntimeError(f"{name} has no address")
+    return address
+
+
+def measure(count: int) -> dict[str, Any]:
+    """Both tools over one fleet of `count` nodes and a base."""
+    with tempfile.TemporaryDirectory(prefix="provisioning-") as directory, Rig(
+        Path(directory), count - 1, window_s=60, parallel=FORKS
+    ) as rig:  # fmt: skip
+        taken = rig.take_in("a")
+        if taken.code:
+            raise RuntimeError(f"the fleet could not be taken in:\n{taken.out}{taken.err}")
+        ours = by_meshctl(rig, "b")
+        ansible = by_ansible(rig, "a")
+        wrong = [name for name in ("base", *rig.names) if rig.state_of(name, "b", "a") != "new"]
+        if wrong:
+            raise RuntimeError(f"ansible left {', '.join(wrong)} as they were")
+    return {"nodes": count, "meshctl": ours, "ansible": ansible}
+
+
+def table(results: Sequence[Mapping[str, Any]]) -> str:
+    lines = [
+        "| nodes | tool | seconds | seconds per node | processor seconds per node |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for result in results:
+        for tool in ("meshctl", "ansible"):
+            took, nodes = result[tool], result["nodes"]
+            lines.append(
+                f"| {nodes} | {tool} | {took['seconds']:.1f} | {took['seconds'] / nodes:.2f} "
+                f"| {took['cpu_s'] / nodes:.3f} |"
+            )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.provisioning", description=__doc__)
+    parser.add_argument("--nodes", default="10,50,200")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    arguments = parser.parse_args()
+    results = []
+    for count in map(int, arguments.nodes.split(",")):
+        results.append(measure(count))
+        arguments.results.parent.mkdir(parents=True, exist_ok=True)
+        with arguments.results.open("a") as file:
+            file.write(json.dumps(results[-1]) + "\n")
+        print(table(results[-1:]), flush=True)
+    print(table(results))
+
+
+if __name__ == "__main__":
+    main()
