@@ -1,12 +1,12 @@
 """Time and processor time per node: `meshctl provision` against the same files pushed by ansible-core.
 
 `python -m benchmarks.provisioning [--nodes 10,50,200] [--results FILE]` starts a virtual fleet of each size, takes it
-in, and then changes every node twice: from configuration `a` to `b` by meshctl, and from `b` back to `a` by ansible's `raw`
-and `script` modules (dropbear has no SFTP and the nodes have no Python). Both use as many connections at once, and
-neither waits for one node before the next. What they do is not the same: ansible writes the files, reloads and looks
-that they are there; meshctl also observes first, keeps the previous state under a dead-man's switch, proves the node
-reachable by a new connection, checks its mesh, and confirms. The nodes run on the same machine, so wall time is theirs
-too; processor time is the tool's own.
+in, and then changes every node twice: from configuration `a` to `b` by meshctl, and from `b` back to `a` by ansible's
+`raw` and `script` modules (dropbear has no SFTP and the nodes have no Python). Both use as many connections at once,
+and neither waits for one node before the next. What they do is not the same: ansible writes the files, reloads and
+looks that they are there; meshctl also observes first, keeps the previous state under a dead-man's switch, proves the
+node reachable by a new connection, checks its mesh, and confirms. The nodes run on the same machine, so wall time is
+theirs too; processor time is the tool's own.
 """
 
 from __future__ import annotations
