@@ -254,7 +254,7 @@ class AdaptiveWindow:
                 self._end_drain(now)
                 self._round_ends = next_number
             return
-        if self.phase is Phase.STARTUP and min(self._latest_four) - trip.least > START_QUEUE_S:
+        if self.phase is Phase.STARTUP and not limited and min(self._latest_four) - trip.least > START_QUEUE_S:
             self.phase = Phase.CRUISE
             self._drained_at = now
             self.packets = max(LEAST_WINDOW, self.packets * trip.least / trip.standing)
@@ -351,7 +351,7 @@ class AdaptiveWindow:
         rates = self._rates
         while rates and rates[0][0] < now - RATE_WINDOW_S and not (limited and len(rates) == 1):
             rates.popleft()
-        if limited and rates and rate < rates[0][1]:
+        if limited and (not rates or rate < rates[0][1]):
             return
         while rates and rates[-1][1] <= rate:
             rates.pop()

@@ -1,0 +1,335 @@
+"""Peers of the fielded format, and each of its known defects held as a law of ours."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import pytest
+
+from tests.udp_mesh.core.pair import KEY, World, pair, settings
+from udp_mesh.core.events import (
+    Event,
+    MessageDelivered,
+    MessageReceived,
+    NameConflict,
+    PeerOnline,
+    Rejected,
+    RejectReason,
+)
+from udp_mesh.core.legacy_receive import LegacyReassembly
+from udp_mesh.core.legacy_send import LAST_SEQUENCE
+from udp_mesh.core.node import Node
+from udp_mesh.core.seams import Datagram
+from udp_mesh.core.settings import Limits, LinkInfo, LinkKind, Neighbour, Settings, Topic
+from udp_mesh.wire.legacy import (
+    Host,
+    LegacyAck,
+    LegacyPayload,
+    PriorityMeshData,
+    decode_legacy,
+    decode_mesh_data,
+    encode_legacy,
+    encode_mesh_data,
+    fragment_legacy,
+)
+
+OLD = ("10.0.0.9", 8700)
+
+
+class OldRobot:
+    """A node of ours with one fielded neighbour `old`, played by hand."""
+
+    def __init__(self, **changes: object) -> None:
+        self.now = 1000.0
+        rng = random.Random(3)
+        config = settings("new", Topic("stop", priority=0), Topic("map", priority=9), **changes)
+        config = replace(config, neighbours=(Neighbour(OLD, name="old", legacy=True),))
+        self.node = Node(config, boot_id=rng.randbytes(16), rng=rng, now=self.now)
+        self.node.link_up(LinkInfo("mesh", LinkKind.BROADCAST, ("10.0.0.1", 8700), ("10.0.0.255", 8700)), self.now)
+        self.say(Host("old", "10.0.0.9"))
+        self.events()
+
+    def say(self, datagram: Host | LegacyPayload | LegacyAck) -> None:
+        self.node.receive(encode_legacy(datagram), "mesh", OLD, self.now)
+
+    def hear(self) -> list[Host | LegacyPayload | LegacyAck]:
+        """What leaves to the old robot now."""
+        self.node.handle_timer(self.now)
+        out: list[Datagram] = []
+        while datagrams := self.node.datagrams_to_send(self.now):
+            out.extend(datagrams)
+        return [decode_legacy(datagram.data) for datagram in out if datagram.data[0] < 0x80]
+
+    def hear_payloads(self) -> list[LegacyPayload]:
+        return [datagram for datagram in self.hear() if isinstance(datagram, LegacyPayload)]
+
+    def events(self) -> list[Event]:
+        told = []
+        while (event := self.node.next_event()) is not None:
+            told.append(event)
+        return told
+
+    def received(self) -> list[MessageReceived]:
+        return [event for event in self.events() if isinstance(event, MessageReceived)]
+
+
+def message(data: bytes, topic: str = "chat", priority: int = 4) -> list[bytes]:
+    return fragment_legacy(encode_mesh_data(PriorityMeshData("old", "std_msgs/String", priority, topic, data)))
+
+
+def pieces(sequence: int, data: bytes, *, wants_ack: bool = True) -> list[LegacyPayload]:
+    chunks = message(data)
+    return [LegacyPayload(sequence, place, len(chunks), chunk, wants_ack) for place, chunk in enumerate(chunks)]
+
+
+def test_messages_go_to_a_fielded_peer_in_its_own_format_with_their_priority() -> None:
+    old = OldRobot()
+    old.node.send("stop", b"halt", destination="old", now=old.now, type_name="std_msgs/Empty")
+    (piece,) = old.hear_payloads()
+    told = decode_mesh_data(piece.data)
+    assert (told.host, told.topic, told.type_name, told.priority, told.data) == (
+        "new",
+        "stop",
+        "std_msgs/Empty",
+        0,
+        b"halt",
+    )
+    old.say(LegacyAck(piece.sequence, piece.position))
+    assert [type(event) for event in old.events()] == [MessageDelivered]
+
+
+def test_messages_of_a_fielded_peer_arrive_and_are_acknowledged() -> None:
+    old = OldRobot()
+    for piece in reversed(pieces(5, b"x" * 4000)):
+        old.say(piece)
+    acks = [answer for answer in old.hear() if isinstance(answer, LegacyAck)]
+    assert {(ack.sequence, ack.position) for ack in acks} == {(5, 0), (5, 1), (5, 2), (5, 3)}
+    (event,) = old.received()
+    assert (event.source, event.topic, event.payload, event.priority) == ("old", "chat", b"x" * 4000, 4)
+
+
+def test_a_broadcast_of_a_fielded_peer_arrives_without_an_acknowledgement() -> None:
+    old = OldRobot()
+    old.say(pieces(0x8001, b"all", wants_ack=False)[0])
+    assert not [answer for answer in old.hear() if isinstance(answer, LegacyAck)]
+    assert [event.broadcast for event in old.received()] == [True]
+
+
+def test_three_fragments_are_in_flight_to_a_fielded_peer_and_urgent_ones_go_first() -> None:
+    old = OldRobot()
+    old.node.send("map", bytes(20_000), destination="old", now=old.now)
+    first = old.hear_payloads()
+    assert len(first) == 3
+    old.node.send("stop", b"!", destination="old", now=old.now)
+    (urgent,) = old.hear_payloads()
+    assert decode_mesh_data(urgent.data).topic == "stop"
+
+
+def test_a_message_to_all_reaches_fielded_peers_too() -> None:
+    old = OldRobot()
+    old.node.send("stop", b"all", now=old.now)
+    assert [decode_mesh_data(piece.data).data for piece in old.hear_payloads()] == [b"all"]
+
+
+# The defects, in the order of the list of the fielded system's facts.
+
+
+def test_defect_1_a_lost_fragment_is_sent_again_and_stalls_nothing() -> None:
+    old = OldRobot()
+    old.node.send("map", bytes(6000), destination="old", now=old.now)
+    seen: set[int] = set()
+    dropped = False
+    for _ in range(200):
+        for piece in old.hear_payloads():
+            if piece.position == 1 and not dropped:
+                dropped = True
+                continue
+            seen.add(piece.position)
+            old.say(LegacyAck(piece.sequence, piece.position))
+        old.now += 0.01
+        if any(isinstance(event, MessageDelivered) for event in old.events()):
+            break
+    assert dropped
+    assert seen == {0, 1, 2, 3, 4}
+
+
+def test_defect_2_nothing_is_allocated_from_a_number_on_the_wire() -> None:
+    reassembly = LegacyReassembly(Limits())
+    reassembly.add(LegacyPayload(1, 0, 65_536, b"x", wants_ack=True), 0.0)
+    assert reassembly.bytes < 1000
+
+
+def test_defect_3_a_fragment_past_its_total_is_counted_and_dropped() -> None:
+    old = OldRobot()
+    raw = bytearray(encode_legacy(LegacyPayload(1, 0, 2, b"x", wants_ack=True)))
+    raw[3:7] = (7).to_bytes(4, "little")
+    old.node.receive(bytes(raw), "mesh", OLD, old.now)
+    assert old.node.conditions(old.now).counters.dropped_malformed == 1
+    old.say(pieces(2, b"fine")[0])
+    assert [event.payload for event in old.received()] == [b"fine"]
+
+
+@pytest.mark.parametrize("kind", [0, 3, 6, 77, 127])
+def test_defect_4_an_unknown_type_is_counted_and_dropped(kind: int) -> None:
+    old = OldRobot()
+    raw = bytearray(encode_legacy(Host("old", "10.0.0.9")))
+    raw[0] = kind
+    old.node.receive(bytes(raw), "mesh", OLD, old.now)
+    old.say(pieces(2, b"fine")[0])
+    assert [event.payload for event in old.received()] == [b"fine"]
+
+
+def test_defect_5_a_name_is_not_believed_as_announced() -> None:
+    old = OldRobot()
+    old.say(Host("base", "10.0.0.9"))
+    old.say(pieces(2, b"who")[0])
+    assert [event.source for event in old.received()] == ["old"]
+    stranger = ("10.0.0.66", 8700)
+    old.node.receive(encode_legacy(Host("old", "10.0.0.66")), "mesh", stranger, old.now)
+    old.node.receive(encode_legacy(pieces(3, b"forged")[0]), "mesh", stranger, old.now)
+    assert old.received() == []
+    assert old.node.conditions(old.now).counters.dropped_unauthenticated == 2
+
+
+def test_defect_5_among_our_own_nodes_a_taken_name_is_reported() -> None:
+    world = World()
+    world.add(settings("a"))
+    world.add(settings("b"))
+    world.run(4.0)
+    impostor = replace(settings("b"), keys=(KEY,))
+    real = world.nodes.pop("b")
+    world.addresses["b2"] = ("10.0.0.77", 8700)
+    fake = Node(impostor, boot_id=world.rng.randbytes(16), rng=world.rng, now=world.now)
+    fake.link_up(LinkInfo("mesh", LinkKind.BROADCAST, ("10.0.0.77", 8700), ("10.0.0.255", 8700)), world.now)
+    world.nodes["b"] = real
+    world.nodes["b2"] = fake
+    world.events["b2"] = []
+    for other in ("a", "b"):
+        world.pipes[("b2", other)] = world.pipes[("a", "b")]
+        world.pipes[(other, "b2")] = world.pipes[("a", "b")]
+    assert world.run(20.0, until=lambda: bool(world.told("a", NameConflict)))
+    assert [event.name for event in world.told("a", NameConflict) if isinstance(event, NameConflict)] == ["b"]
+    assert world.run(5.0, until=lambda: bool(world.told("b", NameConflict)))
+    assert any(event.own for event in world.told("b", NameConflict) if isinstance(event, NameConflict))
+
+
+@pytest.mark.parametrize("broadcast", ["10.0.15.255", "10.0.0.15", "192.168.255.255"])
+def test_defect_6_the_broadcast_address_is_the_one_given_never_guessed(broadcast: str) -> None:
+    both = pair()
+    both.a.link_up(LinkInfo("mesh", LinkKind.BROADCAST, ("10.0.0.1", 8700), (broadcast, 8700)), both.now)
+    both.now += 2.0
+    assert {datagram.destination for datagram in both.drop(both.a)} == {(broadcast, 8700)}
+
+
+def test_defect_7_each_partial_message_is_purged_by_its_own_age() -> None:
+    reassembly = LegacyReassembly(Limits())
+    reassembly.add(pieces(1, bytes(2000))[0], 0.0)
+    reassembly.add(pieces(2, bytes(2000))[0], 9.0)
+    reassembly.purge(11.0)
+    assert len(reassembly) == 1
+    _, whole = reassembly.add(pieces(2, bytes(2000))[1], 11.0)
+    assert whole is not None
+
+
+def test_defect_8_a_number_that_comes_around_does_not_meet_an_old_partial_message() -> None:
+    reassembly = LegacyReassembly(Limits())
+    reassembly.add(pieces(7, b"a" * 2000)[0], 0.0)
+    fresh = pieces(7, b"b" * 3000)
+    wholes = [reassembly.add(piece, 1.0)[1] for piece in fresh]
+    assert wholes[-1] is not None
+    assert wholes[-1].data == b"b" * 3000
+
+
+def test_defect_8_a_number_still_in_use_is_not_given_to_a_new_message() -> None:
+    old = OldRobot()
+    old.node.send("map", b"held", destination="old", now=old.now)
+    (held,) = old.hear_payloads()
+    sender = next(iter(old.node._legacy._by_host.values())).sender
+    sender._sequence = (held.sequence - 2) % LAST_SEQUENCE
+    numbers = {sender._next_sequence() for _ in range(3)}
+    assert held.sequence not in numbers
+
+
+def test_defect_9_priority_order_survives_the_wrap_of_the_sequence_numbers() -> None:
+    old = OldRobot()
+    sender = next(iter(old.node._legacy._by_host.values())).sender
+    sender._sequence = LAST_SEQUENCE - 1
+    for number in range(6):
+        old.node.send("map", bytes([number]), destination="old", now=old.now)
+    order = []
+    for _ in range(6):
+        for piece in old.hear_payloads():
+            order.append(decode_mesh_data(piece.data).data[0])
+            old.say(LegacyAck(piece.sequence, piece.position))
+    assert order == sorted(order)
+
+
+def test_defect_10_a_send_to_a_host_never_heard_of_is_refused_and_the_node_goes_on() -> None:
+    old = OldRobot()
+    answer = old.node.send("map", b"x", destination="nobody", now=old.now)
+    assert isinstance(answer, Rejected)
+    assert answer.reason is RejectReason.UNKNOWN_PEER
+    old.node.send("map", b"x", destination="old", now=old.now)
+    assert len(old.hear_payloads()) == 1
+
+
+@pytest.mark.parametrize("fragments", [1, 2, 3])
+def test_defect_11_an_exact_multiple_of_the_fragment_size_sends_no_empty_fragment(fragments: int) -> None:
+    both = pair(Topic("t"), fragment_bytes=100)
+    # The first fragment gives up room for its head and the announcement of the topic.
+    both.a.send("t", b"learn the name", destination="b", now=both.now)
+    both.roundtrip(times=5)
+    both.events(both.b)
+    size = 100 - 16 + 100 * (fragments - 1)
+    both.a.send("t", bytes(size), destination="b", now=both.now)
+    before = both.b.conditions(both.now).counters.fragments_received
+    both.roundtrip(times=20)
+    assert both.b.conditions(both.now).counters.fragments_received == before + fragments
+    assert [event.payload for event in both.events(both.b) if isinstance(event, MessageReceived)] == [bytes(size)]
+
+
+def test_defect_11_the_fielded_receiver_still_gets_the_empty_fragment_it_counts_on() -> None:
+    overhead = len(encode_mesh_data(PriorityMeshData("new", "", 9, "map", b"")))
+    old = OldRobot()
+    old.node.send("map", bytes(1300 - overhead), destination="old", now=old.now)
+    assert [len(piece.data) for piece in old.hear_payloads()] == [1300, 0]
+
+
+def test_a_repeated_fragment_of_a_finished_message_is_acknowledged_and_opens_no_new_one() -> None:
+    old = OldRobot()
+    for piece in pieces(5, b"x" * 2000) * 2:
+        old.say(piece)
+    assert len(old.received()) == 1
+    assert len([answer for answer in old.hear() if isinstance(answer, LegacyAck)]) == 4
+
+
+def test_a_silent_fielded_peer_is_probed_gently_and_loses_nothing() -> None:
+    old = OldRobot()
+    old.node.send("map", bytes(20_000), destination="old", now=old.now)
+    sent = 0
+    for _ in range(800):
+        sent += len(old.hear_payloads())
+        old.now += 0.01
+    assert 20 < sent < 60
+    old.say(Host("old", "10.0.0.9"))
+    delivered = False
+    for _ in range(400):
+        for piece in old.hear_payloads():
+            old.say(LegacyAck(piece.sequence, piece.position))
+        delivered = delivered or any(isinstance(event, MessageDelivered) for event in old.events())
+        old.now += 0.01
+    assert delivered
+
+
+def test_without_fielded_neighbours_their_format_is_dropped() -> None:
+    both = pair()
+    both.b.receive(encode_legacy(Host("x", "10.0.0.9")), "mesh", OLD, both.now)
+    assert both.events(both.b) == []
+
+
+def test_settings_of_a_fielded_neighbour_need_its_name() -> None:
+    with pytest.raises(ValueError, match="needs a name"):
+        Neighbour(OLD, legacy=True)
+    assert isinstance(settings("x"), Settings)
+    assert PeerOnline is not None

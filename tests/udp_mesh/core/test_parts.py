@@ -1,0 +1,192 @@
+"""The small parts against obvious slow versions: ranges, flight, reassembly, compression, acknowledgements, buckets."""
+
+import zlib
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.udp_mesh.core.test_scheduler import outgoing
+from udp_mesh.core.acks import AckState
+from udp_mesh.core.compression import compress, decompress
+from udp_mesh.core.flight import Flight, Mark, Packet
+from udp_mesh.core.limiter import Gate
+from udp_mesh.core.pacing import Pacer
+from udp_mesh.core.ranges import RangeSet
+from udp_mesh.core.reassembly import PIECE_OVERHEAD_BYTES, Reassembly, Verdict, Whole
+from udp_mesh.core.settings import Limits
+from udp_mesh.wire.frames import Fragment, MessageFlag, MessageHead
+
+RELIABLE = int(MessageFlag.RELIABLE)
+
+
+@given(st.lists(st.integers(0, 60)))
+def test_a_range_set_equals_a_plain_set(numbers: list[int]) -> None:
+    ranges, plain = RangeSet(), set()
+    for number in numbers:
+        ranges.add(number)
+        plain.add(number)
+    assert [number in ranges for number in range(62)] == [number in plain for number in range(62)]
+    pairs = ranges.ranges()
+    assert all(first <= last for first, last in pairs)
+    assert all(before[1] + 1 < after[0] for before, after in zip(pairs, pairs[1:], strict=False))
+
+
+def pieces_of(body: bytes, size: int, message_id: int = 1) -> list[Fragment]:
+    chunks = [body[start : start + size] for start in range(0, len(body), size)] or [b""]
+    head = MessageHead(len(body), len(chunks), 0, 3, RELIABLE)
+    return [
+        Fragment(message_id, position, chunk, head if position == 0 else None) for position, chunk in enumerate(chunks)
+    ]
+
+
+@given(st.binary(max_size=400), st.integers(1, 50), st.data())
+def test_reassembly_does_not_depend_on_order_or_repetition(body: bytes, size: int, data: st.DataObject) -> None:
+    pieces = pieces_of(body, size)
+    order = data.draw(st.permutations(pieces + pieces[: len(pieces) // 2]))
+    reassembly = Reassembly(Limits())
+    results = [reassembly.add(piece, 0.0) for piece in order]
+    wholes = [result for result in results if isinstance(result, Whole)]
+    assert [whole.body for whole in wholes] == [body]
+    assert set(results) - set(wholes) <= {Verdict.KEPT, Verdict.DUPLICATE}
+    assert reassembly.bytes == 0
+
+
+fragments = st.builds(
+    Fragment,
+    st.integers(0, 5),
+    st.integers(0, 2_000_000),
+    st.binary(min_size=1, max_size=30),
+    st.none()
+    | st.builds(MessageHead, st.integers(0, 1 << 30), st.integers(1, 1 << 21), st.just(0), st.just(0), st.just(0)),
+)
+
+
+@given(st.lists(fragments, max_size=60))
+def test_reassembly_never_holds_more_than_its_cap_whatever_fragments_claim(claims: list[Fragment]) -> None:
+    limits = Limits(partial_bytes_per_peer=600, message_bytes=100, partials_per_peer=3, finished_ranges_per_peer=4)
+    reassembly = Reassembly(limits)
+    for now, fragment in enumerate(claims):
+        reassembly.add(fragment, float(now))
+        assert reassembly.bytes <= limits.partial_bytes_per_peer
+        assert len(reassembly) <= limits.partials_per_peer
+        assert len(reassembly.finished) <= limits.finished_ranges_per_peer
+
+
+def test_a_refused_piece_leaves_nothing_behind_and_is_taken_when_there_is_room() -> None:
+    reassembly = Reassembly(Limits(partial_bytes_per_peer=PIECE_OVERHEAD_BYTES + 50))
+    first, second = pieces_of(bytes(60), 30)
+    assert reassembly.add(first, 0.0) is Verdict.KEPT
+    other = Fragment(2, 1, bytes(30))
+    assert reassembly.add(other, 0.0) is Verdict.FULL
+    assert len(reassembly) == 1
+    assert reassembly.add(second, 0.0) is Verdict.FULL
+    reassembly.forget(1)
+    assert reassembly.add(other, 0.0) is Verdict.KEPT
+
+
+def test_a_best_effort_message_that_stops_is_purged_by_its_own_age() -> None:
+    reassembly = Reassembly(Limits())
+    head = MessageHead(100, 2, 0, 3, 0)
+    reassembly.add(Fragment(1, 0, bytes(50), head), 0.0)
+    reassembly.purge(0.0)
+    reassembly.add(Fragment(2, 0, bytes(50), head), 2.5)
+    reassembly.purge(2.5)
+    assert reassembly.missing(1) is None
+    assert reassembly.missing(2) == [(1, 1)]
+
+
+MARK = Mark(0.0, 0, 0.0, 0.0, False)
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["send", "skip", "arrive", "ack", "give up"]), st.integers(0, 400)), max_size=120
+    )
+)
+def test_every_packet_is_acknowledged_or_lost_as_a_plain_model_says(plan: list[tuple[str, int]]) -> None:
+    flight, state = Flight(), AckState()
+    sent: dict[int, Packet] = {}
+    ended: dict[int, str] = {}
+    number = 0
+
+    def book(packets: list[Packet], how: str) -> None:
+        for packet in packets:
+            index = packet.position
+            # Only what was called lost may change its mind, once.
+            assert index not in ended or (ended[index], how) == ("lost", "acknowledged")
+            ended[index] = how
+
+    for what, choice in plan:
+        if what == "send":
+            sent[number] = Packet(MARK, outgoing(1, 1), number)
+            flight.add(number, sent[number])
+            number += 1
+        elif what == "skip":
+            flight.add(number, None)
+            number += 1
+        elif what == "arrive" and number:
+            state.saw(number - 1 - choice % min(number, 12), 0.0) if not received(
+                state, number - 1 - choice % min(number, 12)
+            ) else None
+        elif what == "ack" and state.largest >= 0:
+            acknowledged, lost, _ = flight.acknowledge(state.largest, state.received)
+            book(acknowledged, "acknowledged")
+            book(lost, "lost")
+        elif what == "give up":
+            book(flight.give_up(), "lost")
+        assert flight.outstanding == sum(1 for index in sent if index not in ended)
+    for index, how in ended.items():
+        if how == "acknowledged":
+            assert received(state, index)
+
+
+def received(state: AckState, number: int) -> bool:
+    behind = state.largest - number
+    return behind >= 0 and bool(state.received >> behind & 1)
+
+
+def test_an_acknowledgement_of_what_was_never_sent_says_nothing() -> None:
+    flight = Flight()
+    flight.add(0, Packet(MARK, outgoing(1, 1), 0))
+    assert flight.acknowledge(7, 0xFF) == ([], [], None)
+    assert flight.outstanding == 1
+
+
+@given(st.binary(max_size=2000))
+def test_decompression_inverts_compression(payload: bytes) -> None:
+    packed = compress(payload)
+    if packed is not None:
+        assert len(packed) < len(payload)
+        assert decompress(packed, len(payload)) == payload
+
+
+def test_a_compressed_bomb_is_refused_without_being_inflated() -> None:
+    bomb = zlib.compress(bytes(50_000_000))
+    assert decompress(bomb, 1_000_000) is None
+
+
+@given(st.binary(max_size=200))
+def test_anything_that_is_not_zlib_is_refused(body: bytes) -> None:
+    result = decompress(body, 1000)
+    assert result is None or zlib.compress(result)
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 0.5), st.integers(1, 3000)), max_size=50))
+def test_a_bucket_lets_no_more_through_than_its_rate_and_burst(visits: list[tuple[float, int]]) -> None:
+    gate, now, spent = Gate(10_000, 0.0), 0.0, 0
+    for wait, size in visits:
+        now += wait
+        if gate.open(now):
+            gate.spend(size)
+            spent += size
+    assert spent <= 10_000 * now + 1000 + 3000
+
+
+def test_pacing_spreads_packets_over_time_at_its_rate() -> None:
+    pacer, now, left = Pacer(0.003), 0.0, 0
+    while now < 1.0:
+        count = pacer.allowance(now, 850.0)
+        pacer.spend(count, now, 850.0)
+        left += count
+        now = max(now + 1e-9, pacer.wake_at(850.0))
+    assert 845 <= left <= 856
