@@ -3,10 +3,8 @@
 1. A socket becomes readable: all waiting datagrams go to the core (`_drain`).
 2. `_pump`: timers that are due, datagrams that may leave now (in runs, through segmentation offload), events to the
    listener, one timer for what comes next.
-3. Where single datagrams keep waking the loop (a radio at 10 Mbit/s delivers one per millisecond), the readers are
-   taken off the loop and the sockets are looked at once per `TICK_S` instead: a third of the wake-ups, a few
-   milliseconds of delay. Where each wake-up brings many datagrams (a wire), there is nothing to gain and the readers
-   stay.
+3. Where wake-ups come often and carry little (`rhythm`), the readers are taken off the loop and everything is looked at
+   once per tick instead.
 4. The kernel reports a change of interfaces: the links are brought up to date, the core is told.
 
 A full socket never blocks the other links: its datagrams wait in a short queue, and past that they are lost as on a
@@ -26,6 +24,7 @@ from udp_mesh.core.events import Event, MessageId, Rejected
 from udp_mesh.core.node import Node
 from udp_mesh.core.seams import Datagram, RandomSource, Store
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
+from udp_mesh.daemon.rhythm import TICK_S, Rhythm
 from udp_mesh.links.attachments import Address, LinkWish
 from udp_mesh.links.hub import LinkHub
 from udp_mesh.links.netlink import InterfaceMonitor
@@ -33,16 +32,12 @@ from udp_mesh.links.udp import UdpLink
 
 log = logging.getLogger(__name__)
 
-TICK_S = 0.003
-"""How often the sockets are looked at while small batches keep coming: the pacing quantum of the core."""
-SMALL_BATCH = 4
-"""A wake-up that brings fewer datagrams than this costs more than it carries."""
-BUSY_WAKEUPS = 8
-"""So many small wake-ups within `TICK_S` of each other start the ticking."""
-IDLE_TICKS = 4
-"""So many ticks without a datagram end it."""
 DRAIN_DATAGRAMS = 256
 """Datagrams read per wake-up before timers and sending get their turn (3 ms of work)."""
+CLOCK_READING_S = 50e-6
+"""Two clocks read within this belong together."""
+LONGEST_LOOK_S = 0.5
+"""Reading `DRAIN_DATAGRAMS` takes milliseconds, on a machine that does something else meanwhile no more than this."""
 PUMP_BYTES = 1 << 18
 """Bytes sent before the sockets get their turn again."""
 BLOCKED_DATAGRAMS = 256
@@ -81,12 +76,11 @@ class Driver:
         self._timer_at = 0.0
         self._refresh: asyncio.TimerHandle | None = None
         self._pump_requested = False
-        self._ticking = False
-        self._small_wakeups = 0
-        self._last_wakeup = 0.0
-        self._idle_ticks = 0
+        self._rhythm = Rhythm()
+        self._moved = 0
         self.closed = False
-        self._wall_offset = self._looked_at = 0.0
+        self._wall_offset: float | None = None
+        self._looked_at = 0.0
         self._now = 0.0
         self._link_name = ""
 
@@ -178,7 +172,7 @@ class Driver:
         for link in self.hub.links.values():
             if self._blocked.get(link.attachment.name):
                 self._loop.add_writer(link.fileno(), self._writable, link)
-            if not self._ticking:
+            if not self._rhythm.ticking:
                 self._loop.add_reader(link.fileno(), self._readable, link)
         if changes.failed:
             self._refresh = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
@@ -201,54 +195,47 @@ class Driver:
     # In
 
     def _readable(self, link: UdpLink) -> None:
-        count = self._drain(link)
-        now = self._now
-        if count < SMALL_BATCH and now - self._last_wakeup < TICK_S:
-            self._small_wakeups += 1
-        else:
-            self._small_wakeups = 0
-        self._last_wakeup = now
-        if self._small_wakeups >= BUSY_WAKEUPS:
-            self._start_ticking()
+        self._drain(link)
         self._pump()
 
-    def _drain(self, link: UdpLink) -> int:
-        """Hands what waits to the core; afterwards `_now` is the time it was looked at."""
-        self.wakeups += 1
-        now = self._clock()
-        # The kernel stamps arrivals by the wall clock; a step of that clock only costs this one turn its precision.
-        self._wall_offset = time.time() - now
-        self._looked_at = now
+    def _drain(self, link: UdpLink) -> None:
+        """Hands what waits to the core, each datagram with the time it arrived; then `_now` is the time of the look."""
+        self._looked_at = self._read_clocks()
         self._link_name = link.attachment.name
-        count = link.receive(self._deliver, DRAIN_DATAGRAMS)
-        self._now = max(self._now, now)
-        return count
+        self._moved += link.receive(self._deliver, DRAIN_DATAGRAMS)
+        self._now = max(self._now, self._looked_at)
+
+    def _read_clocks(self) -> float:
+        """Now; and how far the wall clock, by which the kernel stamps arrivals, is ahead of ours.
+
+        A reading between which this process lost the processor would date arrivals too early: the last one is kept
+        then.
+        """
+        before = self._clock()
+        wall = time.time()
+        after = self._clock()
+        if after - before < CLOCK_READING_S or self._wall_offset is None:
+            self._wall_offset = wall - after
+        return after
 
     def _deliver(self, data: memoryview, source: Address, arrived: float) -> None:
-        # Never before what the core was told already, never after now.
-        at = arrived - self._wall_offset
+        # Never before what the core was told already. After the look only by as much as reading it all can take; more
+        # is a step of the wall clock, and then (as without a stamp) it came when it was looked at.
+        assert self._wall_offset is not None
+        at = arrived - self._wall_offset if arrived else self._looked_at
         if at < self._now:
             at = self._now
-        elif at > self._looked_at:
+        elif at > self._looked_at + LONGEST_LOOK_S:
             at = self._looked_at
         self._now = at
         self.node.receive(data, self._link_name, source, at)
 
-    def _start_ticking(self) -> None:
-        self._ticking = True
-        self._small_wakeups = self._idle_ticks = 0
+    def _change_rhythm(self) -> None:
         for link in self.hub.links.values():
-            self._loop.remove_reader(link.fileno())
-        self._schedule(self._clock() + TICK_S)
-
-    def _tick(self) -> None:
-        count = sum(self._drain(link) for link in self.hub.links.values())
-        self._idle_ticks = 0 if count else self._idle_ticks + 1
-        if self._idle_ticks >= IDLE_TICKS or count >= DRAIN_DATAGRAMS:
-            self._ticking = False
-            for link in self.hub.links.values():
+            if self._rhythm.ticking:
+                self._loop.remove_reader(link.fileno())
+            else:
                 self._loop.add_reader(link.fileno(), self._readable, link)
-        self._pump()
 
     # Out
 
@@ -269,10 +256,14 @@ class Driver:
         self._report_events()
         if more:
             self._pump_soon()
+        self.wakeups += 1
+        moved, self._moved = self._moved, 0
+        if self._rhythm.woke(self._now, moved):
+            self._change_rhythm()
         due = self.node.next_timer()
-        if self._ticking:
+        if self._rhythm.ticking:
             # Everything waits for the next tick, a few milliseconds at most.
-            self._schedule(self._clock() + TICK_S)
+            self._schedule(now + TICK_S)
         elif due is not None:
             self._schedule(due)
 
@@ -287,10 +278,10 @@ class Driver:
 
     def _timer_due(self) -> None:
         self._timer = None
-        if self._ticking:
-            self._tick()
-        else:
-            self._pump()
+        if self._rhythm.ticking:
+            for link in list(self.hub.links.values()):
+                self._drain(link)
+        self._pump()
 
     def _transmit_all(self) -> bool:
         """Sends what may leave now, up to `PUMP_BYTES`; True where there may be more."""
@@ -308,6 +299,7 @@ class Driver:
                 self._transmit(name, batch[start:end] if end - start < len(batch) else batch)
                 start = end
             sent += sum(len(datagram.data) for datagram in batch)
+            self._moved += len(batch)
         return True
 
     def _transmit(self, name: str, datagrams: list[Datagram]) -> None:

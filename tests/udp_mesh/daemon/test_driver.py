@@ -1,0 +1,121 @@
+"""The driver at its edges: full sockets, stepped clocks, vanished links, endings."""
+
+import asyncio
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pytest
+
+from tests.udp_mesh.daemon.test_library import make, online, run
+from tests.udp_mesh.links.sockets import WAIT_S, free_port
+from udp_mesh import Node
+from udp_mesh.core.events import MessageDelivered
+from udp_mesh.core.seams import Datagram
+from udp_mesh.daemon.driver import BLOCKED_DATAGRAMS
+from udp_mesh.links.udp import Outgoing, UdpLink
+
+PAYLOAD = bytes(range(256)) * 2000
+
+
+def test_a_socket_that_is_full_for_a_while_costs_nothing_but_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        real, full_for = UdpLink.send, 200
+
+        def send(self: UdpLink, datagrams: Sequence[Outgoing]) -> int:
+            nonlocal full_for
+            if self.attachment.address[0].endswith(".1") and full_for:
+                full_for -= 1
+                return real(self, datagrams[: len(datagrams) // 2])
+            return real(self, datagrams)
+
+        monkeypatch.setattr(UdpLink, "send", send)
+        assert isinstance(await alice.deliver("map", PAYLOAD, to="bob"), MessageDelivered)
+        assert (await anext(bob.messages())).payload == PAYLOAD
+        assert full_for < 200
+
+    run(body)
+
+
+def test_a_socket_that_stays_full_holds_a_bounded_queue_and_counts_what_it_loses(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        monkeypatch.setattr(UdpLink, "send", lambda _self, _datagrams: 0)
+        (name,) = alice.driver.hub.links
+        address = bob.driver.hub.links["127.0.4.2"].attachment.address
+        alice.driver._transmit(name, [Datagram(name, address, b"x", urgent=False)] * (3 * BLOCKED_DATAGRAMS))
+        assert len(alice.driver._blocked[name]) == BLOCKED_DATAGRAMS
+        assert alice.driver.lost_on_full_socket == 2 * BLOCKED_DATAGRAMS
+        monkeypatch.undo()
+        assert isinstance(await alice.deliver("status", b"now there is room", to="bob"), MessageDelivered)
+        assert not alice.driver._blocked[name]
+
+    run(body)
+
+
+@pytest.mark.parametrize("step_s", [-3600.0, -0.2, 0.2, 3600.0])
+def test_a_step_of_the_wall_clock_does_not_disturb_the_transport(
+    monkeypatch: pytest.MonkeyPatch, step_s: float
+) -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        real = UdpLink.receive
+
+        def receive(self: UdpLink, deliver: object, limit: int) -> int:
+            assert callable(deliver)
+            return real(self, lambda data, source, arrived: deliver(data, source, arrived + step_s), limit)
+
+        monkeypatch.setattr(UdpLink, "receive", receive)
+        assert isinstance(await alice.deliver("map", PAYLOAD, to="bob"), MessageDelivered)
+        (peer,) = alice.conditions().peers
+        assert peer.online
+
+    run(body)
+
+
+def test_links_that_are_no_longer_wished_for_close_and_return() -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        wishes = alice.driver.hub.wishes
+        alice.driver.apply_links(())
+        assert alice.driver.hub.links == {}
+        await alice.send("map", b"waits", to="bob")
+        alice.driver.apply_links(wishes)
+        assert (await anext(bob.messages())).payload == b"waits"
+
+    run(body)
+
+
+def test_an_interfaces_address_that_another_process_uses_is_reported_and_tried_again() -> None:
+    async def main() -> None:
+        port = free_port()
+        async with asyncio.timeout(WAIT_S), make("first", 1, 2, port) as first, make("second", 1, 2, port) as second:
+            (reason,) = second.driver.link_failures.values()
+            assert "in use" in reason
+            await first.__aexit__(None, None, None)
+            async with make("bob", 2, 1, port):
+                await online(second, "bob")
+                assert second.driver.link_failures == {}
+
+    asyncio.run(main())
+
+
+def test_nothing_is_left_on_the_loop_after_the_end() -> None:
+    async def main() -> None:
+        async with make("alice", 1, 2, free_port()) as node:
+            await node.send("status", b"to nobody yet")
+            node.driver.close()
+        node.driver.close()
+        await asyncio.sleep(0.05)
+        loop = asyncio.get_running_loop()
+        assert not [handle for handle in getattr(loop, "_scheduled", []) if not handle.cancelled()]
+
+    asyncio.run(main())
+
+
+def test_changed_rates_take_effect_on_the_running_node() -> None:
+    async def body(alice: Node, _: Node) -> None:
+        settings = alice.driver.node.settings
+        changes = alice.apply(replace(settings, rates=replace(settings.rates, heartbeat_s=0.1)))
+        assert changes
+        assert alice.driver.node.settings.rates.heartbeat_s == 0.1
+
+    run(body)
