@@ -1,7 +1,10 @@
 """The command line against real daemons: what scripts rely on is exit codes and JSON."""
 
 import json
+import signal
 import socket
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -49,6 +52,17 @@ def test_what_is_can_be_read_by_people_and_by_scripts(run: Run, command: str) ->
     code, text, _ = run(command, "--json")
     assert code == Exit.OK
     assert isinstance(json.loads(text), dict)
+
+
+def test_a_watch_repeats_until_it_is_interrupted(pair: Pair) -> None:
+    words = ["status", "--watch", "0.05", "--json", "--socket", str(pair[0].socket)]
+    program = subprocess.Popen([sys.executable, "-m", "udp_mesh.cli.main", *words], stdout=subprocess.PIPE)
+    with program:
+        assert program.stdout is not None
+        uptimes = [json.loads(program.stdout.readline())["uptime_s"] for _ in range(2)]
+        program.send_signal(signal.SIGINT)
+        assert program.wait(WAIT_S) == Exit.OK
+    assert uptimes[1] > uptimes[0]
 
 
 def test_a_message_is_sent_and_its_outcome_decides_the_exit_code(run: Run, pair: Pair) -> None:

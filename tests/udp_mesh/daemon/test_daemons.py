@@ -1,6 +1,7 @@
 """Two real daemons: messages, changes at run time, metrics, recording, and hostile local programs."""
 
 import json
+import random
 import shutil
 import socket
 import subprocess
@@ -222,6 +223,31 @@ def test_prometheus_reads_metrics_over_tcp_and_over_the_local_socket() -> None:
     for text in (page, local.decode()):
         assert 'udp_mesh_peer_online{peer="bob"} 1' in text
         assert "# TYPE udp_mesh_datagrams_sent_total counter" in text
+
+
+def test_any_bytes_on_the_udp_port_neither_stop_the_daemon_nor_its_urgent_messages(pair: Pair) -> None:
+    alice, bob = pair
+    source = random.Random(11)
+    with (
+        bob.client() as receiver,
+        alice.client() as sender,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as attacker,
+    ):
+        receiver.subscribe("status")
+        host, port = receiver.request("status")["links"][0]["address"].split(":")
+        before = receiver.request("status")["conditions"]["counters"]
+        for turn in range(3000):
+            # Noise, and headers that look like ours or like the fielded format's in front of noise.
+            first = bytes((source.choice((0x90, 0x91, 0x92, 0x93, 0xA0, 1, 2, 4, 5, source.randrange(256))),))
+            attacker.sendto(first + source.randbytes(source.randrange(200)), (host, int(port)))
+            if turn % 300 == 0:
+                sender.publish("status", b"%d" % turn, to="bob", notify=True)
+        assert set(outcomes(sender, 10).values()) == {"delivered"}
+        assert len(collect(receiver, 10)) == 10
+        after = receiver.request("status")["conditions"]["counters"]
+    dropped = ("dropped_malformed", "dropped_unauthenticated", "dropped_unproven", "dropped_over_limit")
+    assert sum(after[name] - before[name] for name in dropped) > 1000
+    assert "Traceback" not in bob.log.read_text()
 
 
 def test_an_idle_client_does_not_hold_up_the_others(pair: Pair) -> None:
