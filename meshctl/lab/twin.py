@@ -19,6 +19,8 @@ from meshctl.errors import InputError
 from meshctl.lab.spec import MESH_PACKAGES, FleetSpec, LinkSpec, Medium, NodeSpec, RadioSpec
 from meshctl.model import Fleet, Node, Role
 
+# up to here a fleet's default shape is a chain
+_CHAIN_NODES = 12
 FACTORY_ADDRESS = "192.168.1.1"
 # locally administered, so that no real device has it: two bytes of fleet-wide prefix, then the node, then the radio
 _MAC = "02:4d:{:02x}:{:02x}:00:{:02x}"
@@ -39,8 +41,8 @@ def spec_of(
 ) -> FleetSpec:
     """The virtual twin of an inventory: its first `nodes` managed nodes (all by default), fresh from the box.
 
-    Every node stands on the bench; a node with the role `base` is the one the operator sits at. `links` None: a chain
-    in the inventory's order, and weaker links past every second node, so that there are ends and alternatives.
+    Every node stands on the bench; a node with the role `base` is the one the operator sits at. `links` None:
+    `default_links` in the inventory's order.
     """
     chosen = tuple(fleet.managed())[:nodes]
     names = [node.name for node in chosen]
@@ -54,7 +56,10 @@ def spec_of(
 
 
 def default_links(names: Sequence[str]) -> list[LinkSpec]:
-    """A chain, and a weaker link past every second node."""
+    """A chain with a weaker link past every second node; for more than a team, a tree, every node having three behind
+    it: batman-adv's quality is used up after some thirty hops."""
+    if len(names) > _CHAIN_NODES:
+        return [LinkSpec(names[(number - 1) // 3], name, tq=250) for number, name in enumerate(names) if number]
     chain = [LinkSpec(a, b, tq=250, signal_dbm=-58) for a, b in pairwise(names)]
     past = [LinkSpec(a, b, tq=120, signal_dbm=-79) for a, b in list(zip(names, names[2:], strict=False))[::2]]
     return chain + past

@@ -12,6 +12,7 @@ from meshctl.errors import InputError
 from meshctl.firmware.metadata import read_metadata
 from meshctl.lab import breaks, releases, rom, twin
 from meshctl.lab.breaks import Break, Order
+from meshctl.lab.errors import LabError
 from meshctl.lab.images import firmware_image
 from meshctl.lab.spec import FleetSpec, LinkSpec, Medium, NodeSpec, RadioSpec, dump, load
 from meshctl.model import Release
@@ -42,6 +43,16 @@ def test_every_address_has_one_place_on_this_machine() -> None:
     assert twin.bench_of(0) == "127.255.0.1"
     assert twin.bench_of(299) == "127.255.1.44"
     assert len({twin.bench_of(number) for number in range(1000)}) == 1000
+
+
+def test_every_node_of_a_big_fleet_is_a_few_hops_away() -> None:
+    names = [f"n{number}" for number in range(200)]
+    parents = {link.b: link.a for link in twin.default_links(names) if link.tq > 200}
+
+    def hops(name: str) -> int:
+        return 0 if name == "n0" else 1 + hops(parents[name])
+
+    assert max(map(hops, names)) <= 6
 
 
 def test_links_come_from_a_file_with_the_entry_named_when_one_is_wrong(tmp_path: Path) -> None:
@@ -98,5 +109,5 @@ def test_hiding_applets_keeps_the_order_that_lookups_rely_on(names: list[str]) -
 
 
 def test_a_busybox_with_another_table_is_refused() -> None:
-    with pytest.raises(rom.LabError, match="applet names"):
+    with pytest.raises(LabError, match="applet names"):
         rom.without_applets(b"nothing here", ["ash", "cat"], {"cat"}, keep=("ash",))
