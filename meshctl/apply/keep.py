@@ -16,6 +16,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv4Address
+from types import MappingProxyType
 
 from meshctl.apply.attempt import Attempt, begin, prepare
 from meshctl.apply.change import new_change_id, new_nonce
@@ -29,6 +30,7 @@ from meshctl.device.ssh import SshConnection
 from meshctl.errors import InputError, NodeError, Unreachable
 from meshctl.fleet import Outcome, Result
 from meshctl.plan.seen import parsed
+from meshctl.render import MARKER_PATH
 
 INFO_NAME = "meshctl-backup.json"
 # Far above a router's /etc, far below what would hurt: bounds a hostile or broken archive.
@@ -61,18 +63,25 @@ def fetch(connection: SshConnection, node: str, seen: Observation) -> bytes:
     }
     archive = openwrt.backup(connection)
     try:
-        whole = with_info(archive, info)
+        # sysupgrade keeps no file of ours; the marker tells later which configuration this was
+        own = openwrt.fetch_files(connection, [f"/{MARKER_PATH}"])
+        whole = with_info(archive, info, {path: file.content for path, file in own.items()})
         read_backup(whole, node)
     except InputError as error:
         raise NodeError(f"{node}: what it sent is no backup: {error}") from error
     return whole
 
 
-def with_info(archive: bytes, info: Mapping[str, object]) -> bytes:
-    """The archive of `sysupgrade -b` with what it was taken from in front. Raises InputError for a damaged one."""
+def with_info(archive: bytes, info: Mapping[str, object], extra: Mapping[str, bytes] = MappingProxyType({})) -> bytes:
+    """The archive of `sysupgrade -b` with what it was taken from in front, and further public files by absolute path.
+
+    Raises InputError for a damaged archive.
+    """
     out = io.BytesIO()
     with tarfile.open(fileobj=out, mode="w", format=tarfile.GNU_FORMAT) as new:
-        _add(new, INFO_NAME, json.dumps(info, indent=1).encode())
+        _add(new, INFO_NAME, json.dumps(info, indent=1).encode(), 0o600)
+        for path, content in extra.items():
+            _add(new, path.lstrip("/"), content, 0o644)
         for member, content in _members(archive, "the archive"):
             if member.isreg():
                 new.addfile(member, io.BytesIO(content))
@@ -81,9 +90,9 @@ def with_info(archive: bytes, info: Mapping[str, object]) -> bytes:
     return gzip.compress(out.getvalue(), mtime=0)
 
 
-def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
+def _add(tar: tarfile.TarFile, name: str, content: bytes, mode: int) -> None:
     entry = tarfile.TarInfo(name)
-    entry.size, entry.mode = len(content), 0o600
+    entry.size, entry.mode = len(content), mode
     tar.addfile(entry, io.BytesIO(content))
 
 

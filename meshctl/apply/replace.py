@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 from meshctl.apply.access import Access
 from meshctl.apply.bootstrap import Arrivals, BenchPlace, Found, Recorder
@@ -21,7 +22,7 @@ from meshctl.device.ssh import connect
 from meshctl.device.trust import HostKey, TrustStore
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Interrupt
-from meshctl.model import Node, NodeState
+from meshctl.model import Fleet, Node, NodeState
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +93,14 @@ def _must_be_silent(access: Access, old: Node) -> None:
 def give_up(trust: TrustStore, old: Node, successor: Successor) -> None:
     """The change failed: believe what was believed before."""
     trust.replace(old.name, *successor.old_pins)
+
+
+def heir_of(fleet: Fleet, old: Node, spare: Node | None) -> Fleet:
+    """The fleet in which the old node carries the spare's label and serial number, as far as they are rendered."""
+    if spare is None:
+        return fleet
+    heir = replace(old, label=spare.label or old.label, serial=spare.serial or old.serial)
+    return replace(fleet, nodes=MappingProxyType({**fleet.nodes, old.name: heir}))
 
 
 def identity_edits(old: Node, spare: Node | None, seen: Observation) -> tuple[Mapping[str, str], Mapping[str, str]]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import secrets
+from dataclasses import replace as with_changes
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from meshctl.apply.bootstrap import BenchPlace, Found, find_node, look_around, plan_arrivals
-from meshctl.apply.replace import give_up, identity_edits, succeed
+from meshctl.apply.replace import give_up, heir_of, identity_edits, succeed
 from meshctl.cli.carry import SALT_BYTES, ask_and_carry_out, choices_of
 from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
@@ -151,6 +152,9 @@ def replace(
         if spare is not None and (spare.name == node.name or spare.state is not NodeState.SPARE):
             raise InputError(f"{spare.name} is {spare.state.value}: expected a spare", hint="`meshctl inventory state`")
         place = _place(at, node.name) if at else BenchPlace(node=node.name) if spare is None else None
+        fleet = heir_of(opened.fleet, node, spare)
+        opened = with_changes(opened, fleet=fleet, renderer=with_changes(opened.renderer, fleet=fleet))
+        node = fleet.nodes[node.name]
         with opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)):
             successor = succeed(
                 opened.renderer,

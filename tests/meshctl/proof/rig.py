@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import tarfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -161,10 +161,13 @@ class Rig:
             "SSH_AUTH_SOCK": "",
         }
 
-    def start(self, command: str, variant: str, *words: str) -> subprocess.Popen[str]:
-        """Begin a command on inventory `variant`."""
-        arguments = [sys.executable, "-m", "meshctl", command, *words, "-i", str(self.inventory(variant))]
-        arguments += ["--key", str(self._key)]
+    def start(self, verb: str, variant: str, *words: str, command: Sequence[str] = ()) -> subprocess.Popen[str]:
+        """Begin a verb of meshctl on inventory `variant` (empty: the verb takes none); `command` is for the nodes."""
+        arguments = [sys.executable, "-m", "meshctl", verb, *words]
+        if variant:
+            arguments += ["-i", str(self.inventory(variant)), "--key", str(self._key)]
+        if command:
+            arguments += ["--", *command]
         return subprocess.Popen(
             arguments,
             env=self.environ,
@@ -174,9 +177,9 @@ class Rig:
             text=True,
         )
 
-    def meshctl(self, command: str, variant: str, *words: str) -> Ended:
-        """Run a command to its end."""
-        with self.start(command, variant, *words) as process:
+    def meshctl(self, verb: str, variant: str, *words: str, command: Sequence[str] = ()) -> Ended:
+        """Run it to its end."""
+        with self.start(verb, variant, *words, command=command) as process:
             out, err = process.communicate(timeout=COMMAND_LIMIT_S)
             return Ended(process.returncode, out, err)
 
