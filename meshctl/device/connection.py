@@ -45,9 +45,10 @@ class Endpoint:
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """What we try, in this order: key files, the agent's keys, `password`, and, if `empty_password`, none at all.
+    """What we try, in this order: key files, the agent's keys, `password`.
 
-    `empty_password` is for first contact alone: a factory device lets root in with no password.
+    `empty_password` is for first contact alone, because a factory device lets root in with no password: no
+    authentication at all is tried before everything else, an empty password after it.
     """
 
     key_files: tuple[Path, ...] = ()
@@ -70,7 +71,7 @@ class Deadlines:
     auth_s: float = 30.0
     channel_s: float = 15.0
     run_s: float = 60.0
-    # A dead link shows after about three of these, because the server's answer to each is awaited by TCP.
+    # Nobody answers a keepalive, but TCP acknowledges it: a link that is silent for four of these is given up.
     keepalive_s: int = 15
 
 

@@ -6,13 +6,15 @@ written and everything it started ends with it.
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import shutil
 import socket
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -35,10 +37,24 @@ def eventually(what: Callable[[], bool], *, patience_s: float = PATIENCE_S) -> N
 
 
 def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
+    """A port nobody listens on: below those the kernel hands out by itself, apart for each worker of a parallel run."""
+    for port in _PORTS:
+        with socket.socket() as sock:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            with suppress(OSError):
+                sock.bind(("127.0.0.1", port))
+                return port
+    raise AssertionError("no free port")
+
+
+def _own_ports() -> Iterator[int]:
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    first = 20_000 + worker % 20 * 500
+    # another run on the same machine starts elsewhere in the range
+    return ((first + (os.getpid() + n) % 500) for n in itertools.count())
+
+
+_PORTS = _own_ports()
 
 
 def listening(port: int) -> bool:
