@@ -36,7 +36,7 @@ class Node:
 
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
         """Take in one datagram. Bad bytes are counted and dropped; this never raises because of what was received."""
-        if self._legacy and len(data) and data[0] < MARK:
+        if len(data) and data[0] < MARK and self._legacy:
             self._legacy.receive(data, link, source, now)
         else:
             take_datagram(self._state, data, link, source, now)
