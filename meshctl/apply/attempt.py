@@ -7,6 +7,7 @@ over a new connection (`reach`, `look`), and `confirm` opens one of its own. Eac
 from __future__ import annotations
 
 import re
+import threading
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -29,6 +30,8 @@ from meshctl.plan import Cut
 LOCK_SLACK_S = 60
 # reload_config returns before netifd has begun: procd gathers events for 1 s, then interfaces go down and come up.
 SETTLE_S = 3.0
+# The answer to `apply` has to be out before the change cuts the connection; one that is late is not waited for long.
+ANSWER_FIRST_S, ANSWER_S = 0.5, 15.0
 ABSENT = ChangeStatus("absent", installed=False)
 
 
@@ -100,9 +103,20 @@ def _install(job: Job, connection: SshConnection) -> None:
 
 
 def begin(attempt: Attempt, connection: SshConnection, *, at_uptime_s: float | None = None) -> None:
-    """Have the node begin: now, or when its own uptime reaches `at_uptime_s`."""
-    with attempt.job.step("apply"):
-        deadman.apply(connection, attempt.job.work.owner, attempt.id, at_uptime_s=at_uptime_s)
+    """Have the node begin: in a moment, or when its own uptime reaches `at_uptime_s`.
+
+    The change may cut this very connection, so an answer that does not come soon is not waited for: the window is
+    running. Raises NodeRefused, Unreachable.
+    """
+    patience = threading.Timer(min(ANSWER_S, attempt.window_s / 4), connection.close)
+    patience.daemon = True
+    patience.start()
+    in_s = None if at_uptime_s is not None else ANSWER_FIRST_S
+    try:
+        with attempt.job.step("apply"):
+            deadman.apply(connection, attempt.job.work.owner, attempt.id, in_s=in_s, at_uptime_s=at_uptime_s)
+    finally:
+        patience.cancel()
 
 
 def reach(attempt: Attempt) -> SshConnection | None:
