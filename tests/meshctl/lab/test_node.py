@@ -181,6 +181,16 @@ def test_ssh_that_hangs_accepts_and_says_nothing(fleet: VirtualFleet, node: Virt
     transport.close()
 
 
+def test_a_wrong_board_says_so_before_and_after_a_boot(fleet: VirtualFleet, node: VirtualNode) -> None:
+    fleet.break_("box", "wrong-board")
+    for _ in range(2):
+        board = json.loads(node.exec("ubus call system board").stdout)
+        assert board["board_name"] == "virtual,other-board"
+        node.power_cut()
+    fleet.mend("box")
+    assert node.exec("cat /tmp/sysinfo/board_name").stdout.strip() == node.spec.board
+
+
 # -- flashing --
 
 
