@@ -21,6 +21,7 @@ class Entry(NamedTuple):
 _INVENTORY = "Inventory"
 _CHANGE = "Change the fleet"
 _WATCH = "Watch and reach"
+_ROBOTS = "Robots"
 _LAB = "Practise"
 
 COMMANDS: dict[str, Entry] = {
@@ -45,5 +46,6 @@ COMMANDS: dict[str, Entry] = {
     "trust": Entry("meshctl.cli.access", "trust", "Pin the host keys of nodes", _WATCH),
     "run": Entry("meshctl.cli.access", "run", "Run a command on nodes", _WATCH),
     "ssh": Entry("meshctl.cli.access", "ssh", "Log in to a node", _WATCH),
+    "robots": Entry("meshctl.cli.robots", "app", "Deploy and watch udp_mesh on the robots' computers", _ROBOTS),
     "lab": Entry("meshctl.cli.lab", "app", "A virtual fleet on this machine", _LAB),
 }

@@ -1,0 +1,132 @@
+"""What one robot's computer gets: wheels, the release's own files, a manifest of hashes, and a name made of them.
+
+Pure. Two bundles with the same name hold the same bytes, which is what makes a second deploy do nothing. The wheels
+travel by themselves and are shared between releases; a change of topics or keys is a new release of a few kilobytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import tarfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from meshctl.model import Fleet, Secret, SecretRef
+from meshctl.render.daemon import CONFIG_NAME, KEY_NAME, daemon_config, daemon_keys
+from meshctl.robots.scripts import shipped
+from meshctl.robots.wheels import Wheel
+
+UNIT_NAME = "udp-mesh.service"
+_PROGRAM = "/opt/udp-mesh/current/bin/udp-mesh run /opt/udp-mesh/current/etc"
+# Half of a SHA-256: nobody makes two bundles meet by accident, and people read it.
+_ID_DIGITS = 16
+_SECRET_MODE = 0o600
+
+
+@dataclass(frozen=True, slots=True)
+class File:
+    """A file of a release by its path in it; what is secret is not shown."""
+
+    path: str
+    content: bytes = field(repr=False)
+    mode: int = 0o644
+
+    @property
+    def sha256(self) -> str:
+        return hashlib.sha256(self.content).hexdigest()
+
+    @property
+    def is_secret(self) -> bool:
+        return self.mode == _SECRET_MODE
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """A release for one robot. `tree` names the set of wheels, for one Python, that it runs from."""
+
+    robot: str
+    tree: str
+    wheels: tuple[Wheel, ...]
+    files: tuple[File, ...]
+
+    @property
+    def hashes(self) -> tuple[tuple[str, str], ...]:
+        """Path and hash of every file, as the manifest lists them."""
+        return tuple((file.path, file.sha256) for file in self.files)
+
+    @property
+    def manifest(self) -> bytes:
+        """As `sha256sum` writes and checks it."""
+        return "".join(f"{digest}  {path}\n" for path, digest in self.hashes).encode()
+
+    @property
+    def id(self) -> str:
+        modes = "".join(f"{file.mode:o} {file.path}\n" for file in self.files).encode()
+        return hashlib.sha256(self.manifest + modes).hexdigest()[:_ID_DIGITS]
+
+    @property
+    def unpacked_bytes(self) -> int:
+        """What a computer without any of it needs: the wheels, unpacked and as they came."""
+        return sum(wheel.unpacked_bytes + len(wheel.content) for wheel in self.wheels)
+
+    def file(self, path: str) -> File | None:
+        return next((file for file in self.files if file.path == path), None)
+
+    def archive(self) -> bytes:
+        """The release's own files as a tar, with its manifest and the link to its tree."""
+        out = io.BytesIO()
+        with tarfile.open(fileobj=out, mode="w", format=tarfile.USTAR_FORMAT) as archive:
+            for directory in ("bin", "etc"):
+                entry = tarfile.TarInfo(directory)
+                entry.type, entry.mode = tarfile.DIRTYPE, 0o755
+                archive.addfile(entry)
+            link = tarfile.TarInfo("lib")
+            link.type, link.linkname = tarfile.SYMTYPE, f"../../trees/{self.tree}"
+            archive.addfile(link)
+            for file in (*self.files, File("manifest", self.manifest)):
+                entry = tarfile.TarInfo(file.path)
+                entry.size, entry.mode = len(file.content), file.mode
+                archive.addfile(entry, io.BytesIO(file.content))
+        return out.getvalue()
+
+
+def bundle(
+    fleet: Fleet,
+    robot: str,
+    secrets: Callable[[SecretRef], Secret],
+    wheels: Sequence[Wheel],
+    *,
+    executable: str,
+    unit: str,
+) -> Bundle:
+    """The bundle for one robot; `executable` is the absolute path of its Python, `unit` the daemon's unit file.
+
+    Raises InvalidInput for what the daemon would refuse, and for keys that cannot be had.
+    """
+    listed = "".join(f"{wheel.sha256}  {wheel.file}\n" for wheel in wheels).encode()
+    tree = hashlib.sha256(listed + executable.encode()).hexdigest()[:_ID_DIGITS]
+    topics = "".join(f"{topic.name}\n" for topic in fleet.topics).encode()
+    files = [
+        File("bin/udp-mesh", shipped("launcher.sh").encode(), 0o755),
+        File(f"etc/{CONFIG_NAME}", daemon_config(fleet, robot)),
+        File("python", f"{executable}\n".encode()),
+        File("topics", topics),
+        File("tree", f"{tree}\n".encode()),
+        File(UNIT_NAME, service_unit(unit).encode()),
+        File("wheels", listed),
+    ]
+    keys = daemon_keys(fleet, secrets)
+    if keys is not None:
+        files.append(File(f"etc/{KEY_NAME}", keys, _SECRET_MODE))
+    return Bundle(robot, tree, tuple(wheels), tuple(sorted(files, key=lambda file: file.path)))
+
+
+def service_unit(stock: str) -> str:
+    """udp_mesh's own unit, started from the current release. Raises ValueError when it has not one start command."""
+    lines = stock.splitlines()
+    places = [number for number, line in enumerate(lines) if line.startswith("ExecStart=")]
+    if len(places) != 1:
+        raise ValueError(f"expected one ExecStart in the unit, found {len(places)}")
+    lines[places[0]] = f"ExecStart={_PROGRAM}/{CONFIG_NAME}"
+    return "".join(f"{line}\n" for line in lines)

@@ -1,0 +1,139 @@
+"""The seam between meshctl and a robot's computer: run one of our scripts, put a file. `SshHost` is the real one.
+
+An `SshHost` finds out once how it becomes root: it is root, or sudo asks nothing, or sudo wants a password, which goes
+in on standard input before anything else and is never part of a command line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+from meshctl.device.connection import Completed, Connection, Endpoint
+from meshctl.device.errors import CommandFailed
+from meshctl.device.framing import quoted
+from meshctl.device.upload import upload
+from meshctl.errors import NodeError
+from meshctl.model import Secret
+from meshctl.robots.scripts import script
+
+
+class Refused(NodeError):
+    """A script on the robot would not go on; `code` is its reason's word (`no-space`, `busy`, `check`, ...)."""
+
+    def __init__(self, message: str, *, code: str, hint: str = "") -> None:
+        super().__init__(message, hint=hint)
+        self.code = code
+
+
+class Host(Protocol):
+    """A robot's computer, as root."""
+
+    @property
+    def label(self) -> str:
+        """For messages: `husky1 (10.42.0.10)`."""
+        ...
+
+    def run(self, verb: str, *words: str, stdin: bytes = b"", timeout_s: float) -> str:
+        """What `scripts/VERB.sh`, called with `words`, prints. Raises Refused, CommandFailed and what SSH raises."""
+        ...
+
+    def put(self, content: bytes, path: str, mode: int = 0o644) -> int:
+        """Make `path` hold `content`; gives the bytes that had to travel. A put that was cut goes on where it was."""
+        ...
+
+
+_HINTS = {
+    "no-space": "make room at /opt, then deploy again",
+    "busy": "wait until it is done, then deploy again",
+    "damaged": "deploy again; if it happens again, look at the disk",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SshHost(Host):
+    """`connection` is logged in as any user who is root or may use sudo; see `become_root`."""
+
+    connection: Connection
+
+    @property
+    def label(self) -> str:
+        return self.connection.endpoint.label
+
+    def run(self, verb: str, *words: str, stdin: bytes = b"", timeout_s: float) -> str:
+        command = quoted("sh", "-c", script(verb), f"udp-mesh-{verb}", *words)
+        done = self.connection.run(command, stdin=stdin, timeout_s=timeout_s)
+        last = (done.stderr.strip().splitlines() or [""])[-1]
+        if last.startswith("refused "):
+            _, code, reason = f"{last} ".split(" ", 2)
+            raise Refused(f"{self.label}: {reason.strip() or code}", code=code, hint=_HINTS.get(code, ""))
+        return done.check(f"{self.label}: {verb}").stdout
+
+    def put(self, content: bytes, path: str, mode: int = 0o644) -> int:
+        return upload(self.connection, content, path, mode=mode).sent
+
+
+class AsRoot(Connection):
+    """A connection whose scripts run as root through sudo; `password` None where sudo asks for none."""
+
+    def __init__(self, inner: Connection, password: Secret | None) -> None:
+        self._inner = inner
+        self._password = password
+
+    @property
+    def endpoint(self) -> Endpoint:
+        return self._inner.endpoint
+
+    def run(self, script: str, *, stdin: bytes | Iterable[bytes] = b"", timeout_s: float | None = None) -> Completed:
+        # -k: a cached login must not make sudo leave the password unread, for the script would take it as its input
+        how = ("-n",) if self._password is None else ("-k", "-S", "-p", "")
+        command = quoted("sudo", *how, "--", "sh", "-c", script)
+        if self._password is not None:
+            first = f"{self._password.reveal()}\n".encode()
+            stdin = first + stdin if isinstance(stdin, bytes) else _chained(first, stdin)
+        return self._inner.run(command, stdin=stdin, timeout_s=timeout_s)
+
+    def close(self) -> None:
+        self._inner.close()
+
+
+def _chained(first: bytes, rest: Iterable[bytes]) -> Iterable[bytes]:
+    yield first
+    yield from rest
+
+
+# Tells how the login becomes root: `root`, `free` (sudo asks nothing), `password`, `no-sudo`.
+_HOW = """\
+if [ "$(id -u)" = 0 ]; then echo root
+elif ! command -v sudo >/dev/null 2>&1; then echo no-sudo
+elif sudo -k -n true 2>/dev/null; then echo free
+else echo password; fi
+"""
+
+
+def become_root(connection: Connection, password: Callable[[], Secret | None]) -> Connection:
+    """The connection itself for root, or one that goes through sudo. Raises CommandFailed where neither works.
+
+    `password` is asked for only where sudo wants one; None means there is none to give.
+    """
+    label, user = connection.endpoint.label, connection.endpoint.user
+    how = connection.run(_HOW).check(f"{label}: become root").stdout.strip()
+    match how:
+        case "root":
+            return connection
+        case "free":
+            return AsRoot(connection, None)
+        case "password":
+            given = password()
+            if given is None:
+                hint = "give it with --ask-sudo or MESHCTL_SUDO_PASSWORD, or let sudo ask for none"
+                raise CommandFailed(f"{label}: sudo wants a password for {user}", exit_status=1, hint=hint)
+            elevated = AsRoot(connection, given)
+            if elevated.run("id -u").stdout.strip() != "0":
+                hint = "check the password, and that the user may use sudo"
+                raise CommandFailed(f"{label}: sudo does not let {user} become root", exit_status=1, hint=hint)
+            return elevated
+        case _:
+            hint = "log in as root, or install sudo there"
+            raise CommandFailed(f"{label}: {user} is not root and there is no sudo", exit_status=1, hint=hint)

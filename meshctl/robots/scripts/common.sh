@@ -1,0 +1,44 @@
+# What every verb knows: the places, and how a refusal is told. Runs under any POSIX sh (dash, bash, busybox ash).
+#
+#   /opt/udp-mesh/wheels/           wheels as they came, shared by releases
+#   /opt/udp-mesh/trees/TREE/       wheels unpacked, shared by releases; .sums has the hash of every file
+#   /opt/udp-mesh/releases/ID/      bin/udp-mesh, etc/ (configuration, keys), lib -> its tree, the unit, manifest
+#   /opt/udp-mesh/current           -> the release that runs; one rename changes code, configuration, keys and unit
+#   /opt/udp-mesh/previous          -> the release to go back to
+#   /opt/udp-mesh/unproven          exists while a switch has not proved itself
+set -u
+umask 022
+LC_ALL=C
+PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
+export LC_ALL PATH
+root=/opt/udp-mesh
+unit=udp-mesh.service
+unit_file=/etc/systemd/system/$unit
+socket=/run/udp-mesh/udp-mesh.sock
+account=udp-mesh
+
+# die WORD TEXT: one line for the operator; the first word is for programs.
+die() {
+	echo "refused $*" >&2
+	exit 65
+}
+
+# release_of LINK: the name of the release a link names, empty for none.
+release_of() {
+	target=$(readlink "$root/$1" 2>/dev/null) || return 0
+	echo "${target##*/}"
+}
+
+# point LINK RELEASE: in one rename, so there is always either the old one or the new one.
+point() {
+	ln -sfn "releases/$2" "$root/.$1.new" && mv -fT "$root/.$1.new" "$root/$1"
+}
+
+# alone: one change at a time; the lock goes with this process.
+alone() {
+	mkdir -p "$root" || die no-space "cannot make $root"
+	exec 9>"$root/.lock"
+	flock -n 9 || die busy "another operator changes this robot right now"
+}
+
+mesh() { "$root/current/bin/udp-mesh" "$@"; }

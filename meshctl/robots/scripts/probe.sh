@@ -1,0 +1,49 @@
+# probe PYTHON: everything that decides whether and how this computer is changed, as NAME=VALUE lines. Changes nothing.
+python=$1
+
+echo "arch=$(uname -m)"
+echo "now=$(date +%s)"
+echo "uid=$(id -u)"
+[ -d /run/systemd/system ] && echo systemd=yes || echo systemd=no
+missing=
+for tool in systemctl sha256sum tar flock readlink df awk; do
+	command -v "$tool" >/dev/null 2>&1 || missing="$missing $tool"
+done
+echo "missing=${missing# }"
+
+if path=$(command -v "$python" 2>/dev/null); then
+	# any Python since 2.7 answers this, so that a wrong one can be named
+	"$path" -c '
+import struct, sys, platform
+print("python=%d.%d.%d" % tuple(sys.version_info[:3]))
+print("implementation=" + platform.python_implementation())
+print("bits=%d" % (8 * struct.calcsize("P")))
+print("libc=" + " ".join(platform.libc_ver()))
+print("executable=" + sys.executable)
+for name in ("zipfile", "compileall", "asyncio"):
+    try:
+        __import__(name)
+    except ImportError:
+        print("no_module=" + name)
+' 2>/dev/null || echo "python=broken"
+fi
+
+there=$root
+while [ ! -d "$there" ]; do there=$(dirname "$there"); done
+echo "free_kib=$(df -Pk "$there" | awk 'END { print $(NF - 2) }')"
+[ -w "$there" ] && echo writable=yes || echo writable=no
+
+echo "current=$(release_of current)"
+echo "previous=$(release_of previous)"
+for release in "$root"/releases/*; do [ ! -d "$release" ] || echo "release=${release##*/}"; done
+for tree in "$root"/trees/*; do [ ! -d "$tree" ] || echo "tree=${tree##*/}"; done
+[ ! -e "$root/unproven" ] && echo proven=yes || echo proven=no
+if [ -e "$root/current/manifest" ]; then
+	sed 's/^/file=/' "$root/current/manifest"
+	# what was changed by hand, or by a failing disk
+	(cd "$root/current" && sha256sum -c manifest 2>/dev/null) | sed -n 's/: FAILED.*//p' | sed 's/^/damaged=/'
+	(cd "$root/current/lib" && sha256sum -c .sums 2>/dev/null) | sed -n 's/: FAILED.*//p' | sed 's|^|damaged=lib/|'
+	cmp -s "$root/current/$unit" "$unit_file" || echo "damaged=$unit_file"
+fi
+echo "active=$(systemctl is-active "$unit" 2>/dev/null)"
+echo "enabled=$(systemctl is-enabled "$unit" 2>/dev/null)"

@@ -1,0 +1,13 @@
+# remove PURGE: stops the daemon and takes it off this computer. With `purge` also what it kept for absent partners, and
+# its user; otherwise that waits in /var/lib/udp-mesh for the next install.
+purge=$1
+alone
+systemctl disable --now "$unit" >/dev/null 2>&1
+rm -f "$unit_file"
+systemctl daemon-reload
+rm -rf "$root"
+if [ "$purge" = purge ]; then
+	rm -rf /var/lib/udp-mesh
+	! id "$account" >/dev/null 2>&1 || userdel "$account" 2>/dev/null || die account "cannot remove the user $account"
+fi
+echo removed

@@ -1,0 +1,124 @@
+"""An inventory of robots at loopback addresses, their machines, and meshctl's own command line over them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from typer.testing import CliRunner
+
+from meshctl.cli.main import build
+from meshctl.device.trust import TrustStore
+from tests.meshctl.robots.machine import PYTHON, Machine, key_pair
+from tests.udp_mesh.links.sockets import free_port
+
+OLD_KEY, NEW_KEY = "00112233445566778899aabbccddeeff" * 2, "ffeeddccbbaa99887766554433221100" * 2
+
+_INVENTORY = """\
+meshctl: 1
+fleet: robots-test
+country: US
+operators: {{ssh_keys: ["ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8g test"]}}
+hardware:
+  rocket:
+    board: ubnt,rocket-m
+    profile: ubnt_rocket-m
+    target: ath79/generic
+    release: "23.05"
+    lan_ports: [eth0]
+    radios: {{radio0: {{path: "pci0000:00/0000:00:00.0", band: 2g, rated_power_dbm: 30, max_drive_dbm: 28}}}}
+meshes:
+  main: {{ssid: fleet, bssid: "02:ca:fe:00:00:01", band: 2g, channel: 6, network: 10.42.0.0/24}}
+defaults: {{hardware: rocket, state: deployed}}
+nodes:
+  base: {{role: base, address: 10.42.0.1}}
+robots:
+{robots}
+udp_mesh:
+  port: {port}
+  broadcast: false
+  keys: [{{file: keys.yaml, key: old}}]
+  heartbeat_s: 0.2
+  offline_after_s: 10
+topics:
+  estop: {{priority: 0, class: emergency_stop}}
+  status: {{priority: 5}}
+"""
+_ROBOT = """\
+  {name}:
+    nodes: [{nodes}]
+    computer:
+      address: {address}/8
+      arch: {arch}
+      python: {python}
+      ssh: {{port: {port}, user: root, key_files: [operator]}}
+"""
+
+
+class RobotFleet:
+    """`add` robots, then `write` the inventory, then run meshctl's commands on it."""
+
+    def __init__(self, directory: Path, wheels: Path) -> None:
+        self.directory = directory
+        self.wheels = wheels
+        self.key = key_pair(directory / "operator")
+        self.file = directory / "fleet.yaml"
+        self.machines: dict[str, Machine] = {}
+        self._port = free_port()
+        (directory / "keys.yaml").write_text(f'old: "{OLD_KEY}"\nnew: "{NEW_KEY}"\n')
+
+    def add(self, name: str, *, opt_kib: int | None = None) -> Machine:
+        address = f"127.0.4.{len(self.machines) + 1}"
+        machine = Machine(self.directory / name, address, free_port(), self.key, opt_kib=opt_kib)
+        self.machines[name] = machine
+        machine.start()
+        return machine
+
+    def write(self, *, arch: str = "", python: str = PYTHON) -> None:
+        """The inventory of all machines, with their host keys pinned."""
+        robots = "".join(
+            _ROBOT.format(
+                name=name,
+                nodes="base" if number == 0 else "",
+                address=machine.address,
+                port=machine.port,
+                arch=arch or _arch(),
+                python=python,
+            )
+            for number, (name, machine) in enumerate(self.machines.items())
+        )
+        self.file.write_text(_INVENTORY.format(robots=robots, port=self._port))
+        trust = TrustStore(self.directory / "known_hosts")
+        for name, machine in self.machines.items():
+            trust.replace(f"robot.{name}", machine.host_key)
+
+    def meshctl(self, *words: str, exit_code: int = 0, wheels: bool = False) -> str:
+        """What `meshctl robots WORDS` prints; it must end with this exit code."""
+        arguments = ["robots", *words, "-i", str(self.file), *(["--wheels", str(self.wheels)] if wheels else [])]
+        done = CliRunner().invoke(build("robots"), arguments, catch_exceptions=False)
+        assert done.exit_code == exit_code, done.output
+        return done.output
+
+    def deploy(self, *words: str, exit_code: int = 0) -> str:
+        return self.meshctl("deploy", *words, exit_code=exit_code, wheels=True)
+
+    def status(self) -> dict[str, dict[str, Any]]:
+        """What `meshctl robots status --json` tells, by robot, whatever its exit code."""
+        done = CliRunner().invoke(
+            build("robots"), ["robots", "status", "--json", "-i", str(self.file)], catch_exceptions=False
+        )
+        return {one["robot"]: one for one in json.loads(done.stdout)}
+
+    def shell(self, robot: str, command: str) -> str:
+        return self.machines[robot].shell(command, self.directory / "pins")
+
+    def stop(self) -> None:
+        for machine in self.machines.values():
+            machine.stop()
+
+
+def _arch() -> str:
+    import os
+
+    return os.uname().machine
