@@ -41,7 +41,7 @@ class Uci:
 
     def run(self, *arguments: str, stdin: str = "") -> subprocess.CompletedProcess[str]:
         command: Sequence[str] = (
-            str(BUSYBOX), "awk", "-f", str(STAND_INS / "lab" / "uci.awk"), "--",
+            str(BUSYBOX), "awk", "-f", f"{STAND_INS}/lab/uci_tree.awk", "-f", f"{STAND_INS}/lab/uci.awk", "--",
             "-c", str(self.config), "-P", str(self.delta), *arguments,
         )  # fmt: skip
         return subprocess.run(command, input=stdin, capture_output=True, text=True, check=False)
