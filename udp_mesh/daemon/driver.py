@@ -44,6 +44,8 @@ BLOCKED_DATAGRAMS = 256
 """Datagrams that wait for one full socket; more are lost."""
 INTERFACE_SETTLE_S = 0.05
 """After a notice of the kernel more follow (link, then addresses): one refresh answers them all."""
+RECOVERY_S = 0.1
+"""After an exception nobody expected, until the next attempt."""
 RETRY_LINK_S = 2.0
 """Until a socket that could not be opened is tried again."""
 
@@ -169,13 +171,16 @@ class Driver:
             if self.link_failures.get(name) != reason:
                 log.error("link-failed link=%s reason=%s", name, reason)
         self.link_failures = changes.failed
+        self._watch_all()
+        if changes.failed:
+            self._refresh = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
+
+    def _watch_all(self) -> None:
         for link in self.hub.links.values():
             if self._blocked.get(link.attachment.name):
                 self._loop.add_writer(link.fileno(), self._writable, link)
             if not self._rhythm.ticking:
                 self._loop.add_reader(link.fileno(), self._readable, link)
-        if changes.failed:
-            self._refresh = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
 
     def _interfaces_changed(self) -> None:
         assert self._monitor is not None
@@ -185,7 +190,13 @@ class Driver:
             self._refresh = self._loop.call_later(INTERFACE_SETTLE_S, self._refresh_and_pump)
 
     def _refresh_and_pump(self) -> None:
-        self.refresh_links()
+        try:
+            self.refresh_links()
+        except OSError as error:
+            # The kernel would not list its interfaces (out of memory): what is open stays open until it does.
+            log.error("interfaces-unknown error=%s", error)
+            self._watch_all()
+            self._refresh = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
         self._pump()
 
     def _unwatch(self, link: UdpLink) -> None:
@@ -248,6 +259,16 @@ class Driver:
         self._pump_requested = False
         if self.closed:
             return
+        completed = False
+        try:
+            self._pump_once()
+            completed = True
+        finally:
+            # A bug that raises is the loop's to report; the robot's messages go on.
+            if not completed and not self.closed:
+                self._schedule(self._clock() + RECOVERY_S)
+
+    def _pump_once(self) -> None:
         now = self._tell()
         due = self.node.next_timer()
         if due is not None and due <= now:

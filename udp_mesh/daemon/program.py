@@ -15,6 +15,7 @@ import os
 import random
 import signal
 import time
+from typing import Any
 
 from udp_mesh.daemon.api import LocalServer, RequestError
 from udp_mesh.daemon.commands import COMMANDS, render_metrics
@@ -74,6 +75,7 @@ async def _serve(service: Service, notifier: Notifier) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     loop.add_signal_handler(signal.SIGHUP, _reload, service, notifier)
+    loop.set_exception_handler(_report_bug)
     # A daemon that hangs on a robot far away: SIGUSR1 writes where to its log.
     faulthandler.register(signal.SIGUSR1)
     gc.collect()
@@ -88,6 +90,11 @@ async def _serve(service: Service, notifier: Notifier) -> None:
                 await stop.wait()
         except TimeoutError:
             notifier.alive(_status(service))
+
+
+def _report_bug(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """What nobody expected is written down, and the daemon goes on: a robot's link matters more than a clean end."""
+    log.error("bug message=%s", context.get("message"), exc_info=context.get("exception"))
 
 
 def _reload(service: Service, notifier: Notifier) -> None:

@@ -36,26 +36,6 @@ _ANCILLARY_BYTES = socket.CMSG_SPACE(4) + socket.CMSG_SPACE(_TIMESPEC.size)
 Deliver: TypeAlias = Callable[[memoryview, Address, float], None]
 """Takes a datagram, its sender, and when the kernel took it in (seconds since 1970, 0.0 where it does not say)."""
 
-_TRANSIENT = frozenset(
-    {
-        errno.ENETUNREACH,
-        errno.EHOSTUNREACH,
-        errno.ENETDOWN,
-        errno.ENODEV,
-        errno.ENXIO,
-        errno.EADDRNOTAVAIL,
-        errno.ECONNREFUSED,
-        errno.EPERM,
-        errno.EACCES,
-        errno.EINVAL,
-        errno.EMSGSIZE,
-        errno.ENOBUFS,
-        errno.EIO,
-    }
-)
-"""Errors that mean "this datagram is lost": the transport's reliability answers them, an exception would only do
-harm."""
-
 
 class Outgoing(Protocol):
     """What is sent: the core's datagram. `destination` None means the link's broadcast address."""
@@ -205,8 +185,7 @@ class UdpLink:
                 # No segmentation on this device or path (EMSGSIZE: a datagram above the path's MTU).
                 self.segmentation = error.errno == errno.EMSGSIZE
                 return self._send_singly(run, destination)
-            if error.errno not in _TRANSIENT:
-                raise
+            # Unreachable, forbidden, too long, the device gone: as lost as on a radio, and answered by the same means.
             self.datagrams_lost_on_send += len(run)
         return len(run)
 

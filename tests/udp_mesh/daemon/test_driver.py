@@ -12,6 +12,7 @@ from udp_mesh import Node
 from udp_mesh.core.events import MessageDelivered
 from udp_mesh.core.seams import Datagram
 from udp_mesh.daemon.driver import BLOCKED_DATAGRAMS
+from udp_mesh.links.netlink import NetlinkError
 from udp_mesh.links.udp import Outgoing, UdpLink
 
 PAYLOAD = bytes(range(256)) * 2000
@@ -96,6 +97,39 @@ def test_an_interfaces_address_that_another_process_uses_is_reported_and_tried_a
                 assert second.driver.link_failures == {}
 
     asyncio.run(main())
+
+
+def test_an_exception_nobody_expected_is_reported_and_the_transport_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        reported: list[str] = []
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: reported.append(str(context["exception"])))
+        node, raised = alice.driver.node, 0
+        real = node.datagrams_to_send
+
+        def datagrams_to_send(now: float, *, max_bytes: int | None = None) -> list[Datagram]:
+            nonlocal raised
+            if raised < 3:
+                raised += 1
+                raise ZeroDivisionError("a bug")
+            return real(now, max_bytes=max_bytes)
+
+        monkeypatch.setattr(node, "datagrams_to_send", datagrams_to_send)
+        assert isinstance(await alice.deliver("map", PAYLOAD, to="bob"), MessageDelivered)
+        assert reported == ["a bug"] * 3
+
+    run(body)
+
+
+def test_a_kernel_that_will_not_list_its_interfaces_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        def refuse() -> None:
+            raise NetlinkError(12, "no memory")
+
+        monkeypatch.setattr(alice.driver.hub, "refresh", refuse)
+        alice.driver._refresh_and_pump()
+        assert isinstance(await alice.deliver("map", PAYLOAD, to="bob"), MessageDelivered)
+
+    run(body)
 
 
 def test_nothing_is_left_on_the_loop_after_the_end() -> None:
