@@ -1,7 +1,8 @@
 """What one core does per fragment: two nodes in memory, no sockets, a bulk transfer; CPU of each side by itself.
 
-Datagrams pass between the nodes in batches, as a driver with segmentation offload would hand them over. Time is virtual:
-the link has no limit but the nodes' own work. Prints fragments/s and payload Mbit/s that one core sustains on each side.
+Datagrams pass between the nodes in batches, as a driver with segmentation offload would hand them over. Time is
+virtual: the link has no limit but the nodes' own work. Prints fragments/s and payload Mbit/s that one core sustains on
+each side.
 
     python benchmarks/core_throughput.py [--megabytes 200] [--profile sender|receiver]
 """

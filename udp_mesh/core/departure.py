@@ -93,16 +93,18 @@ def leave_level(
 ) -> int:
     """Let what waits on one level leave, at most about `room_bytes`; returns the bytes that left."""
     rates = outbound.rates
-    urgent = priority <= rates.urgent_priority
+    urgent_level = priority <= rates.urgent_priority
     window = outbound.window
     flight = outbound.flight
-    pace = None if urgent else window.packets_per_s()
+    level_pace = window.packets_per_s()
     used = 0
     mark = outbound.mark(now)
     while used < room_bytes:
         run = outbound.scheduler.peek(priority)
         if run is None:
             break
+        urgent = urgent_level and not run.stale
+        pace = None if urgent else level_pace
         if outbound.silent_since is not None:
             permitted = outbound.probe_credit
         else:
@@ -238,7 +240,7 @@ def _leave_one(outbound: Outbound, way: Way, run: Run, urgent: bool, mark: Mark,
         if ack_now:
             outbound.since_ack_wanted = 0
         room -= size
-        if urgent and message.small and outbound.loss >= outbound.rates.twice_loss:
+        if urgent and message.small and outbound.send_twice:
             outbound.copies.append((now + outbound.rates.twice_gap_s, message, next_run.position))
         if not message.reliable and last:
             outbound.finish(message, Outcome.SENT)

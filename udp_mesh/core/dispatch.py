@@ -174,8 +174,7 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
 def _leave_casts(state: State, priority: int, now: float, out: list[Datagram]) -> None:
     rates = state.settings.rates
     urgent = priority <= rates.urgent_priority
-    losses = [peer.outbound.loss for peer in state.roster.online()] if urgent else []
-    twice = urgent and bool(losses) and max(losses) >= rates.twice_loss
+    twice = urgent and any(peer.outbound.send_twice for peer in state.roster.online())
     ways: list[tuple[str, Address | None]] = [
         (link.name, link.broadcast) for link in state.links.values() if link.kind is LinkKind.BROADCAST
     ]

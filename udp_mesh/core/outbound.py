@@ -47,7 +47,7 @@ EXPIRE_EVERY_S = 0.005
 RETURN_BURST_PACKETS = 10
 """What leaves at once when a silent peer is heard without acknowledging (the way to it may still be cut)."""
 
-LOSS_MEMORY_PACKETS = 128
+LOSS_MEMORY_PACKETS = 256
 """Packets over which loss is smoothed."""
 
 
@@ -127,6 +127,8 @@ class Outbound:
         self.since_ack_wanted = 0
         """Packets sent since the last one that asked for an acknowledgement at once."""
         self.loss = 0.0
+        self.send_twice = False
+        """Loss was seen and has not been gone for long: small urgent messages leave twice."""
         self.delivered_packets = 0
         self.delivered_at = 0.0
         self.delivered_sent_at = 0.0
@@ -170,9 +172,10 @@ class Outbound:
             self._replace_older(message, keep_last)
         if not self.flight.outstanding and self.silent_since is None:
             self.last_progress = now
-        self.scheduler.push(message)
         if self.silent_since is not None and message.priority <= self.rates.urgent_priority:
+            # A fresh urgent message is itself the best probe: what waited until now stands behind it.
             self.allow_probe(now)
+        self.scheduler.push(message)
 
     def _replace_older(self, message: Outgoing, keep_last: int) -> None:
         kept = self._kept.setdefault(message.accepted.channel.topic.name, deque())
@@ -229,6 +232,10 @@ class Outbound:
             self._put_back(lost)
         total = len(acknowledged) + len(lost)
         if total:
+            if self.loss >= self.rates.twice_loss:
+                self.send_twice = True
+            elif self.loss < self.rates.twice_loss / 4:
+                self.send_twice = False
             self.loss += (len(lost) - self.loss * total) / max(total, LOSS_MEMORY_PACKETS)
 
     def _book_arrivals(self, packets: Iterable[Packet]) -> None:

@@ -12,12 +12,16 @@ from udp_mesh.wire.limits import PRIORITY_LEVELS
 
 
 class Run(NamedTuple):
-    """Pieces of one message ready to leave: `length` positions from `position` on. `again`: it left before."""
+    """Pieces of one message ready to leave: `length` positions from `position` on.
+
+    `again`: it left before. `stale`: it was set aside and has no claim to be urgent any more.
+    """
 
     message: Outgoing
     position: int
     length: int
     again: bool
+    stale: bool = False
 
 
 class _Level:
@@ -69,14 +73,14 @@ class Scheduler:
                 if message.ended or message.arrived[position]:
                     again.popleft()
                     continue
-                return Run(message, position, 1, again=True)
+                return Run(message, position, 1, again=True, stale=fresh is level.stale_fresh)
             while fresh:
                 message = fresh[0]
                 left = message.fragments - message.next_position if message.begun else 1
                 if message.ended or left <= 0:
                     fresh.popleft()
                     continue
-                return Run(message, message.next_position, left, again=False)
+                return Run(message, message.next_position, left, again=False, stale=fresh is level.stale_fresh)
         self.waiting &= ~(1 << priority)
         return None
 

@@ -3,8 +3,8 @@
 1. Startup doubles the window once per round trip until the round trip has grown by `START_QUEUE_S`.
 2. Then, once per round trip: w <- w/2 + (w * least / standing + a) / 2, where a is `QUEUE_S` worth of packets: the
    window settles where the sender keeps that much queue at the bottleneck, and no more.
-3. w never exceeds twice what the measured delivery rate needs, plus a: a queue too short to be seen as delay is not
-   overrun.
+3. w never exceeds by much what the measured delivery rate needs, plus a, and growth that delivers nothing more ends: a
+   queue too short to be seen as delay is not overrun.
 4. A *drain* lets the queue run empty for one round trip, so that the least round trip is seen again: after
    `DRAIN_EVERY_S` without having seen it, and as soon as the round trip looks longer than our own queue explains. If
    it stays long while the queue is empty, the route has changed: the window moves at once to the new round trip times
@@ -46,7 +46,7 @@ CAPACITY_GAIN = 1.05
 LOSS_GAIN = 0.3
 """And by this much of the loss: its estimate scatters, and too slow a pace costs throughput."""
 
-MOST_LOSS = 0.5
+MOST_LOSS = 0.35
 """The measured rate is that of deliveries; what is lost comes on top, up to this share of what is sent."""
 
 START_WINDOW = 10.0
@@ -73,6 +73,21 @@ GROWTH = 1.25
 
 GROW_AFTER_ROUNDS = 3
 """Round trips without a queue before growth: two happen by themselves around the law's balance."""
+
+FULL_GROWTH = 1.1
+FULL_ROUNDS = 3
+"""A link that did not deliver a tenth more after so many rounds of growth is full, whatever its delay says."""
+
+GROW_AGAIN_S = 2.0
+"""How long after that growth is not tried again."""
+
+RATE_BOUND = 1.2
+START_RATE_BOUND = 2.5
+"""The window never exceeds this many times what the measured rate needs; growing it must run ahead of the
+measurement."""
+
+ACK_BATCH_S = 0.008
+"""About how long batched acknowledgements hold packets in the window beyond the round trip."""
 
 SUSPECT_QUEUE_S = 0.015
 """Queueing of this much is more than our own window explains."""
@@ -157,6 +172,8 @@ class AdaptiveWindow:
     __slots__ = (
         "_drained_at",
         "_empty_rounds",
+        "_full_capacity",
+        "_full_rounds",
         "_grow_from",
         "_growing",
         "_held_least",
@@ -186,6 +203,8 @@ class AdaptiveWindow:
         self._updated_at = 0.0
         self._drained_at = 0.0
         self._empty_rounds = 0
+        self._full_capacity = 0.0
+        self._full_rounds = 0
         self._grow_from = 0.0
         self._growing = False
         self._loss = 0.0
@@ -273,7 +292,7 @@ class AdaptiveWindow:
         assert standing is not None
         if self.phase is Phase.STARTUP:
             if not limited:
-                self.packets = self._bounded(2 * self.packets, least, standing)
+                self._start_faster(least, standing, now)
             return
         since_drain = now - self._drained_at
         suspect = standing - least > SUSPECT_QUEUE_S + 0.25 * least
@@ -290,6 +309,16 @@ class AdaptiveWindow:
         empty = standing - least < QUEUE_S / 4 and not limited and now >= self._grow_from
         self._empty_rounds = self._empty_rounds + 1 if empty else 0
         if self._empty_rounds >= GROW_AFTER_ROUNDS:
+            capacity = self.capacity() or 0.0
+            if not self._growing or capacity > FULL_GROWTH * self._full_capacity:
+                self._full_capacity, self._full_rounds = capacity, 0
+            else:
+                self._full_rounds += 1
+            if self._full_rounds >= FULL_ROUNDS:
+                self._growing = False
+                self._empty_rounds = 0
+                self._grow_from = now + GROW_AGAIN_S
+                return
             self.packets = self._bounded(GROWTH * self.packets, least, standing)
             self._growing = True
             return
@@ -297,6 +326,22 @@ class AdaptiveWindow:
         wanted = 0.5 * self.packets + 0.5 * (self.packets * least / standing + self._queue(standing))
         if wanted < self.packets or not limited:
             self.packets = self._bounded(min(wanted, 2 * self.packets), least, standing)
+
+    def _start_faster(self, least: float, standing: float, now: float) -> None:
+        """Double, unless the link has not become faster by it for some round trips (its queue is too short to see)."""
+        capacity = self.capacity() or 0.0
+        if capacity > FULL_GROWTH * self._full_capacity:
+            self._full_capacity = capacity
+            self._full_rounds = 0
+        else:
+            self._full_rounds += 1
+        if self._full_rounds >= FULL_ROUNDS:
+            self.phase = Phase.CRUISE
+            self._drained_at = now
+            self._grow_from = now + GROW_AGAIN_S
+            self.packets = self._bounded(self.packets, least, standing)
+        else:
+            self.packets = self._bounded(2 * self.packets, least, standing)
 
     def _queue(self, standing: float) -> float:
         # Losses leave holes in the queue as well as in what arrives.
@@ -306,7 +351,10 @@ class AdaptiveWindow:
     def _bounded(self, packets: float, least: float, standing: float) -> float:
         capacity = self.capacity()
         if capacity is not None:
-            packets = min(packets, max(START_WINDOW, 2 * capacity * max(least, LEAST_UPDATE_S) + self._queue(standing)))
+            factor = RATE_BOUND if self.phase is Phase.CRUISE and not self._growing else START_RATE_BOUND
+            # What waits for a batched acknowledgement is on its way too, and what is lost takes part in the window.
+            pipe = capacity * (least + ACK_BATCH_S) / (1 - min(self._loss, MOST_LOSS))
+            packets = min(packets, max(START_WINDOW, factor * pipe + self._queue(standing)))
         return min(MOST_WINDOW, max(LEAST_WINDOW, packets))
 
     def _begin_drain(self, now: float, *, suspicion: bool) -> None:

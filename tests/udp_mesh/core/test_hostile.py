@@ -1,4 +1,4 @@
-"""Hostile bytes: random, mutated, replayed, forged by a key holder; nothing crashes, grows, or delays what is urgent."""
+"""Hostile bytes: random, mutated, replayed, forged by a key holder; nothing crashes, grows, or delays the urgent."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-"""Every accepted reliable message ends, per destination, in exactly one of delivered, expired, peer lost; and a delivered
-one arrived, once per run of its receiver."""
+"""Every accepted reliable message ends, per destination, in exactly one of delivered, expired, peer lost.
+
+And a delivered one arrived whole, once per run of its receiver.
+"""
 
 import random
 from collections import Counter

@@ -1,6 +1,7 @@
 """The small parts against obvious slow versions: ranges, flight, reassembly, compression, acknowledgements, buckets."""
 
 import zlib
+from itertools import pairwise
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -28,7 +29,7 @@ def test_a_range_set_equals_a_plain_set(numbers: list[int]) -> None:
     assert [number in ranges for number in range(62)] == [number in plain for number in range(62)]
     pairs = ranges.ranges()
     assert all(first <= last for first, last in pairs)
-    assert all(before[1] + 1 < after[0] for before, after in zip(pairs, pairs[1:], strict=False))
+    assert all(before[1] + 1 < after[0] for before, after in pairwise(pairs))
 
 
 def pieces_of(body: bytes, size: int, message_id: int = 1) -> list[Fragment]:

@@ -161,11 +161,11 @@ def test_neighbours_are_met_without_any_broadcast() -> None:
     for step in range(300):
         if step == 200:
             nodes["a"].send("any", b"to all", now=now)
-        for name, own, other in (("a", A, "b"), ("b", B, "a")):
+        for name, address, to in (("a", A, "b"), ("b", B, "a")):
             nodes[name].handle_timer(now)
             for datagram in nodes[name].datagrams_to_send(now):
                 destinations.add(datagram.destination)
-                nodes[other].receive(datagram.data, "tunnel", own, now)
+                nodes[to].receive(datagram.data, "tunnel", address, now)
         now += 0.01
     assert destinations == {A, B}
     events = []
