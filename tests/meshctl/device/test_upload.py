@@ -89,7 +89,9 @@ def test_an_upload_goes_on_after_every_cut_from_what_was_verified(node: Sandbox,
     with dropbear(node) as server, log_in(server, node, tmp_path) as connected:
         done = upload(connected, data, TARGET)
     assert node.path(TARGET).read_bytes() == data
-    assert (done.kept, done.sent) == (3 * CHUNK_BYTES, 2 * CHUNK_BYTES + 99)
+    # the chunk under way at a cut may have arrived whole, so more than what was verified may be kept, never less
+    assert done.kept >= 3 * CHUNK_BYTES
+    assert done.kept + done.sent == len(data)
     assert leftovers(node) == []
 
 
