@@ -99,6 +99,8 @@ class Rig:
     parallel: int = 8
     firmware: Mapping[str, str] = field(default_factory=dict)
     fleet: VirtualFleet = field(init=False)
+    # which of the inventories a and b the nodes run
+    current: str = "a"
 
     def __enter__(self) -> Self:
         self.directory.mkdir(parents=True, exist_ok=True)
@@ -146,6 +148,11 @@ class Rig:
     @property
     def _key(self) -> Path:
         return self.directory / "key"
+
+    def flip(self) -> tuple[str, str]:
+        """The inventory the nodes run and the one they shall run next, which counts as current from now on."""
+        old, self.current = self.current, {"a": "b", "b": "a"}[self.current]
+        return old, self.current
 
     def inventory(self, variant: str) -> Path:
         return self.directory / f"{variant}.yaml"

@@ -1,0 +1,77 @@
+"""The commands of provisioning against a real virtual fleet, as an operator uses them one after the other."""
+
+from __future__ import annotations
+
+import json
+import signal
+
+import pytest
+
+from tests.meshctl.proof.rig import Ended, Rig
+
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab"), pytest.mark.timeout(600)]
+
+
+def test_a_fleet_that_is_right_has_nothing_to_do(rig: Rig) -> None:
+    again = rig.meshctl("provision", rig.current, "--check", "--json")
+    assert (again.code, set(again.verdicts.values())) == (0, {"same"}), again.err
+
+
+def test_a_saved_plan_is_applied_exactly_and_a_node_that_moved_on_is_refused(rig: Rig) -> None:
+    old, new = rig.flip()
+    file = rig.directory / "plan.json"
+    assert rig.meshctl("plan", new, "--brief", "--out", str(file)).code == 0
+    rig.fleet.node("n001").exec("uci set system.@system[0].log_size=999 && uci commit system").check("edit by hand")
+    applied = rig.meshctl("apply", new, str(file), "--json")
+    expected = {name: "refused" if name == "n001" else "done" for name in ("base", *rig.names)}
+    assert (applied.code, applied.results) == (1, expected), applied.err
+    assert rig.state_of("n002", old, new) == "new"
+    drifted = rig.meshctl("provision", new, "--check", "--json")
+    assert (drifted.code, drifted.verdicts["n001"], drifted.verdicts["n002"]) == (1, "change", "same")
+    assert rig.meshctl("provision", new, "n001", "--yes", "--json").results == {"n001": "done"}
+
+
+def test_ctrl_c_ends_the_nodes_in_work_properly_and_a_resume_takes_up_the_rest(rig: Rig) -> None:
+    _, new = rig.flip()
+    said: list[str] = []
+    with rig.start("provision", new, "--yes", "--json") as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            said.append(line)
+            if json.loads(line)["event"] == "step":
+                process.send_signal(signal.SIGINT)
+                break
+        rest, err = process.communicate()
+    ended = Ended(process.returncode, "".join(said) + rest, err)
+    assert ended.code == 130, err
+    left = {name for name, result in ended.results.items() if result == "pending"}
+    assert {result for name, result in ended.results.items() if name not in left} == {"done"}
+    assert "base" in left
+    resumed = rig.meshctl("resume", new, "--yes", "--json")
+    assert (resumed.code, resumed.results) == (0, dict.fromkeys(sorted(left), "done")), resumed.err
+
+
+def test_a_backup_brings_back_what_was(rig: Rig) -> None:
+    folder = rig.directory / "backups"
+    assert rig.meshctl("backup", rig.current, "n001", "--out", str(folder)).code == 0
+    (file,) = folder.iterdir()
+    assert file.stat().st_mode & 0o077 == 0
+    rig.fleet.node("n001").exec("uci set system.@system[0].log_size=999 && uci commit system").check("edit by hand")
+    restored = rig.meshctl("restore", rig.current, "n001", str(file), "--yes")
+    assert restored.code == 0, restored.out + restored.err
+    assert rig.state_of("n001", "split", rig.current) == "new"
+    wrong = rig.meshctl("restore", rig.current, "n002", str(file), "--yes")
+    assert "the backup is of n001, not of n002" in wrong.err
+
+
+def test_a_command_runs_on_all_nodes_and_a_failure_is_told(rig: Rig) -> None:
+    done = rig.meshctl("run", rig.current, "n*", command=["grep", "^node=", "/etc/meshctl/node"])
+    assert (done.code, sorted(done.out.splitlines())) == (0, [f"{name}: node={name}" for name in rig.names])
+    failed = rig.meshctl("run", rig.current, "n001", command=["false"])
+    assert (failed.code, failed.err) == (1, "n001: exit status 1\n")
+
+
+def test_the_journal_tells_every_run_with_its_steps(rig: Rig) -> None:
+    first = json.loads(rig.meshctl("history", "", "1", "--json").out)
+    assert (first["command"], {outcome["result"] for outcome in first["outcomes"]}) == ("bootstrap", {"done"})
+    assert [step["step"] for step in first["steps"] if step["node"] == "n001"] == ["stage", "arm", "apply", "prove"]
