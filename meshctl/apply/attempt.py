@@ -85,7 +85,7 @@ def prepare(attempt: Attempt, connection: SshConnection) -> None:
     job, owner = attempt.job, attempt.job.work.owner
     attempt.starts += 1
     with job.step("stage"):
-        _install(job, connection)
+        install_switch(job, connection)
         deadman.lock(connection, owner, ttl_s=attempt.window_s + LOCK_SLACK_S)
         deadman.stage(
             connection, owner, attempt.change, rate_bytes_per_s=job.work.rate_bytes_per_s, progress=job.progress
@@ -94,7 +94,7 @@ def prepare(attempt: Attempt, connection: SshConnection) -> None:
         deadman.arm(connection, owner, attempt.id, nonce=attempt.nonce, window_s=attempt.window_s)
 
 
-def _install(job: Job, connection: SshConnection) -> None:
+def install_switch(job: Job, connection: SshConnection) -> None:
     """Put the switch there unless this very version already is."""
     known = job.before.change
     own = re.search(rb"^VERSION=(\S+)", deadman.installed_files()[deadman.PROGRAM][1], re.MULTILINE)

@@ -12,9 +12,10 @@ import io
 import secrets
 import tarfile
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
-from meshctl.apply.attempt import LOCK_SLACK_S
+from meshctl.apply.attempt import LOCK_SLACK_S, install_switch
 from meshctl.apply.job import Job
 from meshctl.apply.waiting import Pace
 from meshctl.device import deadman, openwrt
@@ -57,6 +58,10 @@ def flash(job: Job, connection: SshConnection, image: Path) -> Outcome:
     """Flash a node and prove it. Owns `connection`. Raises NodeError only while nothing on the node has stopped."""
     try:
         marker = _send(job, connection, image)
+    except NodeError:
+        with suppress(NodeError):
+            deadman.unlock(connection, job.work.owner)
+        raise
     finally:
         connection.close()
     with job.step("flash"):
@@ -68,6 +73,8 @@ def _send(job: Job, connection: SshConnection, image: Path) -> str:
     size = image.stat().st_size
     with job.step("check"):
         _check_memory(job.before, size)
+        # for its lock: a device fresh from its box has none
+        install_switch(job, connection)
         deadman.lock(connection, job.work.owner, ttl_s=int(RETURN_S) + LOCK_SLACK_S)
     with job.step("upload"):
         upload(

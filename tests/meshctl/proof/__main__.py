@@ -52,20 +52,26 @@ def _run(part: str, chosen: argparse.Namespace, out: TextIO, directory: Path) ->
     match part:
         case "apply":
             with Rig(directory, chosen.nodes) as rig:
-                rig.take_in("a")
+                _take_in(rig)
                 apply_matrix(rig, tell, every=chosen.every)
         case "flash":
             with Rig(directory, chosen.nodes, firmware=firmware(directory)) as rig:
-                rig.take_in("a")
+                _take_in(rig)
                 flash_matrix(rig, tell, every=chosen.every)
         case "crowd":
             with Rig(directory, chosen.crowd) as rig:
                 began = time.monotonic()
-                taken = rig.take_in("a")
-                first = {"bootstrapped": len(taken.results), "bootstrap_s": round(time.monotonic() - began, 1)}
+                _take_in(rig)
+                first = {"bootstrap_s": round(time.monotonic() - began, 1)}
                 write({"part": part, **first, **hurt_and_provision(rig, share=0.05, old="a", new="b")})
         case _:
             raise SystemExit(f"no part is called {part!r}: expected {', '.join(PARTS)}")
+
+
+def _take_in(rig: Rig) -> None:
+    taken = rig.take_in("a")
+    if taken.code != 0:
+        raise SystemExit(f"the fleet could not be taken in: {taken.out} {taken.err}")
 
 
 def _report(path: Path) -> int:
