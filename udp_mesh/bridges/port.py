@@ -1,0 +1,129 @@
+"""A bridge's connection to the daemon: kept up through restarts of the daemon, on a thread of its own.
+
+`run` connects, subscribes, says `on_up`, hands every frame to `on_frame`, and starts over when the daemon is gone.
+`publish` may be called from any thread; `request` uses a second connection, so that no reply waits behind messages.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import Any, Callable, Mapping, Sequence
+
+from udp_mesh.client.mesh_client import Frame, Header, MeshClient, MeshError
+
+log = logging.getLogger(__name__)
+
+CONDITIONS_TOPIC = "~mesh/conditions"
+READ_S = 0.5
+"""How long a read waits before it looks whether to stop."""
+RECONNECT_S = 1.0
+"""Between two attempts to reach the daemon: its restart takes about that long."""
+
+
+class MeshPort:
+    """The daemon as a bridge sees it."""
+
+    def __init__(self, path: str, patterns: Sequence[str]) -> None:
+        self._path = path
+        self._patterns = list(patterns)
+        self._client: MeshClient | None = None
+        self._commands: MeshClient | None = None
+        self._command_lock = threading.Lock()
+        self.refused = 0
+        """Messages that could not be handed over: no daemon, or the daemon refused them."""
+
+    def run(self, stop: threading.Event, on_up: Callable[[], None], on_frame: Callable[[Frame], None]) -> None:
+        """Until `stop`. `on_up` is called after every connect, on this thread, as is `on_frame`."""
+        told = False
+        while not stop.is_set():
+            try:
+                with MeshClient(self._path) as client:
+                    client.subscribe(*self._patterns)
+                    client.request("events")
+                    self._client = client
+                    log.info("daemon-connected socket=%s", self._path)
+                    told = False
+                    on_up()
+                    while not stop.is_set():
+                        frame = client.next_frame(READ_S)
+                        if frame is not None:
+                            self._take(frame, on_frame)
+            except MeshError as error:
+                if not told:
+                    log.warning("daemon-unreachable %s", error)
+                    told = True
+            finally:
+                self._client = None
+            stop.wait(RECONNECT_S)
+        self._drop_commands()
+
+    def _take(self, frame: Frame, on_frame: Callable[[Frame], None]) -> None:
+        event = frame[0].get("event")
+        if event == "rejected":
+            self.refused += 1
+            log.warning("message-refused %s", frame[0].get("error"))
+        else:
+            on_frame(frame)
+
+    def publish(self, topic: str, payload: bytes, peer: str | None, type_text: str) -> bool:
+        """Hands a message over; False where there is no daemon now. What the daemon refuses is logged."""
+        client = self._client
+        if client is not None:
+            try:
+                client.publish(topic, payload, to=peer, type=type_text, wait=False)
+                return True
+            except MeshError as error:
+                log.warning("message-lost topic=%s %s", topic, error)
+        self.refused += 1
+        return False
+
+    def request(self, op: str, **fields: Any) -> Header:
+        """A reply's header. Raises MeshError."""
+        with self._command_lock:
+            if self._commands is None:
+                self._commands = MeshClient(self._path)
+            try:
+                return self._commands.request(op, **fields)
+            except MeshError as error:
+                if error.code in ("unreachable", "timeout", "bad-frame"):
+                    self._commands.close()
+                    self._commands = None
+                raise
+
+    def _drop_commands(self) -> None:
+        with self._command_lock:
+            if self._commands is not None:
+                self._commands.close()
+                self._commands = None
+
+    # What bridges ask the daemon
+
+    def ensure_topics(self, wanted: Mapping[str, Mapping[str, object]]) -> dict[str, tuple[str, ...]]:
+        """Declares topics the daemon does not know; returns all it knows, each with its destinations.
+
+        The daemon's file goes first: a topic it lists stays as it is. Raises MeshError.
+        """
+        found = self.topics()
+        for topic, values in wanted.items():
+            if topic not in found:
+                self.request("set-topic", topic=topic, values=dict(values))
+                found[topic] = ()
+        return found
+
+    def topics(self) -> dict[str, tuple[str, ...]]:
+        """Declared topics with their destinations. Raises MeshError."""
+        rows = self.request("topics")["topics"]
+        return {row["name"]: tuple(row.get("destinations", ())) for row in rows if row["configured"]}
+
+    def takes_undeclared(self) -> bool:
+        """Whether the daemon carries topics nobody declared. Raises MeshError."""
+        return self.request("topics")["undeclared"] is not None
+
+    def peers(self) -> dict[str, bool]:
+        """Peers the daemon knows: whether each is online. Raises MeshError."""
+        return {row["name"]: bool(row["online"]) for row in self.request("peers")["peers"]}
+
+    def own_name(self) -> str:
+        """The daemon's name. Raises MeshError."""
+        return str(self.request("status")["conditions"]["name"])

@@ -1,0 +1,234 @@
+"""Decides what a ROS bridge does with everything that happens, as effects for its edges. Pure; no clock, no ROS.
+
+1. From ROS: the definition goes out once per destination, then the message, its type in the type field. The last of
+   every latched publisher is kept for robots that join later.
+2. From the mesh: a message whose definition is here is published; others wait, and their source is asked.
+3. From other bridges: greetings are answered with the latched messages they lack, questions with definitions.
+4. Peers that come online are greeted. `tick` asks again.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from typing import Deque, Iterable, Literal, Mapping, NamedTuple, Union
+
+from udp_mesh.bridges.exchange import Definition, ExchangeError, Hello, Want, decode, digest, encode
+from udp_mesh.bridges.names import Route, inbound_name, ros_word
+from udp_mesh.bridges.types import Definitions, MessageKind, TypeKey, kind_text, parse_kind
+
+MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 64, 32 << 20
+"""Per source, while a definition is on its way: a second's worth; more is dropped, the oldest first."""
+MAX_LATCHED, MAX_LATCHED_BYTES = 4096, 64 << 20
+"""Latched messages kept for late robots: a publisher that latches under ever new names."""
+MAX_HELD_DIGESTS = 32
+"""Latched messages remembered per source and topic: several nodes may latch on one topic (tf_static)."""
+ASK_AGAIN_S = 1.0
+"""Between two questions for one definition."""
+
+
+class ToMesh(NamedTuple):
+    """Publish on the mesh; `peer` None: the topic's destinations, or all."""
+
+    topic: str
+    payload: bytes
+    peer: str | None
+    type: str
+
+
+class ToRos(NamedTuple):
+    """Publish in ROS. `definition` is None where the source did not say (a fielded robot)."""
+
+    name: str
+    key: TypeKey
+    definition: str | None
+    latched: bool
+    payload: bytes
+
+
+class Note(NamedTuple):
+    """Tell the operator."""
+
+    text: str
+
+
+Effect = Union[ToMesh, ToRos, Note]
+
+
+class _Waiting(NamedTuple):
+    topic: str
+    kind: MessageKind
+    payload: bytes
+
+
+class Relay:
+    """One bridge's state. ROS 1 types have two parts (`pkg/Type`), and a message can only be published with its
+    definition; ROS 2 types have three (`pkg/msg/Type`), and must be installed on both sides."""
+
+    def __init__(self, own: str, exchange_topic: str, *, ros_version: Literal[1, 2]) -> None:
+        self.own = own
+        self.exchange_topic = exchange_topic
+        self.dropped = 0
+        self._needs_definitions = ros_version == 1
+        self._slashes = ros_version
+        self._definitions = Definitions()
+        self._told: set[tuple[TypeKey, str | None]] = set()
+        self._latched: OrderedDict[tuple[Route, str], tuple[MessageKind, bytes]] = OrderedDict()
+        self._latched_bytes = 0
+        self._holds: dict[str, dict[str, Deque[str]]] = {}
+        self._waiting: dict[str, Deque[_Waiting]] = {}
+        self._asked_at: dict[tuple[str, TypeKey], float] = {}
+        self._destinations: Mapping[str, Iterable[str]] = {}
+
+    def topics_are(self, destinations: Mapping[str, Iterable[str]]) -> None:
+        """The daemon's topics, each with the peers it goes to (none: all)."""
+        self._destinations = destinations
+
+    # From ROS
+
+    def from_ros(
+        self, route: Route, publisher: str, key: TypeKey, definition: str, latched: bool, payload: bytes
+    ) -> list[Effect]:
+        """A node published. `publisher` tells apart several that latch on one topic."""
+        effects: list[Effect] = []
+        kind = MessageKind(key, latched)
+        if self._needs_definitions:
+            self._definitions.put(key, definition)
+            if (key, route.peer) not in self._told:
+                self._told.add((key, route.peer))
+                effects.append(self._to_bridges(Definition(key, definition), route.peer))
+        if latched:
+            self._keep_latched(route, publisher, kind, payload)
+        effects.append(ToMesh(route.topic, payload, route.peer, kind_text(kind)))
+        return effects
+
+    def _keep_latched(self, route: Route, publisher: str, kind: MessageKind, payload: bytes) -> None:
+        old = self._latched.pop((route, publisher), None)
+        self._latched_bytes += len(payload) - (0 if old is None else len(old[1]))
+        self._latched[route, publisher] = (kind, payload)
+        while len(self._latched) > MAX_LATCHED or self._latched_bytes > MAX_LATCHED_BYTES:
+            _, (_, forgotten) = self._latched.popitem(last=False)
+            self._latched_bytes -= len(forgotten)
+
+    # From the mesh
+
+    def from_mesh(self, source: str, topic: str, type_text: str, payload: bytes, now: float) -> list[Effect]:
+        """A message arrived."""
+        if topic == self.exchange_topic:
+            return self._from_bridge(source, payload)
+        kind = parse_kind(type_text)
+        if kind is None or kind.key.name.count("/") != self._slashes:
+            return []
+        if ros_word(source) == ros_word(self.own):
+            return [Note("{} reads like our own name: its messages are not published".format(source))]
+        if kind.latched:
+            held = self._holds.setdefault(source, {}).setdefault(topic, deque(maxlen=MAX_HELD_DIGESTS))
+            name = digest(kind_text(kind._replace(repeat=False)), payload)
+            if kind.repeat and name in held:
+                return []
+            if name not in held:
+                held.append(name)
+        message = _Waiting(topic, kind, payload)
+        waiting = self._waiting.get(source)
+        blocked = waiting is not None and any(other.topic == topic for other in waiting)
+        if not blocked and self._known(kind.key):
+            return [self._publication(source, message)]
+        self._wait(source, message)
+        return self._ask(source, kind.key, now)
+
+    def _known(self, key: TypeKey) -> bool:
+        return not self._needs_definitions or not key.checksum or key in self._definitions
+
+    def _publication(self, source: str, message: _Waiting) -> ToRos:
+        key = message.kind.key
+        name = inbound_name(self.own, source, message.topic)
+        return ToRos(name, key, self._definitions.get(key), message.kind.latched, message.payload)
+
+    def _wait(self, source: str, message: _Waiting) -> None:
+        waiting = self._waiting.setdefault(source, deque())
+        waiting.append(message)
+        while len(waiting) > MAX_WAITING_MESSAGES or sum(len(each.payload) for each in waiting) > MAX_WAITING_BYTES:
+            waiting.popleft()
+            self.dropped += 1
+
+    def _ask(self, source: str, key: TypeKey, now: float) -> list[Effect]:
+        asked_at = self._asked_at.get((source, key))
+        if self._known(key) or (asked_at is not None and now - asked_at < ASK_AGAIN_S):
+            return []
+        self._asked_at[source, key] = now
+        return [self._to_bridges(Want([key]), source)]
+
+    # Between bridges
+
+    def _from_bridge(self, source: str, payload: bytes) -> list[Effect]:
+        try:
+            message = decode(payload)
+        except ExchangeError as error:
+            return [Note("a message from {} on {}: {}".format(source, self.exchange_topic, error))]
+        if isinstance(message, Definition):
+            if not self._definitions.put(message.key, message.text):
+                return []
+            return self._resume()
+        if isinstance(message, Want):
+            return self._tell(message.keys, source)
+        effects = [self.greeting(source, answer=False)] if message.answer else []
+        return effects + self._missing(source, message.holds)
+
+    def _tell(self, keys: Iterable[TypeKey], peer: str) -> list[Effect]:
+        found = ((key, self._definitions.get(key)) for key in keys)
+        return [self._to_bridges(Definition(key, text), peer) for key, text in found if text is not None]
+
+    def _missing(self, peer: str, holds: Mapping[str, Iterable[str]]) -> list[Effect]:
+        """Our latched messages that the peer has not."""
+        effects: list[Effect] = []
+        for (route, _), (kind, payload) in self._latched.items():
+            allowed = list(self._destinations.get(route.topic, ()))
+            if route.peer not in (None, peer) or (route.peer is None and allowed and peer not in allowed):
+                continue
+            if digest(kind_text(kind), payload) not in holds.get(route.topic, ()):
+                effects.append(ToMesh(route.topic, payload, peer, kind_text(kind._replace(repeat=True))))
+        return effects
+
+    def _resume(self) -> list[Effect]:
+        """Publishes what waited for a definition, in order per source and topic."""
+        effects: list[Effect] = []
+        for source, waiting in list(self._waiting.items()):
+            blocked: set[str] = set()
+            left: Deque[_Waiting] = deque()
+            for message in waiting:
+                if message.topic not in blocked and self._known(message.kind.key):
+                    effects.append(self._publication(source, message))
+                else:
+                    blocked.add(message.topic)
+                    left.append(message)
+            if left:
+                self._waiting[source] = left
+            else:
+                del self._waiting[source]
+        self._asked_at = {asked: at for asked, at in self._asked_at.items() if not self._known(asked[1])}
+        return effects
+
+    def greeting(self, peer: str | None, *, answer: bool) -> Effect:
+        """A greeting for one peer, or (None) for all."""
+        held = self._holds.get(peer, {}) if peer is not None else {}
+        return self._to_bridges(Hello({topic: list(digests) for topic, digests in held.items()}, answer), peer)
+
+    def _to_bridges(self, message: Hello | Want | Definition, peer: str | None) -> ToMesh:
+        return ToMesh(self.exchange_topic, encode(message), peer, "bridge")
+
+    # Peers and time
+
+    def started(self, online: Iterable[str]) -> list[Effect]:
+        """The daemon is there (again): greet everyone who is online."""
+        return [self.greeting(peer, answer=True) for peer in online]
+
+    def peer_online(self, peer: str) -> list[Effect]:
+        """Greets it: each side then sends the latched messages that the other lacks."""
+        return [self.greeting(peer, answer=True)]
+
+    def tick(self, now: float) -> list[Effect]:
+        """Asks again for definitions that did not come."""
+        effects: list[Effect] = []
+        for source, waiting in self._waiting.items():
+            for key in OrderedDict.fromkeys(message.kind.key for message in waiting):
+                effects += self._ask(source, key, now)
+        return effects
