@@ -1,6 +1,6 @@
 """`python -m tests.meshctl.proof`: run the proofs, write every case to a JSONL file, print the tables.
 
-Parts: apply, flash, crowd. `--table FILE` prints the tables of an earlier run.
+Parts: apply, kill, flash, crowd. `--table FILE` prints the tables of an earlier run.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import Any, TextIO
 
 from tests.meshctl.proof.crowd import hurt_and_provision
 from tests.meshctl.proof.kills import Case
-from tests.meshctl.proof.matrix import apply_matrix, firmware, flash_matrix, table
+from tests.meshctl.proof.matrix import apply_matrix, firmware, flash_matrix, kill_matrix, table
 from tests.meshctl.proof.rig import Rig
 
-PARTS = ("apply", "flash", "crowd")
+PARTS = ("apply", "kill", "flash", "crowd")
 
 
 def main() -> int:
@@ -54,6 +54,10 @@ def _run(part: str, chosen: argparse.Namespace, out: TextIO, directory: Path) ->
             with Rig(directory, chosen.nodes) as rig:
                 _take_in(rig)
                 apply_matrix(rig, tell, every=chosen.every)
+        case "kill":
+            with Rig(directory, chosen.nodes) as rig:
+                _take_in(rig)
+                kill_matrix(rig, tell, every=chosen.every)
         case "flash":
             with Rig(directory, chosen.nodes, firmware=firmware(directory)) as rig:
                 _take_in(rig)

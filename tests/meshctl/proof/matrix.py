@@ -1,7 +1,7 @@
 """The whole kill matrix: every external command a node runs during apply and flash, every word meshctl says meanwhile.
 
 `recorded` lists the commands of one undisturbed run; `apply_matrix` and `flash_matrix` strike at each of them, a batch
-of nodes at a time, going back and forth between two states; `phase_of` says what a command belongs to; `table` sums up.
+of nodes at a time, `kill_matrix` at meshctl, going back and forth between two states; `phase_of` says what a command belongs to; `table` sums up.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def recorded(rig: Rig, new: str) -> list[str]:
 
 
 def apply_matrix(rig: Rig, tell: Callable[[Case, str], None], *, every: int = 1) -> None:
-    """Power and links cut at every `every`-th command of an apply, and meshctl killed at every of its words."""
+    """Power and links cut at every `every`-th command of an apply."""
     commands = recorded(rig, "b")
     phases = phases_of(commands)
     there, other = "b", "a"
@@ -68,6 +68,11 @@ def apply_matrix(rig: Rig, tell: Callable[[Case, str], None], *, every: int = 1)
             for case in strike_nodes(rig, steps, kind, old=there, new=other):
                 tell(case, phases[int(case.step) - 1])
             there, other = other, there
+
+
+def kill_matrix(rig: Rig, tell: Callable[[Case, str], None], *, every: int = 1) -> None:
+    """meshctl killed at every `every`-th of its words (node begun, step, progress, outcome)."""
+    there, other = "a", "b"
     words, is_killed = 1, True
     while is_killed:
         cases = strike_meshctl(rig, words, old=there, new=other)

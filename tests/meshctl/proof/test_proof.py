@@ -6,7 +6,7 @@ import pytest
 
 from tests.meshctl.proof.crowd import hurt_and_provision
 from tests.meshctl.proof.kills import Case
-from tests.meshctl.proof.matrix import apply_matrix, firmware, flash_matrix
+from tests.meshctl.proof.matrix import apply_matrix, firmware, flash_matrix, kill_matrix
 from tests.meshctl.proof.rig import Rig
 
 pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("lab"), pytest.mark.timeout(6 * 3600)]
@@ -17,6 +17,14 @@ def test_no_cut_at_any_step_of_an_apply_strands_a_node(tmp_path_factory: pytest.
     with Rig(tmp_path_factory.mktemp("apply"), 8) as rig:
         assert rig.take_in("a").code == 0
         apply_matrix(rig, lambda case, phase: None if case.holds else bad.append(case))
+    assert bad == []
+
+
+def test_killing_meshctl_at_any_of_its_words_strands_no_node(tmp_path_factory: pytest.TempPathFactory) -> None:
+    bad: list[Case] = []
+    with Rig(tmp_path_factory.mktemp("kill"), 8) as rig:
+        assert rig.take_in("a").code == 0
+        kill_matrix(rig, lambda case, phase: None if case.holds else bad.append(case))
     assert bad == []
 
 
