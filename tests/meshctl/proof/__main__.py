@@ -61,7 +61,7 @@ def _run(part: str, chosen: argparse.Namespace, out: TextIO, directory: Path) ->
         case "flash":
             with Rig(directory, chosen.nodes, firmware=firmware(directory)) as rig:
                 _take_in(rig)
-                flash_matrix(rig, tell, every=chosen.every)
+                flash_matrix(rig, tell)
         case "crowd":
             with Rig(directory, chosen.crowd) as rig:
                 began = time.monotonic()

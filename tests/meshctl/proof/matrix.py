@@ -1,7 +1,7 @@
-"""The whole kill matrix: every external command a node runs during apply and flash, every word meshctl says meanwhile.
+"""The whole kill matrix: every external command a node runs during an apply, every step of a flash, every word of meshctl.
 
-`recorded` lists the commands of one undisturbed run; `apply_matrix` and `flash_matrix` strike at each of them, a batch
-of nodes at a time, `kill_matrix` at meshctl, going back and forth between two states; `phase_of` says what a command belongs to; `table` sums up.
+`recorded` lists the commands of one undisturbed run; `apply_matrix` and `flash_matrix` strike at them, a batch of
+nodes at a time, `kill_matrix` at meshctl, all going back and forth between two states; `table` sums up.
 """
 
 from __future__ import annotations
@@ -9,11 +9,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from meshctl.lab.images import firmware_image
 from meshctl.model import Release
 from tests.meshctl.proof.kills import Case, strike_meshctl, strike_nodes
 from tests.meshctl.proof.rig import Rig
+
+T = TypeVar("T")
 
 # A command that begins a phase, in the order in which they come; what comes before the first is `observe`.
 PHASES = (
@@ -26,18 +29,25 @@ PHASES = (
     ("prove", "cat /proc/uptime"),
     ("confirm", "confirmed."),
 )
-FLASH_PHASES = (
-    ("lock", "lock."),
-    ("upload", "firmware.bin"),
+# A flash ends in a reboot that forgets what was recorded, so its steps are named: phase and words of a command.
+FLASH_STEPS = (
+    ("observe", "cat /etc/board.json"),
+    ("lock", "ln /tmp/meshctl/new"),
+    ("upload", "dd if=/dev/null of=/tmp/meshctl/.firmware.bin"),
+    ("upload", "tail -c"),
+    ("upload", "mv -f /tmp/meshctl/.firmware.bin"),
     ("test", "sysupgrade -T"),
-    ("archive", "firmware.tgz"),
-    ("flash", "sysupgrade -n"),
+    ("test", "ubus call system validate_firmware_image"),
+    ("archive", "tar -cf"),
+    ("archive", "mv -f /tmp/meshctl/.firmware.tgz"),
+    ("start", "start-stop-daemon"),
+    ("start", "sysupgrade -n"),
 )
 
 
-def phases_of(commands: Sequence[str], marks: Sequence[tuple[str, str]] = PHASES) -> list[str]:
+def phases_of(commands: Sequence[str]) -> list[str]:
     """The phase of each command: phases come in order, each begins with the first command that holds its mark."""
-    phases, left, now = [], list(marks), "observe"
+    phases, left, now = [], list(PHASES), "observe"
     for command in commands:
         if left and left[0][1] in command:
             now = left.pop(0)[0]
@@ -83,16 +93,15 @@ def kill_matrix(rig: Rig, tell: Callable[[Case, str], None], *, every: int = 1) 
         words += every
 
 
-def flash_matrix(rig: Rig, tell: Callable[[Case, str], None], *, every: int = 1) -> None:
-    """Power and links cut at every command of a flash; the firmware goes back and forth with the configuration."""
-    commands = recorded(rig, "b")
-    phases = phases_of(commands, FLASH_PHASES)
-    there, other = "b", "a"
+def flash_matrix(rig: Rig, tell: Callable[[Case, str], None]) -> None:
+    """Power and links cut at the steps of a flash; the firmware goes back and forth with the configuration."""
+    there, other = "a", "b"
+    phase_at = {words: phase for phase, words in FLASH_STEPS}
     for kind in ("power-cut", "sever"):
-        for batch in _batches(_struck(phases, every), rig.count):
-            steps = {name: str(number) for name, number in zip(rig.names, batch, strict=False)}
+        for batch in _batches(tuple(phase_at), rig.count):
+            steps = dict(zip(rig.names, batch, strict=False))
             for case in strike_nodes(rig, steps, kind, old=there, new=other, verb="flash"):
-                tell(case, phases[int(case.step) - 1])
+                tell(case, phase_at[case.step])
             there, other = other, there
     for case in strike_nodes(rig, {rig.names[0]: "flash"}, "power-cut", old=there, new=other, verb="flash"):
         tell(case, "writing")
@@ -112,8 +121,8 @@ def _struck(phases: Sequence[str], every: int) -> list[int]:
     ]
 
 
-def _batches(numbers: Sequence[int], size: int) -> Iterator[Sequence[int]]:
-    return (numbers[start : start + size] for start in range(0, len(numbers), size))
+def _batches(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
+    return (items[start : start + size] for start in range(0, len(items), size))
 
 
 def firmware(directory: Path) -> dict[str, str]:
