@@ -1,4 +1,4 @@
-"""The whole kill matrix: every external command a node runs during an apply, every step of a flash, every word of meshctl.
+"""The whole kill matrix: every command a node runs during an apply, every step of a flash, every word of meshctl.
 
 `recorded` lists the commands of one undisturbed run; `apply_matrix` and `flash_matrix` strike at them, a batch of
 nodes at a time, `kill_matrix` at meshctl, all going back and forth between two states; `table` sums up.
