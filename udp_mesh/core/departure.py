@@ -6,6 +6,7 @@ last fragments, small messages, pieces sent again) is built frame by frame, smal
 """
 
 import struct
+from heapq import heappop
 
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.flight import Mark, Packet
@@ -151,7 +152,7 @@ def leave_level(
 def leave_copies(outbound: Outbound, way: Way, now: float, out: list[Datagram]) -> None:
     """Second copies of small urgent messages whose time has come and that were not acknowledged meanwhile."""
     while outbound.copies and outbound.copies[0][0] <= now:
-        _, message, position = outbound.copies.popleft()
+        _, _, message, position = heappop(outbound.copies)
         if message.ended or message.arrived[position] or outbound.silent_since is not None:
             continue
         run = Run(message, position, 1, again=True)
@@ -241,7 +242,7 @@ def _leave_one(outbound: Outbound, way: Way, run: Run, urgent: bool, mark: Mark,
             outbound.since_ack_wanted = 0
         room -= size
         if urgent and message.small and outbound.send_twice:
-            outbound.copies.append((now + outbound.rates.twice_gap_s, message, next_run.position))
+            outbound.copy_later(message, next_run.position, now)
         if not message.reliable and last:
             outbound.finish(message, Outcome.SENT)
         if room < LEAST_ROOM_BYTES:

@@ -68,7 +68,7 @@ class Inbound:
         self.fragments = 0
         self.over_limit = 0
         self._refused: dict[tuple[bool, int], RefuseReason] = {}
-        self._gap_ends = -1
+        self._gap_ends: int | None = None
 
     @property
     def partial_bytes(self) -> int:
@@ -143,12 +143,16 @@ class Inbound:
         acks = self.acks
         if number > acks.largest + 1:
             # A gap: the sender can call it a loss once it knows of three later packets, so tell it then.
-            self._gap_ends = number + REORDER_PACKETS - 1
+            if self._gap_ends is None:
+                self._gap_ends = number + REORDER_PACKETS - 1
             ack_now = ack_now or acks.largest < 0
         acks.saw(number, now)
         acks.pending += 1
-        if ack_now or number == self._gap_ends or acks.pending >= self._rates.ack_every_packets:
+        if self._gap_ends is not None and number >= self._gap_ends:
+            ack_now = True
+        if ack_now or acks.pending >= self._rates.ack_every_packets:
             acks.now_wanted = True
+            self._gap_ends = None
         elif acks.due_at is None:
             acks.due_at = now + self._rates.ack_delay_s
 

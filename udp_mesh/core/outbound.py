@@ -51,6 +51,10 @@ LOSS_MEMORY_PACKETS = 256
 """Packets over which loss is smoothed."""
 
 
+COPY_ROUND_TRIPS = 1.1
+"""Round trips after which the answer to an urgent piece, asked for at once, is overdue."""
+
+
 class Outcome(Enum):
     """How a message ended, besides expiring."""
 
@@ -107,8 +111,9 @@ class Outbound:
         self.announced: set[int] = set()
         """Numbers of topics that the peer knows by name."""
         self.next_wire_id = 0
-        self.copies: deque[tuple[float, Outgoing, int]] = deque()
-        """(when, message, position) of urgent pieces to be sent a second time."""
+        self.copies: list[tuple[float, int, Outgoing, int]] = []
+        """Heap of (when, serial, message, position) of urgent pieces to be sent again unless acknowledged by then."""
+        self._copy_serial = 0
         self.served = 0
         """Mask of levels from which something left in this round."""
         self.wake_at = float("inf")
@@ -271,6 +276,15 @@ class Outbound:
             self.finish(message, ExpiryReason.SUPERSEDED)
         else:
             self.scheduler.push_again(message, position)
+
+    def copy_later(self, message: Outgoing, position: int, now: float) -> None:
+        """A small urgent piece left over a lossy way: again soon, and once more when its answer should be here."""
+        delays = [self.rates.twice_gap_s]
+        if self.trip.smoothed is not None:
+            delays.append(COPY_ROUND_TRIPS * self.trip.smoothed + self.rates.twice_gap_s)
+        for delay in delays:
+            self._copy_serial += 1
+            heappush(self.copies, (now + delay, self._copy_serial, message, position))
 
     # Silence
 

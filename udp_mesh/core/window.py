@@ -24,6 +24,10 @@ QUEUE_S = 0.004
 """Queue the sender keeps at the bottleneck: covers batched acknowledgements and pacing; adds this much to urgent
 latency."""
 
+LOSS_QUEUE = 8.0
+LOSS_QUEUE_UP_TO = 0.05
+"""Losses leave holes in the queue: some more of it keeps the link busy, up to what urgent messages can bear."""
+
 START_QUEUE_S = 0.006
 """Growth of the round trip that ends the startup: more than the scatter of a radio, less than an urgent message's
 slack."""
@@ -345,7 +349,7 @@ class AdaptiveWindow:
 
     def _queue(self, standing: float) -> float:
         # Losses leave holes in the queue as well as in what arrives.
-        queue_s = QUEUE_S * (1 + 3 * min(self._loss, MOST_LOSS))
+        queue_s = QUEUE_S * (1 + LOSS_QUEUE * min(self._loss, LOSS_QUEUE_UP_TO))
         return max(LEAST_QUEUE_PACKETS, queue_s * self.packets / standing)
 
     def _bounded(self, packets: float, least: float, standing: float) -> float:
