@@ -134,8 +134,8 @@ def objections(facts: Facts, *, robot: str, arch: str, python: str, now_s: float
     yield from _python_objections(facts, robot, python)
     skew_s = facts.now_s - now_s
     if abs(skew_s) > MAX_CLOCK_SKEW_S:
-        ahead = "ahead" if skew_s > 0 else "behind"
-        yield f"its clock is {_days(abs(skew_s))} {ahead} of ours", "set it: `date -s`, or let NTP do so"
+        side = "ahead of" if skew_s > 0 else "behind"
+        yield f"its clock is {_days(abs(skew_s))} {side} ours", "set it: `date -s`, or let NTP do so"
     if not facts.is_writable:
         yield "its disk is read-only", "remount it, or look at its log for disk errors"
 

@@ -64,7 +64,11 @@ def own_wheel() -> Wheel:
     spec = importlib.util.find_spec(_PACKAGE)
     if spec is None or spec.origin is None:
         raise InputError(f"the package {_PACKAGE} is not installed beside meshctl")
-    package = Path(spec.origin).parent
+    return build_wheel(Path(spec.origin).parent)
+
+
+def build_wheel(package: Path) -> Wheel:
+    """A wheel of the package in this directory, always the same for the same files."""
     files = {
         f"{_PACKAGE}/{path.relative_to(package).as_posix()}": path.read_bytes()
         for path in sorted(package.rglob("*"))

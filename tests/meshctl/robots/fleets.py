@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,10 @@ class RobotFleet:
         assert done.exit_code == exit_code, done.output
         return done.output
 
+    def refused(self, *words: str) -> str:
+        """What a command says that cannot be done as it was asked for."""
+        return self.meshctl(*words, exit_code=2)
+
     def deploy(self, *words: str, exit_code: int = 0) -> str:
         return self.meshctl("deploy", *words, exit_code=exit_code, wheels=True)
 
@@ -119,6 +124,4 @@ class RobotFleet:
 
 
 def _arch() -> str:
-    import os
-
     return os.uname().machine

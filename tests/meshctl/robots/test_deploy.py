@@ -1,17 +1,108 @@
-"""Deploy over a real OpenSSH server: install, again, upgrade, failure and the way back, refusals in time.
+"""Deploy over a real OpenSSH server: install, again, upgrade, failure and the way back, repair, removal.
 
 The service runs under a stand-in for systemctl; everything else is real.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
+
 from tests.meshctl.robots.fleets import RobotFleet
+from tests.meshctl.robots.wheels import own_wheel_with
+
+# What a second deploy must leave as it is: every file with its time, and the process.
+_EVERYTHING = "find /opt/udp-mesh /etc ! -name .lock -printf '%p %T@ %i\\n' | sort; cat /run/stand-in/*.pid"
 
 
 def test_a_first_deploy_installs_and_starts_and_a_second_changes_nothing(fleet: RobotFleet) -> None:
     fleet.add("husky1")
     fleet.write()
+    assert "nothing is installed" in fleet.meshctl("diff", exit_code=1, wheels=True)
     assert "husky1: done: runs " in fleet.deploy()
-    before = fleet.shell("husky1", "find /opt/udp-mesh -newer /run/sshd | sort; cat /run/stand-in/*.pid")
+    before = fleet.shell("husky1", _EVERYTHING)
     assert "husky1: unchanged: already runs " in fleet.deploy()
-    assert fleet.shell("husky1", "find /opt/udp-mesh -newer /run/sshd | sort; cat /run/stand-in/*.pid") == before
+    assert fleet.shell("husky1", _EVERYTHING) == before
+    # the wheels given once are kept for later commands
+    assert "husky1: as the inventory says" in fleet.meshctl("diff")
+    found = fleet.status()["husky1"]
+    assert found["well"]
+    assert {topic["name"] for topic in found["topics"]} == {"estop", "status"}
+    key = fleet.shell("husky1", "stat -L -c '%a %U' /opt/udp-mesh/current/etc/fleet.key")
+    assert key.split()[:2] == ["600", "udp-mesh"]
+
+
+def test_an_upgrade_switches_and_one_that_fails_goes_back_by_itself(
+    fleet: RobotFleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet.add("husky1")
+    fleet.write()
+    fleet.deploy()
+    first = fleet.status()["husky1"]
+    better = own_wheel_with(tmp_path, "__init__.py", '__version__ = "', '__version__ = "9.')
+    monkeypatch.setattr("meshctl.robots.wheels.own_wheel", lambda: better)
+    assert "husky1: done" in fleet.deploy()
+    second = fleet.status()["husky1"]
+    assert second["status"]["version"].startswith("9.")
+    assert second["previous"] == first["release"]
+
+    broken = own_wheel_with(
+        tmp_path,
+        "daemon/program.py",
+        "    service = Service(",
+        '    raise OSError("no such radio")\n    service = Service(',
+    )
+    monkeypatch.setattr("meshctl.robots.wheels.own_wheel", lambda: broken)
+    told = fleet.deploy("--wait", "5", exit_code=1)
+    assert "husky1: rolled back: systemd could not start the daemon; the release before runs again" in told or (
+        "husky1: rolled back: the daemon does not run" in told
+    )
+    assert "no such radio" in told, "the operator sees the daemon's last words"
+    third = fleet.status()["husky1"]
+    assert third["well"]
+    assert third["release"] == second["release"]
+    assert third["status"]["version"].startswith("9.")
+
+    assert f"husky1: done: runs {first['release']}" in fleet.meshctl("rollback")
+    assert fleet.status()["husky1"]["status"]["version"] == first["status"]["version"]
+
+
+def test_a_first_release_that_does_not_run_is_removed_again(
+    fleet: RobotFleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet.add("husky1")
+    fleet.write()
+    broken = own_wheel_with(tmp_path, "daemon/program.py", "    service = Service(", "    raise OSError\n    Service(")
+    monkeypatch.setattr("meshctl.robots.wheels.own_wheel", lambda: broken)
+    assert "so it was removed" in fleet.deploy("--wait", "3", exit_code=1)
+    assert fleet.shell("husky1", "ls /opt/udp-mesh/releases /etc/systemd/system/*.service 2>/dev/null || :") == (
+        "/opt/udp-mesh/releases:\n"
+    )
+
+
+def test_what_was_changed_by_hand_or_cut_short_is_seen_and_mended(fleet: RobotFleet) -> None:
+    fleet.add("husky1")
+    fleet.write()
+    fleet.deploy()
+    release = fleet.status()["husky1"]["release"]
+    fleet.shell("husky1", "echo '# tuned' >>/opt/udp-mesh/current/etc/udp-mesh.toml")
+    fleet.shell("husky1", "echo broken >/opt/udp-mesh/current/lib/udp_mesh/daemon/api.py")
+    told = fleet.meshctl("diff", exit_code=1)
+    assert "changed on the robot: etc/udp-mesh.toml" in told
+    assert "changed on the robot: lib/./udp_mesh/daemon/api.py" in told
+    assert f"husky1: done: runs {release}" in fleet.deploy()
+    assert "as the inventory says" in fleet.meshctl("diff")
+
+    # power was cut in the middle of a switch
+    fleet.shell("husky1", f"echo {release} >/opt/udp-mesh/unproven")
+    assert not fleet.status()["husky1"]["well"]
+    assert f"husky1: done: runs {release}" in fleet.deploy()
+
+    assert "the service is inactive" in fleet.meshctl("stop")
+    assert not fleet.status()["husky1"]["well"]
+    assert "the service is active" in fleet.meshctl("restart")
+    assert "ready name=husky1" in fleet.meshctl("logs", "-n", "20")
+    assert "husky1: done: removed" in fleet.meshctl("uninstall", "husky1", "--purge")
+    assert fleet.shell("husky1", "ls -d /opt/udp-mesh /var/lib/udp-mesh 2>/dev/null || :") == ""
+    fleet.shell("husky1", "! id udp-mesh 2>/dev/null")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib.metadata
+import shutil
 import zipfile
 from pathlib import Path
 
-from meshctl.robots.wheels import REQUIREMENTS
+import udp_mesh
+from meshctl.robots.wheels import REQUIREMENTS, Wheel, build_wheel
 
 
 def repack(directory: Path, projects: tuple[str, ...] = REQUIREMENTS) -> Path:
@@ -18,10 +20,22 @@ def repack(directory: Path, projects: tuple[str, ...] = REQUIREMENTS) -> Path:
         parts = [sorted({tag.split("-")[number] for tag in tags}) for number in range(3)]
         tag = "-".join(".".join(part) for part in parts)
         path = directory / f"{project}-{found.version}-{tag}.whl"
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for file in sorted(found.files or (), key=str):
                 if ".." in file.parts or "__pycache__" in file.parts:
                     continue
                 entry = zipfile.ZipInfo(str(file), (1980, 1, 1, 0, 0, 0))
+                entry.compress_type = zipfile.ZIP_DEFLATED
                 archive.writestr(entry, Path(str(file.locate())).read_bytes())
     return directory
+
+
+def own_wheel_with(directory: Path, module: str, old: str, new: str) -> Wheel:
+    """udp_mesh's wheel with one text in one module replaced: another version of it."""
+    package = directory / "udp_mesh"
+    shutil.rmtree(package, ignore_errors=True)
+    shutil.copytree(Path(udp_mesh.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    text = (package / module).read_text()
+    assert old in text, f"{module} has no {old!r}"
+    (package / module).write_text(text.replace(old, new))
+    return build_wheel(package)

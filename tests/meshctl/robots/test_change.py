@@ -1,0 +1,65 @@
+"""Topics and keys changed on running daemons: the inventory, the files and the daemons together, nothing restarted."""
+
+from __future__ import annotations
+
+from meshctl.inventory import load_fleet
+from tests.meshctl.device.servers import eventually
+from tests.meshctl.robots.fleets import RobotFleet
+
+
+def _boots(fleet: RobotFleet) -> dict[str, str]:
+    return {name: one["status"].get("boot", "") for name, one in fleet.status().items()}
+
+
+def _all_online(fleet: RobotFleet) -> bool:
+    return all(len(one["online"]) == len(fleet.machines) - 1 for one in fleet.status().values())
+
+
+def _pair(fleet: RobotFleet) -> dict[str, str]:
+    """Two robots that see each other; the names of their processes' lives."""
+    for name in ("husky1", "husky2"):
+        fleet.add(name)
+    fleet.write()
+    fleet.deploy()
+    eventually(lambda: _all_online(fleet))
+    return _boots(fleet)
+
+
+def test_a_topic_is_added_set_and_removed_everywhere_at_once_without_a_restart(fleet: RobotFleet) -> None:
+    boots = _pair(fleet)
+    told = fleet.meshctl("topic", "add", "video", "priority=9", "reliable=false", "destinations=[husky1]")
+    assert "+  video:" in told
+    assert "2 done" in told
+    fleet.meshctl("topic", "set", "video", "priority=12")
+    for one in fleet.status().values():
+        (video,) = (topic for topic in one["topics"] if topic["name"] == "video")
+        assert (video["priority"], video["reliable"], video["destinations"]) == (12, False, ["husky1"])
+    assert "2 unchanged" in fleet.deploy()
+    fleet.meshctl("topic", "rm", "video")
+    assert all(topic["name"] != "video" for one in fleet.status().values() for topic in one["topics"])
+    assert _boots(fleet) == boots
+    text = fleet.file.read_text()
+    assert "there is no topic 'video'" in str(fleet.refused("topic", "set", "video", "priority=3"))
+    assert "priority" in str(fleet.refused("topic", "add", "other", "priority=99"))
+    assert fleet.file.read_text() == text
+
+
+def test_a_key_is_rotated_without_an_interruption_and_waits_for_robots_that_are_away(fleet: RobotFleet) -> None:
+    boots = _pair(fleet)
+    fleet.machines["husky2"].stop()
+    told = fleet.meshctl("rotate-key", "file:keys.yaml#new", exit_code=3)
+    assert "husky2 did not take this one" in told
+    assert [key.key for key in load_fleet(fleet.file).udp_mesh.keys] == ["old", "new"]
+
+    fleet.machines["husky2"].start()
+    fleet.meshctl("restart", "husky2")
+    boots["husky2"] = _boots(fleet)["husky2"]
+    eventually(lambda: _all_online(fleet))
+    told = fleet.meshctl("rotate-key", "file:keys.yaml#new")
+    assert "the old key is dropped" in told
+    assert [key.key for key in load_fleet(fleet.file).udp_mesh.keys] == ["new"]
+    eventually(lambda: _all_online(fleet))
+    assert _boots(fleet) == boots
+    keys = {tuple(one["status"]["keys"]) for one in fleet.status().values()}
+    assert len(keys) == 1
+    assert len(keys.pop()) == 1

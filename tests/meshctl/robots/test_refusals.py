@@ -1,0 +1,70 @@
+"""What keeps a computer from running udp_mesh is told before anything on it changes."""
+
+from __future__ import annotations
+
+from tests.meshctl.robots.fleets import RobotFleet
+
+_NOTHING = "ls -A /opt /etc/systemd/system"
+
+
+def test_nothing_is_changed_on_a_computer_that_cannot_take_it(fleet: RobotFleet) -> None:
+    machine = fleet.add("husky1")
+    fleet.write()
+    before = fleet.shell("husky1", _NOTHING)
+
+    fleet.write(arch="aarch65")
+    told = fleet.deploy(exit_code=1)
+    assert "husky1: refused: wrong CPU: the inventory says aarch65" in told
+
+    # another interpreter's answers, as nobody can have every Python installed
+    machine.tool(
+        "python3.8", "#!/bin/sh\nprintf 'python=3.8.10\\nimplementation=CPython\\nbits=64\\nlibc=glibc 2.31\\n'\n"
+    )
+    fleet.write(python="python3.8")
+    assert "wrong Python: python3.8 is 3.8.10, udp_mesh needs 3.11 or newer" in fleet.deploy(exit_code=1)
+    fleet.write(python="python3.99")
+    assert "no python3.99 runs there" in fleet.deploy(exit_code=1)
+
+    fleet.write()
+    machine.tool("date", "#!/bin/sh\necho 86400\n")
+    told = fleet.deploy(exit_code=1)
+    assert "its clock is" in told
+    assert "years behind ours" in told
+    (machine.root / "bin/date").unlink()
+
+    assert fleet.shell("husky1", _NOTHING) == before
+
+
+def test_a_full_disk_is_found_before_and_survived_in_the_middle(fleet: RobotFleet) -> None:
+    fleet.add("husky1", opt_kib=20_000)
+    fleet.write()
+    told = fleet.deploy(exit_code=1)
+    assert "full disk" in told
+    assert fleet.shell("husky1", "ls /opt") == "python\n"
+
+    # it looked large enough, and fills up while the packages are unpacked
+    fleet.machines["husky1"].tool("df", "#!/bin/sh\necho Filesystem\necho tmpfs 1000000 1 999999 1% /opt\n")
+    told = fleet.deploy(exit_code=1)
+    assert "husky1: failed" in told
+    assert (
+        fleet.shell("husky1", "ls -A /opt/udp-mesh/releases /opt/udp-mesh/trees 2>/dev/null | grep -v : || :").strip()
+        == ""
+    )
+    assert fleet.status()["husky1"]["active"] != "active"
+
+
+def test_a_robot_that_is_off_or_not_trusted_does_not_stop_the_others(fleet: RobotFleet) -> None:
+    for name in ("husky1", "husky2"):
+        fleet.add(name)
+    fleet.write()
+    fleet.machines["husky2"].stop()
+    told = fleet.deploy(exit_code=3)
+    assert "husky1: done" in told
+    assert "husky2: unreachable" in told
+    fleet.machines["husky2"].start()
+    (fleet.directory / "known_hosts").unlink()
+    assert "no host key is pinned" in fleet.deploy("husky2", exit_code=1)
+    assert "pinned now" in fleet.meshctl("trust", "--yes")
+    told = fleet.deploy()
+    assert "husky1: unchanged" in told
+    assert "husky2: done: runs " in told
