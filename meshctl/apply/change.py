@@ -48,11 +48,22 @@ def _sha256_seen(path: str, before: Observation) -> str | None:
     return None if text is None else hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
 
 
+# netifd reads /lib/netifd/proto once, when it starts (proto_shell_init, 19.07 to 25.12): where the package came later it
+# does not know batman-adv, and a reload leaves bat0 unmade.
+_LEARN_BATMAN = (
+    "if grep -q batadv /etc/config/network && known=$(ubus call network get_proto_handlers 2>/dev/null); then",
+    "\tcase $known in *'\"batadv\"'*) ;; *) /etc/init.d/network restart || status=$? ;; esac",
+    "fi",
+)
+
+
 def reload_script(paths: set[str], services: tuple[str, ...]) -> str:
     """POSIX sh that makes the node take up changed files; reload_config reloads the services whose package changed."""
     lines = ["status=0"]
     if any(package_of(path) is not None for path in paths):
         lines.append("reload_config || status=$?")
+    if "etc/config/network" in paths:
+        lines += _LEARN_BATMAN
     lines += [f"/etc/init.d/{service} restart || status=$?" for service in services]
     return "\n".join([*lines, "exit $status"]) + "\n"
 

@@ -19,7 +19,7 @@ from ipaddress import IPv4Address
 from types import MappingProxyType
 
 from meshctl.apply.attempt import Attempt, begin, prepare
-from meshctl.apply.change import new_change_id, new_nonce
+from meshctl.apply.change import new_change_id, new_nonce, reload_script
 from meshctl.apply.job import Job
 from meshctl.apply.node import follow
 from meshctl.device import openwrt
@@ -159,7 +159,7 @@ def put_back(job: Job, connection: SshConnection, backup: Backup) -> Outcome:
     if not files:
         job.work.access.keep(job.name, connection)
         return Outcome(job.name, Result.UNCHANGED)
-    change = Change(new_change_id(), files, "reload_config\n")
+    change = Change(new_change_id(), files, reload_script({path.lstrip("/") for path in files}, ()))
     address = _address(backup)
     attempt = Attempt(
         job,

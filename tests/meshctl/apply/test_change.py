@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
 from dataclasses import replace
+from pathlib import Path
+
+import pytest
 
 from meshctl.apply.change import change_of, new_change_id, new_nonce, reload_script
 from meshctl.device.deadman import bundle
@@ -48,6 +52,27 @@ def test_a_change_is_never_printed_with_its_secrets() -> None:
 def test_a_key_file_reloads_nothing_and_a_back_ends_service_is_restarted() -> None:
     assert reload_script({"etc/dropbear/authorized_keys"}, ()) == "status=0\nexit $status\n"
     assert "/etc/init.d/meshmerize restart || status=$?" in reload_script({"etc/config/network"}, ("meshmerize",))
+
+
+@pytest.mark.parametrize(
+    ("network", "known", "restarts"),
+    [
+        ("option proto 'batadv'", 'printf \'{"static": {}, "batadv": {}}\'', False),
+        ("option proto 'batadv'", "printf '{\"static\": {}}'", True),
+        ("option proto 'static'", "printf '{\"static\": {}}'", False),
+        ("option proto 'batadv'", "false", False),
+    ],
+)
+def test_netifd_starts_anew_where_it_does_not_know_batman_adv_yet(
+    tmp_path: Path, network: str, known: str, restarts: bool
+) -> None:
+    (tmp_path / "network").write_text(network)
+    script = reload_script({"etc/config/network"}, ())
+    script = script.replace("/etc/config/network", str(tmp_path / "network"))
+    script = script.replace("/etc/init.d/network restart", "echo restarts")
+    stands_in = f"reload_config() {{ :; }}\nubus() {{ {known}; }}\n"
+    done = subprocess.run(["sh", "-c", stands_in + script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, "restarts" if restarts else "")
 
 
 def test_ids_and_nonces_never_repeat() -> None:
