@@ -48,8 +48,8 @@ def _sha256_seen(path: str, before: Observation) -> str | None:
     return None if text is None else hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
 
 
-# netifd reads /lib/netifd/proto once, when it starts (proto_shell_init, 19.07 to 25.12): where the package came later it
-# does not know batman-adv, and a reload leaves bat0 unmade.
+# netifd reads /lib/netifd/proto once, when it starts (proto_shell_init, 19.07 to 25.12): where the package came later,
+# it does not know batman-adv, and a reload leaves bat0 unmade.
 _LEARN_BATMAN = (
     "if grep -q batadv /etc/config/network && known=$(ubus call network get_proto_handlers 2>/dev/null); then",
     "\tcase $known in *'\"batadv\"'*) ;; *) /etc/init.d/network restart || status=$? ;; esac",
