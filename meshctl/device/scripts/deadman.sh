@@ -8,7 +8,7 @@
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=1
+VERSION=2
 SELF=/usr/sbin/meshctl-deadman
 CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to)
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
@@ -16,6 +16,7 @@ RUN=/tmp/meshctl           # RAM: locks and timers; a reboot forgets them, as it
 SPARE_KIB=64               # flash that must stay free: uci, dropbear and jffs2's garbage collector write too
 GUARD_GRACE_CS=3000        # the second timer fires 30 s after the first should have
 START_LIMIT_CS=1500        # a loaded radio starts a process within 15 s, or something is wrong with it
+RELOAD_TURN_CS=1000       # reload_config takes a few seconds; a restore waits so long for one under way
 RELOAD_LIMIT_CS=12000      # a reload of the restored state that takes over 120 s is stuck; then reboot
 
 # by its path: a busybox that prefers its own applets would leave no way to stand in for it
@@ -225,9 +226,14 @@ drop() { # DIRECTORY CODE TEXT
 	refuse "$2" "$3"
 }
 
+# At the first boot / is RAM until jffs2 is ready, and what is copied into it then may lack what was written meanwhile
+# (fstools, overlay.c and mount.c name that mount so).
+in_flash() { ! grep -q '^overlayfs:/tmp/root / ' /proc/mounts; }
+
 stage() { # OWNER ID BUNDLE
 	need_lock "$1"
 	word "$2"
+	in_flash || refuse no-flash "/ is still in RAM: wait until its flash is ready, some minutes after the first boot"
 	tidy
 	case $MARKER in armed | restoring) refuse busy "change $ID of $OWNER is $MARKER" ;; esac
 	{ [ -f "$3" ] && gzip -t "$3" 2>/dev/null; } || refuse bad-bundle "$3 is missing or damaged"
@@ -361,6 +367,15 @@ reload() { # SCRIPT: in the background, so that no hanging reload holds up the t
 	reload_pid=$!
 }
 
+# Two of reload_config at once take each other's list of sums away, and then tell no service of what changed.
+end_reload() {
+	[ -n "$reload_pid" ] || return 0
+	now
+	limit=$((NOW + RELOAD_TURN_CS))
+	until [ -e "$RUN/reloaded" ] || { now && [ $NOW -ge $limit ]; }; do doze; done
+	kill "$reload_pid" 2>/dev/null
+}
+
 # restore REASON: the marker's rename decides who does it; nothing happens when the change was confirmed meanwhile
 restore() {
 	mv "$CHANGE/armed.$ID" "$CHANGE/restoring.$ID" 2>/dev/null || [ -f "$CHANGE/restoring.$ID" ] || return 0
@@ -368,10 +383,10 @@ restore() {
 	cp "$CHANGE/reload" "$RUN/restored"
 	reload_it=no
 	[ ! -e "$TIMER/applied" ] || reload_it=yes
-	[ -z "$reload_pid" ] || kill "$reload_pid" 2>/dev/null
 	put_previous || return 0 # the marker stays: abort, the second timer and the next boot try again
 	finish restored "$1"
 	[ $reload_it = yes ] || return 0
+	end_reload
 	reload "$RUN/restored"
 	now
 	limit=$((NOW + RELOAD_LIMIT_CS))

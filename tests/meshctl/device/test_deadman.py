@@ -283,6 +283,27 @@ def test_a_reload_that_hangs_does_not_hold_up_the_way_back(node: Sandbox) -> Non
     assert is_before(node.path("/etc"))
 
 
+def test_the_way_back_lets_a_reload_under_way_come_to_its_end_first(node: Sandbox) -> None:
+    # two of OpenWrt's reload_config at once spoil each other's list of what changed
+    log = "echo begin >>/harness/log; until [ -e /harness/go ]; do sleep 0.1; done; echo end >>/harness/log"
+    applied(node, wanted=change(reload=log))
+    eventually(lambda: node.text("/harness/log") == "begin\n")
+    node.deadman("abort", OWNER, "c1")
+    eventually(lambda: is_before(node.path("/etc")))
+    node.put("/harness/go", "")
+    eventually(lambda: (node.text("/harness/log") or "").count("end") == 2)
+    assert node.text("/harness/log") == "begin\nend\nbegin\nend\n"
+
+
+def test_nothing_is_staged_while_the_root_is_still_in_ram(node: Sandbox) -> None:
+    prepare(node)
+    node.deadman("lock", OWNER, LONG)
+    stage = f"exec /usr/sbin/meshctl-deadman stage {OWNER} c1 {BUNDLE}"
+    done = node.run("/bin/sh", "-c", f"/bin/busybox mount -t tmpfs overlayfs:/tmp/root / && {stage}")
+    assert done.stdout.startswith("refused no-flash "), done
+    assert not node.path("/etc/meshctl/change").exists()
+
+
 def test_when_the_restored_state_cannot_be_reloaded_the_node_reboots_into_it(node: Sandbox) -> None:
     applied(node, window_s="1", wanted=change(reload="exit 1"))
     eventually(lambda: node.text("/harness/reboots") == "reboot\n")
