@@ -145,7 +145,8 @@ def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
     request = quoted(json.dumps({"path": image_path}))
     script = (
         "/bin/sync; echo 3 2>/dev/null >/proc/sys/vm/drop_caches\n"
-        f'/sbin/sysupgrade -T {quoted(image_path)} >/tmp/sysupgrade.test 2>&1; echo "status $?"\n'
+        # with -n, as it will be flashed: without, it refuses an image of another minor compat_version
+        f'/sbin/sysupgrade -T -n {quoted(image_path)} >/tmp/sysupgrade.test 2>&1; echo "status $?"\n'
         "sed 's/^/said /' /tmp/sysupgrade.test; rm -f /tmp/sysupgrade.test\n"
         f"ubus call system validate_firmware_image {request} 2>/dev/null | tr -d '\\n\\t' | sed 's/^/json /'; echo\n"
         "cat /proc/meminfo"
@@ -155,10 +156,15 @@ def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
     said = [line[5:].strip() for line in lines if line.startswith("said ")]
     told = mapping(parse_json(next((line[5:] for line in lines if line.startswith("json ")), "")))
     memory = parse_meminfo(done.stdout)
-    passed = "status 0" in lines and (not told or truth(told.get("valid")))
+    # procd refuses `-f` for such an image, only after `sysupgrade` has begun; -T does not look at it
+    bare = told.get("allow_backup") is False
+    passed = "status 0" in lines and (not told or truth(told.get("valid"))) and not bare
+    reason = "; ".join(line for line in said if line) or "sysupgrade -T failed"
+    if bare:
+        reason = "it takes over no configuration from the running system"
     return FirmwareCheck(
         valid=passed,
-        reason="" if passed else "; ".join(line for line in said if line) or "sysupgrade -T failed",
+        reason="" if passed else reason,
         tests={name: truth(value) for name, value in mapping(told.get("tests")).items()},
         available_bytes=None if memory is None else memory.available,
     )

@@ -28,7 +28,7 @@ SYSUPGRADE = (
     + """
 case $1 in
 -b) echo backup >"$2" ;;
--T) if grep -q good "$2"; then exit 0; else echo "Device x not supported by this image"; exit 1; fi ;;
+-T) if [ "$2" = -n ] && grep -q good "$3"; then exit 0; else echo "Device x not supported by this image"; exit 1; fi ;;
 esac
 """
 )
@@ -175,6 +175,10 @@ def test_an_image_is_judged_by_sysupgrade_and_by_procd(connection: SshConnection
     assert good.tests == {"fwtool_signature": True, "fwtool_device_match": True}
     node.put("/bin/ubus", UBUS.replace('"valid": true', '"valid": false'), 0o755)
     assert not openwrt.check_firmware(connection, "/tmp/good.bin").valid
+    # procd would refuse to flash it together with our archive
+    node.put("/bin/ubus", UBUS.replace('"allow_backup": true', '"allow_backup": false'), 0o755)
+    bare = openwrt.check_firmware(connection, "/tmp/good.bin")
+    assert (bare.valid, bare.reason) == (False, "it takes over no configuration from the running system")
 
 
 def test_what_ends_the_connection_is_answered_first(connection: Connection, node: Sandbox) -> None:
