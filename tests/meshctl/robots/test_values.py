@@ -1,0 +1,170 @@
+"""The pure parts: wheel tags, what a probe tells, bundles and their names, what a switch says, the stages of a key."""
+
+from __future__ import annotations
+
+import zipfile
+from io import BytesIO
+
+import pytest
+
+from meshctl.errors import InputError
+from meshctl.fleet import Result
+from meshctl.model import SecretKind, SecretRef
+from meshctl.robots.bundle import Bundle, File, service_unit
+from meshctl.robots.deploy import switched
+from meshctl.robots.rotation import parse_ref, stages, written
+from meshctl.robots.tags import Target, parse_wheel, pip_options, takes
+from meshctl.robots.target import Facts, changed_files, objections, parse_facts, room_objection
+from meshctl.robots.watch import parse_health, table
+from meshctl.robots.wheels import own_wheel, stock_unit
+
+BOOKWORM = Target((3, 11), "x86_64", "glibc", (2, 36))
+PI = Target((3, 12), "aarch64", "glibc", (2, 39))
+ALPINE = Target((3, 12), "x86_64", "musl", (1, 2))
+
+
+@pytest.mark.parametrize(
+    ("file", "takers"),
+    [
+        ("pycparser-2.22-py3-none-any.whl", {BOOKWORM, PI, ALPINE}),
+        ("cffi-1.17.1-cp311-cp311-manylinux_2_17_x86_64.manylinux2014_x86_64.whl", {BOOKWORM}),
+        ("cffi-1.17.1-cp312-cp312-manylinux_2_17_aarch64.manylinux2014_aarch64.whl", {PI}),
+        ("cryptography-44.0.0-cp37-abi3-manylinux_2_28_x86_64.whl", {BOOKWORM}),
+        ("cryptography-44.0.0-cp37-abi3-manylinux_2_38_x86_64.whl", set()),
+        ("cryptography-44.0.0-cp37-abi3-musllinux_1_2_x86_64.whl", {ALPINE}),
+        ("cryptography-44.0.0-cp313-abi3-manylinux_2_28_aarch64.whl", set()),
+        ("cryptography-44.0.0-pp310-pypy310_pp73-manylinux_2_28_x86_64.whl", set()),
+    ],
+)
+def test_a_wheel_is_taken_by_the_computers_that_pip_would_install_it_on(file: str, takers: set[Target]) -> None:
+    wheel = parse_wheel(file)
+    assert wheel is not None
+    assert {target for target in (BOOKWORM, PI, ALPINE) if takes(target, wheel)} == takers
+
+
+def test_pip_is_asked_for_the_targets_python_and_platforms_and_nothing_newer() -> None:
+    options = pip_options(PI)
+    assert options[:2] == ("--python-version", "3.12")
+    assert "manylinux_2_39_aarch64" in options
+    assert "manylinux2014_aarch64" in options
+    assert "manylinux_2_40_aarch64" not in options
+
+
+def test_our_wheel_holds_udp_mesh_alone_and_its_unit_starts_the_current_release() -> None:
+    with zipfile.ZipFile(BytesIO(own_wheel().content)) as archive:
+        tops = {name.split("/")[0] for name in archive.namelist()}
+    assert {top.split("-")[0] for top in tops} == {"udp_mesh"}
+    unit = service_unit(stock_unit())
+    starts = [line for line in unit.splitlines() if line.startswith("ExecStart=")]
+    assert starts == ["ExecStart=/opt/udp-mesh/current/bin/udp-mesh run /opt/udp-mesh/current/etc/udp-mesh.toml"]
+    with pytest.raises(ValueError, match="one ExecStart"):
+        service_unit("[Service]\n")
+
+
+def test_a_bundle_is_named_by_its_content_and_shows_no_secret() -> None:
+    key = File("etc/fleet.key", b"0123456789", 0o600)
+    one, same = (Bundle("husky1", "tree", (), (key, File("topics", b"estop\n"))) for _ in range(2))
+    other = Bundle("husky1", "tree", (), (File("etc/fleet.key", b"9876543210", 0o600), File("topics", b"estop\n")))
+    assert one.id == same.id != other.id
+    assert one.archive() == same.archive()
+    assert "0123456789" not in repr(one)
+
+
+PROBED = """\
+arch=x86_64
+now=1000000000
+uid=0
+systemd=yes
+missing=
+python=3.11.2
+implementation=CPython
+bits=64
+libc=glibc 2.36
+executable=/usr/bin/python3.11
+free_kib=500000
+writable=yes
+current=aaaa
+previous=
+release=aaaa
+tree=tttt
+proven=yes
+file=1111  etc/udp-mesh.toml
+file=2222  python
+active=active
+enabled=enabled
+"""
+
+
+def _reasons(facts: Facts, now_s: float = 1e9) -> list[str]:
+    return [reason for reason, _ in objections(facts, robot="r", arch="x86_64", python="python3", now_s=now_s)]
+
+
+def test_a_fitting_computer_meets_no_objection_and_every_misfit_is_told_at_once() -> None:
+    facts = parse_facts(PROBED)
+    assert facts.is_sound
+    assert facts.target == BOOKWORM
+    assert _reasons(facts) == []
+    worse = parse_facts(
+        PROBED.replace("arch=x86_64", "arch=aarch64").replace("3.11.2", "3.8.10").replace("systemd=yes", "systemd=no")
+    )
+    assert _reasons(worse, now_s=1.2e9) == [
+        "systemd does not run there",
+        "wrong CPU: the inventory says x86_64, it is aarch64",
+        "wrong Python: python3 is 3.8.10, udp_mesh needs 3.11 or newer",
+        "its clock is 6.3 years behind ours",
+    ]
+    assert _reasons(parse_facts("")) != [], "a probe that says nothing is no consent"
+
+
+def test_room_is_asked_for_what_is_unpacked_and_something_to_spare() -> None:
+    facts = parse_facts(PROBED)
+    assert not list(room_objection(facts, 100 << 20))
+    ((reason, _),) = room_objection(facts, 1 << 30)
+    assert reason.startswith("full disk: 1057 MiB are needed at /opt")
+
+
+def test_changed_files_are_those_whose_hash_differs_or_that_one_side_lacks() -> None:
+    facts = parse_facts(PROBED)
+    assert changed_files(facts, [("etc/udp-mesh.toml", "1111"), ("python", "2222")]) == ()
+    assert changed_files(facts, [("etc/udp-mesh.toml", "3333"), ("new", "1")]) == ("etc/udp-mesh.toml", "new", "python")
+
+
+def test_what_a_switch_says_becomes_one_outcome() -> None:
+    assert switched("r", "id", "result=switched\nonline=base husky2\n").reason == "runs id, 2 peers online"
+    back = switched("r", "id", "result=rolled-back\nreason=the daemon does not run\nlog=a=b\nlog=c\n")
+    assert back.result is Result.ROLLED_BACK
+    assert back.hint == "its last words:\na=b\nc"
+    assert switched("r", "id", "").result is Result.FAILED
+
+
+def test_a_daemon_that_does_not_answer_is_not_well_and_says_so() -> None:
+    one = parse_health("husky1", "== service\nactive=active\ncurrent=aaaa\nproven=yes\n== status\n== topics\n")
+    assert not one.is_well
+    assert "the daemon does not answer" in table([one])
+
+
+OLD, NEW, OTHER = (SecretRef(SecretKind.ENV, name) for name in ("OLD", "NEW", "OTHER"))
+
+
+def test_a_rotation_goes_on_from_wherever_the_inventory_says_it_is() -> None:
+    every = [(OLD, NEW), (NEW, OLD), (NEW,)]
+    assert [stage.keys for stage in stages((OLD,), NEW)] == every
+    assert [stage.keys for stage in stages((OLD, NEW), NEW)] == every
+    assert [stage.keys for stage in stages((NEW, OLD), NEW)] == every[1:]
+    assert [stage.keys for stage in stages((NEW,), NEW)] == every[2:]
+    with pytest.raises(InputError, match="two other keys"):
+        stages((OLD, OTHER), NEW)
+    with pytest.raises(InputError, match="no key yet"):
+        stages((), NEW)
+
+
+@pytest.mark.parametrize("text", ["env:NAME", "file:a/b.yaml#new", "age:keys.age#x"])
+def test_a_reference_reads_back_as_it_is_printed(text: str) -> None:
+    assert str(parse_ref(text)) == text
+    assert parse_ref(text).kind.value in dict(written(parse_ref(text)))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("text", ["NAME", "env:", "vault:x", ""])
+def test_what_is_no_reference_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match="expected env:NAME"):
+        parse_ref(text)
