@@ -199,11 +199,14 @@ def main() -> int:
     thread = threading.Thread(target=port.run, args=(stop, bridge.daemon_up, bridge.from_daemon), daemon=True)
     thread.start()
     looked_at = time.monotonic()
-    while not stop.wait(TICK_S):
+    while not stop.wait(TICK_S) and thread.is_alive():
         bridge.tick()
         if time.monotonic() - looked_at >= LOOK_S:
             looked_at = time.monotonic()
             bridge.look()
+    if not stop.is_set():
+        # The port's thread ended by a mistake of ours, and said which: roslaunch starts us anew.
+        return 1
     thread.join(5.0)
     return 0
 

@@ -1,0 +1,170 @@
+"""What the relay decides: two relays joined in memory, no ROS, no daemon."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from udp_mesh.bridges.exchange import Definition, ExchangeError, Hello, Want, decode, encode
+from udp_mesh.bridges.names import Route
+from udp_mesh.bridges.relay import ASK_AGAIN_S, MAX_WAITING_MESSAGES, Effect, Note, Relay, ToMesh, ToRos
+from udp_mesh.bridges.ros2.quality import Quality, parse_quality, quality_text
+from udp_mesh.bridges.types import (
+    MAX_DEFINITION_BYTES,
+    Definitions,
+    MessageKind,
+    TypeKey,
+    kind_text,
+    parse_kind,
+)
+
+EXCHANGE = "bridge/ros1"
+STRING = TypeKey("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1")
+WORDS = st.text(st.characters(codec="ascii", exclude_characters="/ ", exclude_categories=("Z", "C")), min_size=1)
+
+
+def relay(own: str) -> Relay:
+    return Relay(own, EXCHANGE, ros_version=1)
+
+
+def carry(effects: list[Effect], source: str, target: Relay, now: float = 0.0) -> list[Effect]:
+    """What the target makes of what the source put on the mesh."""
+    found: list[Effect] = []
+    for effect in effects:
+        if isinstance(effect, ToMesh) and effect.peer in (None, target.own):
+            found += target.from_mesh(source, effect.topic, effect.type, effect.payload, now)
+    return found
+
+
+def to_bob(alice: Relay, text: bytes, *, latched: bool = False, publisher: str = "/node") -> list[Effect]:
+    return alice.from_ros(Route("status", "bob"), publisher, STRING, "string data", latched, text)
+
+
+def test_the_definition_goes_first_and_only_once() -> None:
+    alice, bob = relay("alice"), relay("bob")
+    first, second = to_bob(alice, b"1"), to_bob(alice, b"2")
+    assert len(first) == 2
+    assert len(second) == 1
+    name = "/alice/mesh_comm/bob/status"
+    assert carry(first, "alice", bob) == [ToRos(name, STRING, "string data", False, b"1")]
+    assert carry(second, "alice", bob) == [ToRos(name, STRING, "string data", False, b"2")]
+
+
+def test_messages_wait_in_order_for_a_lost_definition_which_is_asked_for() -> None:
+    alice, bob = relay("alice"), relay("bob")
+    asked = carry(to_bob(alice, b"1")[1:], "alice", bob, now=0.0)
+    assert carry(to_bob(alice, b"2"), "alice", bob, now=0.1) == []
+    assert bob.tick(ASK_AGAIN_S / 2) == []
+    assert bob.tick(ASK_AGAIN_S) == asked
+    answered = carry(asked, "bob", alice)
+    published = carry(answered, "alice", bob)
+    assert [effect.payload for effect in published if isinstance(effect, ToRos)] == [b"1", b"2"]
+    assert bob.tick(10.0) == []
+
+
+def test_what_waits_is_bounded_and_the_rest_counted() -> None:
+    alice, bob = relay("alice"), relay("bob")
+    for number in range(MAX_WAITING_MESSAGES + 5):
+        carry(to_bob(alice, bytes([number]))[-1:], "alice", bob)
+    assert bob.dropped == 5
+
+
+def test_a_robot_that_comes_late_gets_what_was_latched_and_only_what_it_lacks() -> None:
+    alice, bob = relay("alice"), relay("bob")
+    to_bob(alice, b"old", latched=True)
+    to_bob(alice, b"new", latched=True)
+    to_bob(alice, b"other", latched=True, publisher="/other")
+    missing = carry(bob.peer_online("alice"), "bob", alice)
+    assert sorted(effect.payload for effect in missing if isinstance(effect, ToMesh) and effect.topic == "status") == [
+        b"new",
+        b"other",
+    ]
+    waiting = carry(missing, "alice", bob)
+    carry(carry(waiting, "bob", alice), "alice", bob)
+    again = carry(bob.peer_online("alice"), "bob", alice)
+    assert [effect for effect in again if isinstance(effect, ToMesh) and effect.topic == "status"] == []
+
+
+def test_a_latched_message_that_is_repeated_is_published_once() -> None:
+    alice, bob = relay("alice"), relay("bob")
+    greeting = bob.peer_online("alice")
+    assert len(carry(to_bob(alice, b"map", latched=True), "alice", bob)) == 1
+    repeated = [effect for effect in carry(greeting, "bob", alice) if isinstance(effect, ToMesh)]
+    assert any(effect.payload == b"map" for effect in repeated)
+    assert [effect for effect in carry(list(repeated), "alice", bob) if isinstance(effect, ToRos)] == []
+
+
+def test_latched_messages_go_to_whom_they_were_for() -> None:
+    alice = relay("alice")
+    alice.topics_are({"map": ("base",)})
+    to_bob(alice, b"for bob", latched=True)
+    alice.from_ros(Route("map", None), "/node", STRING, "", True, b"for base")
+    hello = encode(Hello({}, False))
+    sent = {peer: alice.from_mesh(peer, EXCHANGE, "bridge", hello, 0.0) for peer in ("bob", "base", "carol")}
+    payloads = {peer: [e.payload for e in effects if isinstance(e, ToMesh)] for peer, effects in sent.items()}
+    assert payloads == {"bob": [b"for bob"], "base": [b"for base"], "carol": []}
+
+
+def test_a_fielded_robot_names_the_type_alone() -> None:
+    found = relay("bob").from_mesh("old", "status", "std_msgs/String", b"x", 0.0)
+    assert found == [ToRos("/old/mesh_comm/bob/status", TypeKey("std_msgs/String", ""), None, False, b"x")]
+
+
+def test_messages_of_other_bridges_are_left_alone() -> None:
+    for type_text in ("", "zenoh", "std_msgs/msg/String reliable:volatile:10", "a/B c d", "a/B c latched e"):
+        assert relay("bob").from_mesh("alice", "status", type_text, b"x", 0.0) == []
+    assert Relay("bob", "bridge/ros2", ros_version=2).from_mesh("alice", "t", "std_msgs/String", b"x", 0.0) == []
+
+
+def test_a_robot_whose_name_reads_like_ours_is_reported_and_not_published() -> None:
+    found = relay("ugv-1").from_mesh("ugv_1", "status", "std_msgs/String", b"x", 0.0)
+    assert [type(effect) for effect in found] == [Note]
+
+
+def test_ros_2_messages_need_no_definition() -> None:
+    key = TypeKey("std_msgs/msg/String", quality_text(Quality()))
+    alice = Relay("alice", "bridge/ros2", ros_version=2)
+    bob = Relay("bob", "bridge/ros2", ros_version=2)
+    published = carry(alice.from_ros(Route("status", None), "", key, "", False, b"cdr"), "alice", bob)
+    assert published == [ToRos("/alice/mesh_comm/bob/status", key, None, False, b"cdr")]
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_on_the_bridges_topic_are_a_message_or_an_error(data: bytes) -> None:
+    try:
+        decode(data)
+    except ExchangeError:
+        assert [type(effect) for effect in relay("bob").from_mesh("a", EXCHANGE, "", data, 0.0)] == [Note]
+
+
+@given(WORDS, WORDS, st.booleans(), st.booleans())
+def test_a_type_field_is_read_as_it_was_written(name: str, checksum: str, latched: bool, repeat: bool) -> None:
+    kind = MessageKind(TypeKey("pkg/" + name, checksum), latched, latched and repeat)
+    assert parse_kind(kind_text(kind)) == kind
+
+
+def test_messages_between_bridges_are_read_as_they_were_written() -> None:
+    for message in (Hello({"t": ["ab"]}, True), Want([STRING]), Definition(STRING, "string data")):
+        assert decode(encode(message)) == message
+
+
+def test_definitions_are_bounded() -> None:
+    definitions = Definitions()
+    assert not definitions.put(STRING, "x" * (MAX_DEFINITION_BYTES + 1))
+    for number in range(100):
+        assert definitions.put(TypeKey("a/B", str(number)), "x" * MAX_DEFINITION_BYTES)
+    kept = [number for number in range(100) if TypeKey("a/B", str(number)) in definitions]
+    assert kept == list(range(36, 100))
+
+
+@given(
+    st.sampled_from(["reliable", "best_effort"]), st.sampled_from(["volatile", "transient_local"]), st.integers(1, 99)
+)
+def test_a_quality_of_service_is_read_as_it_was_written(reliability: str, durability: str, depth: int) -> None:
+    quality = Quality(reliability, durability, depth)
+    assert parse_quality(quality_text(quality)) == quality
+
+
+def test_a_quality_nobody_wrote_is_none() -> None:
+    for text in ("", "reliable:volatile", "reliable:volatile:0", "reliable:volatile:x", "a:volatile:1"):
+        assert parse_quality(text) is None

@@ -1,0 +1,84 @@
+"""A Zenoh sample as bytes for the mesh, and back: key, kind, quality of service, encoding, attachment, payload. Pure.
+
+Big-endian: version u8 (1), flags u8, priority u8 (1 to 7, Zenoh's), key length u16, encoding length u16, attachment
+length u32, then key, encoding, attachment, payload. Neither payload nor attachment is read: CDR and the attachment of
+`rmw_zenoh` (sequence number, time, publisher) arrive as they left.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+VERSION = 1
+TYPE = "zenoh"
+"""The mesh's type field of every such message: other bridges leave it alone, and this one leaves the others'."""
+_HEAD = struct.Struct(">BBBHHI")
+_DELETE, _EXPRESS, _BLOCK, _ATTACHED = 1, 2, 4, 8
+_FLAGS = _DELETE | _EXPRESS | _BLOCK | _ATTACHED
+PRIORITIES = range(1, 8)
+
+
+class EnvelopeError(ValueError):
+    """These bytes hold no sample; says why."""
+
+
+class Envelope(NamedTuple):
+    """One sample. `block`: Zenoh waits rather than drops under congestion; `attachment`: None is not the empty one."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    attachment: bytes | None
+    priority: int
+    block: bool
+    express: bool
+    delete: bool
+
+
+def seal(sample: Envelope) -> bytes:
+    """The bytes of a sample. Raises EnvelopeError where its key or encoding is longer than the format holds."""
+    key, encoding = sample.key.encode(), sample.encoding.encode()
+    if len(key) > 0xFFFF or len(encoding) > 0xFFFF:
+        raise EnvelopeError("key and encoding: expected at most 65535 bytes each")
+    flags = (
+        _DELETE * sample.delete
+        | _EXPRESS * sample.express
+        | _BLOCK * sample.block
+        | _ATTACHED * (sample.attachment is not None)
+    )
+    attachment = sample.attachment or b""
+    head = _HEAD.pack(VERSION, flags, sample.priority, len(key), len(encoding), len(attachment))
+    return b"".join((head, key, encoding, attachment, sample.payload))
+
+
+def open_envelope(data: bytes) -> Envelope:
+    """The sample in these bytes. Raises EnvelopeError."""
+    if len(data) < _HEAD.size:
+        raise EnvelopeError("expected at least {} bytes, found {}".format(_HEAD.size, len(data)))
+    version, flags, priority, key_bytes, encoding_bytes, attachment_bytes = _HEAD.unpack_from(data)
+    if version != VERSION or flags & ~_FLAGS or priority not in PRIORITIES:
+        raise EnvelopeError("expected version 1, known flags and priority 1 to 7, found {}".format(data[:3].hex()))
+    encoding_at = _HEAD.size + key_bytes
+    attachment_at = encoding_at + encoding_bytes
+    payload_at = attachment_at + attachment_bytes
+    if payload_at > len(data) or not key_bytes or (attachment_bytes and not flags & _ATTACHED):
+        raise EnvelopeError("its parts' lengths do not fit {} bytes".format(len(data)))
+    try:
+        key = data[_HEAD.size : encoding_at].decode("utf-8")
+        encoding = data[encoding_at:attachment_at].decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise EnvelopeError("key or encoding is no UTF-8") from error
+    if any(sign in key for sign in "*$?#"):
+        raise EnvelopeError("expected one key, found the expression {!r}".format(key))
+    attachment = data[attachment_at:payload_at] if flags & _ATTACHED else None
+    return Envelope(
+        key,
+        data[payload_at:],
+        encoding,
+        attachment,
+        priority,
+        bool(flags & _BLOCK),
+        bool(flags & _EXPRESS),
+        bool(flags & _DELETE),
+    )

@@ -1,0 +1,112 @@
+"""How ROS 2 uses Zenoh through `rmw_zenoh`: a topic's key, and the liveliness tokens the ROS graph is made of. Pure.
+
+A topic's key is `<domain>/<topic>/<type>/<type hash>`. Each publisher has a token
+`@ros2_lv/<domain>/<session>/<node>/<entity>/MP/<enclave>/<namespace>/<node name>/<topic>/<type>/<type hash>/<qos>`,
+with `%` for every slash inside a part. Tokens cross the mesh whole, so type hash and QoS do.
+
+`TokenExchange` keeps the tokens of each side known on the other: what is announced is always the full set, so that a
+lost or doubled announcement does no harm; a token that some bridge set up is nobody's own and is not announced again.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import NamedTuple
+
+ADMIN = "@ros2_lv"
+CARRIED = "udp_mesh/carried"
+"""Key prefix of the tokens by which a bridge says which tokens it set up for robots of the mesh."""
+MAX_TOKENS = 4096
+"""Tokens of one robot: a node has some dozens of topics; more is a peer inventing names."""
+MAX_TOKEN_BYTES = 1024
+MAX_ANNOUNCEMENT_BYTES = 4 << 20
+
+
+class AnnouncementError(ValueError):
+    """These bytes announce no tokens; says why."""
+
+
+def topic_keys(topic: str, domain: int) -> str:
+    """The key expression of a ROS 2 topic of any type."""
+    return "{}/{}/*/*".format(domain, topic.strip("/"))
+
+
+def publisher_tokens(topic: str, domain: int) -> str:
+    """The key expression of the tokens of a topic's publishers."""
+    name = "%" + topic.strip("/").replace("/", "%")
+    return "{}/{}/*/*/*/MP/*/*/*/{}/*/*/*".format(ADMIN, domain, name)
+
+
+def carried_key(session: str, token: str) -> str:
+    """The companion of a token that this session set up for a robot of the mesh."""
+    return "{}/{}/{}".format(CARRIED, session, token[1:])
+
+
+def carried_token(key: str) -> str:
+    """The token whose companion this is."""
+    return "@" + key[len(CARRIED) + 1 :].partition("/")[2]
+
+
+class TokenChange(NamedTuple):
+    """What to declare and what to take back on our side."""
+
+    declare: list[str]
+    withdraw: list[str]
+
+
+class TokenExchange:
+    """Tokens on our side, and those of each robot of the mesh."""
+
+    def __init__(self) -> None:
+        self._seen: set[str] = set()
+        self._carried: set[str] = set()
+        self._told: dict[str, set[str]] = {}
+        self._declared: set[str] = set()
+
+    def seen(self, token: str, alive: bool) -> None:
+        """A token came or went on our side."""
+        (self._seen.add if alive else self._seen.discard)(token)
+
+    def carried(self, key: str, alive: bool) -> None:
+        """A companion came or went: its token is some bridge's."""
+        (self._carried.add if alive else self._carried.discard)(carried_token(key))
+
+    def announcement(self, *, answer: bool = False) -> bytes:
+        """All tokens that are our side's own. `answer` asks who hears it for theirs."""
+        own = sorted(self._seen - self._carried - self._declared)
+        return json.dumps({"tokens": own[:MAX_TOKENS], "answer": answer}).encode()
+
+    def heard(self, source: str, announcement: bytes) -> tuple[TokenChange, bool]:
+        """A robot announced its tokens; also whether it asks for ours. Raises AnnouncementError."""
+        self._told[source], answer = _read(announcement)
+        return self._change(), answer
+
+    def gone(self, source: str) -> TokenChange:
+        """A robot is away: so are its publishers."""
+        self._told.pop(source, None)
+        return self._change()
+
+    def _change(self) -> TokenChange:
+        wanted: set[str] = set().union(*self._told.values())
+        # What is our own here needs no copy; what we set up ourselves is also seen here.
+        wanted -= self._seen - self._declared
+        change = TokenChange(sorted(wanted - self._declared), sorted(self._declared - wanted))
+        self._declared = wanted
+        return change
+
+
+def _read(data: bytes) -> tuple[set[str], bool]:
+    if len(data) > MAX_ANNOUNCEMENT_BYTES:
+        raise AnnouncementError("expected at most {} bytes".format(MAX_ANNOUNCEMENT_BYTES))
+    try:
+        fields = json.loads(data.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise AnnouncementError("expected JSON: {}".format(error)) from error
+    tokens = fields.get("tokens") if isinstance(fields, dict) else None
+    if not isinstance(tokens, list) or len(tokens) > MAX_TOKENS:
+        raise AnnouncementError("tokens: expected a list of at most {}".format(MAX_TOKENS))
+    for token in tokens:
+        good = isinstance(token, str) and len(token) <= MAX_TOKEN_BYTES and token.startswith(ADMIN + "/")
+        if not good or any(sign in token for sign in "*$?#") or "//" in token or token.endswith("/"):
+            raise AnnouncementError("expected a token below {}, found {!r}".format(ADMIN, token))
+    return set(tokens), fields.get("answer") is True

@@ -1,0 +1,303 @@
+"""The Zenoh bridge: `python -m udp_mesh.bridges.zenoh_bridge --route 'demo/**=telemetry' --ros2 /chatter=talk ...`.
+
+1. A sample under a routed key expression is sealed whole (`envelope`) and published on the route's mesh topic.
+2. What other Zenoh bridges sent is put under its own key, with its encoding, attachment and quality of service.
+3. The liveliness tokens of routed ROS 2 topics are kept equal on both sides (`rmw_zenoh`).
+
+Nothing that came from the mesh goes back: each bridge has a token `udp_mesh/bridge/<session>`, says its session in
+every sample it puts, and drops samples of every session that has such a token. Needs `eclipse-zenoh`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import re
+import signal
+import sys
+import threading
+from collections import OrderedDict
+from typing import Any, NamedTuple, Sequence
+
+import zenoh
+
+from udp_mesh.bridges.envelope import TYPE, Envelope, EnvelopeError, open_envelope, seal
+from udp_mesh.bridges.port import MeshPort
+from udp_mesh.bridges.rmw_zenoh import (
+    CARRIED,
+    AnnouncementError,
+    TokenChange,
+    TokenExchange,
+    carried_key,
+    publisher_tokens,
+    topic_keys,
+)
+from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError, Message, as_message
+
+log = logging.getLogger(__name__)
+
+EXCHANGE_TOPIC = "bridge/zenoh"
+EXCHANGE_SETTINGS = {"priority": 1, "reliable": True, "compression": True, "keep_last": 1, "outbox": "last"}
+"""Announcements are whole, so only the last one counts, also for a peer that is away."""
+BRIDGE = "udp_mesh/bridge"
+MAX_PUBLISHERS = 1024
+"""Zenoh publishers kept, one per key and quality of service; the longest unused is taken back."""
+LOOK_S = 1.0
+PRIORITIES = dict(
+    enumerate(
+        (
+            zenoh.Priority.REAL_TIME,
+            zenoh.Priority.INTERACTIVE_HIGH,
+            zenoh.Priority.INTERACTIVE_LOW,
+            zenoh.Priority.DATA_HIGH,
+            zenoh.Priority.DATA,
+            zenoh.Priority.DATA_LOW,
+            zenoh.Priority.BACKGROUND,
+        ),
+        start=1,
+    )
+)
+"""Zenoh's levels by number: 1 is the most urgent."""
+
+
+class KeyRoute(NamedTuple):
+    """Samples under `keys` go to the mesh topic, to these peers (none: the topic's destinations, or all)."""
+
+    keys: str
+    topic: str
+    peers: tuple[str, ...]
+    tokens: str | None = None
+    """ROS 2: the key expression of the publishers' tokens."""
+
+
+def parse_route(text: str) -> KeyRoute:
+    """`KEYEXPR=TOPIC[@PEER,PEER]`. Raises argparse.ArgumentTypeError."""
+    keys, _, rest = text.rpartition("=")
+    topic, _, peers = rest.partition("@")
+    try:
+        zenoh.KeyExpr(keys)
+    except zenoh.ZError as error:
+        raise argparse.ArgumentTypeError("{!r}: expected KEYEXPR=TOPIC[@PEER,...]: {}".format(text, error)) from error
+    if not topic:
+        raise argparse.ArgumentTypeError("{!r}: expected KEYEXPR=TOPIC[@PEER,...], found no topic".format(text))
+    return KeyRoute(keys, topic, tuple(peer for peer in peers.split(",") if peer))
+
+
+def parse_ros2_route(text: str) -> KeyRoute:
+    """`[DOMAIN:]/ros/topic=TOPIC[@PEER,PEER]`. Raises argparse.ArgumentTypeError."""
+    found = re.fullmatch(r"(?:(\d+):)?(/?[A-Za-z_][\w/]*)=([^@]+)(?:@(.+))?", text)
+    if found is None:
+        raise argparse.ArgumentTypeError("{!r}: expected [DOMAIN:]/ros/topic=TOPIC[@PEER,...]".format(text))
+    domain, name, topic, peers = int(found[1] or 0), found[2], found[3], found[4] or ""
+    chosen = tuple(peer for peer in peers.split(",") if peer)
+    return KeyRoute(topic_keys(name, domain), topic, chosen, publisher_tokens(name, domain))
+
+
+class Bridge:
+    """The running bridge. Zenoh's callbacks come on its threads, the mesh's on the port's; `_lock` guards what both
+    use."""
+
+    def __init__(self, port: MeshPort, session: Any, routes: Sequence[KeyRoute]) -> None:
+        self._port = port
+        self._session = session
+        self._own = str(session.info.zid())
+        self._routes = routes
+        # Zenoh may call back from within a declaration.
+        self._lock = threading.RLock()
+        self._bridges: set[str] = set()
+        self._exchange = TokenExchange()
+        self._announced = b""
+        self._publishers: OrderedDict[tuple[object, ...], tuple[Any, list[int]]] = OrderedDict()
+        self._tokens: dict[str, tuple[Any, Any]] = {}
+        self._kept: list[Any] = []
+
+    def start(self) -> None:
+        """Declares everything. The token by which other bridges know us comes before the first sample."""
+        live = self._session.liveliness()
+        self._kept.append(live.declare_token("{}/{}".format(BRIDGE, self._own)))
+        self._kept.append(live.declare_subscriber(BRIDGE + "/*", self._bridge_seen, history=True))
+        self._kept.append(live.declare_subscriber(CARRIED + "/**", self._carried_seen, history=True))
+        for route in self._routes:
+            if route.tokens is not None:
+                self._kept.append(live.declare_subscriber(route.tokens, self._token_seen, history=True))
+            self._kept.append(
+                self._session.declare_subscriber(
+                    route.keys,
+                    lambda sample, route=route: self._from_zenoh(sample, route),
+                    allowed_origin=zenoh.Locality.REMOTE,
+                )
+            )
+
+    # Zenoh -> mesh
+
+    def _from_zenoh(self, sample: Any, route: KeyRoute) -> None:
+        source = sample.source_info
+        if source is not None and str(source.source_id.zid) in self._bridges:
+            return
+        attachment = sample.attachment
+        envelope = Envelope(
+            str(sample.key_expr),
+            bytes(sample.payload),
+            str(sample.encoding),
+            None if attachment is None else bytes(attachment),
+            int(sample.priority),
+            sample.congestion_control == zenoh.CongestionControl.BLOCK,
+            bool(sample.express),
+            sample.kind == zenoh.SampleKind.DELETE,
+        )
+        try:
+            sealed = seal(envelope)
+        except EnvelopeError as error:
+            log.warning("sample-dropped key=%.80s %s", envelope.key, error)
+            return
+        for peer in route.peers or (None,):
+            self._port.publish(route.topic, sealed, peer, TYPE)
+
+    def _bridge_seen(self, sample: Any) -> None:
+        zid = str(sample.key_expr).rpartition("/")[2]
+        (self._bridges.add if sample.kind == zenoh.SampleKind.PUT else self._bridges.discard)(zid)
+
+    def _token_seen(self, sample: Any) -> None:
+        with self._lock:
+            self._exchange.seen(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+        self.announce()
+
+    def _carried_seen(self, sample: Any) -> None:
+        with self._lock:
+            self._exchange.carried(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+        self.announce()
+
+    def announce(self, peer: str | None = None, *, answer: bool = False) -> None:
+        """Tells all other bridges our side's tokens if they changed, or one of them in any case."""
+        with self._lock:
+            announcement = self._exchange.announcement(answer=answer)
+            if peer is None and not answer and announcement == self._announced:
+                return
+            # Under the lock: of two announcements the later one must leave last.
+            if self._port.publish(EXCHANGE_TOPIC, announcement, peer, TYPE) and peer is None:
+                self._announced = announcement
+
+    # Mesh -> Zenoh
+
+    def daemon_up(self) -> None:
+        """The port calls this after each connect."""
+        self.look()
+        self.announce(answer=True)
+
+    def from_daemon(self, frame: Frame) -> None:
+        """The port calls this for each frame."""
+        message, header = as_message(frame), frame[0]
+        if message is not None and message.type == TYPE:
+            try:
+                if message.topic == EXCHANGE_TOPIC:
+                    self._from_bridge(message)
+                else:
+                    self._put(open_envelope(message.payload))
+            except (EnvelopeError, AnnouncementError) as error:
+                log.warning("message-dropped source=%s topic=%s %s", message.source, message.topic, error)
+            except zenoh.ZError as error:
+                log.warning("zenoh-refused source=%s topic=%s %s", message.source, message.topic, error)
+        elif header.get("event") in ("peer-online", "peer-restarted"):
+            self.announce(str(header["peer"]))
+        elif header.get("event") == "peer-offline":
+            with self._lock:
+                self._set_up(self._exchange.gone(str(header["peer"])))
+
+    def _put(self, sample: Envelope) -> None:
+        publisher, numbers = self._publisher(sample)
+        numbers[0] += 1
+        source = zenoh.SourceInfo(publisher.id, numbers[0] & 0xFFFFFFFF)
+        if sample.delete:
+            publisher.delete(attachment=sample.attachment, source_info=source)
+        else:
+            publisher.put(sample.payload, encoding=sample.encoding, attachment=sample.attachment, source_info=source)
+
+    def _publisher(self, sample: Envelope) -> tuple[Any, list[int]]:
+        """The publisher of this key and quality of service, with its count. Only the port's thread comes here."""
+        wanted = (sample.key, sample.priority, sample.block, sample.express)
+        found = self._publishers.pop(wanted, None)
+        if found is None:
+            control = zenoh.CongestionControl.BLOCK if sample.block else zenoh.CongestionControl.DROP
+            publisher = self._session.declare_publisher(
+                sample.key,
+                priority=PRIORITIES[sample.priority],
+                congestion_control=control,
+                express=sample.express,
+            )
+            found = (publisher, [0])
+        self._publishers[wanted] = found
+        if len(self._publishers) > MAX_PUBLISHERS:
+            self._publishers.popitem(last=False)[1][0].undeclare()
+        return found
+
+    def _from_bridge(self, message: Message) -> None:
+        with self._lock:
+            change, answer = self._exchange.heard(message.source, message.payload)
+            self._set_up(change)
+        if answer:
+            self.announce(message.source)
+
+    def _set_up(self, change: TokenChange) -> None:
+        live = self._session.liveliness()
+        for token in change.declare:
+            # The companion first: no bridge may take the token for one of its side's own.
+            companion = live.declare_token(carried_key(self._own, token))
+            self._tokens[token] = (companion, live.declare_token(token))
+        for token in change.withdraw:
+            companion, copy = self._tokens.pop(token)
+            copy.undeclare()
+            companion.undeclare()
+
+    def look(self) -> None:
+        """The daemon may have been started anew without the bridges' topic. Raises MeshError."""
+        self._port.ensure_topics({EXCHANGE_TOPIC: EXCHANGE_SETTINGS})
+
+
+def arguments() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="udp_mesh.bridges.zenoh_bridge", description="Zenoh over the mesh")
+    parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket")
+    parser.add_argument("--config", help="a Zenoh configuration file (JSON5)")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=JSON", help="one value of it")
+    parser.add_argument("--route", action="append", default=[], type=parse_route, metavar="KEYEXPR=TOPIC[@PEER,...]")
+    parser.add_argument(
+        "--ros2", action="append", default=[], type=parse_ros2_route, metavar="[DOMAIN:]/ros/topic=TOPIC[@PEER,...]"
+    )
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs until SIGTERM or SIGINT."""
+    options = arguments().parse_args(argv)
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
+    try:
+        config = zenoh.Config.from_file(options.config) if options.config else zenoh.Config()
+        for setting in options.set:
+            key, _, value = setting.partition("=")
+            config.insert_json5(key, value)
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        sys.stderr.write("zenoh_bridge: {}\n".format(error))
+        return 1
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    with session:
+        port = MeshPort(options.socket, ["*"])
+        bridge = Bridge(port, session, [*options.route, *options.ros2])
+        bridge.start()
+        thread = threading.Thread(target=port.run, args=(stop, bridge.daemon_up, bridge.from_daemon), daemon=True)
+        thread.start()
+        while not stop.wait(LOOK_S) and thread.is_alive():
+            try:
+                bridge.look()
+            except MeshError as error:
+                log.debug("daemon-unreachable %s", error)
+        if not stop.is_set():
+            # The port's thread ended by a mistake of ours, and said which: whoever started us starts us anew.
+            return 1
+        thread.join(5.0)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
