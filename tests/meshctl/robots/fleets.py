@@ -53,7 +53,7 @@ _ROBOT = """\
       address: {address}/8
       arch: {arch}
       python: {python}
-      ssh: {{port: {port}, user: root, key_files: [operator]}}
+      ssh: {{port: {port}, user: {user}, key_files: [operator]}}
 """
 
 
@@ -69,14 +69,15 @@ class RobotFleet:
         self._port = free_port()
         (directory / "keys.yaml").write_text(f'old: "{OLD_KEY}"\nnew: "{NEW_KEY}"\n')
 
-    def add(self, name: str, *, opt_kib: int | None = None) -> Machine:
+    def add(self, name: str, *, opt_kib: int | None = None, start: bool = True) -> Machine:
         address = f"127.0.4.{len(self.machines) + 1}"
         machine = Machine(self.directory / name, address, free_port(), self.key, opt_kib=opt_kib)
         self.machines[name] = machine
-        machine.start()
+        if start:
+            machine.start()
         return machine
 
-    def write(self, *, arch: str = "", python: str = PYTHON) -> None:
+    def write(self, *, arch: str = "", python: str = PYTHON, user: str = "root") -> None:
         """The inventory of all machines, with their host keys pinned."""
         robots = "".join(
             _ROBOT.format(
@@ -86,6 +87,7 @@ class RobotFleet:
                 port=machine.port,
                 arch=arch or _arch(),
                 python=python,
+                user=user,
             )
             for number, (name, machine) in enumerate(self.machines.items())
         )

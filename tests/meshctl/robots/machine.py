@@ -30,6 +30,7 @@ mkdir -p "$1/opt/python" "$1/var" "$1/root" "$1/etc/systemd/system"
 [ -z "$OPT_KIB" ] || { mount -t tmpfs -o "size=${OPT_KIB}k" tmpfs "$1/opt"; mkdir -p "$1/opt/python"; }
 mount --bind "$PREFIX" "$1/opt/python"
 mount --rbind "$1/opt" /opt
+[ -z "$OVERLAY" ] || mount -t overlay overlay -o "lowerdir=$OVERLAY:/usr" /usr
 mount --bind "$1/etc" /etc
 mount --bind "$1/var" /var/lib
 mount --bind "$1/root" /root
@@ -44,15 +45,14 @@ exec /usr/sbin/sshd -D -e -f "$1/sshd_config" -p "$2"
 class Machine:
     """One computer. `address` is its own; `root` is where its private directories are, seen from outside."""
 
-    def __init__(
-        self, root: Path, address: str, port: int, key: Path, *, opt_kib: int | None = None, user: str = "root"
-    ) -> None:
+    def __init__(self, root: Path, address: str, port: int, key: Path, *, opt_kib: int | None = None) -> None:
         self.root = root
         self.address = address
         self.port = port
-        self.user = user
         self._key = key
         self._opt_kib = opt_kib
+        self.overlay: Path | None = None
+        """A directory that lies over /usr, with what this computer has more."""
         self._server: Server | None = None
         for name in ("etc", "bin"):
             (root / name).mkdir(parents=True)
@@ -62,6 +62,8 @@ class Machine:
                 shutil.copytree(source, root / "etc" / name, symlinks=True)
             elif source.exists():
                 shutil.copy2(source, root / "etc" / name)
+        # where every user of this computer may read it
+        shutil.copy(f"{key}.pub", root / "etc/operator.pub")
         (root / "etc/shadow").write_text("root:*:0:0:99999:7:::\n")
         (root / "etc/shadow").chmod(0o600)
         stand_in = Path(__file__).with_name("stand_in_systemctl.py").read_text()
@@ -73,7 +75,7 @@ class Machine:
             ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", root / "host_key"], check=True, timeout=PATIENCE_S
         )
         (root / "sshd_config").write_text(
-            f"HostKey {root}/host_key\nAuthorizedKeysFile {key}.pub\nListenAddress {address}\nStrictModes no\n"
+            f"HostKey {root}/host_key\nAuthorizedKeysFile /etc/operator.pub\nListenAddress {address}\nStrictModes no\n"
             f"UsePAM no\nPidFile none\nPermitRootLogin yes\nSetEnv PATH={root}/bin:/usr/sbin:/usr/bin:/sbin:/bin\n"
         )
 
@@ -88,6 +90,7 @@ class Machine:
         environment = {
             "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
             "PREFIX": sys.base_prefix,
+            "OVERLAY": "" if self.overlay is None else str(self.overlay),
             "OPT_KIB": "" if self._opt_kib is None else str(self._opt_kib),
         }
         self._server = _AtAddress([*argv, str(self.root), str(self.port)], self, environment)
@@ -106,7 +109,7 @@ class Machine:
         trust = TrustStore(pins)
         trust.replace("machine", self.host_key)
         return connect(
-            Endpoint(self.address, self.port, self.user, identity="machine"),
+            Endpoint(self.address, self.port, identity="machine"),
             credentials=Credentials((self._key,), use_agent=False),
             trust=trust,
             deadlines=PATIENT,
