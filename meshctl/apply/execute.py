@@ -138,18 +138,17 @@ def _stage(
     budget: FailureBudget,
     images: Mapping[str, Path],
 ) -> dict[str, Outcome]:
-    policy = work.fleet.apply
     observer = Tee((_journaling(setting.run), setting.observer))
     if stage.kind is StageKind.SWITCH:
         ended = _switch_stage(stage, jobs, plan, work, observer)
         for outcome in ended.values():
             budget.count(outcome)
         return ended
-    parallel = policy.parallel if stage.kind is StageKind.FREE else len(stage.nodes)
     return run(
         stage.nodes,
         lambda name: _one_node(jobs[name], images),
-        parallel=max(1, parallel),
+        # a stage says who may be down together, the policy how many we can work on at once
+        parallel=max(1, work.fleet.apply.parallel),
         budget=budget,
         interrupt=setting.interrupt,
         observer=observer,
