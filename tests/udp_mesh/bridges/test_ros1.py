@@ -1,4 +1,4 @@
-"""Two robots with a roscore, a daemon and a bridge each: what holds between their ROS graphs."""
+"""Two robots with a roscore, a daemon and a bridge each: what holds between their ROS graphs. Needs scripts/setup-ros."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.udp_mesh.bridges.ros_processes import BridgeProcess, Master, Robot
 from tests.udp_mesh.daemon.processes import RunningDaemon, configuration, poll, wait_online
 from tests.udp_mesh.links.sockets import free_port
 
-pytestmark = pytest.mark.xdist_group("ros1")
+pytestmark = [pytest.mark.proof, pytest.mark.xdist_group("ros1")]
 
 
 @dataclass
