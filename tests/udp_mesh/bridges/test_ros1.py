@@ -1,4 +1,4 @@
-"""Two robots with a roscore, a daemon and a bridge each: what holds between their ROS graphs. Needs scripts/setup-ros."""
+"""Two robots with a roscore, a daemon and a bridge each: what holds between their graphs. Needs scripts/setup-ros."""
 
 from __future__ import annotations
 
