@@ -22,8 +22,9 @@ check: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# The long proofs: every kill point, hundreds of virtual nodes, hours of virtual time.
+# The long proofs: every kill point, hundreds of virtual nodes, hours of virtual time, real roscores, real sudo.
 proof: setup
+	scripts/setup-ros
 	$(BIN)/pytest -m proof
 
 bench: setup

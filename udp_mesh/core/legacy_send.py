@@ -129,7 +129,8 @@ class LegacySender:
         seconds = int(now)
         data = PriorityMeshData(
             self._own_name,
-            channel.type_name,
+            # what our bridges add behind the type's name (its md5sum), a fielded robot would take for the type
+            channel.type_name.partition(" ")[0],
             message.priority,
             channel.name,
             accepted.payload,
