@@ -1,4 +1,4 @@
-"""The channel: legal in the country, usable in the mesh's mode, at its width (MC321 to MC333)."""
+"""The channel: legal in the country, usable in the mesh's mode, at its width (MC321 to MC334)."""
 
 from __future__ import annotations
 
@@ -268,7 +268,7 @@ def htmode_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         meshes: {main: {channel: 149, band: 5g, htmode: HT40+, encryption: none, key: <removed>}}
         defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
         """,
-        also=("MC408",),
+        also=("MC334", "MC408"),
     ),
     passing=Example(
         """
@@ -276,7 +276,7 @@ def htmode_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         meshes: {main: {channel: 149, band: 5g, htmode: HT40, encryption: none, key: <removed>}}
         defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
         """,
-        also=("MC408",),
+        also=("MC334", "MC408"),
     ),
 )
 def htmode_sign_on_25_12(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
@@ -343,3 +343,29 @@ def channel_indoor(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
             outdoor = legal_channels(country, mesh.band, "HT20", forbidden=_SILENT | Flag.NO_OUTDOOR)
             expected = f"{_shown(outdoor)} (country {country.alpha2})"
             yield Finding(("meshes", mesh.name, "channel"), "for indoor use only", expected, str(mesh.channel))
+
+
+@fleet_rule(
+    "MC334",
+    Severity.NOTE,
+    "Some 25.12 builds cannot join an ad-hoc cell with a multicast rate",
+    why="""Their wifi scripts take `mcast_rate` for a list and hand `iw` no number, so the radio joins no cell. A later
+    version of the scripts has it right. meshctl would notice and go back, but no change would ever hold.""",
+    mend="Try one node first: `meshctl provision NODE`; `iw dev mesh0 link` must name the cell. Or use 802.11s mode.",
+    failing=Example(
+        """
+        hardware: {rocket: {release: "25.12"}}
+        meshes: {main: {encryption: none, key: <removed>}}
+        """,
+        also=("MC408",),
+    ),
+    passing="""
+    hardware: {rocket: {release: "24.10"}}
+    """,
+)
+def multicast_rate_on_25_12(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    new = {mesh for node in fleet.managed() if node.release >= Release.V25_12 for mesh in node.meshes}
+    for mesh in fleet.meshes.values():
+        if mesh.name in new and mesh.mode is MeshMode.ADHOC:
+            path = ("meshes", mesh.name, "mcast_rate_kbps")
+            yield Finding(path, "some 25.12 builds join no cell with it", "a build that was tried", "25.12, ad-hoc")
