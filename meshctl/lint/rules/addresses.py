@@ -283,11 +283,12 @@ def network_full(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     reserve = 2
     taken: dict[str, set[IPv4Address]] = {name: set() for name in fleet.meshes}
     by_network = grouped((mesh.network, name) for name, mesh in fleet.meshes.items())
+    # an address is looked up once per length of prefix, not once per network
+    lengths = {network.prefixlen for network in by_network}
     for address, _ in _stations(fleet):
-        for network, names in by_network.items():
-            if address in network:
-                for name in names:
-                    taken[name].add(address)
+        for length in lengths:
+            for name in by_network.get(IPv4Network((address, length), strict=False), ()):
+                taken[name].add(address)
     for name, mesh in fleet.meshes.items():
         room = mesh.network.num_addresses - 2 - len(taken[name])
         if len(taken[name]) > 0 and room < reserve:

@@ -44,8 +44,9 @@ def mesh_cut_off(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     reached = _reached_from_base(fleet)
     if not reached:
         return
+    members_of = grouped((mesh, node.name) for node in fleet.managed() for mesh in node.meshes)
     for name in fleet.meshes:
-        members = [node.name for node in fleet.members(name)]
+        members = members_of.get(name, ())
         if members and name not in reached:
             path = ("meshes", name)
             message = f"{len(members)} nodes ({listed(members)}) cannot reach the base"
