@@ -21,6 +21,7 @@ _COLUMNS: dict[str, tuple[str, float, str]] = {
     "recovery_fresh_s": ("first fresh urgent after the cut, s", 1, ".2f"),
     "recovery_any_s": ("first urgent of any age, s", 1, ".2f"),
     "goodput_after": ("goodput in the next 8 s, Mbit/s", 1e-6, ".2f"),
+    "share_after": ("of the link in the next 8 s", 1, ".3f"),
     "settled_p50_s": ("settled urgent p50, ms", 1e3, ".0f"),
     "settled_p99_s": ("settled urgent p99, ms", 1e3, ".0f"),
 }

@@ -19,6 +19,12 @@ def test_every_goal_names_a_cell_of_ours_that_is_run() -> None:
     assert {(goal.set, goal.cell) for goal in GOALS} <= known
 
 
+def test_every_goal_is_printed_met_or_missed() -> None:
+    results = [{"set": goal.set, "name": goal.cell, "peer": OURS, goal.figure: 1e12} for goal in GOALS]
+    printed = report(results)
+    assert printed.count("| met |") + printed.count("**missed**") == len(judged(results)) > 0
+
+
 def test_cells_are_named_once() -> None:
     names = [(cell.set, cell.peer, cell.name) for name in SETS for cell in cells(name)]
     assert len(names) == len(set(names))
