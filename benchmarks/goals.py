@@ -27,10 +27,6 @@ class Goal:
             return False
         return (self.at_least is None or value >= self.at_least) and (self.at_most is None or value <= self.at_most)
 
-    @property
-    def text(self) -> str:
-        return f">= {self.at_least:g}" if self.at_least is not None else f"<= {self.at_most:g}"
-
 
 GOALS: tuple[Goal, ...] = (
     Goal("loss", "0%", "share", at_least=0.95),

@@ -98,7 +98,7 @@ def run(lab: Laboratory, peer: str, link: Link, load: Load) -> Measured:
         for end in ends:
             # a sender of a fixed amount has nothing more to say once the receiver has it all
             _stop(end)
-    return _read(results, count, changed_s, load)
+    return _read(results, count, changed_s)
 
 
 def _while_it_runs(lab: Laboratory, load: Load) -> float | None:
@@ -144,7 +144,7 @@ def _stop(end: subprocess.Popen[bytes]) -> None:
             stream.close()
 
 
-def _read(results: Sequence[Path], count: Count, changed_s: float | None, load: Load) -> Measured:
+def _read(results: Sequence[Path], count: Count, changed_s: float | None) -> Measured:
     received = _load(results[1])
     if received is None:
         raise RuntimeError("the receiver left no result")

@@ -95,7 +95,7 @@ class _Play:
         self.rng = random.Random(scenario.seed)
         self.courses: dict[str, Course] = {**scenario.robots, **scenario.relays}
         self.settings = {
-            name: Settings(name, unkeyed=True, topics=scenario.topics, window=_window(scenario))
+            name: Settings(name, unkeyed=True, topics=scenario.topics, window=scenario.window)
             for name in scenario.robots
         }
         self.filling = self.rng.randbytes(_FILLING_BYTES)
@@ -186,10 +186,6 @@ class _Play:
             if self.scenario.appear_s.get(name, 0.0) <= now:
                 self._note(recording.Place(now, name, *course.at(now)))
         self.team.agenda.after(SAMPLE_S, partial(self._sample, progress))
-
-
-def _window(scenario: Scenario) -> Any:
-    return scenario.window
 
 
 def play(scenario: Scenario, progress: Callable[[float], None] = lambda now: None) -> Played:

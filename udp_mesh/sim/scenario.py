@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -70,7 +70,7 @@ class Scenario:
     flows: tuple[Flow, ...]
     incidents: tuple[Incident, ...]
     observer: str
-    window: str | int
+    window: Literal["adaptive"] | int
 
 
 class _At:

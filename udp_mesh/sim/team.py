@@ -19,7 +19,6 @@ from udp_mesh.core.events import (
     MessageExpired,
     MessageId,
     MessagePeerLost,
-    MessageReceived,
     Rejected,
 )
 from udp_mesh.core.node import Node
@@ -188,8 +187,3 @@ class Team:
         member.wake_s = float("inf")
         member.node.handle_timer(self.agenda.now)
         self._settle(member)
-
-
-def received_bytes(event: Event) -> int:
-    """The payload of a message that arrived, 0 for any other event."""
-    return len(event.payload) if isinstance(event, MessageReceived) else 0
