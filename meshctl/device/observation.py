@@ -45,6 +45,14 @@ class Memory:
 
 
 @dataclass(frozen=True, slots=True)
+class Load:
+    """/proc/loadavg: processes running or waiting, averaged over the last minute, and how many processors share them."""
+
+    minute: float
+    processors: int
+
+
+@dataclass(frozen=True, slots=True)
 class Space:
     """One file system, in bytes, after `df -k`."""
 
@@ -206,6 +214,7 @@ class Observation:
     boot_id: str | None = None
     uptime_s: float | None = None
     clock_s: float | None = None
+    load: Load | None = None
     memory: Memory | None = None
     overlay: Space | None = None
     tmp: Space | None = None

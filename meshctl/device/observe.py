@@ -121,6 +121,7 @@ def interpret(sections: Mapping[str, Section], *, asked_at_s: float, answered_at
         boot_id=reader.read("boot_id", system.parse_boot_id),
         uptime_s=reader.read("uptime", system.parse_uptime),
         clock_s=reader.read("clock", system.parse_clock),
+        load=reader.read("load", system.parse_load),
         memory=reader.read("meminfo", system.parse_meminfo),
         overlay=_space(space, "/"),
         tmp=_space(space, "/tmp"),

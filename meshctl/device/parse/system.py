@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from meshctl.device.observation import Bridge, Memory, ReleaseInfo, Space
+from meshctl.device.observation import Bridge, Load, Memory, ReleaseInfo, Space
 
 _ASSIGNMENT = re.compile(r"""^DISTRIB_([A-Z]+)=(['"]?)(.*)\2\s*$""", re.MULTILINE)
 _MEMINFO = re.compile(r"^(\w+):\s+(\d{1,15}) kB$", re.MULTILINE)
@@ -45,6 +45,15 @@ def _first_number(text: str) -> float | None:
 def parse_boot_id(text: str) -> str | None:
     """/proc/sys/kernel/random/boot_id."""
     return text.strip() if _BOOT_ID.fullmatch(text.strip()) else None
+
+
+def parse_load(text: str) -> Load | None:
+    """/proc/loadavg, then the number of processors on a line of its own (1 where the kernel numbers none)."""
+    lines = text.split("\n")
+    minute = _first_number(lines[0])
+    if minute is None or len(lines) < 2 or not re.fullmatch(r"\d{1,5}", lines[1].strip()):
+        return None
+    return Load(minute, max(1, int(lines[1])))
 
 
 def parse_meminfo(text: str) -> Memory | None:

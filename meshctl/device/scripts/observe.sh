@@ -25,6 +25,8 @@ bridges() {
 	done
 }
 
+load() { cat /proc/loadavg && grep -c ^processor /proc/cpuinfo; }
+
 # opkg and apk are slow on a small processor; their databases say the same
 packages() {
 	if command -v apk >/dev/null; then
@@ -68,6 +70,7 @@ section openwrt_release cat /etc/openwrt_release
 section board_name cat /tmp/sysinfo/board_name
 section model cat /tmp/sysinfo/model
 section board.json cat /etc/board.json
+section load load
 section meminfo cat /proc/meminfo
 section df df -k / /tmp
 section macs macs

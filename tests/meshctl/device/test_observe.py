@@ -108,6 +108,7 @@ PARSERS = [
     system.parse_uptime,
     system.parse_clock,
     system.parse_boot_id,
+    system.parse_load,
     system.parse_meminfo,
     system.parse_df,
     system.parse_macs,
