@@ -46,7 +46,7 @@ class Memory:
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """/proc/loadavg: processes running or waiting, averaged over the last minute, and how many processors share them."""
+    """/proc/loadavg: processes running or waiting, averaged over a minute, and how many processors share them."""
 
     minute: float
     processors: int
