@@ -15,10 +15,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from meshctl.lab.addresses import FACTORY_ADDRESS, bench_of, loopback_of
 from meshctl.lab.errors import LabError
 from meshctl.lab.forward import Shape, Tunnel, reset
 from meshctl.lab.spec import Medium
-from meshctl.lab.twin import FACTORY_ADDRESS, bench_of, loopback_of
 
 if TYPE_CHECKING:
     from meshctl.lab.supervisor import Supervisor

@@ -23,11 +23,11 @@ from typing import Any, Self
 
 from meshctl.device.connection import Completed, Endpoint
 from meshctl.lab import rom
+from meshctl.lab.addresses import bench_of, loopback_of
 from meshctl.lab.client import is_running, request
 from meshctl.lab.errors import LabError
 from meshctl.lab.spec import FleetSpec, Medium, dump, load
 from meshctl.lab.state import Power
-from meshctl.lab.twin import bench_of, loopback_of
 
 # how often a waiting caller asks again
 _POLL_S = 0.05
@@ -196,7 +196,7 @@ class VirtualFleet:
         self.directory.mkdir(parents=True, exist_ok=True)
         for leftover in ("rom", "nodes", "mnt"):
             shutil.rmtree(self.directory / leftover, ignore_errors=True)
-        for leftover in ("bell", "failure", "control.sock", "supervisor.pid", "log"):
+        for leftover in ("bell", "failure", "control.sock", "supervisor.pid", "log", standing.FILE_NAME):
             (self.directory / leftover).unlink(missing_ok=True)
         (self.directory / "spec.json").write_text(dump(self.spec), encoding="utf-8")
 
@@ -281,8 +281,25 @@ class VirtualFleet:
         self.ask("mend", where=where)
 
     def link(self, a: str, b: str, **changes: Any) -> None:
-        """Change a link's fields (`up`, `delay_ms`, `loss`, `rate_kbps`, `tq`), or make one that was not there."""
+        """Change a link's fields as seen from `a` (`spec.LinkSpec`, `spec.changed_link`), or make one; `mend` undoes it."""
         self.ask("link", a=a, b=b, changes=changes)
+
+    @property
+    def ground(self) -> Ground:
+        """What it stands on now: where nodes are, as far as somebody said, and who hears whom."""
+        return standing.read(self.directory) or Ground(links=self.spec.links)
+
+    def stand_on(self, ground: Ground) -> None:
+        """Who hears whom is as this ground has it from now on, but for links that were set one by one."""
+        standing.write(self.directory, ground)
+        self.ask("ground")
+
+    def switch(self, name: str, on: bool) -> None:
+        """A node's power switch: an orderly end with everything in flash, or power; does not wait for its boot."""
+        if on:
+            self.ask("power_on", node=name)
+        elif self.node(name).power is not Power.OFF:
+            self.ask("power_cut", node=name, unsynced="kept", back=False)
 
     def status(self) -> dict[str, Any]:
         """What `meshctl lab status --json` prints: fleet, pid, port, and per node power, address, mesh, breaks."""

@@ -1,14 +1,8 @@
-"""From an inventory to its virtual twin: nodes as factory devices, links as a graph, addresses on this machine.
-
-Every management address a.b.c.d appears as 127.b.c.d, all on one port per fleet; a node's LAN port on the bench is
-127.255.0.N, where N counts the nodes from 1. Both refuse connections unless the node would be reached in the field:
-it holds that address, and a path through the mesh (or a wire) leads there.
-"""
+"""From an inventory to its virtual twin: nodes as factory devices, links as a graph."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from ipaddress import IPv4Address
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,19 +15,8 @@ from meshctl.model import Fleet, Node, Role
 
 # up to here a fleet's default shape is a chain
 _CHAIN_NODES = 12
-FACTORY_ADDRESS = "192.168.1.1"
 # locally administered, so that no real device has it: two bytes of fleet-wide prefix, then the node, then the radio
 _MAC = "02:4d:{:02x}:{:02x}:00:{:02x}"
-
-
-def loopback_of(address: str) -> str:
-    """Where a management address is reached on this machine: 10.42.0.11 -> 127.42.0.11."""
-    return "127." + str(IPv4Address(address)).split(".", 1)[1]
-
-
-def bench_of(number: int) -> str:
-    """Where the LAN port of the `number`-th node (from 0) is reached: 127.255.0.1, 127.255.0.2, ..."""
-    return f"127.255.{(number + 1) // 256}.{(number + 1) % 256}"
 
 
 def spec_of(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from meshctl.errors import InputError
 from meshctl.firmware.metadata import read_metadata
-from meshctl.lab import breaks, releases, rom, twin
+from meshctl.lab import addresses, breaks, releases, rom, twin
 from meshctl.lab.breaks import Break, Order
 from meshctl.lab.errors import LabError
 from meshctl.lab.images import firmware_image
@@ -39,10 +39,10 @@ def test_a_spec_names_what_is_wrong_with_it() -> None:
 
 
 def test_every_address_has_one_place_on_this_machine() -> None:
-    assert twin.loopback_of("10.42.0.11") == "127.42.0.11"
-    assert twin.bench_of(0) == "127.255.0.1"
-    assert twin.bench_of(299) == "127.255.1.44"
-    assert len({twin.bench_of(number) for number in range(1000)}) == 1000
+    assert addresses.loopback_of("10.42.0.11") == "127.42.0.11"
+    assert addresses.bench_of(0) == "127.255.0.1"
+    assert addresses.bench_of(299) == "127.255.1.44"
+    assert len({addresses.bench_of(number) for number in range(1000)}) == 1000
 
 
 def test_every_node_of_a_big_fleet_is_a_few_hops_away() -> None:
