@@ -1,7 +1,16 @@
 """The mesh as a graph: who hears whom, how far each node is from where we stand, what each node's loss cuts off."""
 
 from meshctl.topology.graph import EMPTY, Graph, Link, Path, graph_of
-from meshctl.topology.observed import NEIGHBOUR_FRESH_MS, Heard, Report, Sighting, observed_graph, seen_by
+from meshctl.topology.observed import (
+    NEIGHBOUR_FRESH_MS,
+    Heard,
+    Report,
+    Sighting,
+    names_by_mac,
+    neighbours_of,
+    observed_graph,
+    seen_by,
+)
 from meshctl.topology.reports import mesh_macs, report_of
 
 __all__ = [
@@ -15,6 +24,8 @@ __all__ = [
     "Sighting",
     "graph_of",
     "mesh_macs",
+    "names_by_mac",
+    "neighbours_of",
     "observed_graph",
     "report_of",
     "seen_by",

@@ -1,7 +1,8 @@
 """From what nodes tell about their neighbours to one graph of the mesh.
 
-Each node that answered gives a `Report` (its own mesh MACs, whom it hears); `observed_graph` turns MACs into names and
-both directions of a link into one; `seen_by` tells who still hears a node that does not answer.
+Each node that answered gives a `Report` (its own mesh MACs, whom it hears); `neighbours_of` turns the MACs a report
+hears into nodes, each once; `observed_graph` makes both directions of a link into one; `seen_by` tells who still hears a
+node that does not answer.
 """
 
 from __future__ import annotations
@@ -50,6 +51,32 @@ def names_by_mac(reports: Iterable[Report], known_macs: Mapping[str, str]) -> di
     return names
 
 
+def neighbours_of(
+    report: Report, names: Mapping[str, str], *, fresh_ms: int = NEIGHBOUR_FRESH_MS
+) -> dict[str, Heard]:
+    """Whom a node hears now: neighbour -> the best of that neighbour's radios, for it carries the traffic.
+
+    `names` maps lower-case MACs to nodes; a MAC that nobody owns stands for itself. Neighbours not heard for longer
+    than `fresh_ms`, and the node's own radios, are left out.
+    """
+    best: dict[str, Heard] = {}
+    for heard in report.heard:
+        mac = heard.mac.lower()
+        name = names.get(mac, mac)
+        if heard.last_seen_ms <= fresh_ms and name != report.node:
+            known = best.get(name)
+            if known is None or _rank(heard) > _rank(known):
+                best[name] = heard
+    return best
+
+
+def _rank(heard: Heard) -> tuple[float, int, int]:
+    """By measured quality, then by signal, then by how lately it was heard; what nobody measured ranks last."""
+    quality = -1.0 if heard.quality is None else heard.quality
+    # no receiver hears anything at -200 dBm
+    return quality, -200 if heard.signal_dbm is None else heard.signal_dbm, -heard.last_seen_ms
+
+
 def observed_graph(
     reports: Iterable[Report],
     *,
@@ -66,13 +93,8 @@ def observed_graph(
     names = names_by_mac(told, known_macs or {})
     quality: dict[tuple[str, str], float] = {}
     for report in told:
-        for heard in report.heard:
-            other = names.get(heard.mac.lower(), heard.mac.lower())
-            if heard.last_seen_ms > fresh_ms or other == report.node:
-                continue
-            value = 1.0 if heard.quality is None else heard.quality
-            # of a node's several radios, the best one to this neighbour carries the traffic
-            quality[report.node, other] = max(value, quality.get((report.node, other), 0.0))
+        for other, heard in neighbours_of(report, names, fresh_ms=fresh_ms).items():
+            quality[report.node, other] = 1.0 if heard.quality is None else heard.quality
     links = [Link(a, b, min(value, quality.get((b, a), value))) for (a, b), value in quality.items()]
     links += [Link(a, b, 1.0, wired=True) for a, b in wires]
     return graph_of((report.node for report in told), links)
@@ -84,10 +106,10 @@ def seen_by(
     """For every node that somebody hears: by whom and how long ago, the latest first."""
     told = tuple(reports)
     names = names_by_mac(told, known_macs)
+    known = frozenset(names.values())
     sightings: dict[str, list[Sighting]] = {}
     for report in told:
-        for heard in report.heard:
-            name = names.get(heard.mac.lower())
-            if name is not None and name != report.node and heard.last_seen_ms <= fresh_ms:
+        for name, heard in neighbours_of(report, names, fresh_ms=fresh_ms).items():
+            if name in known:
                 sightings.setdefault(name, []).append(Sighting(report.node, heard.last_seen_ms, heard.signal_dbm))
     return {name: tuple(sorted(seen, key=lambda s: (s.age_ms, s.by))) for name, seen in sightings.items()}
