@@ -149,7 +149,7 @@ def peers(service: Service, _client: Client, _header: Header, _: bytes) -> Heade
 def topics(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
     undeclared = service.settings.undeclared
     return {
-        "topics": topics_json(service.settings, service.counts),
+        "topics": topics_json(service.settings, service.counts, service.driver.now()),
         "undeclared": None if undeclared is None else topic_json(undeclared),
     }
 

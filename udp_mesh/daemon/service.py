@@ -158,6 +158,7 @@ class Service:
         count = self._count(topic)
         count.sent_messages += 1
         count.sent_bytes += len(payload)
+        count.last_sent = self.driver.now()
         if self.recorder is not None and how is not None:
             self.recorder.sent(
                 self.driver.now(),
@@ -296,6 +297,7 @@ class Service:
         count = self._count(topic)
         count.received_messages += 1
         count.received_bytes += len(event.payload)
+        count.last_received = self.driver.now()
         self._hand_out(
             {
                 "event": "message",

@@ -98,6 +98,9 @@ class TopicCount:
     sent_bytes: int = 0
     received_messages: int = 0
     received_bytes: int = 0
+    last_sent: float | None = None
+    """On the core's clock, as `last_received`; None before the first."""
+    last_received: float | None = None
 
 
 def topic_json(topic: Topic) -> Json:
@@ -106,17 +109,26 @@ def topic_json(topic: Topic) -> Json:
     return fields
 
 
-def topics_json(settings: Settings, counts: Mapping[str, TopicCount]) -> list[Json]:
-    """Configured topics in order of priority, then topics that only arrived; each with its counts."""
+def topics_json(settings: Settings, counts: Mapping[str, TopicCount], now: float) -> list[Json]:
+    """Configured topics in order of priority, then topics that only arrived; each with its counts and the age of its
+    last message each way."""
     configured = [topic for topic in settings.topics if not topic.name.startswith(RESERVED_PREFIX)]
     rows = [
-        {**topic_json(topic), "configured": True, **dataclasses.asdict(counts.get(topic.name, TopicCount()))}
+        {**topic_json(topic), "configured": True, **_count_json(counts.get(topic.name, TopicCount()), now)}
         for topic in sorted(configured, key=lambda topic: (topic.priority, topic.name))
     ]
     known = {topic.name for topic in configured}
     rows += [
-        {"name": name, "configured": False, **dataclasses.asdict(count)}
+        {"name": name, "configured": False, **_count_json(count, now)}
         for name, count in sorted(counts.items())
         if name not in known and not name.startswith(RESERVED_PREFIX)
     ]
     return rows
+
+
+def _count_json(count: TopicCount, now: float) -> Json:
+    fields: Json = dataclasses.asdict(count)
+    for key, at in (("sent_ago_s", count.last_sent), ("received_ago_s", count.last_received)):
+        fields[key] = None if at is None else round(now - at, 3)
+    del fields["last_sent"], fields["last_received"]
+    return fields
