@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -20,8 +21,9 @@ from meshctl.cli.session import KeyFiles, exit_for, progress_for
 from meshctl.errors import ExitCode, InputError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.robots.deploy import probe, refusal, roll_back, wanted
+from meshctl.robots.facts import RobotFacts, expectation, facts_object, gather
 from meshctl.robots.host import Host
-from meshctl.robots.watch import Health, difference, health, health_object, table
+from meshctl.robots.watch import difference, table
 
 app = typer.Typer(help="udp_mesh on the robots' computers: deploy, watch, change.", no_args_is_help=True)
 app.add_typer(topic_app, name="topic")
@@ -105,15 +107,16 @@ def status_command(
     Example: meshctl robots status
     """
     with crew_of(inventory, robots, key=key, ask_sudo=ask_sudo, as_json=as_json) as crew:
-        found: dict[str, Health] = {}
+        found: dict[str, RobotFacts] = {}
+        wanted = {name: expectation(crew.fleet, name, crew.order.secrets) for name in crew.robots}
 
         def work(host: Host, robot: str) -> Outcome:
-            found[robot] = health(host, robot)
+            found[robot] = gather(host, robot, wanted[robot], now_s=time.time())
             return Outcome(robot, Result.DONE if found[robot].is_well else Result.FAILED)
 
         outcomes = crew.on_each(work)
-        rows = [found.get(name, Health(name, trouble=one.reason)) for name, one in outcomes.items()]
-        typer.echo(json.dumps([health_object(one) for one in rows], indent=2) if as_json else table(rows))
+        rows = [found.get(name, RobotFacts(name, trouble=one.reason)) for name, one in outcomes.items()]
+        typer.echo(json.dumps([facts_object(one) for one in rows], indent=2) if as_json else table(rows))
         raise typer.Exit(exit_for(outcomes.values(), crew.opened.interrupt))
 
 

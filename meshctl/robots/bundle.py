@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import tarfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from meshctl.model import Fleet, Secret, SecretRef
@@ -18,7 +18,8 @@ from meshctl.robots.scripts import shipped
 from meshctl.robots.wheels import Wheel
 
 UNIT_NAME = "udp-mesh.service"
-_PROGRAM = "/opt/udp-mesh/current/bin/udp-mesh run /opt/udp-mesh/current/etc"
+BRIDGE_UNIT_NAME = "udp-mesh-ros1.service"
+_CURRENT = "/opt/udp-mesh/current"
 # Half of a SHA-256: nobody makes two bundles meet by accident, and people read it.
 _ID_DIGITS = 16
 _SECRET_MODE = 0o600
@@ -77,13 +78,15 @@ class Bundle:
         """The release's own files as a tar, with its manifest and the link to its tree."""
         out = io.BytesIO()
         with tarfile.open(fileobj=out, mode="w", format=tarfile.USTAR_FORMAT) as archive:
-            for directory in ("bin", "etc"):
+            for directory in ("bin", "etc", "ros1"):
                 entry = tarfile.TarInfo(directory)
                 entry.type, entry.mode = tarfile.DIRTYPE, 0o755
                 archive.addfile(entry)
-            link = tarfile.TarInfo("lib")
-            link.type, link.linkname = tarfile.SYMTYPE, f"../../trees/{self.tree}"
-            archive.addfile(link)
+            # ROS's Python finds our package in ros1/, and none of the wheels that are built for another one
+            for name, target in (("lib", f"../../trees/{self.tree}"), ("ros1/udp_mesh", "../lib/udp_mesh")):
+                link = tarfile.TarInfo(name)
+                link.type, link.linkname = tarfile.SYMTYPE, target
+                archive.addfile(link)
             for file in (*self.files, File("manifest", self.manifest)):
                 entry = tarfile.TarInfo(file.path)
                 entry.size, entry.mode = len(file.content), file.mode
@@ -98,35 +101,56 @@ def bundle(
     wheels: Sequence[Wheel],
     *,
     executable: str,
-    unit: str,
+    units: Mapping[str, str],
 ) -> Bundle:
-    """The bundle for one robot; `executable` is the absolute path of its Python, `unit` the daemon's unit file.
+    """The bundle for one robot; `executable` is the absolute path of its Python, `units` the unit files we ship.
 
     Raises InvalidInput for what the daemon would refuse, and for keys that cannot be had.
     """
     listed = "".join(f"{wheel.sha256}  {wheel.file}\n" for wheel in wheels).encode()
     tree = hashlib.sha256(listed + executable.encode()).hexdigest()[:_ID_DIGITS]
+    files = [
+        *configuration(fleet, robot, secrets, units),
+        File("python", f"{executable}\n".encode()),
+        File("tree", f"{tree}\n".encode()),
+        File("wheels", listed),
+    ]
+    return Bundle(robot, tree, tuple(wheels), tuple(sorted(files, key=lambda file: file.path)))
+
+
+def configuration(
+    fleet: Fleet, robot: str, secrets: Callable[[SecretRef], Secret], units: Mapping[str, str]
+) -> tuple[File, ...]:
+    """The files of a release that the inventory alone decides, whatever Python and wheels the computer has.
+
+    Raises InvalidInput as `bundle` does.
+    """
     topics = "".join(f"{topic.name}\n" for topic in fleet.topics).encode()
+    start = f"{_CURRENT}/bin/udp-mesh run {_CURRENT}/etc/{CONFIG_NAME}"
     files = [
         File("bin/udp-mesh", shipped("launcher.sh").encode(), 0o755),
         File(f"etc/{CONFIG_NAME}", daemon_config(fleet, robot)),
-        File("python", f"{executable}\n".encode()),
         File("topics", topics),
-        File("tree", f"{tree}\n".encode()),
-        File(UNIT_NAME, service_unit(unit).encode()),
-        File("wheels", listed),
+        File(UNIT_NAME, service_unit(units[UNIT_NAME], start).encode()),
     ]
     keys = daemon_keys(fleet, secrets)
     if keys is not None:
         files.append(File(f"etc/{KEY_NAME}", keys, _SECRET_MODE))
-    return Bundle(robot, tree, tuple(wheels), tuple(sorted(files, key=lambda file: file.path)))
+    computer = fleet.robots[robot].computer
+    if computer is not None and computer.ros:
+        files += [
+            File("bin/udp-mesh-ros1", shipped("bridge.sh").encode(), 0o755),
+            File("ros", f"/opt/ros/{computer.ros}/setup.bash\n".encode()),
+            File(BRIDGE_UNIT_NAME, service_unit(units[BRIDGE_UNIT_NAME], f"{_CURRENT}/bin/udp-mesh-ros1").encode()),
+        ]
+    return tuple(files)
 
 
-def service_unit(stock: str) -> str:
-    """udp_mesh's own unit, started from the current release. Raises ValueError when it has not one start command."""
+def service_unit(stock: str, start: str) -> str:
+    """A unit of udp_mesh's own, started by `start`. Raises ValueError when it has not one start command."""
     lines = stock.splitlines()
     places = [number for number, line in enumerate(lines) if line.startswith("ExecStart=")]
     if len(places) != 1:
         raise ValueError(f"expected one ExecStart in the unit, found {len(places)}")
-    lines[places[0]] = f"ExecStart={_PROGRAM}/{CONFIG_NAME}"
+    lines[places[0]] = f"ExecStart={start}"
     return "".join(f"{line}\n" for line in lines)

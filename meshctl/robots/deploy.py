@@ -19,7 +19,7 @@ from meshctl.robots.bundle import Bundle, bundle
 from meshctl.robots.host import Host, Refused
 from meshctl.robots.tags import Target
 from meshctl.robots.target import Facts, changed_files, objections, parse_facts, room_objection
-from meshctl.robots.wheels import Wheel, choose, fetch, has_all, keep, stock_unit
+from meshctl.robots.wheels import Wheel, choose, fetch, has_all, keep, stock_units
 
 _WHEEL_DIRECTORY = "/opt/udp-mesh/wheels"
 PROBE_TIMEOUT_S = 120.0
@@ -84,7 +84,7 @@ def wanted(order: Order, robot: str, facts: Facts) -> Bundle:
     """The bundle for a probed computer. Raises InputError where a wheel or a key is missing."""
     assert facts.target is not None, "objections come first"
     wheels = order.wheels(facts.target)
-    return bundle(order.fleet, robot, order.secrets, wheels, executable=facts.executable, unit=stock_unit())
+    return bundle(order.fleet, robot, order.secrets, wheels, executable=facts.executable, units=stock_units())
 
 
 def refusal(order: Order, robot: str, computer: Computer, facts: Facts) -> Outcome | None:

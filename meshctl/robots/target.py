@@ -45,8 +45,13 @@ class Facts:
     files: tuple[tuple[str, str], ...] = ()
     damaged: tuple[str, ...] = ()
     is_proven: bool = True
-    active: str = ""
-    enabled: str = ""
+    services: tuple[tuple[str, str, str], ...] = ()
+
+    @property
+    def units(self) -> tuple[tuple[str, str, str], ...]:
+        """(unit, active, enabled) of the units that the current release has, the daemon's first."""
+        ours = {path for path, _ in self.files}
+        return tuple(service for service in self.services if service[0] in ours)
 
     @property
     def target(self) -> Target | None:
@@ -56,9 +61,14 @@ class Facts:
         return Target(self.python[:2], _arch_of_python(self.arch, self.bits), self.libc, self.libc_version)
 
     @property
+    def runs(self) -> bool:
+        """Whether all its units do, and will at the next boot."""
+        return bool(self.units) and all(tuple(state) == ("active", "enabled") for _, *state in self.units)
+
+    @property
     def is_sound(self) -> bool:
         """Whether the current release runs, has proved itself, and is on the disk as it was put there."""
-        return self.is_proven and not self.damaged and self.active == "active" and self.enabled == "enabled"
+        return self.is_proven and not self.damaged and self.runs
 
 
 def parse_facts(text: str) -> Facts:
@@ -93,9 +103,14 @@ def parse_facts(text: str) -> Facts:
         files=tuple((path, digest) for digest, _, path in (row.partition("  ") for row in many.get("file", ()))),
         damaged=tuple(many.get("damaged", ())),
         is_proven=one.get("proven") == "yes",
-        active=one.get("active", ""),
-        enabled=one.get("enabled", ""),
+        services=tuple(_service(row) for row in many.get("unit", ())),
     )
+
+
+def _service(row: str) -> tuple[str, str, str]:
+    """`NAME ACTIVE ENABLED`; systemd says nothing of what it does not know."""
+    name, active, enabled, *_ = (*row.split(), "", "", "")
+    return name, active, enabled
 
 
 def _number(text: str, default: int = 0) -> int:

@@ -14,7 +14,7 @@ import re
 import subprocess
 import sys
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -174,7 +174,13 @@ def _age(wheel: WheelName) -> tuple[tuple[int, ...], str]:
     return tuple(int(part) for part in re.findall(r"\d+", wheel.version)), wheel.file
 
 
-def stock_unit() -> str:
-    """The unit file that udp_mesh ships."""
+@cache
+def stock_units() -> Mapping[str, str]:
+    """The unit files that udp_mesh ships, by name."""
+    folder = f"{_PACKAGE}/daemon/units/"
     with zipfile.ZipFile(io.BytesIO(own_wheel().content)) as archive:
-        return archive.read(f"{_PACKAGE}/daemon/units/udp-mesh.service").decode()
+        return {
+            name.removeprefix(folder): archive.read(name).decode()
+            for name in archive.namelist()
+            if name.startswith(folder) and name.endswith(".service")
+        }

@@ -13,7 +13,9 @@ PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
 export LC_ALL PATH
 root=/opt/udp-mesh
 unit=udp-mesh.service
-unit_file=/etc/systemd/system/$unit
+bridge_unit=udp-mesh-ros1.service
+units=/etc/systemd/system
+unit_file=$units/$unit
 socket=/run/udp-mesh/udp-mesh.sock
 account=udp-mesh
 

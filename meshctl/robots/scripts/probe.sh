@@ -43,7 +43,11 @@ if [ -e "$root/current/manifest" ]; then
 	# what was changed by hand, or by a failing disk
 	(cd "$root/current" && sha256sum -c manifest 2>/dev/null) | sed -n 's/: FAILED.*//p' | sed 's/^/damaged=/'
 	(cd "$root/current/lib" && sha256sum -c .sums 2>/dev/null) | sed -n 's/: FAILED.*//p' | sed 's|^|damaged=lib/|'
-	cmp -s "$root/current/$unit" "$unit_file" || echo "damaged=$unit_file"
+	for service in $unit $bridge_unit; do
+		[ ! -e "$root/current/$service" ] || cmp -s "$root/current/$service" "$units/$service" ||
+			echo "damaged=$units/$service"
+	done
 fi
-echo "active=$(systemctl is-active "$unit" 2>/dev/null)"
-echo "enabled=$(systemctl is-enabled "$unit" 2>/dev/null)"
+for service in $unit $bridge_unit; do
+	echo "unit=$service $(systemctl is-active "$service" 2>/dev/null) $(systemctl is-enabled "$service" 2>/dev/null)"
+done

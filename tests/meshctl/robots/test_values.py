@@ -10,13 +10,12 @@ import pytest
 from meshctl.errors import InputError
 from meshctl.fleet import Result
 from meshctl.model import SecretKind, SecretRef
-from meshctl.robots.bundle import Bundle, File, service_unit
+from meshctl.robots.bundle import UNIT_NAME, Bundle, File, service_unit
 from meshctl.robots.deploy import switched
 from meshctl.robots.rotation import parse_ref, stages, written
 from meshctl.robots.tags import Target, parse_wheel, pip_options, takes
 from meshctl.robots.target import Facts, changed_files, objections, parse_facts, room_objection
-from meshctl.robots.watch import parse_health, table
-from meshctl.robots.wheels import own_wheel, stock_unit
+from meshctl.robots.wheels import own_wheel, stock_units
 
 BOOKWORM = Target((3, 11), "x86_64", "glibc", (2, 36))
 PI = Target((3, 12), "aarch64", "glibc", (2, 39))
@@ -54,11 +53,11 @@ def test_our_wheel_holds_udp_mesh_alone_and_its_unit_starts_the_current_release(
     with zipfile.ZipFile(BytesIO(own_wheel().content)) as archive:
         tops = {name.split("/")[0] for name in archive.namelist()}
     assert {top.split("-")[0] for top in tops} == {"udp_mesh"}
-    unit = service_unit(stock_unit())
+    unit = service_unit(stock_units()[UNIT_NAME], "/opt/udp-mesh/current/bin/udp-mesh run FILE")
     starts = [line for line in unit.splitlines() if line.startswith("ExecStart=")]
-    assert starts == ["ExecStart=/opt/udp-mesh/current/bin/udp-mesh run /opt/udp-mesh/current/etc/udp-mesh.toml"]
+    assert starts == ["ExecStart=/opt/udp-mesh/current/bin/udp-mesh run FILE"]
     with pytest.raises(ValueError, match="one ExecStart"):
-        service_unit("[Service]\n")
+        service_unit("[Service]\n", "x")
 
 
 def test_a_bundle_is_named_by_its_content_and_shows_no_secret() -> None:
@@ -90,8 +89,9 @@ tree=tttt
 proven=yes
 file=1111  etc/udp-mesh.toml
 file=2222  python
-active=active
-enabled=enabled
+file=3333  udp-mesh.service
+unit=udp-mesh.service active enabled
+unit=udp-mesh-ros1.service inactive
 """
 
 
@@ -125,8 +125,9 @@ def test_room_is_asked_for_what_is_unpacked_and_something_to_spare() -> None:
 
 def test_changed_files_are_those_whose_hash_differs_or_that_one_side_lacks() -> None:
     facts = parse_facts(PROBED)
-    assert changed_files(facts, [("etc/udp-mesh.toml", "1111"), ("python", "2222")]) == ()
-    assert changed_files(facts, [("etc/udp-mesh.toml", "3333"), ("new", "1")]) == ("etc/udp-mesh.toml", "new", "python")
+    assert changed_files(facts, [("etc/udp-mesh.toml", "1111"), ("python", "2222"), ("udp-mesh.service", "3333")]) == ()
+    wanted = [("etc/udp-mesh.toml", "3333"), ("udp-mesh.service", "3333"), ("new", "1")]
+    assert changed_files(facts, wanted) == ("etc/udp-mesh.toml", "new", "python")
 
 
 def test_what_a_switch_says_becomes_one_outcome() -> None:
@@ -135,12 +136,6 @@ def test_what_a_switch_says_becomes_one_outcome() -> None:
     assert back.result is Result.ROLLED_BACK
     assert back.hint == "its last words:\na=b\nc"
     assert switched("r", "id", "").result is Result.FAILED
-
-
-def test_a_daemon_that_does_not_answer_is_not_well_and_says_so() -> None:
-    one = parse_health("husky1", "== service\nactive=active\ncurrent=aaaa\nproven=yes\n== status\n== topics\n")
-    assert not one.is_well
-    assert "the daemon does not answer" in table([one])
 
 
 OLD, NEW, OTHER = (SecretRef(SecretKind.ENV, name) for name in ("OLD", "NEW", "OTHER"))

@@ -1,0 +1,370 @@
+"""How one robot fares, in one round trip: `scripts/facts.sh` -> sections -> `RobotFacts`.
+
+`expectation` says what the inventory wants there, `gather` asks a robot, `parse_robot_facts` reads what it told, and
+`facts_object` is all of it for programs. Ages are the robot's own, by a clock that never jumps; nothing here believes
+its wall clock.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from meshctl.model import Fleet, Secret, SecretRef
+from meshctl.robots.bundle import BRIDGE_UNIT_NAME, UNIT_NAME, configuration
+from meshctl.robots.host import Host
+from meshctl.robots.wheels import own_wheel, stock_units
+
+# Two Python programs start and answer there, on a small ARM board that computes all it can.
+FACTS_TIMEOUT_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Expectation:
+    """What the inventory wants of one robot: `files` are hashes by path in the release, `wheel` is the hash of our own
+    packages; `bridge` says whether a ROS 1 bridge belongs there."""
+
+    files: Mapping[str, str] = field(default_factory=dict)
+    wheel: str = ""
+    bridge: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceFacts:
+    """A unit as systemd tells it: `active` is `active`, `activating`, `failed`, `inactive`; `enabled` is empty for a
+    unit that is not installed; `restarts` counts those that systemd did by itself."""
+
+    active: str = ""
+    enabled: str = ""
+    restarts: int = 0
+    result: str = ""
+
+    @property
+    def is_up(self) -> bool:
+        return self.active == "active"
+
+
+@dataclass(frozen=True, slots=True)
+class PeerFacts:
+    """Another robot as this one sees it; times in seconds, None where nothing is known."""
+
+    name: str
+    online: bool
+    heard_ago_s: float | None = None
+    round_trip_s: float | None = None
+    loss: float = 0.0
+    outbox_messages: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class QueueFacts:
+    """What waits on one priority level, for all peers together; `oldest_s` is the age of the oldest message."""
+
+    priority: int
+    messages: int
+    bytes: int
+    oldest_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class TopicFacts:
+    """One topic at this daemon; `priority` is None for one that only arrives. Ages are None before the first message,
+    and where the daemon is too old to tell."""
+
+    name: str
+    priority: int | None
+    sent_messages: int = 0
+    received_messages: int = 0
+    sent_ago_s: float | None = None
+    received_ago_s: float | None = None
+
+    @property
+    def last_ago_s(self) -> float | None:
+        """Since the last message in either direction."""
+        return min((age for age in (self.sent_ago_s, self.received_ago_s) if age is not None), default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class ComputerFacts:
+    """The computer itself. `load` is the average of running processes over 1, 5 and 15 minutes; `clock_ahead_s` is its
+    clock against ours, the way there included."""
+
+    uptime_s: float | None = None
+    load: tuple[float, float, float] | None = None
+    cpus: int = 0
+    memory_kib: int = 0
+    memory_free_kib: int = 0
+    disk_kib: int = 0
+    disk_free_kib: int = 0
+    clock_ahead_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class RobotFacts:
+    """One robot at `seen_s` (our clock, Unix time).
+
+    `trouble` is why the computer could not be asked, and then all else is empty. `drift` has one line for each way in
+    which it is not as the inventory says. `bridge` is None where no ROS 1 bridge is wanted and none is installed.
+    `status` is what `udp-mesh status --json` prints, empty where no daemon answers.
+    """
+
+    robot: str
+    seen_s: float = 0.0
+    trouble: str = ""
+    service: ServiceFacts = ServiceFacts()
+    bridge: ServiceFacts | None = None
+    release: str = ""
+    previous: str = ""
+    is_proven: bool = True
+    drift: tuple[str, ...] = ()
+    version: str = ""
+    daemon_uptime_s: float | None = None
+    keys: tuple[str, ...] = ()
+    unkeyed: bool = False
+    peers: tuple[PeerFacts, ...] = ()
+    queues: tuple[QueueFacts, ...] = ()
+    topics: tuple[TopicFacts, ...] = ()
+    computer: ComputerFacts = ComputerFacts()
+    status: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def answers(self) -> bool:
+        """Whether the daemon itself was heard."""
+        return bool(self.status)
+
+    @property
+    def online(self) -> tuple[str, ...]:
+        return tuple(peer.name for peer in self.peers if peer.online)
+
+    @property
+    def is_well(self) -> bool:
+        """Whether everything that belongs there runs and has proved itself; drift does not make it ill."""
+        bridge_is_well = self.bridge is None or self.bridge.is_up
+        return not self.trouble and self.service.is_up and self.is_proven and self.answers and bridge_is_well
+
+    @property
+    def remark(self) -> str:
+        """What an operator should know, in one line; empty when there is nothing."""
+        if self.trouble:
+            return self.trouble
+        if not self.service.enabled and not self.release:
+            return "not installed: `meshctl robots deploy`"
+        told = []
+        if not self.is_proven:
+            told.append("a switch was cut short: deploy again")
+        if self.service.is_up and not self.answers:
+            told.append("the daemon does not answer")
+        if self.bridge is not None and not self.bridge.is_up:
+            told.append(f"the ROS bridge is {self.bridge.active or 'absent'}")
+        told += [f"{count} differ from the inventory" for count in [len(self.drift)] if count]
+        away = [peer.name for peer in self.peers if not peer.online]
+        told += [f"away: {', '.join(away)}"] if away else []
+        return "; ".join(told)
+
+
+def expectation(fleet: Fleet, robot: str, secrets: Callable[[SecretRef], Secret]) -> Expectation:
+    """What the inventory wants of one robot, without the wheels that only a deploy needs.
+
+    Raises InvalidInput for what the daemon would refuse, and for keys that cannot be had.
+    """
+    files = {file.path: file.sha256 for file in configuration(fleet, robot, secrets, stock_units())}
+    return Expectation(files, own_wheel().sha256, bridge=BRIDGE_UNIT_NAME in files)
+
+
+def gather(host: Host, robot: str, wanted: Expectation, *, now_s: float) -> RobotFacts:
+    """Ask one robot, in one round trip; `now_s` is our clock (Unix time). Raises what `Host.run` raises."""
+    return parse_robot_facts(robot, host.run("facts", timeout_s=FACTS_TIMEOUT_S), wanted, now_s=now_s)
+
+
+def parse_robot_facts(robot: str, text: str, wanted: Expectation, *, now_s: float) -> RobotFacts:
+    """The sections of `scripts/facts.sh`; a section that is missing or no JSON counts as no answer."""
+    sections = _sections(text)
+    services = _services(sections.get("services", ()))
+    release = _values(sections.get("release", ()))
+    status = _object(sections.get("status", ()))
+    peers = tuple(_objects(_within(status, "conditions").get("peers")))
+    bridge = services.get(BRIDGE_UNIT_NAME, ServiceFacts())
+    return RobotFacts(
+        robot,
+        seen_s=now_s,
+        service=services.get(UNIT_NAME, ServiceFacts()),
+        bridge=bridge if wanted.bridge or bridge.enabled else None,
+        release=_last(release, "current"),
+        previous=_last(release, "previous"),
+        is_proven=_last(release, "proven") != "no",
+        drift=drift(release, wanted, services),
+        version=str(status.get("version", "")),
+        daemon_uptime_s=_float(status.get("uptime_s")),
+        keys=tuple(str(key) for key in status.get("keys", ()) or ()),
+        unkeyed=bool(status.get("unkeyed")),
+        peers=tuple(_peer(peer) for peer in peers),
+        queues=_queues(peers),
+        topics=tuple(_topic(topic) for topic in _objects(_object(sections.get("topics", ())).get("topics"))),
+        computer=_computer(_values(sections.get("computer", ())), now_s),
+        status=status,
+    )
+
+
+def drift(
+    release: Mapping[str, list[str]], wanted: Expectation, services: Mapping[str, ServiceFacts]
+) -> tuple[str, ...]:
+    """One line for each way in which what is deployed is not what the inventory says, or not what was deployed."""
+    if not _last(release, "current"):
+        return ("nothing is installed",)
+    here = {path: digest for digest, _, path in (row.partition("  ") for row in release.get("file", ()))}
+    lines = [f"changed on the robot: {path}" for path in release.get("damaged", ())]
+    lines += [f"differs from the inventory: {path}" for path, sha in wanted.files.items() if here.get(path) != sha]
+    if BRIDGE_UNIT_NAME in here and not wanted.bridge:
+        lines.append(f"not in the inventory: {BRIDGE_UNIT_NAME}")
+    wheels = {row.split()[0] for row in release.get("wheel", ()) if row.strip()}
+    if wanted.wheel and wanted.wheel not in wheels:
+        lines.append("another version of udp-mesh than ours")
+    units = (UNIT_NAME, BRIDGE_UNIT_NAME) if wanted.bridge else (UNIT_NAME,)
+    for unit in units:
+        if services.get(unit, ServiceFacts()).enabled != "enabled":
+            lines.append(f"{unit} will not start at boot")
+    return tuple(lines)
+
+
+def facts_object(facts: RobotFacts) -> dict[str, Any]:
+    """For programs: every field under its name, with what follows from them."""
+    told = dataclasses.asdict(facts)
+    return {
+        **told,
+        "well": facts.is_well,
+        "answers": facts.answers,
+        "online": list(facts.online),
+        "remark": facts.remark,
+    }
+
+
+def _sections(text: str) -> dict[str, list[str]]:
+    sections: dict[str, list[str]] = {}
+    name = ""
+    for line in text.splitlines():
+        if line.startswith("== "):
+            name = line.removeprefix("== ")
+            sections.setdefault(name, [])
+        else:
+            sections.setdefault(name, []).append(line)
+    return sections
+
+
+def _values(lines: Iterable[str]) -> dict[str, list[str]]:
+    values: dict[str, list[str]] = {}
+    for line in lines:
+        name, equals, value = line.partition("=")
+        if equals:
+            values.setdefault(name, []).append(value)
+    return values
+
+
+def _last(values: Mapping[str, list[str]], name: str) -> str:
+    return values.get(name, [""])[-1]
+
+
+def _services(lines: Iterable[str]) -> dict[str, ServiceFacts]:
+    """`systemctl show` prints one property a line and no unit twice; an empty line ends a unit."""
+    found = {}
+    unit: dict[str, str] = {}
+    for line in (*lines, ""):
+        name, equals, value = line.partition("=")
+        if equals:
+            unit[name] = value
+        elif unit:
+            found[unit.get("Id", "")] = ServiceFacts(
+                # systemd calls a unit it does not know inactive, and its file state empty
+                "" if unit.get("LoadState") == "not-found" else unit.get("ActiveState", ""),
+                unit.get("UnitFileState", ""),
+                int(_number(unit.get("NRestarts", "")) or 0),
+                unit.get("Result", ""),
+            )
+            unit = {}
+    return found
+
+
+def _object(lines: Iterable[str]) -> dict[str, Any]:
+    try:
+        value = json.loads("\n".join(lines))
+    except ValueError:
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _within(value: Mapping[str, Any], name: str) -> dict[str, Any]:
+    inner = value.get(name)
+    return inner if isinstance(inner, dict) else {}
+
+
+def _objects(value: object) -> list[dict[str, Any]]:
+    return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
+
+
+def _number(text: str) -> float | None:
+    return float(text) if re.fullmatch(r"-?\d+(\.\d+)?", text) else None
+
+
+def _float(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _peer(peer: Mapping[str, Any]) -> PeerFacts:
+    return PeerFacts(
+        str(peer.get("name", "")),
+        bool(peer.get("online")),
+        _float(peer.get("heard_ago_s")),
+        _float(peer.get("round_trip_s")),
+        _float(peer.get("loss")) or 0.0,
+        int(_float(peer.get("outbox_messages")) or 0),
+    )
+
+
+def _queues(peers: Iterable[Mapping[str, Any]]) -> tuple[QueueFacts, ...]:
+    levels: dict[int, QueueFacts] = {}
+    for queue in (queue for peer in peers for queue in _objects(peer.get("queues"))):
+        level = int(_float(queue.get("priority")) or 0)
+        sum_so_far = levels.get(level, QueueFacts(level, 0, 0, 0.0))
+        levels[level] = QueueFacts(
+            level,
+            sum_so_far.messages + int(_float(queue.get("messages")) or 0),
+            sum_so_far.bytes + int(_float(queue.get("bytes")) or 0),
+            max(sum_so_far.oldest_s, _float(queue.get("oldest_s")) or 0.0),
+        )
+    return tuple(levels[level] for level in sorted(levels))
+
+
+def _topic(topic: Mapping[str, Any]) -> TopicFacts:
+    priority = _float(topic.get("priority"))
+    return TopicFacts(
+        str(topic.get("name", "")),
+        None if priority is None else int(priority),
+        int(_float(topic.get("sent_messages")) or 0),
+        int(_float(topic.get("received_messages")) or 0),
+        _float(topic.get("sent_ago_s")),
+        _float(topic.get("received_ago_s")),
+    )
+
+
+def _computer(values: Mapping[str, list[str]], now_s: float) -> ComputerFacts:
+    def numbers(name: str) -> list[float]:
+        return [number for word in _last(values, name).split() if (number := _number(word)) is not None]
+
+    def one(name: str, at: int = 0) -> float:
+        found = numbers(name)
+        return found[at] if len(found) > at else 0.0
+
+    load = numbers("load")
+    return ComputerFacts(
+        one("uptime") if numbers("uptime") else None,
+        (load[0], load[1], load[2]) if len(load) >= 3 else None,
+        int(one("cpus")),
+        int(one("MemTotal")),
+        int(one("MemAvailable")),
+        int(one("disk")),
+        int(one("disk", 1)),
+        one("now") - now_s if numbers("now") else 0.0,
+    )

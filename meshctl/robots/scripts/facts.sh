@@ -1,0 +1,31 @@
+# facts: how the computer, its services and the daemon fare, in sections that a line `== NAME` begins. Changes nothing,
+# and looks at the disk no more than needed: status asks everyone, often.
+echo "== services"
+for service in $unit $bridge_unit; do
+	# of a service that was never installed systemd knows ActiveState=inactive, UnitFileState= and LoadState=not-found
+	systemctl show -p Id,LoadState,ActiveState,SubState,UnitFileState,NRestarts,Result "$service" 2>/dev/null
+	echo
+done
+echo "== release"
+echo "current=$(release_of current)"
+echo "previous=$(release_of previous)"
+[ ! -e "$root/unproven" ] && echo proven=yes || echo proven=no
+if [ -e "$root/current/manifest" ]; then
+	sed 's/^/file=/' "$root/current/manifest"
+	(cd "$root/current" && sha256sum -c manifest 2>/dev/null) | sed -n 's/: FAILED.*//p' | sed 's/^/damaged=/'
+	sed 's/^/wheel=/' "$root/current/wheels"
+fi
+echo "== computer"
+echo "now=$(date +%s)"
+echo "uptime=$(cat /proc/uptime)"
+echo "load=$(cat /proc/loadavg)"
+echo "cpus=$(nproc 2>/dev/null)"
+grep -E '^(MemTotal|MemAvailable):' /proc/meminfo | sed 's/: */=/'
+there=$root
+while [ ! -d "$there" ]; do there=$(dirname "$there"); done
+df -Pk "$there" | awk 'END { print "disk=" $(NF - 4), $(NF - 2) }'
+echo "== status"
+mesh status --json 2>/dev/null
+echo "== topics"
+mesh topics --json 2>/dev/null
+exit 0

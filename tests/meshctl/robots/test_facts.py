@@ -1,0 +1,147 @@
+"""What a robot told becomes facts: recorded outputs beside what they mean, and a table for people."""
+
+from __future__ import annotations
+
+import json
+
+from meshctl.robots.facts import Expectation, RobotFacts, facts_object, parse_robot_facts
+from meshctl.robots.watch import table
+
+NOW_S = 1_800_000_000.0
+WANTED = Expectation({"etc/udp-mesh.toml": "1111", "udp-mesh.service": "2222"}, wheel="9999")
+
+_SERVICES = """\
+== services
+Id=udp-mesh.service
+LoadState=loaded
+ActiveState=active
+SubState=running
+UnitFileState=enabled
+NRestarts=2
+Result=success
+
+Id=udp-mesh-ros1.service
+LoadState=not-found
+ActiveState=inactive
+SubState=dead
+UnitFileState=
+NRestarts=0
+Result=success
+
+== release
+current=aaaa
+previous=bbbb
+proven=yes
+file=1111  etc/udp-mesh.toml
+file=2222  udp-mesh.service
+wheel=9999  udp_mesh-0.1.0-py3-none-any.whl
+wheel=8888  cffi-1.17.1-cp311-cp311-linux_x86_64.whl
+== computer
+now=1799999990
+uptime=3600.25 7000.00
+load=0.52 0.40 0.30 2/345 6789
+cpus=4
+MemTotal=8000000 kB
+MemAvailable=5000000 kB
+disk=60000000 20000000
+"""
+
+
+def _peer(name: str, online: bool, queues: list[dict[str, float]]) -> dict[str, object]:
+    return {"name": name, "online": online, "heard_ago_s": 0.5, "round_trip_s": 0.01, "loss": 0.1, "queues": queues}
+
+
+_STATUS = json.dumps(
+    {
+        "version": "0.1.0",
+        "uptime_s": 3500.5,
+        "keys": ["0011223344556677"],
+        "unkeyed": False,
+        "conditions": {
+            "peers": [
+                _peer("base", True, [{"priority": 9, "messages": 2, "bytes": 100, "oldest_s": 4.0}]),
+                _peer("husky2", False, [{"priority": 9, "messages": 1, "bytes": 50, "oldest_s": 9.0}]),
+            ]
+        },
+    },
+    indent=2,
+)
+_TOPICS = json.dumps(
+    {
+        "topics": [
+            {"name": "estop", "priority": 0, "sent_messages": 0, "sent_ago_s": None, "received_ago_s": None},
+            {"name": "status", "priority": 5, "sent_messages": 7, "sent_ago_s": 1.5, "received_ago_s": 0.25},
+        ]
+    }
+)
+ANSWER = f"{_SERVICES}== status\n{_STATUS}\n== topics\n{_TOPICS}\n"
+
+
+def _facts(text: str = ANSWER, wanted: Expectation = WANTED) -> RobotFacts:
+    return parse_robot_facts("husky1", text, wanted, now_s=NOW_S)
+
+
+def test_one_answer_tells_service_release_daemon_and_computer() -> None:
+    facts = _facts()
+    assert facts.is_well
+    assert (facts.service.active, facts.service.enabled, facts.service.restarts) == ("active", "enabled", 2)
+    assert facts.bridge is None, "none is wanted and none is installed"
+    assert (facts.release, facts.previous, facts.version, facts.drift) == ("aaaa", "bbbb", "0.1.0", ())
+    assert facts.online == ("base",)
+    assert facts.remark == "away: husky2"
+    (queue,) = facts.queues
+    assert (queue.priority, queue.messages, queue.bytes, queue.oldest_s) == (9, 3, 150, 9.0)
+    assert {topic.name: topic.last_ago_s for topic in facts.topics} == {"estop": None, "status": 0.25}
+    computer = facts.computer
+    assert (computer.uptime_s, computer.load, computer.cpus) == (3600.25, (0.52, 0.40, 0.30), 4)
+    assert (computer.memory_kib, computer.memory_free_kib) == (8_000_000, 5_000_000)
+    assert (computer.disk_kib, computer.disk_free_kib) == (60_000_000, 20_000_000)
+    assert computer.clock_ahead_s == -10.0
+    assert json.loads(json.dumps(facts_object(facts)))["peers"][0]["name"] == "base"
+
+
+def test_drift_names_what_differs_from_the_inventory_and_what_was_changed_by_hand() -> None:
+    text = ANSWER.replace("wheel=9999", "wheel=7777").replace("== computer", "damaged=etc/udp-mesh.toml\n== computer")
+    text = text.replace("file=2222", "file=3333").replace("UnitFileState=enabled", "UnitFileState=disabled")
+    facts = _facts(text)
+    assert facts.drift == (
+        "changed on the robot: etc/udp-mesh.toml",
+        "differs from the inventory: udp-mesh.service",
+        "another version of udp-mesh than ours",
+        "udp-mesh.service will not start at boot",
+    )
+    assert facts.is_well, "what runs is well, only not as the inventory says"
+    assert "4 differ" in facts.remark
+
+
+def test_a_bridge_that_is_wanted_and_does_not_run_makes_the_robot_ill() -> None:
+    wanted = Expectation(WANTED.files, WANTED.wheel, bridge=True)
+    facts = _facts(wanted=wanted)
+    assert facts.bridge is not None
+    assert not facts.is_well
+    assert "the ROS bridge is absent" in facts.remark
+    bridge = _SERVICES.index("Id=udp-mesh-ros1")
+    up = ANSWER[:bridge] + ANSWER[bridge:].replace("not-found", "loaded", 1).replace("inactive", "active", 1)
+    up = up.replace("UnitFileState=\n", "UnitFileState=enabled\n")
+    assert _facts(up, wanted).is_well
+    assert _facts(up).bridge is not None, "one that is there is told even where the inventory wants none"
+
+
+def test_a_daemon_that_does_not_answer_is_not_well_and_says_so() -> None:
+    silent = _facts(f"{_SERVICES}== status\n== topics\n")
+    assert not silent.is_well
+    assert silent.remark == "the daemon does not answer"
+    assert "the daemon does not answer" in table([silent, _facts()])
+    nothing = _facts("")
+    assert not nothing.is_well
+    assert nothing.drift == ("nothing is installed",)
+    assert "not installed" in nothing.remark
+    away = RobotFacts("husky9", trouble="husky9 (10.42.0.19): no answer")
+    assert "no answer" in table([away])
+
+
+def test_the_table_tells_queues_by_priority_and_the_youngest_message() -> None:
+    told = table([_facts()])
+    assert "p9: 3" in told
+    assert "status 0 s ago" in told
+    assert "1/2" in told
