@@ -9,7 +9,7 @@ import paramiko
 import pytest
 
 from meshctl.lab.fleet import VirtualFleet, VirtualNode
-from meshctl.lab.images import firmware_image
+from meshctl.lab.images import firmware_image, opkg_package
 from meshctl.lab.state import Power
 from meshctl.model import Release
 from tests.meshctl.lab.conftest import answers, connect, flash_text, run, until
@@ -304,3 +304,15 @@ def test_packages_are_installed_from_files_and_checked(fleet: VirtualFleet, node
     assert "tool-1.2-r3" in new.exec("apk list --installed").stdout
     new.exec("apk del tool").check("remove")
     assert "tool-1.2-r3" not in new.exec("apk list --installed").stdout
+
+
+def test_netifd_knows_the_protocols_that_were_there_when_it_started(fleet: VirtualFleet, node: VirtualNode) -> None:
+    known = json.loads(node.exec("ubus call network get_proto_handlers").stdout)
+    assert set(known) >= {"static", "batadv", "batadv_hardif"}
+    node.exec("opkg remove kmod-batman-adv && /etc/init.d/network restart").check("forget")
+    assert "batadv" not in json.loads(node.exec("ubus call network get_proto_handlers").stdout)
+    node.exec("cat >/tmp/k.ipk", stdin=opkg_package("kmod-batman-adv", "1", {})).check("put it there")
+    again = node.exec("opkg install /tmp/k.ipk >/dev/null; ubus call network reload; ubus call network get_proto_handlers")
+    assert "batadv" not in json.loads(again.stdout)
+    restarted = node.exec("ubus call network restart; ubus call network get_proto_handlers")
+    assert "batadv" in json.loads(restarted.stdout)
