@@ -13,11 +13,11 @@ import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from meshctl.lab.quality import TQ_MAX
 from meshctl.lab.spec import LinkSpec
 
-# batman-adv's default hop_penalty, and its scale of TQ
+# batman-adv's default hop_penalty, on its scale of TQ
 HOP_PENALTY = 30
-TQ_MAX = 255
 # the highest rate of two streams in 20 MHz with short guard interval, MCS 15
 _BEST_RATE_MBIT_S = 144.4
 
@@ -83,12 +83,13 @@ class Effective:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """Two cells that hear each other, seen from the first one."""
+    """A cell that hears another, `peer` of `node`; `tq` (0..255) is the quality of sending there, 0 when it is deaf."""
 
     own: Cell
     peer: Cell
     node: str
     link: LinkSpec
+    tq: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,16 +114,21 @@ def parse_effective(text: str) -> Effective:
 
 
 def edges(nodes: Mapping[str, Effective], links: Iterable[LinkSpec]) -> dict[str, list[Edge]]:
-    """Each node's edges, for the links that are up between nodes that share a cell."""
+    """Whom each node hears: over links that are up, in a cell they share, unless the link loses everything."""
     found: dict[str, list[Edge]] = {name: [] for name in nodes}
     for link in links:
         if not link.up or link.a not in nodes or link.b not in nodes:
             continue
-        for own in nodes[link.a].cells:
-            for peer in nodes[link.b].cells:
-                if own.hears(peer):
-                    found[link.a].append(Edge(own, peer, link.b, link))
-                    found[link.b].append(Edge(peer, own, link.a, link))
+        for own, other in ((link.a, link.b), (link.b, link.a)):
+            if link.loss_to(own) >= 1.0:
+                continue
+            tq = link.tq_to(other)
+            found[own].extend(
+                Edge(cell, peer, other, link, tq)
+                for cell in nodes[own].cells
+                for peer in nodes[other].cells
+                if cell.hears(peer)
+            )
     return found
 
 
@@ -141,7 +147,7 @@ def paths(graph: Mapping[str, list[Edge]], start: str) -> dict[str, Path]:
         for edge in graph.get(name, ()):
             if edge.node in settled or not edge.own.routes_with(edge.peer):
                 continue
-            tq = -negative * edge.link.tq // TQ_MAX
+            tq = -negative * edge.tq // TQ_MAX
             if hops:
                 tq = tq * (TQ_MAX - HOP_PENALTY) // TQ_MAX
             if tq > 0:
@@ -157,11 +163,11 @@ def heard(name: str, nodes: Mapping[str, Effective], graph: Mapping[str, list[Ed
     """
     lines = []
     for edge in graph.get(name, ()):
-        own, peer, link = edge.own, edge.peer, edge.link
-        rate = _BEST_RATE_MBIT_S * link.tq / TQ_MAX
-        lines.append(f"S\t{own.interface}\t{peer.mac}\t{link.signal_dbm}\t{_age_ms(name, peer.mac)}\t{rate:.1f}")
+        own, peer = edge.own, edge.peer
+        rate, signal_dbm = _BEST_RATE_MBIT_S * edge.tq / TQ_MAX, edge.link.signal_at(name)
+        lines.append(f"S\t{own.interface}\t{peer.mac}\t{signal_dbm}\t{_age_ms(name, peer.mac)}\t{rate:.1f}")
         if own.routes_with(peer):
-            lines.append(f"N\t{own.interface}\t{peer.mac}\t{_age_ms(name, peer.mac)}\t{link.tq}")
+            lines.append(f"N\t{own.interface}\t{peer.mac}\t{_age_ms(name, peer.mac)}\t{edge.tq}")
     for target, path in sorted(ways.items()):
         own, hop = path.first.own, path.first.peer.mac
         mac = next(cell.mac for cell in nodes[target].cells if cell.soft != "-")

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from meshctl.errors import MeshctlError
+from meshctl.lab.spec import LinkSpec
 from meshctl.lab.state import NodeState
 from meshctl.lab.warden import MESSAGE_BYTES
 
@@ -125,8 +126,8 @@ class _Operations:
             for name, state in fleet.nodes.items()
         ]
         links = [
-            {"between": [link.a, link.b], "up": link.up, "tq": link.tq, "delay_ms": link.delay_ms, "loss": link.loss,
-             "rate_kbps": link.rate_kbps}
+            {"between": [link.a, link.b], "up": link.up, "tq": link.tq_to(link.b), "delay_ms": link.delay_ms,
+             "loss": link.loss, "loss_back": link.loss_to(link.a), "rate_kbps": link.rate_kbps}
             for link in fleet.ether.links()
         ]  # fmt: skip
         return {"fleet": fleet.spec.name, "pid": os.getpid(), "port": fleet.doors.port, "nodes": nodes, "links": links}
@@ -161,6 +162,13 @@ class _Operations:
 
     def link(self, a: str, b: str, changes: dict[str, Any]) -> None:
         self._fleet.ether.set_link(a, b, changes)
+
+    def links(self, part: list[dict[str, Any]], is_last: bool) -> None:
+        """Who hears whom from now on, in parts because a request has its limit (`standing.stand_on`)."""
+        self._fleet.ether.coming += [LinkSpec(**link) for link in part]
+        if is_last:
+            links, self._fleet.ether.coming = self._fleet.ether.coming, []
+            self._fleet.ether.set_ground(links)
 
     def plug(self, node: str, plugged: bool) -> None:
         self._fleet.hurt.find(node).plugged = plugged

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from meshctl.errors import InputError
 from meshctl.lab import air
 from meshctl.lab.forward import Shape
-from meshctl.lab.spec import LinkSpec, Medium
+from meshctl.lab.spec import LinkSpec, Medium, changed_link
 
 if TYPE_CHECKING:
     from meshctl.lab.supervisor import Supervisor
@@ -24,8 +25,11 @@ class Ether:
 
     def __init__(self, fleet: Supervisor) -> None:
         self._fleet = fleet
-        self._links = {link.ends: link for link in fleet.spec.links}
-        self._original = dict(self._links)
+        # who hears whom by the fleet's spec or its ground, and over it the links that somebody set one by one
+        self._ground = {link.ends: link for link in fleet.spec.links}
+        self._by_hand: dict[frozenset[str], LinkSpec] = {}
+        # parts of a ground that is being told
+        self.coming: list[LinkSpec] = []
         # what `sever`, `link-down` and `slow` do to all links of a node
         self.severed: set[str] = set()
         self.slowed: dict[str, dict[str, Any]] = {}
@@ -46,7 +50,7 @@ class Ether:
 
     def links(self) -> list[LinkSpec]:
         """Every link as it is now, with what was done to its ends."""
-        return [self._hurt(link) for link in self._links.values()]
+        return [self._hurt(link) for link in {**self._ground, **self._by_hand}.values()]
 
     def _hurt(self, link: LinkSpec) -> LinkSpec:
         if link.ends & self.severed:
@@ -55,28 +59,38 @@ class Ether:
             link = replace(link, **self.slowed[name])
         return link
 
+    def set_ground(self, links: Iterable[LinkSpec]) -> None:
+        """Everything that holds from now on, but for what was set by hand; links to nodes not in the fleet are not."""
+        ground = {link.ends: link for link in links if link.ends <= self._fleet.nodes.keys()}
+        if ground != self._ground:
+            self._ground = ground
+            self.changed()
+
     def set_link(self, a: str, b: str, changes: dict[str, Any]) -> None:
-        """Change a link's fields or make the link. Raises InputError for an unknown node or field."""
+        """Change a link's fields, as seen from `a`, or make the link; it holds until `restore`, whatever the ground.
+
+        A new `loss` counts in both directions unless `loss_back` is among the changes, and decides `tq` unless that is.
+        Raises InputError for an unknown node or field.
+        """
         ends = frozenset((a, b))
         for name in ends:
             if name not in self._fleet.nodes:
                 raise InputError(f"no node named {name} in this fleet")
+        known = self._by_hand.get(ends) or self._ground.get(ends) or LinkSpec(a, b)
         try:
-            self._links[ends] = replace(self._links.get(ends) or LinkSpec(a, b), **changes)
+            self._by_hand[ends] = changed_link(known.seen_from(a), changes)
         except TypeError as error:
             raise InputError(f"link {a}-{b}: {error}") from error
         self.changed()
 
     def restore(self, ends: frozenset[str] | None = None) -> None:
-        """One link (or all, and all nodes' links) as the fleet's spec has it."""
+        """One link (or all, and all nodes' links) as the fleet's spec or ground has it."""
         if ends is None:
-            self._links = dict(self._original)
+            self._by_hand.clear()
             self.severed.clear()
             self.slowed.clear()
-        elif ends in self._original:
-            self._links[ends] = self._original[ends]
         else:
-            self._links.pop(ends, None)
+            self._by_hand.pop(ends, None)
         self.changed()
 
     # -- the way to the operator --
@@ -94,7 +108,8 @@ class Ether:
         rates = [link.rate_kbps for link in path.links if link.rate_kbps is not None]
         arrives = 1.0
         for link in path.links:
-            arrives *= 1 - link.loss
+            # a connection waits for what is lost on its way as for the answers to it
+            arrives *= 1 - max(link.loss_to(link.a), link.loss_to(link.b))
         return Shape(
             sum(link.delay_ms for link in path.links) / 1000, 1 - arrives, min(rates) * 125.0 if rates else None
         )

@@ -196,7 +196,7 @@ class VirtualFleet:
         self.directory.mkdir(parents=True, exist_ok=True)
         for leftover in ("rom", "nodes", "mnt"):
             shutil.rmtree(self.directory / leftover, ignore_errors=True)
-        for leftover in ("bell", "failure", "control.sock", "supervisor.pid", "log", standing.FILE_NAME):
+        for leftover in ("bell", "failure", "control.sock", "supervisor.pid", "log", "ground.json"):
             (self.directory / leftover).unlink(missing_ok=True)
         (self.directory / "spec.json").write_text(dump(self.spec), encoding="utf-8")
 
@@ -281,25 +281,8 @@ class VirtualFleet:
         self.ask("mend", where=where)
 
     def link(self, a: str, b: str, **changes: Any) -> None:
-        """Change a link's fields as seen from `a` (`spec.LinkSpec`, `spec.changed_link`), or make one; `mend` undoes it."""
+        """Change a link's fields as seen from `a` (`spec.changed_link`), or make a link; `mend` undoes it."""
         self.ask("link", a=a, b=b, changes=changes)
-
-    @property
-    def ground(self) -> Ground:
-        """What it stands on now: where nodes are, as far as somebody said, and who hears whom."""
-        return standing.read(self.directory) or Ground(links=self.spec.links)
-
-    def stand_on(self, ground: Ground) -> None:
-        """Who hears whom is as this ground has it from now on, but for links that were set one by one."""
-        standing.write(self.directory, ground)
-        self.ask("ground")
-
-    def switch(self, name: str, on: bool) -> None:
-        """A node's power switch: an orderly end with everything in flash, or power; does not wait for its boot."""
-        if on:
-            self.ask("power_on", node=name)
-        elif self.node(name).power is not Power.OFF:
-            self.ask("power_cut", node=name, unsynced="kept", back=False)
 
     def status(self) -> dict[str, Any]:
         """What `meshctl lab status --json` prints: fleet, pid, port, and per node power, address, mesh, breaks."""

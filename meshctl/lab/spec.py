@@ -7,11 +7,13 @@ directory, so everything here converts to JSON and back without loss.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from typing import Any
 
 from meshctl.errors import InputError
+from meshctl.lab.quality import TQ_MAX, tq_of
 from meshctl.model import Release
 
 # what an image needs to take part in an encrypted mesh (openwrt-facts.md section 10)
@@ -69,28 +71,73 @@ class NodeSpec:
 
 @dataclass(frozen=True, slots=True)
 class LinkSpec:
-    """Two nodes that can hear each other while their radios share a cell; the same in both directions.
+    """Two nodes that can hear each other while their radios share a cell.
 
-    `tq` is batman-adv's link quality (0..255), `delay_ms` one way, `loss` 0..1 of packets, `rate_kbps` None: unlimited.
+    `loss` is the share (0..1) of frames from `a` that `b` misses, `loss_back` that of frames from `b` (None: the same);
+    1.0 is deafness. `signal_dbm` is how strong `b` hears `a`, `signal_back_dbm` how strong `a` hears `b` (None: the
+    same). `tq` is the best quality (0..255) that batman-adv may give the link, losses lower it. `delay_ms` is one way,
+    `rate_kbps` None: unlimited.
     """
 
     a: str
     b: str
-    tq: int = 255
+    tq: int = TQ_MAX
     signal_dbm: int = -58
     delay_ms: float = 0.0
     loss: float = 0.0
     rate_kbps: int | None = None
     up: bool = True
+    loss_back: float | None = None
+    signal_back_dbm: int | None = None
 
     @property
     def ends(self) -> frozenset[str]:
         return frozenset((self.a, self.b))
 
+    def loss_to(self, name: str) -> float:
+        """The share of frames that the end `name` misses of the other end's."""
+        return self.loss if name == self.b or self.loss_back is None else self.loss_back
+
+    def signal_at(self, name: str) -> int:
+        """How strong the end `name` hears the other end, in dBm."""
+        return self.signal_dbm if name == self.b or self.signal_back_dbm is None else self.signal_back_dbm
+
+    def tq_to(self, name: str) -> int:
+        """batman-adv's quality (0..255) of sending over this link to the end `name`."""
+        there = self.loss_to(name)
+        back = self.loss_to(self.a if name == self.b else self.b)
+        return min(self.tq, tq_of(there, back))
+
+    def seen_from(self, name: str) -> LinkSpec:
+        """The same link with the end `name` as its `a`."""
+        if name == self.a:
+            return self
+        loss, signal_dbm = self.loss_to(self.a), self.signal_at(self.a)
+        back = None if self.loss_back is None else self.loss
+        signal_back_dbm = None if self.signal_back_dbm is None else self.signal_dbm
+        return replace(
+            self, a=self.b, b=self.a, loss=loss, signal_dbm=signal_dbm, loss_back=back, signal_back_dbm=signal_back_dbm
+        )
+
+
+def changed_link(link: LinkSpec, changes: Mapping[str, Any]) -> LinkSpec:
+    """The link with other fields, as seen from its `a`; `loss_to_b` is the loss in that direction alone.
+
+    A new loss decides the quality: `tq` no longer limits it, unless it is among the changes. A new `loss` holds both
+    ways unless `loss_back` is among them. Raises TypeError for a field that links have not.
+    """
+    wanted = dict(changes)
+    if "loss_to_b" in wanted:
+        wanted = {"loss_back": link.loss_to(link.a), **wanted, "loss": wanted["loss_to_b"]}
+        del wanted["loss_to_b"]
+    if "loss" in wanted:
+        wanted = {"tq": TQ_MAX, "loss_back": None, **wanted}
+    return replace(link, **wanted)
+
 
 @dataclass(frozen=True, slots=True)
 class FleetSpec:
-    """A whole fleet. `port` is the one TCP port all its loopback addresses listen on (`twin.loopback_of`).
+    """A whole fleet. `port` is the one TCP port all its loopback addresses listen on (`addresses.loopback_of`).
 
     0 lets the supervisor choose a free one; `VirtualFleet.port` tells which.
     """

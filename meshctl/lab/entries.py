@@ -1,0 +1,169 @@
+"""A lab file's YAML with its places: typed access to entries, every problem collected with file, line and column.
+
+text -> tree (the inventory's reader) -> `Entry` -> the values that `ground_file` and `mission_file` ask for ->
+`Entry.finish` raises InvalidInput with all problems at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+from meshctl.diagnostics import Diagnostic, InvalidInput, Position
+from meshctl.inventory import codes
+from meshctl.inventory.compose import compose
+from meshctl.inventory.source import Source, read_source
+from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, describe, position
+
+
+class Entry:
+    """One place in the file, or the absence of one: then every reader gives its default."""
+
+    def __init__(self, tree: Tree | None, path: str, problems: list[Diagnostic]) -> None:
+        self.tree = None if isinstance(tree, Scalar) and tree.is_null else tree
+        self.path = path
+        self._where = tree
+        self._problems = problems
+
+    @property
+    def is_there(self) -> bool:
+        return self.tree is not None
+
+    @property
+    def is_list(self) -> bool:
+        return isinstance(self.tree, SequenceNode)
+
+    def problem(self, expected: str, found: str = "") -> None:
+        """Note that something else was expected here."""
+        place = Position("") if self._where is None else position(self._where)
+        self._note(codes.WRONG_VALUE, place, expected, found or self._seen())
+
+    def finish(self) -> None:
+        """Raises InvalidInput when anything in the file was wrong."""
+        if self._problems:
+            raise InvalidInput(self._problems)
+
+    def mapping(self, known: tuple[str, ...] | None = None, required: tuple[str, ...] = ()) -> dict[str, Entry]:
+        """The entries by key; for `known` keys (None: any) an absent entry each, so that it can be asked as well."""
+        if not isinstance(self.tree, MappingNode):
+            if self.is_there or required:
+                self.problem("a mapping")
+            return {key: self._below(None, key) for key in known or ()}
+        entries = {key: self._below(None, key) for key in known or ()}
+        for key, value in self.tree.values.items():
+            if known is not None and key not in known:
+                self._note(codes.UNKNOWN_KEY, position(self.tree.keys[key]), f"one of {', '.join(known)}", repr(key))
+            else:
+                entries[key] = self._below(value, key)
+        for key in required:
+            if key not in self.tree.values:
+                self._note(codes.MISSING_KEY, position(self.tree), f"the key {key}", "no such key")
+        return entries
+
+    def items(self) -> Iterator[Entry]:
+        """The entries of a list."""
+        if isinstance(self.tree, SequenceNode):
+            for number, item in enumerate(self.tree.items):
+                yield Entry(item, f"{self.path}[{number}]", self._problems)
+        elif self.is_there:
+            self.problem("a list")
+
+    def text(self, default: str = "", one_of: tuple[str, ...] | None = None) -> str:
+        if self.tree is None:
+            return default
+        if isinstance(self.tree, Scalar) and (one_of is None or self.tree.text in one_of):
+            return self.tree.text
+        self.problem("text" if one_of is None else f"one of {', '.join(one_of)}")
+        return default
+
+    def number(self, default: float, least: float = -1e6, most: float = 1e6) -> float:
+        if self.tree is None:
+            return default
+        try:
+            value = float(self.tree.text) if isinstance(self.tree, Scalar) else math.nan
+        except ValueError:
+            value = math.nan
+        if not least <= value <= most:
+            self.problem(f"a number from {least:g} to {most:g}")
+            return default
+        return value
+
+    def whole(self, default: int, least: int, most: int) -> int:
+        value = self.number(float(default), least, most)
+        if value != int(value):
+            self.problem(f"a whole number from {least} to {most}")
+            return default
+        return int(value)
+
+    def flag(self, default: bool) -> bool:
+        return self.text(str(default).lower(), ("true", "false")) == "true"
+
+    def share(self, default: float) -> float:
+        """`0.3` or `30%`."""
+        if self.tree is None:
+            return default
+        value = share_of(self.tree.text) if isinstance(self.tree, Scalar) else None
+        if value is None:
+            self.problem("a share from 0 to 1, or 0% to 100%")
+            return default
+        return value
+
+    def point(self, default: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
+        """`[x, y]` in metres."""
+        values = self.row(2, "[x, y] in metres")
+        return (values[0], values[1]) if values else default
+
+    def row(self, count: int, shape: str) -> list[float]:
+        """A list of `count` numbers; empty, with the problem noted, when it is something else."""
+        if not isinstance(self.tree, SequenceNode) or len(self.tree.items) != count:
+            self.problem(shape)
+            return []
+        before = len(self._problems)
+        values = [item.number(0.0) for item in self.items()]
+        return values if len(self._problems) == before else []
+
+    def _below(self, tree: Tree | None, key: str) -> Entry:
+        entry = Entry(tree, f"{self.path}.{key}" if self.path else key, self._problems)
+        entry._where = tree or self._where
+        return entry
+
+    def _seen(self) -> str:
+        match self.tree:
+            case None:
+                return "nothing"
+            case Scalar(text=text):
+                return repr(text[:60])
+            case SequenceNode(items=items):
+                return f"a list of {len(items)}"
+            case tree:
+                return describe(tree)
+
+    def _note(self, code: str, place: Position, expected: str, found: str) -> None:
+        self._problems.append(codes.error(code, place, "", path=self.path, expected=expected, found=found))
+
+
+def share_of(text: str) -> float | None:
+    """`0.3` or `30%` as 0.3; None when it is no share from 0 to 1."""
+    number, scale = (text[:-1], 100.0) if text.endswith("%") else (text, 1.0)
+    try:
+        value = float(number) / scale
+    except ValueError:
+        return None
+    return value if 0.0 <= value <= 1.0 else None
+
+
+def read(path: Path) -> Entry:
+    """The file's root. Raises InvalidInput when it cannot be read or is not YAML."""
+    source = read_source(path)
+    if isinstance(source, Diagnostic):
+        raise InvalidInput([source])
+    return entry_of(source.text, str(path))
+
+
+def entry_of(text: str, file: str) -> Entry:
+    """The root of a file's text. Raises InvalidInput when it is not YAML."""
+    composed = compose(Source(file, text))
+    if composed.root is None:
+        raise InvalidInput(composed.diagnostics)
+    return Entry(composed.root, "", list(composed.diagnostics))

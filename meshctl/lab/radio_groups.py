@@ -1,0 +1,92 @@
+"""Who hears whom -> a 64-bit mask per radio for mac80211_hwsim, whose radios hear each other where masks share a bit.
+
+`assign` gives masks for a graph; `steps` orders the writing of new masks so that no two radios ever hear each other
+that are joined neither before nor after.
+
+A bit is a clique: all radios that have it hear each other. Up to 11 nodes, every pair has a bit of its own, the same
+whatever the graph, so that a changed link touches two masks and no other link. For more nodes the graph's edges are
+covered by cliques, greedily (a minimal cover is NP-hard: Kou, Stockmeyer and Wong, CACM 21(2), 1978).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from meshctl.errors import InputError
+
+# drivers/net/wireless/virtual/mac80211_hwsim.c: `u64 group` in struct mac80211_hwsim_data
+GROUP_BITS = 64
+# 11 * 10 / 2 = 55 pairs fit, 12 * 11 / 2 = 66 do not
+_PAIRED_NODES = 11
+
+
+def assign(nodes: Sequence[str], edges: Iterable[tuple[str, str]]) -> dict[str, int]:
+    """A mask for each of `nodes` so that two masks overlap exactly where `edges` join them; 0 for who hears nobody.
+
+    Raises InputError when 64 bits are not enough, saying how many are needed, and ValueError for an unknown node.
+    """
+    place = {name: number for number, name in enumerate(nodes)}
+    joined: dict[str, set[str]] = {name: set() for name in nodes}
+    for a, b in edges:
+        if a not in place or b not in place:
+            raise ValueError(f"edge {a}-{b}: not among the nodes")
+        if a != b:
+            joined[a].add(b)
+            joined[b].add(a)
+    masks = dict.fromkeys(nodes, 0)
+    if len(nodes) <= _PAIRED_NODES:
+        for name in nodes:
+            for other in joined[name]:
+                masks[name] |= 1 << _pair_bit(place[name], place[other])
+        return masks
+    cliques = cover(nodes, joined)
+    if len(cliques) > GROUP_BITS:
+        edge_count = sum(map(len, joined.values())) // 2
+        raise InputError(
+            f"{len(nodes)} radios and {edge_count} links need {len(cliques)} groups, hwsim has {GROUP_BITS}",
+            hint="fewer nodes, a sparser graph, or nodes that stand together in clusters need fewer",
+        )
+    for bit, clique in enumerate(cliques):
+        for name in clique:
+            masks[name] |= 1 << bit
+    return masks
+
+
+def cover(nodes: Sequence[str], joined: Mapping[str, set[str]]) -> list[list[str]]:
+    """Cliques that hold every edge of the graph at least once, and no pair that is not an edge; sorted by `nodes`.
+
+    Each clique grows from the first edge not yet covered, by the node that adds most of those.
+    """
+    place = {name: number for number, name in enumerate(nodes)}
+    left = {name: set(joined[name]) for name in nodes}
+    cliques = []
+    for a in nodes:
+        while left[a]:
+            clique = [a, min(left[a], key=place.__getitem__)]
+            fitting = set(joined[a]) & set(joined[clique[1]])
+            while fitting:
+                best = min(fitting, key=lambda name: (-len(left[name].intersection(clique)), place[name]))
+                if not left[best].intersection(clique):
+                    break
+                clique.append(best)
+                fitting &= joined[best]
+            for name in clique:
+                left[name].difference_update(clique)
+            cliques.append(sorted(clique, key=place.__getitem__))
+    return cliques
+
+
+def steps(old: Mapping[str, int], new: Mapping[str, int]) -> list[tuple[str, int]]:
+    """The masks to write, in order, to get from `old` to `new` one radio at a time.
+
+    First each radio keeps the bits it has in both, which joins no pair that was not joined; then each takes its new
+    ones, which joins no pair that is not to be.
+    """
+    narrowed = [(name, old.get(name, 0) & mask) for name, mask in new.items() if old.get(name, 0) & ~mask]
+    final = [(name, mask) for name, mask in new.items() if mask != old.get(name, 0) & mask]
+    return narrowed + final
+
+
+def _pair_bit(a: int, b: int) -> int:
+    low, high = sorted((a, b))
+    return high * (high - 1) // 2 + low
