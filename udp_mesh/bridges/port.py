@@ -2,12 +2,16 @@
 
 `run` connects, subscribes, says `on_up`, hands every frame to `on_frame`, and starts over when the daemon is gone.
 `publish` may be called from any thread; `request` uses a second connection, so that no reply waits behind messages.
+
+What the daemon refuses is counted, and told once per REPORT_S: thirty images a second must not become as many lines. A
+frame that is longer than the daemon takes ends the connection, so the length that did is not tried again.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 from typing import Any, Callable, Mapping, Sequence
 
 from udp_mesh.client.mesh_client import Frame, Header, MeshClient, MeshError
@@ -19,6 +23,8 @@ READ_S = 0.5
 """How long a read waits before it looks whether to stop."""
 RECONNECT_S = 1.0
 """Between two attempts to reach the daemon: its restart takes about that long."""
+REPORT_S = 10.0
+"""Between two lines about messages that were refused."""
 
 
 class MeshPort:
@@ -32,6 +38,11 @@ class MeshPort:
         self._command_lock = threading.Lock()
         self.refused = 0
         """Messages that could not be handed over: no daemon, or the daemon refused them."""
+        self._told_at: float | None = None
+        self._untold = 0
+        self._longest = 0
+        self._too_long: int | None = None
+        self._cut = False
 
     def run(self, stop: threading.Event, on_up: Callable[[], None], on_frame: Callable[[Frame], None]) -> None:
         """Until `stop`. `on_up` is called after every connect, on this thread, as is `on_frame`."""
@@ -41,7 +52,10 @@ class MeshPort:
                 with MeshClient(self._path) as client:
                     client.subscribe(*self._patterns)
                     client.request("events")
-                    self._client = client
+                    if not self._cut:
+                        # Another start of the daemon, perhaps with another limit.
+                        self._too_long = None
+                    self._client, self._longest, self._cut = client, 0, False
                     log.info("daemon-connected socket=%s", self._path)
                     told = False
                     on_up()
@@ -59,24 +73,41 @@ class MeshPort:
         self._drop_commands()
 
     def _take(self, frame: Frame, on_frame: Callable[[Frame], None]) -> None:
-        event = frame[0].get("event")
-        if event == "rejected":
-            self.refused += 1
-            log.warning("message-refused %s", frame[0].get("error"))
+        header = frame[0]
+        if header.get("event") == "rejected":
+            if header.get("code") == "bad-frame":
+                self._too_long, self._cut = self._longest, True
+            self._refuse("{}: {}".format(header.get("code"), header.get("error")))
+        elif header.get("event") == "dropped":
+            log.warning("messages-lost count=%s this program read too slowly", header.get("messages"))
         else:
             on_frame(frame)
+
+    def _refuse(self, reason: str) -> None:
+        self.refused += 1
+        self._untold += 1
+        now = time.monotonic()
+        if self._told_at is None or now - self._told_at >= REPORT_S:
+            self._told_at = now
+            log.warning("messages-refused count=%d %s", self._untold, reason)
+            self._untold = 0
 
     def publish(self, topic: str, payload: bytes, peer: str | None, type_text: str) -> bool:
         """Hands a message over; False where there is no daemon now. What the daemon refuses is logged."""
         client = self._client
-        if client is not None:
-            try:
-                client.publish(topic, payload, to=peer, type=type_text, wait=False)
-                return True
-            except MeshError as error:
-                log.warning("message-lost topic=%s %s", topic, error)
-        self.refused += 1
-        return False
+        if client is None:
+            self._refuse("{}: no daemon".format(topic))
+            return False
+        if self._too_long is not None and len(payload) >= self._too_long:
+            self._refuse("{}: {} bytes are more than the daemon takes".format(topic, len(payload)))
+            return False
+        self._longest = max(self._longest, len(payload))
+        try:
+            client.publish(topic, payload, to=peer, type=type_text, wait=False)
+            return True
+        except MeshError as error:
+            self._refuse("{}: {}".format(topic, error))
+            return False
 
     def request(self, op: str, **fields: Any) -> Header:
         """A reply's header. Raises MeshError."""

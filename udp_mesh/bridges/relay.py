@@ -20,10 +20,18 @@ MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 64, 32 << 20
 """Per source, while a definition is on its way: a second's worth; more is dropped, the oldest first."""
 MAX_LATCHED, MAX_LATCHED_BYTES = 4096, 64 << 20
 """Latched messages kept for late robots: a publisher that latches under ever new names."""
-MAX_HELD_DIGESTS = 32
-"""Latched messages remembered per source and topic: several nodes may latch on one topic (tf_static)."""
+MAX_LATCHED_PER_ROUTE = 32
+"""Publishers that latch on one topic (tf_static); past it the oldest is forgotten, as are the names of programs that
+came, latched and went."""
+MAX_HELD_DIGESTS = 4 * MAX_LATCHED_PER_ROUTE
+"""Latched messages remembered per source and topic: more than a source can repeat by its two routes to us, or an old
+one would be published over a new one."""
 ASK_AGAIN_S = 1.0
 """Between two questions for one definition."""
+GIVE_UP_S = 30.0
+"""How long a message waits for its definition, and later ones of its topic behind it: a bridge may just be starting."""
+MAX_NOTED = 1000
+"""Things told once: names are a peer's to invent."""
 
 
 class ToMesh(NamedTuple):
@@ -58,6 +66,7 @@ class _Waiting(NamedTuple):
     topic: str
     kind: MessageKind
     payload: bytes
+    since: float
 
 
 class Relay:
@@ -78,6 +87,7 @@ class Relay:
         self._waiting: dict[str, Deque[_Waiting]] = {}
         self._asked_at: dict[tuple[str, TypeKey], float] = {}
         self._destinations: Mapping[str, Iterable[str]] = {}
+        self._noted: set[Route | str] = set()
 
     def topics_are(self, destinations: Mapping[str, Iterable[str]]) -> None:
         """The daemon's topics, each with the peers it goes to (none: all)."""
@@ -91,8 +101,12 @@ class Relay:
         """A node published. `publisher` tells apart several that latch on one topic."""
         effects: list[Effect] = []
         kind = MessageKind(key, latched)
+        if "/" not in key.name:
+            # A publisher of any type, which says none before its first message: nobody could read it.
+            return self._note_once(route, "{} publishes type {!r} on {}".format(publisher, key.name, route.topic))
         if self._needs_definitions:
-            self._definitions.put(key, definition)
+            if definition or key not in self._definitions:
+                self._definitions.put(key, definition)
             if (key, route.peer) not in self._told:
                 self._told.add((key, route.peer))
                 effects.append(self._to_bridges(Definition(key, definition), route.peer))
@@ -105,6 +119,9 @@ class Relay:
         old = self._latched.pop((route, publisher), None)
         self._latched_bytes += len(payload) - (0 if old is None else len(old[1]))
         self._latched[route, publisher] = (kind, payload)
+        same_route = [held for held in self._latched if held[0] == route]
+        if len(same_route) > MAX_LATCHED_PER_ROUTE:
+            self._latched_bytes -= len(self._latched.pop(same_route[0])[1])
         while len(self._latched) > MAX_LATCHED or self._latched_bytes > MAX_LATCHED_BYTES:
             _, (_, forgotten) = self._latched.popitem(last=False)
             self._latched_bytes -= len(forgotten)
@@ -119,15 +136,16 @@ class Relay:
         if kind is None or kind.key.name.count("/") != self._slashes:
             return []
         if ros_word(source) == ros_word(self.own):
-            return [Note("{} reads like our own name: its messages are not published".format(source))]
+            return self._note_once(source, "{} reads like our own name: its messages are not published".format(source))
         if kind.latched:
             held = self._holds.setdefault(source, {}).setdefault(topic, deque(maxlen=MAX_HELD_DIGESTS))
             name = digest(kind_text(kind._replace(repeat=False)), payload)
-            if kind.repeat and name in held:
-                return []
-            if name not in held:
-                held.append(name)
-        message = _Waiting(topic, kind, payload)
+            if name in held:
+                if kind.repeat:
+                    return []
+                held.remove(name)
+            held.append(name)
+        message = _Waiting(topic, kind, payload, now)
         waiting = self._waiting.get(source)
         blocked = waiting is not None and any(other.topic == topic for other in waiting)
         if not blocked and self._known(kind.key):
@@ -226,9 +244,30 @@ class Relay:
         return [self.greeting(peer, answer=True)]
 
     def tick(self, now: float) -> list[Effect]:
-        """Asks again for definitions that did not come."""
-        effects: list[Effect] = []
+        """Asks again for definitions that did not come, and gives up on what waited too long."""
+        effects = self._give_up(now) if self._waiting else []
         for source, waiting in self._waiting.items():
             for key in OrderedDict.fromkeys(message.kind.key for message in waiting):
                 effects += self._ask(source, key, now)
         return effects
+
+    def _give_up(self, now: float) -> list[Effect]:
+        notes: list[Effect] = []
+        for source, waiting in self._waiting.items():
+            late = [message for message in waiting if self._is_late(message, now)]
+            if late:
+                names = sorted({message.kind.key.name for message in late})
+                notes.append(Note("{} did not tell what {} is: not published".format(source, ", ".join(names))))
+                self.dropped += len(late)
+                self._waiting[source] = deque(message for message in waiting if not self._is_late(message, now))
+        self._asked_at = {asked: at for asked, at in self._asked_at.items() if now - at <= GIVE_UP_S}
+        return notes + self._resume() if notes else notes
+
+    def _is_late(self, message: _Waiting, now: float) -> bool:
+        return now - message.since > GIVE_UP_S and not self._known(message.kind.key)
+
+    def _note_once(self, about: Route | str, text: str) -> list[Effect]:
+        if about in self._noted or len(self._noted) >= MAX_NOTED:
+            return []
+        self._noted.add(about)
+        return [Note(text)]

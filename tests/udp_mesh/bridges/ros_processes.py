@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -19,6 +20,7 @@ from tests.udp_mesh.links.sockets import WAIT_S
 
 ROOT = Path(udp_mesh.__file__).parent.parent
 ROS_PYTHON = "/usr/bin/python3"
+DEBIAN_PACKAGES = "/usr/lib/python3/dist-packages"
 ROBOT = Path(__file__).with_name("ros_robot.py")
 
 
@@ -40,31 +42,57 @@ def stop(process: subprocess.Popen[Any], number: signal.Signals = signal.SIGINT)
 
 
 class Master:
-    """One robot's roscore."""
+    """One robot's roscore, and the environment of its nodes. `inside` goes before every command of this robot: where
+    robots have networks of their own, what enters that one."""
 
-    def __init__(self, folder: Path, name: str) -> None:
+    def __init__(self, folder: Path, name: str, inside: Sequence[str] = ()) -> None:
+        self.name = name
+        self.folder = folder
+        self.inside = tuple(inside)
         self.port = free_tcp_port()
         self.log = folder / f"{name}-roscore.log"
         self.environment = {
             **{key: value for key, value in os.environ.items() if not key.startswith(("ROS", "PYTHON", "VIRTUAL"))},
-            "PATH": "/usr/bin:/bin",
+            "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
             "ROS_MASTER_URI": f"http://127.0.0.1:{self.port}",
             "ROS_IP": "127.0.0.1",
             "ROS_HOME": str(folder / f"{name}-ros"),
             "PYTHONDONTWRITEBYTECODE": "1",
+            "PYTHONUNBUFFERED": "1",
         }
         self.process: subprocess.Popen[bytes] | None = None
+        self._starts = 0
 
-    def start(self) -> None:
+    def start(self, *, wait: bool = True) -> None:
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                ["/usr/bin/roscore", "-p", str(self.port)], env=self.environment, stdout=log, stderr=subprocess.STDOUT
+                [*self.inside, "/usr/bin/roscore", "-p", str(self.port)],
+                env=self.environment,
+                stdout=log,
+                stderr=subprocess.STDOUT,
             )
-        poll(self._answers, f"roscore: {self.log}")
+        self._starts += 1
+        if wait:
+            self.wait()
 
-    def _answers(self) -> bool:
-        with socket.socket() as probe:
-            return probe.connect_ex(("127.0.0.1", self.port)) == 0
+    def wait(self) -> None:
+        """Until it has started its own rosout too: before, it does not end in order."""
+        poll(lambda: self.log.read_text().count("started core service") >= self._starts, f"roscore: {self.log}")
+
+    def command(self, *words: str) -> str:
+        """Runs a command of this robot to its end; what it prints."""
+        done = subprocess.run(
+            [*self.inside, *words], env=self.environment, capture_output=True, text=True, timeout=WAIT_S, check=False
+        )
+        assert done.returncode == 0, f"{words}: {done.stdout}{done.stderr}"
+        return done.stdout
+
+    def spawn(self, log_name: str, *words: str) -> subprocess.Popen[bytes]:
+        """Starts a program of this robot; what it prints is in `log_name`."""
+        with (self.folder / log_name).open("ab") as log:
+            return subprocess.Popen(
+                [*self.inside, *words], env=self.environment, cwd=self.folder, stdout=log, stderr=subprocess.STDOUT
+            )
 
     def stop(self) -> None:
         if self.process is not None:
@@ -77,7 +105,7 @@ class Robot:
 
     def __init__(self, master: Master, name: str) -> None:
         self.process = subprocess.Popen(
-            [ROS_PYTHON, str(ROBOT), name],
+            [*master.inside, ROS_PYTHON, str(ROBOT), name],
             env=master.environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -116,8 +144,24 @@ class Robot:
         """Messages that came and were not taken."""
         return [line for line in list(self._lines) if "name" in line]
 
-    def subscribe(self, name: str, type_name: str = "std_msgs/String") -> None:
-        self._tell(subscribe=name, type=type_name)
+    def subscribe(self, name: str, type_name: str = "std_msgs/String", **more: object) -> None:
+        """Waits until the subscriber is registered."""
+        self._tell(subscribe=name, type=type_name, **more)
+        self.expect("subscribed", name)
+
+    def stream(self, name: str, type_name: str, rate_hz: float, payload_bytes: int = 0) -> None:
+        """Publishes at this rate until `stop_streams`: images of so many bytes, or texts with number and time."""
+        self._tell(stream=name, type=type_name, rate_hz=rate_hz, bytes=payload_bytes)
+
+    def stop_streams(self) -> dict[str, int]:
+        """How many messages each stream has published."""
+        self._tell(stop_streams=True)
+        return dict(self.expect("streamed")["streamed"])
+
+    def call(self, service: str) -> dict[str, Any]:
+        """Calls a service without a request, as a program that was built with its package does."""
+        self._tell(call=service)
+        return dict(self.expect("answer")["answer"])
 
     def publish(self, name: str, data: object, type_name: str = "std_msgs/String", **more: object) -> int:
         """Publishes; returns how many subscribers were connected."""
@@ -143,26 +187,51 @@ class Robot:
 
 
 class BridgeProcess:
-    """One robot's bridge, started by hand or by roslaunch."""
+    """One robot's bridge, started by hand or by a launch file; `python` is its interpreter, where that is not ROS's."""
 
-    def __init__(self, folder: Path, master: Master, daemon: RunningDaemon) -> None:
-        self._folder, self._master, self._daemon = folder, master, daemon
-        self.log = folder / f"{daemon.name}-bridge.log"
+    def __init__(self, master: Master, daemon: RunningDaemon, python: str = ROS_PYTHON) -> None:
+        self._master, self._daemon = master, daemon
+        self._python = python
+        self.log = master.folder / f"{daemon.name}-bridge.log"
         self.process: subprocess.Popen[bytes] | None = None
 
-    def start(self, *, launch: bool = False, arguments: Sequence[str] = ()) -> None:
-        environment = {**self._master.environment, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
-        command = [ROS_PYTHON, "-m", "udp_mesh.bridges.ros1", f"_socket:={self._daemon.socket}"]
+    def start(self, *, launch: str = "", arguments: Sequence[str] = ()) -> None:
+        """`launch` is a launch file's path; else the module is run."""
         if launch:
             package = ROOT / "udp_mesh" / "bridges" / "ros1"
             environment = {**self._master.environment, "ROS_PACKAGE_PATH": str(package)}
-            command = ["/usr/bin/roslaunch", "udp_mesh", "rudp_mesh_node.launch", f"mesh_socket:={self._daemon.socket}"]
+            command = ["/usr/bin/roslaunch", launch]
+        else:
+            path = str(ROOT) if self._python == ROS_PYTHON else f"{ROOT}:{DEBIAN_PACKAGES}"
+            environment = {**self._master.environment, "PYTHONPATH": path}
+            command = [self._python, "-m", "udp_mesh.bridges.ros1", f"_socket:={self._daemon.socket}"]
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [*command, *arguments], env=environment, cwd=self._folder, stdout=log, stderr=subprocess.STDOUT
+                [*self._master.inside, *command, *arguments],
+                env=environment,
+                cwd=self._master.folder,
+                stdout=log,
+                stderr=subprocess.STDOUT,
             )
+
+    def resident_bytes(self) -> int:
+        assert self.process is not None
+        return resident_bytes(self.process.pid)
+
+    def kill(self) -> None:
+        assert self.process is not None
+        self.process.kill()
+        self.process.wait(WAIT_S)
+        self.process = None
 
     def stop(self) -> None:
         if self.process is not None:
             stop(self.process)
             self.process = None
+
+
+def resident_bytes(pid: int) -> int:
+    """Memory a process holds."""
+    found = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+    assert found is not None
+    return int(found[1]) * 1024

@@ -1,43 +1,71 @@
 """A robot's ROS node for tests, in ROS's own interpreter: commands as JSON lines in, messages as JSON lines out.
 
-{"subscribe": NAME, "type": TYPE or "*"}, {"publish": NAME, "type": TYPE, "data": VALUE, "latch": BOOL}; what arrives is
-{"name", "type", "md5sum", "definition", "latching", "data" (typed) or "hex" (of "*")}. TYPE may be one that is
-installed nowhere: then "md5sum" and "definition" stand in the command, and the data is hex.
+{"subscribe": NAME, "type": TYPE or "*", "delay_s": how long each message keeps the subscriber busy};
+{"publish": NAME, "type": TYPE, "data": VALUE, "latch": BOOL, "repeat": how often}; {"stream": NAME, "type": TYPE,
+"rate_hz": HZ, "bytes": SIZE}; {"stop_streams": true}; {"call": SERVICE}.
+
+What arrives is {"name", "type", "md5sum", "definition", "latching"} and one of "data" (typed), "number" (of an image),
+"text" (of a fielded message) or "hex" (of "*"). TYPE may be one that is installed
+nowhere: then "md5sum" and "definition" stand in the command, and the data is hex.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+import threading
+import time
 from typing import Any
 
+import genpy.dynamic
 import roslib.message
 import rospy
 
 publishers: dict[Any, Any] = {}
 subscribers: list[Any] = []
+streams: dict[str, Any] = {}
+streamed: dict[str, int] = {}
+printing = threading.Lock()
+MAX_HEX_BYTES = 1000
 
 
 def say(**fields: object) -> None:
-    sys.stdout.write(json.dumps(fields) + "\n")
-    sys.stdout.flush()
+    with printing:
+        sys.stdout.write(json.dumps(fields) + "\n")
+        sys.stdout.flush()
 
 
-def arrived(message: Any, name: str) -> None:
+def arrived(message: Any, about: tuple[str, float]) -> None:
+    name, delay_s = about
     header = message._connection_header
     fields = {"name": name, "type": header["type"], "md5sum": header["md5sum"], "latching": header.get("latching")}
     fields["definition"] = header.get("message_definition")
     if isinstance(message, rospy.AnyMsg):
-        fields["hex"] = message._buff.hex()
+        fields["bytes"] = len(message._buff)
+        fields["hex"] = message._buff[:MAX_HEX_BYTES].hex()
+    elif header["type"] == "sensor_msgs/Image":
+        fields.update(bytes=len(message.data), number=message.header.seq, at=time.monotonic())
+        fields.pop("definition")
+    elif header["type"] in ("udp_mesh/NetworkStats", "udp_mesh/HostEntry"):
+        fields["text"] = str(message)
     else:
-        fields["data"] = message.data
+        fields.update(data=message.data, at=time.monotonic())
     say(**fields)
+    if delay_s:
+        time.sleep(delay_s)
 
 
 def subscribe(command: dict[str, Any]) -> None:
     name = command["subscribe"]
-    wanted = rospy.AnyMsg if command["type"] == "*" else roslib.message.get_message_class(command["type"])
-    subscribers.append(rospy.Subscriber(name, wanted, arrived, callback_args=name))
+    if command["type"] == "*":
+        wanted: Any = rospy.AnyMsg
+    elif "definition" in command:
+        wanted = genpy.dynamic.generate_dynamic(command["type"], command["definition"])[command["type"]]
+    else:
+        wanted = roslib.message.get_message_class(command["type"])
+    about = (name, command.get("delay_s", 0.0))
+    subscribers.append(rospy.Subscriber(name, wanted, arrived, callback_args=about, buff_size=1 << 24))
+    say(subscribed=name)
 
 
 def publish(command: dict[str, Any]) -> None:
@@ -49,21 +77,75 @@ def publish(command: dict[str, Any]) -> None:
         if message_class is None:
             fields = {"_type": type_name, "_md5sum": command["md5sum"], "_full_text": command["definition"]}
             message_class = type("Made", (rospy.AnyMsg,), fields)
-        publisher = rospy.Publisher(name, message_class, queue_size=10, latch=command.get("latch", False))
+        publisher = rospy.Publisher(name, message_class, queue_size=10_000, latch=command.get("latch", False))
         publishers[name, type_name] = publisher, message_class
     publisher, message_class = publishers[name, type_name]
-    message = message_class()
-    if isinstance(message, rospy.AnyMsg):
-        message._buff = bytes.fromhex(command["data"])
-    else:
-        message.data = command["data"]
-    publisher.publish(message)
+    for number in range(command.get("repeat", 1)):
+        message = message_class()
+        if not isinstance(message, rospy.AnyMsg):
+            message.data = f"{command['data']}{number}" if "repeat" in command else command["data"]
+        elif "zeros" in command:
+            message._buff = bytes(command["zeros"])
+        else:
+            message._buff = bytes.fromhex(command["data"])
+        publisher.publish(message)
     say(connections=publisher.get_num_connections())
+
+
+def stream(command: dict[str, Any]) -> None:
+    name, stop = command["stream"], threading.Event()
+    streams[name] = stop
+    message_class: Any = roslib.message.get_message_class(command["type"])
+    publisher = rospy.Publisher(name, message_class, queue_size=10)
+
+    def run() -> None:
+        number = 0
+        while not stop.wait(1.0 / command["rate_hz"]):
+            message = message_class()
+            number += 1
+            if command["type"] == "sensor_msgs/Image":
+                message.header.seq = number
+                # Pixels that do not compress.
+                message.data = command["bytes"] // len(NOISE) * NOISE
+            else:
+                message.data = json.dumps({"number": number, "at": time.monotonic()})
+            publisher.publish(message)
+            streamed[name] = number
+
+    threading.Thread(target=run, daemon=True).start()
+
+
+with open("/dev/urandom", "rb") as source:
+    NOISE = source.read(10_000)
+
+
+class GetHosts:
+    """The fielded service as its package defines it."""
+
+    _type = "udp_mesh/GetHosts"
+    _md5sum = "240aa9a842ed6592e7a3e693aebc36a4"
+    _request_class: Any = genpy.dynamic.generate_dynamic("udp_mesh/Request", "")["udp_mesh/Request"]
+    _response_class: Any = genpy.dynamic.generate_dynamic("udp_mesh/Response", "string[] hosts\nstring[] macs")[
+        "udp_mesh/Response"
+    ]
 
 
 rospy.init_node(sys.argv[1], disable_signals=True)
 say(ready=True)
 for line in sys.stdin:
     command = json.loads(line)
-    (subscribe if "subscribe" in command else publish)(command)
+    if "subscribe" in command:
+        subscribe(command)
+    elif "stream" in command:
+        stream(command)
+    elif "stop_streams" in command:
+        for event in streams.values():
+            event.set()
+        say(streamed=streamed)
+    elif "call" in command:
+        rospy.wait_for_service(command["call"])
+        response = rospy.ServiceProxy(command["call"], GetHosts)()
+        say(answer={"hosts": list(response.hosts), "macs": list(response.macs)})
+    else:
+        publish(command)
 rospy.signal_shutdown("end of input")

@@ -6,6 +6,7 @@ import json
 import subprocess
 import tempfile
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,37 @@ import pytest
 from tests.udp_mesh.bridges.ros_processes import BridgeProcess, Master, Robot
 from tests.udp_mesh.daemon.processes import RunningDaemon, configuration, poll, wait_online
 from tests.udp_mesh.links.sockets import free_port
+
+HEADER = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+PEER = "string host\nstring addr\nuint32 xmitDepth\nuint32 seqNum\nuint32 staleInflightCount\nuint32 incompleteCount\n"
+FIELDED = {
+    "mesh_status": (
+        "udp_mesh/NetworkStats",
+        "Header header\nPeerStats[] peers\n"
+        + (
+            "=" * 80 + "\nMSG: udp_mesh/PeerStats\n" + PEER + "duration lastRTT\nbool offline\ntime lastSeen\n" + HEADER
+        ),
+    ),
+    "hosts": ("udp_mesh/HostEntry", "Header header\nstring host\nstring mac\n" + HEADER),
+}
+"""The fielded package's messages, as its users' programs know them."""
+
+LAUNCH = """
+<launch>
+  <include file="$(find udp_mesh)/launch/rudp_mesh_node.launch">
+    <arg name="mesh_data_port" value="8700"/>
+    <arg name="mesh_interface" value="wlan0"/>
+    <arg name="mesh_hostname" value="alice"/>
+    <arg name="mesh_heartbeat_interval" value="1.0"/>
+    <arg name="topic_list" value="[2|std_msgs/String|listed,
+                                   8|sensor_msgs/Image|image_raw]"/>
+    <arg name="use_broadcast" value="true"/>
+    <arg name="broadcast_frag_max" value="5"/>
+    <arg name="mesh_socket" value="{socket}"/>
+  </include>
+</launch>
+"""
+"""A fielded robot's own launch file, every argument given; the socket's place is the only new one."""
 
 pytestmark = [pytest.mark.proof, pytest.mark.xdist_group("ros1")]
 
@@ -30,40 +62,32 @@ class Side:
 
 @pytest.fixture(scope="module")
 def team() -> Iterator[tuple[Side, Side]]:
-    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path, ExitStack() as kept:
         folder, port = Path(path), free_port()
+        sides = []
         masters = {name: Master(folder, name) for name in ("alice", "bob")}
-        robots: list[Robot] = []
-        bridges: list[BridgeProcess] = []
-        alice = RunningDaemon(folder, "alice", configuration(folder, "alice", 1, [2], port))
-        bob = RunningDaemon(folder, "bob", configuration(folder, "bob", 2, [1], port))
-        try:
-            with alice, bob:
-                sides = []
-                for daemon in (alice, bob):
-                    master = masters[daemon.name]
-                    master.start()
-                    bridge = BridgeProcess(folder, master, daemon)
-                    bridges.append(bridge)
-                    if daemon is alice:
-                        listed = "topic_list:=[2|std_msgs/String|listed]"
-                        bridge.start(launch=True, arguments=[listed])
-                    else:
-                        bridge.start()
-                    robots.append(Robot(master, f"{daemon.name}_node"))
-                    sides.append(Side(daemon, master, bridge, robots[-1]))
-                wait_online(alice, "bob")
-                wait_online(bob, "alice")
-                yield sides[0], sides[1]
-                for robot in robots:
-                    robot.close()
-                for bridge in bridges:
-                    bridge.stop()
-        finally:
-            for bridge in bridges:
-                bridge.stop()
-            for master in masters.values():
-                master.stop()
+        for master in masters.values():
+            kept.callback(master.stop)
+            master.start(wait=False)
+        for name, own, other in (("alice", 1, 2), ("bob", 2, 1)):
+            daemon = RunningDaemon(folder, name, configuration(folder, name, own, [other], port))
+            kept.enter_context(daemon)
+            master = masters[name]
+            master.wait()
+            bridge = BridgeProcess(master, daemon)
+            kept.callback(bridge.stop)
+            if name == "alice":
+                launch = folder / "robot.launch"
+                launch.write_text(LAUNCH.format(socket=daemon.socket))
+                bridge.start(launch=str(launch))
+            else:
+                bridge.start()
+            robot = Robot(master, f"{name}_node")
+            kept.callback(robot.close)
+            sides.append(Side(daemon, master, bridge, robot))
+        wait_online(sides[0].daemon, "bob")
+        wait_online(sides[1].daemon, "alice")
+        yield sides[0], sides[1]
 
 
 def test_a_message_to_one_robot_comes_out_typed_under_the_fielded_name(team: tuple[Side, Side]) -> None:
@@ -147,21 +171,43 @@ def test_a_topic_added_while_everything_runs_is_carried(team: tuple[Side, Side])
     alice.robot.publish_until_heard("/alice/mesh_comm/bob/new/topic", "late news", bob.robot)
 
 
+def test_the_fielded_status_messages_and_service_need_no_package(team: tuple[Side, Side]) -> None:
+    alice, _ = team
+    for name, (type_name, definition) in FIELDED.items():
+        alice.robot.subscribe(f"/alice/{name}", type_name, definition=definition)
+    status = alice.robot.expect("name", "/alice/mesh_status")
+    assert status["md5sum"] == "b798b3f36b773e8807958d91f6f464bb"
+    poll(lambda: 'host: "bob"' in alice.robot.expect("name", "/alice/mesh_status")["text"], "bob in mesh_status")
+    entry = alice.robot.expect("name", "/alice/hosts")
+    assert entry["md5sum"] == "b444fcd5e93804f9d8148d66d10b2520"
+    assert 'host: "bob"' in entry["text"]
+    assert 'mac: "127.0.3.2"' in entry["text"]
+    assert alice.robot.call("/alice/getHosts") == {"hosts": ["bob"], "macs": ["127.0.3.2"]}
+
+
 def test_the_networks_conditions_are_a_topic(team: tuple[Side, Side]) -> None:
     alice, _ = team
-    alice.robot.subscribe("/alice/mesh_status")
-    alice.robot.subscribe("/alice/hosts")
     alice.robot.subscribe("/alice/mesh_conditions")
+    conditions = json.loads(alice.robot.expect("name", "/alice/mesh_conditions")["data"])
+    assert [(peer["name"], peer["online"]) for peer in conditions["peers"]] == [("bob", True)]
+    assert "counters" in conditions
 
-    def told(name: str) -> dict[str, object] | None:
-        lines = [line for line in alice.robot.received() if line["name"] == name]
-        return dict(json.loads(lines[-1]["data"])) if lines else None
 
-    status = poll(lambda: told("/alice/mesh_status"), "mesh_status")
-    assert [(peer["host"], peer["offline"]) for peer in status["peers"]] == [("bob", False)]  # type: ignore[attr-defined]
-    hosts = poll(lambda: told("/alice/hosts"), "hosts")
-    assert [host["host"] for host in hosts["hosts"]] == ["bob"]  # type: ignore[attr-defined]
-    assert "counters" in poll(lambda: told("/alice/mesh_conditions"), "mesh_conditions")
+def test_the_fielded_settings_message_sets_the_window(team: tuple[Side, Side]) -> None:
+    alice, _ = team
+    settings = {"type_name": "udp_mesh/MeshSettings", "md5sum": "00" * 16, "definition": "uint8 windowSize\n"}
+
+    def window() -> object:
+        with alice.daemon.client() as client:
+            return client.request("status")["conditions"]["peers"][0]["window_packets"]
+
+    def narrowed() -> bool:
+        alice.robot.publish("/alice/mesh_settings", "03", **settings)
+        return window() == 3
+
+    poll(narrowed, "a window of 3")
+    alice.robot.publish("/alice/mesh_settings", "00", **settings)
+    poll(lambda: window() != 3, "an adaptive window")
 
 
 def test_rostopic_knows_what_came(team: tuple[Side, Side]) -> None:

@@ -1,7 +1,10 @@
-"""The ROS 1 graph as the bridge uses it: opaque subscribers and publishers that outlive the master. All rospy is here.
+"""The ROS 1 graph as the bridge uses it: opaque subscribers and publishers that outlive the master. With `fielded`, all
+of rospy is here.
 
 A master that was restarted knows nobody, and rospy does not notice. So `renew` looks at the master's process number and
 at whether it knows this node, and registers everything again, leaving every connection as it is.
+
+`publish` never waits for the master (`publications`); `listen` and `renew` do, and are called by one thread alone.
 """
 
 from __future__ import annotations
@@ -9,8 +12,9 @@ from __future__ import annotations
 import http.client
 import logging
 import threading
+import time
 import xmlrpc.client
-from typing import Any, Callable, Iterable, NamedTuple
+from typing import Any, Callable, Mapping, NamedTuple
 
 import rosgraph
 import roslib.message
@@ -19,16 +23,16 @@ from std_msgs.msg import String
 
 from udp_mesh.bridges.names import Route
 from udp_mesh.bridges.relay import ToRos
+from udp_mesh.bridges.ros1 import fielded
+from udp_mesh.bridges.ros1.publications import Outgoing, Publications
 from udp_mesh.bridges.types import TypeKey
 
 log = logging.getLogger(__name__)
 
-FIRST_HOLD_S = 2.0
-"""How long the first messages of a new topic wait for subscribers who were there before it."""
 BUFFER_BYTES = 1 << 24
 """rospy's receive buffer: with its own 64 kB large images lag ever further behind."""
-QUEUE_MESSAGES = 100
-"""Messages that wait for a slow subscriber."""
+QUEUE_MESSAGES, QUEUE_BYTES = 100, 16 << 20
+"""What waits at most for one slow subscriber of a topic: a hundred messages, fewer of large ones, but at least one."""
 
 MASTER_ERRORS = (rosgraph.MasterException, OSError, xmlrpc.client.Error, http.client.HTTPException)
 """What a call to a master that is gone, or going, raises."""
@@ -36,36 +40,42 @@ MASTER_ERRORS = (rosgraph.MasterException, OSError, xmlrpc.client.Error, http.cl
 OnMessage = Callable[[Route, str, TypeKey, str, bool, bytes], None]
 
 
-class _Publication:
-    """One topic we publish, and its first messages until the subscribers that were there before have connected."""
+class _Opaque:
+    """One topic we advertise: rospy's publisher of a class made for its type."""
 
-    def __init__(self, message: ToRos, subscribers: int, now: float) -> None:
-        self.key, self.latched = message.key, message.latched
-        fields = {
-            "_type": message.key.name,
-            "_md5sum": message.key.checksum,
-            "_full_text": message.definition or "",
-        }
-        self.message_class = type("Opaque", (rospy.AnyMsg,), fields)
-        self.publisher = rospy.Publisher(
-            message.name, self.message_class, queue_size=QUEUE_MESSAGES, latch=message.latched
-        )
-        self._subscribers = subscribers
-        self._until = now + FIRST_HOLD_S
-        self._first: list[bytes] = []
+    def __init__(self, message: Outgoing) -> None:
+        fields = {"_type": message.key.name, "_md5sum": message.key.checksum, "_full_text": message.definition}
+        self._class = type("Opaque", (rospy.AnyMsg,), fields)
+        self._depth = _depth(len(message.payload))
+        self._publisher = rospy.Publisher(message.name, self._class, queue_size=self._depth, latch=message.latched)
 
-    def publish(self, payload: bytes, now: float) -> None:
-        self._first.append(payload)
-        self.flush(now)
+    def connections(self) -> int:
+        return int(self._publisher.get_num_connections())
 
-    def flush(self, now: float) -> None:
-        if self.publisher.get_num_connections() >= self._subscribers or now >= self._until:
-            self._subscribers = 0
-            waiting, self._first = self._first, []
-            for payload in waiting:
-                opaque = self.message_class()
-                opaque._buff = payload
-                self.publisher.publish(opaque)
+    def publish(self, payload: bytes) -> None:
+        depth = _depth(len(payload))
+        if depth < self._depth:
+            self._bound(depth)
+        opaque = self._class()
+        opaque._buff = payload
+        self._publisher.publish(opaque)
+
+    def _bound(self, depth: int) -> None:
+        """Messages have become larger: fewer may wait for a slow subscriber, those that are connected included."""
+        self._depth = depth
+        self._publisher.impl.set_queue_size(depth)
+        for connection in self._publisher.impl.connections:
+            # rospy has no other way to shorten a queue; it drops from the front one by one, so cut it here.
+            with connection._lock:
+                connection._queue_size = depth
+                del connection._queue[:-depth]
+
+    def withdraw(self) -> None:
+        self._publisher.unregister()
+
+
+def _depth(payload_bytes: int) -> int:
+    return max(1, min(QUEUE_MESSAGES, QUEUE_BYTES // max(1, payload_bytes)))
 
 
 class Parameters(NamedTuple):
@@ -78,31 +88,37 @@ class Parameters(NamedTuple):
 
 
 class Graph:
-    """Topics of this node. `listen`, `publish` and `flush` may be called from any thread."""
+    """Topics of this node, and the fielded status topics and service under `prefix`."""
 
-    def __init__(self, on_message: OnMessage) -> None:
+    def __init__(self, on_message: OnMessage, prefix: str, on_window: Callable[[int], None]) -> None:
         self._on_message = on_message
-        self._lock = threading.RLock()
         self._pid = _master().getPid()
         self._subscribers: dict[str, tuple[Route, Any]] = {}
-        self._publications: dict[str, _Publication] = {}
-        self._texts: dict[str, Any] = {}
-        self._settings: Any = None
+        self._publications = Publications(_Opaque, _subscribers_of, time.monotonic)
         self._unknown: set[TypeKey] = set()
+        self._conditions: Mapping[str, Any] | None = None
+        self._stats = rospy.Publisher(prefix + "mesh_status", fielded.NetworkStats, queue_size=1)
+        self._hosts = rospy.Publisher(prefix + "hosts", fielded.HostEntry, queue_size=100)
+        self._text = rospy.Publisher(prefix + "mesh_conditions", String, queue_size=1)
+        self._service = rospy.Service(prefix + "getHosts", fielded.GetHosts, self._get_hosts)
+        self._settings = rospy.Subscriber(prefix + "mesh_settings", rospy.AnyMsg, self._settings_arrived, on_window)
+
+    def start(self, stop: threading.Event) -> None:
+        """Begins to advertise; until `stop`."""
+        threading.Thread(target=self._publications.run, args=(stop,), daemon=True).start()
 
     # Subscribing
 
     def listen(self, routes: dict[str, Route]) -> None:
-        """Subscribes to exactly these names."""
-        with self._lock:
-            for name in [name for name, (route, _) in self._subscribers.items() if routes.get(name) != route]:
-                self._subscribers.pop(name)[1].unregister()
-            for name, route in routes.items():
-                if name not in self._subscribers:
-                    subscriber = rospy.Subscriber(
-                        name, rospy.AnyMsg, self._arrived, callback_args=route, buff_size=BUFFER_BYTES, tcp_nodelay=True
-                    )
-                    self._subscribers[name] = (route, subscriber)
+        """Subscribes to exactly these names. Waits for the master."""
+        for name in [name for name, (route, _) in self._subscribers.items() if routes.get(name) != route]:
+            self._subscribers.pop(name)[1].unregister()
+        for name, route in routes.items():
+            if name not in self._subscribers:
+                subscriber = rospy.Subscriber(
+                    name, rospy.AnyMsg, self._arrived, callback_args=route, buff_size=BUFFER_BYTES, tcp_nodelay=True
+                )
+                self._subscribers[name] = (route, subscriber)
 
     def _arrived(self, message: Any, route: Route) -> None:
         header = message._connection_header
@@ -115,14 +131,10 @@ class Graph:
             bytes(message._buff),
         )
 
-    def listen_settings(self, name: str, on_window: Callable[[int], None]) -> None:
+    def _settings_arrived(self, message: Any, on_window: Callable[[int], None]) -> None:
         """The fielded `MeshSettings`, one byte: the window in packets, 0 for adaptive."""
-
-        def arrived(message: Any) -> None:
-            if len(message._buff) == 1:
-                on_window(message._buff[0])
-
-        self._settings = (name, rospy.Subscriber(name, rospy.AnyMsg, arrived))
+        if len(message._buff) == 1:
+            on_window(message._buff[0])
 
     def published(self) -> list[str]:
         """Names somebody publishes, as the master knows them. Raises one of MASTER_ERRORS."""
@@ -130,44 +142,30 @@ class Graph:
 
     # Publishing
 
-    def publish(self, message: ToRos, now: float) -> None:
-        """Publishes an opaque message; a topic whose type or latching changed is advertised anew."""
-        complete = self._complete(message)
-        if complete is None:
-            return
-        with self._lock:
-            known = self._publications.get(message.name)
-            if known is None or known.key != complete.key or known.latched != complete.latched:
-                if known is not None:
-                    # rospy keeps the first type of a topic until its last publisher is gone.
-                    known.publisher.unregister()
-                known = _Publication(complete, 0 if complete.latched else _subscribers_of(message.name), now)
-                self._publications[message.name] = known
-            known.publish(message.payload, now)
+    def publish(self, message: ToRos) -> None:
+        """Publishes an opaque message, from any thread; a topic whose type or latching changed is advertised anew."""
+        key, definition = message.key, message.definition
+        if not key.checksum:
+            # A fielded robot names only the type: checksum and definition are then those installed here.
+            found = roslib.message.get_message_class(key.name)
+            if found is None:
+                if key not in self._unknown:
+                    self._unknown.add(key)
+                    log.warning("type-unknown type=%s name=%s", key.name, message.name)
+                return
+            key, definition = TypeKey(key.name, found._md5sum), found._full_text
+        self._publications.publish(Outgoing(message.name, key, definition or "", message.latched, message.payload))
 
-    def _complete(self, message: ToRos) -> ToRos | None:
-        """A fielded robot names only the type: checksum and definition are then those installed here."""
-        if message.key.checksum:
-            return message
-        found = roslib.message.get_message_class(message.key.name)
-        if found is None:
-            if message.key not in self._unknown:
-                self._unknown.add(message.key)
-                log.warning("type-unknown type=%s name=%s", message.key.name, message.name)
-            return None
-        return message._replace(key=TypeKey(message.key.name, found._md5sum), definition=found._full_text)
+    def publish_conditions(self, conditions: Mapping[str, Any], text: str) -> None:
+        """The network's conditions: to programs of the fielded system, and whole (`text`) for the autonomy."""
+        self._conditions = conditions
+        self._stats.publish(fielded.network_stats(conditions))
+        for entry in fielded.host_entries(conditions):
+            self._hosts.publish(entry)
+        self._text.publish(String(text))
 
-    def publish_text(self, name: str, text: str, *, latched: bool = False) -> None:
-        """A std_msgs/String."""
-        if name not in self._texts:
-            self._texts[name] = rospy.Publisher(name, String, queue_size=1, latch=latched)
-        self._texts[name].publish(String(text))
-
-    def flush(self, now: float) -> None:
-        """First messages of new topics whose subscribers have come by now."""
-        with self._lock:
-            for publication in self._publications.values():
-                publication.flush(now)
+    def _get_hosts(self, _request: object) -> Any:
+        return fielded.hosts_response(self._conditions)
 
     # The master
 
@@ -179,22 +177,17 @@ class Graph:
             return False
         uri = rospy.get_node_uri()
         ourselves = xmlrpc.client.ServerProxy(uri)
-        for name, message_type in self._published_types():
+        fixed = [(publisher.resolved_name, publisher.type) for publisher in (self._stats, self._hosts, self._text)]
+        for name, message_type in [*fixed, *self._publications.advertised()]:
             master.registerPublisher(name, message_type, uri)
-        for name in self._listened():
+        for name in [*self._subscribers, self._settings.resolved_name]:
             publishers = master.registerSubscriber(name, rospy.AnyMsg._type, uri)
             # The new master's answer reaches rospy as if the master had called.
             ourselves.publisherUpdate("/master", name, publishers)
+        master.registerService(self._service.resolved_name, self._service.uri, uri)
         self._pid = pid
         log.info("master-restarted pid=%d", pid)
         return True
-
-    def _published_types(self) -> Iterable[tuple[str, str]]:
-        yield from [(name, publication.key.name) for name, publication in self._publications.items()]
-        yield from [(name, String._type) for name in self._texts]
-
-    def _listened(self) -> list[str]:
-        return [*self._subscribers, *([self._settings[0]] if self._settings else [])]
 
 
 def _master() -> Any:
@@ -218,10 +211,18 @@ def _subscribers_of(name: str) -> int:
 
 
 def parameters(default_socket: str) -> Parameters:
-    """The node's private parameters."""
+    """The node's private parameters. One that should be a list and is none is reported, and taken for empty."""
     return Parameters(
         str(rospy.get_param("~socket", default_socket)),
         str(rospy.get_param("~hostname", "")),
-        list(rospy.get_param("~topic_list", [])),
-        list(rospy.get_param("~host_list", [])),
+        _list_parameter("topic_list"),
+        _list_parameter("host_list"),
     )
+
+
+def _list_parameter(name: str) -> list[object]:
+    value = rospy.get_param("~" + name, [])
+    if isinstance(value, list):
+        return value
+    log.error("parameter-refused %s: expected a list, found %r", name, value)
+    return []

@@ -1,0 +1,96 @@
+"""Whole robots for tests: each with a network of its own, a roscore, a daemon, a bridge and a node; one lossy link
+joins them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.link.laboratory import INTERFACE, Laboratory, Link, laboratory
+from tests.udp_mesh.bridges.ros_processes import BridgeProcess, Master, Robot
+from tests.udp_mesh.daemon.processes import KEY, RATES, RunningDaemon, poll, wait_online
+
+LOSSY = Link(rate=20e6, delay_ms=5.0, loss=0.05)
+"""Loss in both directions, acknowledgements included."""
+
+TOPICS = """
+[topics]
+status = { priority = 0 }
+odometry = { priority = 3, reliable = false, keep_last = 1 }
+map = { priority = 5 }
+image = { priority = 9, keep_last = 1 }
+"""
+
+
+class RobotsDaemon(RunningDaemon):
+    """A daemon in a robot's own network, on the shared link, which finds its peers."""
+
+    def __init__(self, folder: Path, name: str, inside: Sequence[str], topics: str = TOPICS) -> None:
+        key = folder / f"{name}.key"
+        key.write_text(KEY + "\n")
+        self._inside = tuple(inside)
+        super().__init__(
+            folder,
+            name,
+            f'name = "{name}"\nkey_file = "{key}"\n[[links]]\ninterface = "{INTERFACE}"\n{topics}{RATES}'
+            f'[daemon]\nsocket = "{folder / name}.sock"\nstate_directory = "{folder / name}"\n',
+        )
+
+    def start(self) -> None:
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [*self._inside, sys.executable, "-m", "udp_mesh.cli.main", "run", str(self.file)],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **self.environment},
+            )
+        poll(self._answers, f"{self.name} answers")
+
+
+@dataclass
+class Member:
+    """One robot of the team; `node` is a program of its autonomy."""
+
+    name: str
+    daemon: RobotsDaemon
+    master: Master
+    bridge: BridgeProcess
+    node: Robot
+
+
+@contextmanager
+def team(*names: str, link: Link = LOSSY, topics: str = TOPICS) -> Iterator[tuple[Laboratory, list[Member]]]:
+    """Robots of these names on one link, all of them online for one another."""
+    # A Unix socket's path has at most 107 bytes: pytest's folders are too long.
+    with (
+        tempfile.TemporaryDirectory(prefix="udp-mesh-") as path,
+        laboratory(len(names), link=link) as lab,
+        ExitStack() as kept,
+    ):
+        folder = Path(path)
+        places = {name: lab.inside(place, []) for place, name in enumerate(names)}
+        masters = {name: Master(folder, name, places[name]) for name in names}
+        for master in masters.values():
+            kept.callback(master.stop)
+            master.start(wait=False)
+        members = []
+        for name, master in masters.items():
+            daemon = kept.enter_context(RobotsDaemon(folder, name, places[name], topics))
+            master.wait()
+            bridge = BridgeProcess(master, daemon)
+            kept.callback(bridge.stop)
+            bridge.start()
+            node = Robot(master, f"{name}_node")
+            kept.callback(node.close)
+            members.append(Member(name, daemon, master, bridge, node))
+        for member in members:
+            for other in names:
+                if other != member.name:
+                    wait_online(member.daemon, other)
+        yield lab, members

@@ -1,0 +1,139 @@
+"""What goes out into a ROS graph, without ever waiting for its master.
+
+rospy blocks whoever advertises a topic until the master answers, for as long as the master is away. So:
+
+1. `publish` hands a message to its topic's publisher where one of the right type is ready; else it waits, in order.
+2. `run`, on a thread of its own, advertises what messages wait for, withdrawing the topic's last type first.
+3. A new topic's first messages wait until the subscribers that were there before it have connected.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import Callable, Deque, NamedTuple, Protocol
+
+from udp_mesh.bridges.types import TypeKey
+
+FIRST_HOLD_S = 2.0
+"""How long the first messages of a new topic wait for subscribers who were there before it."""
+LOOK_S = 0.05
+"""Between two looks whether those subscribers have connected."""
+MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 100, 16 << 20
+"""Per topic, until it is advertised: some seconds of telemetry, half a second of images; the oldest are dropped."""
+
+
+class Outgoing(NamedTuple):
+    """A message to publish, with all that its topic must be advertised with."""
+
+    name: str
+    key: TypeKey
+    definition: str
+    latched: bool
+    payload: bytes
+
+
+class Advertised(Protocol):
+    """One advertised topic. `publish` returns at once."""
+
+    def connections(self) -> int: ...
+
+    def publish(self, payload: bytes) -> None: ...
+
+    def withdraw(self) -> None: ...
+
+
+class _Topic:
+    """One name: what it was last advertised as, and what waits."""
+
+    def __init__(self) -> None:
+        self.advertised: Advertised | None = None
+        self.kind: tuple[TypeKey, bool] | None = None
+        self.subscribers = 0
+        self.until = 0.0
+        self.waiting: Deque[Outgoing] = deque()
+        self.waiting_bytes = 0
+
+    def fits(self, message: Outgoing) -> bool:
+        return self.advertised is not None and self.kind == (message.key, message.latched)
+
+
+class Publications:
+    """All topics of one node. `advertise` and `subscribers_of` may block; only `run` calls them."""
+
+    def __init__(
+        self,
+        advertise: Callable[[Outgoing], Advertised],
+        subscribers_of: Callable[[str], int],
+        clock: Callable[[], float],
+    ) -> None:
+        self._advertise = advertise
+        self._subscribers_of = subscribers_of
+        self._clock = clock
+        self._topics: dict[str, _Topic] = {}
+        self._changed = threading.Condition()
+        self.dropped = 0
+        """Messages that waited for the master in vain."""
+
+    def publish(self, message: Outgoing) -> None:
+        """Publishes now or as soon as the topic is advertised; never blocks."""
+        with self._changed:
+            topic = self._topics.setdefault(message.name, _Topic())
+            topic.waiting.append(message)
+            topic.waiting_bytes += len(message.payload)
+            self._flush(topic)
+            while len(topic.waiting) > MAX_WAITING_MESSAGES or topic.waiting_bytes > MAX_WAITING_BYTES:
+                topic.waiting_bytes -= len(topic.waiting.popleft().payload)
+                self.dropped += 1
+            if topic.waiting:
+                self._changed.notify()
+
+    def run(self, stop: threading.Event) -> None:
+        """Advertises what messages wait for, until `stop`."""
+        while not stop.is_set():
+            with self._changed:
+                due = [topic for topic in self._topics.values() if topic.waiting]
+                if not due:
+                    # `stop` does not wake it: bounded, so that it is seen.
+                    self._changed.wait(1.0)
+                    continue
+            for topic in due:
+                self._serve(topic)
+            stop.wait(LOOK_S)
+
+    def _serve(self, topic: _Topic) -> None:
+        with self._changed:
+            self._flush(topic)
+            if not topic.waiting or topic.fits(topic.waiting[0]):
+                return
+            first, last = topic.waiting[0], topic.advertised
+            topic.advertised = None
+        # Outside of the lock: here the master may let us wait.
+        if last is not None:
+            # rospy keeps the first type of a topic until its last publisher is gone.
+            last.withdraw()
+        subscribers = 0 if first.latched else self._subscribers_of(first.name)
+        advertised = self._advertise(first)
+        with self._changed:
+            topic.advertised, topic.kind = advertised, (first.key, first.latched)
+            topic.subscribers, topic.until = subscribers, self._clock() + FIRST_HOLD_S
+            self._flush(topic)
+
+    def _flush(self, topic: _Topic) -> None:
+        """Publishes what waits at the head, as far as it is of the advertised type."""
+        advertised = topic.advertised
+        if advertised is None or not topic.waiting or not topic.fits(topic.waiting[0]):
+            return
+        if topic.subscribers and advertised.connections() < topic.subscribers and self._clock() < topic.until:
+            return
+        topic.subscribers = 0
+        while topic.waiting and topic.fits(topic.waiting[0]):
+            payload = topic.waiting.popleft().payload
+            topic.waiting_bytes -= len(payload)
+            advertised.publish(payload)
+
+    def advertised(self) -> list[tuple[str, str]]:
+        """Names and types that the master knows from us, or should."""
+        with self._changed:
+            known = [(name, topic.kind) for name, topic in self._topics.items() if topic.advertised is not None]
+        return [(name, kind[0].name) for name, kind in known if kind is not None]
