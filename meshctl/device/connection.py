@@ -71,8 +71,13 @@ class Deadlines:
     auth_s: float = 30.0
     channel_s: float = 15.0
     run_s: float = 60.0
-    # Nobody answers a keepalive, but TCP acknowledges it: a link that is silent for four of these is given up.
+    # Between commands. Nobody answers it, but TCP acknowledges it: a link that is silent for four of these is given up.
     keepalive_s: int = 15
+    # While a command runs its server is asked for a sign so often, and given up after so long a silence. A radio that
+    # hashes an image or erases flash still answers within a few seconds, and what stands before the question on the
+    # slowest link that is worth an upload (24 KiB of window at 4 KiB/s) takes six.
+    ask_s: float = 5.0
+    silence_s: float = 20.0
 
 
 @dataclass(frozen=True, slots=True)

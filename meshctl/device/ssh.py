@@ -1,8 +1,8 @@
 """SSH to one node: socket or tunnel -> key exchange -> host key judged -> login -> `SshConnection` -> `run`.
 
 `connect` walks that line, each step under its own deadline. paramiko waits without bound in places (the answer to
-`exec`, a full TCP buffer), so every wait here runs under `_Deadline`, which closes the transport when time is up: all
-of paramiko's waits end then. A connection that timed out is closed and cannot be used again.
+`exec`, a full TCP buffer), so every wait here runs under a `Watch`, which closes the transport when time is up, or when
+the server gives no sign of life: all of paramiko's waits end then. Such a connection cannot be used again.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import select
 import socket
 import threading
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from types import TracebackType
 
 import paramiko
@@ -30,6 +30,7 @@ from meshctl.device.errors import (
 )
 from meshctl.device.framing import framed
 from meshctl.device.legacy_rsa import SSH_RSA, LegacyTransport
+from meshctl.device.liveness import Heard, Watch, asking
 from meshctl.device.trust import HostKey, HostKeyPolicy
 from meshctl.model import Release
 
@@ -72,7 +73,7 @@ def connect(
         allowed: tuple[str, ...] = ()
         while True:
             try:
-                transport = _handshake(endpoint, limits, trust, via, legacy=legacy)
+                transport, heard = _handshake(endpoint, limits, trust, via, legacy=legacy)
             except _OnlySha1 as error:
                 if legacy or release is not Release.V19_07:
                     raise IncompatibleServer(
@@ -87,7 +88,7 @@ def connect(
                 transport.close()
                 raise
             if accepted:
-                return SshConnection(endpoint, transport, limits)
+                return SshConnection(endpoint, transport, limits, heard)
             transport.close()
             tried += [attempt.name for attempt in left[:TRIES_PER_CONNECTION]]
             allowed = refused or allowed
@@ -106,43 +107,37 @@ class _OnlySha1(Exception):
     """No host key algorithm in common; 19.07's dropbear is the known reason."""
 
 
-class _Deadline:
-    """Closes `transport` when `seconds` have passed; `passed` tells whether that happened."""
-
-    def __init__(self, transport: paramiko.Transport, seconds: float) -> None:
-        self.passed = False
-        self._transport = transport
-        self._timer = threading.Timer(max(seconds, 0.0), self._close)
-        self._timer.daemon = True
-
-    def _close(self) -> None:
-        self.passed = True
-        self._transport.close()
-
-    def __enter__(self) -> _Deadline:
-        self._timer.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._timer.cancel()
-
-
 @contextmanager
-def _translated(endpoint: Endpoint, transport: paramiko.Transport, seconds: float, phase: str) -> Iterator[None]:
-    """Foreign exceptions become ours here; a passed deadline is a Timeout whatever it made paramiko raise."""
-    with _Deadline(transport, seconds) as deadline:
+def _translated(
+    endpoint: Endpoint,
+    transport: paramiko.Transport,
+    seconds: float,
+    phase: str,
+    *,
+    heard: Heard | None = None,
+    silence_s: float = 0.0,
+) -> Iterator[None]:
+    """Foreign exceptions become ours here; a wait that took too long is told as such whatever it made paramiko raise.
+
+    With `heard`, a connection that is silent for `silence_s` meanwhile is lost.
+    """
+    with Watch(transport, seconds, heard=heard, silence_s=silence_s) as watch:
         try:
             yield
         except (paramiko.SSHException, OSError, EOFError) as error:
-            if deadline.passed:
-                raise Timeout(f"{endpoint.label}: no answer to {phase} within {seconds:g} s", phase=phase) from error
+            if watch.passed or watch.silent:
+                raise _waited(endpoint, watch, seconds, silence_s, phase) from error
             if transport.is_active():
                 raise ChannelClosed(f"{endpoint.label}: {phase} was refused or cut: {error}") from error
             raise ConnectionLost(f"{endpoint.label}: the connection broke during {phase}: {error}") from error
-    if deadline.passed:
-        raise Timeout(f"{endpoint.label}: no answer to {phase} within {seconds:g} s", phase=phase)
+    if watch.passed or watch.silent:
+        raise _waited(endpoint, watch, seconds, silence_s, phase)
+
+
+def _waited(endpoint: Endpoint, watch: Watch, seconds: float, silence_s: float, phase: str) -> Unreachable:
+    if watch.passed:
+        return Timeout(f"{endpoint.label}: no answer to {phase} within {seconds:g} s", phase=phase)
+    return ConnectionLost(f"{endpoint.label}: silent for {silence_s:g} s during {phase}")
 
 
 def _open_socket(endpoint: Endpoint, limits: Deadlines, via: SshConnection | None) -> socket.socket | paramiko.Channel:
@@ -156,16 +151,17 @@ def _open_socket(endpoint: Endpoint, limits: Deadlines, via: SshConnection | Non
         ) from error
     except OSError as error:
         raise Unreachable(f"{endpoint.label}: cannot connect: {error.strerror or error}") from error
-    # keepalives ask for no answer, so the kernel has to notice that nobody acknowledges them
+    # between commands keepalives ask for no answer, so the kernel has to notice that nobody acknowledges them
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 4 * limits.keepalive_s * 1000)
     return sock
 
 
 def _handshake(
     endpoint: Endpoint, limits: Deadlines, trust: HostKeyPolicy, via: SshConnection | None, *, legacy: bool
-) -> paramiko.Transport:
+) -> tuple[paramiko.Transport, Heard]:
     known = trust.known(endpoint)
-    transport = (LegacyTransport if legacy else paramiko.Transport)(_open_socket(endpoint, limits, via))
+    heard = Heard(_open_socket(endpoint, limits, via))
+    transport = (LegacyTransport if legacy else paramiko.Transport)(heard)  # type: ignore[arg-type]
     transport.daemon = True
     transport.banner_timeout = transport.handshake_timeout = limits.handshake_s * 2  # ours comes first
     transport.auth_timeout = limits.auth_s * 2
@@ -189,7 +185,7 @@ def _handshake(
         transport.close()
         raise
     transport.set_keepalive(limits.keepalive_s)
-    return transport
+    return transport, heard
 
 
 def _prefer(transport: paramiko.Transport, known: tuple[HostKey, ...], *, legacy: bool) -> None:
@@ -231,10 +227,11 @@ def _login(
 class SshConnection(Connection):
     """See `Connection`. Also carries tunnels to nodes behind this one."""
 
-    def __init__(self, endpoint: Endpoint, transport: paramiko.Transport, limits: Deadlines) -> None:
+    def __init__(self, endpoint: Endpoint, transport: paramiko.Transport, limits: Deadlines, heard: Heard) -> None:
         self._endpoint = endpoint
         self._transport = transport
         self._limits = limits
+        self._heard = heard
 
     @property
     def endpoint(self) -> Endpoint:
@@ -271,22 +268,27 @@ class SshConnection(Connection):
         sent = framed(script)
         seconds = self._limits.run_s if timeout_s is None else timeout_s
         pieces = (stdin,) if isinstance(stdin, bytes) else stdin
-        with _translated(self._endpoint, self._transport, min(seconds, self._limits.channel_s), "opening a channel"):
-            channel = self._transport.open_session()
-        try:
-            with _translated(self._endpoint, self._transport, seconds, "a command"):
-                channel.exec_command(sent.command)
-                with _fed(channel, sent.preamble, pieces, inline=isinstance(stdin, bytes)) as feeder:
-                    out, err = _collect(channel)
-                status = channel.recv_exit_status()
-                if status < 0:
-                    raise EOFError("no exit status: it was killed, or the link was cut")
-            if feeder is not None and feeder.failure is not None:
-                raise feeder.failure
-        finally:
-            with _quiet():
-                channel.close()
+        with asking(self._transport, self._limits.ask_s, self._limits.keepalive_s):
+            with self._waiting(min(seconds, self._limits.channel_s), "opening a channel"):
+                channel = self._transport.open_session()
+            try:
+                with self._waiting(seconds, "a command"):
+                    channel.exec_command(sent.command)
+                    with _fed(channel, sent.preamble, pieces, inline=isinstance(stdin, bytes)) as feeder:
+                        out, err = _collect(channel)
+                    status = channel.recv_exit_status()
+                    if status < 0:
+                        raise EOFError("no exit status: it was killed, or the link was cut")
+                if feeder is not None and feeder.failure is not None:
+                    raise feeder.failure
+            finally:
+                with _quiet():
+                    channel.close()
         return Completed(out, err, status)
+
+    def _waiting(self, seconds: float, phase: str) -> AbstractContextManager[None]:
+        silence_s = self._limits.silence_s
+        return _translated(self._endpoint, self._transport, seconds, phase, heard=self._heard, silence_s=silence_s)
 
     def close(self) -> None:
         self._transport.close()

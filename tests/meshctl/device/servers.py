@@ -199,7 +199,7 @@ def openssh(directory: Path, authorized: Path, *settings: str, host_key_type: st
 
 
 # No wait of a healthy server comes near these on the busiest machine; tests of deadlines set their own.
-PATIENT = Deadlines(connect_s=60, handshake_s=120, auth_s=120, channel_s=120, run_s=120)
+PATIENT = Deadlines(connect_s=60, handshake_s=120, auth_s=120, channel_s=120, run_s=120, silence_s=120)
 
 
 def ready(node: Sandbox, directory: Path) -> Path:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -410,6 +413,43 @@ def test_a_server_frozen_after_login_is_a_timeout_and_not_a_hang(
     finally:
         for pid in frozen:
             os.kill(pid, 18)
+
+
+def test_a_server_that_falls_silent_is_given_up_long_before_the_command_has_to_end(
+    server: Server, key: Path, trust: TrustStore, node: Sandbox
+) -> None:
+    alert = replace(PATIENT, ask_s=0.2, silence_s=1.0)
+    with connect(server.endpoint(), credentials=only(key), trust=trust, deadlines=alert) as connected:
+        frozen = [pid for pid in node.processes() if b"dropbear" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+        for pid in frozen:
+            os.kill(pid, signal.SIGSTOP)
+        try:
+            with pytest.raises(ConnectionLost, match="silent for 1 s during"):
+                connected.run("echo there", timeout_s=100_000)
+        finally:
+            for pid in frozen:
+                os.kill(pid, signal.SIGCONT)
+        assert not connected.is_open
+
+
+def test_a_quiet_command_keeps_its_connection_because_its_server_gives_signs_of_life(
+    server: Server, key: Path, trust: TrustStore, node: Sandbox
+) -> None:
+    alert = replace(PATIENT, ask_s=0.05)
+    with (
+        connect(server.endpoint(), credentials=only(key), trust=trust, deadlines=alert) as connected,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        node.run("/bin/busybox", "mkfifo", "/tmp/end")
+        waiting = pool.submit(connected.run, "read -r end </tmp/end; echo $end")
+        first = connected._heard.at_s
+        eventually(lambda: connected._heard.at_s > first)
+        second = connected._heard.at_s
+        eventually(lambda: connected._heard.at_s > second)
+        assert not waiting.done()
+        with connect(server.endpoint(), credentials=only(key), trust=trust, deadlines=PATIENT) as other:
+            other.run("echo now >/tmp/end").check("end it")
+        assert waiting.result().stdout == "now\n"
 
 
 def test_closing_leaves_no_process_of_ours_on_the_node(
