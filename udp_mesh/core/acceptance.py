@@ -82,6 +82,8 @@ def _room_for(state: State, topic: Topic, names: list[str], size_bytes: int) -> 
             if len(state.roster.peers) >= limits.peers:
                 return Rejected(RejectReason.QUEUE_FULL, f"already {limits.peers} peers")
             continue
+        if not peer.engaged:
+            continue
         outbound = peer.outbound
         if (
             outbound.queued_bytes + size_bytes > limits.queue_bytes_per_peer
@@ -156,7 +158,7 @@ def _broadcast_bytes(accepted: Accepted) -> int:
 
 def shelve(state: State, peer: Peer, now: float) -> None:
     """The peer went out of reach: move what its outboxes keep out of the queue."""
-    for message in list(peer.outbound.open):
+    for message in list(peer.outbound.open) if peer.engaged else ():
         if message.accepted.channel.topic.outbox is Outbox.NONE or message.accepted.broadcast_number is not None:
             continue
         peer.outbound.withdraw(message)

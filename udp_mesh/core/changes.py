@@ -43,7 +43,7 @@ def link_up(state: State, link: LinkInfo, now: float) -> None:
         way = session.way
         if way.link == link.name:
             way.lead(link.name, way.address, link.mtu, state.settings.fragment_bytes)
-    state.discovery.hurry(now)
+    state.discovery.hurry(len(state.roster.sessions), now)
 
 
 def link_down(state: State, name: str) -> None:
@@ -73,15 +73,16 @@ def apply(state: State, settings: Settings, now: float) -> list[str]:
     for session in state.roster.sessions.values():
         session.inbound.apply(settings.rates, settings.limits)
     for peer in state.roster.peers.values():
-        peer.outbound.apply(settings)
-        state.ready[peer] = None
+        peer.apply(settings)
+        if peer.engaged:
+            state.ready[peer] = None
         state.arm(peer)
     for session in state.roster.sessions.values():
         way = session.way
         info = state.links.get(way.link)
         if info is not None:
             way.lead(way.link, way.address, info.mtu, settings.fragment_bytes)
-    state.discovery.hurry(now)
+    state.discovery.hurry(len(state.roster.sessions), now)
     return changes
 
 
@@ -133,7 +134,8 @@ def _retopic(state: State, now: float) -> None:
         if topic.rate_limit_bytes_per_s is not None and topic.name not in state.gates:
             state.gates[topic.name] = Gate(topic.rate_limit_bytes_per_s, now)
     for peer in state.roster.peers.values():
-        peer.outbound.reprioritize()
+        if peer.engaged:
+            peer.outbound.reprioritize()
     state.casts.reprioritize()
 
 
@@ -142,6 +144,8 @@ def close(state: State, now: float) -> None:
     if state.closed:
         return
     for peer in state.roster.peers.values():
+        if not peer.engaged:
+            continue
         for message in list(peer.outbound.open):
             if message.store_key is None:
                 peer.outbound.finish(message, ExpiryReason.CLOSED)

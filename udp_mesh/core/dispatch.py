@@ -60,7 +60,7 @@ def _leave_owed(state: State, session: Session, now: float, out: list[Datagram])
         return
     frames: list[Frame] = []
     if session.inbound.acks.pending or session.inbound.acks.now_wanted:
-        waiting = state.yielding.waiting_here([other.outbound for other in state.waiting_peers()], now)
+        waiting = state.yielding.waiting_here(state.waiting_outbounds(), now)
         ack = session.take_ack(now, waiting[:1])
         if ack is not None:
             frames.append(ack)
@@ -174,7 +174,7 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
 def _leave_casts(state: State, priority: int, now: float, out: list[Datagram]) -> None:
     rates = state.settings.rates
     urgent = priority <= rates.urgent_priority
-    twice = urgent and any(peer.outbound.send_twice for peer in state.roster.online())
+    twice = urgent and any(peer.engaged and peer.outbound.send_twice for peer in state.roster.online())
     ways: list[tuple[str, Address | None]] = [
         (link.name, link.broadcast) for link in state.links.values() if link.kind is LinkKind.BROADCAST
     ]
@@ -245,7 +245,7 @@ def handle_timer(state: State, now: float) -> None:
             waiting = {outbound for outbound, _ in gate.parked}
             gate.release()
             for peer in state.roster.peers.values():
-                if peer.outbound in waiting:
+                if peer.engaged and peer.outbound in waiting:
                     state.ready[peer] = None
     casts: list[Datagram] = []
     state.casts.leave_copies(now, casts)
@@ -259,7 +259,7 @@ def handle_timer(state: State, now: float) -> None:
 
 def _send_heartbeats(state: State, now: float) -> None:
     sessions = list(state.roster.sessions.values())
-    waiting = state.yielding.waiting_here([peer.outbound for peer in state.waiting_peers()], now)
+    waiting = state.yielding.waiting_here(state.waiting_outbounds(), now)
     beat = state.discovery.compose(state.settings, sessions, waiting, state.casts.next_number, now)
     datagrams = announce(beat, state.to_all, state.links.values(), state.settings.neighbours)
     state.ledger.counters.heartbeats_sent += len(datagrams)
@@ -267,14 +267,16 @@ def _send_heartbeats(state: State, now: float) -> None:
 
 
 def _ask_for_repairs(state: State, now: float) -> None:
-    for boot_id, repairs in state.repairs.items():
-        if repairs.next_at > now:
-            state.housekeeping_at = min(state.housekeeping_at, repairs.next_at)
-            continue
+    asking = list(state.asking)
+    state.asking.clear()
+    for boot_id in asking:
+        repairs = state.repairs.get(boot_id)
         session = state.roster.sessions.get(boot_id)
-        asks = repairs.ask(now)
-        state.housekeeping_at = min(state.housekeeping_at, repairs.next_at)
-        if session is None or not asks:
+        if repairs is None or session is None:
+            continue
+        asks = repairs.ask(now) if repairs.next_at <= now else []
+        state.ask_by(boot_id, repairs)
+        if not asks:
             continue
         state.ledger.counters.repairs_asked += len(asks)
         for ask in asks:

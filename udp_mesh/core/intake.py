@@ -266,7 +266,7 @@ def _hand_over(state: State, session: Session, now: float) -> None:
         number = message.from_broadcast
         if number is not None and number < UNREPAIRED_FROM and repairs is not None:
             repairs.received(number, now, inbound.broadcasts.finished)
-            state.housekeeping_at = min(state.housekeeping_at, repairs.next_at)
+            state.ask_by(session.boot_id, repairs)
         state.ledger.counters.messages_received += 1
         state.ledger.tell(
             MessageReceived(

@@ -27,6 +27,9 @@ from udp_mesh.wire.frames import Heartbeat
 from udp_mesh.wire.header import VERSION
 from udp_mesh.wire.limits import HEARD_TAG_BYTES
 
+LOOKED_AT_PER_ROUND = 64
+"""Peers without traffic looked at per round: of 1,000 each is looked at every 8 s, and a round stays short."""
+
 REPORT_AGAIN_S = 60.0
 """The same conflict, mismatch or incompatibility is reported once in this time."""
 
@@ -54,7 +57,7 @@ def greet(state: State, session: Session, beat: Heartbeat, link: str, source: Ad
         heard(state, session, link, source, now)
     if not (session.proven and session.knows_us):
         # It does not hear us, or we cannot know yet that it does.
-        state.discovery.answer(session, now)
+        state.discovery.answer(session, len(state.roster.sessions), now)
     if session.proven and session.peer is not None:
         repairs = state.repairs.get(session.boot_id)
         if repairs is None:
@@ -62,7 +65,7 @@ def greet(state: State, session: Session, beat: Heartbeat, link: str, source: Ad
             for channel in session.broadcast_channels:
                 channel.window.raise_floor(beat.broadcast_number)
         repairs.counted(beat.broadcast_messages, now, session.inbound.broadcasts.finished)
-        state.housekeeping_at = min(state.housekeeping_at, repairs.next_at)
+        state.ask_by(session.boot_id, repairs)
         if beat.waiting:
             state.yielding.heard(beat.waiting, now)
 
@@ -85,13 +88,14 @@ def prove(state: State, session: Session, now: float) -> None:
     if old is not None:
         state.repairs.pop(old.boot_id, None)
         state.owing.pop(old, None)
-    peer.outbound.restart(now)
-    state.discovery.answer(session, now)
+    if peer.engaged:
+        peer.outbound.restart(now)
+        state.ready[peer] = None
+    state.discovery.answer(session, len(state.roster.sessions), now)
     if arrival is Arrival.RESTARTED and peer.online:
         state.ledger.tell(PeerRestarted(peer.name))
         peer.online_since = now
     come_online(state, peer, session, now)
-    state.ready[peer] = None
     state.arm(peer)
 
 
@@ -121,7 +125,7 @@ def heard(state: State, session: Session, link: str, source: Address, now: float
         return
     if not peer.online:
         come_online(state, peer, session, now)
-    if peer.outbound.silent_since is not None:
+    if peer.engaged and peer.outbound.silent_since is not None:
         peer.outbound.heard(now)
         state.ready[peer] = None
 
@@ -144,7 +148,7 @@ def follow(state: State, session: Session, link: str, source: Address, now: floa
     if info is None:
         return
     way = session.way
-    outbound = session.peer.outbound if session.peer is not None else None
+    outbound = session.peer.outbound if session.peer is not None and session.peer.engaged else None
     struggling = outbound is not None and (outbound.struggling or outbound.silent_since is not None)
     first = not way.link
     if not first and now - way.heard_at < STALE_PATH_S and not struggling and way.link in state.links:
@@ -175,39 +179,49 @@ def go_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
     peer.left = left
     peer.online_since = None
     state.ledger.tell(PeerOffline(peer.name, left))
-    if peer.outbound.silent_since is None and peer.outbound.flight.outstanding:
+    if peer.engaged and peer.outbound.silent_since is None and peer.outbound.flight.outstanding:
         peer.outbound.silent_since = now
         peer.outbound.allow_probe(now)
     shelve(state, peer, now)
 
 
 def housekeep(state: State, now: float) -> None:
-    """The round through all peers."""
+    """A round: all peers with traffic, and of the others as many as one round bears."""
+    peers = list(state.roster.peers.values())
+    start = state.look_from if state.look_from < len(peers) else 0
+    state.look_from = start + LOOKED_AT_PER_ROUND
+    for place, peer in enumerate(peers):
+        if peer.engaged or start <= place < state.look_from:
+            _look_at(state, peer, now)
+    for session in state.roster.not_current():
+        if now - session.last_heard > state.settings.rates.offline_s:
+            state.roster.forget(session)
+            state.repairs.pop(session.boot_id, None)
+            state.incompatible_reported.pop(session.boot_id, None)
+
+
+def _look_at(state: State, peer: Peer, now: float) -> None:
+    session = peer.session
+    if session is None:
+        return
     rates = state.settings.rates
-    for peer in list(state.roster.peers.values()):
-        session = peer.session
-        if session is None:
-            continue
-        quiet_s = now - session.last_heard
-        if peer.online and quiet_s > max(rates.offline_s, MISSED_HEARTBEATS * session.interval_s):
-            go_offline(state, peer, now, left=False)
-        if not peer.online and not peer.lost and quiet_s > rates.peer_lost_s:
-            peer.lost = True
+    quiet_s = now - session.last_heard
+    if peer.online and quiet_s > max(rates.offline_s, MISSED_HEARTBEATS * session.interval_s):
+        go_offline(state, peer, now, left=False)
+    if not peer.online and not peer.lost and quiet_s > rates.peer_lost_s:
+        peer.lost = True
+        if peer.engaged:
             peer.outbound.finish_all(Outcome.PEER_LOST)
             report_ended(state, peer, now)
+    if session.inbound.fragments:
         session.inbound.unicasts.purge(now)
         session.inbound.broadcasts.purge(now)
+    if session.received_bytes:
+        session.meters.received.feed(session.received_bytes, now)
+    if peer.engaged:
         _report_starved(state, peer, now)
-        meters = session.meters
-        meters.sent.feed(peer.outbound.sent_bytes, now)
-        meters.delivered.feed(peer.outbound.delivered_bytes, now)
-        meters.received.feed(session.received_bytes, now)
-    for boot_id, session in list(state.roster.sessions.items()):
-        current = session.peer is not None and session.peer.session is session
-        if not current and now - session.last_heard > rates.offline_s:
-            state.roster.forget(session)
-            state.repairs.pop(boot_id, None)
-            state.incompatible_reported.pop(boot_id, None)
+        session.meters.sent.feed(peer.outbound.sent_bytes, now)
+        session.meters.delivered.feed(peer.outbound.delivered_bytes, now)
 
 
 def _report_starved(state: State, peer: Peer, now: float) -> None:

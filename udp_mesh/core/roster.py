@@ -111,6 +111,12 @@ class Roster:
             session.set_keys(self.own_boot, keys)
             self._enter_tags(session)
 
+    def not_current(self) -> list[Session]:
+        """Strangers, and runs of a name that another one replaced."""
+        return [
+            session for session in self.sessions.values() if session.peer is None or session.peer.session is not session
+        ]
+
     def online(self) -> list[Peer]:
         return [peer for peer in self.peers.values() if peer.online]
 

@@ -8,7 +8,6 @@ from collections import deque
 from typing import NamedTuple
 
 from udp_mesh.core.message import Outgoing
-from udp_mesh.wire.limits import PRIORITY_LEVELS
 
 
 class Run(NamedTuple):
@@ -37,13 +36,21 @@ class _Level:
         return not (self.again or self.fresh or self.stale_again or self.stale_fresh)
 
 
+class _Levels(dict[int, _Level]):
+    """By priority, made when first used: most peers use few levels, and a node may have a thousand peers."""
+
+    def __missing__(self, priority: int) -> _Level:
+        level = self[priority] = _Level()
+        return level
+
+
 class Scheduler:
     """`waiting` has bit p set while something waits on level p; the lowest bit is the most urgent."""
 
     __slots__ = ("_levels", "waiting")
 
     def __init__(self) -> None:
-        self._levels = [_Level() for _ in range(PRIORITY_LEVELS)]
+        self._levels = _Levels()
         self.waiting = 0
 
     def push(self, message: Outgoing, *, first: bool = False) -> None:
@@ -107,7 +114,9 @@ class Scheduler:
 
     def set_aside(self, last_priority: int) -> None:
         """What waits on levels up to `last_priority` is stale from now on: fresh messages overtake it."""
-        for level in self._levels[: last_priority + 1]:
+        for priority, level in self._levels.items():
+            if priority > last_priority:
+                continue
             if level.again:
                 level.stale_again.extend(level.again)
                 level.again.clear()
@@ -120,9 +129,9 @@ class Scheduler:
         waiting."""
         kept = []
         if pieces:
-            for level in self._levels:
+            for _, level in sorted(self._levels.items()):
                 kept.extend([*level.again, *level.stale_again])
-        self._levels = [_Level() for _ in range(PRIORITY_LEVELS)]
+        self._levels = _Levels()
         self.waiting = 0
         for message in messages:
             if not message.begun or message.next_position < message.fragments:

@@ -32,10 +32,15 @@ class Meters:
 
 
 class Peer:
-    """A name: what is on its way to it, whichever run of it listens."""
+    """A name: what is on its way to it, whichever run of it listens.
+
+    `outbound` is made when first asked for, and `engaged` is True from then on: in a large team most nodes send to few.
+    """
 
     __slots__ = (
+        "_settings",
         "conflict_reported_at",
+        "engaged",
         "left",
         "legacy",
         "lost",
@@ -48,9 +53,12 @@ class Peer:
         "timer_at",
     )
 
+    outbound: Outbound
+
     def __init__(self, name: str, settings: Settings) -> None:
         self.name = name
-        self.outbound = Outbound(settings)
+        self._settings = settings
+        self.engaged = False
         self.session: Session | None = None
         self.online = False
         self.left = False
@@ -63,6 +71,20 @@ class Peer:
         """Earlier boot ids: never believed again."""
         self.timer_at = float("inf")
         """When this peer stands in the node's timer queue."""
+
+    def __getattr__(self, name: str) -> Outbound:
+        # Only called for a slot not yet set: nothing is paid for this once the sending half is there.
+        if name != "outbound":
+            raise AttributeError(name)
+        self.engaged = True
+        self.outbound = Outbound(self._settings)
+        return self.outbound
+
+    def apply(self, settings: Settings) -> None:
+        """New settings; nothing on its way is touched."""
+        self._settings = settings
+        if self.engaged:
+            self.outbound.apply(settings)
 
 
 class Session:

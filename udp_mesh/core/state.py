@@ -5,6 +5,7 @@ The parts, in the order bytes and messages pass them: `intake` (datagrams in), `
 state and of `now`.
 """
 
+from collections.abc import Iterator
 from heapq import heappush
 
 from udp_mesh.core.casts import CastQueue, Repairs
@@ -12,6 +13,7 @@ from udp_mesh.core.discovery import Discovery
 from udp_mesh.core.ledger import Ledger
 from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Channel
+from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.outbox import Outboxes
 from udp_mesh.core.roster import Roster
 from udp_mesh.core.seams import Datagram, RandomSource, Store
@@ -44,12 +46,16 @@ class State:
         self.roster = Roster(settings, boot_id)
         self.ledger = Ledger(settings.limits.events)
         self.outboxes = Outboxes(store)
-        self.discovery = Discovery(rng, now)
+        self.discovery = Discovery(rng, settings.rates, now)
         self.casts = CastQueue()
         self.to_all = SendChannel(self.keys[0], boot_id)
         self.yielding = Yielding(settings.rates, now)
         self.repairs: dict[bytes, Repairs] = {}
         """By the sender's boot id."""
+        self.asking: dict[bytes, None] = {}
+        """Those of `repairs` in which something is missing."""
+        self.look_from = 0
+        """Where the next round of housekeeping begins."""
         self.topics: dict[str, Topic] = {topic.name: topic for topic in settings.topics}
         self.channels: dict[tuple[str, str], Channel] = {}
         self.gates: dict[str, Gate] = {}
@@ -76,7 +82,7 @@ class State:
 
     def arm(self, peer: Peer) -> None:
         """Bring the peer's timer up to what its halves want now."""
-        at = peer.outbound.timer()
+        at = peer.outbound.timer() if peer.engaged else None
         if at is not None and at < peer.timer_at:
             self.set_timer(peer, at)
         session = peer.session
@@ -85,13 +91,21 @@ class State:
             if due is not None and due < peer.timer_at:
                 self.set_timer(peer, due)
 
+    def ask_by(self, boot_id: bytes, repairs: Repairs) -> None:
+        """Ask this sender for what is missing, when it is time."""
+        if repairs.next_at != float("inf"):
+            self.asking[boot_id] = None
+            self.housekeeping_at = min(self.housekeeping_at, repairs.next_at)
+
     def owe(self, session: Session) -> None:
         """The session has small frames or an acknowledgement to send now."""
         self.owing[session] = None
 
-    def waiting_peers(self) -> list[Peer]:
-        """Peers with open messages."""
-        return [peer for peer in self.roster.peers.values() if peer.outbound.open and peer.online]
+    def waiting_outbounds(self) -> Iterator[Outbound]:
+        """Of peers in reach with open messages."""
+        for peer in self.roster.peers.values():
+            if peer.engaged and peer.online and peer.outbound.open:
+                yield peer.outbound
 
     def broadcasts(self) -> bool:
         """Whether some link reaches everyone with one datagram."""

@@ -4,13 +4,19 @@ from dataclasses import replace
 
 from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions
 from udp_mesh.core.meter import Meter
+from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.session import Peer
 from udp_mesh.core.state import State
 
 
 def conditions(state: State, now: float) -> Conditions:
     """See `Node.conditions`."""
-    peers = tuple(_peer(state, peer, now) for _, peer in sorted(state.roster.peers.items()))
+    idle = Outbound(state.settings)
+    peers = tuple(
+        _peer(state, peer, peer.outbound if peer.engaged else idle, now)
+        for _, peer in sorted(state.roster.peers.items())
+    )
+    outbounds = [peer.outbound for peer in state.roster.peers.values() if peer.engaged]
     counters = state.ledger.counters
     inbounds = [session.inbound for session in state.roster.sessions.values()]
     return Conditions(
@@ -21,18 +27,17 @@ def conditions(state: State, now: float) -> Conditions:
             counters,
             fragments_received=sum(inbound.fragments for inbound in inbounds),
             duplicates_received=sum(inbound.duplicates for inbound in inbounds),
-            fragments_retransmitted=sum(peer.outbound.retransmitted for peer in state.roster.peers.values()),
-            fragments_sent=sum(peer.outbound.sent_packets for peer in state.roster.peers.values()),
+            fragments_retransmitted=sum(outbound.retransmitted for outbound in outbounds),
+            fragments_sent=sum(outbound.sent_packets for outbound in outbounds),
             dropped_over_limit=counters.dropped_over_limit + sum(inbound.over_limit for inbound in inbounds),
         ),
         sum(inbound.partial_bytes for inbound in inbounds),
-        sum(peer.outbound.queued_bytes for peer in state.roster.peers.values()),
+        sum(outbound.queued_bytes for outbound in outbounds),
         state.casts.kept_bytes,
     )
 
 
-def _peer(state: State, peer: Peer, now: float) -> PeerConditions:
-    outbound = peer.outbound
+def _peer(state: State, peer: Peer, outbound: Outbound, now: float) -> PeerConditions:
     session = peer.session
     held_messages, held_bytes = state.outboxes.count(peer.name)
     capacity = outbound.window.capacity()
@@ -56,15 +61,15 @@ def _peer(state: State, peer: Peer, now: float) -> PeerConditions:
         outbound.window.packets,
         outbound.flight.outstanding,
         outbound.retransmitted,
-        _queues(peer, now),
+        _queues(outbound, now),
         held_messages,
         held_bytes,
     )
 
 
-def _queues(peer: Peer, now: float) -> tuple[QueueConditions, ...]:
+def _queues(outbound: Outbound, now: float) -> tuple[QueueConditions, ...]:
     queues = []
-    for priority, book in enumerate(peer.outbound.levels):
+    for priority, book in enumerate(outbound.levels):
         oldest = book.oldest()
         starved_s = book.starved_s + (now - book.starved_since if book.starved_since is not None else 0.0)
         if not book.messages and not starved_s and not book.held_s:

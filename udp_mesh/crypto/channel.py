@@ -64,34 +64,44 @@ class Opened(NamedTuple):
     """The encoded frames, for `codec.decode`."""
 
 
-class _ChannelKey:
-    """What both ends derive: cipher, nonce salt and the public tag."""
+class _Channel:
+    """What both ends derive: cipher, nonce salt and the public tag.
 
-    __slots__ = ("cipher", "salt", "tag")
+    The cipher is set up when first needed: of a large team most nodes never send each other anything.
+    """
+
+    __slots__ = ("_cipher", "_salt", "_secret", "key", "tag")
+
+    _cipher: AESGCM
 
     def __init__(self, key: Key, sender_boot: bytes, receiver_boot: bytes) -> None:
         if len(sender_boot) != BOOT_ID_BYTES or len(receiver_boot) != BOOT_ID_BYTES:
             raise ValueError(f"a boot id has {BOOT_ID_BYTES} bytes")
         material = hmac.digest(key.prk, b"channel" + sender_boot + receiver_boot + b"\x01", "sha256")
-        self.cipher = AESGCM(material[:16])
-        self.salt = material[16:20]
+        self.key = key
+        self._secret = material[:16]
+        self._salt = material[16:20]
         self.tag = int.from_bytes(material[20:22], "big")
+        """Two derived bytes: short headers carry it; several channels may share one, try each."""
+
+    def __getattr__(self, name: str) -> AESGCM:
+        # Only called for a slot not yet set.
+        if name != "_cipher":
+            raise AttributeError(name)
+        self._cipher = AESGCM(self._secret)
+        return self._cipher
 
 
-class SendChannel:
+class SendChannel(_Channel):
     """Seals; owns the packet numbers. `receiver_boot=TO_ALL` for the channel to all."""
 
-    __slots__ = ("_cipher", "_long", "_salt", "_short", "boot_id", "key", "next_number", "tag")
+    __slots__ = ("_long", "_short", "boot_id", "next_number")
 
     def __init__(self, key: Key, sender_boot: bytes, receiver_boot: bytes = TO_ALL) -> None:
-        derived = _ChannelKey(key, sender_boot, receiver_boot)
-        self.key = key
+        super().__init__(key, sender_boot, receiver_boot)
         self.boot_id = sender_boot
-        self.tag = derived.tag
         self.next_number = 0
         """The packet number of the next datagram sealed."""
-        self._cipher = derived.cipher
-        self._salt = derived.salt
         to_all = receiver_boot == TO_ALL
         self._short = Kind.BROADCAST if to_all else Kind.DATA
         self._long = Kind.HELLO if to_all else Kind.INTRODUCTION
@@ -117,19 +127,14 @@ class SendChannel:
         return number
 
 
-class ReceiveChannel:
+class ReceiveChannel(_Channel):
     """Opens the datagrams of one sender boot to us (or to all), each packet number once."""
 
-    __slots__ = ("_cipher", "_salt", "key", "tag", "window")
+    __slots__ = ("window",)
 
     def __init__(self, key: Key, sender_boot: bytes, receiver_boot: bytes = TO_ALL) -> None:
-        derived = _ChannelKey(key, sender_boot, receiver_boot)
-        self.key = key
-        self.tag = derived.tag
-        """First two derived bytes: short headers carry it; several channels may share one, try each."""
+        super().__init__(key, sender_boot, receiver_boot)
         self.window = ReplayWindow()
-        self._cipher = derived.cipher
-        self._salt = derived.salt
 
     def open(self, data: bytes | bytearray | memoryview, number_low: int) -> Opened:
         """Opens a datagram with a short header; `number_low` is that header's. Raises `ReplayError` or `OpenError`."""

@@ -309,7 +309,8 @@ def _decode_heartbeat(reader: Reader) -> Heartbeat:
     if interval_ms == 0:
         raise DecodeError("heartbeat interval: expected at least 1 ms, found 0")
     count = reader.at_most(1, limits.MAX_HEARD, "number of heard boots")
-    heard = tuple(bytes(reader.take(limits.HEARD_TAG_BYTES, "heard boot")) for _ in range(count))
+    tags = bytes(reader.take(count * limits.HEARD_TAG_BYTES, "heard boots"))
+    heard = tuple([tags[at : at + limits.HEARD_TAG_BYTES] for at in range(0, len(tags), limits.HEARD_TAG_BYTES)])
     waiting = _decode_waiting(reader)
     reader.take(reader.integer(1, "extension length"), "heartbeat extension")
     return Heartbeat(name, low, high, features, interval_ms, known, rate, number, messages, heard, waiting)
