@@ -99,7 +99,7 @@ def crew_of(
     wait_s: int = 30,
     as_json: bool = False,
 ) -> Iterator[Crew]:
-    password = _sudo_password(ask_sudo)
+    password = sudo_password(ask_sudo)
     with session(inventory, key_files=key or ()) as opened:
         fleet = opened.fleet
         order = Order(
@@ -112,7 +112,8 @@ def crew_of(
         yield Crew(opened, Reach(fleet, opened.access, lambda: password), chosen_robots(fleet, robots), order, as_json)
 
 
-def _sudo_password(ask: bool) -> Secret | None:
+def sudo_password(ask: bool) -> Secret | None:
+    """From the environment, or asked for. Raises InputError where nobody can be asked."""
     given = os.environ.get("MESHCTL_SUDO_PASSWORD", "")
     if ask:
         if not sys.stdin.isatty():

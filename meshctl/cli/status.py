@@ -1,152 +1,136 @@
-"""`meshctl status`, `preflight` and `topology`: one look at the whole fleet, told three ways."""
+"""`meshctl status`: one look at all radios and robots, as a table, as JSON, once or until Ctrl-C."""
 
 from __future__ import annotations
 
 import json
+import sys
 import time
-from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from meshctl.apply.gather import known_macs
-from meshctl.apply.planning import Choices, Prepared
-from meshctl.cli.carry import prepared_for
+from meshctl.cli.live import live
+from meshctl.cli.looking import CONNECT_S, Everybody, NoRobots, Timeout, glance, line_width, paint_of, watcher
 from meshctl.cli.options import AsJson, InventoryPath
-from meshctl.cli.session import KeyFiles, Lab, Nodes, Session, chosen, session
-from meshctl.errors import ExitCode, InputError
-from meshctl.fleet.journal import LastKnown
-from meshctl.model import Backend, Node
+from meshctl.cli.robots_crew import AskSudo
+from meshctl.cli.session import KeyFiles, Lab
+from meshctl.errors import ExitCode
 from meshctl.status import FleetStatus, assess
-from meshctl.status import preflight as checks_of
 from meshctl.status.assess import Look
-from meshctl.status.picture import FORMATS, Picture, directions
-from meshctl.status.text import as_json as status_json
-from meshctl.status.text import preflight_text, text
-from meshctl.topology import report_of
+from meshctl.status.document import as_json as status_json
+from meshctl.status.filters import ROLES, STATES, Filter
+from meshctl.status.memory import facts_to_keep
+from meshctl.status.text import text
 
-_CLEAR = "\x1b[H\x1b[2J"
-
-
-class Format(str, Enum):  # noqa: UP042 - typer shows the values of a str enum
-    """How `meshctl topology` draws."""
-
-    TABLE = "table"
-    TREE = "tree"
-    JSON = "json"
-    NETJSON = "netjson"
-    DOT = "dot"
+Names = Annotated[
+    list[str] | None, typer.Argument(metavar="[NAME]...", help="Radios and robots, or patterns: 'husky*'.")
+]
 
 
 def status(
-    nodes: Nodes = None,
+    names: Names = None,
     inventory: InventoryPath = Path(),
     watch: Annotated[
-        float | None, typer.Option("--watch", min=1.0, metavar="S", help="Look again every S seconds.")
+        float | None,
+        typer.Option("--watch", "-w", min=1.0, metavar="S", help="Look again every S seconds; Ctrl-C ends."),
     ] = None,
+    group: Annotated[list[str] | None, typer.Option("--group", help="Only members of this group.")] = None,
+    robot: Annotated[list[str] | None, typer.Option("--robot", help="Only this robot's radios and computer.")] = None,
+    role: Annotated[list[str] | None, typer.Option("--role", help=f"Only {', '.join(ROLES)}.")] = None,
+    state: Annotated[list[str] | None, typer.Option("--state", help=f"Only {', '.join(STATES)}.")] = None,
+    alarm: Annotated[
+        list[str] | None,
+        typer.Option("--alarm", help="Only with this alarm: a code, error, warning, note, or any (error or warning)."),
+    ] = None,
+    only: Annotated[
+        bool, typer.Option("--only", help="Ask only those shown: quicker, without hops and who hears the silent.")
+    ] = False,
+    topics: Annotated[bool, typer.Option("--topics", help="Add when each topic was last sent and received.")] = False,
+    wide: Annotated[bool, typer.Option("--wide", help="All columns, however wide the terminal.")] = False,
+    no_robots: NoRobots = False,
+    timeout: Timeout = CONNECT_S,
     as_json: AsJson = False,
+    ask_sudo: AskSudo = False,
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Show every node: does it answer, is it as the inventory says, whom does it hear, what is wrong.
+    """Show every radio and every robot: does it answer, is it as the inventory says, whom does it hear, what is wrong.
 
-    Exit code: 0 all well, 1 something degraded, 3 a deployed node does not answer.
+    Names and filters choose what is shown; everybody is asked. Nothing is changed anywhere.
+
+    Exit code: 0 all well, 1 something degraded, 3 somebody who must answer does not (of those shown), 2 could not look.
 
     Example: meshctl status --watch 5
+    Example: meshctl status --role beacon --state deployed
+    Example: meshctl status --alarm any
     """
-    with session(inventory, key_files=key or (), lab=lab) as opened:
-        while True:
-            found, _ = _look(opened, nodes)
-            if as_json:
-                typer.echo(json.dumps(status_json(found), indent=None if watch else 2))
-            else:
-                typer.echo((_CLEAR if watch else "") + text(found))
-            if watch is None:
-                raise typer.Exit(found.exit_code)
-            time.sleep(watch)
+    chosen = Filter(*(tuple(values or ()) for values in (names, group, robot, role, state, alarm)))
+    with watcher(
+        inventory, key=key, lab=lab, timeout_s=timeout, ask_sudo=ask_sudo, with_robots=not no_robots
+    ) as everybody:
+        chosen.check(everybody.fleet)
+        view = _View(everybody, chosen, only, topics, wide)
+        if watch is None:
+            found = view.status(view.look(), time.time())
+            typer.echo(json.dumps(status_json(found), indent=2) if as_json else view.text(found))
+            raise typer.Exit(found.exit_code)
+        if as_json or not sys.stdout.isatty():
+            _follow(view, watch, as_json)
+        _watch(view, watch)
 
 
-def preflight(
-    inventory: InventoryPath = Path(), as_json: AsJson = False, key: KeyFiles = None, lab: Lab = None
-) -> None:
-    """Go or no-go for the run: one line per check, with the reason. Exit code 0 go, 1 no-go.
+class _View:
+    """Which part of the fleet is looked at, and how it is shown."""
 
-    Example: meshctl preflight
-    """
-    with session(inventory, key_files=key or (), lab=lab) as opened:
-        found, _ = _look(opened, None)
-        checks = checks_of(opened.fleet, found)
-    is_go = all(check.is_go for check in checks)
-    if as_json:
-        told = [{"check": check.name, "go": check.is_go, "reason": check.reason} for check in checks]
-        typer.echo(json.dumps({"go": is_go, "checks": told}, indent=2))
-    else:
-        typer.echo(preflight_text(checks))
-    raise typer.Exit(ExitCode.OK if is_go else ExitCode.FINDINGS)
+    def __init__(self, everybody: Everybody, chosen: Filter, only: bool, topics: bool, wide: bool) -> None:
+        self._everybody = everybody
+        self._chosen = chosen
+        self._topics = topics
+        self._wide = wide
+        fleet = everybody.fleet
+        self._nodes = tuple(n for n in everybody.nodes if not only or chosen.takes_node(n))
+        self._robots = tuple(name for name in everybody.robots if not only or chosen.takes_robot(fleet, name))
 
+    def look(self) -> Look:
+        """Ask, and remember what was told."""
+        look = glance(self._everybody, self._nodes, self._robots)
+        whole = assess(look, self._nodes, time.time(), self._robots)
+        self._everybody.opened.journal.remember_all(self._everybody.fleet.name, facts_to_keep(whole), time.time())
+        return look
 
-def topology(
-    mesh: Annotated[str, typer.Option("--mesh", help="Which mesh, where the fleet has several.")] = "",
-    form: Annotated[Format, typer.Option("--format", "-f", help="How to draw it.")] = Format.TREE,
-    inventory: InventoryPath = Path(),
-    key: KeyFiles = None,
-    lab: Lab = None,
-) -> None:
-    """Draw the mesh as its nodes see it: links with quality both ways, hops to the base, cut vertices marked.
+    def status(self, look: Look, now: float) -> FleetStatus:
+        """Of those that are shown, with ages as of `now`."""
+        return self._chosen.apply(self._everybody.fleet, assess(look, self._nodes, now, self._robots))
 
-    Example: meshctl topology --format dot | dot -Tsvg > mesh.svg
-    """
-    with session(inventory, key_files=key or (), lab=lab) as opened:
-        fleet = opened.fleet
-        if mesh and mesh not in fleet.meshes:
-            raise InputError(f"no mesh of {fleet.name} is called {mesh!r}: it has {', '.join(fleet.meshes)}")
-        names = {node.name for node in fleet.members(mesh)} if mesh else set(fleet.nodes)
-        found, prepared = _look(opened, sorted(names & {node.name for node in fleet.managed()}))
-        known = opened.journal.last_known(fleet.name)
-        macs = known_macs(fleet, known)
-        seen = prepared.seen
-        reports = {name: report_of(name, one) for name, one in seen.observations.items()}
-        for report in reports.values():
-            macs.update(dict.fromkeys(report.macs, report.node))
-        routing = next((m.backend for m in fleet.meshes.values() if m.name == mesh or not mesh), Backend.BATMAN)
-        picture = Picture(
-            mesh=mesh or fleet.name,
-            entry=found.entry,
-            graph=seen.graph(fleet, known),
-            directions=directions(reports, macs),
-            ages_s={
-                node.name: node.age_s for node in found.nodes if node.age_s is not None and not node.silent_because
-            },
-            addresses={node.name: str(node.address.ip) for node in fleet.nodes.values()},
-            routing=routing.value,
-        )
-        typer.echo(FORMATS[form.value](picture))
+    def text(self, status: FleetStatus, width: int | None = None) -> str:
+        wide = width if width is not None and not self._wide else line_width(wide=self._wide)
+        return text(status, wide, paint_of(), topics=self._topics)
 
 
-def _look(opened: Session, patterns: list[str] | None) -> tuple[FleetStatus, Prepared]:
-    """Observe and compare; the status of the chosen nodes."""
-    fleet = opened.fleet
-    before: dict[str, LastKnown] = opened.journal.last_known(fleet.name)
-    prepared = prepared_for(opened, patterns, Choices())
-    seen = prepared.seen
-    macs = known_macs(fleet, opened.journal.last_known(fleet.name))
-    for report in seen.reports:
-        macs.update(dict.fromkeys(report.macs, report.node))
-    silent = {**seen.away, **{name: str(error) for name, error in seen.refused.items()}}
-    look = Look(
-        fleet=fleet,
-        observations=seen.observations,
-        silent=silent,
-        plans=prepared.plan.nodes,
-        graph=seen.graph(fleet, before),
-        known=before,
-        macs=macs,
-        entry=prepared.plan.entry or _base_name(fleet.base_node),
-        own_lock=opened.owner,
-    )
-    return assess(look, chosen(fleet, patterns), time.time()), prepared
+def _follow(view: _View, period_s: float, as_json: bool) -> None:
+    """One look after the other, for pipes and logs: JSON lines, or the text with a blank line behind."""
+    while True:
+        began = time.monotonic()
+        found = view.status(view.look(), time.time())
+        typer.echo(json.dumps(status_json(found)) if as_json else view.text(found) + "\n")
+        time.sleep(max(0.0, period_s - (time.monotonic() - began)))
 
 
-def _base_name(node: Node | None) -> str:
-    return node.name if node is not None else ""
+def _watch(view: _View, period_s: float) -> None:
+    """The page until Ctrl-C; then what was seen last, where it stays."""
+
+    def draw(look: Look | None, width: int) -> list[str]:
+        if look is None:
+            return ["looking at everybody for the first time ... (Ctrl-C ends)"]
+        now = time.time()
+        return [
+            *view.text(view.status(look, now), width).splitlines(),
+            "",
+            f"a look every {period_s:g} s; Ctrl-C ends",
+        ]
+
+    latest = live(view.look, draw, period_s, sys.stdout)
+    if latest is not None:
+        typer.echo(view.text(view.status(latest, time.time())))
+    raise typer.Exit(ExitCode.INTERRUPTED)

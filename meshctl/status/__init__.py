@@ -1,11 +1,12 @@
-"""The fleet as it is: what every node tells, how old that is, what is wrong, and whether the run may begin.
+"""The fleet as it is: what everybody tells, how old that is, what is wrong, and whether the run may begin.
 
-observations + plan + journal -> `assess` -> `FleetStatus` (with `alarms`) -> `text` | `json` | `preflight`.
+`look` asks radios and robots -> `assess` (radios) with `robots` (robots) -> `FleetStatus` with its alarms -> `text` (by
+`rows` and `table`), `document` (JSON) or `preflight`; `memory` keeps what was told, `filters` chooses what is shown.
 """
 
 from meshctl.status.assess import assess
 from meshctl.status.preflight import Check, preflight
-from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbour, NodeStatus
+from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbour, NodeStatus, RobotStatus
 
 __all__ = [
     "Alarm",
@@ -15,6 +16,7 @@ __all__ = [
     "Level",
     "Neighbour",
     "NodeStatus",
+    "RobotStatus",
     "assess",
     "preflight",
 ]

@@ -1,6 +1,7 @@
-"""What is wrong with a node that answers: one small function per concern, each gives the alarms it sees.
+"""What is wrong with a radio that answers: one small function per concern, each gives the alarms it sees.
 
-A node's state decides what is expected of it: a carried beacon need not hear anybody, a deployed one must.
+A node's state decides what is expected of it: a carried beacon need not hear anybody, a deployed one must. Each alarm
+says what to do about it, where there is something to do.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from meshctl.device.observation import Observation
-from meshctl.model import Fleet, Node, NodeState
+from meshctl.model import Fleet, Node, NodeState, Role
 from meshctl.plan import NodePlan, Verdict
 from meshctl.status.values import Alarm, Level, Neighbour
 from meshctl.topology import Path
@@ -20,8 +21,15 @@ WEAK_QUALITY = 0.3
 LOW_MEMORY_SHARE = 0.1
 # the dead-man's switch keeps the previous state in flash: about this much with headroom
 LOW_FLASH_BYTES = 256 * 1024
+# a forwarding radio with this many processes waiting per processor answers late and drops frames
+BUSY_LOAD = 4.0
 # radios have no clock of their own and no NTP in a mine: only what breaks logs and certificates matters
 CLOCK_TOLERANCE_S = 3600.0
+
+
+# how iw names the modes that a mesh runs in
+MESH_MODES = ("ibss", "mesh point")
+NAMES_IN_A_SENTENCE = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,23 +63,27 @@ def alarms(seen: Seen) -> tuple[Alarm, ...]:
 def _identity(seen: Seen) -> Iterator[Alarm]:
     board = seen.observation.board
     if board is not None and board.board_name and board.board_name != seen.node.hardware.board:
-        yield Alarm(Level.ERROR, "board", f"is a {board.board_name}, the inventory says {seen.node.hardware.board}")
+        told = f"is a {board.board_name}, the inventory says {seen.node.hardware.board}"
+        hint = f"another device answers there: look at its label, or mend nodes.{seen.node.name} in the inventory"
+        yield Alarm(Level.ERROR, "board", told, hint)
 
 
 def _drift(seen: Seen) -> Iterator[Alarm]:
-    plan = seen.plan
+    plan, name = seen.plan, seen.node.name
     if plan is None:
         return
     if plan.verdict is Verdict.REFUSED:
-        yield Alarm(Level.ERROR, "refused", plan.reason)
+        yield Alarm(Level.ERROR, "refused", f"cannot be provisioned as it is: {plan.reason}", plan.hint)
     if plan.firmware is not None:
-        told = f"{plan.firmware.from_revision or 'unknown'}, the inventory says {plan.firmware.to_revision}"
-        yield Alarm(Level.WARNING, "firmware", f"firmware {told}")
+        told = f"firmware {plan.firmware.from_revision or 'unknown'}, the inventory says {plan.firmware.to_revision}"
+        yield Alarm(Level.WARNING, "firmware", told, f"meshctl plan {name}, then meshctl provision {name}")
     if plan.packages is not None:
-        yield Alarm(Level.WARNING, "packages", f"packages missing: {', '.join(plan.packages.install)}")
+        told = f"packages missing: {', '.join(plan.packages.install)}"
+        yield Alarm(Level.WARNING, "packages", told, f"meshctl provision {name}")
     if plan.files:
         names = ", ".join(change.path.removeprefix("etc/config/") for change in plan.files)
-        yield Alarm(Level.WARNING, "drift", f"configuration differs: {names}")
+        hint = f"meshctl plan {name} shows how; meshctl provision {name} puts it right"
+        yield Alarm(Level.WARNING, "drift", f"configuration differs: {names}", hint)
 
 
 def _radios(seen: Seen) -> Iterator[Alarm]:
@@ -79,41 +91,68 @@ def _radios(seen: Seen) -> Iterator[Alarm]:
     for radio in seen.observation.radios or ():
         if radio.name in wanted and (not radio.up or radio.setup_failed):
             why = "setup failed" if radio.setup_failed else "disabled" if radio.disabled else "down"
-            yield Alarm(Level.ERROR, "radio", f"{radio.name} is {why}")
+            hint = f"meshctl run {seen.node.name} -- logread -e netifd"
+            yield Alarm(Level.ERROR, "radio", f"{radio.name} is {why}", hint)
+    channels = {seen.fleet.meshes[mesh].channel for mesh in seen.node.meshes}
     for link in seen.observation.links or ():
         if link.mode.upper() == "IBSS" and link.joined is False:
-            yield Alarm(Level.ERROR, "join", f"{link.ifname} has joined no cell")
+            hint = "look at channel, SSID, BSSID and key: meshctl topology shows who is in the cell"
+            yield Alarm(Level.ERROR, "join", f"{link.ifname} has joined no cell", hint)
+        if link.mode.lower() in MESH_MODES and link.channel is not None and link.channel not in channels:
+            told = f"{link.ifname} is on channel {link.channel}, its mesh on {', '.join(map(str, sorted(channels)))}"
+            yield Alarm(Level.ERROR, "channel", told, f"meshctl plan {seen.node.name}")
 
 
 def _mesh(seen: Seen) -> Iterator[Alarm]:
     if seen.must_mesh and not seen.neighbours:
-        yield Alarm(Level.ERROR, "alone", "hears no other node")
+        yield Alarm(Level.ERROR, "alone", "hears no other node", "antennas, distance, and whether its channel is free")
     elif seen.path is not None and seen.path.hops and seen.path.quality < WEAK_QUALITY:
-        yield Alarm(
-            Level.WARNING, "weak", f"path to the base carries {seen.path.quality:.0%} over {seen.path.hops} hops"
-        )
+        hops = f"{seen.path.hops} hop{'s' if seen.path.hops > 1 else ''}"
+        told = f"path to the base carries {seen.path.quality:.0%} over {hops}"
+        yield Alarm(Level.WARNING, "weak", told, f"drop a beacon between {seen.node.name} and {seen.path.via}")
     if seen.cuts_off and seen.node.state is NodeState.DEPLOYED:
-        yield Alarm(Level.NOTE, "cut-vertex", f"without it {', '.join(seen.cuts_off)} would be cut off")
+        yield Alarm(Level.NOTE, "cut-vertex", f"without it {some(seen.cuts_off)} would be cut off")
+
+
+def _bridge(seen: Seen) -> Iterator[Alarm]:
+    """A radio whose bridge lacks a LAN port, or the mesh, carries nothing for the computer beside it."""
+    bridges = seen.observation.bridges
+    if bridges is None or not seen.node.meshes:
+        return
+    joined = {port for bridge in bridges for port in bridge.ports}
+    missing = [port for port in seen.node.lan_ports if port not in joined]
+    if missing:
+        level = Level.WARNING if seen.node.role is Role.BEACON else Level.ERROR
+        told = f"no bridge joins {', '.join(missing)}: what is plugged in there is not in the mesh"
+        yield Alarm(level, "bridge", told, f"meshctl plan {seen.node.name}")
 
 
 def _resources(seen: Seen) -> Iterator[Alarm]:
-    memory, flash = seen.observation.memory, seen.observation.overlay
+    memory, flash, load = seen.observation.memory, seen.observation.overlay, seen.observation.load
     if memory is not None and memory.total and memory.available / memory.total < LOW_MEMORY_SHARE:
-        yield Alarm(Level.WARNING, "memory", f"{memory.available / 2**20:.1f} MiB of memory left")
+        told = f"{memory.available / 2**20:.1f} MiB of memory left"
+        yield Alarm(Level.WARNING, "memory", told, "reboot it before anything is changed on it")
     if flash is not None and flash.free < LOW_FLASH_BYTES:
-        yield Alarm(Level.WARNING, "flash", f"{flash.free // 1024} KiB of flash left")
+        hint = "remove packages or files: a change keeps the previous state there"
+        yield Alarm(Level.WARNING, "flash", f"{flash.free // 1024} KiB of flash left", hint)
+    if load is not None and load.minute / load.processors > BUSY_LOAD:
+        told = f"load {load.minute:.1f} on {load.processors} processor{'s' if load.processors > 1 else ''}"
+        yield Alarm(Level.NOTE, "load", told, f"meshctl run {seen.node.name} -- top -b -n 1")
 
 
 def _changes(seen: Seen) -> Iterator[Alarm]:
     change = seen.observation.change
-    if change is not None and change.state not in ("idle", "", "unknown"):
+    if change is not None and change.state not in ("idle", "", "unknown", "absent"):
         left = "" if change.left_s is None else f", {change.left_s:.0f} s left"
-        yield Alarm(Level.WARNING, "change", f"a change by {change.owner or 'somebody'} is {change.state}{left}")
+        told = f"a change by {change.owner or 'somebody'} is {change.state}{left}"
+        yield Alarm(Level.WARNING, "change", told, "wait until it is confirmed or has gone back")
     if change is not None and change.lock_owner and change.lock_owner != seen.own_lock:
         yield Alarm(Level.NOTE, "locked", f"locked by {change.lock_owner}")
     if seen.observation.uci_changes:
         count = len(seen.observation.uci_changes)
-        yield Alarm(Level.WARNING, "foreign", f"{count} uncommitted UCI change{'s' if count > 1 else ''} by hand")
+        told = f"{count} uncommitted UCI change{'s' if count > 1 else ''} by hand"
+        hint = f"meshctl run {seen.node.name} -- uci changes; commit them into the inventory, or `uci revert` them"
+        yield Alarm(Level.WARNING, "foreign", told, hint)
 
 
 def _time(seen: Seen) -> Iterator[Alarm]:
@@ -125,11 +164,19 @@ def _time(seen: Seen) -> Iterator[Alarm]:
         yield Alarm(Level.NOTE, "rebooted", f"rebooted {duration(uptime_s)} ago")
 
 
+def some(names: tuple[str, ...]) -> str:
+    """The first names and how many more: a sentence stays a sentence in a fleet of hundreds."""
+    if len(names) <= NAMES_IN_A_SENTENCE:
+        return ", ".join(names)
+    return f"{', '.join(names[:NAMES_IN_A_SENTENCE])} and {len(names) - NAMES_IN_A_SENTENCE} more"
+
+
 _CONCERNS: tuple[Callable[[Seen], Iterator[Alarm]], ...] = (
     _identity,
     _drift,
     _radios,
     _mesh,
+    _bridge,
     _resources,
     _changes,
     _time,

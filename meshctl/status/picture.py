@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from meshctl.status.alarms import duration
-from meshctl.topology import NEIGHBOUR_FRESH_MS, Graph, Report
+from meshctl.topology import Graph, Report, neighbours_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,17 +40,12 @@ class Picture:
 
 
 def directions(reports: Mapping[str, Report], macs: Mapping[str, str]) -> dict[tuple[str, str], Direction]:
-    """What every reporting node tells of each neighbour heard lately; of several radios the best one."""
-    found: dict[tuple[str, str], Direction] = {}
-    for name, report in reports.items():
-        for heard in report.heard:
-            other = macs.get(heard.mac, heard.mac)
-            if heard.last_seen_ms > NEIGHBOUR_FRESH_MS or other == name:
-                continue
-            known = found.get((name, other))
-            if known is None or (heard.quality or 0.0) > (known.quality or 0.0):
-                found[name, other] = Direction(heard.quality, heard.signal_dbm, heard.last_seen_ms)
-    return found
+    """What every reporting node tells of each neighbour heard lately."""
+    return {
+        (name, other): Direction(heard.quality, heard.signal_dbm, heard.last_seen_ms)
+        for name, report in reports.items()
+        for other, heard in neighbours_of(report, macs).items()
+    }
 
 
 def _share(value: float | None) -> str:

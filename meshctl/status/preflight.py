@@ -1,4 +1,8 @@
-"""Go or no-go: the questions a team asks before robots drive off, each answered with its reason."""
+"""Go or no-go: the questions a team asks before robots drive off, each answered with its reason.
+
+`preflight` asks all of them, in the order in which a team would mend what is wrong: the base, the radios, the robots'
+computers, what the daemons tell of each other, and last whether urgent messages really get through.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,14 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from meshctl.model import Fleet, NodeState, Role
-from meshctl.status.alarms import WEAK_QUALITY
-from meshctl.status.values import FleetStatus, Health, NodeStatus
+from meshctl.status.alarms import WEAK_QUALITY, some
+from meshctl.status.pings import Pings
+from meshctl.status.robots import takes_part
+from meshctl.status.topics import is_urgent
+from meshctl.status.values import Alarm, FleetStatus, Health, NodeStatus, RobotStatus
+
+# More reasons than this make a line that nobody reads; `meshctl status` has them all.
+REASONS_SHOWN = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,31 +29,48 @@ class Check:
     reason: str
 
 
-def preflight(fleet: Fleet, status: FleetStatus) -> tuple[Check, ...]:
-    """Every check, in the order in which a team would mend what is wrong."""
-    return tuple(check(fleet, status) for check in _CHECKS)
+def preflight(fleet: Fleet, status: FleetStatus, pings: Pings | None = None) -> tuple[Check, ...]:
+    """Every check. `pings` None means that no robot was asked to send any."""
+    checks = [check(fleet, status) for check in _CHECKS]
+    if any(robot.computer is not None for robot in fleet.robots.values()) and not _unasked(status):
+        checks += [check(fleet, status) for check in _ROBOT_CHECKS]
+        checks.append(_delivery(fleet, status, pings or Pings()))
+    elif _unasked(status):
+        checks.append(Check("robots", True, f"not checked: {_unasked(status)}"))
+    return tuple(checks)
 
 
-def _listed(nodes: Iterable[NodeStatus], tell: Callable[[NodeStatus], str] = lambda node: node.name) -> str:
-    return "; ".join(tell(node) for node in nodes)
+def _unasked(status: FleetStatus) -> str:
+    return next((alarm.text for alarm in status.alarms if alarm.code == "robots-unasked"), "")
 
 
-def _with_alarm(status: FleetStatus, *codes: str) -> list[NodeStatus]:
-    return [node for node in status.nodes if any(alarm.code in codes for alarm in node.alarms)]
+def _check(name: str, bad: Iterable[str], good: str) -> Check:
+    told = list(bad)
+    more = f"; and {len(told) - REASONS_SHOWN} more" if len(told) > REASONS_SHOWN else ""
+    return Check(name, not told, "; ".join(told[:REASONS_SHOWN]) + more if told else good)
 
 
-def _alarm_check(name: str, good: str, *codes: str) -> Callable[[Fleet, FleetStatus], Check]:
-    """A check that no node has one of these alarms."""
+def _plural(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def _alarm_check(
+    name: str, good: str, *codes: str, robots: bool = False, is_fleetwide: bool = False
+) -> Callable[[Fleet, FleetStatus], Check]:
+    """A check that nobody has one of these alarms."""
 
     def check(fleet: Fleet, status: FleetStatus) -> Check:
-        bad = _with_alarm(status, *codes)
-
-        def tell(node: NodeStatus) -> str:
-            return f"{node.name}: " + ", ".join(alarm.text for alarm in node.alarms if alarm.code in codes)
-
-        return Check(name, not bad, _listed(bad, tell) if bad else good)
+        devices: Sequence[NodeStatus | RobotStatus] = status.robots if robots else status.nodes
+        bad = [_told(one.name, one.alarms, codes) for one in devices]
+        everywhere = [alarm.text for alarm in status.alarms if is_fleetwide and alarm.code in codes]
+        return _check(name, [*everywhere, *(text for text in bad if text)], good)
 
     return check
+
+
+def _told(name: str, alarms: Iterable[Alarm], codes: Iterable[str]) -> str:
+    found = ", ".join(alarm.text for alarm in alarms if alarm.code in codes)
+    return f"{name}: {found}" if found else ""
 
 
 def _base_answers(fleet: Fleet, status: FleetStatus) -> Check:
@@ -51,63 +78,138 @@ def _base_answers(fleet: Fleet, status: FleetStatus) -> Check:
     if base is None:
         return Check("base", False, "the inventory has no base")
     found = next((node for node in status.nodes if node.name == base.name), None)
-    answers = found is not None and found.health in (Health.OK, Health.DEGRADED)
-    return Check("base", answers, f"{base.name} {'answers' if answers else 'does not answer'}")
+    is_there = found is not None and not found.silent_because
+    why = f": {found.silent_because}" if found is not None and found.silent_because else ""
+    return Check("base", is_there, f"{base.name} answers" if is_there else f"{base.name} does not answer{why}")
 
 
-def _robots_answer(fleet: Fleet, status: FleetStatus) -> Check:
-    """Robot radios must answer whatever their state says: they are about to drive."""
-    radios = [node for node in status.nodes if node.node.role is Role.ROBOT and node.node.state is not NodeState.SPARE]
-    missing = [node for node in radios if node.health in (Health.UNREACHABLE, Health.OFF)]
-    good = f"{len(radios)} robot radio{'s' if len(radios) != 1 else ''} answer"
-    return Check("robots", not missing, _listed(missing, _silence) if missing else good)
+def _robot_radios(fleet: Fleet, status: FleetStatus) -> Check:
+    """Those deployed must answer; a robot on the shelf is named, so that nobody forgets it there."""
+    radios = [node for node in status.nodes if node.node.role is Role.ROBOT]
+    deployed = [node for node in radios if node.node.state is NodeState.DEPLOYED]
+    shelved = [f"{node.name} ({node.node.state.value})" for node in radios if node.node.state is not NodeState.DEPLOYED]
+    good = f"{_plural(len(deployed), 'robot radio')} answer{'s' if len(deployed) == 1 else ''}"
+    good += f"; not taking part: {some(tuple(shelved))}" if shelved else ""
+    return _check("robot radios", [_silence(node) for node in deployed if node.silent_because], good)
 
 
-def _beacons_answer(fleet: Fleet, status: FleetStatus) -> Check:
+def _beacons(fleet: Fleet, status: FleetStatus) -> Check:
     """Those in a rack must have been seen once, those deployed must answer now."""
-    beacons = [
-        node
-        for node in status.nodes
-        if node.node.role is Role.BEACON and node.node.state in (NodeState.CARRIED, NodeState.DEPLOYED)
-    ]
-    unknown = [node for node in beacons if node.age_s is None]
+    states = (NodeState.CARRIED, NodeState.DEPLOYED)
+    beacons = [node for node in status.nodes if node.node.role is Role.BEACON and node.node.state in states]
+    unknown = [node for node in beacons if node.age_s is None and node.silent_because]
     missed = [node for node in beacons if node.health is Health.UNREACHABLE and node not in unknown]
-    told = [f"never seen: {_listed(unknown)}"] if unknown else []
-    told += [_listed(missed, _silence)] if missed else []
-    good = f"{len(beacons)} beacon{'s' if len(beacons) != 1 else ''} known"
-    return Check("beacons", not told, "; ".join(told) or good)
+    told = (
+        [f"{some(tuple(n.name for n in unknown))}: never seen; switch on once before it is packed"] if unknown else []
+    )
+    on = sum(not node.silent_because for node in beacons)
+    good = f"{_plural(len(beacons), 'beacon')} known, {on} on"
+    return _check("beacons", [*told, *(_silence(node) for node in missed)], good)
 
 
-def _silence(node: NodeStatus) -> str:
-    return f"{node.name}: {node.silent_because}"
+def _silence(one: NodeStatus | RobotStatus) -> str:
+    return f"{one.name}: {one.silent_because}"
 
 
 def _quality(fleet: Fleet, status: FleetStatus) -> Check:
-    weak = [node for node in status.nodes if node.quality is not None and node.hops and node.quality < WEAK_QUALITY]
-    return Check(
-        "links",
-        not weak,
-        _listed(weak, lambda node: f"{node.name}: {node.quality:.0%} to the base") if weak else "every path carries",
-    )
+    deployed = [node for node in status.nodes if node.hops and node.quality is not None]
+    weak = [f"{n.name}: {n.quality:.0%} to the base" for n in deployed if n.quality and n.quality < WEAK_QUALITY]
+    worst = min((node.quality for node in deployed if node.quality is not None), default=None)
+    return _check("links", weak, "every path carries" + ("" if worst is None else f", the weakest {worst:.0%}"))
 
 
 def _strangers(fleet: Fleet, status: FleetStatus) -> Check:
-    strangers = status.strangers
-    return Check(
-        "strangers", not strangers, f"in the mesh: {', '.join(strangers)}" if strangers else "nobody else heard"
-    )
+    found = [f"{some(status.strangers)} in the mesh"] if status.strangers else []
+    return _check("strangers", found, "nobody else heard")
 
 
 _CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
     _base_answers,
-    _robots_answer,
-    _beacons_answer,
-    _alarm_check("identity", "every board is what the inventory says", "board"),
+    _robot_radios,
+    _beacons,
+    _alarm_check(
+        "identity", "every radio is the one it should be", "board", "host-key", "untrusted", "login", "failed"
+    ),
     _alarm_check("firmware", "firmware and packages as in the inventory", "firmware", "packages"),
-    _alarm_check("configuration", "configuration as in the inventory", "drift", "foreign", "refused"),
+    _alarm_check(
+        "configuration", "as in the inventory", "drift", "foreign", "refused", "not-compared", is_fleetwide=True
+    ),
     _alarm_check("changes", "no change is under way", "change"),
-    _alarm_check("radios", "every radio is in its cell", "radio", "join", "alone"),
+    _alarm_check("radios", "every radio is in its cell", "radio", "join", "channel", "alone", "bridge"),
     _quality,
-    _alarm_check("resources", "memory and flash suffice", "memory", "flash"),
+    _alarm_check("resources", "memory, flash and load allow it", "memory", "flash", "load"),
     _strangers,
+)
+
+
+def _crew(status: FleetStatus) -> tuple[RobotStatus, ...]:
+    """The robots that take part."""
+    return tuple(robot for robot in status.robots if takes_part(robot.state))
+
+
+def _daemons(fleet: Fleet, status: FleetStatus) -> Check:
+    """A daemon up on every robot that takes part."""
+    codes = ("not-installed", "daemon", "unproven")
+    bad = [_silence(r) if r.silent_because else _told(r.name, r.alarms, codes) for r in _crew(status)]
+    without = [f"{name} has no computer" for name, robot in fleet.robots.items() if robot.computer is None]
+    shelved = [robot.name for robot in status.robots if not takes_part(robot.state)]
+    good = f"{_plural(len(_crew(status)), 'daemon')} up"
+    good += f"; not taking part: {some(tuple(shelved))}" if shelved else ""
+    good += f"; {', '.join(without)}" if without else ""
+    return _check("daemons", [text for text in bad if text], good)
+
+
+def _peers(fleet: Fleet, status: FleetStatus) -> Check:
+    """Every robot's daemon hears every other's."""
+    crew = [robot for robot in _crew(status) if robot.facts is not None and robot.facts.answers]
+    names = [robot.name for robot in _crew(status)]
+    bad = []
+    for robot in crew:
+        online = robot.facts.online if robot.facts is not None else ()
+        missing = tuple(name for name in names if name not in online and name != robot.name)
+        if missing:
+            bad.append(f"{robot.name} does not hear {some(missing)}")
+    if not crew:
+        bad.append("no daemon answers")
+    return _check("peers", bad, f"every robot hears all {_plural(len(names) - 1, 'other')}")
+
+
+def _urgent_topics(fleet: Fleet, status: FleetStatus) -> Check:
+    """Emergency stops and commands are declared, with the inventory's priority, at every daemon."""
+    urgent = [topic.name for topic in fleet.topics if is_urgent(topic)]
+    if not urgent:
+        return Check("urgent topics", False, "the inventory has no topic of class emergency_stop or command")
+    bad = [
+        f"{robot.name}: {topic.name} {topic.trouble}"
+        for robot in _crew(status)
+        for topic in robot.topics
+        if topic.name in urgent and topic.code == "undeclared"
+    ]
+    return _check("urgent topics", bad, f"{some(tuple(urgent))} declared everywhere")
+
+
+def _delivery(fleet: Fleet, status: FleetStatus, pings: Pings) -> Check:
+    """A message through both daemons and back, from each robot to each other."""
+    names = [robot.name for robot in _crew(status) if robot.facts is not None and robot.facts.answers]
+    pairs = [(a, b) for a in names for b in names if a != b]
+    bad = [
+        f"{a} to {b}: {pings.failed.get((a, b), 'not tried')}" for a, b in pairs if (a, b) not in pings.round_trips_s
+    ]
+    if len(names) < 2:
+        return Check("delivery", False, "fewer than two daemons answer: nothing can be sent")
+    worst = max(pings.round_trips_s.items(), key=lambda pair: pair[1], default=None)
+    slowest = "" if worst is None else f", the slowest {worst[0][0]} to {worst[0][1]} in {worst[1] * 1000:.0f} ms"
+    return _check("delivery", bad, f"urgent messages arrive between all {_plural(len(pairs), 'pair')}{slowest}")
+
+
+_ROBOT_CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
+    _daemons,
+    _alarm_check("one release", "the same version and configuration on all", "drift", "version", robots=True),
+    _alarm_check("keys", "all open what all seal", "key", "unkeyed", robots=True),
+    _alarm_check("ROS bridges", "up where one belongs", "ros-bridge", robots=True),
+    _peers,
+    _urgent_topics,
+    _alarm_check("queues", "no urgent message waits", "urgent-queue", "restarts", robots=True),
+    _alarm_check("topics", "every topic flows", "topic-undeclared", "topic-silent", "topic-not-arriving", robots=True),
+    _alarm_check("computers", "disk, memory, load and clock allow it", "disk", "memory", "load", "clock", robots=True),
 )

@@ -1,104 +1,151 @@
-"""The status for people: one table, then what is wrong, worst first. Plain text; the caller colours or pages it."""
+"""The status for people: totals, then what is wrong and what to do, worst first, then one table of all. Plain text.
+
+The same alarm at many devices is one line. The caller gives the width of the terminal and its colours.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+import textwrap
+import time
+from collections.abc import Iterable, Iterator, Sequence
 
-from meshctl.status.alarms import duration
+from meshctl.errors import ExitCode
+from meshctl.status.alarms import duration, some
 from meshctl.status.preflight import Check
-from meshctl.status.values import FleetStatus, Health, NodeStatus
+from meshctl.status.rows import COMPUTER, row
+from meshctl.status.table import Paint, plain, table_lines
+from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus
 
-_HEADINGS = ("node", "role", "state", "health", "up", "release", "config", "ch", "neighbours", "hops", "quality", "age")
-
-
-def table(status: FleetStatus) -> str:
-    """Columns as wide as they must be."""
-    rows = [_HEADINGS, *(_row(node) for node in status.nodes)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADINGS))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
-
-
-def _row(node: NodeStatus) -> tuple[str, ...]:
-    first = node.neighbours[0] if node.neighbours else None
-    neighbours = str(len(node.neighbours))
-    if first is not None:
-        best = f"{first.signal_dbm} dBm" if first.signal_dbm is not None else ""
-        best = best or (f"{first.quality:.0%}" if first.quality is not None else "")
-        neighbours += f" ({first.name}{' ' + best if best else ''})"
-    answers = node.health in (Health.OK, Health.DEGRADED) and not node.silent_because
-    return (
-        node.name,
-        node.node.role.value,
-        node.node.state.value,
-        node.health.value,
-        duration(node.uptime_s) if node.uptime_s is not None else "-",
-        node.version or "-",
-        "-" if node.drift is None else "differs" if node.drift else "same",
-        ",".join(map(str, node.channels)) or "-",
-        neighbours if answers else "-",
-        "-" if node.hops is None else str(node.hops),
-        "-" if node.quality is None else f"{node.quality:.0%}",
-        "never" if node.age_s is None else duration(node.age_s),
-    )
+# More devices than this with the same alarm are told together.
+SINGLE_ALARMS = 3
+# After a table longer than this its verdict is told once more, for the first one has left the screen.
+ROWS_ON_A_SCREEN = 20
+_LEAST_WIDTH = 40
+_VERDICTS = {
+    ExitCode.OK: ("all well", "ok"),
+    ExitCode.FINDINGS: ("DEGRADED", "degraded"),
+    ExitCode.UNREACHABLE: ("UNREACHABLE", "unreachable"),
+}
 
 
-def text(status: FleetStatus) -> str:
-    """The table, the alarms, and one line of totals."""
-    lines = [table(status), ""]
-    found = [(alarm, node.name) for node in status.nodes for alarm in node.alarms]
-    for alarm, name in sorted(found, key=lambda pair: -pair[0].level):
-        lines.append(f"{alarm.level.text}: {name}: {alarm.text}")
-    lines += [f"warning: {mac} is in the mesh and in no inventory" for mac in status.strangers]
-    counted = (f"{count} {health.value}" for health in Health if (count := status.count(health)))
-    lines.append(f"{status.fleet}: {', '.join(counted) or 'no node'}")
+def text(status: FleetStatus, width: int | None = None, paint: Paint = plain, *, topics: bool = False) -> str:
+    """Everything, as lines no longer than `width` (None: as long as they are). `topics` adds one line per topic and
+    robot."""
+    devices = list(status)
+    lines = [*summary_lines(status, width, paint), ""]
+    lines += table_lines([row(one) for one in devices], width, paint)
+    if topics:
+        lines += ["", *topic_lines(status)]
+    if len(devices) > ROWS_ON_A_SCREEN:
+        lines += ["", verdict_line(status, paint)]
     return "\n".join(lines)
 
 
-def as_json(status: FleetStatus) -> dict[str, Any]:
-    """The same for scripts; times in seconds, shares 0..1."""
-    return {
-        "fleet": status.fleet,
-        "taken": status.taken_s,
-        "entry": status.entry,
-        "exit_code": int(status.exit_code),
-        "totals": {health.value: status.count(health) for health in Health},
-        "strangers": list(status.strangers),
-        "nodes": [_node_json(node) for node in status.nodes],
-    }
+def summary_lines(status: FleetStatus, width: int | None = None, paint: Paint = plain) -> list[str]:
+    """The verdict, the totals and the alarms."""
+    lines = [verdict_line(status, paint)]
+    lines += [f"  {text}" for text in _totals(status)]
+    alarms = list(_alarm_lines(status, width, paint))
+    return [*lines, "", *alarms] if alarms else lines
 
 
-def _node_json(node: NodeStatus) -> dict[str, Any]:
-    plain = (
-        "age_s", "silent_because", "version", "revision", "uptime_s", "memory_free", "flash_free_bytes",
-        "clock_offset_s", "tx_power_dbm", "hops", "quality", "via", "is_cut_vertex",
-    )  # fmt: skip
-    return {
-        "name": node.name,
-        "role": node.node.role.value,
-        "state": node.node.state.value,
-        "address": str(node.node.address),
-        "health": node.health.value,
-        "alarms": [{"level": a.level.text, "code": a.code, "text": a.text} for a in node.alarms],
-        **{name: getattr(node, name) for name in plain},
-        "drift": None if node.drift is None else list(node.drift),
-        "channels": list(node.channels),
-        "lan_ports": None if node.lan_ports is None else list(node.lan_ports),
-        "neighbours": [
-            {"name": n.name, "age_ms": n.age_ms, "quality": n.quality, "signal_dbm": n.signal_dbm}
-            for n in node.neighbours
-        ],
-        "heard_by": [{"by": s.by, "age_ms": s.age_ms, "signal_dbm": s.signal_dbm} for s in node.heard_by],
-        "last_known": None if node.last_known is None else dict(node.last_known),
-    }
+def verdict_line(status: FleetStatus, paint: Paint = plain) -> str:
+    """`lab: DEGRADED: 1 error, 2 warnings (23:45:12 UTC, looked for 1.2 s)`."""
+    word, style = _VERDICTS[status.exit_code]
+    counts = {level: sum(alarm.level is level for _, alarm in _all_alarms(status)) for level in reversed(Level)}
+    told = [f"{count} {level.text}{'s' if count > 1 else ''}" for level, count in counts.items() if count]
+    when = time.strftime("%H:%M:%S UTC", time.gmtime(status.taken_s))
+    took = f", looked for {status.took_s:.1f} s" if status.took_s else ""
+    return f"{status.fleet}: {paint(word, style)}{': ' if told else ''}{', '.join(told)} ({when}{took})"
 
 
-def preflight_text(checks: Iterable[Check]) -> str:
+def _totals(status: FleetStatus) -> Iterator[str]:
+    groups: tuple[tuple[str, Sequence[NodeStatus | RobotStatus]], ...] = (
+        ("radio", status.nodes),
+        (COMPUTER, status.robots),
+    )
+    for what, devices in groups:
+        if devices:
+            counts = [(health, sum(one.health is health for one in devices)) for health in Health]
+            told = ", ".join(f"{count} {health.value}" for health, count in counts if count)
+            yield f"{len(devices)} {what}{'s' if len(devices) > 1 else ''}: {told}"
+
+
+def _all_alarms(status: FleetStatus) -> list[tuple[str, Alarm]]:
+    """(whose, alarm), the worst first; an empty name for the fleet itself."""
+    found = [("", alarm) for alarm in status.alarms]
+    if status.strangers:
+        count = len(status.strangers)
+        told = f"{some(status.strangers)} {'are' if count > 1 else 'is'} in the mesh and in no inventory"
+        found.append(("", Alarm(Level.WARNING, "stranger", told, "whose is it? Write it down as `mac:` of its radio")))
+    for one in status:
+        name = one.name if isinstance(one, NodeStatus) else f"{one.name} {COMPUTER}"
+        found += [(name, alarm) for alarm in one.alarms]
+    return sorted(found, key=lambda pair: -pair[1].level)
+
+
+def _alarm_lines(status: FleetStatus, width: int | None, paint: Paint) -> Iterator[str]:
+    groups: dict[tuple[Level, str], list[tuple[str, Alarm]]] = {}
+    for name, alarm in _all_alarms(status):
+        groups.setdefault((alarm.level, alarm.code), []).append((name, alarm))
+    for (level, code), members in groups.items():
+        lead = level.text.upper().ljust(7)
+        if len(members) > SINGLE_ALARMS:
+            names = some(tuple(name for name, _ in members))
+            told = f"{code} at {len(members)}: {names} (each: --alarm {code})"
+            yield from _wrapped(lead, told, width, paint, level.text)
+            continue
+        for name, alarm in members:
+            yield from _wrapped(lead, f"{name}: {alarm.text}" if name else alarm.text, width, paint, level.text)
+            if alarm.hint:
+                yield from _wrapped("       ", f"-> {alarm.hint}", width, paint, "")
+
+
+def _wrapped(lead: str, told: str, width: int | None, paint: Paint, style: str) -> Iterator[str]:
+    """`lead` painted, then the text beside it, broken where the terminal ends."""
+    room = None if width is None else max(width, _LEAST_WIDTH) - len(lead) - 1
+    indent = "   " if told.startswith("-> ") else ""
+    parts = [told] if room is None else textwrap.wrap(told, room, subsequent_indent=indent, break_on_hyphens=False)
+    for index, part in enumerate(parts):
+        yield f"{paint(lead, style)} {part}" if index == 0 else f"{' ' * len(lead)} {part}"
+
+
+def topic_lines(status: FleetStatus) -> list[str]:
+    """Per topic and robot: when it last sent and received, and what is wrong."""
+    rows = [("topic", "priority", COMPUTER, "sent", "received", "")]
+    for robot in status.robots:
+        for topic in robot.topics:
+            rows.append(
+                (
+                    topic.name,
+                    "-" if topic.priority is None else str(topic.priority),
+                    robot.name,
+                    _ago(topic.sent_ago_s),
+                    _ago(topic.received_ago_s),
+                    topic.trouble,
+                )
+            )
+    rows = [rows[0], *sorted(rows[1:], key=lambda cells: (cells[1] == "-", cells[1].rjust(3), cells[0]))]
+    widths = [max(len(cells[column]) for cells in rows) for column in range(len(rows[0]))]
+    return ["  ".join(c.ljust(w) for c, w in zip(cells, widths, strict=True)).rstrip() for cells in rows]
+
+
+def _ago(age_s: float | None) -> str:
+    return "-" if age_s is None else f"{duration(age_s)} ago"
+
+
+def preflight_text(checks: Iterable[Check], width: int | None = None, paint: Paint = plain) -> str:
     """`GO` or `NO-GO`, one line per check."""
     listed: Sequence[Check] = tuple(checks)
-    width = max((len(check.name) for check in listed), default=0)
-    lines = [f"{'go   ' if check.is_go else 'NO-GO'}  {check.name.ljust(width)}  {check.reason}" for check in listed]
-    verdict = "GO" if all(check.is_go for check in listed) else "NO-GO"
-    return "\n".join([*lines, verdict])
+    room = max((len(check.name) for check in listed), default=0)
+    lines = []
+    for check in listed:
+        word, style = ("go   ", "ok") if check.is_go else ("NO-GO", "error")
+        lead = f"{word}  {check.name.ljust(room)} "
+        parts = (
+            [check.reason] if width is None else textwrap.wrap(check.reason, max(width, _LEAST_WIDTH) - len(lead) - 1)
+        )
+        for index, part in enumerate(parts or [""]):
+            lines.append(f"{paint(word, style)}{lead[5:]} {part}" if index == 0 else f"{' ' * len(lead)} {part}")
+    verdict = ("GO", "ok") if all(check.is_go for check in listed) else ("NO-GO", "error")
+    return "\n".join([*lines, paint(*verdict)])

@@ -28,8 +28,9 @@ from meshctl.model import Fleet
 from meshctl.plan import FileChange, NodePlan, Verdict
 from meshctl.status import FleetStatus, Health, assess, preflight
 from meshctl.status.assess import Look
+from meshctl.status.document import as_json
 from meshctl.status.picture import FORMATS, Picture, directions
-from meshctl.status.text import as_json, preflight_text, text
+from meshctl.status.text import preflight_text, text
 from meshctl.topology import observed_graph, report_of
 
 INVENTORY = """\
@@ -138,7 +139,7 @@ def test_a_deployed_node_that_is_silent_is_missed_and_told_by_whom_it_is_heard(f
     status = status_of(fleet, {name: HEALTHY[name] for name in ("base", "b01")}, known=known)
     assert health(status)["rover"] is Health.UNREACHABLE
     (alarm,) = next(node for node in status.nodes if node.name == "rover").alarms
-    assert "last answered 10 min ago, still heard by b01" in alarm.text
+    assert "last answered 10 min ago; b01 hears it" in alarm.text
     assert status.exit_code is ExitCode.UNREACHABLE
 
 
@@ -203,7 +204,7 @@ def test_preflight_is_a_go_only_when_every_check_is(fleet: Fleet) -> None:
     never_seen = preflight(fleet, status_of(fleet, HEALTHY))
     assert [check.name for check in never_seen if not check.is_go] == ["beacons"]
     without_robot = preflight(fleet, status_of(fleet, {n: HEALTHY[n] for n in ("base", "b01")}, known=known))
-    assert [check.name for check in without_robot if not check.is_go] == ["robots"]
+    assert [check.name for check in without_robot if not check.is_go] == ["robot radios"]
 
 
 def test_json_holds_every_node_and_is_json(fleet: Fleet) -> None:

@@ -1,0 +1,137 @@
+"""What `status`, `preflight` and `topology` share: a `Watcher` over everything, who is asked, and how wide to write.
+
+`watcher` opens the fleet and finds a way to its radios and robots; `glance` takes one look, with its progress told on a
+terminal.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from meshctl.cli.robots_crew import sudo_password
+from meshctl.cli.session import Session, session
+from meshctl.model import Fleet, Node
+from meshctl.robots.reach import Reach
+from meshctl.status.assess import Look
+from meshctl.status.look import Progress, Watcher
+from meshctl.status.table import Paint, plain
+
+# A look wants to be quick: in this time TCP asks three times (RFC 6298: after 1 and 3 s), and a mesh that answers at
+# all answers one of them. Provisioning, which must not give up early, waits longer.
+CONNECT_S = 5.0
+
+Timeout = Annotated[
+    float, typer.Option("--timeout", min=0.5, metavar="S", help="Seconds a device has to take a connection.")
+]
+NoRobots = Annotated[bool, typer.Option("--no-robots", help="Ask the radios alone, not the robots' computers.")]
+
+_COLOURS = {
+    "ok": {"fg": "green"},
+    "degraded": {"fg": "yellow", "bold": True},
+    "unreachable": {"fg": "red", "bold": True},
+    "off": {"dim": True},
+    "known": {"dim": True},
+    "note": {"dim": True},
+    "heading": {"bold": True},
+    "warning": {"fg": "yellow", "bold": True},
+    "error": {"fg": "red", "bold": True},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Everybody:
+    """A fleet opened for looking, and who is in it: its managed radios, its robots with a computer we can reach."""
+
+    opened: Session
+    watcher: Watcher
+    nodes: tuple[Node, ...]
+    robots: tuple[str, ...]
+
+    @property
+    def fleet(self) -> Fleet:
+        return self.opened.fleet
+
+
+@contextmanager
+def watcher(
+    inventory: Path,
+    *,
+    key: Iterable[Path] | None,
+    lab: Path | None,
+    timeout_s: float = CONNECT_S,
+    ask_sudo: bool = False,
+    with_robots: bool = True,
+) -> Iterator[Everybody]:
+    """Open all of it, and close it in the end. Raises InvalidInput, InputError, MeshctlError."""
+    password = sudo_password(ask_sudo) if with_robots else None
+    with session(inventory, key_files=key or (), lab=lab) as opened:
+        opened.access.deadlines = replace(opened.access.deadlines, connect_s=timeout_s)
+        robots, unasked = _robots(opened, with_robots)
+        reach = Reach(opened.fleet, opened.access, lambda: password) if robots else None
+        with Watcher(
+            opened.fleet, opened.renderer, opened.access, opened.journal, opened.owner, reach, unasked
+        ) as watching:
+            yield Everybody(opened, watching, tuple(opened.fleet.managed()), robots)
+
+
+def _robots(opened: Session, with_robots: bool) -> tuple[tuple[str, ...], str]:
+    """The robots to ask; where there are some and none is asked, why."""
+    able = {name: robot.computer for name, robot in opened.fleet.robots.items() if robot.computer is not None}
+    if not with_robots:
+        return (), "the robots' computers were not asked (--no-robots)" if able else ""
+    if opened.lab is None:
+        return tuple(able), ""
+    # what the inventory calls 10.42.0.21 may be somebody's real machine; a virtual fleet is reached on loopback alone
+    named = tuple(name for name, computer in able.items() if computer.ssh.host)
+    if named or not able:
+        return named, ""
+    return (), "the robots' computers were not asked: a virtual fleet has none"
+
+
+def glance(everybody: Everybody, nodes: Iterable[Node] | None = None, robots: Iterable[str] | None = None) -> Look:
+    """One look at these (default: everybody)."""
+    return everybody.watcher.look(
+        everybody.nodes if nodes is None else nodes,
+        everybody.robots if robots is None else robots,
+        _progress(),
+    )
+
+
+def _progress() -> Progress:
+    """A line that counts up on a terminal, and is gone in the end."""
+    if not sys.stderr.isatty():
+        return lambda done, count: None
+
+    def tell(done: int, count: int) -> None:
+        text = "" if done == count else f"{done} of {count} have answered or given up"
+        sys.stderr.write(f"\r\x1b[K{text}")
+        sys.stderr.flush()
+
+    return tell
+
+
+def line_width(*, wide: bool = False) -> int | None:
+    """The terminal's, or COLUMNS; None where nobody wants lines broken."""
+    if wide or not (sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdecimal()):
+        return None
+    return shutil.get_terminal_size().columns
+
+
+def paint_of() -> Paint:
+    """Colours on a terminal, unless NO_COLOR (no-color.org) is set."""
+    return paint if sys.stdout.isatty() and not os.environ.get("NO_COLOR") else plain
+
+
+def paint(text: str, style: str) -> str:
+    """Terminal colours."""
+    given = _COLOURS.get(style)
+    return typer.style(text, **given) if given else text  # type: ignore[arg-type]

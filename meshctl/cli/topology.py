@@ -1,0 +1,69 @@
+"""`meshctl topology`: the mesh as its nodes see it, drawn."""
+
+from __future__ import annotations
+
+import time
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from meshctl.cli.looking import CONNECT_S, Timeout, glance, watcher
+from meshctl.cli.options import InventoryPath
+from meshctl.cli.session import KeyFiles, Lab
+from meshctl.errors import ExitCode, InputError
+from meshctl.inventory.suggest import did_you_mean
+from meshctl.model import Backend
+from meshctl.status import assess
+from meshctl.status.picture import FORMATS, Picture, directions
+from meshctl.topology import report_of
+
+
+class Format(str, Enum):  # noqa: UP042 - typer shows the values of a str enum
+    """How `meshctl topology` draws."""
+
+    TABLE = "table"
+    TREE = "tree"
+    JSON = "json"
+    NETJSON = "netjson"
+    DOT = "dot"
+
+
+def topology(
+    mesh: Annotated[str, typer.Option("--mesh", help="Which mesh, where the fleet has several.")] = "",
+    form: Annotated[Format, typer.Option("--format", "-f", help="How to draw it.")] = Format.TREE,
+    inventory: InventoryPath = Path(),
+    timeout: Timeout = CONNECT_S,
+    as_json: Annotated[bool, typer.Option("--json", help="The same as --format json.")] = False,
+    key: KeyFiles = None,
+    lab: Lab = None,
+) -> None:
+    """Draw the mesh as its nodes see it: links with quality both ways, hops to the base, cut vertices marked.
+
+    Exit code: 0 drawn, 3 nobody answered, 2 could not look.
+
+    Example: meshctl topology --format dot | dot -Tsvg > mesh.svg
+    """
+    with watcher(inventory, key=key, lab=lab, timeout_s=timeout, with_robots=False) as everybody:
+        fleet = everybody.fleet
+        if mesh and mesh not in fleet.meshes:
+            hint = did_you_mean(mesh, fleet.meshes) or f"it has {', '.join(fleet.meshes)}"
+            raise InputError(f"no mesh of {fleet.name} is called {mesh!r}", hint=hint)
+        names = {node.name for node in fleet.members(mesh)} if mesh else set(fleet.nodes)
+        nodes = tuple(node for node in everybody.nodes if node.name in names)
+        look = glance(everybody, nodes)
+        found = assess(look, nodes, time.time())
+    reports = {name: report_of(name, one) for name, one in look.observations.items()}
+    routing = next((m.backend for m in fleet.meshes.values() if m.name == mesh or not mesh), Backend.BATMAN)
+    picture = Picture(
+        mesh=mesh or fleet.name,
+        entry=found.entry,
+        graph=look.graph,
+        directions=directions(reports, look.macs),
+        ages_s={node.name: node.age_s for node in found.nodes if node.age_s is not None and not node.silent_because},
+        addresses={node.name: str(node.address.ip) for node in fleet.nodes.values()},
+        routing=routing.value,
+    )
+    typer.echo(FORMATS["json" if as_json else form.value](picture))
+    raise typer.Exit(ExitCode.OK if look.observations or not nodes else ExitCode.UNREACHABLE)

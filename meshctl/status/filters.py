@@ -1,0 +1,103 @@
+"""Which radios and robots of a status are shown: names, groups, robots, roles, states, alarms.
+
+Values of one kind are alternatives, kinds narrow each other down. Everybody may have been asked all the same: hops, and
+who hears a silent node, come from the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+
+from meshctl.errors import InputError
+from meshctl.inventory.suggest import did_you_mean
+from meshctl.model import Fleet, Node, NodeState, Role
+from meshctl.status.robots import robot_state
+from meshctl.status.rows import COMPUTER
+from meshctl.status.values import Alarm, FleetStatus, Level
+
+ROLES = (*(role.value for role in Role), COMPUTER)
+STATES = tuple(state.value for state in NodeState if state.is_managed)
+ANY_ALARM = "any"
+
+
+@dataclass(frozen=True, slots=True)
+class Filter:
+    """Empty means all. `names` match radios and robots; `alarms` are codes, levels, or `any` (warnings and errors)."""
+
+    names: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
+    robots: tuple[str, ...] = ()
+    roles: tuple[str, ...] = ()
+    states: tuple[str, ...] = ()
+    alarms: tuple[str, ...] = ()
+
+    @property
+    def is_empty(self) -> bool:
+        return self == Filter()
+
+    def check(self, fleet: Fleet) -> None:
+        """Raises InputError for a value that selects nothing in this fleet, whatever its state."""
+        names = [*(node.name for node in fleet.managed()), *fleet.robots]
+        _known("node or robot", self.names, names, fleet.name)
+        _known("group", self.groups, {group for node in fleet.nodes.values() for group in node.groups}, fleet.name)
+        _known("robot", self.robots, fleet.robots, fleet.name)
+        _known("role", self.roles, ROLES, "a status")
+        _known("state", self.states, STATES, "a status")
+
+    def takes_node(self, node: Node) -> bool:
+        return (
+            _matches(node.name, self.names)
+            and (not self.groups or any(_matches(group, self.groups) for group in node.groups))
+            and _matches(node.robot, self.robots)
+            and (not self.roles or node.role.value in self.roles)
+            and (not self.states or node.state.value in self.states)
+        )
+
+    def takes_robot(self, fleet: Fleet, name: str) -> bool:
+        """A robot belongs to the groups of its radios, and has their state."""
+        robot = fleet.robots[name]
+        groups = {group for node in robot.nodes if node in fleet.nodes for group in fleet.nodes[node].groups}
+        state = robot_state(fleet, robot)
+        return (
+            _matches(name, self.names)
+            and (not self.groups or any(_matches(group, self.groups) for group in groups))
+            and _matches(name, self.robots)
+            and (not self.roles or COMPUTER in self.roles)
+            and (not self.states or (state is not None and state.value in self.states))
+        )
+
+    def apply(self, fleet: Fleet, status: FleetStatus) -> FleetStatus:
+        """The same status of those that are shown; what concerns the whole fleet goes when anything is filtered."""
+        if self.is_empty:
+            return status
+        return replace(
+            status,
+            nodes=tuple(one for one in status.nodes if self.takes_node(one.node) and self._alarmed(one.alarms)),
+            robots=tuple(
+                one for one in status.robots if self.takes_robot(fleet, one.name) and self._alarmed(one.alarms)
+            ),
+            alarms=(),
+            strangers=(),
+        )
+
+    def _alarmed(self, alarms: Iterable[Alarm]) -> bool:
+        if not self.alarms:
+            return True
+        wanted = set(self.alarms)
+        return any(
+            alarm.code in wanted or alarm.level.text in wanted or (ANY_ALARM in wanted and alarm.level > Level.NOTE)
+            for alarm in alarms
+        )
+
+
+def _matches(name: str, patterns: tuple[str, ...]) -> bool:
+    return not patterns or any(fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def _known(what: str, patterns: tuple[str, ...], names: Iterable[str], where: str) -> None:
+    listed = list(names)
+    for pattern in patterns:
+        if not any(fnmatchcase(name, pattern) for name in listed):
+            raise InputError(f"no {what} of {where} is called {pattern!r}", hint=did_you_mean(pattern, listed))

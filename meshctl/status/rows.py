@@ -1,0 +1,193 @@
+"""The cells of the status table: one row per radio and per robot's computer, under the same columns.
+
+`row` gives the cells by column; what a device that is silent told last stands in brackets. A cell has a short form for
+narrow terminals where it says more than it must.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from meshctl.status.alarms import duration
+from meshctl.status.robot_alarms import size
+from meshctl.status.values import NodeStatus, RobotStatus
+
+COMPUTER = "computer"
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """`short` is what stands there when the whole text has no room."""
+
+    text: str = ""
+    short: str = ""
+
+    @property
+    def least(self) -> str:
+        return self.short or self.text
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """`rank` orders columns by how soon they give way on a narrow terminal, the highest first; 0 never does."""
+
+    key: str
+    heading: str
+    rank: int
+
+
+# In the order they stand in; docs/status.md explains each.
+COLUMNS = (
+    Column("name", "name", 0),
+    Column("what", "what", 0),
+    Column("state", "state", 5),
+    Column("health", "health", 0),
+    Column("up", "up", 3),
+    Column("load", "load", 9),
+    Column("memory", "mem free", 8),
+    Column("disk", "disk free", 11),
+    Column("release", "release", 6),
+    Column("config", "config", 2),
+    Column("channel", "ch", 7),
+    Column("bridge", "bridge", 12),
+    Column("hears", "hears", 0),
+    Column("path", "to base", 1),
+    Column("via", "via", 10),
+    Column("waits", "waits", 4),
+    Column("topics", "topics", 4),
+    Column("age", "seen", 0),
+)
+
+
+def row(one: NodeStatus | RobotStatus) -> dict[str, Cell]:
+    """Its cells by column key."""
+    return _node_row(one) if isinstance(one, NodeStatus) else _robot_row(one)
+
+
+def _node_row(node: NodeStatus) -> dict[str, Cell]:
+    cells = {
+        "name": Cell(node.name),
+        "what": Cell(node.node.role.value),
+        "state": Cell(node.node.state.value),
+        "health": Cell(node.health.value),
+        "age": Cell(_age(node.age_s)),
+    }
+    if node.silent_because:
+        return cells | _bracketed(_known_node(node.last_known or {}))
+    return cells | {
+        "up": Cell(_up(node.uptime_s)),
+        "load": Cell(_share(node.load)),
+        "memory": Cell(_share(node.memory_free)),
+        "disk": Cell("" if node.flash_free_bytes is None else size(node.flash_free_bytes / 1024)),
+        "release": Cell(node.version),
+        "config": Cell(_same(node.drift)),
+        "channel": Cell(",".join(map(str, node.channels))),
+        "bridge": Cell("" if node.lan_ports is None else "+".join(node.lan_ports) or "nothing"),
+        "hears": _hears(node),
+        "path": _path(node.hops, node.quality),
+        "via": Cell(node.via),
+    }
+
+
+def _hears(node: NodeStatus) -> Cell:
+    """How many nodes it hears, and the best of them: `3: b01 -70 dBm 62%`."""
+    count = str(len(node.neighbours))
+    if not node.neighbours:
+        return Cell(count)
+    best = node.neighbours[0]
+    signal = "" if best.signal_dbm is None else f" {best.signal_dbm} dBm"
+    quality = "" if best.quality is None else f" {best.quality:.0%}"
+    return Cell(f"{count}: {best.name}{signal}{quality}", count)
+
+
+def _path(hops: int | None, quality: float | None) -> Cell:
+    if hops is None:
+        return Cell("no path", "none")
+    if not hops:
+        return Cell("is base", "base")
+    share = "" if quality is None else f" {quality:.0%}"
+    return Cell(f"{hops} hop{'s' if hops > 1 else ''}{share}", f"{hops}h{share}")
+
+
+def _known_node(facts: Mapping[str, str]) -> dict[str, Cell]:
+    heard = facts.get("heard", "").split()
+    hops = facts.get("hops", "")
+    return {
+        "release": Cell(facts.get("version", "")),
+        "config": Cell(facts.get("config", "")),
+        "channel": Cell(facts.get("channels", "").replace(" ", ",")),
+        "bridge": Cell(facts.get("lan_ports", "").replace(" ", "+")),
+        "hears": Cell(", ".join(heard), str(len(heard)) if heard else ""),
+        "path": Cell(f"{hops} hop{'s' if hops != '1' else ''}" if hops else "", f"{hops}h" if hops else ""),
+        "via": Cell(facts.get("via", "")),
+    }
+
+
+def _robot_row(robot: RobotStatus) -> dict[str, Cell]:
+    cells = {
+        "name": Cell(robot.name),
+        "what": Cell(COMPUTER),
+        "state": Cell("" if robot.state is None else robot.state.value),
+        "health": Cell(robot.health.value),
+        "age": Cell(_age(robot.age_s)),
+    }
+    facts = robot.facts
+    if facts is None:
+        return cells | _bracketed(_known_robot(robot.last_known or {}))
+    computer = facts.computer
+    memory = computer.memory_free_kib / computer.memory_kib if computer.memory_kib else None
+    cells |= {
+        "up": Cell(_up(computer.uptime_s)),
+        "load": Cell(_share(computer.load[0] / computer.cpus if computer.load and computer.cpus else None)),
+        "memory": Cell(_share(memory)),
+        "disk": Cell(size(computer.disk_free_kib) if computer.disk_kib else ""),
+        "release": Cell(facts.version or ("installed" if facts.release else "none")),
+        "config": Cell(_same(facts.drift) if robot.is_compared else ""),
+        "bridge": Cell("" if facts.bridge is None else f"ROS {facts.bridge.active or 'absent'}"),
+    }
+    if not facts.answers:
+        return cells | {"hears": Cell("no daemon", "none")}
+    waiting = [queue for queue in facts.queues if queue.messages]
+    by_priority = " ".join(f"{queue.priority}:{queue.messages}" for queue in waiting)
+    messages = sum(queue.messages for queue in waiting)
+    bad = sum(bool(topic.trouble) for topic in robot.topics)
+    peers = f"{len(facts.online)} of {len(facts.peers)}"
+    return cells | {
+        "hears": Cell(f"{peers} daemons", peers),
+        "path": Cell("" if robot.base_round_trip_s is None else f"{robot.base_round_trip_s * 1000:.0f} ms"),
+        "waits": Cell(by_priority or "0", str(messages)),
+        "topics": Cell(f"{bad} of {len(robot.topics)} bad" if bad else "ok" if robot.topics else ""),
+    }
+
+
+def _known_robot(facts: Mapping[str, str]) -> dict[str, Cell]:
+    online = facts.get("online", "").split()
+    return {
+        "release": Cell(facts.get("version", "")),
+        "config": Cell(facts.get("config", "")),
+        "hears": Cell(", ".join(online), str(len(online)) if online else ""),
+    }
+
+
+def _bracketed(cells: Mapping[str, Cell]) -> dict[str, Cell]:
+    """Known from before."""
+    return {
+        key: Cell(f"({cell.text})", f"({cell.short})" if cell.short else "") for key, cell in cells.items() if cell.text
+    }
+
+
+def _up(uptime_s: float | None) -> str:
+    return "" if uptime_s is None else duration(uptime_s)
+
+
+def _age(age_s: float | None) -> str:
+    return "never" if age_s is None else duration(age_s)
+
+
+def _share(value: float | None) -> str:
+    return "" if value is None else f"{value:.0%}"
+
+
+def _same(drift: tuple[str, ...] | None) -> str:
+    return "" if drift is None else "differs" if drift else "same"

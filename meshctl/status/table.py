@@ -1,0 +1,95 @@
+"""Rows of cells -> lines that fit a width: what has no room is said shorter, then left out and named.
+
+First whole cells with every column, then columns give way by rank, the cells' short forms in between; a column in which
+nobody has anything is left out without a word.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from meshctl.status.rows import COLUMNS, Cell, Column
+
+_GAP = "  "
+# Between the columns that matter least and those that matter more, cells take their short form.
+_SHORTEN_BELOW_RANK = 5
+Paint = Callable[[str, str], str]
+"""(text, style) -> text; styles: ok, degraded, unreachable, off, heading, known, error, warning, note, hint."""
+
+
+def plain(text: str, style: str) -> str:
+    """No colour at all."""
+    return text
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Which columns are shown, and whether their cells are short; `dropped` are the headings of those left out."""
+
+    columns: tuple[Column, ...]
+    is_short: bool
+    dropped: tuple[str, ...]
+
+
+def layout(rows: Sequence[Mapping[str, Cell]], width: int | None) -> Layout:
+    """What fits into `width` characters (None: everything)."""
+    columns = [column for column in COLUMNS if any(row.get(column.key, Cell()).text for row in rows)]
+    leaving = sorted((column for column in columns if column.rank), key=lambda column: -column.rank)
+    dropped: set[str] = set()
+    is_short = False
+    while width is not None and _width(rows, _left(columns, dropped), is_short) > width:
+        if not is_short and (not leaving or leaving[0].rank < _SHORTEN_BELOW_RANK):
+            is_short = True
+        elif leaving:
+            dropped.add(leaving.pop(0).key)
+        else:
+            break
+    # short cells may have made room for what went before they were
+    for column in sorted((column for column in columns if column.key in dropped), key=lambda column: column.rank):
+        if _width(rows, _left(columns, dropped - {column.key}), is_short) <= (width or 0):
+            dropped.discard(column.key)
+    return Layout(
+        _left(columns, dropped), is_short, tuple(column.heading for column in columns if column.key in dropped)
+    )
+
+
+def _left(columns: Sequence[Column], dropped: set[str]) -> tuple[Column, ...]:
+    return tuple(column for column in columns if column.key not in dropped)
+
+
+def _cell(row: Mapping[str, Cell], column: Column, is_short: bool) -> str:
+    cell = row.get(column.key, Cell())
+    return (cell.least if is_short else cell.text) or "-"
+
+
+def _widths(rows: Sequence[Mapping[str, Cell]], columns: Sequence[Column], is_short: bool) -> list[int]:
+    return [max([len(column.heading), *(len(_cell(row, column, is_short)) for row in rows)]) for column in columns]
+
+
+def _width(rows: Sequence[Mapping[str, Cell]], columns: Sequence[Column], is_short: bool) -> int:
+    return sum(_widths(rows, columns, is_short)) + len(_GAP) * (len(columns) - 1)
+
+
+def table_lines(rows: Sequence[Mapping[str, Cell]], width: int | None = None, paint: Paint = plain) -> list[str]:
+    """The heading, a line for each row, and which columns had no room."""
+    if not rows:
+        return []
+    shown = layout(rows, width)
+    widths = _widths(rows, shown.columns, shown.is_short)
+    pairs = list(zip(shown.columns, widths, strict=True))
+    heading = _GAP.join(column.heading.ljust(room) for column, room in pairs).rstrip()
+    lines = [paint(heading, "heading")]
+    for row in rows:
+        health = row["health"].text
+        cells = []
+        for column, room in pairs:
+            text = _cell(row, column, shown.is_short)
+            style = health if column.key == "health" else "known" if text.startswith("(") else ""
+            cells.append(paint(text, style) + " " * (room - len(text)))
+        lines.append(_GAP.join(cells).rstrip())
+    if shown.dropped:
+        told = f"no room for {', '.join(shown.dropped)}: --wide and --json have them"
+        lines += [paint(line, "note") for line in textwrap.wrap(told, width or len(told))]
+    return lines

@@ -1,0 +1,105 @@
+"""Each topic at each robot: the inventory's rate and deadline, and when its daemon last sent and received.
+
+A topic is expected where the inventory gives it a rate. It is silent at a source that sends nothing for longer than
+that allows, and does not arrive where a source that is heard sends and nothing comes. Nothing is said of receivers
+while nobody sends: their silence follows from the sources'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+
+from meshctl.model import Fleet, Topic, TopicClass
+from meshctl.robots.facts import RobotFacts, TopicFacts
+from meshctl.status.alarms import duration
+from meshctl.status.values import TopicStatus
+
+# A topic misses this many of its periods before it counts as silent: one lost message is no alarm.
+SILENT_PERIODS = 5
+# Robots are asked one after the other, and each daemon is some seconds older than the other when we compare them.
+LEAST_LIMIT_S = 10.0
+
+
+def is_urgent(topic: Topic) -> bool:
+    """What must get through before everything else."""
+    return topic.topic_class in (TopicClass.EMERGENCY_STOP, TopicClass.COMMAND)
+
+
+def urgent_priorities(fleet: Fleet) -> frozenset[int]:
+    """The levels of emergency stops and commands; level 0 where the inventory names neither."""
+    return frozenset(topic.priority for topic in fleet.topics if is_urgent(topic)) or frozenset((0,))
+
+
+def limit_s(topic: Topic) -> float | None:
+    """The longest silence that its rate and deadline allow; None for a topic that comes when it comes."""
+    if topic.rate_hz <= 0:
+        return None
+    return max(SILENT_PERIODS / topic.rate_hz, topic.deadline_s or 0.0, LEAST_LIMIT_S)
+
+
+def topic_statuses(fleet: Fleet, told: Mapping[str, RobotFacts], robot: str) -> tuple[TopicStatus, ...]:
+    """The inventory's topics at this robot, most urgent first, then those that only its daemon knows."""
+    facts = told[robot]
+    here = {topic.name: topic for topic in facts.topics}
+    wanted = sorted(fleet.topics, key=lambda topic: (topic.priority, topic.name))
+    known = [_status(topic, here.get(topic.name), told, facts) for topic in wanted]
+    names = {topic.name for topic in wanted}
+    others = [
+        TopicStatus(one.name, one.priority, one.sent_ago_s, one.received_ago_s)
+        for one in facts.topics
+        if one.name not in names
+    ]
+    return (*known, *others)
+
+
+def _status(topic: Topic, here: TopicFacts | None, told: Mapping[str, RobotFacts], facts: RobotFacts) -> TopicStatus:
+    limit = limit_s(topic)
+    if here is None or here.priority is None:
+        return TopicStatus(topic.name, topic.priority, None, None, limit, "is not declared", "undeclared")
+    status = TopicStatus(topic.name, here.priority, here.sent_ago_s, here.received_ago_s, limit)
+    for code, trouble in _troubles(topic, here, told, facts, limit):
+        return TopicStatus(topic.name, here.priority, here.sent_ago_s, here.received_ago_s, limit, trouble, code)
+    return status
+
+
+def _troubles(
+    topic: Topic, here: TopicFacts, told: Mapping[str, RobotFacts], facts: RobotFacts, limit: float | None
+) -> Iterator[tuple[str, str]]:
+    if here.priority != topic.priority:
+        yield "undeclared", f"has priority {here.priority}, the inventory says {topic.priority}"
+    if limit is None or (facts.daemon_uptime_s or 0.0) <= limit:
+        return
+    if _sends(topic, facts.robot):
+        silent = _silence(here.sent_ago_s, here.sent_messages, limit)
+        if silent:
+            yield "silent", f"{silent} sent"
+    live = [name for name in _live_sources(topic, told, facts, limit) if name != facts.robot]
+    silent = _silence(here.received_ago_s, here.received_messages, limit)
+    if live and silent and ("all" in topic.destinations or facts.robot in topic.destinations):
+        yield "not-arriving", f"{silent} arrived, though {', '.join(live)} sends"
+
+
+def _sends(topic: Topic, robot: str) -> bool:
+    return not topic.sources or robot in topic.sources
+
+
+def _silence(ago_s: float | None, messages: int, limit: float) -> str:
+    """How long nothing came, where that is too long; a daemon that counts and tells no ages is believed."""
+    if ago_s is None:
+        return "" if messages else "nothing was ever"
+    return f"for {duration(ago_s)} nothing was" if ago_s > limit else ""
+
+
+def _live_sources(topic: Topic, told: Mapping[str, RobotFacts], facts: RobotFacts, limit: float) -> Iterable[str]:
+    """The robots that this one hears and that send the topic now."""
+    for name in facts.online:
+        other = told.get(name)
+        if other is None or not _sends(topic, name):
+            continue
+        ages = [one.sent_ago_s for one in other.topics if one.name == topic.name and one.sent_ago_s is not None]
+        if ages and ages[0] <= limit and _sends_to(topic, facts.robot):
+            yield name
+
+
+def _sends_to(topic: Topic, robot: str) -> bool:
+    return "all" in topic.destinations or robot in topic.destinations
