@@ -1,15 +1,15 @@
-"""`meshctl lab up|down|status|shell|break|mend|link|plug|unplug|image`: a virtual fleet on this machine."""
+"""`meshctl lab`: a virtual fleet on this machine; who hears whom in it is `lab_ground`'s part."""
 
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from meshctl.cli.options import AsJson
+from meshctl.cli import lab_ground
+from meshctl.cli.options import AsJson, LabDirectory, lab_directory
 from meshctl.errors import InputError
 from meshctl.lab.breaks import BREAKS
 from meshctl.lab.console import run_shell
@@ -26,10 +26,6 @@ app = typer.Typer(help="A virtual fleet on this machine.", no_args_is_help=True)
 _BOOT_S = 2.0
 _START_S = 60.0
 
-Directory = Annotated[
-    Path | None,
-    typer.Option("--dir", envvar="MESHCTL_LAB", help="Where the fleet lives; default: $XDG_STATE_HOME/meshctl/lab."),
-]
 Where = Annotated[str, typer.Argument(help="A node (b03) or a link (b01-b02).")]
 
 
@@ -37,14 +33,14 @@ Where = Annotated[str, typer.Argument(help="A node (b03) or a link (b01-b02).")]
 def up(
     inventory: Annotated[Path | None, typer.Argument(help="The fleet to copy; default: the example lab.")] = None,
     nodes: Annotated[int | None, typer.Option("--nodes", min=1, help="Only its first N nodes.")] = None,
-    directory: Directory = None,
+    directory: LabDirectory = None,
     port: Annotated[int, typer.Option("--port", help="TCP port of all its addresses; 0 takes a free one.")] = 0,
 ) -> None:
     """Start a fleet of factory-fresh OpenWrt-like nodes, as the inventory describes them.
 
     Example: meshctl lab up inventory/lab --nodes 6
     """
-    place = _directory(directory)
+    place = lab_directory(directory)
     copy = prepare(inventory or shipped("inventory") / "lab", place)
     spec = spec_of(copy.fleet, links=copy.links, nodes=nodes, port=port)
     fleet = VirtualFleet(spec, place).up(wait_s=_START_S + _BOOT_S * len(spec.nodes))
@@ -55,23 +51,23 @@ def up(
 
 
 @app.command("down")
-def down(directory: Directory = None) -> None:
+def down(directory: LabDirectory = None) -> None:
     """End the fleet; its directory stays, for a look at flash and logs.
 
     Example: meshctl lab down
     """
-    fleet = VirtualFleet.attach(_directory(directory))
+    fleet = VirtualFleet.attach(lab_directory(directory))
     fleet.down()
     typer.echo(f"{fleet.spec.name} is down")
 
 
 @app.command("status")
-def status(directory: Directory = None, as_json: AsJson = False) -> None:
+def status(directory: LabDirectory = None, as_json: AsJson = False) -> None:
     """Show every node's power, address, way in, and what was broken.
 
     Example: meshctl lab status --json
     """
-    state = VirtualFleet.attach(_directory(directory)).status()
+    state = VirtualFleet.attach(lab_directory(directory)).status()
     if as_json:
         typer.echo(json.dumps(state, indent=2))
         return
@@ -91,13 +87,13 @@ def status(directory: Directory = None, as_json: AsJson = False) -> None:
 def shell(
     node: Annotated[str, typer.Argument(help="Name of the node.")],
     command: Annotated[list[str] | None, typer.Argument(help="A command; without it an interactive shell.")] = None,
-    directory: Directory = None,
+    directory: LabDirectory = None,
 ) -> None:
     """Open a node's serial console, which works without its network.
 
     Example: meshctl lab shell b01 -- uci show network
     """
-    fleet = VirtualFleet.attach(_directory(directory))
+    fleet = VirtualFleet.attach(lab_directory(directory))
     raise typer.Exit(run_shell(fleet, fleet.node(node).name, " ".join(command or ())))
 
 
@@ -105,46 +101,29 @@ def shell(
 def break_(
     where: Where,
     what: Annotated[str, typer.Argument(help="What happens to it, some with @STEP: power-cut@7, power-cut@flash.")],
-    directory: Directory = None,
+    directory: LabDirectory = None,
 ) -> None:
-    VirtualFleet.attach(_directory(directory)).break_(where, what)
+    VirtualFleet.attach(lab_directory(directory)).break_(where, what)
 
 
 @app.command("mend")
 def mend(
     where: Annotated[str, typer.Argument(help="A node or a link; without it everything.")] = "",
-    directory: Directory = None,
+    directory: LabDirectory = None,
 ) -> None:
     """Undo what was broken: power and links back, flash freed, dead firmware recovered as on a bench.
 
     Example: meshctl lab mend b03
     """
-    VirtualFleet.attach(_directory(directory)).mend(where)
+    VirtualFleet.attach(lab_directory(directory)).mend(where)
 
 
-@app.command("link")
-def link(
-    a: Annotated[str, typer.Argument(help="One node.")],
-    b: Annotated[str, typer.Argument(help="The other.")],
-    up: Annotated[bool | None, typer.Option("--up/--down", help="Whether they hear each other.")] = None,
-    tq: Annotated[int | None, typer.Option("--tq", min=0, max=255, help="Link quality, 255 is perfect.")] = None,
-    delay_ms: Annotated[float | None, typer.Option("--delay", min=0, help="Milliseconds one way.")] = None,
-    loss: Annotated[float | None, typer.Option("--loss", min=0, max=1, help="Share of packets lost, 0 to 1.")] = None,
-    rate_kbps: Annotated[int | None, typer.Option("--rate", min=1, help="Kilobit per second.")] = None,
-    directory: Directory = None,
-) -> None:
-    """Change a link between two nodes, or make one.
-
-    Example: meshctl lab link b01 b02 --delay 40 --loss 0.05
-    """
-    given = {"up": up, "tq": tq, "delay_ms": delay_ms, "loss": loss, "rate_kbps": rate_kbps}
-    changes = {name: value for name, value in given.items() if value is not None}
-    VirtualFleet.attach(_directory(directory)).link(a, b, **changes)
+lab_ground.register(app)
 
 
 @app.command("plug")
 def plug(
-    nodes: Annotated[list[str] | None, typer.Argument(help="Nodes; none: all.")] = None, directory: Directory = None
+    nodes: Annotated[list[str] | None, typer.Argument(help="Nodes; none: all.")] = None, directory: LabDirectory = None
 ) -> None:
     """Plug nodes' LAN ports into this machine, as on a bench.
 
@@ -156,7 +135,7 @@ def plug(
 @app.command("unplug")
 def unplug(
     nodes: Annotated[list[str] | None, typer.Argument(help="Nodes; none: all but the base.")] = None,
-    directory: Directory = None,
+    directory: LabDirectory = None,
 ) -> None:
     """Pull nodes' LAN ports out: from then on only the mesh leads to them.
 
@@ -183,17 +162,10 @@ def image(
 
 
 def _plug(directory: Path | None, names: list[str] | None, plugged: bool) -> None:
-    fleet = VirtualFleet.attach(_directory(directory))
+    fleet = VirtualFleet.attach(lab_directory(directory))
     for node in (fleet.node(name) for name in names) if names else fleet.nodes:
         if names or plugged or not node.is_base:
             node.plug(plugged)
-
-
-def _directory(given: Path | None) -> Path:
-    if given is not None:
-        return given
-    home = os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()
-    return Path(home) / "meshctl" / "lab"
 
 
 def _row(node: dict[str, Any]) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ Point = tuple[float, float]
 """Metres."""
 
 # what a radio loses more than this of is not heard: batman-adv makes nothing of such a link
-DEAF_LOSS = 0.95
+DEAF_LOSS = 0.9
 # losses are told in hundredths: who moves a little need not be configured anew
 _LOSS_DIGITS = 2
 # antennas do not stand inside each other; also where the path-loss model begins
