@@ -9,6 +9,7 @@ quality is the product of its links' TQ, less a hop penalty, as BATMAN_IV has it
 from __future__ import annotations
 
 import heapq
+import itertools
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -135,10 +136,13 @@ def edges(nodes: Mapping[str, Effective], links: Iterable[LinkSpec]) -> dict[str
 def paths(graph: Mapping[str, list[Edge]], start: str) -> dict[str, Path]:
     """The best batman-adv path from `start` to every node it reaches."""
     best: dict[str, Path] = {}
-    queue: list[tuple[int, int, str, Edge | None, tuple[LinkSpec, ...]]] = [(-TQ_MAX, 0, start, None, ())]
+    count = itertools.count()
+    queue: list[tuple[int, int, str, int, Edge | None, tuple[LinkSpec, ...]]] = [
+        (-TQ_MAX, 0, start, next(count), None, ())
+    ]
     settled: set[str] = set()
     while queue:
-        negative, hops, name, first, links = heapq.heappop(queue)
+        negative, hops, name, _, first, links = heapq.heappop(queue)
         if name in settled:
             continue
         settled.add(name)
@@ -151,8 +155,8 @@ def paths(graph: Mapping[str, list[Edge]], start: str) -> dict[str, Path]:
             if hops:
                 tq = tq * (TQ_MAX - HOP_PENALTY) // TQ_MAX
             if tq > 0:
-                # equal paths: fewer hops first, then the name, so that tables do not flap
-                heapq.heappush(queue, (-tq, hops + 1, edge.node, first or edge, (*links, edge.link)))
+                # equal paths: fewer hops first, then the name, then who was found first, so that tables do not flap
+                heapq.heappush(queue, (-tq, hops + 1, edge.node, next(count), first or edge, (*links, edge.link)))
     return best
 
 

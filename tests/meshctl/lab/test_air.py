@@ -66,6 +66,13 @@ def test_a_path_takes_the_better_way_around() -> None:
     assert path.tq == 250 * 250 // 255 * (255 - air.HOP_PENALTY) // 255
 
 
+def test_of_two_equal_ways_one_is_taken_and_the_same_every_time() -> None:
+    nodes = {name: node(number) for number, name in enumerate("abcd")}
+    links = [LinkSpec(one, other, tq=200) for one, other in ("ab", "ac", "bd", "cd")]
+    taken = {air.paths(air.edges(nodes, links), "a")["d"].first.node for _ in range(3)}
+    assert taken == {"b"}
+
+
 @given(st.integers(2, 12), st.data())
 def test_cutting_a_chain_separates_exactly_what_lies_behind(count: int, data: st.DataObject) -> None:
     nodes, links = chain(count)
