@@ -17,7 +17,7 @@ from meshctl.device.connection import Credentials, Deadlines, Endpoint
 from meshctl.device.errors import ConnectionLost
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import HostKeyPolicy, TrustStore
-from meshctl.errors import InputError
+from meshctl.errors import InputError, Unreachable
 from meshctl.model import Fleet, Node
 
 
@@ -49,6 +49,8 @@ class Access:
     locate: Locate = as_written
     # devices on the bench, by node: they answer there, and let in whoever comes
     newcomers: dict[str, Endpoint] = field(default_factory=dict)
+    # nodes met through one interface of this machine, by node: their new address is looked for there first
+    interfaces: dict[str, str] = field(default_factory=dict)
     _kept: dict[str, SshConnection] = field(default_factory=dict, repr=False)
     _jumps: dict[str, SshConnection] = field(default_factory=dict, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
@@ -56,7 +58,12 @@ class Access:
 
     def endpoint(self, node: Node, address: IPv4Address | None = None) -> Endpoint:
         host, port = self.locate(node, address or node.address.ip)
-        return Endpoint(host, port, node.ssh.user, identity=node.name)
+        return Endpoint(host, port, node.ssh.user, identity=node.name, interface=self.interfaces.get(node.name, ""))
+
+    def places(self, node: Node, address: IPv4Address | None = None) -> tuple[Endpoint, ...]:
+        """Where a node is looked for: through its own interface, if it has one, then wherever the routes lead."""
+        first = self.endpoint(node, address)
+        return (first, replace(first, interface="")) if first.interface else (first,)
 
     def credentials(self, node: Node, endpoint: Endpoint | None = None) -> Credentials:
         """What we log in with: keys, and on the bench alone no password. At a node's own address only a key proves
@@ -75,15 +82,22 @@ class Access:
         deadlines: Deadlines | None = None,
     ) -> SshConnection:
         """A new connection, owned by the caller. Raises what `ssh.connect` raises."""
-        where = endpoint or self.endpoint(node)
-        return connect(
-            where,
-            credentials=credentials or self.credentials(node, where),
-            trust=policy or self.policy or self.trust,
-            deadlines=deadlines or self.deadlines,
-            via=self._via(node),
-            release=node.release,
-        )
+        places = (endpoint,) if endpoint is not None else self.places(node)
+        while True:
+            where, *places_left = places
+            try:
+                return connect(
+                    where,
+                    credentials=credentials or self.credentials(node, where),
+                    trust=policy or self.policy or self.trust,
+                    deadlines=deadlines or self.deadlines,
+                    via=self._via(node),
+                    release=node.release,
+                )
+            except Unreachable:
+                if not places_left:
+                    raise
+                places = tuple(places_left)
 
     def _via(self, node: Node) -> SshConnection | None:
         if not node.ssh.jump:

@@ -37,20 +37,28 @@ ABSENT = ChangeStatus("absent", installed=False)
 
 @dataclass(slots=True)
 class Attempt:
-    """One change. `gaps` is what was still missing when the node was last seen (`last`), `trouble` why it was not."""
+    """One change. `old` is where the node answers before it, `new` where it shall answer after it: the first of
+    `places`, until it was `met` at another. `gaps` is what was still missing when the node was last seen (`last`),
+    `trouble` why it was not."""
 
     job: Job
     change: Change
     nonce: Secret
     window_s: int
     old: Endpoint
-    new: Endpoint
+    places: tuple[Endpoint, ...]
     starts: int = 0
     gaps: tuple[str, ...] = ()
     last: Observation | None = None
     trouble: str = ""
     # decided against: from now on it is only ever taken back
     is_given_up: bool = False
+    # the one of `places` where it was met
+    met: Endpoint | None = None
+
+    @property
+    def new(self) -> Endpoint:
+        return self.met or self.places[0]
 
     @property
     def id(self) -> str:
@@ -76,7 +84,7 @@ def attempt_of(job: Job, old: Endpoint, *, window_s: int | None = None) -> Attem
         new_nonce(),
         window_s or job.node.confirm_window_s,
         old,
-        job.work.access.endpoint(job.node),
+        job.work.access.places(job.node),
     )
 
 
@@ -122,11 +130,15 @@ def begin(attempt: Attempt, connection: SshConnection, *, at_uptime_s: float | N
 def reach(attempt: Attempt) -> SshConnection | None:
     """A new connection to where the node shall be, or else to where it was."""
     job = attempt.job
-    for endpoint in dict.fromkeys((attempt.new, attempt.old)):
+    for endpoint in dict.fromkeys((attempt.new, *attempt.places, attempt.old)):
         try:
-            return job.work.access.open(job.node, endpoint=endpoint)
+            connection = job.work.access.open(job.node, endpoint=endpoint)
         except NodeError as error:
             attempt.trouble = str(error)
+            continue
+        if endpoint in attempt.places:
+            attempt.met = endpoint
+        return connection
     return None
 
 

@@ -29,14 +29,20 @@ FACTORY_ADDRESS = "192.168.1.1"
 
 @dataclass(frozen=True, slots=True)
 class BenchPlace:
-    """Where one device answers; `node` is whom the operator says it is, empty when the device has to tell."""
+    """Where one device answers; `node` is whom the operator says it is, empty when the device has to tell; `interface`
+    the interface of this machine that it is plugged into, empty where only one device has the address."""
 
     host: str = FACTORY_ADDRESS
     port: int = 22
     node: str = ""
+    interface: str = ""
+
+    @property
+    def endpoint(self) -> Endpoint:
+        return Endpoint(self.host, self.port, interface=self.interface)
 
     def __str__(self) -> str:
-        where = self.host if self.port == 22 else f"{self.host}:{self.port}"
+        where = self.endpoint.label
         return f"{self.node} at {where}" if self.node else where
 
 
@@ -158,6 +164,8 @@ def look_around(
         with lock:
             found[node.name] = Found(place, node, seen, recorder.key)
             access.newcomers[node.name] = replace(connection.endpoint, identity=node.name)
+            if place.interface:
+                access.interfaces[node.name] = place.interface
         access.keep(node.name, connection)
         return Outcome(name, Result.DONE)
 
@@ -169,9 +177,8 @@ def _connect(access: Access, fleet: Fleet, place: BenchPlace, recorder: Recorder
     """Log in with no password, or with the fleet's keys where an earlier attempt has come half way."""
     some = next(fleet.managed())
     credentials = replace(access.credentials(some), empty_password=True)
-    endpoint = Endpoint(place.host, place.port)
     release = find_node(fleet, place.node).release if place.node else None
-    return connect(endpoint, credentials=credentials, trust=recorder, deadlines=access.deadlines, release=release)
+    return connect(place.endpoint, credentials=credentials, trust=recorder, deadlines=access.deadlines, release=release)
 
 
 def _paths(renderer: Renderer, place: BenchPlace) -> tuple[str, ...]:

@@ -167,7 +167,7 @@ def put_back(job: Job, connection: SshConnection, backup: Backup) -> Outcome:
         new_nonce(),
         job.node.confirm_window_s,
         connection.endpoint,
-        job.work.access.endpoint(job.node, address),
+        job.work.access.places(job.node, address),
     )
     try:
         prepare(attempt, connection)

@@ -16,7 +16,6 @@ from meshctl.apply.bootstrap import Arrivals, BenchPlace, Found, Recorder
 from meshctl.apply.gather import observe_cleared
 from meshctl.apply.planning import other_paths
 from meshctl.apply.wanted import Renderer
-from meshctl.device.connection import Endpoint
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import connect
 from meshctl.device.trust import HostKey, TrustStore
@@ -51,10 +50,9 @@ def succeed(
     _must_be_silent(access, old)
     recorder = Recorder()
     if place is not None:
-        endpoint = Endpoint(place.host, place.port)
         credentials = replace(access.credentials(old), empty_password=True)
         connection = connect(
-            endpoint, credentials=credentials, trust=recorder, deadlines=access.deadlines, release=old.release
+            place.endpoint, credentials=credentials, trust=recorder, deadlines=access.deadlines, release=old.release
         )
         key = recorder.key
     elif spare is not None:
@@ -73,6 +71,8 @@ def succeed(
     pins = trust.pinned(old.name)
     trust.replace(old.name, key)
     access.newcomers[old.name] = replace(connection.endpoint, identity=old.name)
+    if connection.endpoint.interface:
+        access.interfaces[old.name] = connection.endpoint.interface
     access.keep(old.name, connection)
     where = place or BenchPlace(connection.endpoint.host, connection.endpoint.port, old.name)
     return Successor(Arrivals({old.name: Found(where, old, seen, key)}, ()), spare, pins)

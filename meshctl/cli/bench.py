@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import socket
 from dataclasses import replace as with_changes
 from pathlib import Path
 from typing import Annotated
@@ -32,6 +33,14 @@ At = Annotated[
     ),
 ]
 
+Interfaces = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--interface",
+        help="An interface that one factory device is plugged into, e.g. eth1; one for each NODE, in their order.",
+    ),
+]
+
 
 def bootstrap(
     nodes: Annotated[
@@ -39,6 +48,7 @@ def bootstrap(
         typer.Argument(help="Whom to expect: name, label, serial number or MAC; default: whoever answers, by its MAC."),
     ] = None,
     at: At = None,
+    interface: Interfaces = None,
     inventory: InventoryPath = Path(),
     replace_key: Annotated[bool, typer.Option("--replace-key", help="Take a device whose host key is new.")] = False,
     yes: Yes = False,
@@ -51,11 +61,11 @@ def bootstrap(
 ) -> None:
     """Take factory devices (root without a password at 192.168.1.1) into the fleet: identify, set keys, provision.
 
-    Example: meshctl bootstrap b03 b04 --at fe80::1%eth1 --at fe80::1%eth2
+    Example: meshctl bootstrap b03 b04 --interface eth1 --interface eth2
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        places = _places(opened, nodes or [], at or [])
+        places = _places(opened, nodes or [], _spots(at or [], interface or []))
         with opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)):
             arrivals = look_around(
                 opened.renderer,
@@ -70,7 +80,7 @@ def bootstrap(
             _complain(outcome)
         if not as_json:
             for name, item in arrivals.found.items():
-                typer.echo(f"{name}: found at {item.place.host}, host key {item.key.fingerprint}")
+                typer.echo(f"{name}: found at {item.place.endpoint.label}, host key {item.key.fingerprint}")
         if not arrivals.found:
             raise typer.Exit(ExitCode.UNREACHABLE if arrivals.outcomes else ExitCode.OK)
         prepared = plan_arrivals(
@@ -95,7 +105,20 @@ def _complain(outcome: Outcome) -> None:
         typer.echo(f"  hint: {outcome.hint}", err=True)
 
 
-def _places(opened: Session, words: list[str], at: list[str]) -> list[BenchPlace]:
+def _spots(at: list[str], interfaces: list[str]) -> list[BenchPlace]:
+    """The places that were named, each by an address or by an interface."""
+    if at and interfaces:
+        raise InputError("expected --at or --interface, found both")
+    if doubles := sorted({name for name in interfaces if interfaces.count(name) > 1}):
+        raise InputError(f"--interface {doubles[0]} was given twice: one device answers on each")
+    known = {name for _, name in socket.if_nameindex()}
+    for name in interfaces:
+        if name not in known:
+            raise InputError(f"--interface {name}: there is none here, found {', '.join(sorted(known))}")
+    return [_place(text) for text in at] + [BenchPlace(interface=name) for name in interfaces]
+
+
+def _places(opened: Session, words: list[str], at: list[BenchPlace]) -> list[BenchPlace]:
     """Who is expected where."""
     if opened.lab is not None and not at:
         known = set(opened.lab.spec.names)
@@ -108,23 +131,23 @@ def _places(opened: Session, words: list[str], at: list[str]) -> list[BenchPlace
         if len(expected) > 1:
             raise InputError(
                 f"{len(expected)} nodes cannot all answer at one address",
-                hint="one at a time, or say where each is: --at fe80::1%eth1 --at fe80::1%eth2",
+                hint="one at a time, or say where each is plugged in: --interface eth1 --interface eth2",
             )
         return [BenchPlace(node=expected[0] if expected else "")]
     if expected and len(expected) != len(at):
-        raise InputError(f"{len(expected)} nodes and {len(at)} places: expected as many --at as nodes")
+        raise InputError(f"{len(expected)} nodes and {len(at)} places: expected as many places as nodes")
     names = expected or [""] * len(at)
-    return [_place(text, name) for text, name in zip(at, names, strict=True)]
+    return [with_changes(place, node=name) for place, name in zip(at, names, strict=True)]
 
 
-def _place(text: str, name: str) -> BenchPlace:
+def _place(text: str) -> BenchPlace:
     """`HOST`, `HOST:PORT` or `[v6]:PORT`; a bare IPv6 address holds colons of its own."""
     host, colon, port = text.rpartition(":")
     if not colon or (text.count(":") > 1 and not text.startswith("[")):
-        return BenchPlace(text, node=name)
+        return BenchPlace(text)
     if not port.isdigit() or not 0 < int(port) < 65536:
         raise InputError(f"--at {text}: expected HOST or HOST:PORT")
-    return BenchPlace(host.strip("[]"), int(port), name)
+    return BenchPlace(host.strip("[]"), int(port))
 
 
 def replace(
@@ -132,6 +155,9 @@ def replace(
     new: Annotated[str, typer.Argument(help="A spare of the inventory; `bench` for a device that is in none.")],
     at: Annotated[
         str, typer.Option("--at", help="Where the new device answers, if not at its own address: HOST or HOST:PORT.")
+    ] = "",
+    interface: Annotated[
+        str, typer.Option("--interface", help="The interface that a factory device is plugged into, e.g. eth1.")
     ] = "",
     inventory: InventoryPath = Path(),
     yes: Yes = False,
@@ -151,7 +177,8 @@ def replace(
         spare = None if new == BENCH else find_node(opened.fleet, new)
         if spare is not None and (spare.name == node.name or spare.state is not NodeState.SPARE):
             raise InputError(f"{spare.name} is {spare.state.value}: expected a spare", hint="`meshctl inventory state`")
-        place = _place(at, node.name) if at else BenchPlace(node=node.name) if spare is None else None
+        spots = _spots([at] if at else [], [interface] if interface else []) or [BenchPlace()][: spare is None]
+        place = with_changes(spots[0], node=node.name) if spots else None
         fleet = heir_of(opened.fleet, node, spare)
         opened = with_changes(opened, fleet=fleet, renderer=with_changes(opened.renderer, fleet=fleet))
         node = fleet.nodes[node.name]

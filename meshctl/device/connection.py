@@ -17,7 +17,8 @@ from meshctl.model import Secret
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where a node answers. `identity` is the name its host key is pinned under.
+    """Where a node answers. `identity` is the name its host key is pinned under, `interface` the interface of this
+    machine that leads there, empty for whichever the routes name.
 
     It is the node's name in the inventory rather than its address, because factory devices all answer at 192.168.1.1
     and a node's address may change with a plan (OpenSSH calls this `HostKeyAlias`).
@@ -27,6 +28,7 @@ class Endpoint:
     port: int = 22
     user: str = "root"
     identity: str = ""
+    interface: str = ""
 
     @property
     def address(self) -> str:
@@ -39,8 +41,9 @@ class Endpoint:
 
     @property
     def label(self) -> str:
-        """For messages: `b03 (10.42.0.13)`."""
-        return f"{self.identity} ({self.address})" if self.identity else self.address
+        """For messages: `b03 (10.42.0.13 on eth1)`."""
+        where = f"{self.address} on {self.interface}" if self.interface else self.address
+        return f"{self.identity} ({where})" if self.identity else where
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import select
-import socket
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -31,6 +30,7 @@ from meshctl.device.errors import (
 from meshctl.device.framing import framed
 from meshctl.device.legacy_rsa import SSH_RSA, LegacyTransport
 from meshctl.device.liveness import Heard, Watch, asking
+from meshctl.device.sockets import open_socket
 from meshctl.device.trust import HostKey, HostKeyPolicy
 from meshctl.model import Release
 
@@ -140,27 +140,11 @@ def _waited(endpoint: Endpoint, watch: Watch, seconds: float, silence_s: float, 
     return ConnectionLost(f"{endpoint.label}: silent for {silence_s:g} s during {phase}")
 
 
-def _open_socket(endpoint: Endpoint, limits: Deadlines, via: SshConnection | None) -> socket.socket | paramiko.Channel:
-    if via is not None:
-        return via.tunnel(endpoint)
-    try:
-        sock = socket.create_connection((endpoint.host, endpoint.port), timeout=limits.connect_s)
-    except TimeoutError as error:
-        raise Timeout(
-            f"{endpoint.label}: no answer to connect within {limits.connect_s:g} s", phase="connect"
-        ) from error
-    except OSError as error:
-        raise Unreachable(f"{endpoint.label}: cannot connect: {error.strerror or error}") from error
-    # between commands keepalives ask for no answer, so the kernel has to notice that nobody acknowledges them
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 4 * limits.keepalive_s * 1000)
-    return sock
-
-
 def _handshake(
     endpoint: Endpoint, limits: Deadlines, trust: HostKeyPolicy, via: SshConnection | None, *, legacy: bool
 ) -> tuple[paramiko.Transport, Heard]:
     known = trust.known(endpoint)
-    heard = Heard(_open_socket(endpoint, limits, via))
+    heard = Heard(open_socket(endpoint, limits) if via is None else via.tunnel(endpoint))
     transport = (LegacyTransport if legacy else paramiko.Transport)(heard)  # type: ignore[arg-type]
     transport.daemon = True
     transport.banner_timeout = transport.handshake_timeout = limits.handshake_s * 2  # ours comes first

@@ -98,6 +98,8 @@ class Rig:
     window_s: int = 10
     parallel: int = 8
     firmware: Mapping[str, str] = field(default_factory=dict)
+    # whether meshctl is told of the virtual fleet; without, it goes by addresses and cables as in the field
+    is_told_of_lab: bool = True
     fleet: VirtualFleet = field(init=False)
     # which of the inventories a and b the nodes run
     current: str = "a"
@@ -161,9 +163,9 @@ class Rig:
     def environ(self) -> dict[str, str]:
         root = str(Path(__file__).resolve().parents[3])
         return {
-            **os.environ,
+            **{name: text for name, text in os.environ.items() if not name.startswith("MESHCTL_")},
             "XDG_STATE_HOME": str(self.directory / "state"),
-            "MESHCTL_LAB": str(self.fleet.directory),
+            **({"MESHCTL_LAB": str(self.fleet.directory)} if self.is_told_of_lab else {}),
             "PYTHONPATH": root,
             "SSH_AUTH_SOCK": "",
         }
