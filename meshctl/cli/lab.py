@@ -16,6 +16,7 @@ from meshctl.lab.console import run_shell
 from meshctl.lab.copybook import prepare
 from meshctl.lab.fleet import VirtualFleet
 from meshctl.lab.images import firmware_image
+from meshctl.lab.real.fleet import RealFleet
 from meshctl.lab.twin import spec_of
 from meshctl.model import Release
 from meshctl.resources import shipped
@@ -25,6 +26,9 @@ app = typer.Typer(help="A virtual fleet on this machine.", no_args_is_help=True)
 # seconds for one node to boot on a machine that has much else to do, and for the first one to begin
 _BOOT_S = 2.0
 _START_S = 60.0
+# the same for a machine under emulation: packages are fetched, its kernel boots, at worst twice
+_REAL_BOOT_S = 10.0
+_REAL_START_S = 600.0
 
 Where = Annotated[str, typer.Argument(help="A node (b03) or a link (b01-b02).")]
 
@@ -35,15 +39,22 @@ def up(
     nodes: Annotated[int | None, typer.Option("--nodes", min=1, help="Only its first N nodes.")] = None,
     directory: LabDirectory = None,
     port: Annotated[int, typer.Option("--port", help="TCP port of all its addresses; 0 takes a free one.")] = 0,
+    real: Annotated[
+        bool, typer.Option("--real", help="In a machine with the kernel's own 802.11 radios and batman-adv (QEMU).")
+    ] = False,
 ) -> None:
     """Start a fleet of factory-fresh OpenWrt-like nodes, as the inventory describes them.
 
-    Example: meshctl lab up inventory/lab --nodes 6
+    Example: meshctl lab up inventory/lab --nodes 6 --real
     """
     place = lab_directory(directory)
     copy = prepare(inventory or shipped("inventory") / "lab", place)
     spec = spec_of(copy.fleet, links=copy.links, nodes=nodes, port=port)
-    fleet = VirtualFleet(spec, place).up(wait_s=_START_S + _BOOT_S * len(spec.nodes))
+    if real:
+        typer.echo("starting a machine with real radios; its image is made at the first start")
+        fleet: VirtualFleet = RealFleet(spec, place).up(wait_s=_REAL_START_S + _REAL_BOOT_S * len(spec.nodes))
+    else:
+        fleet = VirtualFleet(spec, place).up(wait_s=_START_S + _BOOT_S * len(spec.nodes))
     typer.echo(f"{len(spec.nodes)} nodes of {spec.name} are up, each at 192.168.1.1 on its own bench port")
     typer.echo(f"inventory: {copy.inventory}")
     typer.echo(f"reach it:  export MESHCTL_LAB={place} MESHCTL_INVENTORY={copy.inventory}")

@@ -37,6 +37,8 @@ class Container:
     overlay_kib: int
     memory_kib: int
     deny_setgroups: bool
+    # its devices are the kernel's own (a machine with radios), where they otherwise are files in /sys
+    real_devices: bool = False
 
     @property
     def home(self) -> Path:
@@ -72,10 +74,15 @@ def write_meminfo(container: Container, *, available_kib: int) -> None:
     (container.home / "proc" / "meminfo").write_text(text, encoding="ascii")
 
 
-def become_node(container: Container, report: int) -> None:
-    """Turn this process into the node; on failure write the reason to the descriptor `report` and exit."""
+def become_node(container: Container, report: int, gate: int | None = None) -> None:
+    """Turn this process into the node; on failure write the reason to the descriptor `report` and exit.
+
+    It waits until something arrives on `gate`: its devices are being put in.
+    """
     try:
         ns.die_with_parent()
+        if gate is not None and not os.read(gate, 1):
+            os._exit(111)
         _restore_signals()
         _own_uptime()
         _mounts(container)
@@ -126,12 +133,23 @@ def _mounts(container: Container) -> None:
     ns.bind(str(container.fleet / "bell"), f"{root}/lab/bell")
     ns.mount("tmpfs", f"{root}/tmp", "tmpfs", ns.MS_NOSUID, f"size={container.memory_kib // _TMP_SHARE}k,mode=1777")
     ns.mount("sysfs", f"{root}/sys", "tmpfs", 0, "size=1m,mode=755")
+    if container.real_devices:
+        _real_devices(root)
     _devices(root)
     ns.mount("proc", f"{root}/proc", "proc", ns.MS_NOSUID | ns.MS_NODEV | ns.MS_NOEXEC)
     ns.bind(str(home / "proc" / "boot_id"), f"{root}/proc/sys/kernel/random/boot_id")
     ns.bind(str(home / "proc" / "meminfo"), f"{root}/proc/meminfo")
     ns.pivot_root(str(root))
     ns.bind("/", "/overlay")
+
+
+def _real_devices(root: Path) -> None:
+    """The kernel's own view of the node's network devices; radios are at the paths of the board (lab/phys)."""
+    (root / "lab" / "sysfs").mkdir()
+    ns.mount("sysfs", f"{root}/lab/sysfs", "sysfs")
+    (root / "sys" / "class").mkdir()
+    for link in ("class/net", "module"):
+        (root / "sys" / link).symlink_to(f"/lab/sysfs/{link}")
 
 
 def _devices(root: Path) -> None:

@@ -1,6 +1,6 @@
 """The supervisor's socket: one JSON request per datagram, one JSON answer; descriptors ride beside `exec`.
 
-The operations are the methods of `_Operations` by name; `fleet` holds the other end.
+The operations are the methods of `Operations` by name; `fleet` holds the other end.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import json
 import os
 import re
 import socket
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,22 +31,26 @@ def address_of(directory: Path, descriptor: int) -> str:
     return f"/proc/self/fd/{descriptor}/{_NAME}"
 
 
-class Control:
-    """Listens in the fleet's directory."""
+Answer = Callable[[dict[str, Any], list[int]], Awaitable[dict[str, Any]]]
 
-    def __init__(self, fleet: Supervisor) -> None:
-        self._fleet = fleet
+
+class Control:
+    """Listens in the fleet's directory; `answer` gets each request with the descriptors beside it."""
+
+    def __init__(self, directory: Path, answer: Answer) -> None:
+        self._directory = directory
+        self._answer = answer
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._tasks: set[asyncio.Task[None]] = set()
 
     def open(self) -> None:
         loop = asyncio.get_running_loop()
-        folder = os.open(self._fleet.directory, os.O_RDONLY | os.O_DIRECTORY)
+        folder = os.open(self._directory, os.O_RDONLY | os.O_DIRECTORY)
         try:
-            self._listener.bind(address_of(self._fleet.directory, folder))
+            self._listener.bind(address_of(self._directory, folder))
         finally:
             os.close(folder)
-        (self._fleet.directory / _NAME).chmod(0o600)
+        (self._directory / _NAME).chmod(0o600)
         self._listener.listen(64)
         self._listener.setblocking(False)
         loop.add_reader(self._listener, self._accept)
@@ -53,7 +58,7 @@ class Control:
     def close(self) -> None:
         asyncio.get_running_loop().remove_reader(self._listener)
         self._listener.close()
-        (self._fleet.directory / _NAME).unlink(missing_ok=True)
+        (self._directory / _NAME).unlink(missing_ok=True)
         for task in self._tasks:
             task.cancel()
 
@@ -84,24 +89,24 @@ class Control:
                     connection.send(json.dumps(answer).encode())
                     connection.setblocking(False)
 
-    async def _answer(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
-        operations = _Operations(self._fleet)
+
+class Operations:
+    """What a client may ask for; every public method but `answer` is an operation and returns a JSON object or None."""
+
+    def __init__(self, fleet: Supervisor) -> None:
+        self._fleet = fleet
+
+    async def answer(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
+        """The answer to one request; what went wrong is one, too."""
         try:
             if request["op"] == "exec":
-                return await operations.execute(request["node"], request["command"], descriptors)
-            result = getattr(operations, request.pop("op"))(**request)
+                return await self.execute(request["node"], request["command"], descriptors)
+            result = getattr(self, request.pop("op"))(**request)
             if asyncio.iscoroutine(result):
                 result = await result
         except MeshctlError as error:
             return {"error": str(error), "hint": error.hint}
         return result or {}
-
-
-class _Operations:
-    """What a client may ask for; every method returns a JSON object or None."""
-
-    def __init__(self, fleet: Supervisor) -> None:
-        self._fleet = fleet
 
     def status(self) -> dict[str, Any]:
         fleet = self._fleet

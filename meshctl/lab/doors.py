@@ -57,20 +57,7 @@ class Doors:
 
         Raises LabError when it is taken (or all are).
         """
-        for port in (self.port,) if self.port else range(_FIRST_PORT, _LAST_PORT + 1):
-            claim = socket.socket()
-            try:
-                claim.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                claim.bind(("127.255.255.254", port))
-                claim.listen(1)
-            except OSError:
-                claim.close()
-                continue
-            self._claim, self.port = claim, port
-            return
-        raise LabError(
-            f"port {self.port or f'{_FIRST_PORT}-{_LAST_PORT}'} on 127.255.255.254 is taken by another fleet"
-        )
+        self._claim, self.port = claim_port(self.port)
 
     async def close(self) -> None:
         for listener, task in self._listening.values():
@@ -169,3 +156,18 @@ class Doors:
             pass
         finally:
             client.close()
+
+
+def claim_port(wanted: int) -> tuple[socket.socket, int]:
+    """A fleet's port, `wanted` or (0) a free one, and what holds it. Raises LabError when it is taken (or all are)."""
+    for port in (wanted,) if wanted else range(_FIRST_PORT, _LAST_PORT + 1):
+        claim = socket.socket()
+        try:
+            claim.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            claim.bind(("127.255.255.254", port))
+            claim.listen(1)
+        except OSError:
+            claim.close()
+            continue
+        return claim, port
+    raise LabError(f"port {wanted or f'{_FIRST_PORT}-{_LAST_PORT}'} on 127.255.255.254 is taken by another fleet")

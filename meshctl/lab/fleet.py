@@ -150,6 +150,9 @@ class VirtualNode:
 class VirtualFleet:
     """A fleet in `directory` (made if needed). Use as a context manager, or call `up()` and `down()`."""
 
+    # the module whose process stands behind the running fleet
+    SUPERVISOR = "meshctl.lab.supervisor"
+
     def __init__(self, spec: FleetSpec, directory: Path) -> None:
         self.spec = spec
         self.directory = directory.resolve()
@@ -166,15 +169,14 @@ class VirtualFleet:
 
     def up(self, *, wait_s: float = 120.0) -> Self:
         """Start it and wait until every node has booted. Raises LabError with the reason and the log's path."""
-        for program, package in (("busybox", "busybox-static"), ("dropbear", "dropbear-bin")):
-            rom.find_program(program, package)
+        self._check_programs()
         if is_running(self.directory):
             raise LabError(f"a virtual fleet runs in {self.directory} already", hint="meshctl lab down ends it")
         self._make_directory()
         log_path = self.directory / "log"
         with log_path.open("ab") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", "meshctl.lab.supervisor", str(self.directory)],
+                [sys.executable, "-m", self.SUPERVISOR, str(self.directory)],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -191,6 +193,10 @@ class VirtualFleet:
         self._process = process
         weakref.finalize(self, _let_go, process)
         return self
+
+    def _check_programs(self) -> None:
+        for program, package in (("busybox", "busybox-static"), ("dropbear", "dropbear-bin")):
+            rom.find_program(program, package)
 
     def _make_directory(self) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
@@ -289,7 +295,7 @@ class VirtualFleet:
         return self.ask("status")
 
     def ask(self, operation: str, **words: Any) -> dict[str, Any]:
-        """One request to the supervisor (`control._Operations`)."""
+        """One request to the supervisor (`control.Operations`)."""
         return request(self.directory, {"op": operation, **words})
 
     def ask_with(

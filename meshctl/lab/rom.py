@@ -25,12 +25,20 @@ _APPLETS = STAND_INS / "lab" / "applets"
 _SEARCH_PATHS = ("/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin")
 
 
-def build(rom: Path) -> None:
-    """Make the ROM in the new directory `rom`. Raises LabError naming the package that is missing."""
-    busybox = find_program("busybox", "busybox-static")
-    dropbear = find_program("dropbear", "dropbear-bin")
-    dropbearkey = find_program("dropbearkey", "dropbear-bin")
+def build(
+    rom: Path, *, sysroot: Path | None = None, more: Path | None = None, library_folders: Sequence[str] = ()
+) -> None:
+    """Make the ROM in the new directory `rom`. Raises LabError naming the package that is missing.
+
+    `sysroot`: take the programs from another root of this architecture; the caller then puts the libraries into
+    `library_folders`. `more` is laid over the stand-ins.
+    """
+    busybox = find_program("busybox", "busybox-static", sysroot=sysroot)
+    dropbear = find_program("dropbear", "dropbear-bin", sysroot=sysroot)
+    dropbearkey = find_program("dropbearkey", "dropbear-bin", sysroot=sysroot)
     shutil.copytree(STAND_INS, rom, ignore=shutil.ignore_patterns("__pycache__"))
+    if more is not None:
+        shutil.copytree(more, rom, dirs_exist_ok=True)
     for folder in ("bin", "sbin", "usr/bin", "usr/sbin", "lab", "lib"):
         (rom / folder).mkdir(parents=True, exist_ok=True)
     for script in (path for path in rom.rglob("*") if path.is_file()):
@@ -38,13 +46,17 @@ def build(rom: Path) -> None:
         script.chmod(0o755 if script.read_bytes().startswith(b"#!") else 0o644)
     for name, program in (("dropbear", dropbear), ("dropbearkey", dropbearkey)):
         shutil.copy2(program, rom / "lab" / name)
-    _copy_libraries((busybox, dropbear, dropbearkey), rom)
+    if sysroot is None:
+        _copy_libraries((busybox, dropbear, dropbearkey), rom)
+    else:
+        _note_library_folders(library_folders, rom)
     _install_busybox(busybox, rom)
 
 
-def find_program(name: str, package: str) -> Path:
-    """The program's path. Raises LabError naming Debian's package when it is not installed."""
-    found = shutil.which(name) or shutil.which(name, path=":".join(_SEARCH_PATHS))
+def find_program(name: str, package: str, *, sysroot: Path | None = None) -> Path:
+    """The program's path. Raises LabError naming Debian's package when it is not installed (in `sysroot`)."""
+    places = ":".join(f"{sysroot or ''}{folder}" for folder in _SEARCH_PATHS)
+    found = (None if sysroot else shutil.which(name)) or shutil.which(name, path=places)
     if found is None:
         raise LabError(f"the virtual fleet needs {name}, which is not installed", hint=f"apt install {package}")
     return Path(found).resolve()
@@ -69,6 +81,10 @@ def _copy_libraries(programs: Sequence[Path], rom: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(Path(path).resolve(), target)
         folders.add(str(Path(path).parent).lstrip("/"))
+    _note_library_folders(folders, rom)
+
+
+def _note_library_folders(folders: Iterable[str], rom: Path) -> None:
     (rom / "lab" / "library_folders").write_text("\n".join(sorted(folders)) + "\n", encoding="utf-8")
 
 

@@ -136,6 +136,16 @@ def changed_link(link: LinkSpec, changes: Mapping[str, Any]) -> LinkSpec:
 
 
 @dataclass(frozen=True, slots=True)
+class LanSpec:
+    """A robot's wired network in the field: one switch, the LAN ports of `nodes`, and its computer with an address
+    such as `10.42.0.21/24`. Only fleets of real radios have LANs."""
+
+    name: str
+    nodes: tuple[str, ...]
+    computer: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class FleetSpec:
     """A whole fleet. `port` is the one TCP port all its loopback addresses listen on (`addresses.loopback_of`).
 
@@ -148,6 +158,7 @@ class FleetSpec:
     port: int = 0
     # how long a link takes until batman-adv knows it; real meshes need 10 to 20 s
     convergence_s: float = 0.2
+    lans: tuple[LanSpec, ...] = ()
 
     def __post_init__(self) -> None:
         names = [node.name for node in self.nodes]
@@ -197,4 +208,5 @@ def load(text: str) -> FleetSpec:
         for node in data.pop("nodes")
     )
     links = tuple(LinkSpec(**link) for link in data.pop("links"))
-    return FleetSpec(nodes=nodes, links=links, **data)
+    lans = tuple(LanSpec(**{**lan, "nodes": tuple(lan["nodes"])}) for lan in data.pop("lans"))
+    return FleetSpec(nodes=nodes, links=links, lans=lans, **data)

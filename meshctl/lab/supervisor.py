@@ -23,7 +23,7 @@ from meshctl.lab import namespaces as ns
 from meshctl.lab import rom
 from meshctl.lab.air import parse_effective
 from meshctl.lab.container import Container, prepare
-from meshctl.lab.control import Control
+from meshctl.lab.control import Control, Operations
 from meshctl.lab.doors import Doors
 from meshctl.lab.errors import LabError
 from meshctl.lab.ether import Ether
@@ -50,9 +50,19 @@ class Supervisor:
         self._waiting: list[str] = []
         self._requests: dict[int, asyncio.Future[tuple[dict[str, Any], list[int]]]] = {}
         self._serial = 0
-        self.ether = Ether(self)
-        self.doors = Doors(self)
+        self.ether = self._make_ether()
+        self.doors = self._make_doors()
         self.hurt = Hurt(self)
+        self.operations = self._make_operations()
+
+    def _make_ether(self) -> Ether:
+        return Ether(self)
+
+    def _make_doors(self) -> Doors:
+        return Doors(self)
+
+    def _make_operations(self) -> Operations:
+        return Operations(self)
 
     # -- life --
 
@@ -69,7 +79,7 @@ class Supervisor:
         for number, node in enumerate(self.spec.nodes):
             self._make(number)
             self.power_on(node.name)
-        control = Control(self)
+        control = Control(self.directory, self.operations.answer)
         control.open()
         try:
             await self.stopping.wait()
@@ -273,7 +283,7 @@ def main(arguments: Sequence[str]) -> int:
         os.mkfifo(directory / "bell", 0o622)
         (directory / "bell").chmod(0o622)
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        _fork_warden(theirs, close=ours)
+        fork_warden(lambda: Warden(theirs), theirs, close=ours)
         spec = load((directory / "spec.json").read_text(encoding="utf-8"))
         supervise: Callable[[], Any] = Supervisor(spec, directory, ours, deny_setgroups=deny_setgroups).run
         (directory / "supervisor.pid").write_text(f"{os.getpid()}\n", encoding="ascii")
@@ -305,7 +315,8 @@ def _take_privileges() -> bool:
     return False
 
 
-def _fork_warden(channel: socket.socket, *, close: socket.socket) -> None:
+def fork_warden(make: Callable[[], Warden], channel: socket.socket, *, close: socket.socket) -> None:
+    """Let the warden, whose end of the pair is `channel`, serve in a process of its own."""
     if os.fork() != 0:
         channel.close()
         return
@@ -313,7 +324,7 @@ def _fork_warden(channel: socket.socket, *, close: socket.socket) -> None:
     close.close()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        Warden(channel).serve()
+        make().serve()
     except BaseException:
         log.exception("warden-failed")
         os._exit(1)

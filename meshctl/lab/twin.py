@@ -10,8 +10,8 @@ from typing import Any
 import yaml
 
 from meshctl.errors import InputError
-from meshctl.lab.spec import MESH_PACKAGES, FleetSpec, LinkSpec, Medium, NodeSpec, RadioSpec
-from meshctl.model import Fleet, Node, Role
+from meshctl.lab.spec import MESH_PACKAGES, FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
+from meshctl.model import Fleet, Node, Robot, Role
 
 # up to here a fleet's default shape is a chain
 _CHAIN_NODES = 12
@@ -35,6 +35,7 @@ def spec_of(
         nodes=tuple(_node_spec(node, number) for number, node in enumerate(chosen)),
         links=tuple(wanted),
         port=port,
+        lans=tuple(_lan_spec(robot, names) for robot in fleet.robots.values() if set(robot.nodes) & set(names)),
     )
 
 
@@ -73,6 +74,12 @@ def _link(path: Path, number: int, entry: object) -> LinkSpec:
                 raise InputError(f"{path}: link {number} ({a}-{b}): {error}") from error
         case _:
             raise InputError(f"{path}: link {number}: expected `between: [A, B]`, found {entry!r}")
+
+
+def _lan_spec(robot: Robot, names: Sequence[str]) -> LanSpec:
+    computer = robot.computer
+    nodes = tuple(name for name in robot.nodes if name in names)
+    return LanSpec(robot.name, nodes, str(computer.address) if computer else "")
 
 
 def _node_spec(node: Node, number: int) -> NodeSpec:

@@ -24,13 +24,14 @@ import selectors
 import signal
 import socket
 import termios
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from meshctl.lab import namespaces as ns
 from meshctl.lab.container import FLAGS, Container, become_node
+from meshctl.lab.errors import LabError
 
 # JSON of one request or event; commands of `lab shell NODE -- ...` are the longest
 MESSAGE_BYTES = 1 << 17
@@ -47,10 +48,14 @@ class _Running:
 
 
 class Warden:
-    """Serves requests on `channel` until the supervisor closes it."""
+    """Serves requests on `channel` until the supervisor closes it.
 
-    def __init__(self, channel: socket.socket) -> None:
+    `put_devices` gives a new node (its process number) its network devices before its process 1 begins.
+    """
+
+    def __init__(self, channel: socket.socket, put_devices: Callable[[Container, int], None] | None = None) -> None:
         self._channel = channel
+        self._put_devices = put_devices
         self._selector = selectors.DefaultSelector()
         self._nodes: dict[str, _Running] = {}
 
@@ -93,23 +98,36 @@ class Warden:
             overlay_kib=request["overlay_kib"],
             memory_kib=request["memory_kib"],
             deny_setgroups=request["deny_setgroups"],
+            real_devices=self._put_devices is not None,
         )
         console = os.open(container.home / "console.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
         silence = os.open("/dev/null", os.O_RDONLY | os.O_CLOEXEC)
         report, report_end = os.pipe2(os.O_CLOEXEC)
+        gate, gate_end = os.pipe2(os.O_CLOEXEC)
         pid = ns.clone(FLAGS)
         if pid == 0:
             os.dup2(silence, 0)
             os.dup2(console, 1)
             os.dup2(console, 2)
-            become_node(container, report_end)
-        for descriptor in (console, silence, report_end):
+            os.close(gate_end)
+            become_node(container, report_end, gate)
+        self._open_gate(container, pid, gate_end, report_end)
+        for descriptor in (console, silence, report_end, gate, gate_end):
             os.close(descriptor)
         pidfd = os.pidfd_open(pid)
         network = os.open(f"/proc/{pid}/ns/net", os.O_RDONLY | os.O_CLOEXEC)
         self._nodes[container.name] = _Running(pid, pidfd, network, container.deny_setgroups)
         self._selector.register(pidfd, selectors.EVENT_READ, lambda: self._ended(container.name, report))
         self._tell({"event": "started", "node": container.name, "pid": pid})
+
+    def _open_gate(self, container: Container, pid: int, gate: int, report: int) -> None:
+        try:
+            if self._put_devices is not None:
+                self._put_devices(container, pid)
+            os.write(gate, b"\n")
+        except LabError as error:
+            # a gate that closes unopened ends the node
+            os.write(report, str(error).encode())
 
     def _ended(self, name: str, report: int) -> None:
         running = self._nodes.pop(name)

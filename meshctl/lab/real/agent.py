@@ -1,0 +1,205 @@
+"""The machine's end of the channel to the host: requests, processes, doors (`channel` has the words)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import hmac
+import json
+import logging
+import os
+import pty
+import struct
+import termios
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from meshctl.lab.errors import LabError
+from meshctl.lab.real import channel
+from meshctl.lab.real.doors import RealDoors
+
+log = logging.getLogger("meshctl.lab.real.agent")
+_CHUNK_BYTES = 1 << 16
+# what a process that has ended may have left in its pipes is there already
+_DRAIN_S = 0.05
+
+
+class Agent:
+    """Serves connections whose first line holds `token`; `answer` is the fleet's (`control.Answer`)."""
+
+    def __init__(
+        self, token: str, answer: Callable[[dict[str, Any], list[int]], Awaitable[dict[str, Any]]], doors: RealDoors
+    ) -> None:
+        self._token = token
+        self._answer = answer
+        self._doors = doors
+        self._server: asyncio.Server | None = None
+
+    async def open(self, host: str, port: int) -> None:
+        self._server = await asyncio.start_server(self._serve, host, port, limit=channel.LINE_BYTES)
+
+    def close(self) -> None:
+        if self._server is not None:
+            self._server.close()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            first = json.loads(await reader.readline())
+            if not hmac.compare_digest(str(first["token"]), self._token):
+                return
+            match first["kind"]:
+                case "request":
+                    writer.write(channel.line(await self._answer(first["request"], [])))
+                    await writer.drain()
+                case "exec":
+                    await self._execute(first, reader, writer)
+                case "dial":
+                    await self._dial(first["host"], reader, writer)
+                case "watch":
+                    await self._watch(writer)
+        except (OSError, ValueError, KeyError, asyncio.IncompleteReadError) as error:
+            log.info("connection-ended reason=%s", error)
+        finally:
+            writer.close()
+
+    # -- doors --
+
+    async def _watch(self, writer: asyncio.StreamWriter) -> None:
+        while True:
+            changed = self._doors.changed
+            doors = {host: door.node for host, door in self._doors.wanted().items()}
+            writer.write(channel.line({"doors": doors}))
+            await writer.drain()
+            await changed.wait()
+
+    async def _dial(self, host: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self._doors.is_hung(host):
+            # accepted, and then nothing until the other side gives up
+            writer.write(channel.line({}))
+            while await reader.read(_CHUNK_BYTES):
+                pass
+            return
+        try:
+            made = await self._doors.dial(host)
+        except (OSError, LabError) as error:
+            log.info("dial-failed host=%s reason=%s", host, error or type(error).__name__)
+            writer.write(channel.line({"error": str(error) or type(error).__name__}))
+            await writer.drain()
+            return
+        node_reader, node_writer = await asyncio.open_connection(sock=made)
+        try:
+            writer.write(channel.line({}))
+            await asyncio.gather(_copy(reader, node_writer), _copy(node_reader, writer))
+        finally:
+            node_writer.close()
+
+    # -- processes --
+
+    async def _execute(self, first: dict[str, Any], reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        streams = _Terminal(first["terminal"]) if first["terminal"] else _Pipes()
+        loop = asyncio.get_running_loop()
+        tasks = [asyncio.ensure_future(_feed(reader, streams.input))]
+        waiting = []
+        for number, descriptor in streams.outputs:
+            waiting.append(loop.create_task(_tell(number, descriptor, writer)))
+        try:
+            answer = await self._answer(first["request"], list(streams.theirs))
+            streams.close_theirs()
+            # a process that stays behind may keep them open for ever
+            await asyncio.wait(waiting, timeout=_DRAIN_S)
+            writer.write(channel.frame(channel.ANSWER, json.dumps(answer).encode()))
+            await writer.drain()
+        finally:
+            for task in (*tasks, *waiting):
+                task.cancel()
+            await asyncio.gather(*tasks, *waiting, return_exceptions=True)
+            streams.close()
+
+
+class _Pipes:
+    """Three pipes: what a process gets, and our ends of them."""
+
+    def __init__(self) -> None:
+        read, self.input = os.pipe()
+        out, out_end = os.pipe()
+        err, err_end = os.pipe()
+        self.theirs: tuple[int, ...] = (read, out_end, err_end)
+        self.outputs: tuple[tuple[int, int], ...] = ((channel.OUTPUT, out), (channel.ERRORS, err))
+        self._ours = [self.input, out, err]
+
+    def close_theirs(self) -> None:
+        for descriptor in self.theirs:
+            os.close(descriptor)
+        self.theirs = ()
+
+    def close(self) -> None:
+        self.close_theirs()
+        for descriptor in self._ours:
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+
+
+class _Terminal(_Pipes):
+    """One terminal for all three, of so many rows and columns."""
+
+    def __init__(self, size: list[int]) -> None:
+        ours, theirs = pty.openpty()
+        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", size[0], size[1], 0, 0))
+        self.input = ours
+        self.theirs = (theirs, os.dup(theirs), os.dup(theirs))
+        self.outputs = ((channel.OUTPUT, ours),)
+        self._ours = [ours]
+
+
+async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    while data := await reader.read(_CHUNK_BYTES):
+        writer.write(data)
+        await writer.drain()
+    with contextlib.suppress(OSError):
+        writer.write_eof()
+
+
+async def _feed(reader: asyncio.StreamReader, descriptor: int) -> None:
+    """Input frames into a pipe; an empty one closes it."""
+    loop = asyncio.get_running_loop()
+    while True:
+        _, length = channel.header(await reader.readexactly(channel.HEADER_BYTES))
+        content = await reader.readexactly(length)
+        if not content:
+            if not os.isatty(descriptor):
+                os.close(descriptor)
+            return
+        # a pipe that is full waits in a thread of its own
+        await loop.run_in_executor(None, _write_all, descriptor, content)
+
+
+def _write_all(descriptor: int, content: bytes) -> None:
+    with contextlib.suppress(BrokenPipeError):
+        while content:
+            content = content[os.write(descriptor, content) :]
+
+
+async def _tell(number: int, descriptor: int, writer: asyncio.StreamWriter) -> None:
+    """A process's output as frames, until it closes it."""
+    loop = asyncio.get_running_loop()
+    os.set_blocking(descriptor, False)
+    ready = asyncio.Event()
+    loop.add_reader(descriptor, ready.set)
+    try:
+        while True:
+            await ready.wait()
+            try:
+                content = os.read(descriptor, _CHUNK_BYTES)
+            except BlockingIOError:
+                ready.clear()
+                continue
+            except OSError:
+                # EIO: a terminal whose other side is gone
+                return
+            if not content:
+                return
+            writer.write(channel.frame(number, content))
+            await writer.drain()
+    finally:
+        loop.remove_reader(descriptor)

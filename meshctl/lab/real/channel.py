@@ -1,0 +1,46 @@
+"""What host and machine say to each other over one TCP port of the machine.
+
+Each connection begins with one JSON line, `{"token": T, "kind": K, ...}`:
+
+    request  {"request": {...}}                  one JSON line answers, as on a fleet's control socket
+    exec     {"request": {...}, "terminal": [rows, columns] or null}
+                                                 frames both ways; the machine's last one is the answer
+    dial     {"host": "127.42.0.11"}             one JSON line, then the bytes of that door's connection
+    watch    {}                                  a JSON line with the doors that are open, at every change
+
+A frame is a stream's number (0 input or answer, 1 output, 2 errors), a length, and as many bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+# no frame is larger, and no line: answers of big fleets hold a few hundred bytes per node
+FRAME_BYTES = 1 << 16
+LINE_BYTES = 1 << 20
+_HEADER = struct.Struct("!BI")
+HEADER_BYTES = _HEADER.size
+
+ANSWER = 0
+INPUT = 0
+OUTPUT = 1
+ERRORS = 2
+
+
+def line(message: dict[str, Any]) -> bytes:
+    return json.dumps(message).encode() + b"\n"
+
+
+def frame(stream: int, content: bytes) -> bytes:
+    """One frame. Input ends with an empty one."""
+    if len(content) > LINE_BYTES:
+        raise ValueError(f"a frame holds at most {LINE_BYTES} bytes")
+    return _HEADER.pack(stream, len(content)) + content
+
+
+def header(content: bytes) -> tuple[int, int]:
+    """Stream and length of the frame that begins with these `HEADER_BYTES`."""
+    stream, length = _HEADER.unpack(content)
+    return int(stream), int(length)

@@ -1,0 +1,85 @@
+# netifd's stand-in on real radios, the computing part: after netifd.awk, what the kernel is to have -> run/kernel.new.
+#
+# One line per device, port or address, tab-separated, in the order of making. A line ends with the lines it stands on:
+# when a radio or bat0 is made anew, so is what hangs on it.
+#
+#   bridge NAME MAC
+#   soft   NAME ALGORITHM OPTIONS
+#   radio  NAME NUMBER MODE MHZ WIDTH SSID BSSID MCAST_KBPS DBM MAC BEACON_TU DISTANCE_M COUNTRY ALGORITHM KEY FORWARDING
+#   hard   NAME MASTER MTU OPTIONS
+#   port   BRIDGE NAME
+#   addr   DEVICE ADDRESS/PREFIX
+
+function field(value) { return "\t" (value == "" ? "-" : value) }
+
+# OPTION=VALUE of those that are set, separated by blanks
+function chosen(id, wanted,    n, i, list, text) {
+	n = split(wanted, list, " ")
+	for (i = 1; i <= n; i++) if ((id, list[i]) in opt) text = text (text == "" ? "" : " ") list[i] "=" opt[id, list[i]]
+	return text
+}
+
+function add(name, line) { made_of[name] = line; plan = plan line "\n" }
+
+# without the tabs, so that a line's own fields can be told from those of what it stands on
+function standing_on(name,    text) { text = made_of[name]; gsub(/\t/, "|", text); return field(text) }
+
+function plan_radios(    i, id, device, ifname, path) {
+	for (i = 1; i <= sections; i++) {
+		id = order[i]
+		if (!(id in iface_name)) continue
+		ifname = iface_name[id]
+		if (!(ifname in cell)) continue
+		device = get(id, "device", ""); path = radio_path[device]
+		split(cell[ifname], part, "\t")
+		add(ifname, "radio" field(ifname) field(phy_of[path]) field(get(id, "mode", "")) field(part[4]) \
+			field(get(id_of(device), "htmode", "NOHT")) field(part[5]) field(part[6]) field(get(id, "mcast_rate", "")) \
+			field(power(device, path)) field(mac_of[path]) field(get(id_of(device), "beacon_int", "100")) \
+			field(get(id_of(device), "distance", "")) field(get(id_of(device), "country", "")) field(part[7]) field(part[8]) \
+			field(yes(get(id, "mesh_fwding", "1")) ? 1 : 0))
+	}
+}
+
+function plan_batman(    i, id, name) {
+	for (i = 1; i <= sections; i++) {
+		id = order[i]; name = label[id]
+		if (kind[id] == "network.interface" && get(id, "proto", "") == "batadv" && name in is_soft)
+			add(name, "soft" field(name) field(algorithm[name]) field(chosen(id, "aggregated_ogms ap_isolation bonding " \
+				"bridge_loop_avoidance distributed_arp_table fragmentation gw_mode hop_penalty multicast_mode " \
+				"multicast_fanout orig_interval")))
+	}
+}
+
+function plan_hard(    i, j, id, ifname) {
+	for (i = 1; i <= sections; i++) {
+		id = order[i]
+		if (kind[id] != "network.interface" || get(id, "proto", "") != "batadv_hardif") continue
+		for (ifname in master) if (network_of[ifname] == label[id] || ifname == get(id, "device", get(id, "ifname", "")))
+			add("hard " ifname, "hard" field(ifname) field(master[ifname]) field(mtu[ifname]) \
+				field(chosen(id, "elp_interval hop_penalty throughput_override")) standing_on(ifname) standing_on(master[ifname]))
+	}
+}
+
+function plan_bridges(    name, n, i, list) {
+	for (name in is_bridge) add(name, "bridge" field(name) field(lan_mac))
+	for (name in is_bridge) {
+		n = split(bridge_ports[name], list, " ")
+		for (i = 1; i <= n; i++) plan = plan "port" field(name) field(list[i]) standing_on(list[i]) "\n"
+	}
+}
+
+function plan_addresses(    line) {
+	close(run "/addresses.new")
+	while ((getline line < (run "/addresses.new")) > 0) { sub(/ /, "\t", line); plan = plan "addr\t" line "\n" }
+}
+
+END {
+	if (mode != "down") {
+		plan_batman()
+		plan_radios()
+		plan_bridges()
+		plan_hard()
+		plan_addresses()
+	}
+	printf "%s", plan > (run "/kernel.new")
+}
