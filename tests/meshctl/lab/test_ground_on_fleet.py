@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -45,7 +48,7 @@ def mac_of(fleet: VirtualFleet, name: str) -> str:
     return words[words.index("addr") + 1]
 
 
-def signal(fleet: VirtualFleet, name: str) -> list[int]:
+def signals(fleet: VirtualFleet, name: str) -> list[int]:
     dump = fleet.node(name).exec("iw dev mesh0 station dump").stdout
     return [int(line.split()[1]) for line in dump.splitlines() if line.strip().startswith("signal: ")]
 
@@ -72,8 +75,8 @@ def test_a_node_that_nobody_hears_hears_others_and_is_not_reached(grounded: Virt
     lab(grounded, "link", "far", "near", "--loss", "100%", "--one-way")
     until(lambda: in_mesh(grounded) == {"near"}, "the mesh without far")
     assert not answers(grounded.endpoint("10.42.0.3"))
-    until(lambda: len(signal(grounded, "near")) == 1, "near to hear the base alone")
-    assert len(signal(grounded, "far")) == 1
+    until(lambda: len(signals(grounded, "near")) == 1, "near to hear the base alone")
+    assert len(signals(grounded, "far")) == 1
     assert neighbours(grounded, "far") == {}
 
 
@@ -82,7 +85,7 @@ def test_a_node_that_moves_away_leaves_the_mesh_and_returns_over_another(grounde
     until(lambda: set(neighbours(grounded, "base")) == {"near", "far"}, "three that hear each other")
     (link,) = [link for link in links_of(ROW) if link.ends == {"base", "near"}]
     assert neighbours(grounded, "base")["near"] == link.tq_to("near")
-    assert link.signal_at("base") in signal(grounded, "base")
+    assert link.signal_at("base") in signals(grounded, "base")
     lab(grounded, "move", "far", "200", "-5")
     until(lambda: set(neighbours(grounded, "base")) == {"near"}, "far to be out of the base's earshot")
     until(lambda: in_mesh(grounded) == {"near", "far"} and answers(grounded.endpoint("10.42.0.3")), "far over near")
@@ -149,6 +152,25 @@ def test_a_mission_drops_a_beacon_and_the_robot_is_reached_over_it(grounded: Vir
     assert grounded.node("near").exec("cat /proc/uptime").exit_status == 0
     assert standing.ground_of(grounded).places["near"].at == (90.0, 0.0)
     until(lambda: set(neighbours(grounded, "base")) == {"near"}, "the robot out of the base's own earshot")
+
+
+def test_a_mission_that_is_interrupted_says_where_to_go_on(grounded: VirtualFleet, tmp_path: Path) -> None:
+    file = tmp_path / "mission.yaml"
+    file.write_text(
+        "nodes: {base: [0, 0], near: [60, 0]}\nduration_s: 600\n"
+        "robots: {far: {path: [[0, 100, 0], [1, 90, 0], [600, 100, 0]]}}\n",
+        encoding="utf-8",
+    )
+    words = [sys.executable, "-m", "meshctl", "lab", "mission", str(file), "--dir", str(grounded.directory)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as playing:
+        assert playing.stdout is not None
+        assert playing.stdout.readline() == "     1.0 s  far arrives at 90, 0 m\n"
+        playing.send_signal(signal.SIGINT)
+        _, said = playing.communicate(timeout=60)
+    assert playing.returncode == 130
+    assert "everything stays as it is" in said
+    assert f"go on with: meshctl lab mission {file} --from " in said
+    assert standing.ground_of(grounded).places["far"].at[0] < 100
 
 
 def test_a_link_of_the_spec_is_a_ground_of_its_own(grounded: VirtualFleet) -> None:
