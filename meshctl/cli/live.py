@@ -57,13 +57,13 @@ class _Looks(Generic[T]):
 
 def live(
     take: Callable[[], T],
-    draw: Callable[[T | None, int], list[str]],
+    draw: Callable[[T | None, os.terminal_size], list[str]],
     period_s: float,
     out: TextIO,
     size: Callable[[], os.terminal_size] = shutil.get_terminal_size,
 ) -> T | None:
     """Draw what `take` gives every `period_s`, until Ctrl-C; returns the latest. `draw` gets it (None before the first)
-    and the width, and gives lines. Raises what `take` raises."""
+    and the window's size, and gives lines. Raises what `take` raises."""
     reader, writer = os.pipe2(os.O_NONBLOCK)
     looks = _Looks(take, period_s, writer)
     thread = threading.Thread(target=looks.run, name="looks", daemon=True)
@@ -94,9 +94,10 @@ def _ring(bell: int) -> None:
         return
 
 
-def _draw(draw: Callable[[T | None, int], list[str]], value: T | None, out: TextIO, size: os.terminal_size) -> None:
-    lines = draw(value, size.columns)
-    out.write(page(lines, size.lines))
+def _draw(
+    draw: Callable[[T | None, os.terminal_size], list[str]], value: T | None, out: TextIO, size: os.terminal_size
+) -> None:
+    out.write(page(draw(value, size), size.lines))
     out.flush()
 
 

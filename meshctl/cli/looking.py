@@ -11,7 +11,7 @@ import shutil
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +19,7 @@ import typer
 
 from meshctl.cli.robots_crew import sudo_password
 from meshctl.cli.session import Session, session
+from meshctl.device.connection import Deadlines
 from meshctl.model import Fleet, Node
 from meshctl.robots.reach import Reach
 from meshctl.status.assess import Look
@@ -30,7 +31,13 @@ from meshctl.status.table import Paint, plain
 CONNECT_S = 5.0
 
 Timeout = Annotated[
-    float, typer.Option("--timeout", min=0.5, metavar="S", help="Seconds a device has to take a connection.")
+    float,
+    typer.Option(
+        "--timeout",
+        min=0.5,
+        metavar="S",
+        help="Seconds a device has to take a connection; twice that for each step after it.",
+    ),
 ]
 NoRobots = Annotated[bool, typer.Option("--no-robots", help="Ask the radios alone, not the robots' computers.")]
 
@@ -74,13 +81,18 @@ def watcher(
     """Open all of it, and close it in the end. Raises InvalidInput, InputError, MeshctlError."""
     password = sudo_password(ask_sudo) if with_robots else None
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        opened.access.deadlines = replace(opened.access.deadlines, connect_s=timeout_s)
+        opened.access.deadlines = _deadlines(timeout_s)
         robots, unasked = _robots(opened, with_robots)
         reach = Reach(opened.fleet, opened.access, lambda: password) if robots else None
         with Watcher(
             opened.fleet, opened.renderer, opened.access, opened.journal, opened.owner, reach, unasked
         ) as watching:
             yield Everybody(opened, watching, tuple(opened.fleet.managed()), robots)
+
+
+def _deadlines(connect_s: float) -> Deadlines:
+    """Each further step has twice that: it computes, on a small processor, besides travelling."""
+    return Deadlines(connect_s, handshake_s=2 * connect_s, auth_s=2 * connect_s, channel_s=2 * connect_s)
 
 
 def _robots(opened: Session, with_robots: bool) -> tuple[tuple[str, ...], str]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -89,12 +91,13 @@ class _View:
         self._topics = topics
         self._wide = wide
         fleet = everybody.fleet
+        self._is_partial = only and not chosen.is_empty
         self._nodes = tuple(n for n in everybody.nodes if not only or chosen.takes_node(n))
         self._robots = tuple(name for name in everybody.robots if not only or chosen.takes_robot(fleet, name))
 
     def look(self) -> Look:
         """Ask, and remember what was told."""
-        look = glance(self._everybody, self._nodes, self._robots)
+        look = replace(glance(self._everybody, self._nodes, self._robots), is_partial=self._is_partial)
         whole = assess(look, self._nodes, time.time(), self._robots)
         self._everybody.opened.journal.remember_all(self._everybody.fleet.name, facts_to_keep(whole), time.time())
         return look
@@ -103,9 +106,9 @@ class _View:
         """Of those that are shown, with ages as of `now`."""
         return self._chosen.apply(self._everybody.fleet, assess(look, self._nodes, now, self._robots))
 
-    def text(self, status: FleetStatus, width: int | None = None) -> str:
-        wide = width if width is not None and not self._wide else line_width(wide=self._wide)
-        return text(status, wide, paint_of(), topics=self._topics)
+    def text(self, status: FleetStatus, width: int | None = None, *, brief: bool = False) -> str:
+        room = width if width is not None and not self._wide else line_width(wide=self._wide)
+        return text(status, room, paint_of(), topics=self._topics, brief=brief)
 
 
 def _follow(view: _View, period_s: float, as_json: bool) -> None:
@@ -120,15 +123,16 @@ def _follow(view: _View, period_s: float, as_json: bool) -> None:
 def _watch(view: _View, period_s: float) -> None:
     """The page until Ctrl-C; then what was seen last, where it stays."""
 
-    def draw(look: Look | None, width: int) -> list[str]:
+    def draw(look: Look | None, size: os.terminal_size) -> list[str]:
         if look is None:
             return ["looking at everybody for the first time ... (Ctrl-C ends)"]
-        now = time.time()
-        return [
-            *view.text(view.status(look, now), width).splitlines(),
-            "",
-            f"a look every {period_s:g} s; Ctrl-C ends",
-        ]
+        status = view.status(look, time.time())
+        footer = ["", f"a look every {period_s:g} s; Ctrl-C ends"]
+        lines = [*view.text(status, size.columns).splitlines(), *footer]
+        if len(lines) > size.lines:
+            # in a small window the table comes before notes and advice
+            lines = [*view.text(status, size.columns, brief=True).splitlines(), *footer]
+        return lines
 
     latest = live(view.look, draw, period_s, sys.stdout)
     if latest is not None:

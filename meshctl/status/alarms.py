@@ -42,6 +42,8 @@ class Seen:
     plan: NodePlan | None
     neighbours: tuple[Neighbour, ...]
     path: Path | None
+    is_path_known: bool
+    """Whether enough was asked to tell its path."""
     cuts_off: tuple[str, ...]
     seconds_since_last_known: float | None
     """Time between the last look, if any, and this one."""
@@ -106,6 +108,9 @@ def _radios(seen: Seen) -> Iterator[Alarm]:
 def _mesh(seen: Seen) -> Iterator[Alarm]:
     if seen.must_mesh and not seen.neighbours:
         yield Alarm(Level.ERROR, "alone", "hears no other node", "antennas, distance, and whether its channel is free")
+    elif seen.must_mesh and seen.path is None and seen.is_path_known:
+        told = "no path through the mesh leads from it to the base"
+        yield Alarm(Level.WARNING, "no-path", told, "which node between them is gone? meshctl topology")
     elif seen.path is not None and seen.path.hops and seen.path.quality < WEAK_QUALITY:
         hops = f"{seen.path.hops} hop{'s' if seen.path.hops > 1 else ''}"
         told = f"path to the base carries {seen.path.quality:.0%} over {hops}"

@@ -27,6 +27,7 @@ class Look:
     `known` is what the journal knew before it, by node and by `robot.NAME`; `macs` maps MACs to nodes; `silent` and
     `silent_robots` tell why somebody gave no answer; `unrendered` why a node or a `robot.NAME` could not be compared
     with the inventory; `own_lock` is who we are to the nodes' locks; `robots_unasked` why no robot was asked at all.
+    `is_partial` says that only some were asked, so that paths and cut vertices cannot be told.
     """
 
     fleet: Fleet
@@ -42,6 +43,7 @@ class Look:
     robots: Mapping[str, RobotFacts] = field(default_factory=dict)
     silent_robots: Mapping[str, Silence] = field(default_factory=dict)
     robots_unasked: str = ""
+    is_partial: bool = False
     took_s: float = 0.0
 
 
@@ -49,8 +51,8 @@ def assess(look: Look, nodes: Iterable[Node], now: float, robots: Iterable[str] 
     """The status of these radios and robots at `now` (Unix time)."""
     reports = {name: report_of(name, seen) for name, seen in look.observations.items()}
     sightings = seen_by(reports.values(), look.macs)
-    paths = look.graph.paths(look.entry)
-    cuts = look.graph.cut_off_by(look.entry)
+    paths = {} if look.is_partial else look.graph.paths(look.entry)
+    cuts = {} if look.is_partial else look.graph.cut_off_by(look.entry)
     statuses = []
     for node in nodes:
         seen = look.observations.get(node.name)
@@ -65,6 +67,7 @@ def assess(look: Look, nodes: Iterable[Node], now: float, robots: Iterable[str] 
             plan=look.plans.get(node.name),
             neighbours=_neighbours(reports[node.name], look.macs),
             path=paths.get(node.name),
+            is_path_known=look.entry in paths,
             cuts_off=cuts.get(node.name, ()),
             seconds_since_last_known=None if last is None else max(0.0, seen.answered_at_s - last.seen_s),
             own_lock=look.own_lock,
@@ -152,6 +155,7 @@ def _answering(seen: Seen, now: float) -> NodeStatus:
         tx_power_dbm=next((link.tx_power_dbm for link in mesh_links if link.tx_power_dbm is not None), None),
         lan_ports=lan,
         neighbours=seen.neighbours,
+        is_path_known=seen.is_path_known,
         hops=seen.path.hops if seen.path else None,
         quality=seen.path.quality if seen.path else None,
         via=seen.path.via if seen.path and seen.path.hops else "",

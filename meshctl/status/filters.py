@@ -13,6 +13,7 @@ from fnmatch import fnmatchcase
 from meshctl.errors import InputError
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Node, NodeState, Role
+from meshctl.status.codes import CODES
 from meshctl.status.robots import robot_state
 from meshctl.status.rows import COMPUTER
 from meshctl.status.values import Alarm, FleetStatus, Level
@@ -20,6 +21,8 @@ from meshctl.status.values import Alarm, FleetStatus, Level
 ROLES = (*(role.value for role in Role), COMPUTER)
 STATES = tuple(state.value for state in NodeState if state.is_managed)
 ANY_ALARM = "any"
+# a hint that fills the screen is none
+NAMES_IN_A_HINT = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +48,7 @@ class Filter:
         _known("robot", self.robots, fleet.robots, fleet.name)
         _known("role", self.roles, ROLES, "a status")
         _known("state", self.states, STATES, "a status")
+        _known("alarm", self.alarms, (*CODES, *(level.text for level in Level), ANY_ALARM), "a status")
 
     def takes_node(self, node: Node) -> bool:
         return (
@@ -100,4 +104,5 @@ def _known(what: str, patterns: tuple[str, ...], names: Iterable[str], where: st
     listed = list(names)
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in listed):
-            raise InputError(f"no {what} of {where} is called {pattern!r}", hint=did_you_mean(pattern, listed))
+            hint = did_you_mean(pattern, listed) or f"there are: {', '.join(listed[:NAMES_IN_A_HINT])}"
+            raise InputError(f"no {what} of {where} is called {pattern!r}", hint=hint)

@@ -40,6 +40,8 @@ T = TypeVar("T")
 
 # So many are asked at once: enough that the silent cost one deadline for all, few enough for a laptop's memory.
 SIDE_BY_SIDE = 64
+# A busy radio with a 560 MHz processor takes about ten seconds for all its answers (device/observe.py).
+OBSERVE_S = 30.0
 _SALT_BYTES = 16
 Progress = Callable[[int, int], None]
 
@@ -144,7 +146,7 @@ class Watcher:
         wanted = self._want(node)
         paths = () if isinstance(wanted, str) else other_paths(wanted)
         with self.access.lease(node) as connection:
-            return observe(connection, extra_paths=paths)
+            return observe(connection, extra_paths=paths, timeout_s=OBSERVE_S)
 
     def _want(self, node: Node) -> Wanted | str:
         """What the inventory wants of a node, or why that cannot be told: a fleet shows its state without its secrets,

@@ -88,7 +88,7 @@ def _robot_radios(fleet: Fleet, status: FleetStatus) -> Check:
     radios = [node for node in status.nodes if node.node.role is Role.ROBOT]
     deployed = [node for node in radios if node.node.state is NodeState.DEPLOYED]
     shelved = [f"{node.name} ({node.node.state.value})" for node in radios if node.node.state is not NodeState.DEPLOYED]
-    good = f"{_plural(len(deployed), 'robot radio')} answer{'s' if len(deployed) == 1 else ''}"
+    good = f"{_plural(len(deployed), 'robot radio')} answer{'s' if len(deployed) == 1 else ''}" if radios else "none"
     good += f"; not taking part: {some(tuple(shelved))}" if shelved else ""
     return _check("robot radios", [_silence(node) for node in deployed if node.silent_because], good)
 
@@ -103,7 +103,7 @@ def _beacons(fleet: Fleet, status: FleetStatus) -> Check:
         [f"{some(tuple(n.name for n in unknown))}: never seen; switch on once before it is packed"] if unknown else []
     )
     on = sum(not node.silent_because for node in beacons)
-    good = f"{_plural(len(beacons), 'beacon')} known, {on} on"
+    good = f"{_plural(len(beacons), 'beacon')} known, {on} on" if beacons else "none"
     return _check("beacons", [*told, *(_silence(node) for node in missed)], good)
 
 
@@ -115,7 +115,9 @@ def _quality(fleet: Fleet, status: FleetStatus) -> Check:
     deployed = [node for node in status.nodes if node.hops and node.quality is not None]
     weak = [f"{n.name}: {n.quality:.0%} to the base" for n in deployed if n.quality and n.quality < WEAK_QUALITY]
     worst = min((node.quality for node in deployed if node.quality is not None), default=None)
-    return _check("links", weak, "every path carries" + ("" if worst is None else f", the weakest {worst:.0%}"))
+    return _check(
+        "links", weak, "no path to measure" if worst is None else f"every path carries, the weakest {worst:.0%}"
+    )
 
 
 def _strangers(fleet: Fleet, status: FleetStatus) -> Check:

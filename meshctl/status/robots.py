@@ -85,7 +85,7 @@ def _silent(
     hint = f"is its address right? Then {trust}, and meshctl robots deploy {robot.name}"
     alarm = silent_alarm(why, last, heard_by, crew.now, is_missed=is_missed, trust=trust, take_in=hint)
     if alarm is not None and heard_by and alarm.code == "unreachable":
-        told = f"{alarm.text}: its daemon works, its SSH does not"
+        told = f"{alarm.text}: its daemon is heard, its SSH is not"
         alarm = Alarm(Level.ERROR, "unreachable", told, "the run may go on without SSH; look at its sshd and its load")
     return RobotStatus(
         robot=robot,

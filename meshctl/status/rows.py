@@ -85,7 +85,7 @@ def _node_row(node: NodeStatus) -> dict[str, Cell]:
         "channel": Cell(",".join(map(str, node.channels))),
         "bridge": Cell("" if node.lan_ports is None else "+".join(node.lan_ports) or "nothing"),
         "hears": _hears(node),
-        "path": _path(node.hops, node.quality),
+        "path": _path(node.hops, node.quality) if node.is_path_known else Cell(),
         "via": Cell(node.via),
     }
 

@@ -28,12 +28,19 @@ _VERDICTS = {
 }
 
 
-def text(status: FleetStatus, width: int | None = None, paint: Paint = plain, *, topics: bool = False) -> str:
+def text(
+    status: FleetStatus,
+    width: int | None = None,
+    paint: Paint = plain,
+    *,
+    topics: bool = False,
+    brief: bool = False,
+) -> str:
     """Everything, as lines no longer than `width` (None: as long as they are). `topics` adds one line per topic and
-    robot."""
+    robot; `brief` leaves out notes and what to do."""
     devices = list(status)
-    lines = [*summary_lines(status, width, paint), ""]
-    lines += table_lines([row(one) for one in devices], width, paint)
+    lines = [*summary_lines(status, width, paint, brief=brief), ""]
+    lines += table_lines([row(one) for one in devices], width, paint) or ["nobody to show"]
     if topics:
         lines += ["", *topic_lines(status)]
     if len(devices) > ROWS_ON_A_SCREEN:
@@ -41,11 +48,13 @@ def text(status: FleetStatus, width: int | None = None, paint: Paint = plain, *,
     return "\n".join(lines)
 
 
-def summary_lines(status: FleetStatus, width: int | None = None, paint: Paint = plain) -> list[str]:
+def summary_lines(
+    status: FleetStatus, width: int | None = None, paint: Paint = plain, *, brief: bool = False
+) -> list[str]:
     """The verdict, the totals and the alarms."""
     lines = [verdict_line(status, paint)]
     lines += [f"  {text}" for text in _totals(status)]
-    alarms = list(_alarm_lines(status, width, paint))
+    alarms = list(_alarm_lines(status, width, paint, brief))
     return [*lines, "", *alarms] if alarms else lines
 
 
@@ -84,11 +93,13 @@ def _all_alarms(status: FleetStatus) -> list[tuple[str, Alarm]]:
     return sorted(found, key=lambda pair: -pair[1].level)
 
 
-def _alarm_lines(status: FleetStatus, width: int | None, paint: Paint) -> Iterator[str]:
+def _alarm_lines(status: FleetStatus, width: int | None, paint: Paint, brief: bool) -> Iterator[str]:
     groups: dict[tuple[Level, str], list[tuple[str, Alarm]]] = {}
     for name, alarm in _all_alarms(status):
         groups.setdefault((alarm.level, alarm.code), []).append((name, alarm))
     for (level, code), members in groups.items():
+        if brief and level is Level.NOTE:
+            continue
         lead = level.text.upper().ljust(7)
         if len(members) > SINGLE_ALARMS:
             names = some(tuple(name for name, _ in members))
@@ -97,7 +108,7 @@ def _alarm_lines(status: FleetStatus, width: int | None, paint: Paint) -> Iterat
             continue
         for name, alarm in members:
             yield from _wrapped(lead, f"{name}: {alarm.text}" if name else alarm.text, width, paint, level.text)
-            if alarm.hint:
+            if alarm.hint and level > Level.NOTE and not brief:
                 yield from _wrapped("       ", f"-> {alarm.hint}", width, paint, "")
 
 

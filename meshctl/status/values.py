@@ -97,6 +97,8 @@ class NodeStatus:
     lan_ports: tuple[str, ...] | None = None
     """What its LAN bridge joins now."""
     neighbours: tuple[Neighbour, ...] = ()
+    is_path_known: bool = True
+    """Whether enough was asked to tell its path; then no `hops` means that there is none."""
     hops: int | None = None
     quality: float | None = None
     """Of the whole path to the base, 0..1."""
