@@ -20,6 +20,7 @@ from meshctl.apply.node import configure
 from meshctl.apply.packages import install
 from meshctl.apply.planning import Prepared, base_macs
 from meshctl.apply.switch import switch
+from meshctl.apply.whereabouts import ask_around
 from meshctl.device.observation import Observation
 from meshctl.errors import NodeError
 from meshctl.fleet import (
@@ -90,7 +91,32 @@ def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
             stopped = f"stopped: the canary {stage.nodes[0]} failed"
         elif budget.spent:
             stopped = budget.reason
+    outcomes.update(_searched(prepared, setting, jobs, outcomes))
     return {name: outcomes[name] for name in plan.nodes}
+
+
+# Results of a node that was in work and is out of sight.
+_LOST = (Result.UNCERTAIN, Result.UNREACHABLE)
+
+
+def _searched(
+    prepared: Prepared, setting: Setting, jobs: Mapping[str, Job], outcomes: Mapping[str, Outcome]
+) -> dict[str, Outcome]:
+    """The outcomes of nodes that did not return, with what was last seen of them, and by whom."""
+    lost = [name for name in jobs if outcomes[name].result in _LOST]
+    if not lost or setting.interrupt.leaving:
+        return {}
+    fleet = setting.fleet
+    known = setting.journal.last_known(fleet.name)
+    found = ask_around(setting.access, fleet, lost, prepared.seen, known, interrupt=setting.interrupt)
+    told = {}
+    for name, place in found.items():
+        text = place.text(time.time())
+        outcome = outcomes[name]
+        told[name] = replace(outcome, reason=f"{outcome.reason}; {text}", facts={**outcome.facts, **place.facts})
+        setting.run.finish_node(told[name])
+        setting.observer(Event(EventKind.NOTE, name, time.time(), text))
+    return told
 
 
 def _tell(setting: Setting, outcome: Outcome) -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from meshctl.apply.access import Access
 from meshctl.apply.gather import Seen, facts_of, gather
 from meshctl.apply.wanted import Renderer
+from meshctl.apply.whereabouts import whereabouts
 from meshctl.device.observation import Observation
 from meshctl.fleet import Interrupt, Observer, silent
 from meshctl.fleet.journal import Journal, LastKnown
@@ -103,6 +104,9 @@ def assemble(
         if error is not None:
             made = replace(made, verdict=Verdict.REFUSED, reason=str(error), hint=error.hint)
         plans[name] = made
+    away = [name for name, made in plans.items() if made.verdict is Verdict.AWAY]
+    for name, place in whereabouts(fleet, away, seen.observations, known).items():
+        plans[name] = replace(plans[name], reason=f"{plans[name].reason}; {place.text(time.time())}")
     plan = fleet_plan(
         fleet,
         plans,
