@@ -77,6 +77,9 @@ def status_view(status: Json) -> str:
     lines += [f"link {name} FAILED: {reason}" for name, reason in status["link_failures"].items()]
     lines += ["", peers_view(conditions["peers"]), ""]
     lines.append(
+        f"channel: {rate(conditions['sent_bits_per_s'])} sent here, {rate(conditions['heard_bits_per_s'])} by all heard"
+    )
+    lines.append(
         f"messages: {counters['messages_sent']} sent, {counters['messages_delivered']} delivered, "
         f"{counters['messages_expired']} expired, {counters['messages_peer_lost']} peer lost, "
         f"{counters['messages_received']} received; {size(conditions['queued_bytes'])} queued"

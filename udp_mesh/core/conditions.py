@@ -41,6 +41,10 @@ class PeerConditions:
     """Payload bits the peer acknowledged."""
     received_bits_per_s: float
     """Wire bits received from the peer."""
+    arrived_bits_per_s: float | None
+    """Wire bits sent to the peer that arrive, as the peer itself says in its acknowledgements."""
+    peer_sends_bits_per_s: float | None
+    """Wire bits that the peer says it sends to everybody."""
     capacity_bits_per_s: float | None
     """The link's estimated rate for payload, where enough was sent to see it."""
     window_packets: float
@@ -88,6 +92,10 @@ class Conditions:
     name: str
     peers: tuple[PeerConditions, ...]
     counters: Counters
+    sent_bits_per_s: float
+    """Wire bits of this node, to everybody."""
+    heard_bits_per_s: float
+    """Wire bits that this node and the peers online say they send together: how busy the channel is."""
     partial_bytes: int
     queued_bytes: int
     repair_bytes: int

@@ -73,7 +73,13 @@ class Discovery:
         return max(base, len(online) / rates.heartbeats_heard_per_s)
 
     def compose(
-        self, settings: Settings, sessions: list[Session], waiting: tuple[Waiting, ...], next_cast: int, now: float
+        self,
+        settings: Settings,
+        sessions: list[Session],
+        waiting: tuple[Waiting, ...],
+        next_cast: int,
+        sent_bytes_per_s: float,
+        now: float,
     ) -> Heartbeat:
         """The heartbeat to send now; the next one is due after its interval. `broadcast_number` is filled by `seal`."""
         self._heard_per_s = settings.rates.heartbeats_heard_per_s
@@ -87,7 +93,7 @@ class Discovery:
             int(Feature.ZLIB | Feature.REPAIR),
             min(65_535, int(self._interval_s * 1000)),
             min(65_535, sum(1 for session in sessions if session.peer is not None and session.peer.online)),
-            0,
+            min(0xFFFFFFFF, int(sent_bytes_per_s)),
             0,
             next_cast,
             self._heard(sessions, now),

@@ -168,6 +168,7 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
         if held & outbound.scheduler.waiting:
             until = state.yielding.holds_until(now)
             if until is not None:
+                peer.book_held(held & outbound.scheduler.waiting, now, until)
                 state.set_timer(peer, until)
 
 
@@ -260,7 +261,8 @@ def handle_timer(state: State, now: float) -> None:
 def _send_heartbeats(state: State, now: float) -> None:
     sessions = list(state.roster.sessions.values())
     waiting = state.yielding.waiting_here(state.waiting_outbounds(), now)
-    beat = state.discovery.compose(state.settings, sessions, waiting, state.casts.next_number, now)
+    sent = state.sent.per_s(now)
+    beat = state.discovery.compose(state.settings, sessions, waiting, state.casts.next_number, sent, now)
     datagrams = announce(beat, state.to_all, state.links.values(), state.settings.neighbours)
     state.ledger.counters.heartbeats_sent += len(datagrams)
     state.outgoing.extend(datagrams)

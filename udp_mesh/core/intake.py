@@ -155,6 +155,7 @@ def _take_frames(state: State, session: Session, frames: list[Frame], number: in
             case Ack():
                 if frame.largest < session.way.channel.next_number:
                     session.way.confirmed = session.knows_us = True
+                    session.peer_receives = (frame.receive_rate, now)
                     outbound.acknowledge(frame, now)
                     report_ended(state, peer, now)
                     state.ready[peer] = None
@@ -342,7 +343,7 @@ def _take_long(
                 leave(state, session, now)
         return
     if beat is not None and not session.proven:
-        session.learn(beat)
+        session.learn(beat, now)
         follow(state, session, link, source, now)
         prove(state, session, now)
     if beat is not None:

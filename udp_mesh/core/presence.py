@@ -36,7 +36,7 @@ REPORT_AGAIN_S = 60.0
 
 def greet(state: State, session: Session, beat: Heartbeat, link: str, source: Address, now: float) -> None:
     """An authentic heartbeat of a session, perhaps a recording until the session is proven."""
-    session.learn(beat)
+    session.learn(beat, now)
     session.last_heard = now
     if not beat.min_version <= VERSION <= beat.max_version:
         if now - state.incompatible_reported.get(session.boot_id, float("-inf")) > REPORT_AGAIN_S:
@@ -187,6 +187,7 @@ def go_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
 
 def housekeep(state: State, now: float) -> None:
     """A round: all peers with traffic, and of the others as many as one round bears."""
+    state.sent.feed(state.ledger.counters.bytes_sent, now)
     peers = list(state.roster.peers.values())
     start = state.look_from if state.look_from < len(peers) else 0
     state.look_from = start + LOOKED_AT_PER_ROUND

@@ -41,6 +41,7 @@ class Peer:
         "_settings",
         "conflict_reported_at",
         "engaged",
+        "held_until",
         "left",
         "legacy",
         "lost",
@@ -71,6 +72,8 @@ class Peer:
         """Earlier boot ids: never believed again."""
         self.timer_at = float("inf")
         """When this peer stands in the node's timer queue."""
+        self.held_until: dict[int, float] = {}
+        """Priority -> until when the time it is held back for other robots is booked."""
 
     def __getattr__(self, name: str) -> Outbound:
         # Only called for a slot not yet set: nothing is paid for this once the sending half is there.
@@ -79,6 +82,13 @@ class Peer:
         self.engaged = True
         self.outbound = Outbound(self._settings)
         return self.outbound
+
+    def book_held(self, levels: int, now: float, until: float) -> None:
+        """Levels of the mask wait here and are held back for other robots' urgent messages until then."""
+        for priority, book in enumerate(self.outbound.levels):
+            if levels >> priority & 1:
+                book.held_s += max(0.0, until - max(now, self.held_until.get(priority, now)))
+                self.held_until[priority] = until
 
     def apply(self, settings: Settings) -> None:
         """New settings; nothing on its way is touched."""
@@ -95,7 +105,6 @@ class Session:
         "broadcast_channels",
         "data_channels",
         "features",
-        "heard_from",
         "inbound",
         "interval_s",
         "introduced_at",
@@ -105,12 +114,11 @@ class Session:
         "name",
         "owed",
         "peer",
+        "peer_receives",
+        "peer_sends",
         "proven",
         "received_bytes",
-        "repair",
         "versions",
-        "waiting",
-        "waiting_at",
         "way",
     )
 
@@ -125,14 +133,16 @@ class Session:
         self.last_heard = float("-inf")
         self.meters = Meters(0.0)
         self.received_bytes = 0
+        self.peer_sends = (0, float("-inf"))
+        """Bytes per second that the peer says it sends to everybody, and when it said so."""
+        self.peer_receives = (0, float("-inf"))
+        """Bytes per second from here that the peer says arrive, and when it said so."""
         self.interval_s = settings.rates.heartbeat_s
         self.versions = (1, 1)
         self.features = 0
         self.inbound = Inbound(settings.rates, settings.limits)
         self.way = Way(SendChannel(keys[0], own_boot, boot_id))
         self.owed: list[Frame] = []
-        self.waiting: tuple[Waiting, ...] = ()
-        self.waiting_at = float("-inf")
         self.data_channels: list[ReceiveChannel] = []
         self.broadcast_channels: list[ReceiveChannel] = []
         self.set_keys(own_boot, keys)
@@ -164,10 +174,12 @@ class Session:
             return None
         delay_us = min((1 << 24) - 1, int(max(0.0, now - acks.arrived_at) * 1e6))
         acks.sent()
-        return Ack(acks.largest, acks.received >> 1, delay_us, 0, waiting)
+        arriving = min(0xFFFFFFFF, int(self.meters.received.per_s(now)))
+        return Ack(acks.largest, acks.received >> 1, delay_us, arriving, waiting)
 
-    def learn(self, beat: Heartbeat) -> None:
+    def learn(self, beat: Heartbeat, now: float) -> None:
         """What a heartbeat says about its sender."""
+        self.peer_sends = (beat.send_rate, now)
         self.interval_s = beat.interval_ms / 1000
         self.versions = (beat.min_version, beat.max_version)
         self.features = beat.features

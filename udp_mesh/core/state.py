@@ -13,6 +13,7 @@ from udp_mesh.core.discovery import Discovery
 from udp_mesh.core.ledger import Ledger
 from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Channel
+from udp_mesh.core.meter import Meter
 from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.outbox import Outboxes
 from udp_mesh.core.roster import Roster
@@ -44,6 +45,8 @@ class State:
         self.keys = live_keys(settings)
         self.links: dict[str, LinkInfo] = {}
         self.roster = Roster(settings, boot_id)
+        self.sent = Meter(now)
+        """Wire bytes of this node, to everybody."""
         self.ledger = Ledger(settings.limits.events)
         self.outboxes = Outboxes(store)
         self.discovery = Discovery(rng, settings.rates, now)

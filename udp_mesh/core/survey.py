@@ -3,10 +3,14 @@
 from dataclasses import replace
 
 from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions
+from udp_mesh.core.discovery import MISSED_HEARTBEATS
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.session import Peer
 from udp_mesh.core.state import State
+
+TOLD_FOR_S = 2.0
+"""What an acknowledgement says about rates holds for the second it averages, and one more."""
 
 
 def conditions(state: State, now: float) -> Conditions:
@@ -18,6 +22,7 @@ def conditions(state: State, now: float) -> Conditions:
     )
     outbounds = [peer.outbound for peer in state.roster.peers.values() if peer.engaged]
     counters = state.ledger.counters
+    sent_bits_per_s = _bits(state.sent, now)
     inbounds = [session.inbound for session in state.roster.sessions.values()]
     return Conditions(
         now,
@@ -31,6 +36,8 @@ def conditions(state: State, now: float) -> Conditions:
             fragments_sent=sum(outbound.sent_packets for outbound in outbounds),
             dropped_over_limit=counters.dropped_over_limit + sum(inbound.over_limit for inbound in inbounds),
         ),
+        sent_bits_per_s,
+        sent_bits_per_s + sum(peer.peer_sends_bits_per_s or 0.0 for peer in peers if peer.online),
         sum(inbound.partial_bytes for inbound in inbounds),
         sum(outbound.queued_bytes for outbound in outbounds),
         state.casts.kept_bytes,
@@ -57,6 +64,8 @@ def _peer(state: State, peer: Peer, outbound: Outbound, now: float) -> PeerCondi
         _bits(meters.sent, now) if meters is not None else 0.0,
         _bits(meters.delivered, now) if meters is not None else 0.0,
         _bits(meters.received, now) if meters is not None else 0.0,
+        _told(session.peer_receives, TOLD_FOR_S, now) if session is not None else None,
+        _told(session.peer_sends, MISSED_HEARTBEATS * session.interval_s, now) if session is not None else None,
         None if capacity is None else capacity * fragment_bytes * 8,
         outbound.window.packets,
         outbound.flight.outstanding,
@@ -85,6 +94,12 @@ def _queues(outbound: Outbound, now: float) -> tuple[QueueConditions, ...]:
             )
         )
     return tuple(queues)
+
+
+def _told(rate: tuple[int, float], for_s: float, now: float) -> float | None:
+    """Bits per second of what a peer said, unless that was too long ago."""
+    bytes_per_s, told_at = rate
+    return 8.0 * bytes_per_s if now - told_at <= for_s else None
 
 
 def _bits(meter: Meter, now: float) -> float:

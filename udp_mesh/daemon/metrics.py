@@ -20,6 +20,8 @@ _PEER_GAUGES = (
     ("peer_sent_bits_per_second", "Wire bits sent to the peer.", lambda peer: peer.sent_bits_per_s),
     ("peer_delivered_bits_per_second", "Payload bits the peer acknowledged.", lambda peer: peer.delivered_bits_per_s),
     ("peer_received_bits_per_second", "Wire bits received from the peer.", lambda peer: peer.received_bits_per_s),
+    ("peer_arrived_bits_per_second", "Wire bits the peer says arrive.", lambda peer: peer.arrived_bits_per_s),
+    ("peer_sends_bits_per_second", "Wire bits the peer says it sends to all.", lambda peer: peer.peer_sends_bits_per_s),
     ("peer_capacity_bits_per_second", "Estimated rate of the link.", lambda peer: peer.capacity_bits_per_s),
     ("peer_window_packets", "Packets that may be in flight.", lambda peer: peer.window_packets),
     ("peer_in_flight_packets", "Packets in flight.", lambda peer: float(peer.in_flight_packets)),
@@ -44,6 +46,11 @@ def render(conditions: Conditions, topics: Mapping[str, TopicCount], extra: Mapp
     for name in ("partial_bytes", "queued_bytes", "repair_bytes"):
         help_text = f"{name.replace('_', ' ').capitalize()} held."
         _family(lines, name, "gauge", help_text, [({}, getattr(conditions, name))])
+    for name, help_text, value in (
+        ("sent_bits_per_second", "Wire bits sent to everybody.", conditions.sent_bits_per_s),
+        ("heard_bits_per_second", "Wire bits that all nodes heard here send together.", conditions.heard_bits_per_s),
+    ):
+        _family(lines, name, "gauge", help_text, [({}, value)])
     for name, help_text, read in _PEER_GAUGES:
         samples = [({"peer": peer.name}, value) for peer in conditions.peers if (value := read(peer)) is not None]
         _family(lines, name, "gauge", help_text, samples)

@@ -84,6 +84,8 @@ def conditions_json(conditions: Conditions) -> Json:
         "name": conditions.name,
         "peers": [peer_json(peer, conditions.now) for peer in conditions.peers],
         "counters": plain(conditions.counters),
+        "sent_bits_per_s": round(conditions.sent_bits_per_s, 1),
+        "heard_bits_per_s": round(conditions.heard_bits_per_s, 1),
         "partial_bytes": conditions.partial_bytes,
         "queued_bytes": conditions.queued_bytes,
         "repair_bytes": conditions.repair_bytes,

@@ -55,7 +55,7 @@ class Heartbeat:
     known_peers: int
     """Peers online at the speaker."""
     send_rate: int
-    """What the speaker sends over this link, bytes/s averaged over about 1 s, for sharing a busy channel."""
+    """What the speaker sends to everybody, wire bytes/s averaged over about 1 s: how busy the channel is."""
     broadcast_number: int
     """The speaker's next packet number to all; a verified peer accepts no older broadcast packet (replays)."""
     broadcast_messages: int
@@ -123,7 +123,7 @@ class Ack(NamedTuple):
     delay_us: int
     """From the arrival of `largest` to this acknowledgement's sending, at most 2**24-1 us."""
     receive_rate: int
-    """Bytes/s arriving at the speaker from this peer, averaged over about one round trip (0 = unknown)."""
+    """Wire bytes/s arriving at the speaker from this peer, averaged over about 1 s (0 = none, or not known yet)."""
     waiting: tuple[Waiting, ...] = ()
 
 

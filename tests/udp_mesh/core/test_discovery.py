@@ -32,7 +32,7 @@ def test_whatever_asks_for_heartbeats_a_node_sends_no_more_than_its_share(
         now += wait
         while discovery.next_at <= now:
             sent.append(discovery.next_at)
-            discovery.compose(settings("a"), [], (), 0, discovery.next_at)
+            discovery.compose(settings("a"), [], (), 0, 0.0, discovery.next_at)
         discovery.answer(_session(), team, now)
     gaps = [later - earlier for earlier, later in itertools.pairwise(sent)]
     # a sparser heartbeat of its own may fall in between two answers
@@ -44,7 +44,7 @@ def test_a_new_node_is_answered_at_once_in_a_small_team_and_not_by_all_at_once_i
     rng = random.Random(seed)
     small, large = (Discovery(rng, RATES, 0.0) for _ in range(2))
     for discovery in (small, large):
-        discovery.compose(settings("a"), [], (), 0, 0.0)
+        discovery.compose(settings("a"), [], (), 0, 0.0, 0.0)
     small.answer(_session(), 10, 0.9)
     large.answer(_session(), 1000, 0.1)
     assert small.next_at <= 0.9 + ANSWER_WITHIN_S
@@ -86,3 +86,25 @@ def test_every_silent_peer_goes_offline_although_a_round_looks_at_few(monkeypatc
     for name in "bcdef":
         del world.nodes[name]
     assert world.run(20.0, until=lambda: len(world.told("a", PeerOffline)) == 5)
+
+
+def test_nodes_tell_each_other_what_they_send_and_what_arrives() -> None:
+    world = World(seed=5)
+    for name in ("a", "b", "c"):
+        world.add(settings(name, Topic("video", priority=9, reliable=False)))
+    world.run(3.0)
+    for _ in range(100):
+        world.send("a", "video", bytes(10_000), "b")
+        world.run(0.1)
+    sending = world.nodes["a"].conditions(world.now)
+    to_b = next(peer for peer in sending.peers if peer.name == "b")
+    # 10 kB ten times a second, with headers
+    assert 0.8e6 < sending.sent_bits_per_s < 1.0e6
+    assert to_b.arrived_bits_per_s is not None
+    assert 0.8e6 < to_b.arrived_bits_per_s < 1.0e6
+    heard = world.nodes["c"].conditions(world.now)
+    assert 0.8e6 < heard.heard_bits_per_s < 1.2e6
+    world.run(20.0)
+    later = world.nodes["a"].conditions(world.now)
+    assert next(peer for peer in later.peers if peer.name == "b").arrived_bits_per_s is None
+    assert world.nodes["c"].conditions(world.now).heard_bits_per_s < 20_000
