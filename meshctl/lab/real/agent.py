@@ -23,6 +23,7 @@ log = logging.getLogger("meshctl.lab.real.agent")
 _CHUNK_BYTES = 1 << 16
 # what a process that has ended may have left in its pipes is there already
 _DRAIN_S = 0.05
+_FAREWELL_S = 5.0
 
 
 class Agent:
@@ -35,13 +36,20 @@ class Agent:
         self._answer = answer
         self._doors = doors
         self._server: asyncio.Server | None = None
+        self._serving: set[asyncio.Task[None]] = set()
 
     async def open(self, host: str, port: int) -> None:
-        self._server = await asyncio.start_server(self._serve, host, port, limit=channel.LINE_BYTES)
+        self._server = await asyncio.start_server(self._accept, host, port, limit=channel.LINE_BYTES)
 
     def close(self) -> None:
         if self._server is not None:
             self._server.close()
+
+    def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        # a connection that is over must not take the task that serves it along
+        task = asyncio.ensure_future(self._serve(reader, writer))
+        self._serving.add(task)
+        task.add_done_callback(self._serving.discard)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
@@ -58,7 +66,7 @@ class Agent:
                     await self._dial(first["host"], reader, writer)
                 case "watch":
                     await self._watch(writer)
-        except (OSError, ValueError, KeyError, asyncio.IncompleteReadError) as error:
+        except (OSError, ValueError, KeyError, TimeoutError, asyncio.IncompleteReadError) as error:
             log.info("connection-ended reason=%s", error)
         finally:
             writer.close()
@@ -90,9 +98,18 @@ class Agent:
         node_reader, node_writer = await asyncio.open_connection(sock=made)
         try:
             writer.write(channel.line({}))
-            await asyncio.gather(_copy(reader, node_writer), _copy(node_reader, writer))
+            there = asyncio.ensure_future(_copy(reader, node_writer))
+            back = asyncio.ensure_future(_copy(node_reader, writer))
+            try:
+                # whichever ends first, the other one gets a while: a node without power says no farewell
+                await asyncio.wait((there, back), return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait((there, back), timeout=_FAREWELL_S)
+            finally:
+                there.cancel()
+                back.cancel()
+                await asyncio.gather(there, back, return_exceptions=True)
         finally:
-            node_writer.close()
+            node_writer.transport.abort()
 
     # -- processes --
 

@@ -14,6 +14,7 @@ from meshctl.lab import radio_groups
 from meshctl.lab.errors import LabError
 from meshctl.lab.ether import Ether
 from meshctl.lab.forward import Shape
+from meshctl.lab.quality import loss_of
 from meshctl.lab.real import hardware, losses
 from meshctl.lab.spec import Medium
 from meshctl.lab.state import NodeState
@@ -86,7 +87,9 @@ class RealEther(Ether):
             if name not in link.ends or not link.up:
                 continue
             other = link.b if name == link.a else link.a
-            fate = losses.Fate(link.loss_to(name), link.delay_ms, link.rate_kbps)
+            # a quality given by hand is what losses of that size make of a link
+            loss = max(link.loss_to(name), loss_of(link.tq))
+            fate = losses.Fate(loss, link.delay_ms, link.rate_kbps)
             if not fate.is_nothing:
                 heard.update({cell.mac: fate for cell in self._fleet.nodes[other].effective.cells})
         self.lose(state, heard)
@@ -97,16 +100,14 @@ class RealEther(Ether):
         wanted = (state.boots, batch)
         if self._lossy.get(state.spec.name, (state.boots, "")) == wanted:
             return
-        space = ("nsenter", f"--net=/proc/{state.pid}/ns/net")
         for cell in state.effective.cells:
-            losses.clear(space, cell.interface)
+            losses.clear(state.pid, cell.interface)
             if heard:
-                losses.put(space, cell.interface, losses.batch(cell.interface, heard))
+                losses.put(state.pid, cell.interface, losses.batch(cell.interface, heard))
         self._lossy[state.spec.name] = wanted
 
     def forget(self, name: str) -> None:
         """The node has configured its interfaces anew: what was done to them is gone."""
-        self._lossy.pop(name, None)
         self._lossy[name] = (self._fleet.nodes[name].boots, "?")
 
     # -- the way to the operator --

@@ -7,6 +7,7 @@ mac80211_hwsim's, moved into its namespace at every boot and back by the kernel 
 
 from __future__ import annotations
 
+import os
 import subprocess
 import time
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 from ipaddress import IPv4Interface
 from pathlib import Path
 
+from meshctl.lab import namespaces as ns
 from meshctl.lab.errors import LabError
 from meshctl.lab.spec import FleetSpec, LanSpec, Medium
 from meshctl.lab.state import label_mac
@@ -143,9 +145,21 @@ def ip(lines: Sequence[str], *, space: str = "") -> None:
     run(("ip", *where, "-batch", "-"), stdin="".join(f"{line}\n" for line in lines))
 
 
-def run(words: Sequence[str], *, stdin: str = "") -> str:
-    """What a program of the machine prints. Raises LabError with its complaint."""
-    done = subprocess.run(words, input=stdin, capture_output=True, text=True, check=False)
+def run(words: Sequence[str], *, stdin: str = "", node: int = 0) -> str:
+    """What a program of the machine prints, run in the network of the node whose process 1 is `node` (0: outside).
+
+    Raises LabError with its complaint. busybox' nsenter would run applets of its own where iproute2 is meant.
+    """
+    try:
+        network = os.open(f"/proc/{node}/ns/net", os.O_RDONLY | os.O_CLOEXEC) if node else -1
+    except FileNotFoundError as error:
+        raise LabError("the node has just ended") from error
+    enter = (lambda: ns.setns(network, ns.CLONE_NEWNET)) if node else None
+    try:
+        done = subprocess.run(words, input=stdin, capture_output=True, text=True, check=False, preexec_fn=enter)
+    finally:
+        if node:
+            os.close(network)
     if done.returncode != 0:
         raise LabError(f"{' '.join(words)}: {done.stderr.strip() or done.returncode}")
     return done.stdout

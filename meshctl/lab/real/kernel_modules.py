@@ -12,7 +12,7 @@ from meshctl.lab.errors import LabError
 MODULES = (
     "crc32c_generic", "virtio_pci", "virtio_net", "af_packet", "bridge", "veth",
     "aes_generic", "ctr", "ccm", "cmac", "gcm", "mac80211_hwsim", "batman-adv",
-    "sch_netem", "sch_ingress", "sch_prio", "cls_flower", "cls_matchall", "act_gact", "act_mirred", "ifb",
+    "sch_netem", "sch_htb", "sch_ingress", "cls_flower", "cls_matchall", "act_gact", "act_mirred", "ifb",
 )  # fmt: skip
 _DEPENDS = re.compile(rb"\0depends=([^\0]*)\0")
 

@@ -7,9 +7,9 @@ are lost with the probability that every attempt is: hwsim itself loses nothing.
 
 from __future__ import annotations
 
+import contextlib
 import json
-import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from meshctl.lab.errors import LabError
@@ -77,23 +77,24 @@ def _class(device: str, number: int, fate: Fate, loss: float) -> list[str]:
     ]
 
 
-def clear(space: Sequence[str], interface: str) -> None:
-    """Take away what `put` did; quiet when there is nothing."""
+def clear(pid: int, interface: str) -> None:
+    """Take away what `put` did to an interface of the node (its process 1); quiet when there is nothing."""
     for words in (("tc", "qdisc", "del", "dev", interface, "ingress"), ("ip", "link", "del", device_of(interface))):
-        subprocess.run((*space, *words), capture_output=True, check=False)
+        with contextlib.suppress(LabError):
+            run(words, node=pid)
 
 
-def put(space: Sequence[str], interface: str, lines: str) -> None:
-    """Apply `batch`'s lines in the namespace that the words `space` enter. Raises LabError."""
-    run((*space, "ip", "link", "add", device_of(interface), "up", "type", "ifb"))
-    run((*space, "tc", "-batch", "-"), stdin=lines)
+def put(pid: int, interface: str, lines: str) -> None:
+    """Apply `batch`'s lines in the network of the node. Raises LabError."""
+    device = device_of(interface)
+    run(("ip", "-batch", "-"), stdin=f"link add dev {device} type ifb\nlink set {device} up\n", node=pid)
+    run(("tc", "-batch", "-"), stdin=lines, node=pid)
 
 
 def originators(pid: int) -> list[str]:
     """The MAC addresses that the batman-adv of a node (its process 1) has a route to; none while it has no mesh."""
-    words = ("nsenter", f"--net=/proc/{pid}/ns/net", "batctl", "meshif", "bat0", "originators_json")
     try:
-        known = json.loads(run(words))
+        known = json.loads(run(("batctl", "meshif", "bat0", "originators_json"), node=pid))
     except (LabError, json.JSONDecodeError):
         return []
     return [str(one["orig_address"]) for one in known if one.get("best")]
