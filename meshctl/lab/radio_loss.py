@@ -5,12 +5,14 @@ losses change; `batch` turns each into the input of `ip -batch` and `tc -batch`.
 
 A broadcast leaves its sender once for all who hear it, so what one of them misses must be lost where it arrives:
 frames that a radio receives are redirected to an ifb device, sorted there by source MAC (u32 filters) into classes of
-an HTB that never slows anything, and lost by the netem of their class. Who is in no class passes untouched. What is
-taken here the radio has already acknowledged: a lost frame is not sent again, unlike on real radios, where unicast
-frames are tried several times and only broadcasts are lost as told.
+an HTB that never slows anything, and lost by the netem of their class. Who is in no class passes untouched.
 
-Devices and numbers: `ifb0`; HTB 1:, class 1:N+1 and netem N+10: for the sender with number N; filters 800::(16 N + k)
-for its k-th MAC. Numbers in tc are hexadecimal.
+802.11 sends a unicast frame again until it is acknowledged and a broadcast only once, so each sender has two classes:
+broadcasts are lost as told, and unicast frames as seldom as all attempts together are. The radios below have
+acknowledged everything already, hwsim loses nothing.
+
+Devices and numbers: `ifb0`; HTB 1:; for the sender with number N, classes 1:2N+1 (broadcasts) and 1:2N+2 (unicast),
+netem 2N+16: and 2N+17:, filters 800::(16N + 2k + 1) and the next for its k-th MAC. tc writes numbers in hexadecimal.
 """
 
 from __future__ import annotations
@@ -22,9 +24,13 @@ Command = tuple[str, ...]
 """A program and its words: `("tc", "qdisc", "add", ...)`."""
 
 DEVICE = "ifb0"
-# filters are numbered with 12 bits, of which a MAC takes 4
-_MACS = 15
+# filters are numbered with 12 bits, of which a sender takes 4 and each of its MACs two filters
+_MACS = 7
 _SENDERS = 255
+# how often a unicast frame is sent at most: dot11ShortRetryLimit's default of 7 (IEEE 802.11-2020, annex C)
+_ATTEMPTS = 7
+# matches a destination's group bit, the lowest of the frame's first byte, 14 before the network header
+_BROADCAST, _UNICAST = "match u8 0x01 0x01 at -14", "match u8 0x00 0x01 at -14"
 # faster than any radio, so that only netem ever holds a frame back
 _ENDLESS_RATE = "10gbit"
 # frames that wait in netem for their delay: 12 Mbit/s for a second
@@ -33,7 +39,7 @@ _QUEUE_FRAMES = 1000
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """What happens to frames from the sender with these MACs: `loss` is 0..1, `rate_kbps` None is endless."""
+    """What happens to frames from the sender with these MACs: `loss` 0..1 at one attempt, `rate_kbps` None: endless."""
 
     macs: tuple[str, ...]
     loss: float = 0.0
@@ -82,7 +88,7 @@ def changes(old: Mapping[int, Missing], new: Mapping[int, Missing]) -> list[Comm
         if known is None or known.macs != sender.macs:
             commands += _with(number, sender)
         elif known != sender:
-            commands.append(_netem("change", number, sender))
+            commands += [_netem("change", number, kind, sender) for kind in (0, 1)]
     return commands
 
 
@@ -92,36 +98,43 @@ def batch(commands: list[Command], program: str) -> str:
 
 
 def _with(number: int, sender: Missing) -> list[Command]:
-    filters = [
-        _tc("filter", "add", "parent 1: protocol all prio 1", f"handle {_handle(number, count)} u32", _from(mac),
-            f"flowid 1:{number + 1:x}")
-        for count, mac in enumerate(sender.macs)
-    ]  # fmt: skip
-    return [
-        _tc("class", "add", f"parent 1: classid 1:{number + 1:x} htb rate {_ENDLESS_RATE} quantum 60000"),
-        _netem("add", number, sender),
-        *filters,
-    ]
+    commands = []
+    for kind in (0, 1):
+        commands += [
+            _tc("class", "add", f"parent 1: classid {_class(number, kind)} htb rate {_ENDLESS_RATE} quantum 60000"),
+            _netem("add", number, kind, sender),
+        ]
+    for count, mac in enumerate(sender.macs):
+        commands += [
+            _tc("filter", "add", _filter(number, count, kind), to, _from(mac), f"flowid {_class(number, kind)}")
+            for kind, to in enumerate((_BROADCAST, _UNICAST))
+        ]
+    return commands
 
 
 def _without(number: int, sender: Missing) -> list[Command]:
     filters = [
-        _tc("filter", "del", f"parent 1: protocol all prio 1 handle {_handle(number, count)} u32")
-        for count in range(len(sender.macs))
+        _tc("filter", "del", _filter(number, count, kind)) for count in range(len(sender.macs)) for kind in (0, 1)
     ]
-    return [*filters, _tc("class", "del", f"classid 1:{number + 1:x}")]
+    return [*filters, *(_tc("class", "del", f"classid {_class(number, kind)}") for kind in (0, 1))]
 
 
-def _netem(verb: str, number: int, sender: Missing) -> Command:
-    rate = () if sender.rate_kbps is None else (f"rate {sender.rate_kbps}kbit",)
+def _netem(verb: str, number: int, kind: int, sender: Missing) -> Command:
+    loss = sender.loss ** (_ATTEMPTS if kind else 1)
     return _tc(
-        "qdisc", verb, f"parent 1:{number + 1:x} handle {number + 16:x}: netem limit {_QUEUE_FRAMES}",
-        f"loss {sender.loss * 100:g}% delay {sender.delay_ms:g}ms", *rate,
+        "qdisc", verb, f"parent {_class(number, kind)} handle {number * 2 + 16 + kind:x}:",
+        f"netem limit {_QUEUE_FRAMES}",
+        f"loss {loss * 100:.6f}% delay {sender.delay_ms:g}ms",
+        f"rate {sender.rate_kbps}kbit" if sender.rate_kbps is not None else "",
     )  # fmt: skip
 
 
-def _handle(number: int, count: int) -> str:
-    return f"800::{number * 16 + count + 1:x}"
+def _class(number: int, kind: int) -> str:
+    return f"1:{number * 2 + 1 + kind:x}"
+
+
+def _filter(number: int, count: int, kind: int) -> str:
+    return f"parent 1: protocol all prio 1 handle 800::{number * 16 + count * 2 + kind + 1:x} u32"
 
 
 def _from(mac: str) -> str:

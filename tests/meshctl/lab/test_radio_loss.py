@@ -40,28 +40,34 @@ def told(commands: list[Command]) -> list[str]:
     return [" ".join(words) for words in commands]
 
 
-def test_a_sender_gets_a_class_a_netem_and_a_filter_per_mac() -> None:
-    assert told(changes({}, {11: Missing((FIRST, SECOND), 0.3, 5.0, 64)})) == [
-        "tc class add dev ifb0 parent 1: classid 1:c htb rate 10gbit quantum 60000",
-        "tc qdisc add dev ifb0 parent 1:c handle 1b: netem limit 1000 loss 30% delay 5ms rate 64kbit",
-        "tc filter add dev ifb0 parent 1: protocol all prio 1 handle 800::b1 u32 match u32 0x024d0000 0xffffffff at -8"
-        " match u16 0x0001 0xffff at -4 flowid 1:c",
-        "tc filter add dev ifb0 parent 1: protocol all prio 1 handle 800::b2 u32 match u32 0x024d0001 0xffffffff at -8"
-        " match u16 0x0001 0xffff at -4 flowid 1:c",
+def test_a_sender_gets_a_class_and_a_netem_for_broadcasts_and_for_unicast_and_two_filters_per_mac() -> None:
+    from_first = "match u32 0x024d0000 0xffffffff at -8 match u16 0x0001 0xffff at -4"
+    assert told(changes({}, {11: Missing((FIRST,), 0.5, 5.0, 64)})) == [
+        "tc class add dev ifb0 parent 1: classid 1:17 htb rate 10gbit quantum 60000",
+        "tc qdisc add dev ifb0 parent 1:17 handle 26: netem limit 1000 loss 50.000000% delay 5ms rate 64kbit",
+        "tc class add dev ifb0 parent 1: classid 1:18 htb rate 10gbit quantum 60000",
+        "tc qdisc add dev ifb0 parent 1:18 handle 27: netem limit 1000 loss 0.781250% delay 5ms rate 64kbit",
+        "tc filter add dev ifb0 parent 1: protocol all prio 1 handle 800::b1 u32 match u8 0x01 0x01 at -14 "
+        f"{from_first} flowid 1:17",
+        "tc filter add dev ifb0 parent 1: protocol all prio 1 handle 800::b2 u32 match u8 0x00 0x01 at -14 "
+        f"{from_first} flowid 1:18",
     ]
 
 
-def test_another_loss_is_one_command_and_none_takes_everything_away() -> None:
+def test_another_loss_is_a_command_for_each_kind_and_none_takes_everything_away() -> None:
     old = {0: Missing((FIRST,), 0.3)}
     assert told(changes(old, {0: Missing((FIRST,), 1.0)})) == [
-        "tc qdisc change dev ifb0 parent 1:1 handle 10: netem limit 1000 loss 100% delay 0ms"
+        "tc qdisc change dev ifb0 parent 1:1 handle 10: netem limit 1000 loss 100.000000% delay 0ms",
+        "tc qdisc change dev ifb0 parent 1:2 handle 11: netem limit 1000 loss 100.000000% delay 0ms",
     ]
     assert (
         told(changes(old, {0: Missing((FIRST,))}))
         == told(changes(old, {}))
         == [
             "tc filter del dev ifb0 parent 1: protocol all prio 1 handle 800::1 u32",
+            "tc filter del dev ifb0 parent 1: protocol all prio 1 handle 800::2 u32",
             "tc class del dev ifb0 classid 1:1",
+            "tc class del dev ifb0 classid 1:2",
         ]
     )
 
@@ -131,7 +137,7 @@ def run(commands: list[Command]) -> None:
         subprocess.run([program, "-batch", "-"], input=plain, text=True, check=True)
 
 
-def counted() -> dict[str, int]:
+def sorted_frames() -> dict[str, int]:
     """Class -> frames that came to it."""
     text = subprocess.run(["tc", "-s", "class", "show", "dev", DEVICE], capture_output=True, text=True, check=True)
     return {
@@ -147,9 +153,9 @@ def arrived() -> int:
     return int(match[1])
 
 
-def send(air: socket.socket, mac: str, frames: int) -> None:
+def send(air: socket.socket, mac: str, frames: int, to: str = "ff:ff:ff:ff:ff:ff") -> None:
     for _ in range(frames):
-        air.send(bytes.fromhex("ff" * 6 + mac.replace(":", "") + "4305") + bytes(60))
+        air.send(bytes.fromhex((to + mac).replace(":", "") + "4305") + bytes(60))
 
 
 def test_frames_are_sorted_by_their_sender_and_all_others_pass(radio: socket.socket) -> None:
@@ -157,8 +163,10 @@ def test_frames_are_sorted_by_their_sender_and_all_others_pass(radio: socket.soc
     run([*prepare(), *receive("mesh0"), *changes({}, table)])
     for mac, frames in ((FIRST, 3), (SECOND, 4), (THIRD, 5), ("02:4d:00:00:00:02", 6)):
         send(radio, mac, frames)
-    until(lambda: counted() == {"1:1": 3, "1:8": 9}, "12 sorted frames")
-    assert arrived() >= 18
+    for mac, frames in ((FIRST, 7), (THIRD, 8)):
+        send(radio, mac, frames, to="02:4d:00:0f:00:01")
+    until(lambda: sorted_frames() == {"1:1": 3, "1:2": 7, "1:f": 9, "1:10": 8}, "27 sorted frames")
+    assert arrived() >= 27 + 6
 
 
 def test_a_sender_that_is_heard_well_again_is_no_longer_sorted(radio: socket.socket) -> None:
@@ -167,7 +175,7 @@ def test_a_sender_that_is_heard_well_again_is_no_longer_sorted(radio: socket.soc
     run([*prepare(), *receive("mesh0"), *changes({}, table), *changes(table, after)])
     for mac in (FIRST, SECOND, THIRD):
         send(radio, mac, 2)
-    until(lambda: counted() == {"1:1": 2, "1:3": 2}, "4 sorted frames")
+    until(lambda: sorted_frames() == {"1:1": 2, "1:2": 0, "1:5": 2, "1:6": 0}, "4 sorted frames")
 
 
 def test_a_radio_interface_that_is_made_anew_needs_its_own_step_alone(radio: socket.socket) -> None:
@@ -178,4 +186,4 @@ def test_a_radio_interface_that_is_made_anew_needs_its_own_step_alone(radio: soc
     with socket.socket(socket.AF_PACKET, socket.SOCK_RAW) as again:
         again.bind(("air2", 0))
         send(again, FIRST, 2)
-    until(lambda: counted() == {"1:1": 2}, "2 sorted frames")
+    until(lambda: sorted_frames() == {"1:1": 2, "1:2": 0}, "2 sorted frames")
