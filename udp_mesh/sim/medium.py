@@ -6,6 +6,10 @@ quiet meanwhile. The next hop queues it in turn. Routes follow the least expecte
 looked at anew every `route_s`, which stands for the mesh layer's own reconnect time. A broadcast is flooded: each
 station sends it on once, `broadcast_repeats` times, without acknowledgement.
 
+Each station has two queues, as wifi's access categories for video and best effort (IEEE 802.11, EDCA; every 802.11n
+radio has them, and our daemon marks urgent datagrams for the first): urgent frames do not stand behind others and
+draw from fewer slots. `access_categories=False` is a radio without them.
+
 Not modelled: hidden stations, capture, rate adaptation.
 """
 
@@ -23,9 +27,11 @@ from udp_mesh.sim.agenda import Agenda
 # IP and UDP headers, and what 802.11 and batman-adv add to a frame
 IP_UDP_BYTES = 28
 FRAME_BYTES = 68
-# 802.11n at 2.4 GHz: one slot, and the smallest contention window
+# 802.11n at 2.4 GHz: one slot; slots waited before drawing and the smallest contention window, for best effort and for
+# video (IEEE 802.11-2020, table 9-155; the two slots that both wait are part of a transmission's overhead)
 SLOT_S = 9e-6
-CONTENTION_SLOTS = 16
+BEST_EFFORT_SLOTS = (1, 16)
+VIDEO_SLOTS = (0, 8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +45,7 @@ class Channel:
     broadcast_repeats: int = 1
     route_s: float = 1.0
     hop_delay_s: float = 0.0005
+    access_categories: bool = True
 
 
 @dataclass(slots=True)
@@ -49,6 +56,7 @@ class Frame:
     source: str
     to: str | None
     data: bytes
+    urgent: bool = False
 
 
 @dataclass(slots=True)
@@ -58,19 +66,31 @@ class Counts:
     transmissions: int = 0
     bytes: int = 0
     airtime_s: float = 0.0
+    airtime_s_of: dict[str, float] = field(default_factory=dict)
+    """By the station that sent."""
     queue_drops: int = 0
     losses: int = 0
     unroutable: int = 0
 
 
 @dataclass(slots=True)
-class _Station:
-    name: str
-    queue: deque[Frame] = field(default_factory=deque)
-    quiet_until_s: float = 0.0
+class _Queue:
+    """One access category of one station."""
+
+    station: _Station
+    slots: tuple[int, int]
+    frames: deque[Frame] = field(default_factory=deque)
     is_waiting: bool = False
-    is_on: bool = True
-    flooded: deque[int] = field(default_factory=lambda: deque(maxlen=512))
+
+
+class _Station:
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.urgent = _Queue(self, VIDEO_SLOTS)
+        self.other = _Queue(self, BEST_EFFORT_SLOTS)
+        self.quiet_until_s = 0.0
+        self.is_on = True
+        self.flooded: deque[int] = deque(maxlen=512)
 
 
 Loss = Callable[[str, str, float], float]
@@ -107,7 +127,8 @@ class Medium:
         found = self._stations[station]
         found.is_on = on
         if not on:
-            found.queue.clear()
+            found.urgent.frames.clear()
+            found.other.frames.clear()
         self._routed_s = -1.0
 
     def links(self) -> dict[str, dict[str, float]]:
@@ -126,10 +147,10 @@ class Medium:
             a, count = step, count + 1
         return count
 
-    def send(self, source: str, to: str | None, data: bytes) -> None:
+    def send(self, source: str, to: str | None, data: bytes, *, urgent: bool = False) -> None:
         """Hand over one datagram; a full queue drops it without a word, as a radio does."""
         self._frames += 1
-        frame = Frame(self._frames, source, to, data)
+        frame = Frame(self._frames, source, to, data, urgent and self._channel.access_categories)
         station = self._stations[source]
         if to is None:
             station.flooded.append(frame.number)
@@ -138,35 +159,38 @@ class Medium:
     def _enqueue(self, station: _Station, frame: Frame) -> None:
         if not station.is_on:
             return
-        if len(station.queue) >= self._channel.queue_frames:
+        queue = station.urgent if frame.urgent else station.other
+        if len(queue.frames) >= self._channel.queue_frames:
             self.counts.queue_drops += 1
             return
-        station.queue.append(frame)
-        self._contend(station)
+        queue.frames.append(frame)
+        self._contend(queue)
 
-    def _contend(self, station: _Station) -> None:
+    def _contend(self, queue: _Queue) -> None:
         """Try at the next silence, after a random number of slots."""
-        if station.is_waiting or not station.queue:
+        if queue.is_waiting or not queue.frames:
             return
-        station.is_waiting = True
-        backoff_s = self._rng.randrange(CONTENTION_SLOTS) * SLOT_S
-        start_s = max(self._agenda.now, station.quiet_until_s) + backoff_s
-        self._agenda.at(start_s, lambda: self._turn(station))
+        queue.is_waiting = True
+        first, window = queue.slots
+        backoff_s = (first + self._rng.randrange(window)) * SLOT_S
+        start_s = max(self._agenda.now, queue.station.quiet_until_s) + backoff_s
+        self._agenda.at(start_s, lambda: self._turn(queue))
 
-    def _turn(self, station: _Station) -> None:
-        station.is_waiting = False
-        if not station.queue or not station.is_on:
+    def _turn(self, queue: _Queue) -> None:
+        queue.is_waiting = False
+        station = queue.station
+        if not queue.frames or not station.is_on:
             return
         if station.quiet_until_s > self._agenda.now:
-            self._contend(station)
+            self._contend(queue)
             return
         self._look_around()
-        frame = station.queue.popleft()
+        frame = queue.frames.popleft()
         if frame.to is None:
             self._broadcast(station, frame)
         else:
             self._forward(station, frame)
-        self._contend(station)
+        self._contend(queue)
 
     def _occupy(self, station: _Station, frame: Frame, times: int) -> float:
         """The air around a station is taken for `times` transmissions; returns their end."""
@@ -180,6 +204,7 @@ class Medium:
         self.counts.transmissions += times
         self.counts.bytes += size * times
         self.counts.airtime_s += took_s
+        self.counts.airtime_s_of[station.name] = self.counts.airtime_s_of.get(station.name, 0.0) + took_s
         return end_s + self._channel.hop_delay_s
 
     def _forward(self, station: _Station, frame: Frame) -> None:

@@ -258,6 +258,9 @@ def _numbers(at: _At, made: Any, whole: tuple[str, ...] = ()) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for name in known:
         if name in entries:
+            if isinstance(getattr(made, name), bool):
+                values[name] = entries[name].flag()
+                continue
             value = entries[name].number(getattr(made, name))
             values[name] = int(value) if name in whole else value
     return values

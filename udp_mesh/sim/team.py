@@ -172,7 +172,7 @@ class Team:
                 to_all = datagram.destination is None or datagram.destination[0] == BROADCAST
                 to = None if datagram.destination is None else self._addresses.get(datagram.destination[0])
                 if to_all or to is not None:
-                    self.medium.send(member.name, to, bytes(datagram.data))
+                    self.medium.send(member.name, to, bytes(datagram.data), urgent=datagram.urgent)
         while (event := member.node.next_event()) is not None:
             self.ledger.note(member.name, member.run, event)
             self._on_event(now, member.name, event)

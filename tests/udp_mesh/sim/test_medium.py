@@ -134,3 +134,41 @@ def test_a_course_is_walked_in_straight_lines() -> None:
     assert walked.at(0) == (0, 0)
     assert walked.at(15) == (50, 25)
     assert walked.at(99) == (100, 50)
+
+
+def test_an_urgent_frame_does_not_stand_behind_its_stations_others() -> None:
+    line = Line("ab", rate=1e6)
+    for _ in range(20):
+        line.medium.send("a", "b", bytes(1000))
+    line.medium.send("a", "b", b"stop", urgent=True)
+    line.agenda.run_until(1.0)
+    places = [frame.urgent for _, _, frame in line.arrived]
+    assert len(places) == 21
+    assert places.index(True) <= 1
+
+
+def test_urgent_frames_wait_less_for_the_channel_than_others() -> None:
+    line = Line("ab", rate=1e6, queue_frames=10_000)
+    for _ in range(500):
+        line.medium.send("a", "b", bytes(1000), urgent=True)
+        line.medium.send("b", "a", bytes(1000))
+    line.agenda.run_until(4.0)
+    assert line.stations.count("b") > 1.5 * line.stations.count("a")
+
+
+def test_a_radio_without_access_categories_keeps_the_order() -> None:
+    line = Line("ab", rate=1e6, access_categories=False)
+    for number in range(20):
+        line.medium.send("a", "b", bytes(1000), urgent=number % 2 == 1)
+    line.agenda.run_until(1.0)
+    assert [frame.number for _, _, frame in line.arrived] == list(range(1, 21))
+
+
+def test_each_stations_airtime_is_counted() -> None:
+    line = Line("ab")
+    line.medium.send("a", "b", bytes(1000))
+    line.medium.send("b", "a", bytes(10))
+    line.agenda.run_until(1.0)
+    counts = line.medium.counts
+    assert counts.airtime_s_of["a"] > counts.airtime_s_of["b"] > 0
+    assert sum(counts.airtime_s_of.values()) == counts.airtime_s
