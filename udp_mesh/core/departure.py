@@ -8,6 +8,7 @@ last fragments, small messages, pieces sent again) is built frame by frame, smal
 import struct
 from heapq import heappop
 
+from udp_mesh.core.allowance import ack_spacing, look_again, permitted
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.flight import Mark, Packet
 from udp_mesh.core.limiter import Gate
@@ -38,12 +39,6 @@ IP6_EXTRA_BYTES = 20
 
 LEAST_ROOM_BYTES = 64
 """Less room than this in a datagram is not worth looking for another small message."""
-
-MOST_ACK_SPACING = 10
-"""Packets between two that ask for an acknowledgement at once; a third of the window, if that is less."""
-
-ACK_SPACING = 0.25
-"""Part of the window between two packets that ask for an acknowledgement at once."""
 
 _NARROW = struct.Struct(">BIH")
 _WIDE = struct.Struct(">BII")
@@ -93,11 +88,8 @@ def leave_level(
     gates: dict[str, Gate],
 ) -> int:
     """Let what waits on one level leave, at most about `room_bytes`; returns the bytes that left."""
-    rates = outbound.rates
-    urgent_level = priority <= rates.urgent_priority
-    window = outbound.window
-    flight = outbound.flight
-    level_pace = window.packets_per_s()
+    urgent_level = priority <= outbound.rates.urgent_priority
+    level_pace = outbound.window.packets_per_s()
     used = 0
     mark = outbound.mark(now)
     while used < room_bytes:
@@ -106,19 +98,11 @@ def leave_level(
             break
         urgent = urgent_level and not run.stale
         pace = None if urgent else level_pace
-        if outbound.silent_since is not None:
-            permitted = outbound.probe_credit
-        else:
-            permitted = int(window.packets) - flight.outstanding
-            if urgent:
-                permitted += rates.urgent_excess_packets
-            else:
-                permitted = min(permitted, outbound.pacer.allowance(now, pace))
-            permitted = max(permitted, outbound.probe_credit)
-        if permitted <= 0:
+        most = permitted(outbound, now, pace, urgent=urgent)
+        if most <= 0:
             outbound.limited = False
-            if not urgent and outbound.silent_since is None and flight.outstanding < window.packets - 1:
-                outbound.wake_at = outbound.pacer.wake_at(pace)
+            if not urgent and (again := look_again(outbound, now, pace)) is not None:
+                outbound.wake_at = again
             break
         message = run.message
         if message.superseded and run.again:
@@ -134,8 +118,8 @@ def leave_level(
             run = Run(message, 0, message.fragments, again=False)
         before = used
         is_plain = gate is None and message.accepted.broadcast_number is None
-        if run.position and run.length > 2 and permitted > 1 and is_plain:
-            count = min(run.length - 1, permitted, 1 + (room_bytes - used) // message.fragment_bytes)
+        if run.position and run.length > 2 and most > 1 and is_plain:
+            count = min(run.length - 1, most, 1 + (room_bytes - used) // message.fragment_bytes)
             used += _leave_run(outbound, way, run, count, mark, out)
         else:
             count = 1
@@ -188,7 +172,7 @@ def _leave_run(outbound: Outbound, way: Way, run: Run, count: int, mark: Mark, o
     add = outbound.flight.add
     append = out.append
     link, address = way.link, way.address
-    spacing = max(2, min(MOST_ACK_SPACING, int(outbound.window.packets * ACK_SPACING)))
+    spacing = ack_spacing(outbound)
     since = outbound.since_ack_wanted
     wide = position + count > _NARROW_POSITIONS
     pack = _WIDE.pack if wide else _NARROW.pack
@@ -224,7 +208,7 @@ def _leave_one(outbound: Outbound, way: Way, run: Run, urgent: bool, mark: Mark,
     priority = message.priority
     scheduler = outbound.scheduler
     again = 0
-    spacing = max(2, min(MOST_ACK_SPACING, int(outbound.window.packets * ACK_SPACING)))
+    spacing = ack_spacing(outbound)
     outbound.since_ack_wanted += 1
     next_run: Run | None = run
     while next_run is not None:

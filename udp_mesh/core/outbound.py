@@ -25,7 +25,7 @@ from udp_mesh.core.window import AdaptiveWindow, FixedWindow, Window
 from udp_mesh.wire.frames import Ack
 from udp_mesh.wire.limits import PRIORITY_LEVELS
 
-PROBE_SOON_S = 0.05
+PROBE_SOON_S = 0.025
 """Between probes in the first second of a silence: most cuts of a moving robot are that short."""
 
 PROBE_S = 0.25
@@ -34,7 +34,7 @@ PROBE_S = 0.25
 PROBE_SOON_FOR_S = 1.0
 
 SILENT_AFTER_TIMEOUTS = 3
-SILENT_AFTER_S = 0.15
+SILENT_AFTER_S = 0.25
 """Without any acknowledgement for both of these the peer is silent. Until then packets are replaced as they time out,
 at the pace of the window: a burst of losses then costs little more than its own length."""
 
@@ -53,6 +53,10 @@ LOSS_MEMORY_PACKETS = 256
 
 COPY_ROUND_TRIPS = 1.1
 """Round trips after which the answer to an urgent piece, asked for at once, is overdue."""
+
+LOSSY = 0.1
+LOSSY_COPY_S = 0.02
+"""From this loss on two copies are often lost together: the third does not wait longer than this for the answer."""
 
 
 class Outcome(Enum):
@@ -281,7 +285,8 @@ class Outbound:
         """A small urgent piece left over a lossy way: again soon, and once more when its answer should be here."""
         delays = [self.rates.twice_gap_s]
         if self.trip.smoothed is not None:
-            delays.append(COPY_ROUND_TRIPS * self.trip.smoothed + self.rates.twice_gap_s)
+            overdue_s = COPY_ROUND_TRIPS * self.trip.smoothed + self.rates.twice_gap_s
+            delays.append(min(overdue_s, LOSSY_COPY_S) if self.loss >= LOSSY else overdue_s)
         for delay in delays:
             self._copy_serial += 1
             heappush(self.copies, (now + delay, self._copy_serial, message, position))

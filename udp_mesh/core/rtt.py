@@ -1,12 +1,12 @@
 """The round trip to one peer: a sample per acknowledgement -> smoothed, least and standing round trip.
 
-*Least* is the path without queues (minimum over about 2.5 s), *standing* is what packets take now, free of single late
+*Least* is the path without queues (minimum over about 5 s), *standing* is what packets take now, free of single late
 acknowledgements (minimum over half a round trip, at least 20 ms). Smoothed and variation as RFC 6298.
 """
 
 from collections import deque
 
-LEAST_WINDOW_S = 2.5
+LEAST_WINDOW_S = 5.0
 """Longer hides a route that became longer for that time; shorter forgets the empty path between two drains."""
 
 LEAST_WINDOW_ROUND_TRIPS = 37.5

@@ -18,13 +18,13 @@ from collections import deque
 from enum import Enum
 from typing import Protocol
 
-from udp_mesh.core.rtt import RoundTrip
+from udp_mesh.core.rtt import STANDING_WINDOW_S, RoundTrip
 
-QUEUE_S = 0.004
+QUEUE_S = 0.0035
 """Queue the sender keeps at the bottleneck: covers batched acknowledgements and pacing; adds this much to urgent
 latency."""
 
-LOSS_QUEUE = 8.0
+LOSS_QUEUE = 12.0
 LOSS_QUEUE_UP_TO = 0.05
 """Losses leave holes in the queue: some more of it keeps the link busy, up to what urgent messages can bear."""
 
@@ -56,21 +56,23 @@ MOST_LOSS = 0.35
 START_WINDOW = 10.0
 """Packets before anything is known (RFC 6928)."""
 
-LEAST_UPDATE_S = 0.004
-"""On links faster than this round trip the law runs at this pace: single acknowledgements are too noisy there."""
+LEAST_UPDATE_S = STANDING_WINDOW_S
+"""On links faster than this round trip the law runs at this pace: until then the standing round trip still tells of the
+window before."""
+
+LEAST_START_S = 0.004
+"""The same while starting, when only growth counts."""
 
 RATE_WINDOW_S = 2.0
 """How long a measured delivery rate is believed."""
 
-DRAIN_EVERY_S = 1.0
+DRAIN_EVERY_S = 2.0
 DRAIN_EVERY_ROUND_TRIPS = 15.0
 """Between two drains, at least: each costs about a quarter of a round trip of throughput."""
 
-DRAIN_TO = 0.8
-"""Part of the pipe filled while draining."""
-
-GROWTH = 1.25
-"""Growth per round trip while the window is used up and yet no queue is seen: the link has become faster."""
+DRAIN_TO = 0.95
+DRAIN_PACKETS = 3
+"""Part of the pipe filled while draining, less these packets: on a short path a burst of them is the queue."""
 
 GROWTH = 1.25
 """Growth per round trip while the window is used up and yet no queue is seen: the link has become faster."""
@@ -97,6 +99,7 @@ SUSPECT_QUEUE_S = 0.015
 """Queueing of this much is more than our own window explains."""
 
 SUSPECT_AGAIN_S = 0.3
+MOST_SUSPECT_AGAIN_S = 4.0
 """Between two drains on suspicion, doubled each time one finds nothing."""
 
 
@@ -131,6 +134,10 @@ class Window(Protocol):
         """Estimated packets/s of the path."""
         ...
 
+    def presumable(self) -> bool:
+        """Whether the link can be presumed to go on delivering as it did while acknowledgements are late."""
+        ...
+
 
 class FixedWindow:
     """A number of packets, whatever happens: the paper's scheme."""
@@ -159,6 +166,9 @@ class FixedWindow:
 
     def capacity(self) -> float | None:
         return None
+
+    def presumable(self) -> bool:
+        return False
 
 
 class Phase(Enum):
@@ -223,6 +233,10 @@ class AdaptiveWindow:
     def capacity(self) -> float | None:
         return self._rates[0][1] if self._rates else None
 
+    def presumable(self) -> bool:
+        # A queue that our window does not explain is work enough for the link; and a drain wants it empty.
+        return bool(self._rates) and self.phase in (Phase.STARTUP, Phase.CRUISE) and not self._queue_is_suspect()
+
     def packets_per_s(self) -> float | None:
         smoothed = self._trip.smoothed
         if smoothed is None:
@@ -273,7 +287,7 @@ class AdaptiveWindow:
             return
         if self.phase is Phase.HOLD:
             self._held_least = min(self._held_least, trip.latest)
-            if largest >= self._hold_from:
+            if largest >= self._hold_from or trip.latest <= trip.least:
                 self._end_drain(now)
                 self._round_ends = next_number
             return
@@ -281,7 +295,7 @@ class AdaptiveWindow:
             self.phase = Phase.CRUISE
             self._drained_at = now
             self.packets = max(LEAST_WINDOW, self.packets * trip.least / trip.standing)
-        if largest < self._round_ends or now - self._updated_at < max(trip.standing, LEAST_UPDATE_S):
+        if largest < self._round_ends or now - self._updated_at < max(trip.standing, self._least_update_s()):
             return
         self._round_ends = next_number
         self._updated_at = now
@@ -289,6 +303,13 @@ class AdaptiveWindow:
             # The empty path was seen just now: no drain is needed to see it.
             self._drained_at = now
         self._update(limited=limited, now=now)
+
+    def _least_update_s(self) -> float:
+        return LEAST_START_S if self.phase is Phase.STARTUP else LEAST_UPDATE_S
+
+    def _queue_is_suspect(self) -> bool:
+        least, standing = self._trip.least, self._trip.standing
+        return least is not None and standing is not None and standing - least > SUSPECT_QUEUE_S + 0.25 * least
 
     def _update(self, *, limited: bool, now: float) -> None:
         least, standing = self._trip.least, self._trip.standing
@@ -299,8 +320,7 @@ class AdaptiveWindow:
                 self._start_faster(least, standing, now)
             return
         since_drain = now - self._drained_at
-        suspect = standing - least > SUSPECT_QUEUE_S + 0.25 * least
-        self._suspected = self._suspected + 1 if suspect else 0
+        self._suspected = self._suspected + 1 if self._queue_is_suspect() else 0
         if self._suspected >= 2 and since_drain > max(self._suspect_every, 4 * standing):
             self._begin_drain(now, suspicion=True)
             return
@@ -370,7 +390,7 @@ class AdaptiveWindow:
         self._saved = self.packets
         self._was_standing = standing
         self._updated_at = now
-        self.packets = max(LEAST_WINDOW - 1, DRAIN_TO * self.packets * least / standing)
+        self.packets = max(LEAST_WINDOW - 1, DRAIN_TO * self.packets * least / standing - DRAIN_PACKETS)
 
     def _end_drain(self, now: float) -> None:
         least = self._trip.least
@@ -389,7 +409,7 @@ class AdaptiveWindow:
                 throughput = self.capacity() or throughput
             self._suspect_every = SUSPECT_AGAIN_S
         elif self._suspicion:
-            self._suspect_every = min(2 * self._suspect_every, DRAIN_EVERY_S * 4)
+            self._suspect_every = min(2 * self._suspect_every, MOST_SUSPECT_AGAIN_S)
         else:
             self.packets = self._saved
             return

@@ -95,15 +95,15 @@ def settled(seconds: float = 4.0, *, urgent: bool = True, seed: int = 1, **link:
     return run.measure(seconds)
 
 
-@pytest.mark.parametrize(("loss", "share"), [(0.0, 0.945), (0.05, 0.93), (0.2, 0.92)])
+@pytest.mark.parametrize(("loss", "share"), [(0.0, 0.95), (0.05, 0.94), (0.2, 0.935)])
 def test_bulk_fills_a_lossy_link(loss: float, share: float) -> None:
     figures = settled(urgent=False, loss=loss)
     assert figures.goodput_bits_per_s >= share * 10e6 * (1 - loss)
 
 
-@pytest.mark.parametrize(("loss", "least_p99_s"), [(0.0, 0.021), (0.05, 0.028), (0.2, 0.060)])
+@pytest.mark.parametrize(("loss", "least_p99_s"), [(0.0, 0.020), (0.05, 0.028), (0.2, 0.050)])
 def test_an_urgent_message_overtakes_the_bulk_that_fills_the_link(loss: float, least_p99_s: float) -> None:
-    figures = settled(6.0, loss=loss)
+    figures = settled(15.0, loss=loss)
     assert figures.latency(0.5) <= 0.022
     assert figures.latency(0.99) <= least_p99_s
 
