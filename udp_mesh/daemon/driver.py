@@ -3,9 +3,7 @@
 1. A socket becomes readable: all waiting datagrams go to the core (`_drain`).
 2. `_pump`: timers that are due, datagrams that may leave now (in runs, through segmentation offload), events to the
    listener, one timer for what comes next.
-3. Where wake-ups come often and carry little (`rhythm`), the readers are taken off the loop and everything is looked at
-   once per tick instead.
-4. The kernel reports a change of interfaces: the links are brought up to date, the core is told.
+3. The kernel reports a change of interfaces: the links are brought up to date, the core is told.
 
 A full socket never blocks the other links: its datagrams wait in a short queue, and past that they are lost as on a
 radio.
@@ -24,7 +22,6 @@ from udp_mesh.core.events import Event, MessageId, Rejected
 from udp_mesh.core.node import Node
 from udp_mesh.core.seams import Datagram, RandomSource, Store
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
-from udp_mesh.daemon.rhythm import TICK_S, Rhythm
 from udp_mesh.links.attachments import Address, LinkWish
 from udp_mesh.links.hub import LinkHub
 from udp_mesh.links.netlink import InterfaceMonitor
@@ -78,8 +75,6 @@ class Driver:
         self._timer_at = 0.0
         self._refresh: asyncio.TimerHandle | None = None
         self._pump_requested = False
-        self._rhythm = Rhythm()
-        self._moved = 0
         self.closed = False
         self._wall_offset: float | None = None
         self._looked_at = 0.0
@@ -179,8 +174,7 @@ class Driver:
         for link in self.hub.links.values():
             if self._blocked.get(link.attachment.name):
                 self._loop.add_writer(link.fileno(), self._writable, link)
-            if not self._rhythm.ticking:
-                self._loop.add_reader(link.fileno(), self._readable, link)
+            self._loop.add_reader(link.fileno(), self._readable, link)
 
     def _interfaces_changed(self) -> None:
         assert self._monitor is not None
@@ -213,7 +207,7 @@ class Driver:
         """Hands what waits to the core, each datagram with the time it arrived; then `_now` is the time of the look."""
         self._looked_at = self._read_clocks()
         self._link_name = link.attachment.name
-        self._moved += link.receive(self._deliver, DRAIN_DATAGRAMS)
+        link.receive(self._deliver, DRAIN_DATAGRAMS)
         self._now = max(self._now, self._looked_at)
 
     def _read_clocks(self) -> float:
@@ -240,13 +234,6 @@ class Driver:
             at = self._looked_at
         self._now = at
         self.node.receive(data, self._link_name, source, at)
-
-    def _change_rhythm(self) -> None:
-        for link in self.hub.links.values():
-            if self._rhythm.ticking:
-                self._loop.remove_reader(link.fileno())
-            else:
-                self._loop.add_reader(link.fileno(), self._readable, link)
 
     # Out
 
@@ -278,14 +265,8 @@ class Driver:
         if more:
             self._pump_soon()
         self.wakeups += 1
-        moved, self._moved = self._moved, 0
-        if self._rhythm.woke(self._now, moved):
-            self._change_rhythm()
         due = self.node.next_timer()
-        if self._rhythm.ticking:
-            # Everything waits for the next tick, a few milliseconds at most.
-            self._schedule(now + TICK_S)
-        elif due is not None:
+        if due is not None:
             self._schedule(due)
 
     def _schedule(self, at: float) -> None:
@@ -299,9 +280,6 @@ class Driver:
 
     def _timer_due(self) -> None:
         self._timer = None
-        if self._rhythm.ticking:
-            for link in list(self.hub.links.values()):
-                self._drain(link)
         self._pump()
 
     def _transmit_all(self) -> bool:
@@ -320,7 +298,6 @@ class Driver:
                 self._transmit(name, batch[start:end] if end - start < len(batch) else batch)
                 start = end
             sent += sum(len(datagram.data) for datagram in batch)
-            self._moved += len(batch)
         return True
 
     def _transmit(self, name: str, datagrams: list[Datagram]) -> None:
