@@ -18,8 +18,9 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from meshctl.errors import InputError
 from meshctl.inventory import load_fleet
 from meshctl.inventory.edit import Editor, save
+from meshctl.lab import ground_file
+from meshctl.lab.ground import links_of
 from meshctl.lab.spec import LinkSpec
-from meshctl.lab.twin import load_links
 from meshctl.model import Fleet
 
 # beside fleet.yaml, if the fleet's own shape matters
@@ -58,7 +59,8 @@ def prepare(source: Path, directory: Path, *, environ: Mapping[str, str] = os.en
     editor.set(("defaults", "ssh", "key_files"), [str(key_file)])
     save(editor.changes())
     links = target / LINKS_FILE
-    return Copy(copied, load_fleet(copied, environ=environ), key_file, load_links(links) if links.exists() else None)
+    heard = list(links_of(ground_file.load(links))) if links.exists() else None
+    return Copy(copied, load_fleet(copied, environ=environ), key_file, heard)
 
 
 def _key_pair(path: Path) -> str:

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
-import yaml
-
-from meshctl.errors import InputError
 from meshctl.lab.spec import MESH_PACKAGES, FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
 from meshctl.model import Fleet, Node, Robot, Role
 
@@ -47,33 +42,6 @@ def default_links(names: Sequence[str]) -> list[LinkSpec]:
     chain = [LinkSpec(a, b, tq=250, signal_dbm=-58) for a, b in pairwise(names)]
     past = [LinkSpec(a, b, tq=120, signal_dbm=-79) for a, b in list(zip(names, names[2:], strict=False))[::2]]
     return chain + past
-
-
-def load_links(path: Path) -> list[LinkSpec]:
-    """Links from a YAML file: a list of `{between: [A, B], tq: 250, signal_dbm: -58, delay_ms: 5, loss: 0.01, ...}`.
-
-    Raises InputError naming the file and the entry.
-    """
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from error
-    entries = content.get("links") if isinstance(content, dict) else None
-    if not isinstance(entries, list):
-        raise InputError(f"{path}: expected a mapping with the list `links`")
-    return [_link(path, number, entry) for number, entry in enumerate(entries, 1)]
-
-
-def _link(path: Path, number: int, entry: object) -> LinkSpec:
-    match entry:
-        case {"between": [str(a), str(b)], **rest}:
-            fields: Mapping[str, Any] = {str(key): value for key, value in rest.items()}
-            try:
-                return LinkSpec(a, b, **fields)
-            except TypeError as error:
-                raise InputError(f"{path}: link {number} ({a}-{b}): {error}") from error
-        case _:
-            raise InputError(f"{path}: link {number}: expected `between: [A, B]`, found {entry!r}")
 
 
 def _lan_spec(robot: Robot, names: Sequence[str]) -> LanSpec:

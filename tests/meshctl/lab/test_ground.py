@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -17,6 +18,7 @@ from meshctl.lab.ground import DEAF_LOSS, Air, Ground, Place, Wall, frame_loss, 
 from meshctl.lab.spec import LinkSpec
 
 FILE = "ground.yaml"
+EXAMPLES = Path(__file__).parents[3] / "inventory" / "lab"
 coordinates = st.integers(-400, 400).map(float)
 points = st.tuples(coordinates, coordinates)
 names = st.sampled_from([f"n{number}" for number in range(8)])
@@ -122,6 +124,17 @@ links:
             LinkSpec("b01", "b02", up=False),
         ),
     )
+
+
+def test_the_example_s_links_are_a_ground_without_places() -> None:
+    ground = ground_file.load(EXAMPLES / "links.yaml")
+    assert ground.places == {}
+    assert links_of(ground)[0] == LinkSpec("base", "b01", tq=252, signal_dbm=-52)
+
+
+def test_the_example_s_places_make_a_line_with_a_robot_at_two_of_its_nodes() -> None:
+    pairs = {"-".join(sorted(link.ends)) for link in links_of(ground_file.load(EXAMPLES / "ground.yaml"))}
+    assert pairs == {"b01-base", "b01-b02", "b02-b03", "b01-rover1", "b03-rover2"}
 
 
 @given(grounds)

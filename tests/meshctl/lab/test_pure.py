@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -53,15 +51,6 @@ def test_every_node_of_a_big_fleet_is_a_few_hops_away() -> None:
         return 0 if name == "n0" else 1 + hops(parents[name])
 
     assert max(map(hops, names)) <= 6
-
-
-def test_links_come_from_a_file_with_the_entry_named_when_one_is_wrong(tmp_path: Path) -> None:
-    file = tmp_path / "links.yaml"
-    file.write_text("links:\n  - {between: [a, b], tq: 200, loss: 0.1}\n", encoding="utf-8")
-    assert twin.load_links(file) == [LinkSpec("a", "b", tq=200, loss=0.1)]
-    file.write_text("links:\n  - {between: [a, b], colour: red}\n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"links\.yaml: link 1 \(a-b\).*colour"):
-        twin.load_links(file)
 
 
 def test_breaks_are_words_and_some_take_a_step() -> None:
