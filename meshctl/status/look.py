@@ -38,8 +38,11 @@ from meshctl.status.values import Silence
 
 T = TypeVar("T")
 
-# So many are asked at once: enough that the silent cost one deadline for all, few enough for a laptop's memory.
-SIDE_BY_SIDE = 64
+# So many are asked at once while answers come in: more would only make each other's handshakes late.
+SIDE_BY_SIDE = 32
+# When none came for so long, those asked are silent, and so many more are asked beside them: all the silent of a fleet
+# cost one deadline together.
+NOBODY_ANSWERS_S = 0.3
 # A busy radio with a 560 MHz processor takes about ten seconds for all its answers (device/observe.py).
 OBSERVE_S = 30.0
 _SALT_BYTES = 16
@@ -216,18 +219,29 @@ def first_line(error: Exception) -> str:
 K = TypeVar("K")
 
 
-def side_by_side(jobs: Mapping[K, Callable[[], object]], parallel: int, progress: Progress = _quiet) -> dict[K, object]:
-    """What each job returned, or the NodeError it raised, in the jobs' order; at most `parallel` run at once.
+def side_by_side(
+    jobs: Mapping[K, Callable[[], object]],
+    parallel: int,
+    progress: Progress = _quiet,
+    *,
+    patience_s: float = NOBODY_ANSWERS_S,
+) -> dict[K, object]:
+    """What each job returned, or the NodeError it raised, in the jobs' order.
 
-    Any other exception is raised here. The threads are daemons: nobody who leaves early waits for them.
+    `parallel` run at once, and `parallel` more whenever none has ended for `patience_s`. Any other exception is raised
+    here. The threads are daemons: nobody who leaves early waits for them.
     """
-    waiting: queue.SimpleQueue[K | None] = queue.SimpleQueue()
+    waiting: queue.SimpleQueue[K] = queue.SimpleQueue()
     finished: queue.SimpleQueue[tuple[K, object, BaseException | None]] = queue.SimpleQueue()
     for key in jobs:
         waiting.put(key)
 
     def work() -> None:
-        while (key := waiting.get()) is not None:
+        while True:
+            try:
+                key = waiting.get_nowait()
+            except queue.Empty:
+                return
             try:
                 finished.put((key, jobs[key](), None))
             except NodeError as error:
@@ -235,16 +249,20 @@ def side_by_side(jobs: Mapping[K, Callable[[], object]], parallel: int, progress
             except BaseException as error:  # noqa: BLE001 - handed over to the caller's thread, which raises it
                 finished.put((key, None, error))
 
-    threads = min(parallel, len(jobs))
-    for _ in range(threads):
-        # one end mark for each thread, behind the last job
-        waiting.put(None)
-        threading.Thread(target=work, name="look", daemon=True).start()
+    def ask_more() -> None:
+        for _ in range(min(parallel, waiting.qsize())):
+            threading.Thread(target=work, name="look", daemon=True).start()
+
+    ask_more()
     found: dict[K, object] = {}
-    for done in range(1, len(jobs) + 1):
-        key, answer, bug = finished.get()
+    while len(found) < len(jobs):
+        try:
+            key, answer, bug = finished.get(timeout=patience_s)
+        except queue.Empty:
+            ask_more()
+            continue
         if bug is not None:
             raise bug
         found[key] = answer
-        progress(done, len(jobs))
+        progress(len(found), len(jobs))
     return {key: found[key] for key in jobs}

@@ -72,11 +72,11 @@ def _troubles(
     if _sends(topic, facts.robot):
         silent = _silence(here.sent_ago_s, here.sent_messages, limit)
         if silent:
-            yield "silent", f"{silent} sent"
+            yield "silent", f"has sent nothing {silent}"
     live = [name for name in _live_sources(topic, told, facts, limit) if name != facts.robot]
     silent = _silence(here.received_ago_s, here.received_messages, limit)
     if live and silent and ("all" in topic.destinations or facts.robot in topic.destinations):
-        yield "not-arriving", f"{silent} arrived, though {', '.join(live)} sends"
+        yield "not-arriving", f"nothing has arrived {silent}, though {', '.join(live)} sends"
 
 
 def _sends(topic: Topic, robot: str) -> bool:
@@ -86,8 +86,8 @@ def _sends(topic: Topic, robot: str) -> bool:
 def _silence(ago_s: float | None, messages: int, limit: float) -> str:
     """How long nothing came, where that is too long; a daemon that counts and tells no ages is believed."""
     if ago_s is None:
-        return "" if messages else "nothing was ever"
-    return f"for {duration(ago_s)} nothing was" if ago_s > limit else ""
+        return "" if messages else "yet"
+    return f"for {duration(ago_s)}" if ago_s > limit else ""
 
 
 def _live_sources(topic: Topic, told: Mapping[str, RobotFacts], facts: RobotFacts, limit: float) -> Iterable[str]:

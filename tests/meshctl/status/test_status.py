@@ -1,157 +1,114 @@
-"""What the status says of a fleet follows from what was seen: health, alarms, go or no-go, pictures."""
+"""What the status says of the radios follows from what was seen: health, alarms, what is kept and remembered."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
+from typing import Any
 
 import pytest
 
+from meshctl.device.errors import AuthenticationRefused, HostKeyChanged, HostKeyUnknown, Timeout
 from meshctl.device.observation import (
     BoardInfo,
+    Bridge,
     ChangeStatus,
+    Load,
     Memory,
     MeshNeighbour,
-    Observation,
-    Originator,
     RadioState,
-    ReleaseInfo,
     Space,
-    Station,
     WirelessLink,
 )
-from meshctl.errors import ExitCode
+from meshctl.errors import ExitCode, NodeError
 from meshctl.fleet.journal import LastKnown
-from meshctl.inventory import load_fleet
 from meshctl.model import Fleet
 from meshctl.plan import FileChange, NodePlan, Verdict
-from meshctl.status import FleetStatus, Health, assess, preflight
-from meshctl.status.assess import Look
-from meshctl.status.document import as_json
-from meshctl.status.picture import FORMATS, Picture, directions
-from meshctl.status.text import preflight_text, text
-from meshctl.topology import observed_graph, report_of
+from meshctl.status import Health
+from meshctl.status.memory import facts_to_keep, remembered, typed
+from meshctl.status.silence import silence_of
+from meshctl.status.text import text
+from meshctl.status.values import Silence
+from tests.meshctl.status.fleets import HEALTHY, MACS, NOW, alarms, health, seen, status_of
 
-INVENTORY = """\
-meshctl: 1
-fleet: trio
-country: US
-operators: {ssh_keys: ["ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIGWzgxmFwBtebEfUvHgyG0To5jOoLtmIA3MQHQjEQWFX alice"]}
-hardware:
-  rocket:
-    board: ubnt,rocket-m
-    profile: ubnt_rocket-m
-    target: ath79/generic
-    release: "23.05"
-    lan_ports: [eth0]
-    memory_mib: 64
-    radios: {radio0: {path: pci0000:00/0000:00:00.0, band: 2g, rated_power_dbm: 27, max_drive_dbm: 27}}
-meshes:
-  main: {ssid: trio, bssid: "02:ca:fe:00:00:01", band: 2g, channel: 6, network: 10.42.0.0/24}
-defaults: {hardware: rocket, state: deployed, radios: {radio0: {tx_power_dbm: 20}}}
-nodes:
-  base: {role: base, address: 10.42.0.1}
-  b01: {role: beacon, address: 10.42.0.2}
-  b02: {role: beacon, address: 10.42.0.3, state: carried}
-  rover: {role: robot, robot: rover, address: 10.42.0.4}
-robots:
-  rover: {nodes: [rover]}
-"""
-NOW = 1_700_000_000.0
-MACS = {
-    "base": "02:00:00:00:00:01",
-    "b01": "02:00:00:00:00:02",
-    "b02": "02:00:00:00:00:03",
-    "rover": "02:00:00:00:00:04",
-}
+WITHOUT_ROVER = {name: HEALTHY[name] for name in ("base", "b01")}
 
 
-@pytest.fixture
-def fleet(tmp_path: Path) -> Fleet:
-    path = tmp_path / "fleet.yaml"
-    path.write_text(INVENTORY)
-    return load_fleet(path)
-
-
-def seen(name: str, hears: dict[str, int], **other: object) -> Observation:
-    """A healthy node that hears these nodes with these batman qualities (0..255)."""
-    made = Observation(
-        asked_at_s=NOW - 1.5,
-        answered_at_s=NOW - 1.0,
-        release=ReleaseInfo("OpenWrt", "23.05.5", "r24106", "ath79/generic"),
-        board=BoardInfo("ubnt,rocket-m"),
-        boot_id="one",
-        uptime_s=5000.0,
-        clock_s=NOW - 1.25,
-        memory=Memory(64 << 20, 20 << 20, 30 << 20),
-        overlay=Space("/overlay", 4 << 20, 2 << 20),
-        macs={"mesh0": MACS[name]},
-        radios=(RadioState("radio0", True, False, False, False, {}, (("mesh0", "mesh0"),)),),
-        links=(WirelessLink("mesh0", "IBSS", MACS[name], "trio", channel=6, joined=True),),
-        stations=tuple(Station("mesh0", MACS[n], signal_dbm=-60) for n in hears),
-        neighbours=tuple(MeshNeighbour(MACS[n], "mesh0", 100) for n in hears),
-        originators=tuple(Originator(MACS[n], MACS[n], "mesh0", 100, True, tq=tq) for n, tq in hears.items()),
-        uci_changes=(),
-        change=ChangeStatus("idle"),
-    )
-    return replace(made, **other)  # type: ignore[arg-type]
-
-
-HEALTHY = {
-    "base": seen("base", {"b01": 250}),
-    "b01": seen("b01", {"base": 250, "rover": 200}),
-    "rover": seen("rover", {"b01": 200}),
-}
-
-
-def status_of(
-    fleet: Fleet,
-    observations: dict[str, Observation],
-    plans: dict[str, NodePlan] | None = None,
-    known: dict[str, LastKnown] | None = None,
-) -> FleetStatus:
-    macs = {mac: name for name, mac in MACS.items()}
-    graph = observed_graph([report_of(name, one) for name, one in observations.items()], known_macs=macs)
-    look = Look(
-        fleet=fleet, observations=observations, silent={}, plans=plans or {}, graph=graph, known=known or {},
-        macs=macs, entry="base",
-    )  # fmt: skip
-    return assess(look, fleet.managed(), NOW)
-
-
-def codes(status: FleetStatus, name: str) -> list[str]:
-    return [alarm.code for node in status.nodes if node.name == name for alarm in node.alarms]
-
-
-def health(status: FleetStatus) -> dict[str, Health]:
-    return {node.name: node.health for node in status.nodes}
-
-
-def test_a_carried_beacon_that_is_off_is_fine(fleet: Fleet) -> None:
-    status = status_of(fleet, HEALTHY)
-    assert health(status) == {"base": Health.OK, "b01": Health.OK, "rover": Health.OK, "b02": Health.OFF}
+def test_what_is_carried_and_off_is_fine(fleet: Fleet) -> None:
+    status = status_of(fleet)
+    off = {"b02": Health.OFF, "shelf": Health.OFF}
+    assert health(status) == {"base": Health.OK, "b01": Health.OK, "rover": Health.OK, **off}
     assert status.exit_code is ExitCode.OK
+
+
+def test_a_carried_beacon_that_others_hear_and_that_does_not_answer_is_worth_a_look(fleet: Fleet) -> None:
+    b01 = seen("b01", {"base": 250, "rover": 200, "b02": 240})
+    status = status_of(fleet, {**HEALTHY, "b01": b01}, silent={"b02": Silence("no answer to connect within 5 s")})
+    assert "b01 hears it" in alarms(status, "b02")["mute"].text
+    assert status.exit_code is ExitCode.FINDINGS
 
 
 def test_a_deployed_node_that_is_silent_is_missed_and_told_by_whom_it_is_heard(fleet: Fleet) -> None:
     known = {"rover": LastKnown("rover", NOW - 600, {"version": "23.05.5"})}
-    status = status_of(fleet, {name: HEALTHY[name] for name in ("base", "b01")}, known=known)
+    status = status_of(fleet, WITHOUT_ROVER, known=known)
     assert health(status)["rover"] is Health.UNREACHABLE
-    (alarm,) = next(node for node in status.nodes if node.name == "rover").alarms
-    assert "last answered 10 min ago; b01 hears it" in alarm.text
+    alarm = alarms(status, "rover")["unreachable"]
+    assert "last answered 10 min ago; b01 hears it (-60 dBm, 0.1 s ago)" in alarm.text
     assert status.exit_code is ExitCode.UNREACHABLE
 
 
+def test_who_is_gone_for_good_is_told_with_the_place_it_was_at(fleet: Fleet) -> None:
+    known = {"rover": LastKnown("rover", NOW - 600, {"hops": "2", "via": "b01"})}
+    status = status_of(fleet, {"base": seen("base", {})}, known=known)
+    assert alarms(status, "rover")["unreachable"].hint.startswith("it was 2 hops out, behind b01")
+    assert "meshctl bootstrap b01" in alarms(status, "b01")["unreachable"].hint
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (Timeout("b01 (10.42.0.2): no answer to connect within 5 s", phase="connect"), "unreachable"),
+        (HostKeyChanged("b01 (10.42.0.2): the host key changed", fingerprint="x", key_type="y"), "host-key"),
+        (HostKeyUnknown("b01 (10.42.0.2): not pinned", fingerprint="x", key_type="y"), "untrusted"),
+        (AuthenticationRefused("b01 (10.42.0.2): let root in with none of: key", hint="name a key"), "login"),
+        (NodeError("b01 (10.42.0.2): odd"), "failed"),
+    ],
+)
+def test_why_a_node_gave_no_answer_has_a_code_of_its_own(fleet: Fleet, error: NodeError, code: str) -> None:
+    silence = silence_of(error)
+    assert not silence.reason.startswith("b01")
+    status = status_of(fleet, WITHOUT_ROVER, silent={"rover": silence})
+    (found,) = alarms(status, "rover").values()
+    assert found.code == code
+
+
+def test_a_carried_node_that_keeps_us_out_is_told_though_it_may_be_off(fleet: Fleet) -> None:
+    status = status_of(fleet, silent={"b02": Silence("the host key changed", "host-key")})
+    assert "meshctl trust b02 --replace" in alarms(status, "b02")["host-key"].hint
+    assert health(status)["b02"] is Health.DEGRADED
+
+
 def test_hops_and_quality_follow_the_path_to_the_base(fleet: Fleet) -> None:
-    rover = next(node for node in status_of(fleet, HEALTHY).nodes if node.name == "rover")
+    rover = next(node for node in status_of(fleet).nodes if node.name == "rover")
     assert (rover.hops, rover.via) == (2, "b01")
     assert rover.quality == pytest.approx(250 / 255 * 200 / 255)
 
 
+def test_a_look_at_some_tells_no_paths(fleet: Fleet) -> None:
+    rover = next(node for node in status_of(fleet, is_partial=True).nodes if node.name == "rover")
+    assert (rover.hops, rover.is_path_known, rover.is_cut_vertex) == (None, False, False)
+    assert alarms(status_of(fleet, is_partial=True), "b01") == {}
+
+
+def test_a_node_without_a_path_to_a_base_that_answers_is_told(fleet: Fleet) -> None:
+    apart = {"base": seen("base", {}), "b01": seen("b01", {"rover": 200}), "rover": HEALTHY["rover"]}
+    status = status_of(fleet, apart)
+    assert "no-path" in alarms(status, "rover")
+    assert "alone" in alarms(status, "base")
+
+
 def test_a_node_that_holds_others_is_named_as_a_cut_vertex_without_degrading_it(fleet: Fleet) -> None:
-    status = status_of(fleet, HEALTHY)
-    assert codes(status, "b01") == ["cut-vertex"]
+    status = status_of(fleet)
+    assert list(alarms(status, "b01")) == ["cut-vertex"]
     assert health(status)["b01"] is Health.OK
 
 
@@ -165,28 +122,39 @@ def test_a_node_that_holds_others_is_named_as_a_cut_vertex_without_degrading_it(
         ({"change": ChangeStatus("armed", owner="bob", left_s=40.0)}, "change"),
         ({"radios": (RadioState("radio0", False, False, False, True, {}, ()),)}, "radio"),
         ({"links": (WirelessLink("mesh0", "IBSS", MACS["rover"], joined=False),)}, "join"),
+        ({"links": (WirelessLink("mesh0", "IBSS", MACS["rover"], channel=11, joined=True),)}, "channel"),
+        ({"bridges": (Bridge("br-lan", ("bat0",)),)}, "bridge"),
         ({"neighbours": (), "originators": (), "stations": ()}, "alone"),
     ],
 )
-def test_what_is_wrong_with_a_node_degrades_it(fleet: Fleet, change: dict[str, object], code: str) -> None:
+def test_what_is_wrong_with_a_node_degrades_it(fleet: Fleet, change: dict[str, Any], code: str) -> None:
     status = status_of(fleet, {**HEALTHY, "rover": seen("rover", {"b01": 200}, **change)})
-    assert code in codes(status, "rover")
+    assert code in alarms(status, "rover")
     assert health(status)["rover"] is Health.DEGRADED
     assert status.exit_code is not ExitCode.OK
 
 
-@pytest.mark.parametrize(("change", "code"), [({"clock_s": 10.0}, "clock"), ({"uptime_s": 20.0}, "rebooted")])
-def test_what_only_informs_does_not_degrade(fleet: Fleet, change: dict[str, object], code: str) -> None:
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [({"clock_s": 10.0}, "clock"), ({"uptime_s": 20.0}, "rebooted"), ({"load": Load(9.0, 2)}, "load")],
+)
+def test_what_only_informs_does_not_degrade(fleet: Fleet, change: dict[str, Any], code: str) -> None:
     known = {"rover": LastKnown("rover", NOW - 600, {})}
     status = status_of(fleet, {**HEALTHY, "rover": seen("rover", {"b01": 200}, **change)}, known=known)
-    assert code in codes(status, "rover")
+    assert code in alarms(status, "rover")
     assert health(status)["rover"] is Health.OK
 
 
-def test_drift_names_the_files(fleet: Fleet) -> None:
+def test_a_factory_device_has_no_change_under_way(fleet: Fleet) -> None:
+    rover = seen("rover", {"b01": 200}, change=ChangeStatus("absent", installed=False))
+    assert alarms(status_of(fleet, {**HEALTHY, "rover": rover}), "rover") == {}
+
+
+def test_drift_names_the_files_and_the_commands_that_mend_it(fleet: Fleet) -> None:
     plan = NodePlan("rover", Verdict.CHANGE, files=(FileChange("etc/config/wireless", "changed", ""),))
-    status = status_of(fleet, HEALTHY, {"rover": plan})
-    assert "configuration differs: wireless" in text(status)
+    told = text(status_of(fleet, plans={"rover": plan}))
+    assert "rover: configuration differs: wireless" in told
+    assert "meshctl provision rover puts it right" in told
 
 
 def test_a_stranger_in_the_mesh_is_reported(fleet: Fleet) -> None:
@@ -197,32 +165,25 @@ def test_a_stranger_in_the_mesh_is_reported(fleet: Fleet) -> None:
     assert status.exit_code is ExitCode.FINDINGS
 
 
-def test_preflight_is_a_go_only_when_every_check_is(fleet: Fleet) -> None:
-    known = {"b02": LastKnown("b02", NOW - 60, {})}
-    good = preflight(fleet, status_of(fleet, HEALTHY, known=known))
-    assert preflight_text(good).splitlines()[-1] == "GO"
-    never_seen = preflight(fleet, status_of(fleet, HEALTHY))
-    assert [check.name for check in never_seen if not check.is_go] == ["beacons"]
-    without_robot = preflight(fleet, status_of(fleet, {n: HEALTHY[n] for n in ("base", "b01")}, known=known))
-    assert [check.name for check in without_robot if not check.is_go] == ["robot radios"]
+def test_what_could_not_be_compared_is_told_once_for_all(fleet: Fleet) -> None:
+    status = status_of(fleet, unrendered={"base": "env:KEY is not set", "b01": "env:KEY is not set"})
+    (alarm,) = status.alarms
+    assert alarm.text == "base, b01 not compared with the inventory: env:KEY is not set"
+    assert status.exit_code is ExitCode.FINDINGS
 
 
-def test_json_holds_every_node_and_is_json(fleet: Fleet) -> None:
-    told = json.loads(json.dumps(as_json(status_of(fleet, HEALTHY))))
-    assert [node["name"] for node in told["nodes"]] == ["base", "b01", "b02", "rover"]
-    assert told["exit_code"] == 0
+def test_what_is_kept_of_a_node_comes_back_when_it_is_silent(fleet: Fleet) -> None:
+    kept = facts_to_keep(status_of(fleet))
+    known = {"rover": LastKnown("rover", NOW - 90, {"version": "23.05.4", "macs": MACS["rover"]})}
+    known |= {name: LastKnown(name, NOW - 60, facts) for name, facts in kept.items()}
+    status = status_of(fleet, WITHOUT_ROVER, known=remembered(known))
+    rover = next(node for node in status.nodes if node.name == "rover")
+    assert rover.last_known is not None
+    facts = typed(rover.last_known)
+    assert (facts["version"], facts["hops"], facts["via"], facts["heard"]) == ("23.05.5", 2, "b01", ["b01"])
+    assert (facts["macs"], rover.age_s) == ([MACS["rover"]], 60)
+    assert "(2 hops)" in text(status)
 
 
-@pytest.mark.parametrize("form", list(FORMATS))
-def test_each_picture_shows_every_node_and_marks_the_cut_vertex(fleet: Fleet, form: str) -> None:
-    reports = {name: report_of(name, one) for name, one in HEALTHY.items()}
-    picture = Picture(
-        "main", "base", observed_graph(reports.values()), directions(reports, {m: n for n, m in MACS.items()}),
-        dict.fromkeys(HEALTHY, 1.0), {},
-    )  # fmt: skip
-    drawn = FORMATS[form](picture)
-    assert all(name in drawn for name in HEALTHY)
-    marks = {"table": "cut vertex: b01", "tree": "b01 *", "json": '"cuts_off"', "dot": '"b01" [shape=box]'}
-    assert marks.get(form, "NetworkGraph") in drawn
-    if form in ("json", "netjson"):
-        json.loads(drawn)
+def test_a_fact_that_another_version_wrote_otherwise_is_no_error() -> None:
+    assert typed({"hops": "two", "quality": "", "later": "x"}) == {"hops": None, "quality": None, "later": "x"}

@@ -1,0 +1,103 @@
+"""Preflight is a go only when every check is, and each no-go has its reason."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from meshctl.fleet.journal import LastKnown
+from meshctl.model import Fleet
+from meshctl.robots.facts import RobotFacts, ServiceFacts
+from meshctl.status import Check, preflight
+from meshctl.status.document import preflight_json
+from meshctl.status.pings import Pings, parse_pings, pings_of
+from meshctl.status.text import preflight_text
+from meshctl.status.values import Alarm, Level
+from tests.meshctl.status.fleets import CREW, HEALTHY, NOW, status_of, told
+
+KNOWN = {"b02": LastKnown("b02", NOW - 60, {})}
+DELIVERED = Pings({("station", "rover"): 0.01, ("rover", "station"): 0.02})
+
+
+def checks(
+    fleet: Fleet, robots: Mapping[str, RobotFacts] = CREW, pings: Pings | None = DELIVERED, **other: Any
+) -> dict[str, Check]:
+    status = status_of(fleet, robots=robots, **{"known": KNOWN, **other})
+    return {check.name: check for check in preflight(fleet, status, pings)}
+
+
+def stopped(found: Mapping[str, Check]) -> list[str]:
+    return [check.name for check in found.values() if not check.is_go]
+
+
+def test_a_healthy_team_is_a_go(fleet: Fleet) -> None:
+    found = checks(fleet)
+    assert stopped(found) == []
+    assert preflight_text(found.values()).splitlines()[-1] == "GO"
+    assert "the slowest rover to station in 20 ms" in found["delivery"].reason
+    assert preflight_json(found.values())["go"]
+
+
+def test_who_stays_on_the_shelf_is_named_and_stops_nobody(fleet: Fleet) -> None:
+    found = checks(fleet)
+    assert "not taking part: shelf (carried)" in found["robot radios"].reason
+    assert "not taking part: shelf" in found["daemons"].reason
+
+
+def test_a_beacon_that_was_never_seen_is_a_no_go_before_it_is_packed(fleet: Fleet) -> None:
+    found = checks(fleet, known={})
+    assert stopped(found) == ["beacons"]
+    assert "b02: never seen" in found["beacons"].reason
+
+
+def test_a_robot_whose_radio_is_silent_is_a_no_go(fleet: Fleet) -> None:
+    status = status_of(fleet, {name: HEALTHY[name] for name in ("base", "b01")}, known=KNOWN)
+    assert stopped({check.name: check for check in preflight(fleet, status, DELIVERED)}) == ["robot radios"]
+
+
+def test_a_robot_whose_daemon_is_down_is_a_no_go_with_the_reason(fleet: Fleet) -> None:
+    rover = replace(CREW["rover"], service=ServiceFacts("failed", "enabled", 0, "exit-code"), status={}, peers=())
+    found = checks(fleet, {**CREW, "rover": rover}, Pings())
+    assert "rover: its daemon is failed (exit-code)" in found["daemons"].reason
+    assert {"daemons", "delivery"} <= set(stopped(found))
+
+
+def test_robots_that_do_not_hear_each_other_are_a_no_go(fleet: Fleet) -> None:
+    found = checks(fleet, {**CREW, "station": told("station")})
+    assert found["peers"].reason == "station does not hear rover"
+
+
+def test_a_message_that_does_not_arrive_is_a_no_go_whatever_the_daemons_say(fleet: Fleet) -> None:
+    found = checks(fleet, pings=Pings({("station", "rover"): 0.01}, {("rover", "station"): "no-answer"}))
+    assert stopped(found) == ["delivery"]
+    assert found["delivery"].reason == "rover to station: no-answer"
+
+
+def test_an_urgent_topic_that_is_not_declared_is_a_no_go(fleet: Fleet) -> None:
+    found = checks(fleet, {**CREW, "rover": replace(CREW["rover"], topics=CREW["rover"].topics[1:])})
+    assert found["urgent topics"].reason == "rover: estop is not declared"
+
+
+def test_a_fleet_without_its_secrets_is_a_no_go_that_names_them(fleet: Fleet) -> None:
+    found = checks(fleet, unrendered={"base": "env:KEY is not set"})
+    assert stopped(found) == ["configuration"]
+    assert "env:KEY is not set" in found["configuration"].reason
+
+
+def test_robots_that_were_not_asked_are_told_and_not_judged(fleet: Fleet) -> None:
+    status = replace(
+        status_of(fleet, robots={}, known=KNOWN), robots=(), alarms=(Alarm(Level.NOTE, "robots-unasked", "not asked"),)
+    )
+    found = {check.name: check for check in preflight(fleet, status)}
+    assert stopped(found) == []
+    assert found["robots"].reason == "not checked: not asked"
+
+
+def test_pings_are_read_line_by_line_and_what_is_missing_has_no_answer() -> None:
+    text = '{"peer": "a", "round_trip_s": 0.5}\nnoise\n{"peer": "b", "error": "no-answer"}\n[1]\n{"peer": "c"}\n'
+    told = parse_pings(text, ("a", "b", "c", "d"))
+    assert told == {"a": 0.5, "b": "no-answer", "c": "no answer", "d": "the daemon did not try"}
+    pings = pings_of({"x": told})
+    assert pings.round_trips_s == {("x", "a"): 0.5}
+    assert pings.failed["x", "b"] == "no-answer"

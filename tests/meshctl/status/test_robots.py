@@ -1,0 +1,169 @@
+"""What the status says of the robots follows from what their computers told: health, alarms, topics, who hears whom."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from meshctl.errors import ExitCode
+from meshctl.fleet.journal import LastKnown
+from meshctl.model import Fleet
+from meshctl.robots.facts import ComputerFacts, RobotFacts, ServiceFacts, TopicFacts
+from meshctl.status import Health, Level
+from meshctl.status.memory import facts_to_keep, remembered
+from meshctl.status.text import text
+from meshctl.status.topics import limit_s
+from meshctl.status.values import Silence
+from tests.meshctl.status.fleets import CREW, NOW, alarms, peer, queue, robot_health, status_of, told
+
+DOWN = Silence("no answer to connect within 5 s")
+COMPUTER = CREW["rover"].computer
+
+
+def with_rover(**change: Any) -> dict[str, RobotFacts]:
+    return {**CREW, "rover": replace(CREW["rover"], **change)}
+
+
+def test_a_healthy_crew_has_no_alarm_and_the_one_on_the_shelf_is_off(fleet: Fleet) -> None:
+    status = status_of(fleet, silent_robots={"shelf": DOWN})
+    assert robot_health(status) == {"station": Health.OK, "rover": Health.OK, "shelf": Health.OFF}
+    assert status.exit_code is ExitCode.OK
+
+
+def test_a_silent_robot_whose_daemon_others_hear_is_told_so(fleet: Fleet) -> None:
+    status = status_of(fleet, robots={"station": CREW["station"]}, silent_robots={"rover": DOWN})
+    assert robot_health(status)["rover"] is Health.UNREACHABLE
+    assert (
+        "station hears it (0.5 s ago): its daemon is heard" in alarms(status, "rover", robot=True)["unreachable"].text
+    )
+    assert status.exit_code is ExitCode.UNREACHABLE
+
+
+def test_an_unpinned_computer_is_told_with_the_command_that_pins_it(fleet: Fleet) -> None:
+    silent = {"rover": Silence("no key is pinned", "untrusted")}
+    status = status_of(fleet, robots={"station": told("station")}, silent_robots=silent)
+    assert "meshctl robots trust rover" in alarms(status, "rover", robot=True)["untrusted"].hint
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "level"),
+    [
+        ({"service": ServiceFacts("failed", "enabled", 3, "exit-code")}, "daemon", Level.ERROR),
+        ({"service": ServiceFacts(), "release": ""}, "not-installed", Level.ERROR),
+        ({"status": {}}, "daemon", Level.ERROR),
+        ({"is_proven": False}, "unproven", Level.WARNING),
+        ({"bridge": ServiceFacts("failed", "enabled")}, "ros-bridge", Level.ERROR),
+        ({"drift": ("differs from the inventory: etc/udp-mesh.toml",)}, "drift", Level.WARNING),
+        ({"version": "0.0.9"}, "version", Level.WARNING),
+        ({"keys": ("cc", "bb")}, "key", Level.ERROR),
+        ({"unkeyed": True}, "unkeyed", Level.NOTE),
+        ({"peers": (peer("station", online=False),)}, "peers", Level.ERROR),
+        ({"queues": (queue(0, 2, 7.0),)}, "urgent-queue", Level.WARNING),
+        ({"computer": replace(COMPUTER, disk_free_kib=1 << 10)}, "disk", Level.ERROR),
+        ({"computer": replace(COMPUTER, disk_free_kib=1 << 20)}, "disk", Level.WARNING),
+        ({"computer": replace(COMPUTER, memory_free_kib=1 << 10)}, "memory", Level.WARNING),
+        ({"computer": replace(COMPUTER, clock_ahead_s=-3600.0)}, "clock", Level.WARNING),
+        ({"computer": replace(COMPUTER, load=(40.0, 9.0, 3.0))}, "load", Level.NOTE),
+    ],
+)
+def test_what_is_wrong_with_a_robot_has_a_code_and_a_level(
+    fleet: Fleet, change: dict[str, Any], code: str, level: Level
+) -> None:
+    status = status_of(fleet, robots=with_rover(**change))
+    alarm = alarms(status, "rover", robot=True)[code]
+    assert alarm.level is level
+    is_degraded = robot_health(status)["rover"] is Health.DEGRADED
+    assert is_degraded == (level > Level.NOTE)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"queues": (queue(6, 500, 60.0), queue(0, 1, 0.1))},
+        {"computer": ComputerFacts()},
+        {"computer": replace(COMPUTER, clock_ahead_s=2.0)},
+    ],
+)
+def test_what_is_as_it_should_be_or_was_not_told_is_no_alarm(fleet: Fleet, change: dict[str, Any]) -> None:
+    assert alarms(status_of(fleet, robots=with_rover(**change)), "rover", robot=True) == {}
+
+
+def test_the_version_that_most_run_is_the_right_one(fleet: Fleet) -> None:
+    crew = {name: told(name, version=version) for name, version in (("station", "2"), ("rover", "2"), ("shelf", "1"))}
+    status = status_of(fleet, robots=crew)
+    assert "version" not in alarms(status, "rover", robot=True)
+    assert "most others run 2" in alarms(status, "shelf", robot=True)["version"].text
+
+
+def test_a_robot_that_is_off_is_not_missed_by_its_peers(fleet: Fleet) -> None:
+    status = status_of(fleet, robots={"station": told("station")}, silent_robots={"rover": DOWN})
+    assert "peers" not in alarms(status, "station", robot=True)
+
+
+def test_an_urgent_queue_that_grows_since_the_last_look_is_an_error(fleet: Fleet) -> None:
+    first = status_of(fleet, robots=with_rover(queues=(queue(0, 2, 7.0, 1000),)))
+    known = remembered({name: LastKnown(name, NOW - 5, facts) for name, facts in facts_to_keep(first).items()})
+    second = status_of(fleet, robots=with_rover(queues=(queue(0, 4, 12.0, 2500),)), known=known)
+    alarm = alarms(second, "rover", robot=True)["urgent-queue"]
+    assert (alarm.level, "1000 to 2500 B" in alarm.text) == (Level.ERROR, True)
+    drained = status_of(fleet, robots=with_rover(queues=(queue(0, 1, 12.0, 500),)), known=known)
+    assert alarms(drained, "rover", robot=True)["urgent-queue"].level is Level.WARNING
+
+
+def test_restarts_count_since_the_last_look(fleet: Fleet) -> None:
+    known = {"robot.rover": LastKnown("robot.rover", NOW - 60, {"restarts": "2"})}
+    status = status_of(fleet, robots=with_rover(service=ServiceFacts("active", "enabled", 5)), known=known)
+    assert "3 times since the last look" in alarms(status, "rover", robot=True)["restarts"].text
+
+
+def topics(robot: str, **change: TopicFacts) -> dict[str, RobotFacts]:
+    """The crew, with one robot's topics changed by name."""
+    mine = tuple(change.get(topic.name, topic) for topic in CREW[robot].topics if topic.name not in change)
+    return {**CREW, robot: replace(CREW[robot], topics=(*mine, *change.values()))}
+
+
+def test_the_silence_a_topic_allows_follows_from_its_rate_and_deadline(fleet: Fleet) -> None:
+    limits = {topic.name: limit_s(topic) for topic in fleet.topics}
+    assert limits == {"estop": 50.0, "commands": None, "telemetry": 10.0}
+
+
+def test_a_source_that_sends_nothing_for_too_long_is_silent(fleet: Fleet) -> None:
+    crew = topics("rover", telemetry=TopicFacts("telemetry", 3, 10, 10, 40.0, 0.3))
+    alarm = alarms(status_of(fleet, robots=crew), "rover", robot=True)["topic-silent"]
+    assert alarm.text == "telemetry: has sent nothing for 40 s"
+
+
+def test_a_topic_that_others_send_and_that_does_not_arrive_names_them(fleet: Fleet) -> None:
+    crew = topics("rover", estop=TopicFacts("estop", 0, 0, 10, None, 90.0))
+    alarm = alarms(status_of(fleet, robots=crew), "rover", robot=True)["topic-not-arriving"]
+    assert (alarm.level, alarm.text) == (Level.ERROR, "estop: nothing has arrived for 90 s, though station sends")
+
+
+def test_nothing_is_said_of_receivers_while_the_source_is_silent(fleet: Fleet) -> None:
+    crew = topics("station", estop=TopicFacts("estop", 0, 10, 0, 300.0, None))
+    crew = {**crew, "rover": topics("rover", estop=TopicFacts("estop", 0, 0, 10, None, 300.0))["rover"]}
+    status = status_of(fleet, robots=crew)
+    assert "topic-silent" in alarms(status, "station", robot=True)
+    assert alarms(status, "rover", robot=True) == {}
+
+
+def test_a_daemon_younger_than_the_limit_is_not_silent_yet(fleet: Fleet) -> None:
+    crew = with_rover(
+        daemon_uptime_s=4.0, topics=(TopicFacts("estop", 0), TopicFacts("commands", 1), TopicFacts("telemetry", 3))
+    )
+    assert alarms(status_of(fleet, robots=crew), "rover", robot=True) == {}
+
+
+def test_an_urgent_topic_that_a_daemon_lacks_is_an_error(fleet: Fleet) -> None:
+    crew = with_rover(topics=CREW["rover"].topics[1:])
+    assert alarms(status_of(fleet, robots=crew), "rover", robot=True)["topic-undeclared"].level is Level.ERROR
+    other = topics("rover", telemetry=TopicFacts("telemetry", 7, 10, 10, 0.1, 0.1))
+    alarm = alarms(status_of(fleet, robots=other), "rover", robot=True)["topic-undeclared"]
+    assert (alarm.level, alarm.text) == (Level.WARNING, "telemetry: has priority 7, the inventory says 3")
+
+
+def test_the_computer_stands_below_its_radio(fleet: Fleet) -> None:
+    rows = [line.split()[:2] for line in text(status_of(fleet)).splitlines() if line.startswith(("rover", "station"))]
+    assert rows == [["station", "computer"], ["rover", "robot"], ["rover", "computer"]]
