@@ -14,8 +14,8 @@ VERSION = 1
 TYPE = "zenoh"
 """The mesh's type field of every such message: other bridges leave it alone, and this one leaves the others'."""
 _HEAD = struct.Struct(">BBBHHI")
-_DELETE, _EXPRESS, _BLOCK, _ATTACHED = 1, 2, 4, 8
-_FLAGS = _DELETE | _EXPRESS | _BLOCK | _ATTACHED
+_DELETE, _EXPRESS, _BLOCK, _ATTACHED, _AGAIN = 1, 2, 4, 8, 16
+_FLAGS = _DELETE | _EXPRESS | _BLOCK | _ATTACHED | _AGAIN
 PRIORITIES = range(1, 8)
 
 
@@ -24,7 +24,8 @@ class EnvelopeError(ValueError):
 
 
 class Envelope(NamedTuple):
-    """One sample. `block`: Zenoh waits rather than drops under congestion; `attachment`: None is not the empty one."""
+    """One sample. `block`: Zenoh waits rather than drops under congestion; `attachment`: None is not the empty one;
+    `again`: told to a late robot, which may have it already."""
 
     key: str
     payload: bytes
@@ -34,6 +35,7 @@ class Envelope(NamedTuple):
     block: bool
     express: bool
     delete: bool
+    again: bool = False
 
 
 def seal(sample: Envelope) -> bytes:
@@ -46,6 +48,7 @@ def seal(sample: Envelope) -> bytes:
         | _EXPRESS * sample.express
         | _BLOCK * sample.block
         | _ATTACHED * (sample.attachment is not None)
+        | _AGAIN * sample.again
     )
     attachment = sample.attachment or b""
     head = _HEAD.pack(VERSION, flags, sample.priority, len(key), len(encoding), len(attachment))
@@ -81,4 +84,5 @@ def open_envelope(data: bytes) -> Envelope:
         bool(flags & _BLOCK),
         bool(flags & _EXPRESS),
         bool(flags & _DELETE),
+        bool(flags & _AGAIN),
     )

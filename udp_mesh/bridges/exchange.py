@@ -7,7 +7,6 @@ so a lost or a doubled one does no harm.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from typing import Any, NamedTuple, Union
 
@@ -23,10 +22,10 @@ TOPIC_SETTINGS = {"priority": 1, "reliable": True, "compression": True, "deadlin
 
 
 class Hello(NamedTuple):
-    """`holds`: by mesh topic, digests of the latched messages that came from whom this is sent to. `answer`: greet me
-    back."""
+    """`holds`: by mesh topic and publisher, the number of the last latched message that came from whom this is sent to
+    (`types.Mark`). `answer`: greet me back."""
 
-    holds: dict[str, list[str]]
+    holds: dict[str, dict[str, int]]
     answer: bool
 
 
@@ -83,11 +82,6 @@ def decode(data: bytes) -> Exchange:
     raise ExchangeError("op: expected hello, want or type, found {!r}".format(op))
 
 
-def digest(type_text: str, payload: bytes) -> str:
-    """A latched message's name: 64 bits tell apart what one robot ever latches."""
-    return hashlib.blake2b(type_text.encode() + b"\0" + payload, digest_size=8).hexdigest()
-
-
 def _list(value: object) -> list[object]:
     if not isinstance(value, list):
         raise ExchangeError("expected a list, found {!r}".format(value))
@@ -100,7 +94,18 @@ def _key(value: object) -> TypeKey:
     return TypeKey(value[0], value[1])
 
 
-def _holds(value: object) -> dict[str, list[str]]:
+def _holds(value: object) -> dict[str, dict[str, int]]:
+    found: dict[str, dict[str, int]] = {}
+    for topic, numbers in _object(value).items():
+        found[topic] = {}
+        for publisher, number in _object(numbers).items():
+            if not isinstance(number, int):
+                raise ExchangeError("holds: expected a number, found {!r}".format(number))
+            found[topic][publisher] = number
+    return found
+
+
+def _object(value: object) -> dict[str, object]:
     if not isinstance(value, dict):
         raise ExchangeError("holds: expected an object, found {!r}".format(value))
-    return {str(topic): [str(part) for part in _list(digests)] for topic, digests in value.items()}
+    return value

@@ -9,12 +9,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import OrderedDict, deque
 from typing import Deque, Iterable, Literal, Mapping, NamedTuple, Union
 
-from udp_mesh.bridges.exchange import Definition, ExchangeError, Hello, Want, decode, digest, encode
+from udp_mesh.bridges.exchange import Definition, ExchangeError, Hello, Want, decode, encode
 from udp_mesh.bridges.names import Route, inbound_name, ros_word
-from udp_mesh.bridges.types import Definitions, MessageKind, TypeKey, kind_text, parse_kind
+from udp_mesh.bridges.types import Definitions, Mark, MessageKind, TypeKey, kind_text, parse_kind
 
 MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 64, 32 << 20
 """Per source, while a definition is on its way: a second's worth; more is dropped, the oldest first."""
@@ -23,9 +24,9 @@ MAX_LATCHED, MAX_LATCHED_BYTES = 4096, 64 << 20
 MAX_LATCHED_PER_ROUTE = 32
 """Publishers that latch on one topic (tf_static); past it the oldest is forgotten, as are the names of programs that
 came, latched and went."""
-MAX_HELD_DIGESTS = 4 * MAX_LATCHED_PER_ROUTE
-"""Latched messages remembered per source and topic: more than a source can repeat by its two routes to us, or an old
-one would be published over a new one."""
+MAX_HELD = 4 * MAX_LATCHED_PER_ROUTE
+"""Publishers whose last latched message is remembered, per source and topic: more than a source can repeat by its two
+routes to us, or an old one would be published over a new one."""
 ASK_AGAIN_S = 1.0
 """Between two questions for one definition."""
 GIVE_UP_S = 30.0
@@ -73,8 +74,11 @@ class Relay:
     """One bridge's state. ROS 1 types have two parts (`pkg/Type`), and a message can only be published with its
     definition; ROS 2 types have three (`pkg/msg/Type`), and must be installed on both sides."""
 
-    def __init__(self, own: str, exchange_topic: str, *, ros_version: Literal[1, 2]) -> None:
+    def __init__(self, own: str, exchange_topic: str, *, ros_version: Literal[1, 2], nonce: bytes) -> None:
+        """`nonce`: random, so that the numbers of another start of this bridge are not taken for later or earlier."""
         self.own = own
+        self._nonce = nonce
+        self._number = 0
         self.exchange_topic = exchange_topic
         self.dropped = 0
         self._needs_definitions = ros_version == 1
@@ -83,7 +87,7 @@ class Relay:
         self._told: set[tuple[TypeKey, str | None]] = set()
         self._latched: OrderedDict[tuple[Route, str], tuple[MessageKind, bytes]] = OrderedDict()
         self._latched_bytes = 0
-        self._holds: dict[str, dict[str, Deque[str]]] = {}
+        self._holds: dict[str, dict[str, OrderedDict[str, int]]] = {}
         self._waiting: dict[str, Deque[_Waiting]] = {}
         self._asked_at: dict[tuple[str, TypeKey], float] = {}
         self._destinations: Mapping[str, Iterable[str]] = {}
@@ -100,7 +104,6 @@ class Relay:
     ) -> list[Effect]:
         """A node published. `publisher` tells apart several that latch on one topic."""
         effects: list[Effect] = []
-        kind = MessageKind(key, latched)
         if "/" not in key.name:
             # A publisher of any type, which says none before its first message: nobody could read it.
             return self._note_once(route, "{} publishes type {!r} on {}".format(publisher, key.name, route.topic))
@@ -110,7 +113,11 @@ class Relay:
             if (key, route.peer) not in self._told:
                 self._told.add((key, route.peer))
                 effects.append(self._to_bridges(Definition(key, definition), route.peer))
+        kind = MessageKind(key)
         if latched:
+            self._number += 1
+            tag = hashlib.blake2b(publisher.encode(), key=self._nonce, digest_size=4).hexdigest()
+            kind = MessageKind(key, Mark(tag, self._number))
             self._keep_latched(route, publisher, kind, payload)
         effects.append(ToMesh(route.topic, payload, route.peer, kind_text(kind)))
         return effects
@@ -137,14 +144,8 @@ class Relay:
             return []
         if ros_word(source) == ros_word(self.own):
             return self._note_once(source, "{} reads like our own name: its messages are not published".format(source))
-        if kind.latched:
-            held = self._holds.setdefault(source, {}).setdefault(topic, deque(maxlen=MAX_HELD_DIGESTS))
-            name = digest(kind_text(kind._replace(repeat=False)), payload)
-            if name in held:
-                if kind.repeat:
-                    return []
-                held.remove(name)
-            held.append(name)
+        if kind.mark is not None and not self._is_news(source, topic, kind.mark):
+            return []
         message = _Waiting(topic, kind, payload, now)
         waiting = self._waiting.get(source)
         blocked = waiting is not None and any(other.topic == topic for other in waiting)
@@ -153,13 +154,24 @@ class Relay:
         self._wait(source, message)
         return self._ask(source, kind.key, now)
 
+    def _is_news(self, source: str, topic: str, mark: Mark) -> bool:
+        """Whether no later latched message of its publisher came before it, nor itself."""
+        held = self._holds.setdefault(source, {}).setdefault(topic, OrderedDict())
+        if held.get(mark.publisher, -1) >= mark.number:
+            return False
+        held.pop(mark.publisher, None)
+        held[mark.publisher] = mark.number
+        while len(held) > MAX_HELD:
+            held.popitem(last=False)
+        return True
+
     def _known(self, key: TypeKey) -> bool:
         return not self._needs_definitions or not key.checksum or key in self._definitions
 
     def _publication(self, source: str, message: _Waiting) -> ToRos:
         key = message.kind.key
         name = inbound_name(self.own, source, message.topic)
-        return ToRos(name, key, self._definitions.get(key), message.kind.latched, message.payload)
+        return ToRos(name, key, self._definitions.get(key), message.kind.mark is not None, message.payload)
 
     def _wait(self, source: str, message: _Waiting) -> None:
         waiting = self._waiting.setdefault(source, deque())
@@ -195,15 +207,15 @@ class Relay:
         found = ((key, self._definitions.get(key)) for key in keys)
         return [self._to_bridges(Definition(key, text), peer) for key, text in found if text is not None]
 
-    def _missing(self, peer: str, holds: Mapping[str, Iterable[str]]) -> list[Effect]:
+    def _missing(self, peer: str, holds: Mapping[str, Mapping[str, int]]) -> list[Effect]:
         """Our latched messages that the peer has not."""
         effects: list[Effect] = []
         for (route, _), (kind, payload) in self._latched.items():
             allowed = list(self._destinations.get(route.topic, ()))
             if route.peer not in (None, peer) or (route.peer is None and allowed and peer not in allowed):
                 continue
-            if digest(kind_text(kind), payload) not in holds.get(route.topic, ()):
-                effects.append(ToMesh(route.topic, payload, peer, kind_text(kind._replace(repeat=True))))
+            if kind.mark is None or holds.get(route.topic, {}).get(kind.mark.publisher, -1) < kind.mark.number:
+                effects.append(ToMesh(route.topic, payload, peer, kind_text(kind)))
         return effects
 
     def _resume(self) -> list[Effect]:
@@ -228,7 +240,7 @@ class Relay:
     def greeting(self, peer: str | None, *, answer: bool) -> Effect:
         """A greeting for one peer, or (None) for all."""
         held = self._holds.get(peer, {}) if peer is not None else {}
-        return self._to_bridges(Hello({topic: list(digests) for topic, digests in held.items()}, answer), peer)
+        return self._to_bridges(Hello({topic: dict(numbers) for topic, numbers in held.items()}, answer), peer)
 
     def _to_bridges(self, message: Hello | Want | Definition, peer: str | None) -> ToMesh:
         return ToMesh(self.exchange_topic, encode(message), peer, "bridge")

@@ -2,7 +2,11 @@
 
 A topic's key is `<domain>/<topic>/<type>/<type hash>`. Each publisher has a token
 `@ros2_lv/<domain>/<session>/<node>/<entity>/MP/<enclave>/<namespace>/<node name>/<topic>/<type>/<type hash>/<qos>`,
-with `%` for every slash inside a part. Tokens cross the mesh whole, so type hash and QoS do.
+with `%` for every slash inside a part. Tokens cross the mesh whole, so type hash and QoS do. The QoS is
+`reliability:durability:history,depth:deadline:lifespan:liveliness`: numbers of rmw's enums, empty for defaults.
+
+A publisher with transient local durability answers queries below `<its key>/@adv/` with its last samples. A message's
+attachment ends with its publisher's id of 16 bytes. (ros2/rmw_zenoh: docs/design.md, detail/liveliness_utils.hpp.)
 
 `TokenExchange` keeps the tokens of each side known on the other: what is announced is always the full set, so that a
 lost or doubled announcement does no harm; a token that some bridge set up is nobody's own and is not announced again.
@@ -10,14 +14,26 @@ lost or doubled announcement does no harm; a token that some bridge set up is no
 
 from __future__ import annotations
 
+import hashlib
 import json
+from collections import OrderedDict
 from typing import NamedTuple
 
 ADMIN = "@ros2_lv"
 CARRIED = "udp_mesh/carried"
 """Key prefix of the tokens by which a bridge says which tokens it set up for robots of the mesh."""
+HISTORY = "@adv/**"
+"""Below a key: where publishers answer with what they keep."""
+TRANSIENT_LOCAL, KEEP_ALL = "1", "2"
+DEFAULT_DEPTH = 42
+"""What `rmw_zenoh` takes where none is given."""
+MAX_DEPTH = 1000
+"""Samples kept for one publisher: a peer's token may ask for any number."""
+PUBLISHER_ID_BYTES = 16
 MAX_TOKENS = 4096
 """Tokens of one robot: a node has some dozens of topics; more is a peer inventing names."""
+MAX_KEPT = 1 << 16
+"""Samples remembered so that none is put twice: more than all publishers that keep some can tell again at once."""
 MAX_TOKEN_BYTES = 1024
 MAX_ANNOUNCEMENT_BYTES = 4 << 20
 
@@ -35,6 +51,27 @@ def publisher_tokens(topic: str, domain: int) -> str:
     """The key expression of the tokens of a topic's publishers."""
     name = "%" + topic.strip("/").replace("/", "%")
     return "{}/{}/*/*/*/MP/*/*/*/{}/*/*/*".format(ADMIN, domain, name)
+
+
+def kept_samples(token: str) -> tuple[str, int]:
+    """A publisher's key, and how many samples it keeps for late subscribers: 0 where it is not transient local."""
+    parts = token.split("/")
+    if len(parts) != 13 or parts[5] != "MP":
+        return "", 0
+    key = "/".join((parts[1], parts[9].replace("%", "/").strip("/"), parts[10], parts[11]))
+    quality = parts[12].split(":")
+    if len(quality) < 3 or quality[1] != TRANSIENT_LOCAL:
+        return key, 0
+    history, _, depth = quality[2].partition(",")
+    if history == KEEP_ALL:
+        return key, MAX_DEPTH
+    number = int(depth) if depth.isascii() and depth.isdigit() else DEFAULT_DEPTH
+    return key, min(number or DEFAULT_DEPTH, MAX_DEPTH)
+
+
+def publisher_id(attachment: bytes | None) -> bytes:
+    """Tells apart the publishers of one key; an attachment that is none of `rmw_zenoh`'s tells nothing."""
+    return attachment[-PUBLISHER_ID_BYTES:] if attachment is not None else b""
 
 
 def carried_key(session: str, token: str) -> str:
@@ -62,6 +99,7 @@ class TokenExchange:
         self._carried: set[str] = set()
         self._told: dict[str, set[str]] = {}
         self._declared: set[str] = set()
+        self._depths: dict[str, int] = {}
 
     def seen(self, token: str, alive: bool) -> None:
         """A token came or went on our side."""
@@ -70,6 +108,15 @@ class TokenExchange:
     def carried(self, key: str, alive: bool) -> None:
         """A companion came or went: its token is some bridge's."""
         (self._carried.add if alive else self._carried.discard)(carried_token(key))
+
+    def depth(self, key: str) -> int:
+        """How many samples each publisher of this key on other robots keeps for late subscribers; 0: none."""
+        return self._depths.get(key, 0)
+
+    def keeping_keys(self) -> list[str]:
+        """Keys of our side's own publishers that keep samples."""
+        own = (kept_samples(token) for token in self._seen - self._carried - self._declared)
+        return sorted({key for key, depth in own if depth})
 
     def announcement(self, *, answer: bool = False) -> bytes:
         """All tokens that are our side's own. `answer` asks who hears it for theirs."""
@@ -92,6 +139,10 @@ class TokenExchange:
         wanted -= self._seen - self._declared
         change = TokenChange(sorted(wanted - self._declared), sorted(self._declared - wanted))
         self._declared = wanted
+        self._depths = {}
+        for token in wanted:
+            key, depth = kept_samples(token)
+            self._depths[key] = max(depth, self._depths.get(key, 0))
         return change
 
 
@@ -110,3 +161,24 @@ def _read(data: bytes) -> tuple[set[str], bool]:
         if not good or any(sign in token for sign in "*$?#") or "//" in token or token.endswith("/"):
             raise AnnouncementError("expected a token below {}, found {!r}".format(ADMIN, token))
     return set(tokens), fields.get("answer") is True
+
+
+class Kept:
+    """What came of publishers that keep samples: so that what is told again is put once."""
+
+    def __init__(self) -> None:
+        self._digests: OrderedDict[bytes, None] = OrderedDict()
+
+    def is_new(self, key: str, attachment: bytes | None, payload: bytes) -> bool:
+        """Notes a sample; False where it came before."""
+        digest = hashlib.blake2b(digest_size=16)
+        for part in (key.encode(), attachment or b"", payload):
+            digest.update(len(part).to_bytes(8, "big"))
+            digest.update(part)
+        name = digest.digest()
+        known = name in self._digests
+        self._digests.pop(name, None)
+        self._digests[name] = None
+        if len(self._digests) > MAX_KEPT:
+            self._digests.popitem(last=False)
+        return not known

@@ -1,11 +1,15 @@
 """What a bridge says about a message without reading it: its type, in the mesh's type field. Pure.
 
-`pkg/Type CHECKSUM [latched|repeat]`: ROS 1 puts the md5sum there, ROS 2 the QoS. The definition crosses separately,
-once per type (`exchange`), and is kept here by type and checksum. A fielded robot sends `pkg/Type` alone.
+`pkg/Type CHECKSUM [latched:PUBLISHER:NUMBER]`: ROS 1 puts the md5sum there, ROS 2 the QoS. The definition crosses
+separately, once per type (`exchange`), and is kept here by type and checksum. A fielded robot sends `pkg/Type` alone.
+
+The mesh may deliver a topic's messages in another order than they were sent. Of what is latched the last one must stay,
+so latched messages are numbered per publisher.
 """
 
 from __future__ import annotations
 
+import re
 from collections import OrderedDict
 from typing import NamedTuple
 
@@ -15,7 +19,7 @@ MAX_DEFINITION_BYTES = 1 << 18
 """One definition: the largest of common ROS packages are some 10 kB."""
 MAX_DEFINITIONS_BYTES = 16 << 20
 """All definitions together: as above."""
-_FLAGS = ("latched", "repeat")
+_LATCHED = re.compile(r"latched:([0-9a-f]{1,16}):([0-9]{1,18})")
 
 
 class TypeKey(NamedTuple):
@@ -25,13 +29,19 @@ class TypeKey(NamedTuple):
     checksum: str
 
 
+class Mark(NamedTuple):
+    """A latched message's place: the later of one publisher's has the larger number. `publisher` is a hex word, another
+    one after each start of the bridge."""
+
+    publisher: str
+    number: int
+
+
 class MessageKind(NamedTuple):
-    """A message's type field. `latched`: late subscribers get the last one. `repeat`: sent again for a peer that may
-    have it already."""
+    """A message's type field. `mark`: late subscribers get the last one of each publisher; None: not latched."""
 
     key: TypeKey
-    latched: bool = False
-    repeat: bool = False
+    mark: Mark | None = None
 
 
 def kind_text(kind: MessageKind) -> str:
@@ -39,8 +49,8 @@ def kind_text(kind: MessageKind) -> str:
     words = [kind.key.name]
     if kind.key.checksum:
         words.append(kind.key.checksum)
-        if kind.latched:
-            words.append("repeat" if kind.repeat else "latched")
+        if kind.mark is not None:
+            words.append("latched:{}:{}".format(*kind.mark))
     return " ".join(words)
 
 
@@ -49,10 +59,11 @@ def parse_kind(text: str) -> MessageKind | None:
     words = text.split(" ")
     if not 1 <= len(words) <= 3 or not all(words) or "/" not in words[0].strip("/"):
         return None
-    if len(words) == 3 and words[2] not in _FLAGS:
-        return None
     key = TypeKey(words[0], words[1] if len(words) > 1 else "")
-    return MessageKind(key, len(words) == 3, len(words) == 3 and words[2] == "repeat")
+    if len(words) < 3:
+        return MessageKind(key)
+    found = _LATCHED.fullmatch(words[2])
+    return None if found is None else MessageKind(key, Mark(found[1], int(found[2])))
 
 
 class Definitions:

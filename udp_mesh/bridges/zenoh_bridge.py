@@ -3,6 +3,7 @@
 1. A sample under a routed key expression is sealed whole (`envelope`) and published on the route's mesh topic.
 2. What other Zenoh bridges sent is put under its own key, with its encoding, attachment and quality of service.
 3. The liveliness tokens of routed ROS 2 topics are kept equal on both sides (`rmw_zenoh`).
+4. Robots and subscribers that come late get what transient local publishers keep: a robot that comes is told it again.
 
 Nothing that came from the mesh goes back: each bridge has a token `udp_mesh/bridge/<session>`, says its session in
 every sample it puts, and drops samples of every session that has such a token. Needs `eclipse-zenoh`.
@@ -16,7 +17,6 @@ import re
 import signal
 import sys
 import threading
-from collections import OrderedDict
 from typing import Any, NamedTuple, Sequence
 
 import zenoh
@@ -25,13 +25,17 @@ from udp_mesh.bridges.envelope import TYPE, Envelope, EnvelopeError, open_envelo
 from udp_mesh.bridges.port import MeshPort
 from udp_mesh.bridges.rmw_zenoh import (
     CARRIED,
+    HISTORY,
     AnnouncementError,
+    Kept,
     TokenChange,
     TokenExchange,
     carried_key,
+    kept_samples,
     publisher_tokens,
     topic_keys,
 )
+from udp_mesh.bridges.zenoh_publishers import Publishers
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError, Message, as_message
 
 log = logging.getLogger(__name__)
@@ -40,24 +44,9 @@ EXCHANGE_TOPIC = "bridge/zenoh"
 EXCHANGE_SETTINGS = {"priority": 1, "reliable": True, "compression": True, "keep_last": 1, "outbox": "last"}
 """Announcements are whole, so only the last one counts, also for a peer that is away."""
 BRIDGE = "udp_mesh/bridge"
-MAX_PUBLISHERS = 1024
-"""Zenoh publishers kept, one per key and quality of service; the longest unused is taken back."""
 LOOK_S = 1.0
-PRIORITIES = dict(
-    enumerate(
-        (
-            zenoh.Priority.REAL_TIME,
-            zenoh.Priority.INTERACTIVE_HIGH,
-            zenoh.Priority.INTERACTIVE_LOW,
-            zenoh.Priority.DATA_HIGH,
-            zenoh.Priority.DATA,
-            zenoh.Priority.DATA_LOW,
-            zenoh.Priority.BACKGROUND,
-        ),
-        start=1,
-    )
-)
-"""Zenoh's levels by number: 1 is the most urgent."""
+HISTORY_S = 10.0
+"""How long publishers have to tell what they keep."""
 
 
 class KeyRoute(NamedTuple):
@@ -104,10 +93,11 @@ class Bridge:
         self._routes = routes
         # Zenoh may call back from within a declaration.
         self._lock = threading.RLock()
-        self._bridges: set[str] = set()
+        self._bridges = {self._own}
         self._exchange = TokenExchange()
         self._announced = b""
-        self._publishers: OrderedDict[tuple[object, ...], tuple[Any, list[int]]] = OrderedDict()
+        self._publishers = Publishers(session, self._exchange.depth)
+        self._held = Kept()
         self._tokens: dict[str, tuple[Any, Any]] = {}
         self._kept: list[Any] = []
 
@@ -131,9 +121,14 @@ class Bridge:
     # Zenoh -> mesh
 
     def _from_zenoh(self, sample: Any, route: KeyRoute) -> None:
+        if not self._is_bridges(sample):
+            self._tell(sample, route, route.peers or (None,))
+
+    def _is_bridges(self, sample: Any) -> bool:
         source = sample.source_info
-        if source is not None and str(source.source_id.zid) in self._bridges:
-            return
+        return source is not None and str(source.source_id.zid) in self._bridges
+
+    def _tell(self, sample: Any, route: KeyRoute, peers: Sequence[str | None], *, again: bool = False) -> None:
         attachment = sample.attachment
         envelope = Envelope(
             str(sample.key_expr),
@@ -144,23 +139,49 @@ class Bridge:
             sample.congestion_control == zenoh.CongestionControl.BLOCK,
             bool(sample.express),
             sample.kind == zenoh.SampleKind.DELETE,
+            again,
         )
         try:
             sealed = seal(envelope)
         except EnvelopeError as error:
             log.warning("sample-dropped key=%.80s %s", envelope.key, error)
             return
-        for peer in route.peers or (None,):
+        for peer in peers:
             self._port.publish(route.topic, sealed, peer, TYPE)
+
+    def _tell_history(self, keys: Sequence[str], peer: str | None = None) -> None:
+        """What our side's publishers keep, to one robot or to all: those who have it leave it."""
+        for route in self._routes:
+            if route.tokens is None or (route.peers and peer is not None and peer not in route.peers):
+                continue
+            peers = (peer,) if peer is not None else route.peers or (None,)
+            for key in keys:
+                if zenoh.KeyExpr(route.keys).includes(zenoh.KeyExpr(key)):
+                    self._query(key, route, peers)
+
+    def _query(self, key: str, route: KeyRoute, peers: Sequence[str | None]) -> None:
+        def answered(reply: Any) -> None:
+            if reply.ok is not None and not self._is_bridges(reply.ok):
+                self._tell(reply.ok, route, peers, again=True)
+
+        # A reply's key is the publisher's, not the one asked for.
+        selector = "{}/{}?_anyke".format(key, HISTORY)
+        self._session.get(selector, answered, consolidation=zenoh.ConsolidationMode.NONE, timeout=HISTORY_S)
 
     def _bridge_seen(self, sample: Any) -> None:
         zid = str(sample.key_expr).rpartition("/")[2]
         (self._bridges.add if sample.kind == zenoh.SampleKind.PUT else self._bridges.discard)(zid)
 
     def _token_seen(self, sample: Any) -> None:
+        token, alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
         with self._lock:
-            self._exchange.seen(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+            self._exchange.seen(token, alive)
+            keys = self._exchange.keeping_keys()
         self.announce()
+        key = kept_samples(token)[0]
+        if alive and key in keys:
+            # It may have published before we listened.
+            self._tell_history([key])
 
     def _carried_seen(self, sample: Any) -> None:
         with self._lock:
@@ -183,6 +204,11 @@ class Bridge:
         """The port calls this after each connect."""
         self.look()
         self.announce(answer=True)
+        self._tell_history(self._keeping())
+
+    def _keeping(self) -> list[str]:
+        with self._lock:
+            return self._exchange.keeping_keys()
 
     def from_daemon(self, frame: Frame) -> None:
         """The port calls this for each frame."""
@@ -199,36 +225,18 @@ class Bridge:
                 log.warning("zenoh-refused source=%s topic=%s %s", message.source, message.topic, error)
         elif header.get("event") in ("peer-online", "peer-restarted"):
             self.announce(str(header["peer"]))
+            self._tell_history(self._keeping(), str(header["peer"]))
         elif header.get("event") == "peer-offline":
             with self._lock:
                 self._set_up(self._exchange.gone(str(header["peer"])))
 
     def _put(self, sample: Envelope) -> None:
-        publisher, numbers = self._publisher(sample)
-        numbers[0] += 1
-        source = zenoh.SourceInfo(publisher.id, numbers[0] & 0xFFFFFFFF)
-        if sample.delete:
-            publisher.delete(attachment=sample.attachment, source_info=source)
-        else:
-            publisher.put(sample.payload, encoding=sample.encoding, attachment=sample.attachment, source_info=source)
-
-    def _publisher(self, sample: Envelope) -> tuple[Any, list[int]]:
-        """The publisher of this key and quality of service, with its count. Only the port's thread comes here."""
-        wanted = (sample.key, sample.priority, sample.block, sample.express)
-        found = self._publishers.pop(wanted, None)
-        if found is None:
-            control = zenoh.CongestionControl.BLOCK if sample.block else zenoh.CongestionControl.DROP
-            publisher = self._session.declare_publisher(
-                sample.key,
-                priority=PRIORITIES[sample.priority],
-                congestion_control=control,
-                express=sample.express,
-            )
-            found = (publisher, [0])
-        self._publishers[wanted] = found
-        if len(self._publishers) > MAX_PUBLISHERS:
-            self._publishers.popitem(last=False)[1][0].undeclare()
-        return found
+        with self._lock:
+            kept = self._exchange.depth(sample.key) > 0
+            is_new = not kept or self._held.is_new(sample.key, sample.attachment, sample.payload)
+        # What the network brings twice is put twice, as it came; what is told again is not.
+        if is_new or not sample.again:
+            self._publishers.put(sample)
 
     def _from_bridge(self, message: Message) -> None:
         with self._lock:
@@ -236,6 +244,7 @@ class Bridge:
             self._set_up(change)
         if answer:
             self.announce(message.source)
+            self._tell_history(self._keeping(), message.source)
 
     def _set_up(self, change: TokenChange) -> None:
         live = self._session.liveliness()
@@ -247,6 +256,7 @@ class Bridge:
             companion, copy = self._tokens.pop(token)
             copy.undeclare()
             companion.undeclare()
+        self._publishers.forget()
 
     def look(self) -> None:
         """The daemon may have been started anew without the bridges' topic. Raises MeshError."""

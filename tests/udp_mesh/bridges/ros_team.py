@@ -23,6 +23,7 @@ TOPICS = """
 [topics]
 status = { priority = 0 }
 odometry = { priority = 3, reliable = false, keep_last = 1 }
+plan = { priority = 4 }
 map = { priority = 5 }
 image = { priority = 9, keep_last = 1 }
 """
@@ -81,7 +82,8 @@ def team(*names: str, link: Link = LOSSY, topics: str = TOPICS) -> Iterator[tupl
             master.start(wait=False)
         members = []
         for name, master in masters.items():
-            daemon = kept.enter_context(RobotsDaemon(folder, name, places[name], topics))
+            daemon = RobotsDaemon(folder, name, places[name], topics)
+            kept.enter_context(daemon)
             master.wait()
             bridge = BridgeProcess(master, daemon)
             kept.callback(bridge.stop)

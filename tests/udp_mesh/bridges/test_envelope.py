@@ -7,7 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from udp_mesh.bridges.envelope import Envelope, EnvelopeError, open_envelope, seal
-from udp_mesh.bridges.rmw_zenoh import AnnouncementError, TokenExchange, carried_key, publisher_tokens, topic_keys
+from udp_mesh.bridges.rmw_zenoh import (
+    AnnouncementError,
+    Kept,
+    TokenExchange,
+    carried_key,
+    kept_samples,
+    publisher_tokens,
+    topic_keys,
+)
 
 SAMPLES = st.builds(
     Envelope,
@@ -16,6 +24,7 @@ SAMPLES = st.builds(
     st.text(st.characters(exclude_categories=["C"]), max_size=20),
     st.none() | st.binary(max_size=40),
     st.integers(1, 7),
+    st.booleans(),
     st.booleans(),
     st.booleans(),
     st.booleans(),
@@ -46,6 +55,36 @@ def test_an_expression_is_no_key() -> None:
 def test_keys_and_tokens_are_those_of_rmw_zenoh() -> None:
     assert topic_keys("/ns/chatter", 7) == "7/ns/chatter/*/*"
     assert publisher_tokens("/ns/chatter", 7) == "@ros2_lv/7/*/*/*/MP/*/*/*/%ns%chatter/*/*/*"
+
+
+@pytest.mark.parametrize(
+    ("quality", "depth"),
+    [
+        (":1:,1:,:,:,,", 1),
+        ("1:1:1,5:,:,:,,", 5),
+        (":1:,:,:,:,,", 42),
+        (":1:2,:,:,:,,", 1000),
+        (":1:,99999:,:,:,,", 1000),
+        ("::,10:,:,:,,", 0),
+        ("1:2:1,10:,:,:,,", 0),
+        ("nonsense", 0),
+    ],
+)
+def test_a_tokens_quality_says_how_many_samples_are_kept(quality: str, depth: int) -> None:
+    token = f"@ros2_lv/7/ab/0/10/MP/%/%ns/talker/%ns%chatter/a::B_/RIHS01_df/{quality}"
+    assert kept_samples(token) == ("7/ns/chatter/a::B_/RIHS01_df", depth)
+
+
+def test_a_token_of_anything_but_a_publisher_keeps_nothing() -> None:
+    assert kept_samples("@ros2_lv/0/ab/0/0/NN/%/%/talker") == ("", 0)
+    assert kept_samples(TOKEN.replace("/MP/", "/MS/").replace("1:2:", ":1:"))[1] == 0
+
+
+def test_what_is_told_again_is_new_once() -> None:
+    kept = Kept()
+    assert [kept.is_new("k", b"a", b"p") for _ in range(2)] == [True, False]
+    assert kept.is_new("k", b"", b"ap")
+    assert kept.is_new("ka", None, b"p")
 
 
 def test_a_token_is_set_up_once_and_withdrawn_with_its_last_announcer() -> None:

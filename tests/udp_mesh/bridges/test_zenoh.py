@@ -12,9 +12,10 @@ from typing import Any
 
 import pytest
 import zenoh
+import zenoh.ext
 
 from tests.udp_mesh.bridges.ros_processes import free_tcp_port
-from tests.udp_mesh.daemon.processes import RunningDaemon, poll, two_daemons
+from tests.udp_mesh.daemon.processes import RunningDaemon, poll, two_daemons, wait_online
 from tests.udp_mesh.links.sockets import WAIT_S
 
 pytestmark = pytest.mark.xdist_group("zenoh")
@@ -22,6 +23,9 @@ pytestmark = pytest.mark.xdist_group("zenoh")
 TYPE = "std_msgs::msg::dds_::String_/RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 CHATTER = f"0/chatter/{TYPE}"
 TOKEN = f"@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/10/MP/%/%/talker/%chatter/{TYPE}/1:2:1,10:,:,:,,"
+KEPT_TYPE = "tf2_msgs::msg::dds_::TFMessage_/RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf61d5abe85d020f087"
+KEPT = f"0/tf_static/{KEPT_TYPE}"
+KEPT_TOKEN = f"@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/11/MP/%/%/frames/%tf_static/{KEPT_TYPE}/:1:,2:,:,:,,"
 CDR_HELLO = bytes.fromhex("00010000") + struct.pack("<I", 6) + b"hello\0"
 
 
@@ -52,7 +56,7 @@ class Side:
         command = [sys.executable, "-m", "udp_mesh.bridges.zenoh_bridge", "--socket", str(self.daemon.socket)]
         for key, value in {**settings(connect=self.port), "mode": json.dumps(mode)}.items():
             command += ["--set", f"{key}={value}"]
-        command += ["--route", "demo/**=map", "--ros2", "/chatter=status"]
+        command += ["--route", "demo/**=map", "--ros2", "/chatter=status", "--ros2", "/tf_static=map"]
         with (self.daemon.folder / f"{self.daemon.name}-zenoh.log").open("ab") as log:
             self.bridge = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
 
@@ -180,10 +184,10 @@ def test_a_second_bridge_beside_the_first_sends_nothing_back(team: tuple[Side, S
 
 def test_a_ros_2_message_keeps_its_cdr_type_hash_and_attachment(team: tuple[Side, Side]) -> None:
     alice, bob = team
-    attachment = struct.pack("<qqB16s", 7, 1_700_000_000_000_000_000, 16, bytes(range(16)))
-    sample = alice.put_until_seen(bob, CHATTER, CDR_HELLO, attachment=attachment)
+    attached = attachment(7, bytes(range(16)))
+    sample = alice.put_until_seen(bob, CHATTER, CDR_HELLO, attachment=attached)
     assert str(sample.key_expr) == CHATTER
-    assert bytes(sample.attachment) == attachment
+    assert bytes(sample.attachment) == attached
 
 
 def test_a_ros_2_publisher_is_in_the_other_graph_with_its_qos_for_as_long_as_it_lives(team: tuple[Side, Side]) -> None:
@@ -196,6 +200,68 @@ def test_a_ros_2_publisher_is_in_the_other_graph_with_its_qos_for_as_long_as_it_
     poll(lambda: bob.tokens.get(TOKEN), "the publisher again")
     token.undeclare()
     poll(lambda: bob.tokens.get(TOKEN) is False, "the publisher gone")
+
+
+def attachment(number: int, publisher: bytes) -> bytes:
+    """What rmw_zenoh attaches: sequence number, time, publisher."""
+    return struct.pack("<qqB16s", number, 1_700_000_000_000_000_000 + number, 16, publisher)
+
+
+def keeping(session: Any, depth: int) -> Any:
+    """A transient local publisher as rmw_zenoh makes one."""
+    numbered = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
+    cache = zenoh.ext.CacheConfig(depth)
+    return zenoh.ext.declare_advanced_publisher(
+        session, KEPT, cache=cache, publisher_detection=True, sample_miss_detection=numbered
+    )
+
+
+def late_subscriber(side: Side, seen: list[bytes]) -> Any:
+    """A transient local subscriber as rmw_zenoh makes one."""
+    history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+    return zenoh.ext.declare_advanced_subscriber(
+        side.session, KEPT, lambda sample: seen.append(bytes(sample.payload)), history=history
+    )
+
+
+def test_late_subscribers_and_late_robots_get_what_transient_local_publishers_keep(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    bob.stop_bridge()
+    token = alice.session.liveliness().declare_token(KEPT_TOKEN)
+    publishers = [keeping(alice.session, 2), keeping(alice.session, 2)]
+    for place, publisher in enumerate(publishers):
+        for number in range(4):
+            publisher.put(b"%d %d" % (place, number), attachment=attachment(number, bytes([place] * 16)))
+    present: list[bytes] = []
+    kept = [late_subscriber(bob, present)]
+    # A robot that comes late: told what is kept, of each publisher the last two.
+    bob.start_bridge()
+    poll(lambda: sorted(present) == [b"0 2", b"0 3", b"1 2", b"1 3"], f"what was kept: {present}")
+    # A subscriber that comes late, on the robot that had it from the mesh.
+    late: list[bytes] = []
+    kept.append(late_subscriber(bob, late))
+    poll(lambda: sorted(late) == [b"0 2", b"0 3", b"1 2", b"1 3"], f"what the bridge keeps: {late}")
+    # What comes now comes once, also when the robots meet again and it is told again.
+    publishers[0].put(b"0 4", attachment=attachment(4, bytes(16)))
+    poll(lambda: b"0 4" in present and b"0 4" in late, "what is new")
+    bob.daemon.kill()
+    wait_online(alice.daemon, "bob", online=False)
+    bob.daemon.start()
+    publishers[0].put(b"0 5", attachment=attachment(5, bytes(16)))
+    poll(lambda: b"0 5" in present, "what came after they met again")
+    alice.put_until_seen(bob, "demo/after", b"whatever was told again has come before")
+    assert len(present) == len(set(present)) == 6
+    # With the publisher goes what was kept of it.
+    token.undeclare()
+    poll(lambda: bob.tokens.get(KEPT_TOKEN) is False, "the publisher gone")
+
+    def nothing_kept() -> bool:
+        replies = bob.session.get(f"{KEPT}/@adv/**?_anyke", consolidation=zenoh.ConsolidationMode.NONE)
+        return not [reply for reply in replies if reply.ok is not None]
+
+    poll(nothing_kept, "nothing kept at bob")
+    for declared in [*publishers, *kept]:
+        declared.undeclare()
 
 
 def test_a_restarted_daemon_is_found_again(team: tuple[Side, Side]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import threading
 import time
 from typing import Callable
@@ -27,7 +28,7 @@ from udp_mesh.bridges.names import (
 )
 from udp_mesh.bridges.port import CONDITIONS_TOPIC, MeshPort
 from udp_mesh.bridges.relay import Effect, Note, Relay, ToMesh, ToRos
-from udp_mesh.bridges.ros1.graph import MASTER_ERRORS, Graph, Parameters, parameters
+from udp_mesh.bridges.ros1.graph import MASTER_ERRORS, Graph, Parameters, log_to_ros, parameters
 from udp_mesh.bridges.types import TypeKey
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError, as_message
 
@@ -47,7 +48,7 @@ class Bridge:
     def __init__(self, port: MeshPort, own: str, given: Parameters) -> None:
         self._port = port
         self._own = own
-        self._relay = Relay(own, EXCHANGE_TOPIC, ros_version=1)
+        self._relay = Relay(own, EXCHANGE_TOPIC, ros_version=1, nonce=os.urandom(16))
         self._lock = threading.Lock()
         self._look_soon = threading.Event()
         self._hosts = {str(host) for host in given.host_list}
@@ -178,6 +179,7 @@ def main() -> int:
     except KeyboardInterrupt:
         return 0
     rospy.init_node("mesh_bridge")
+    log_to_ros()
     stop = threading.Event()
     rospy.on_shutdown(stop.set)
     given = parameters(DEFAULT_SOCKET)

@@ -210,6 +210,15 @@ def _subscribers_of(name: str) -> int:
     return sum(len(nodes) for topic, nodes in subscribers if topic == name)
 
 
+def log_to_ros() -> None:
+    """What the bridge logs goes where rospy's own messages go: terminal and /rosout. Call it after `init_node`, which
+    takes all other handlers away."""
+    ours = logging.getLogger("udp_mesh")
+    ours.handlers = list(logging.getLogger("rosout").handlers)
+    ours.setLevel(logging.INFO)
+    ours.propagate = False
+
+
 def parameters(default_socket: str) -> Parameters:
     """The node's private parameters. One that should be a list and is none is reported, and taken for empty."""
     return Parameters(

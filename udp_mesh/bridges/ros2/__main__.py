@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import sys
 import threading
 import time
@@ -56,7 +57,7 @@ class Bridge:
 
     def __init__(self, node: Any, port: MeshPort, own: str) -> None:
         self._node, self._port, self._own = node, port, own
-        self._relay = Relay(own, EXCHANGE_TOPIC, ros_version=2)
+        self._relay = Relay(own, EXCHANGE_TOPIC, ros_version=2, nonce=os.urandom(16))
         self._lock = threading.RLock()
         self._table: dict[str, Route] = {}
         self._subscriptions: dict[str, tuple[TypeKey, Any]] = {}
