@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.apply.planning import Choices
+from meshctl.apply.resumed import settled
 from meshctl.cli.carry import ask_and_carry_out, carry_out_plan, checked, choices_of, prepared_for, show, write_text
 from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.session import KeyFiles, Lab, Nodes, session
@@ -125,6 +127,10 @@ def resume(
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
         record = _to_resume(opened.journal, opened.fleet.name, run)
+        if record.command.startswith("robots "):
+            from meshctl.cli.robots_work import take_up
+
+            raise take_up(opened, inventory, record, as_json=as_json)
         managed = {node.name for node in opened.fleet.managed()}
         names = [name for name in opened.journal.unfinished(record.id) if name in managed]
         if not names:
@@ -139,6 +145,9 @@ def resume(
             tuple(told.get("accept_cuts", ())),
         )
         prepared = prepared_for(opened, names, choices)
+        for name, text in settled(record.id, opened.journal.outcomes(record.id), prepared).items():
+            line = json.dumps({"event": "note", "node": name, "at_s": round(time.time(), 3), "text": text})
+            typer.echo(line if as_json else f"{name}: {text}")
         ask_and_carry_out(opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
 
 
@@ -179,7 +188,7 @@ def _list_runs(journal: Journal, limit: int, *, as_json: bool) -> None:
         typer.echo(json.dumps([_run_object(record) for record in records], indent=1))
         return
     for record in records:
-        typer.echo(f"{record.id:>5}  {_moment(record.began_s)}  {record.command:<10} {record.fleet:<16} {record.state}")
+        typer.echo(f"{record.id:>5}  {_moment(record.began_s)}  {record.command:<17} {record.fleet:<16} {record.state}")
     if not records:
         typer.echo("no runs yet")
 

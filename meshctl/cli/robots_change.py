@@ -10,15 +10,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Annotated
 
 import typer
 import yaml
 
-from meshctl.cli.options import AsJson, InventoryPath
-from meshctl.cli.robots_crew import AskSudo, Crew, Wait, Wheels, crew_of, end
-from meshctl.cli.session import KeyFiles
+from meshctl.cli.robots_crew import Crew, end, with_crew
+from meshctl.cli.robots_work import begin
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, totals
 from meshctl.inventory import load_fleet
@@ -35,62 +33,39 @@ Assignments = Annotated[
 ]
 
 
+_SHARED = ("inventory", "wheels", "wait_s", "ask_sudo", "as_json", "key")
+
+
 @topic_app.command("add")
-def topic_add(
-    topic: Topic,
-    values: Assignments,
-    inventory: InventoryPath = Path(),
-    wheels: Wheels = None,
-    wait: Wait = 30,
-    ask_sudo: AskSudo = False,
-    as_json: AsJson = False,
-    key: KeyFiles = None,
-) -> None:
+@with_crew(*_SHARED)
+def topic_add(crew: Crew, topic: Topic, values: Assignments) -> None:
     """Add a topic to the inventory and to every running daemon, without a restart.
 
     Example: meshctl robots topic add video priority=9 reliable=false destinations=[base-station]
     """
     fields = _fields(values)
-    with crew_of(inventory, None, key=key, ask_sudo=ask_sudo, wheels=wheels, wait_s=wait, as_json=as_json) as crew:
-        _change_topics(crew, inventory, lambda editor: add_topic(editor, topic, fields))
+    _change_topics(crew, topic, lambda editor: add_topic(editor, topic, fields))
 
 
 @topic_app.command("set")
-def topic_set(
-    topic: Topic,
-    values: Assignments,
-    inventory: InventoryPath = Path(),
-    wheels: Wheels = None,
-    wait: Wait = 30,
-    ask_sudo: AskSudo = False,
-    as_json: AsJson = False,
-    key: KeyFiles = None,
-) -> None:
+@with_crew(*_SHARED)
+def topic_set(crew: Crew, topic: Topic, values: Assignments) -> None:
     """Change a topic in the inventory and in every running daemon, without a restart.
 
     Example: meshctl robots topic set video priority=12
     """
     fields = _fields(values)
-    with crew_of(inventory, None, key=key, ask_sudo=ask_sudo, wheels=wheels, wait_s=wait, as_json=as_json) as crew:
-        _change_topics(crew, inventory, lambda editor: set_topic(editor, topic, fields))
+    _change_topics(crew, topic, lambda editor: set_topic(editor, topic, fields))
 
 
 @topic_app.command("rm")
-def topic_rm(
-    topic: Topic,
-    inventory: InventoryPath = Path(),
-    wheels: Wheels = None,
-    wait: Wait = 30,
-    ask_sudo: AskSudo = False,
-    as_json: AsJson = False,
-    key: KeyFiles = None,
-) -> None:
+@with_crew(*_SHARED)
+def topic_rm(crew: Crew, topic: Topic) -> None:
     """Take a topic out of the inventory and out of every running daemon, without a restart.
 
     Example: meshctl robots topic rm video
     """
-    with crew_of(inventory, None, key=key, ask_sudo=ask_sudo, wheels=wheels, wait_s=wait, as_json=as_json) as crew:
-        _change_topics(crew, inventory, lambda editor: remove_topic(editor, topic))
+    _change_topics(crew, topic, lambda editor: remove_topic(editor, topic))
 
 
 def _fields(assignments: list[str]) -> dict[str, Value]:
@@ -113,35 +88,39 @@ def _fields(assignments: list[str]) -> dict[str, Value]:
     return fields
 
 
-def _change_topics(crew: Crew, inventory: Path, edit: Callable[[Editor], None]) -> None:
-    changed, changes = _edited(crew, inventory, edit)
+def _change_topics(crew: Crew, topic: str, edit: Callable[[Editor], None]) -> None:
+    changed, changes = _edited(crew, edit)
     if not crew.as_json:
         for change in changes:
             typer.echo(change.diff(), nl=False)
-    outcomes = changed.deploy()
+    outcomes = begin(changed, "topic", topic=topic)
     if not any(outcome.result.is_good for outcome in outcomes.values()):
-        save(tuple(Change(change.file, change.after, change.before) for change in changes))
+        _undo(changes)
         typer.echo("no robot took the change, so the inventory is as it was", err=True)
-    elif not totals(outcomes.values()).all_good:
-        typer.echo("the inventory is changed; `meshctl robots deploy` brings the others to it", err=True)
     raise end(changed, outcomes)
 
 
-def _edited(crew: Crew, inventory: Path, edit: Callable[[Editor], None]) -> tuple[Crew, tuple[Change, ...]]:
+def _edited(crew: Crew, edit: Callable[[Editor], None]) -> tuple[Crew, tuple[Change, ...]]:
     """The inventory edited, checked and saved, and the crew under it."""
-    editor = Editor.open(inventory, environ=os.environ)
+    editor = Editor.open(crew.inventory, environ=os.environ)
     edit(editor)
     changes = editor.changes()
     save(changes)
     try:
-        return crew.at(load_fleet(inventory, environ=os.environ), only_configuration=True), changes
+        return crew.at(load_fleet(crew.inventory, environ=os.environ), only_configuration=True), changes
     except InputError:
         # what loads, but no daemon would take
-        save(tuple(Change(change.file, change.after, change.before) for change in changes))
+        _undo(changes)
         raise
 
 
+def _undo(changes: tuple[Change, ...]) -> None:
+    save(tuple(Change(change.file, change.after, change.before) for change in changes))
+
+
+@with_crew(*_SHARED)
 def rotate_key_command(
+    crew: Crew,
     new_key: Annotated[
         str,
         typer.Argument(
@@ -149,12 +128,6 @@ def rotate_key_command(
             help="Where the new key is: env:NAME, file:PATH or file:PATH#ENTRY (relative to the inventory).",
         ),
     ],
-    inventory: InventoryPath = Path(),
-    wheels: Wheels = None,
-    wait: Wait = 30,
-    ask_sudo: AskSudo = False,
-    as_json: AsJson = False,
-    key: KeyFiles = None,
 ) -> None:
     """Give the fleet a new key without an interruption: accepted everywhere, then used, then the old one dropped.
 
@@ -163,21 +136,19 @@ def rotate_key_command(
 
     Example: meshctl robots rotate-key file:secrets.yaml#udp_mesh_2027
     """
-    new = parse_ref(new_key)
-    with crew_of(inventory, None, key=key, ask_sudo=ask_sudo, wheels=wheels, wait_s=wait, as_json=as_json) as crew:
-        todo = stages(crew.fleet.udp_mesh.keys, new)
-        outcomes: dict[str, Outcome] = {}
-        for number, stage in enumerate(todo, start=1):
-            if not as_json:
-                typer.echo(f"step {number} of {len(todo)}: {stage.title}")
-            crew, _ = _edited(crew, inventory, partial(_set_keys, keys=stage.keys))
-            outcomes = crew.deploy()
-            if not totals(outcomes.values()).all_good:
-                late = ", ".join(name for name, outcome in outcomes.items() if not outcome.result.is_good)
-                typer.echo(f"stopped before the next step, nothing is cut off: {late} did not take this one", err=True)
-                typer.echo("run the same command again once they can be reached", err=True)
-                break
-        raise end(crew, outcomes)
+    todo = stages(crew.fleet.udp_mesh.keys, parse_ref(new_key))
+    outcomes: dict[str, Outcome] = {}
+    for number, stage in enumerate(todo, start=1):
+        if not crew.as_json:
+            typer.echo(f"step {number} of {len(todo)}: {stage.title}")
+        crew, _ = _edited(crew, partial(_set_keys, keys=stage.keys))
+        outcomes = begin(crew, "rotate-key", new_key=new_key)
+        if not totals(outcomes.values()).all_good:
+            late = ", ".join(name for name, outcome in outcomes.items() if not outcome.result.is_good)
+            typer.echo(f"stopped before the next step, nothing is cut off: {late} did not take this one", err=True)
+            typer.echo("run the same command again once they can be reached", err=True)
+            break
+    raise end(crew, outcomes)
 
 
 def _set_keys(editor: Editor, keys: tuple[SecretRef, ...]) -> None:

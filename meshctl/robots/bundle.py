@@ -12,6 +12,8 @@ import tarfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from meshctl.errors import InputError
+from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.render.daemon import CONFIG_NAME, KEY_NAME, daemon_config, daemon_keys
 from meshctl.robots.scripts import shipped
@@ -20,6 +22,10 @@ from meshctl.robots.wheels import Wheel
 UNIT_NAME = "udp-mesh.service"
 BRIDGE_UNIT_NAME = "udp-mesh-ros1.service"
 _CURRENT = "/opt/udp-mesh/current"
+# The one release of ROS 1 with a Python the bridge runs in; with ROS 2 a bridge is started by hand (docs/bridges.md).
+ROS_1 = "noetic"
+_TOO_OLD = ("indigo", "jade", "kinetic", "lunar", "melodic")
+_ROS_2 = ("foxy", "galactic", "humble", "iron", "jazzy", "kilted", "lyrical", "rolling")
 # Half of a SHA-256: nobody makes two bundles meet by accident, and people read it.
 _ID_DIGITS = 16
 _SECRET_MODE = 0o600
@@ -107,7 +113,7 @@ def bundle(
 
     Raises InvalidInput for what the daemon would refuse, and for keys that cannot be had.
     """
-    listed = "".join(f"{wheel.sha256}  {wheel.file}\n" for wheel in wheels).encode()
+    listed = "".join(f"{wheel.sha256}  {wheel.stored}\n" for wheel in wheels).encode()
     tree = hashlib.sha256(listed + executable.encode()).hexdigest()[:_ID_DIGITS]
     files = [
         *configuration(fleet, robot, secrets, units),
@@ -136,14 +142,27 @@ def configuration(
     keys = daemon_keys(fleet, secrets)
     if keys is not None:
         files.append(File(f"etc/{KEY_NAME}", keys, _SECRET_MODE))
-    computer = fleet.robots[robot].computer
-    if computer is not None and computer.ros:
+    if has_bridge(fleet, robot):
         files += [
             File("bin/udp-mesh-ros1", shipped("bridge.sh").encode(), 0o755),
-            File("ros", f"/opt/ros/{computer.ros}/setup.bash\n".encode()),
+            File("ros", f"/opt/ros/{ROS_1}/setup.bash\n".encode()),
             File(BRIDGE_UNIT_NAME, service_unit(units[BRIDGE_UNIT_NAME], f"{_CURRENT}/bin/udp-mesh-ros1").encode()),
         ]
     return tuple(files)
+
+
+def has_bridge(fleet: Fleet, robot: str) -> bool:
+    """Whether a ROS 1 bridge belongs there. Raises InputError for a `ros` that is unknown, or older than the bridge."""
+    computer = fleet.robots[robot].computer
+    ros = "" if computer is None else computer.ros
+    place = f"robots.{robot}.computer.ros"
+    if ros in _TOO_OLD:
+        hint = "leave `ros` out: no bridge is deployed then"
+        raise InputError(f"{place}: the Python of {ros} is older than 3.8, which the bridge needs", hint=hint)
+    if ros not in ("", ROS_1, *_ROS_2):
+        hint = did_you_mean(ros, (ROS_1, *_ROS_2)) or "leave `ros` out: no bridge is deployed then"
+        raise InputError(f"{place}: expected {ROS_1} or a release of ROS 2, found {ros!r}", hint=hint)
+    return ros == ROS_1
 
 
 def service_unit(stock: str, start: str) -> str:

@@ -7,18 +7,28 @@ arrived stays and is not sent twice. `switch` runs to its end on the robot whate
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from meshctl.device.errors import ConnectionLost, Timeout
-from meshctl.errors import InputError
+from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome, Result
-from meshctl.model import Computer, Fleet, Secret, SecretRef
-from meshctl.robots.bundle import Bundle, bundle
+from meshctl.fleet.journal import is_dead
+from meshctl.model import Fleet, Secret, SecretRef
+from meshctl.robots.bundle import ROS_1, Bundle, bundle, has_bridge
 from meshctl.robots.host import Host, Refused
 from meshctl.robots.tags import Target
-from meshctl.robots.target import Facts, changed_files, objections, parse_facts, room_objection
+from meshctl.robots.target import (
+    Facts,
+    changed_files,
+    clock_remark,
+    computer_of,
+    objections,
+    parse_facts,
+    room_objection,
+)
 from meshctl.robots.wheels import Wheel, choose, fetch, has_all, keep, stock_units
 
 _WHEEL_DIRECTORY = "/opt/udp-mesh/wheels"
@@ -63,7 +73,8 @@ class Order:
     """What all robots of one deploy share.
 
     `now_s` reads the operator's clock (Unix time); `wait_s` is how long a daemon may take to prove itself; with
-    `only_configuration` a robot that would get other code is refused; `tell` gets a robot and the step it begins.
+    `only_configuration` a robot that would get other code is refused; `step` gets a robot, the step's name and a few
+    words more, and is left when the step ends.
     """
 
     fleet: Fleet
@@ -72,12 +83,13 @@ class Order:
     now_s: Callable[[], float]
     wait_s: int = 30
     only_configuration: bool = False
-    tell: Callable[[str, str], None] = lambda robot, step: None
+    step: Callable[[str, str, str], AbstractContextManager[None]] = lambda robot, name, text: nullcontext()
 
 
-def probe(host: Host, python: str) -> Facts:
+def probe(host: Host, fleet: Fleet, robot: str) -> Facts:
     """What the computer is and has. Changes nothing."""
-    return parse_facts(host.run("probe", python, timeout_s=PROBE_TIMEOUT_S))
+    ros = ROS_1 if has_bridge(fleet, robot) else ""
+    return parse_facts(host.run("probe", computer_of(fleet, robot).python, ros, timeout_s=PROBE_TIMEOUT_S))
 
 
 def wanted(order: Order, robot: str, facts: Facts) -> Bundle:
@@ -87,10 +99,17 @@ def wanted(order: Order, robot: str, facts: Facts) -> Bundle:
     return bundle(order.fleet, robot, order.secrets, wheels, executable=facts.executable, units=stock_units())
 
 
-def refusal(order: Order, robot: str, computer: Computer, facts: Facts) -> Outcome | None:
-    """The outcome for a computer that cannot run udp_mesh; None when it can."""
-    reasons = list(objections(facts, robot=robot, arch=computer.arch, python=computer.python, now_s=order.now_s()))
-    return _refused(robot, reasons) if reasons else None
+def planned(host: Host, robot: str, order: Order) -> tuple[Facts, Bundle] | Outcome:
+    """The probed computer and what it shall have; an outcome for one that cannot have it. Changes nothing."""
+    facts = probe(host, order.fleet, robot)
+    computer = computer_of(order.fleet, robot)
+    reasons = list(objections(facts, robot=robot, arch=computer.arch, python=computer.python))
+    if reasons:
+        return _refused(robot, reasons)
+    try:
+        return facts, wanted(order, robot, facts)
+    except InputError as error:
+        return Outcome(robot, Result.REFUSED, str(error), hint=error.hint)
 
 
 def _refused(robot: str, reasons: list[tuple[str, str]]) -> Outcome:
@@ -102,49 +121,63 @@ def _refused(robot: str, reasons: list[tuple[str, str]]) -> Outcome:
     )
 
 
-def deploy(host: Host, robot: str, computer: Computer, order: Order) -> Outcome:
+def deploy(host: Host, robot: str, order: Order) -> Outcome:
     """Bring one robot to its bundle. Raises NodeError where it fails before anything that runs was touched."""
-    order.tell(robot, "look")
-    facts = probe(host, computer.python)
-    refused = refusal(order, robot, computer, facts)
-    if refused is not None:
-        return refused
-    try:
-        release = wanted(order, robot, facts)
-    except InputError as error:
-        return Outcome(robot, Result.REFUSED, str(error), hint=error.hint)
+    with order.step(robot, "look", ""):
+        plan = planned(host, robot, order)
+    if isinstance(plan, Outcome):
+        return plan
+    facts, release = plan
     if facts.current == release.id and facts.is_sound:
-        return Outcome(robot, Result.UNCHANGED, f"already runs {release.id}", facts={"release": release.id})
+        same = Outcome(robot, Result.UNCHANGED, f"already runs {release.id}", facts={"release": release.id})
+        return _with_clock(same, facts, order)
     if order.only_configuration and not _only_configuration(facts, release):
         return _refused(robot, [_more_than_configuration(facts, release)])
+    is_new = release.id not in facts.releases or bool(facts.damaged)
+    needed = release.unpacked_bytes if is_new and (release.tree not in facts.trees or facts.damaged) else 0
+    full = list(room_objection(facts, needed)) if is_new else []
+    if full:
+        return _refused(robot, full)
+    with claimed(host, current=facts.current):
+        sent = _bring(host, robot, order, release, is_new=is_new, with_wheels=needed > 0)
+        how = "reload" if _only_configuration(facts, release) else "restart"
+        with order.step(robot, "switch", f"to {release.id} ({how})"):
+            outcome = switch(host, robot, release.id, how, order.wait_s)
+    told = {**outcome.facts, "release": release.id, "how": how, "sent_bytes": str(sent)}
+    return _with_clock(replace(outcome, facts=told), facts, order)
+
+
+def _bring(host: Host, robot: str, order: Order, release: Bundle, *, is_new: bool, with_wheels: bool) -> int:
+    """Put the release beside what runs; the bytes of packages that had to travel."""
     sent = 0
-    if release.id not in facts.releases or facts.damaged:
-        needed = release.unpacked_bytes if release.tree not in facts.trees or facts.damaged else 0
-        full = list(room_objection(facts, needed))
-        if full:
-            return _refused(robot, full)
-        if needed:
-            order.tell(robot, f"send {sum(len(wheel.content) for wheel in release.wheels) >> 10} KiB of packages")
+    if with_wheels:
+        size_kib = sum(len(wheel.content) for wheel in release.wheels) >> 10
+        with order.step(robot, "send", f"{size_kib} KiB of packages"):
             for wheel in release.wheels:
-                sent += host.put(wheel.content, f"{_WHEEL_DIRECTORY}/{wheel.file}")
-        order.tell(robot, f"install {release.id}")
-        host.run("install", release.id, release.tree, stdin=release.archive(), timeout_s=INSTALL_TIMEOUT_S)
-    how = "reload" if _only_configuration(facts, release) else "restart"
-    order.tell(robot, f"switch to {release.id} ({how})")
-    outcome = switch(host, robot, release.id, how, order.wait_s)
-    return Outcome(
-        outcome.node,
-        outcome.result,
-        outcome.reason,
-        outcome.hint,
-        facts={**outcome.facts, "release": release.id, "how": how, "sent_bytes": str(sent)},
+                sent += host.put(wheel.content, f"{_WHEEL_DIRECTORY}/{wheel.stored}")
+    if is_new:
+        with order.step(robot, "install", release.id):
+            host.run("install", release.id, release.tree, stdin=release.archive(), timeout_s=INSTALL_TIMEOUT_S)
+    return sent
+
+
+def _with_clock(outcome: Outcome, facts: Facts, order: Order) -> Outcome:
+    remark, hint = clock_remark(facts, order.now_s())
+    if not remark:
+        return outcome
+    return replace(
+        outcome, reason=f"{outcome.reason}; {remark}", hint="; ".join(text for text in (outcome.hint, hint) if text)
     )
 
 
 def _only_configuration(facts: Facts, release: Bundle) -> bool:
     """Whether the running daemon can take the new release by reading its files again, losing nothing it holds."""
+    return facts.is_sound and not _other_files(facts, release)
+
+
+def _other_files(facts: Facts, release: Bundle) -> list[str]:
     changed = changed_files(facts, release.hashes)
-    return facts.is_sound and all(path.startswith("etc/") or path == "topics" for path in changed)
+    return [path for path in changed if not path.startswith("etc/") and path != "topics"]
 
 
 def _more_than_configuration(facts: Facts, release: Bundle) -> tuple[str, str]:
@@ -152,8 +185,30 @@ def _more_than_configuration(facts: Facts, release: Bundle) -> tuple[str, str]:
         return "udp_mesh is not installed there", "`meshctl robots deploy` first"
     if not facts.is_sound:
         return "the daemon there does not run as it was deployed", "`meshctl robots diff`, then `meshctl robots deploy`"
-    other = [path for path in changed_files(facts, release.hashes) if not path.startswith("etc/") and path != "topics"]
-    return f"more than the configuration would change ({', '.join(other)})", "`meshctl robots deploy` first"
+    other = ", ".join(_other_files(facts, release))
+    return f"more than the configuration would change ({other})", "`meshctl robots deploy` first"
+
+
+@contextmanager
+def claimed(host: Host, *, current: str = "-") -> Iterator[None]:
+    """Hold a robot against other operators and processes, from one script to the next.
+
+    With `current` it must still run that release. Raises Refused for one that another process holds or has changed. A
+    claim whose process on this computer has died is taken over; others end by themselves (scripts/common.sh).
+    """
+    told = host.run("claim", current, "", timeout_s=PROBE_TIMEOUT_S).split()
+    if told[:1] == ["held"] and is_dead(told[1]):
+        told = host.run("claim", current, told[1], timeout_s=PROBE_TIMEOUT_S).split()
+    if told[:1] != ["claimed"]:
+        _, holder, seconds = (*told, "", "", "")[:3]
+        hint = "wait until it is done; a claim that nobody gives back ends by itself after 15 minutes"
+        raise Refused(f"{host.label}: {holder} changes this robot, for {seconds} s now", code="busy", hint=hint)
+    try:
+        yield
+    finally:
+        # where the link broke, the claim ends as said above
+        with suppress(NodeError):
+            host.run("release", timeout_s=PROBE_TIMEOUT_S)
 
 
 def switch(host: Host, robot: str, release: str, how: str, wait_s: int) -> Outcome:
@@ -181,7 +236,8 @@ def switched(robot: str, release: str, told: str) -> Outcome:
         case "rolled-back":
             return Outcome(robot, Result.ROLLED_BACK, f"{reason}; the release before runs again", hint)
         case "rolled-back-ill":
-            why = f"{reason}; went back to the release before, which does not prove itself either"
+            still = one.get("still", "") or "it does not prove itself"
+            why = f"{reason}; went back to the release before, which is not well either: {still}"
             return Outcome(robot, Result.ROLLED_BACK, why, hint)
         case "removed":
             return Outcome(robot, Result.ROLLED_BACK, f"{reason}; there was no release before, so it was removed", hint)
@@ -189,9 +245,13 @@ def switched(robot: str, release: str, told: str) -> Outcome:
             return Outcome(robot, Result.FAILED, f"{reason or 'the switch said nothing'}; nothing to go back to", hint)
 
 
-def roll_back(host: Host, robot: str, computer: Computer, wait_s: int) -> Outcome:
+def roll_back(host: Host, robot: str, order: Order) -> Outcome:
     """Go back to the release before, which stays installed for this."""
-    facts = probe(host, computer.python)
+    facts = probe(host, order.fleet, robot)
     if not facts.previous or facts.previous not in facts.releases:
-        raise Refused(f"{host.label}: there is no release before {facts.current or 'this'}", code="no-release")
-    return switch(host, robot, facts.previous, "restart", wait_s)
+        hint = "`meshctl robots deploy` brings what the inventory says"
+        raise Refused(
+            f"{host.label}: there is no release before {facts.current or 'this'}", code="no-release", hint=hint
+        )
+    with claimed(host, current=facts.current), order.step(robot, "switch", f"back to {facts.previous}"):
+        return switch(host, robot, facts.previous, "restart", order.wait_s)

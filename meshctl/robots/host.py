@@ -46,23 +46,31 @@ class Host(Protocol):
 
 _HINTS = {
     "no-space": "make room at /opt, then deploy again",
-    "busy": "wait until it is done, then deploy again",
+    "busy": "wait until it is done, then run the command again",
+    "moved": "look with `meshctl robots diff`, then run the command again",
+    "not-installed": "`meshctl robots deploy` installs it",
+    "service": "`meshctl robots logs` shows why",
+    "check": "the release is not installed; what runs there was not touched",
+    "account": "look at /etc/passwd there, and whether its disk is writable",
     "damaged": "deploy again; if it happens again, look at the disk",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class SshHost(Host):
-    """`connection` is logged in as any user who is root or may use sudo; see `become_root`."""
+    """`connection` is logged in as any user who is root or may use sudo; see `become_root`. `owner` names us to the
+    robot's lock, where we change something."""
 
     connection: Connection
+    owner: str = ""
 
     @property
     def label(self) -> str:
         return self.connection.endpoint.label
 
     def run(self, verb: str, *words: str, stdin: bytes = b"", timeout_s: float) -> str:
-        command = quoted("sh", "-c", script(verb), f"udp-mesh-{verb}", *words)
+        program = f"owner={quoted(self.owner)}\n{script(verb)}"
+        command = quoted("sh", "-c", program, f"udp-mesh-{verb}", *words)
         done = self.connection.run(command, stdin=stdin, timeout_s=timeout_s)
         last = (done.stderr.strip().splitlines() or [""])[-1]
         if last.startswith("refused "):
@@ -118,6 +126,8 @@ def become_root(connection: Connection, password: Callable[[], Secret | None]) -
     `password` is asked for only where sudo wants one; None means there is none to give.
     """
     label, user = connection.endpoint.label, connection.endpoint.user
+    if user == "root":
+        return connection
     how = connection.run(_HOW).check(f"{label}: become root").stdout.strip()
     match how:
         case "root":

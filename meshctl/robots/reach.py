@@ -6,21 +6,22 @@ Host keys are pinned in the fleet's own file under `robot.NAME`, since a node ma
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 from meshctl.apply.access import Access
 from meshctl.apply.bootstrap import Recorder
-from meshctl.device.connection import Credentials, Endpoint
+from meshctl.device.connection import Connection, Credentials, Endpoint
 from meshctl.device.errors import AuthenticationRefused
-from meshctl.device.ssh import connect
+from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import HostKey, HostKeyPolicy
 from meshctl.errors import InputError
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.model import Computer, Fleet, Secret
+from meshctl.model import Fleet, Secret
 from meshctl.robots.host import Host, SshHost, become_root
+from meshctl.robots.target import computer_of
 
 
 def _no_password() -> Secret | None:
@@ -30,68 +31,75 @@ def _no_password() -> Secret | None:
 @dataclass(frozen=True, slots=True)
 class Reach:
     """How to get at the computers of a fleet. `access` holds its pins, keys and the way through radios; `password` is
-    what sudo gets where it wants one. Safe for many threads."""
+    what sudo gets where it wants one; `owner` names us to the robots' locks. Safe for many threads."""
 
     fleet: Fleet
     access: Access
     password: Callable[[], Secret | None] = field(default=_no_password, repr=False)
+    owner: str = ""
 
     def endpoint(self, robot: str) -> Endpoint:
-        computer = self.computer(robot)
+        computer = computer_of(self.fleet, robot)
         host = computer.ssh.host or str(computer.address.ip)
         return Endpoint(host, computer.ssh.port, computer.ssh.user, identity=f"robot.{robot}")
 
-    def computer(self, robot: str) -> Computer:
-        """Raises InputError for a robot that has none."""
-        computer = self.fleet.robots[robot].computer
-        if computer is None:
-            raise InputError(f"robot {robot} has no computer in the inventory", hint=f"write robots.{robot}.computer")
-        return computer
+    @contextmanager
+    def host(
+        self, robot: str, policy: HostKeyPolicy | None = None, *, opened: Callable[[Connection], None] = lambda _: None
+    ) -> Iterator[Host]:
+        """The robot's computer, as root. Raises what `ssh.connect` and `become_root` raise.
+
+        `opened` gets the connection as soon as it stands, for somebody else to close when all shall end at once.
+        """
+        settings = computer_of(self.fleet, robot).ssh
+        named = tuple(self._path(text) for text in settings.key_files)
+        with self._connected(
+            robot,
+            Credentials((*self.access.key_files, *named), use_agent=self.access.use_agent),
+            policy or self.access.trust,
+        ) as connection:
+            opened(connection)
+            yield SshHost(become_root(connection, self.password), self.owner)
 
     @contextmanager
-    def host(self, robot: str, policy: HostKeyPolicy | None = None) -> Iterator[Host]:
-        """The robot's computer, as root. Raises what `ssh.connect` and `become_root` raise."""
-        settings = self.computer(robot).ssh
-        named = tuple(self._path(text) for text in settings.key_files)
-        jump = self.fleet.nodes.get(settings.jump) if settings.jump else None
-        if settings.jump and jump is None:
-            raise InputError(f"robots.{robot}.computer.ssh.jump: there is no node {settings.jump!r}")
-        via = self.access.open(jump) if jump is not None else None
-        try:
-            with connect(
-                self.endpoint(robot),
-                credentials=Credentials((*self.access.key_files, *named), use_agent=self.access.use_agent),
-                trust=policy or self.access.trust,
-                deadlines=self.access.deadlines,
-                via=via,
-            ) as connection:
-                yield SshHost(become_root(connection, self.password))
-        finally:
+    def _connected(self, robot: str, credentials: Credentials, trust: HostKeyPolicy) -> Iterator[SshConnection]:
+        endpoint = self.endpoint(robot)
+        with ExitStack() as stack:
+            via = self._jump(robot)
             if via is not None:
-                via.close()
+                stack.callback(via.close)
+            try:
+                connection = connect(
+                    endpoint, credentials=credentials, trust=trust, deadlines=self.access.deadlines, via=via
+                )
+            except AuthenticationRefused as error:
+                # the device layer knows radios, whose keys are in another place
+                hint = f"put your public key into ~{endpoint.user}/.ssh/authorized_keys there (ssh-copy-id), or name"
+                error.hint = f"{hint} another in robots.{robot}.computer.ssh"
+                raise
+            yield stack.enter_context(connection)
+
+    def _jump(self, robot: str) -> SshConnection | None:
+        """The radio on the way, logged in; None where there is none."""
+        name = computer_of(self.fleet, robot).ssh.jump
+        if not name:
+            return None
+        radio = self.fleet.nodes.get(name)
+        if radio is None:
+            place = f"robots.{robot}.computer.ssh.jump"
+            raise InputError(f"{place}: there is no node {name!r}", hint=did_you_mean(name, self.fleet.nodes))
+        return self.access.open(radio)
 
     def shown_key(self, robot: str) -> HostKey | None:
         """The host key that the computer shows, believed by nobody. Raises what `ssh.connect` raises."""
         recorder = Recorder()
-        settings = self.computer(robot).ssh
-        jump = self.fleet.nodes.get(settings.jump)
-        via = self.access.open(jump) if jump is not None else None
         try:
             # without credentials: the key is shown before anyone logs in
-            connect(
-                self.endpoint(robot),
-                credentials=Credentials(use_agent=False),
-                trust=recorder,
-                deadlines=self.access.deadlines,
-                via=via,
-            ).close()
+            with self._connected(robot, Credentials(use_agent=False), recorder):
+                return recorder.key
         except AuthenticationRefused:
             # expected: what was asked for has come before
             return recorder.key
-        finally:
-            if via is not None:
-                via.close()
-        return recorder.key
 
     def _path(self, text: str) -> Path:
         path = Path(text).expanduser()

@@ -9,11 +9,13 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+from meshctl.errors import InputError
+from meshctl.model import Computer, Fleet
 from meshctl.robots.tags import Target
 
 # udp_mesh uses asyncio.timeout and tomllib.
 LEAST_PYTHON = (3, 11)
-# A clock this far off has lost its battery: logs and recordings would lie, and certificates and outboxes would age.
+# A clock this far off has lost its battery.
 MAX_CLOCK_SKEW_S = 24 * 3600.0
 # What other programs on the computer need while a release is unpacked.
 SPARE_KIB = 32 << 10
@@ -29,6 +31,7 @@ class Facts:
     uid: int = -1
     has_systemd: bool = False
     missing_tools: tuple[str, ...] = ()
+    missing_ros: str = ""
     python: tuple[int, int, int] | None = None
     implementation: str = ""
     bits: int = 0
@@ -87,6 +90,7 @@ def parse_facts(text: str) -> Facts:
         uid=_number(one.get("uid", "-1"), -1),
         has_systemd=one.get("systemd") == "yes",
         missing_tools=tuple(one.get("missing", "").split()),
+        missing_ros=one.get("no_ros", ""),
         python=_version(one.get("python", "")),
         implementation=one.get("implementation", ""),
         bits=_number(one.get("bits", "")),
@@ -135,7 +139,28 @@ def _arch_of_python(machine: str, bits: int) -> str:
     return machine
 
 
-def objections(facts: Facts, *, robot: str, arch: str, python: str, now_s: float) -> Iterator[tuple[str, str]]:
+def computer_of(fleet: Fleet, robot: str) -> Computer:
+    """Raises InputError for a robot that has none."""
+    computer = fleet.robots[robot].computer
+    if computer is None:
+        raise InputError(f"robot {robot} has no computer in the inventory", hint=f"write robots.{robot}.computer")
+    return computer
+
+
+def clock_remark(facts: Facts, now_s: float) -> tuple[str, str]:
+    """(what is wrong with its clock, how to mend it), empty where nothing is.
+
+    A wrong clock keeps nothing from working, since no step here and nothing in the daemon believes it; but its logs
+    and recordings lie.
+    """
+    skew_s = facts.now_s - now_s
+    if abs(skew_s) <= MAX_CLOCK_SKEW_S:
+        return "", ""
+    side = "ahead of" if skew_s > 0 else "behind"
+    return f"its clock is {_days(abs(skew_s))} {side} ours", "its logs lie until it is set: `date -s`, or NTP"
+
+
+def objections(facts: Facts, *, robot: str, arch: str, python: str) -> Iterator[tuple[str, str]]:
     """Why the computer cannot run udp_mesh as the inventory (`arch`, `python`) has it: (reason, how to mend it)."""
     if facts.uid != 0:
         yield "the scripts did not run as root", "log in as root, or as a user who may use sudo"
@@ -143,14 +168,13 @@ def objections(facts: Facts, *, robot: str, arch: str, python: str, now_s: float
         yield "systemd does not run there", "udp_mesh is deployed as a systemd service"
     if facts.missing_tools:
         yield f"it lacks {', '.join(facts.missing_tools)}", "they are in coreutils, util-linux, tar and mawk"
+    if facts.missing_ros:
+        hint = f"install ROS there, or take `ros` out of robots.{robot}.computer"
+        yield f"ROS is not there: no {facts.missing_ros}", hint
     if facts.arch != arch:
         hint = f"write `arch: {facts.arch}` at robots.{robot}.computer, if it is the right computer"
         yield f"wrong CPU: the inventory says {arch}, it is {facts.arch}", hint
     yield from _python_objections(facts, robot, python)
-    skew_s = facts.now_s - now_s
-    if abs(skew_s) > MAX_CLOCK_SKEW_S:
-        side = "ahead of" if skew_s > 0 else "behind"
-        yield f"its clock is {_days(abs(skew_s))} {side} ours", "set it: `date -s`, or let NTP do so"
     if not facts.is_writable:
         yield "its disk is read-only", "remount it, or look at its log for disk errors"
 

@@ -44,6 +44,11 @@ class Wheel:
     def sha256(self) -> str:
         return hashlib.sha256(self.content).hexdigest()
 
+    @property
+    def stored(self) -> str:
+        """Its name on a robot: two wheels with one name but other bytes never meet there."""
+        return f"{self.sha256[:16]}-{self.file}"
+
 
 def _wheel(file: str, content: bytes) -> Wheel:
     """Raises InputError for what is no archive, or would not install by unpacking alone."""

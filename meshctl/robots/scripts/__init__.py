@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 _DIRECTORY = Path(__file__).resolve().parent
@@ -9,7 +10,9 @@ _DIRECTORY = Path(__file__).resolve().parent
 
 def script(name: str) -> str:
     """The text of one verb (`probe`, `install`, `switch`, ...), with the part that all of them share before it."""
-    return shipped("common.sh") + shipped(f"{name}.sh")
+    verb = shipped(f"{name}.sh")
+    program = f"health_program={shlex.quote(shipped('health.py'))}\n" if "health " in verb else ""
+    return shipped("common.sh") + program + verb
 
 
 def shipped(name: str) -> str:

@@ -15,9 +15,10 @@ root=/opt/udp-mesh
 unit=udp-mesh.service
 bridge_unit=udp-mesh-ros1.service
 units=/etc/systemd/system
-unit_file=$units/$unit
 socket=/run/udp-mesh/udp-mesh.sock
 account=udp-mesh
+# longer than the longest script of a deploy takes
+claim_s=900
 
 # die WORD TEXT: one line for the operator; the first word is for programs.
 die() {
@@ -36,11 +37,33 @@ point() {
 	ln -sfn "releases/$2" "$root/.$1.new" && mv -fT "$root/.$1.new" "$root/$1"
 }
 
-# alone: one change at a time; the lock goes with this process.
+# alone: one change at a time; the lock goes with this process. Between the scripts of one command the robot is held by
+# a claim: `OWNER UPTIME BOOT`, in $root/.claim. A claim ends with a boot, and by itself when nobody gives it back.
 alone() {
 	mkdir -p "$root" || die no-space "cannot make $root"
 	exec 9>"$root/.lock"
-	flock -n 9 || die busy "another operator changes this robot right now"
+	flock -n 9 || die busy "another command changes this robot right now"
+	claimed_by
+	[ -z "$claimer" ] || [ "$claimer" = "$owner" ] || die busy "$claimer changes this robot, for ${claimed_s} s now"
+}
+
+claimed_by() {
+	claimer='' claimed_s=0 boot=$(cat /proc/sys/kernel/random/boot_id)
+	read -r uptime _ </proc/uptime
+	uptime=${uptime%.*}
+	[ -e "$root/.claim" ] || return 0
+	read -r claimer since when <"$root/.claim"
+	claimed_s=$((uptime - since))
+	[ "$when" = "$boot" ] && [ "$claimed_s" -lt "$claim_s" ] || claimer=
 }
 
 mesh() { "$root/current/bin/udp-mesh" "$@"; }
+
+# ours: the units that are installed here, the daemon's first.
+ours() { for service in $unit $bridge_unit; do [ ! -e "$units/$service" ] || echo "$service"; done; }
+
+# health WORD...: what health.py, which stands in $health_program, tells in the Python of the current release.
+health() {
+	read -r python 2>/dev/null <"$root/current/python" || return 1
+	"$python" -I -c "$health_program" "$@"
+}

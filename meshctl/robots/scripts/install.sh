@@ -36,6 +36,6 @@ chmod 755 "$new"
 chown "$account:" "$new/etc"/*
 words=$("$new/bin/udp-mesh" check "$new/etc/udp-mesh.toml" 2>&1) || die check "$words"
 [ ! -e "$root/releases/$id" ] || mv -T "$root/releases/$id" "$root/releases/.$id.old.new"
-sync
-mv -T "$new" "$root/releases/$id" && sync || die no-space "cannot place the release"
+sync -f "$root"
+mv -T "$new" "$root/releases/$id" && sync -f "$root" || die no-space "cannot place the release"
 echo "installed $id"

@@ -1,6 +1,3 @@
-# logs LINES SINCE: the daemon's last words; SINCE as journalctl takes it, or empty.
-if [ -n "$2" ]; then
-	journalctl -u "$unit" -n "$1" --since "$2" --no-pager -o short-iso
-else
-	journalctl -u "$unit" -n "$1" --no-pager -o short-iso
-fi
+# logs LINES SINCE: the last words of the daemon and of the bridge; SINCE as journalctl takes it, or empty.
+set -- -n "$1" ${2:+--since "$2"}
+journalctl -u "$unit" -u "$bridge_unit" "$@" --no-pager -o short-iso

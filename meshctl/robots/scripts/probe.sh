@@ -1,5 +1,5 @@
-# probe PYTHON: everything that decides whether and how this computer is changed, as NAME=VALUE lines. Changes nothing.
-python=$1
+# probe PYTHON ROS: everything that decides whether and how this computer is changed, as NAME=VALUE lines. Changes nothing.
+python=$1 ros=$2
 
 echo "arch=$(uname -m)"
 echo "now=$(date +%s)"
@@ -10,6 +10,7 @@ for tool in systemctl sha256sum tar flock readlink df awk; do
 	command -v "$tool" >/dev/null 2>&1 || missing="$missing $tool"
 done
 echo "missing=${missing# }"
+[ -z "$ros" ] || [ -e "/opt/ros/$ros/setup.bash" ] || echo "no_ros=/opt/ros/$ros/setup.bash"
 
 if path=$(command -v "$python" 2>/dev/null); then
 	# any Python since 2.7 answers this, so that a wrong one can be named

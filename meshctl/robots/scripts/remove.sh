@@ -2,8 +2,10 @@
 # its user; otherwise that waits in /var/lib/udp-mesh for the next install.
 purge=$1
 alone
-systemctl disable --now "$unit" >/dev/null 2>&1
-rm -f "$unit_file"
+for service in $(ours); do
+	systemctl disable --now "$service" >/dev/null 2>&1
+	rm -f "$units/$service"
+done
 systemctl daemon-reload
 rm -rf "$root"
 if [ "$purge" = purge ]; then

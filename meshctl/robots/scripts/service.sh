@@ -1,5 +1,7 @@
-# service VERB: start, stop or restart, as systemd does it.
-[ -e "$unit_file" ] || die not-installed "udp-mesh is not installed here"
+# service VERB: stop or restart, as systemd does it, the daemon and the ROS bridge if there is one. Prints their states.
+[ -n "$(ours)" ] || die not-installed "udp-mesh is not installed here"
 alone
-systemctl "$1" "$unit" || die service "systemctl $1 $unit failed; see the log"
-echo "$(systemctl is-active "$unit" 2>/dev/null)"
+for service in $(ours); do
+	systemctl "$1" "$service" || die service "systemctl $1 $service failed: $(systemctl is-active "$service" 2>/dev/null)"
+done
+for service in $(ours); do echo "$service $(systemctl is-active "$service" 2>/dev/null)"; done

@@ -9,54 +9,44 @@ was=$(release_of current)
 # a switch that was cut short has proved nothing: what ran before it is still what to go back to
 [ ! -e "$root/unproven" ] || read -r was <"$root/unproven" || was=
 
-# names KEY: the names of JSON objects whose KEY is true (udp-mesh prints one field a line, the name first).
-names() {
-	awk -F'"' -v key="$1" '$2 == "name" { name = $4 } $2 == key && $3 ~ /true/ { print name }'
-}
-
-peers() { mesh peers --json 2>/dev/null | names online | sort; }
-
-field() { awk -F'"' -v key="$1" '$2 == key { print $4; exit }'; }
-
-# bring HOW: lets the current release run.
+# bring HOW: lets the units of the current release run, and no other ones of ours.
 bring() {
-	cp "$root/current/$unit" "$unit_file.new" && mv -f "$unit_file.new" "$unit_file" || return 1
-	systemctl daemon-reload && systemctl enable "$unit" >/dev/null 2>&1 || return 1
-	if [ "$1" = reload ] && systemctl is-active "$unit" >/dev/null 2>&1 && changes=$(mesh reload 2>&1); then
-		case $changes in *"takes effect with the next start"*) ;; *) return 0 ;; esac
+	for service in $bridge_unit $unit; do
+		if [ -e "$root/current/$service" ]; then
+			cp "$root/current/$service" "$units/$service.new" && mv -f "$units/$service.new" "$units/$service" || return 1
+		elif [ -e "$units/$service" ]; then
+			systemctl disable --now "$service" >/dev/null 2>&1
+			rm -f "$units/$service"
+		fi
+	done
+	systemctl daemon-reload
+	for service in $(ours); do
+		systemctl enable "$service" >/dev/null 2>&1 || return 1
+		if [ "$1" = reload ] && systemctl is-active "$service" >/dev/null 2>&1 && takes_over "$service"; then continue; fi
+		systemctl reset-failed "$service" 2>/dev/null
+		systemctl restart "$service" || return 1
+	done
+}
+
+# takes_over UNIT: lets a running service take the new files without an interruption, where it can.
+takes_over() {
+	# the bridge reads none of them
+	[ "$1" = "$unit" ] || return 0
+	changes=$(mesh reload 2>&1) || return 1
+	case $changes in *"takes effect with the next start"*) return 1 ;; esac
+}
+
+# well HOW: brings the current release and waits for it to prove itself; `reason` tells why it does not.
+well() {
+	reason=
+	if bring "$1"; then
+		reason=$(health prove "$wait_s" "$before" $(ours) 2>&1) && [ -z "$reason" ]
+	else
+		# one look is enough to say why, and a robot should not be without its daemon for longer
+		reason=$(health prove 0 "$before" $(ours) 2>&1)
+		[ -n "$reason" ] || reason="systemd could not start it"
+		return 1
 	fi
-	systemctl reset-failed "$unit" 2>/dev/null
-	systemctl restart "$unit"
-}
-
-# ill: one line on what keeps the daemon from being well; nothing when it is.
-ill() {
-	[ "$(systemctl is-active "$unit" 2>/dev/null)" = active ] || { echo "the daemon does not run"; return; }
-	status=$(mesh status --json 2>&1) || { echo "the daemon does not answer: $status"; return; }
-	boot=$(echo "$status" | field boot)
-	[ "$boot" = "$seen_boot" ] || { seen_boot=$boot; echo "the daemon has only just started"; return; }
-	topics=$(mesh topics --json 2>/dev/null | names configured)
-	while read -r topic; do
-		echo "$topics" | grep -qxF -e "$topic" || { echo "topic $topic is not there"; return; }
-	done <"$root/current/topics"
-	online=$(peers)
-	for peer in $before; do
-		echo "$online" | grep -qxF -e "$peer" || { echo "peer $peer was online before and is not seen"; return; }
-	done
-}
-
-# prove WAIT: whether the daemon is well within so long; `reason` tells why not. Two looks have to see the same process.
-prove() {
-	left=$1 seen_boot=
-	while :; do
-		# not in a subshell, which would forget the process it saw
-		ill >"$root/.ill"
-		read -r reason <"$root/.ill" || reason=
-		[ -n "$reason" ] || { rm -f "$root/.ill"; return 0; }
-		[ "$left" -gt 0 ] || { rm -f "$root/.ill"; return 1; }
-		left=$((left - 1))
-		sleep 1
-	done
 }
 
 # what is gone with the last release that used it
@@ -75,40 +65,45 @@ tidy() {
 	rm -f "$root"/wheels/.*.part
 }
 
-before=$(peers)
-echo "$was" >"$root/unproven" && sync
+trap 'rm -f "$root/.claim"' EXIT
+before=$(health before 2>/dev/null) || before='[[], {}, ""]'
+echo "$was" >"$root/unproven" && sync -f "$root"
 point current "$id" || die no-space "cannot change $root/current"
-if bring "$how" && prove "$wait_s"; then
+if well "$how"; then
 	[ -z "$was" ] || [ "$was" = "$id" ] || point previous "$was"
 	rm -f "$root/unproven"
 	tidy
-	sync
+	sync -f "$root"
 	echo "result=switched"
-	echo "online=$(echo $(peers))"
+	echo "online=$(health online 2>/dev/null)"
 	exit 0
 fi
-[ -n "${reason:-}" ] || reason="systemd could not start the daemon"
-log=$(journalctl -u "$unit" -n 12 --no-pager -o cat 2>/dev/null | sed 's/^/log=/')
+why=$reason
+journalctl --sync 2>/dev/null
+log=$(journalctl -u "$unit" -u "$bridge_unit" -n 12 --no-pager -o cat 2>/dev/null | sed 's/^/log=/')
 
 if [ -n "$was" ] && [ "$was" != "$id" ] && [ -d "$root/releases/$was" ]; then
 	point current "$was"
-	if bring "$how" && reason_before=$reason && prove "$wait_s"; then
+	if well "$how"; then
 		echo "result=rolled-back"
 	else
 		echo "result=rolled-back-ill"
+		echo "still=$(echo $reason)"
 	fi
-	reason=${reason_before:-$reason}
 	rm -f "$root/unproven"
 	rm -rf "$root/releases/$id"
 elif [ -z "$was" ]; then
-	systemctl disable --now "$unit" >/dev/null 2>&1
-	rm -f "$unit_file" "$root/current" "$root/unproven"
+	for service in $(ours); do
+		systemctl disable --now "$service" >/dev/null 2>&1
+		rm -f "$units/$service"
+	done
+	rm -f "$root/current" "$root/unproven"
 	rm -rf "$root/releases/$id"
 	systemctl daemon-reload
 	echo "result=removed"
 else
 	echo "result=ill"
 fi
-sync
-echo "reason=$reason"
+sync -f "$root"
+echo "reason=$(echo $why)"
 echo "$log"

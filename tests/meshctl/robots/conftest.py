@@ -1,4 +1,4 @@
-"""A fleet of two robots on loopback, and wheels for them."""
+"""Robots on a network of their own, and wheels for them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,15 @@ from pathlib import Path
 import pytest
 
 from tests.meshctl.robots.fleets import RobotFleet
+from tests.meshctl.robots.lan import Lan
+from tests.meshctl.robots.machine import debian
 from tests.meshctl.robots.wheels import repack
+
+
+@pytest.fixture(scope="session")
+def base() -> Path:
+    """The Debian that the machines stand on; building it the first time takes its while."""
+    return debian()
 
 
 @pytest.fixture(scope="session")
@@ -17,11 +25,17 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def fleet(tmp_path: Path, wheels: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RobotFleet]:
+def fleet(base: Path, wheels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RobotFleet]:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.delenv("SSH_AUTH_SOCK", raising=False)
     monkeypatch.delenv("MESHCTL_INVENTORY", raising=False)
-    running = RobotFleet(tmp_path, wheels)
-    yield running
-    running.stop()
+    monkeypatch.delenv("MESHCTL_SUDO_PASSWORD", raising=False)
+    lan = Lan()
+    running = RobotFleet(tmp_path, wheels, base, lan)
+    try:
+        with lan.inside():
+            yield running
+    finally:
+        running.stop()
+        lan.close()

@@ -1,4 +1,4 @@
-"""An inventory of robots at loopback addresses, their machines, and meshctl's own command line over them."""
+"""An inventory of robots, their machines on a network of their own, and meshctl's own command line over them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from meshctl.cli.main import build
 from meshctl.device.trust import TrustStore
+from tests.meshctl.robots.lan import Lan
 from tests.meshctl.robots.machine import PYTHON, Machine, key_pair
-from tests.udp_mesh.links.sockets import free_port
 
 OLD_KEY, NEW_KEY = "00112233445566778899aabbccddeeff" * 2, "ffeeddccbbaa99887766554433221100" * 2
 
@@ -37,8 +37,6 @@ nodes:
 robots:
 {robots}
 udp_mesh:
-  port: {port}
-  broadcast: false
   keys: [{{file: keys.yaml, key: old}}]
   heartbeat_s: 0.2
   offline_after_s: 10
@@ -50,28 +48,29 @@ _ROBOT = """\
   {name}:
     nodes: [{nodes}]
     computer:
-      address: {address}/8
+      address: {address}/24
       arch: {arch}
       python: {python}
-      ssh: {{port: {port}, user: {user}, key_files: [operator]}}
+      ssh: {{user: {user}, key_files: [operator]}}
 """
 
 
 class RobotFleet:
     """`add` robots, then `write` the inventory, then run meshctl's commands on it."""
 
-    def __init__(self, directory: Path, wheels: Path) -> None:
+    def __init__(self, directory: Path, wheels: Path, base: Path, lan: Lan) -> None:
         self.directory = directory
         self.wheels = wheels
         self.key = key_pair(directory / "operator")
         self.file = directory / "fleet.yaml"
         self.machines: dict[str, Machine] = {}
-        self._port = free_port()
+        self._base = base
+        self._lan = lan
         (directory / "keys.yaml").write_text(f'old: "{OLD_KEY}"\nnew: "{NEW_KEY}"\n')
 
     def add(self, name: str, *, opt_kib: int | None = None, start: bool = True) -> Machine:
-        address = f"127.0.4.{len(self.machines) + 1}"
-        machine = Machine(self.directory / name, address, free_port(), self.key, opt_kib=opt_kib)
+        address = f"10.42.0.{10 + len(self.machines)}"
+        machine = Machine(self._base, self.directory / name, self._lan, address, self.key, opt_kib=opt_kib)
         self.machines[name] = machine
         if start:
             machine.start()
@@ -84,14 +83,13 @@ class RobotFleet:
                 name=name,
                 nodes="base" if number == 0 else "",
                 address=machine.address,
-                port=machine.port,
                 arch=arch or _arch(),
                 python=python,
                 user=user,
             )
             for number, (name, machine) in enumerate(self.machines.items())
         )
-        self.file.write_text(_INVENTORY.format(robots=robots, port=self._port))
+        self.file.write_text(_INVENTORY.format(robots=robots))
         trust = TrustStore(self.directory / "known_hosts")
         for name, machine in self.machines.items():
             trust.replace(f"robot.{name}", machine.host_key)
@@ -119,6 +117,11 @@ class RobotFleet:
 
     def shell(self, robot: str, command: str) -> str:
         return self.machines[robot].shell(command, self.directory / "pins")
+
+    def tool(self, robot: str, name: str, text: str) -> None:
+        """A program of this name that everyone there finds before Debian's own."""
+        path = f"/usr/local/bin/{name}"
+        self.shell(robot, f"cat >{path} <<'END'\n{text}END\nchmod 755 {path}")
 
     def stop(self) -> None:
         for machine in self.machines.values():

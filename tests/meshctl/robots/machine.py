@@ -1,14 +1,15 @@
-"""Robot computers for tests: a real OpenSSH server whose sessions live in a root of their own.
+"""Robot computers for tests: a Debian of packages with a real systemd as its first process, and a real OpenSSH server.
 
-Each machine is a mount and process namespace with private /etc, /opt, /root, /run and /var/lib on a loopback address of
-its own; nothing of the machine the tests run on is written. Its `systemctl` is the stand-in of stand_in_systemctl.py,
-because pid 1 is no systemd here; the daemon under it is the real one, run by the real interpreter at /opt/python.
+`debian` has the root built (once; scripts/setup-robot-machine). A `Machine` is that root under a writable layer of its
+own, booted in namespaces, with a cable in a `Lan`. What it wrote stays when it reboots or loses power.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
+import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -16,100 +17,132 @@ from pathlib import Path
 from meshctl.device.connection import Credentials, Deadlines, Endpoint
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import HostKey, TrustStore, parse_key
-from tests.meshctl.device.servers import PATIENCE_S, Server, eventually
+from tests.meshctl.device.servers import PATIENCE_S, eventually
+from tests.meshctl.robots.lan import Lan
 
-PYTHON = f"/opt/python/bin/python{sys.version_info.major}.{sys.version_info.minor}"
+PYTHON = "python3" if sys.version_info[:2] == (3, 11) else f"/opt/python/bin/python3.{sys.version_info.minor}"
+"""Tests deploy wheels made of their own packages: Debian's Python runs them where it is as old as ours, ours else."""
 PATIENT = Deadlines(connect_s=60, handshake_s=120, auth_s=120, channel_s=120, run_s=120)
+BUILD_TIMEOUT_S = 280
+_SETUP = Path(__file__).parents[3] / "scripts/setup-robot-machine"
+_BOOT = Path(__file__).with_name("boot_machine.sh")
 
-# Enough of /etc for sshd, useradd and the dynamic linker.
-_ETC = ("passwd", "group", "nsswitch.conf", "ld.so.cache", "ld.so.conf", "ld.so.conf.d", "login.defs", "alternatives")
 
-_ENTER = r"""
-mount --make-rprivate /
-mkdir -p "$1/opt/python" "$1/var" "$1/root" "$1/etc/systemd/system"
-[ -z "$OPT_KIB" ] || { mount -t tmpfs -o "size=${OPT_KIB}k" tmpfs "$1/opt"; mkdir -p "$1/opt/python"; }
-mount --bind "$PREFIX" "$1/opt/python"
-mount --rbind "$1/opt" /opt
-[ -z "$OVERLAY" ] || mount -t overlay overlay -o "lowerdir=$OVERLAY:/usr" /usr
-mount --bind "$1/etc" /etc
-mount --bind "$1/var" /var/lib
-mount --bind "$1/root" /root
-mount -t tmpfs tmpfs /run
-mkdir -p /run/sshd /run/systemd/system
-# no test cuts the power of the disk, and a real sync waits for whatever else this computer writes
-mount --bind /bin/true /bin/sync
-exec /usr/sbin/sshd -D -e -f "$1/sshd_config" -p "$2"
-"""
+def debian() -> Path:
+    """The root that all machines stand on. Fails, and says why, where it can neither be found nor built."""
+    done = subprocess.run([_SETUP], capture_output=True, text=True, timeout=BUILD_TIMEOUT_S, check=False)
+    assert done.returncode == 0, f"no Debian machine to test on:\n{done.stderr}"
+    return Path(done.stdout.strip())
 
 
 class Machine:
-    """One computer. `address` is its own; `root` is where its private directories are, seen from outside."""
+    """One computer: `root` of the operator's key logs in at `address`. `opt_kib` gives /opt a small disk of its own."""
 
-    def __init__(self, root: Path, address: str, port: int, key: Path, *, opt_kib: int | None = None) -> None:
-        self.root = root
+    def __init__(
+        self, base: Path, directory: Path, lan: Lan, address: str, key: Path, *, opt_kib: int | None = None
+    ) -> None:
+        self.name = directory.name
         self.address = address
-        self.port = port
+        self._base = base
+        self._directory = directory
         self._key = key
         self._opt_kib = opt_kib
-        self.overlay: Path | None = None
-        """A directory that lies over /usr, with what this computer has more."""
-        self._server: Server | None = None
-        for name in ("etc", "bin"):
-            (root / name).mkdir(parents=True)
-        for name in _ETC:
-            source = Path("/etc", name)
-            if source.is_dir():
-                shutil.copytree(source, root / "etc" / name, symlinks=True)
-            elif source.exists():
-                shutil.copy2(source, root / "etc" / name)
-        # where every user of this computer may read it
-        shutil.copy(f"{key}.pub", root / "etc/operator.pub")
-        (root / "etc/shadow").write_text("root:*:0:0:99999:7:::\n")
-        (root / "etc/shadow").chmod(0o600)
-        stand_in = Path(__file__).with_name("stand_in_systemctl.py").read_text()
-        self.tool("systemctl", f"#!{PYTHON}\n{stand_in}")
-        self.tool(
-            "journalctl", '#!/bin/sh\nwhile [ "$1" != -n ]; do shift; done\nexec tail -n "$2" /run/stand-in/log\n'
-        )
-        subprocess.run(
-            ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", root / "host_key"], check=True, timeout=PATIENCE_S
-        )
-        (root / "sshd_config").write_text(
-            f"HostKey {root}/host_key\nAuthorizedKeysFile /etc/operator.pub\nListenAddress {address}\nStrictModes no\n"
-            f"UsePAM no\nPidFile none\nPermitRootLogin yes\nSetEnv PATH={root}/bin:/usr/sbin:/usr/bin:/sbin:/bin\n"
-        )
+        self._network = lan.plug_in(address)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._cgroup = _cgroup_root() / f"{self.name}-{os.getpid()}-{id(self):x}"
+        for name in ("upper", "work", "root"):
+            (directory / name).mkdir(parents=True)
+        self.write("/etc/hostname", f"{self.name}\n")
+        self.write("/root/.ssh/authorized_keys", key.with_suffix(".pub").read_text())
+        host_key = directory / "host_key"
+        key_pair(host_key)
+        self.host_key: HostKey = parse_key(host_key.with_suffix(".pub").read_text())
+        self.write("/etc/ssh/ssh_host_ed25519_key", host_key.read_text(), 0o600)
 
-    def tool(self, name: str, text: str) -> None:
-        """A program that comes first in the PATH of every session."""
-        (self.root / "bin" / name).write_text(text)
-        (self.root / "bin" / name).chmod(0o755)
+    def write(self, path: str, text: str, mode: int = 0o644) -> None:
+        """Put a file there before it is started for the first time."""
+        assert self._process is None
+        target = self._directory / "upper" / path.lstrip("/")
+        for parent in reversed(target.relative_to(self._directory / "upper").parents):
+            made = self._directory / "upper" / parent
+            if not made.exists():
+                made.mkdir()
+                if (self._base / parent).is_dir():
+                    shutil.copystat(self._base / parent, made)
+        target.write_text(text)
+        target.chmod(mode)
+
+    def append(self, path: str, text: str) -> None:
+        """`write`, below what Debian has there."""
+        there = self._base / path.lstrip("/")
+        self.write(path, there.read_text() + text, there.stat().st_mode & 0o7777)
 
     def start(self) -> None:
-        """Power on: sshd, and nothing else until somebody logs in."""
-        argv = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc", "sh", "-ec", _ENTER, "machine"]
-        environment = {
-            "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
-            "PREFIX": sys.base_prefix,
-            "OVERLAY": "" if self.overlay is None else str(self.overlay),
-            "OPT_KIB": "" if self._opt_kib is None else str(self._opt_kib),
-        }
-        self._server = _AtAddress([*argv, str(self.root), str(self.port)], self, environment)
+        """Power on, and wait until it lets somebody log in."""
+        self._cgroup.mkdir()
+        enter = 'echo $$ >"$1/cgroup.procs" && shift && exec "$@"'
+        namespaces = ["--pid", "--fork", "--kill-child", "--mount", "--uts", "--ipc", "--cgroup"]
+        argv: list[str | Path] = [
+            # nothing of it outlives the tests, however they end
+            *("setpriv", "--pdeathsig", "KILL", "sh", "-c", enter, "enter", self._cgroup),
+            *("nsenter", f"--net={self._network}", "unshare", *namespaces),
+            *("sh", _BOOT, self._base, self._directory, str(self._opt_kib or ""), sys.base_prefix),
+        ]
+        self._process = subprocess.Popen(
+            argv,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+        try:
+            eventually(lambda: self._ended() or self.answers)
+            if self._ended():
+                assert self._process.stdout is not None
+                raise AssertionError(f"{self.name} did not boot: {self._process.stdout.read().decode()}")
+        except BaseException:
+            self.stop()
+            raise
+
+    @property
+    def answers(self) -> bool:
+        """Whether its SSH server does."""
+        try:
+            with socket.create_connection((self.address, 22), timeout=5.0) as server:
+                return server.recv(4) == b"SSH-"
+        except OSError:
+            return False
+
+    def _ended(self) -> bool:
+        return self._process is None or self._process.poll() is not None
+
+    def reboot(self, pins: Path) -> None:
+        """As `systemctl reboot` does it: services stop in order, and everything starts anew."""
+        self.shell("systemctl reboot", pins)
+        eventually(self._ended)
+        assert self._process is not None
+        # what the kernel tells of a namespace whose first process asked for a restart: reboot(2)
+        assert self._process.returncode == -signal.SIGHUP
+        self.stop()
+        self.start()
 
     def stop(self) -> None:
         """Power off, at once and without a word to anyone."""
-        if self._server is not None:
-            self._server.stop()
-            self._server = None
+        if self._process is None:
+            return
+        self._process.kill()
+        self._process.wait(PATIENCE_S)
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+        self._process = None
+        eventually(lambda: "populated 0" in (self._cgroup / "cgroup.events").read_text())
+        for directory, _, _ in os.walk(self._cgroup, topdown=False):
+            os.rmdir(directory)
 
-    @property
-    def host_key(self) -> HostKey:
-        return parse_key((self.root / "host_key.pub").read_text())
-
-    def log_in(self, pins: Path) -> SshConnection:
+    def log_in(self, pins: Path, user: str = "root") -> SshConnection:
         trust = TrustStore(pins)
-        trust.replace("machine", self.host_key)
+        trust.replace(self.name, self.host_key)
         return connect(
-            Endpoint(self.address, self.port, identity="machine"),
+            Endpoint(self.address, user=user, identity=self.name),
             credentials=Credentials((self._key,), use_agent=False),
             trust=trust,
             deadlines=PATIENT,
@@ -121,28 +154,16 @@ class Machine:
             return connection.run(command).check(command).stdout
 
 
-class _AtAddress(Server):
-    """A server that is up once its own loopback address takes connections."""
-
-    def __init__(self, argv: list[str], machine: Machine, environment: dict[str, str]) -> None:
-        log = machine.root / "sshd.log"
-        self.port = machine.port
-        self._log = log
-        with log.open("wb") as output:
-            self._process = subprocess.Popen(
-                argv, stdout=output, stderr=output, stdin=subprocess.DEVNULL, env=environment
-            )
-        try:
-            eventually(lambda: self._process.poll() is not None or b"listening on" in log.read_bytes())
-            if self._process.poll() is not None:
-                raise AssertionError(f"the machine did not start: {log.read_text()}")
-        except BaseException:
-            self.stop()
-            raise
+def _cgroup_root() -> Path:
+    """Where this machine has its cgroup v2 hierarchy."""
+    for line in Path("/proc/self/mounts").read_text().splitlines():
+        _, where, kind, *_ = line.split()
+        if kind == "cgroup2":
+            return Path(where)
+    raise AssertionError("a machine's systemd needs cgroup v2, and it is mounted nowhere here")
 
 
 def key_pair(path: Path) -> Path:
     """A new key pair; the private file's path."""
     subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", path], check=True, timeout=PATIENCE_S)
-    os.chmod(path, 0o600)
     return path

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import json
+
+import pytest
+
 from meshctl.inventory import load_fleet
 from tests.meshctl.device.servers import eventually
 from tests.meshctl.robots.fleets import RobotFleet
+
+pytestmark = [pytest.mark.xdist_group("robots"), pytest.mark.timeout(600)]
 
 
 def _boots(fleet: RobotFleet) -> dict[str, str]:
@@ -31,8 +37,9 @@ def test_a_topic_is_added_set_and_removed_everywhere_at_once_without_a_restart(f
     assert "+  video:" in told
     assert "2 done" in told
     fleet.meshctl("topic", "set", "video", "priority=12")
-    for one in fleet.status().values():
-        (video,) = (topic for topic in one["topics"] if topic["name"] == "video")
+    for name in fleet.machines:
+        here = json.loads(fleet.shell(name, "/opt/udp-mesh/current/bin/udp-mesh topics --json"))
+        (video,) = (topic for topic in here["topics"] if topic["name"] == "video")
         assert (video["priority"], video["reliable"], video["destinations"]) == (12, False, ["husky1"])
     assert "2 unchanged" in fleet.deploy()
     fleet.meshctl("topic", "rm", "video")

@@ -12,8 +12,12 @@ import pytest
 from tests.meshctl.robots.fleets import RobotFleet
 from tests.meshctl.robots.wheels import own_wheel_with
 
+pytestmark = [pytest.mark.xdist_group("robots"), pytest.mark.timeout(600)]
+
 # What a second deploy must leave as it is: every file with its time, and the process.
-_EVERYTHING = "find /opt/udp-mesh /etc ! -name .lock -printf '%p %T@ %i\\n' | sort; cat /run/stand-in/*.pid"
+_EVERYTHING = (
+    "find /opt/udp-mesh /etc ! -name .lock -printf '%p %T@ %i\\n' | sort; systemctl show -p MainPID udp-mesh.service"
+)
 
 
 def test_a_first_deploy_installs_and_starts_and_a_second_changes_nothing(fleet: RobotFleet) -> None:
@@ -76,7 +80,7 @@ def test_a_first_release_that_does_not_run_is_removed_again(
     broken = own_wheel_with(tmp_path, "daemon/program.py", "    service = Service(", "    raise OSError\n    Service(")
     monkeypatch.setattr("meshctl.robots.wheels.own_wheel", lambda: broken)
     assert "so it was removed" in fleet.deploy("--wait", "3", exit_code=1)
-    assert fleet.shell("husky1", "ls /opt/udp-mesh/releases /etc/systemd/system/*.service 2>/dev/null || :") == (
+    assert fleet.shell("husky1", "ls /opt/udp-mesh/releases /etc/systemd/system/udp*.service 2>/dev/null || :") == (
         "/opt/udp-mesh/releases:\n"
     )
 

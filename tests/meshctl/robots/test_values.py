@@ -14,7 +14,7 @@ from meshctl.robots.bundle import UNIT_NAME, Bundle, File, service_unit
 from meshctl.robots.deploy import switched
 from meshctl.robots.rotation import parse_ref, stages, written
 from meshctl.robots.tags import Target, parse_wheel, pip_options, takes
-from meshctl.robots.target import Facts, changed_files, objections, parse_facts, room_objection
+from meshctl.robots.target import Facts, changed_files, clock_remark, objections, parse_facts, room_objection
 from meshctl.robots.wheels import own_wheel, stock_units
 
 BOOKWORM = Target((3, 11), "x86_64", "glibc", (2, 36))
@@ -95,8 +95,8 @@ unit=udp-mesh-ros1.service inactive
 """
 
 
-def _reasons(facts: Facts, now_s: float = 1e9) -> list[str]:
-    return [reason for reason, _ in objections(facts, robot="r", arch="x86_64", python="python3", now_s=now_s)]
+def _reasons(facts: Facts) -> list[str]:
+    return [reason for reason, _ in objections(facts, robot="r", arch="x86_64", python="python3")]
 
 
 def test_a_fitting_computer_meets_no_objection_and_every_misfit_is_told_at_once() -> None:
@@ -107,13 +107,20 @@ def test_a_fitting_computer_meets_no_objection_and_every_misfit_is_told_at_once(
     worse = parse_facts(
         PROBED.replace("arch=x86_64", "arch=aarch64").replace("3.11.2", "3.8.10").replace("systemd=yes", "systemd=no")
     )
-    assert _reasons(worse, now_s=1.2e9) == [
+    assert _reasons(worse) == [
         "systemd does not run there",
         "wrong CPU: the inventory says x86_64, it is aarch64",
         "wrong Python: python3 is 3.8.10, udp_mesh needs 3.11 or newer",
-        "its clock is 6.3 years behind ours",
     ]
     assert _reasons(parse_facts("")) != [], "a probe that says nothing is no consent"
+
+
+def test_a_clock_that_is_years_off_is_told_and_is_no_objection() -> None:
+    facts = parse_facts(PROBED)
+    assert clock_remark(facts, 1e9) == ("", "")
+    assert clock_remark(facts, 1.2e9)[0] == "its clock is 6.3 years behind ours"
+    assert clock_remark(facts, 1e9 - 7 * 86_400)[0] == "its clock is 7.0 days ahead of ours"
+    assert _reasons(facts) == []
 
 
 def test_room_is_asked_for_what_is_unpacked_and_something_to_spare() -> None:

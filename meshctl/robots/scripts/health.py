@@ -1,0 +1,190 @@
+"""Asks the daemon on a robot how it fares; runs there, in the release's own Python, with the standard library alone.
+
+    facts                     prints the daemon's status and topics, as sections that a line `== NAME` begins
+    online                    prints the peers that are online
+    before                    prints, as one line of JSON, what has to be so again after a switch: `Before`
+    prove WAIT_S BEFORE UNIT... prints nothing as soon as all is well, or after WAIT_S what is not
+
+The scripts beside this file call it; `look` and `ask` are all its I/O, `flowing` and `ill` decide.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+SOCKET = "/run/udp-mesh/udp-mesh.sock"
+CURRENT = Path("/opt/udp-mesh/current")
+ASK_TIMEOUT_S = 10.0
+LOOK_EVERY_S = 0.25
+# A daemon that dies at start is back within RestartSec=1 for another try: a process must have lived for longer.
+STEADY_S = 2.0
+# Topics are called flowing when so many messages came within so long, so that a single message is no promise of more.
+FLOW_WATCH_S = 1.0
+FLOW_MESSAGES = 2
+
+Json = dict[str, Any]
+
+
+class Before(NamedTuple):
+    """What was so while the release before ran: peers that were online, messages received by topic that flowed, and
+    which process it was (a reload keeps it, and its counts go on)."""
+
+    online: list[str]
+    flowing: dict[str, int]
+    boot: str
+
+
+class Unit(NamedTuple):
+    """A service as `systemctl show` tells it; `started_s` is on the monotonic clock."""
+
+    name: str
+    active: str = ""
+    sub: str = ""
+    result: str = ""
+    restarts: str = "0"
+    started_s: float = 0.0
+
+    def __str__(self) -> str:
+        again = f", started again {self.restarts} times" if self.restarts not in ("", "0") else ""
+        result = f", {self.result}" if self.result not in ("", "success") else ""
+        return f"{self.active or 'not there'} ({self.sub}{result}{again})"
+
+
+class Look(NamedTuple):
+    """One look: the units, and what the daemon answered, or why it did not."""
+
+    units: list[Unit]
+    status: Json
+    topics: list[Json]
+    silent_because: str = ""
+
+    @property
+    def online(self) -> list[str]:
+        peers = self.status.get("conditions", {}).get("peers", [])
+        return sorted(str(peer["name"]) for peer in peers if peer.get("online"))
+
+
+def flowing(first: list[Json], then: list[Json]) -> dict[str, int]:
+    """Topics that received at least FLOW_MESSAGES between two looks, with their counts at the second."""
+    counts = {topic["name"]: int(topic["received_messages"]) for topic in first}
+    later = {topic["name"]: int(topic["received_messages"]) for topic in then}
+    return {name: count for name, count in later.items() if count - counts.get(name, 0) >= FLOW_MESSAGES}
+
+
+def ill(look: Look, wanted: list[str], before: Before, now_s: float) -> str:
+    """Why the robot is not well yet, in one line; empty when it is. `wanted` are the topics it shall have."""
+    for unit in look.units:
+        if unit.active != "active":
+            return f"{_called(unit)} does not run: systemd says {unit}"
+    if look.silent_because:
+        return f"the daemon does not answer: {look.silent_because}"
+    here = {topic["name"]: topic for topic in look.topics}
+    lacking = [name for name in wanted if not here.get(name, {}).get("configured")]
+    if lacking:
+        return f"topics are not there: {', '.join(lacking)}"
+    away = [peer for peer in before.online if peer not in look.online]
+    if away:
+        return f"peers were online before and are not seen: {', '.join(away)}"
+    same = look.status.get("boot") == before.boot
+    dry = [
+        name
+        for name, count in before.flowing.items()
+        if name in here and int(here[name]["received_messages"]) <= (count if same else 0)
+    ]
+    if dry:
+        return f"topics flowed before and receive nothing: {', '.join(dry)}"
+    young = [unit for unit in look.units if now_s - unit.started_s < STEADY_S]
+    return f"{_called(young[0])} has only just started" if young else ""
+
+
+def _called(unit: Unit) -> str:
+    return "the ROS bridge" if "ros" in unit.name else "the daemon"
+
+
+def ask(*operations: str) -> list[Json]:
+    """The daemon's replies. Raises OSError, and ValueError for what is no reply (docs/local-api.md)."""
+    with socket.socket(socket.AF_UNIX) as server:
+        server.settimeout(ASK_TIMEOUT_S)
+        server.connect(SOCKET)
+        with server.makefile("rwb") as stream:
+            replies = []
+            for number, operation in enumerate(operations):
+                header = json.dumps({"op": operation, "id": number}).encode()
+                stream.write(struct.pack(">II", len(header), 0) + header)
+                stream.flush()
+                reply: Json = {}
+                while reply.get("id") != number:
+                    lengths = stream.read(8)
+                    if len(lengths) < 8:
+                        raise ConnectionResetError("it closed the connection")
+                    head, payload = struct.unpack(">II", lengths)
+                    reply = json.loads(stream.read(head))
+                    stream.read(payload)
+                replies.append(reply)
+            return replies
+
+
+def look(units: list[str]) -> Look:
+    seen = [_unit(unit) for unit in units]
+    try:
+        status, topics = ask("status", "topics")
+    except (OSError, ValueError) as error:
+        return Look(seen, {}, [], str(error) or type(error).__name__)
+    return Look(seen, status, list(topics.get("topics", ())))
+
+
+def _unit(name: str) -> Unit:
+    asked = "ActiveState,SubState,Result,NRestarts,ExecMainStartTimestampMonotonic"
+    shown = subprocess.run(["systemctl", "show", "-p", asked, name], capture_output=True, text=True, check=False)
+    told = dict(line.partition("=")[::2] for line in shown.stdout.splitlines())
+    active, sub, result, restarts, started_us = (told.get(key, "") for key in asked.split(","))
+    started_s = int(started_us) / 1e6 if started_us.isdecimal() else 0.0
+    return Unit(name, active, sub, result, restarts, started_s)
+
+
+def before() -> Before:
+    """Waits for FLOW_WATCH_S, but only where something may be flowing."""
+    first = look([])
+    recent = [
+        topic for topic in first.topics if (age := topic.get("received_ago_s")) is not None and age < FLOW_WATCH_S
+    ]
+    flows: dict[str, int] = {}
+    if recent:
+        time.sleep(FLOW_WATCH_S)
+        flows = flowing(first.topics, look([]).topics)
+    return Before(first.online, flows, str(first.status.get("boot", "")))
+
+
+def prove(wait_s: float, was: Before, units: list[str]) -> str:
+    """Looks until all is well; after `wait_s` tells what is not."""
+    wanted = (CURRENT / "topics").read_text(encoding="utf-8").splitlines()
+    deadline = time.monotonic() + wait_s
+    while True:
+        reason = ill(look(units), wanted, was, time.monotonic())
+        if not reason or time.monotonic() >= deadline:
+            return reason
+        time.sleep(LOOK_EVERY_S)
+
+
+def main(words: list[str]) -> None:
+    if words[0] == "facts":
+        seen = look([])
+        sys.stdout.write(f"== status\n{json.dumps(seen.status)}\n== topics\n{json.dumps({'topics': seen.topics})}\n")
+    elif words[0] == "online":
+        sys.stdout.write(" ".join(look([]).online))
+    elif words[0] == "before":
+        sys.stdout.write(f"{json.dumps(before())}\n")
+    else:
+        _, wait_s, was, *units = words
+        sys.stdout.write(prove(float(wait_s), Before(*json.loads(was)), units))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,80 @@
+"""A network of its own for robots and their operator: a bridge in a namespace, one cable to each machine.
+
+Nothing of the network of the machine the tests run on is touched. A test stands inside (`Lan.inside`), as the operator
+at `OPERATOR`.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from meshctl.lab.namespaces import CLONE_NEWNET, setns, unshare
+from tests.meshctl.device.servers import PATIENCE_S
+
+OPERATOR = "10.42.0.1"
+# Of a cable's two ends: the longest name the kernel takes is 15 characters.
+_CABLE = "cable{number}"
+
+
+class Lan:
+    """The bridge. `plug_in` gives a new machine's namespace a cable; `close` takes it all down."""
+
+    def __init__(self) -> None:
+        self._namespaces = [_new_namespace()]
+        self._run("ip", "link", "set", "lo", "up")
+        self._run("ip", "link", "add", "lan", "type", "bridge")
+        self._run("ip", "addr", "add", f"{OPERATOR}/24", "brd", "+", "dev", "lan")
+        self._run("ip", "link", "set", "lan", "up")
+
+    def plug_in(self, address: str) -> str:
+        """A new network namespace with this address on its `eth0`; the path to enter it by."""
+        there = _new_namespace()
+        cable = _CABLE.format(number=len(self._namespaces))
+        self._namespaces.append(there)
+        self._run("ip", "link", "add", cable, "type", "veth", "peer", "name", "eth0", "netns", _path(there))
+        self._run("ip", "link", "set", cable, "master", "lan", "up")
+        self._run("ip", "link", "set", "lo", "up", at=there)
+        self._run("ip", "addr", "add", f"{address}/24", "brd", "+", "dev", "eth0", at=there)
+        self._run("ip", "link", "set", "eth0", "up", at=there)
+        return _path(there)
+
+    @contextmanager
+    def inside(self) -> Iterator[None]:
+        """This thread, and the threads and processes it starts, are in the network."""
+        outside = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
+        try:
+            setns(self._namespaces[0], CLONE_NEWNET)
+            yield
+        finally:
+            setns(outside, CLONE_NEWNET)
+            os.close(outside)
+
+    def close(self) -> None:
+        while self._namespaces:
+            os.close(self._namespaces.pop())
+
+    def _run(self, *words: str, at: int | None = None) -> None:
+        there = _path(self._namespaces[0] if at is None else at)
+        subprocess.run(["nsenter", f"--net={there}", *words], check=True, timeout=PATIENCE_S)
+
+
+def _new_namespace() -> int:
+    """An open descriptor keeps it alive. Made by a thread that ends, since a thread cannot be in two."""
+    made: list[int] = []
+
+    def make() -> None:
+        unshare(CLONE_NEWNET)
+        made.append(os.open("/proc/thread-self/ns/net", os.O_RDONLY))
+
+    thread = threading.Thread(target=make)
+    thread.start()
+    thread.join()
+    return made[0]
+
+
+def _path(namespace: int) -> str:
+    return f"/proc/{os.getpid()}/fd/{namespace}"
