@@ -1,7 +1,9 @@
 """The ROS 2 bridge's edge: rclpy's raw subscriptions and publishers, joined to the daemon by the relay.
 
-A timer looks every LOOK_S at the ROS graph (which types are published under our names?) and at the daemon (topics,
-peers). Types must be installed on both robots: rclpy makes publishers and subscriptions from their classes only.
+All of rclpy is touched by the executor's thread alone: a timer looks every LOOK_S at the ROS graph (which types are
+published under our names?) and at the daemon (topics, peers); what the port's thread brings waits in a queue, and a
+guard condition wakes the executor for it. Types must be installed on both robots: rclpy makes publishers and
+subscriptions from their classes only.
 """
 
 from __future__ import annotations
@@ -12,9 +14,11 @@ import os
 import sys
 import threading
 import time
-from typing import Any, Sequence
+from collections import deque
+from typing import Any, Deque, Sequence
 
 import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosidl_runtime_py.utilities import get_message
@@ -23,7 +27,7 @@ from udp_mesh.bridges.exchange import TOPIC_SETTINGS
 from udp_mesh.bridges.names import Route, ros_word, routes
 from udp_mesh.bridges.port import MeshPort
 from udp_mesh.bridges.relay import Effect, Note, Relay, ToMesh, ToRos
-from udp_mesh.bridges.ros2.quality import Quality, parse_quality, quality_text
+from udp_mesh.bridges.ros2.quality import Quality, parse_quality, quality_text, ros2_name, shared
 from udp_mesh.bridges.types import TypeKey
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError, as_message
 
@@ -31,6 +35,8 @@ log = logging.getLogger(__name__)
 
 EXCHANGE_TOPIC = "bridge/ros2"
 LOOK_S = 1.0
+MAX_ARRIVED = 1000
+"""Messages of the mesh that wait for the executor: the oldest are dropped."""
 
 
 def profile(quality: Quality) -> Any:
@@ -47,8 +53,13 @@ def quality_of(info: Any) -> Quality:
     """The quality an endpoint of the graph offers; its depth is not told by the graph."""
     reliable = info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
     latched = info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    # Since Iron; "INVALID" where the middleware does not tell it.
+    type_hash = str(getattr(info, "topic_type_hash", ""))
     return Quality(
-        "reliable" if reliable else "best_effort", "transient_local" if latched else "volatile", 1 if latched else 10
+        "reliable" if reliable else "best_effort",
+        "transient_local" if latched else "volatile",
+        1 if latched else 10,
+        type_hash if type_hash.startswith("RIHS") else "",
     )
 
 
@@ -58,11 +69,12 @@ class Bridge:
     def __init__(self, node: Any, port: MeshPort, own: str) -> None:
         self._node, self._port, self._own = node, port, own
         self._relay = Relay(own, EXCHANGE_TOPIC, ros_version=2, nonce=os.urandom(16))
-        self._lock = threading.RLock()
-        self._table: dict[str, Route] = {}
+        self._lock = threading.Lock()
+        self._arrived: Deque[ToRos] = deque(maxlen=MAX_ARRIVED)
         self._subscriptions: dict[str, tuple[TypeKey, Any]] = {}
         self._publishers: dict[str, tuple[TypeKey, Any]] = {}
-        self._unknown: set[str] = set()
+        self._told: set[str] = set()
+        self._wake = node.create_guard_condition(self.publish_arrived)
         node.create_timer(LOOK_S, self.look)
 
     def _run(self, effects: list[Effect]) -> None:
@@ -70,56 +82,66 @@ class Bridge:
             if isinstance(effect, ToMesh):
                 self._port.publish(effect.topic, effect.payload, effect.peer, effect.type)
             elif isinstance(effect, ToRos):
-                self._publish(effect)
+                self._arrived.append(effect)
+                self._wake.trigger()
             elif isinstance(effect, Note):
                 log.warning("%s", effect.text)
 
+    # The port's thread
+
     def daemon_up(self) -> None:
-        """The port calls this after each connect."""
-        self._look_at_daemon()
+        """The port calls this after each connect. Raises MeshError."""
+        self._learn()
         online = [peer for peer, is_online in self._port.peers().items() if is_online]
         with self._lock:
-            self._run(self._relay.started(online))
+            effects = self._relay.started(online)
+        self._run(effects)
 
     def from_daemon(self, frame: Frame) -> None:
         """The port calls this for each frame."""
         message, header = as_message(frame), frame[0]
+        effects: list[Effect] = []
         with self._lock:
             if message is not None:
                 now = time.monotonic()
-                self._run(self._relay.from_mesh(message.source, message.topic, message.type, message.payload, now))
+                effects = self._relay.from_mesh(message.source, message.topic, message.type, message.payload, now)
             elif header.get("event") == "peer-online":
-                self._run(self._relay.peer_online(str(header["peer"])))
+                effects = self._relay.peer_online(str(header["peer"]))
+        self._run(effects)
+
+    def _learn(self) -> dict[str, tuple[str, ...]]:
+        topics = self._port.ensure_topics({EXCHANGE_TOPIC: TOPIC_SETTINGS})
+        with self._lock:
+            self._relay.topics_are(topics)
+        return topics
+
+    # The executor's thread
 
     def look(self) -> None:
         """Every LOOK_S: topics, peers, and what is published under our names."""
         try:
-            self._look_at_daemon()
+            topics, peers = self._learn(), self._port.peers()
         except MeshError as error:
             log.debug("daemon-unreachable %s", error)
-        with self._lock:
-            for name, route in self._table.items():
-                self._look_at_publishers(name, route)
-
-    def _look_at_daemon(self) -> None:
-        topics = self._port.ensure_topics({EXCHANGE_TOPIC: TOPIC_SETTINGS})
-        peers = self._port.peers()
-        with self._lock:
-            self._relay.topics_are(topics)
-            self._table = routes(self._own, [topic for topic in topics if not topic.startswith("bridge/")], peers)
-            for name in [name for name in self._subscriptions if name not in self._table]:
-                self._node.destroy_subscription(self._subscriptions.pop(name)[1])
+            return
+        found = routes(self._own, [topic for topic in topics if not topic.startswith("bridge/")], peers)
+        table = {ros2_name(name): route for name, route in found.items()}
+        for name in [name for name in self._subscriptions if name not in table]:
+            self._node.destroy_subscription(self._subscriptions.pop(name)[1])
+        for name, route in table.items():
+            self._look_at_publishers(name, route)
 
     def _look_at_publishers(self, name: str, route: Route) -> None:
-        found = self._node.get_publishers_info_by_topic(name)
-        if not found:
+        infos = self._node.get_publishers_info_by_topic(name)
+        if not infos:
             return
-        quality = quality_of(found[0])
-        key = TypeKey(str(found[0].topic_type), quality_text(quality))
+        type_name = str(infos[0].topic_type)
+        quality = shared(quality_of(info) for info in infos if info.topic_type == type_name)
+        key = TypeKey(type_name, quality_text(quality))
         known = self._subscriptions.get(name)
         if known is not None and known[0] == key:
             return
-        message_class = self._class(key.name)
+        message_class = self._class(type_name)
         if message_class is None:
             return
         if known is not None:
@@ -127,64 +149,108 @@ class Bridge:
 
         def arrived(data: bytes) -> None:
             with self._lock:
-                self._run(self._relay.from_ros(route, "", key, "", quality.latched, bytes(data)))
+                effects = self._relay.from_ros(route, name, key, "", quality.latched, bytes(data))
+            self._run(effects)
 
-        subscription = self._node.create_subscription(message_class, name, arrived, profile(quality), raw=True)
-        self._subscriptions[name] = (key, subscription)
+        # The graph does not tell depths; ten messages bridge what the executor is busy with.
+        wanted = profile(quality._replace(depth=10))
+        self._subscriptions[name] = (
+            key,
+            self._node.create_subscription(message_class, name, arrived, wanted, raw=True),
+        )
+
+    def publish_arrived(self) -> None:
+        """What the mesh brought since the last call."""
+        while self._arrived:
+            self._publish(self._arrived.popleft())
 
     def _publish(self, message: ToRos) -> None:
-        quality = parse_quality(message.key.checksum)
+        quality, name = parse_quality(message.key.checksum), ros2_name(message.name)
         message_class = self._class(message.key.name)
         if quality is None or message_class is None:
             return
-        known = self._publishers.get(message.name)
+        known = self._publishers.get(name)
         if known is None or known[0] != message.key:
             if known is not None:
                 self._node.destroy_publisher(known[1])
-            known = (message.key, self._node.create_publisher(message_class, message.name, profile(quality)))
-            self._publishers[message.name] = known
-        # rclpy takes bytes for a message that is serialized already.
-        known[1].publish(message.payload)
+            known = (message.key, self._node.create_publisher(message_class, name, profile(quality)))
+            self._publishers[name] = known
+        if self._is_of_hash(name, quality.type_hash):
+            # rclpy takes bytes for a message that is serialized already.
+            known[1].publish(message.payload)
+
+    def _is_of_hash(self, name: str, type_hash: str) -> bool:
+        """Whether our publisher's type is the source's, as far as ROS tells: CDR of another definition is garbage."""
+        hashes = {
+            quality_of(info).type_hash
+            for info in self._node.get_publishers_info_by_topic(name)
+            if info.node_name == self._node.get_name()
+        } - {""}
+        if not type_hash or not hashes or type_hash in hashes:
+            return True
+        self._tell_once(name, "{}: the type is defined otherwise on its source: not published".format(name))
+        return False
 
     def _class(self, name: str) -> Any:
         try:
             return get_message(name)
         except (AttributeError, ModuleNotFoundError, ValueError) as error:
-            if name not in self._unknown:
-                self._unknown.add(name)
-                log.warning("type-unknown type=%s %s", name, error)
+            self._tell_once(name, "type-unknown type={} {}".format(name, error))
             return None
+
+    def _tell_once(self, about: str, text: str) -> None:
+        if about not in self._told:
+            self._told.add(about)
+            log.warning("%s", text)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs until ROS or a signal ends it."""
+    """Runs until ROS or a signal ends it. Waits for the daemon."""
     parser = argparse.ArgumentParser(prog="udp_mesh.bridges.ros2", description="ROS 2 over the mesh")
     parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket")
     options, ros_arguments = parser.parse_known_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
     port = MeshPort(options.socket, ["*"])
-    try:
-        own = port.own_name()
-    except MeshError as error:
-        sys.stderr.write("ros2 bridge: {}\n".format(error))
-        return 1
-    rclpy.init(args=ros_arguments)
-    node = Node("mesh_bridge", namespace="/" + ros_word(own))
-    bridge = Bridge(node, port, own)
     stop = threading.Event()
-    thread = threading.Thread(target=port.run, args=(stop, bridge.daemon_up, bridge.from_daemon), daemon=True)
-    thread.start()
+    rclpy.init(args=ros_arguments)
     try:
+        own = _own_name(port)
+        if own is None:
+            return 0
+        node = Node("mesh_bridge", namespace=ros2_name("/" + ros_word(own)))
+        bridge = Bridge(node, port, own)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        thread = threading.Thread(target=port.run, args=(stop, bridge.daemon_up, bridge.from_daemon), daemon=True)
+        thread.start()
         while rclpy.ok() and thread.is_alive():
-            rclpy.spin_once(node, timeout_sec=LOOK_S)
-    except KeyboardInterrupt:
-        log.info("interrupted")
-    finally:
+            executor.spin_once(timeout_sec=LOOK_S)
+        failed = rclpy.ok()
         stop.set()
         thread.join(5.0)
+        executor.shutdown()
         node.destroy_node()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    finally:
+        stop.set()
         rclpy.try_shutdown()
-    return 0
+    # The port's thread ended by a mistake of ours, and said which: whoever started us starts us anew.
+    return 1 if failed else 0
+
+
+def _own_name(port: MeshPort) -> str | None:
+    """The daemon's name, asked for until it answers; None where ROS ends before."""
+    told = False
+    while rclpy.ok():
+        try:
+            return port.own_name()
+        except MeshError as error:
+            if not told:
+                log.info("waiting-for what=daemon %s", error)
+                told = True
+        time.sleep(LOOK_S)
+    return None
 
 
 if __name__ == "__main__":

@@ -1,24 +1,28 @@
-"""ROS 2's quality of service as the checksum word of a type field (`types`), and back. Pure.
+"""ROS 2's quality of service and type hash as the checksum word of a type field (`types`), and back. Pure.
 
-`reliable:transient_local:10`: reliability, durability, depth. A receiver publishes with what the source offered.
+`reliable:transient_local:10:RIHS01_df66...`: reliability, durability, depth, and the type's hash where ROS tells it
+(since Iron). A receiver publishes with what the source offered, and only where its own type has that hash.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import re
+from typing import Iterable, NamedTuple
 
 RELIABILITIES = ("reliable", "best_effort")
 DURABILITIES = ("volatile", "transient_local")
 MAX_DEPTH = 10_000
 """History kept per topic: bounds what a peer can make a publisher hold."""
+_TYPE_HASH = re.compile(r"(RIHS[0-9]{2}_[0-9a-f]{64})?")
 
 
 class Quality(NamedTuple):
-    """What a publisher offers."""
+    """What a publisher offers. `type_hash`: "" where it is not known."""
 
     reliability: str = "reliable"
     durability: str = "volatile"
     depth: int = 10
+    type_hash: str = ""
 
     @property
     def latched(self) -> bool:
@@ -27,14 +31,30 @@ class Quality(NamedTuple):
 
 
 def quality_text(quality: Quality) -> str:
-    return "{}:{}:{}".format(*quality)
+    return "{}:{}:{}:{}".format(*quality)
 
 
 def parse_quality(text: str) -> Quality | None:
     """The quality in a checksum word; None where it is none."""
     parts = text.split(":")
-    if len(parts) != 3 or parts[0] not in RELIABILITIES or parts[1] not in DURABILITIES:
+    if len(parts) != 4 or parts[0] not in RELIABILITIES or parts[1] not in DURABILITIES:
         return None
     if not (parts[2].isascii() and parts[2].isdigit()) or not 1 <= int(parts[2]) <= MAX_DEPTH:
         return None
-    return Quality(parts[0], parts[1], int(parts[2]))
+    return Quality(parts[0], parts[1], int(parts[2]), parts[3]) if _TYPE_HASH.fullmatch(parts[3]) else None
+
+
+def shared(qualities: Iterable[Quality]) -> Quality:
+    """What all publishers of a topic offer: a subscription that asks for more than one of them offers does not hear it.
+    Expects at least one quality."""
+    found = list(qualities)
+    return found[0]._replace(
+        reliability=max((quality.reliability for quality in found), key=RELIABILITIES.index),
+        durability=min((quality.durability for quality in found), key=DURABILITIES.index),
+        depth=max(quality.depth for quality in found),
+    )
+
+
+def ros2_name(name: str) -> str:
+    """A ROS name as ROS 2 allows it: underscores do not follow one another."""
+    return re.sub("_{2,}", "_", name)

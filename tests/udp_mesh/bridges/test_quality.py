@@ -1,0 +1,46 @@
+"""ROS 2's quality of service, as it crosses the mesh."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from udp_mesh.bridges.ros2.quality import Quality, parse_quality, quality_text, ros2_name, shared
+
+QUALITIES = st.builds(
+    Quality,
+    st.sampled_from(["reliable", "best_effort"]),
+    st.sampled_from(["volatile", "transient_local"]),
+    st.integers(1, 99),
+    st.just("") | st.from_regex("RIHS01_[0-9a-f]{64}", fullmatch=True),
+)
+
+
+@given(QUALITIES)
+def test_a_quality_of_service_is_read_as_it_was_written(quality: Quality) -> None:
+    assert parse_quality(quality_text(quality)) == quality
+
+
+def test_a_quality_nobody_wrote_is_none() -> None:
+    good = quality_text(Quality())
+    assert parse_quality(good) is not None
+    for text in (
+        "",
+        "reliable:volatile:10",
+        "reliable:volatile:0:",
+        "reliable:volatile:x:",
+        "a:volatile:1:",
+        good + "RIHS",
+    ):
+        assert parse_quality(text) is None
+
+
+@given(st.lists(QUALITIES, min_size=1, max_size=5))
+def test_a_subscription_asks_for_no_more_than_every_publisher_offers(qualities: list[Quality]) -> None:
+    asked = shared(qualities)
+    assert (asked.reliability == "reliable") == all(quality.reliability == "reliable" for quality in qualities)
+    assert asked.latched == all(quality.latched for quality in qualities)
+
+
+def test_names_are_those_ros_2_allows() -> None:
+    assert ros2_name("/ugv__1/mesh_comm/a___b/x_y") == "/ugv_1/mesh_comm/a_b/x_y"
