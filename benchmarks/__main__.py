@@ -1,7 +1,7 @@
-"""Run the comparison: `python -m benchmarks [--quick] [--sets loss,cut] [--results FILE] [--tables]`.
+"""Run the comparison: `python -m benchmarks [--quick] [--sets loss,cut] [--runs N] [--tables] [--fill]`.
 
-Each finished cell is appended to the results at once; a cell that is there already is not run again, so a run that was
-interrupted is taken up by the same command.
+Each finished cell is appended to the results at once; one that is there already (`--runs` times) is not run again, so
+a run that was interrupted is taken up by the same command.
 """
 
 from __future__ import annotations
@@ -9,11 +9,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from benchmarks.cells import QUICK, SETS, Cell, cells, measure
 from benchmarks.link.laboratory import laboratory
+from benchmarks.page import fill
 from benchmarks.tables import report
 
 RESULTS = Path(__file__).with_name("results") / "transports.jsonl"
@@ -36,14 +38,20 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a few cells that tell most")
     parser.add_argument("--sets", default="", help=f"comma-separated, of {', '.join(SETS)}")
     parser.add_argument("--peer", action="append", default=[], help="only this transport (repeatable)")
+    parser.add_argument("--runs", type=int, default=1, help="how often each cell is run; tables give the median")
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--fill", action="store_true", help="put the tables into docs/benchmarks.md")
     parser.add_argument("--tables", action="store_true", help="only print the tables of what was measured")
     arguments = parser.parse_args()
     results = finished(arguments.results)
     if not arguments.tables:
         arguments.results.parent.mkdir(parents=True, exist_ok=True)
-        known = {(r["set"], r["peer"], r["name"]) for r in results}
-        todo = [cell for cell in wanted(arguments) if (cell.set, cell.peer, cell.name) not in known]
+        known = Counter((r["set"], r["peer"], r["name"]) for r in results)
+        chosen = wanted(arguments)
+        # Round by round, so that the runs of a cell are apart in time.
+        todo = [
+            cell for turn in range(arguments.runs) for cell in chosen if known[cell.set, cell.peer, cell.name] <= turn
+        ]
         with laboratory(2) as lab:
             for number, cell in enumerate(todo, 1):
                 print(f"[{number}/{len(todo)}] {cell.set}: {cell.name}: {cell.peer}", file=sys.stderr, flush=True)
@@ -52,6 +60,8 @@ def main() -> None:
                 with arguments.results.open("a") as file:
                     file.write(json.dumps(result) + "\n")
     print(report(results))
+    if arguments.fill:
+        fill("tables", report(results))
 
 
 if __name__ == "__main__":

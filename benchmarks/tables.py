@@ -1,11 +1,14 @@
-"""Results as Markdown: one table per set, then every goal with our figure, met or missed."""
+"""Results as Markdown: one table per set, then every goal with our figure, met or missed.
+
+A cell that was run several times is one row: the median of each figure over its runs.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from benchmarks.goals import judged
+from benchmarks.goals import judged, medians
 
 _COLUMNS: dict[str, tuple[str, float, str]] = {
     # figure: heading, factor, format
@@ -43,12 +46,15 @@ def table(results: Sequence[Mapping[str, Any]]) -> str:
     """One set's results, in the order they were run."""
     figures = [figure for figure in _COLUMNS if any(figure in result for result in results)]
     lines = [
-        row(["link", "transport", *(_COLUMNS[figure][0] for figure in figures)]),
-        row(["---"] * (2 + len(figures))),
+        row(["link", "transport", "runs", *(_COLUMNS[figure][0] for figure in figures)]),
+        row(["---"] * (3 + len(figures))),
     ]
     lines += [
-        row([result["name"], result["peer"], *(shown(figure, result.get(figure)) for figure in figures)])
-        for result in results
+        row(
+            [result["name"], result["peer"], str(result["runs"])]
+            + [shown(figure, result.get(figure)) for figure in figures]
+        )
+        for result in medians(results)
     ]
     return "\n".join(lines)
 
@@ -56,7 +62,7 @@ def table(results: Sequence[Mapping[str, Any]]) -> str:
 def report(results: Sequence[Mapping[str, Any]]) -> str:
     """Everything measured, as one Markdown text."""
     sets = list(dict.fromkeys(result["set"] for result in results))
-    parts = [f"## {name}\n\n{table([r for r in results if r['set'] == name])}" for name in sets]
+    parts = [f"### {name}\n\n{table([r for r in results if r['set'] == name])}" for name in sets]
     goals = [row(["set", "link", "figure", "goal", "measured", ""]), row(["---"] * 6)]
     for goal, value, met in judged(results):
         heading, factor, _ = _COLUMNS[goal.figure]
@@ -67,4 +73,4 @@ def report(results: Sequence[Mapping[str, Any]]) -> str:
             row([goal.set, goal.cell, heading, f"{sign} {bound * factor:g}", shown(goal.figure, value),
                  "met" if met else "**missed**"])
         )  # fmt: skip
-    return "\n\n".join([*parts, "## goals\n\n" + "\n".join(goals)]) + "\n"
+    return "\n\n".join([*parts, "### goals\n\n" + "\n".join(goals)]) + "\n"

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.cells import OURS, SETS, cells
-from benchmarks.goals import GOALS, judged
+from benchmarks.goals import GOALS, judged, medians
+from benchmarks.page import fill
 from benchmarks.tables import report
 from benchmarks.trial import percentile
 
@@ -45,3 +47,23 @@ def test_a_percentile_is_the_smallest_value_that_its_share_does_not_exceed(value
     assert found is not None
     assert sum(value <= found for value in ordered) >= math.ceil(share * len(ordered))
     assert all(sum(value <= lower for value in ordered) < share * len(ordered) for lower in ordered if lower < found)
+
+
+def test_a_cell_run_several_times_is_judged_by_its_median() -> None:
+    runs = [{"set": "loss", "name": "0%", "peer": OURS, "share": share} for share in (0.2, 0.96, 0.97)]
+    assert [(result["share"], result["runs"]) for result in medians(runs)] == [(0.96, 3)]
+    assert [met for goal, _, met in judged(runs) if goal.figure == "share"] == [True]
+
+
+def test_what_mostly_never_arrived_has_no_median() -> None:
+    runs = [{"set": "cut", "name": "x", "peer": OURS, "recovery_any_s": value} for value in (0.1, None, None)]
+    assert medians(runs)[0]["recovery_any_s"] is None
+
+
+def test_a_page_keeps_what_stands_around_a_section(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("before\n\n<!-- tables: how -->\n\nold\n\n<!-- end of tables -->\n\nafter\n")
+    fill("tables", "new\\1", page)
+    assert page.read_text() == "before\n\n<!-- tables: how -->\n\nnew\\1\n\n<!-- end of tables -->\n\nafter\n"
+    with pytest.raises(ValueError, match="no such section"):
+        fill("no such section", "new", page)

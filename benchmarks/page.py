@@ -1,0 +1,21 @@
+"""Puts what a benchmark printed into `docs/benchmarks.md`, between the two comments that name it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
+
+
+def fill(section: str, text: str, page: Path = PAGE) -> None:
+    """Replace what stands between `<!-- section: command -->` and `<!-- end of section -->`.
+
+    Raises ValueError where the page has no such pair of comments.
+    """
+    name = re.escape(section)
+    between = re.compile(rf"(<!-- {name}: [^\n]*-->\n).*?(\n<!-- end of {name} -->)", re.DOTALL)
+    filled, count = between.subn(lambda marks: f"{marks[1]}\n{text.strip()}\n{marks[2]}", page.read_text())
+    if count != 1:
+        raise ValueError(f"{page}: expected one section {section!r} between its two comments, found {count}")
+    page.write_text(filled)
