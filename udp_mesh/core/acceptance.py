@@ -7,6 +7,7 @@ as it goes and comes; `report_ended` turns ends into events.
 from dataclasses import replace
 
 from udp_mesh.core.compression import compress
+from udp_mesh.core.departure import IP6_EXTRA_BYTES
 from udp_mesh.core.events import (
     ExpiryReason,
     MessageDelivered,
@@ -20,7 +21,7 @@ from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Accepted, Channel, Outgoing
 from udp_mesh.core.outbound import Outcome
 from udp_mesh.core.session import Peer
-from udp_mesh.core.settings import Outbox, Topic
+from udp_mesh.core.settings import LinkInfo, Outbox, Topic
 from udp_mesh.core.state import IP_UDP_BYTES, State
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
 from udp_mesh.wire.codec import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
@@ -140,7 +141,8 @@ def enqueue(state: State, name: str, accepted: Accepted, now: float, store_key: 
 def _to_all(state: State, accepted: Accepted, now: float) -> None:
     topic = accepted.channel.topic
     accepted = replace(accepted, flags=accepted.flags | MessageFlag.TO_ALL)
-    fits = state.broadcasts() and _broadcast_bytes(accepted) <= min(link.mtu for link in state.links.values())
+    room = min((link.mtu - _headers(link) for link in state.links.values()), default=0)
+    fits = state.broadcasts() and _broadcast_bytes(accepted) <= room
     if fits:
         state.casts.push(accepted)
     for peer in list(state.roster.peers.values()):
@@ -148,12 +150,16 @@ def _to_all(state: State, accepted: Accepted, now: float) -> None:
             enqueue(state, peer.name, accepted, now)
 
 
+def _headers(link: LinkInfo) -> int:
+    return IP_UDP_BYTES + (IP6_EXTRA_BYTES if ":" in link.address[0] else 0)
+
+
 def _broadcast_bytes(accepted: Accepted) -> int:
-    """The IP packet of a broadcast of this message."""
+    """The datagram of a broadcast of this message."""
     channel = accepted.channel
     names = ANNOUNCE_BYTES + len(channel.name.encode()) + len(channel.type_name.encode())
     fragment = FRAGMENT_BYTES + HEAD_BYTES + LENGTH_BYTES + len(accepted.body)
-    return IP_UDP_BYTES + SHORT_OVERHEAD_BYTES + names + fragment
+    return SHORT_OVERHEAD_BYTES + names + fragment
 
 
 def shelve(state: State, peer: Peer, now: float) -> None:

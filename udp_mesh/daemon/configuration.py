@@ -240,7 +240,8 @@ def _read_link(table: Table) -> LinkWish:
         table.source.report(table.path, "either interface or address", "both" if interface else "neither")
     if address is not None:
         try:
-            ipaddress.ip_address(address)
+            if ipaddress.ip_address(address).is_link_local and ":" in address:
+                table.report("address", "an address of one interface (name a link-local one's `interface`)", address)
         except ValueError:
             table.report("address", "an IPv4 or IPv6 address", address)
     return LinkWish(interface, address, kind == "broadcast", mtu)
@@ -274,6 +275,9 @@ def parse_address(text: str, port: int) -> Address | None:
     try:
         ipaddress.ip_address(host)
     except ValueError:
+        return None
+    if "%" in host:
+        # The interface of a link-local address is the neighbour's `link`.
         return None
     if not number.isdigit() or not 1 <= int(number) <= 65_535:
         return None

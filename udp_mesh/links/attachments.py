@@ -1,8 +1,9 @@
 """The kernel's interfaces and the operator's wishes -> the attachments this node uses. Pure.
 
 A wish names an interface (a pattern such as `wlan*`; all broadcast interfaces if nothing is wished for) or one own
-address. An attachment is what the transport's core calls a link: a name, an own address, perhaps a broadcast address,
-an MTU.
+address. An attachment is what the transport's core calls a link: a name, an own address, perhaps an address that
+reaches everybody on it, an MTU. IPv4 goes first; where an interface has no IPv4 broadcast address, its link-local IPv6
+address and the group of all nodes on the link stand in for it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,11 @@ MAX_MTU = 65_535
 """The loopback's 65,536 is one byte more than an IP packet can have."""
 
 
+ALL_NODES = "ff02::1"
+"""Every IPv6 node on the link (RFC 4291, 2.7.1): what a broadcast is for IPv4. It needs no joining, and switches and
+meshes that prune multicast always let it pass (RFC 4541, 3)."""
+
+
 @dataclass(frozen=True, slots=True)
 class LinkWish:
     """What the operator wants: interfaces by pattern, or one own address; broadcast, or fixed neighbours only."""
@@ -34,7 +40,8 @@ class LinkWish:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """One socket's place: bound to `device`, at `address`; `broadcast` is None where neighbours are fixed."""
+    """One socket's place: bound to `device`, at `address`. `broadcast` is the address that reaches everybody, None where
+    neighbours are fixed."""
 
     name: str
     device: str
@@ -64,12 +71,15 @@ def _of_interface(running: list[Interface], wish: LinkWish, port: int) -> Iterab
             continue
         if interface.loopback and wish.interface != interface.name:
             continue
-        for address in interface.addresses:
-            if ":" in address.host or (wish.broadcast and not (interface.can_broadcast and address.broadcast)):
-                continue
-            broadcast = (address.broadcast, port) if wish.broadcast and address.broadcast else None
+        usable = [address for address in interface.addresses if not wish.broadcast or _to_all(interface, address)]
+        if wish.broadcast:
+            # Everybody on the link is reached from the link-local address, which every IPv6 interface has.
+            usable = [one for one in usable if ":" not in one.host or ipaddress.ip_address(one.host).is_link_local]
+        if usable:
+            address = min(usable, key=_preference)
+            to_all = _to_all(interface, address) if wish.broadcast else None
+            broadcast = None if to_all is None else (to_all, port)
             yield Attachment(interface.name, interface.name, (address.host, port), broadcast, _mtu(interface, wish))
-            break
 
 
 def _of_address(running: list[Interface], wish: LinkWish, port: int) -> Iterable[Attachment]:
@@ -79,9 +89,24 @@ def _of_address(running: list[Interface], wish: LinkWish, port: int) -> Iterable
             # Every address of 127.0.0.0/8 is the loopback's own.
             own = ipaddress.ip_address(address.host) == wanted or (interface.loopback and _within(wanted, address))
             if own:
-                broadcast = (address.broadcast, port) if wish.broadcast and address.broadcast else None
+                to_all = _to_all(interface, address) if wish.broadcast else None
+                broadcast = None if to_all is None else (to_all, port)
                 yield Attachment(str(wanted), interface.name, (str(wanted), port), broadcast, _mtu(interface, wish))
                 return
+
+
+def _to_all(interface: Interface, address: InterfaceAddress) -> str | None:
+    """What reaches everybody on the link from this address (None: nothing does)."""
+    if ":" in address.host:
+        return ALL_NODES if interface.can_multicast and not interface.loopback else None
+    return address.broadcast if interface.can_broadcast else None
+
+
+def _preference(address: InterfaceAddress) -> int:
+    """IPv4 first, then routable IPv6, then link-local; of equals the first."""
+    if ":" not in address.host:
+        return 0
+    return 2 if ipaddress.ip_address(address.host).is_link_local else 1
 
 
 def _within(wanted: ipaddress.IPv4Address | ipaddress.IPv6Address, address: InterfaceAddress) -> bool:

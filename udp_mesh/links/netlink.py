@@ -22,7 +22,8 @@ RTM_NEWLINK, RTM_GETLINK, RTM_NEWADDR, RTM_GETADDR = 16, 18, 20, 22
 NLM_F_REQUEST, NLM_F_DUMP = 1, 0x300
 IFLA_IFNAME, IFLA_MTU = 3, 4
 IFA_ADDRESS, IFA_LOCAL, IFA_BROADCAST = 1, 2, 4
-IFF_UP, IFF_BROADCAST, IFF_LOOPBACK, IFF_RUNNING = 0x1, 0x2, 0x8, 0x40
+IFA_F_DADFAILED, IFA_F_TENTATIVE = 0x08, 0x40
+IFF_UP, IFF_BROADCAST, IFF_LOOPBACK, IFF_RUNNING, IFF_MULTICAST = 0x1, 0x2, 0x8, 0x40, 0x1000
 GROUPS = 0x1 | 0x10 | 0x100
 """RTMGRP_LINK, RTMGRP_IPV4_IFADDR, RTMGRP_IPV6_IFADDR."""
 
@@ -54,6 +55,7 @@ class Interface:
     running: bool
     loopback: bool
     can_broadcast: bool
+    can_multicast: bool
     addresses: tuple[InterfaceAddress, ...] = field(default=())
 
 
@@ -109,9 +111,13 @@ def parse(data: bytes) -> tuple[Interface, ...]:
                 running=flags & (IFF_UP | IFF_RUNNING) == IFF_UP | IFF_RUNNING,
                 loopback=bool(flags & IFF_LOOPBACK),
                 can_broadcast=bool(flags & IFF_BROADCAST),
+                can_multicast=bool(flags & IFF_MULTICAST),
             )
         elif kind == RTM_NEWADDR and len(payload) >= _IFADDR.size:
-            family, prefix_length, _, _, index = _IFADDR.unpack_from(payload)
+            family, prefix_length, flags, _, index = _IFADDR.unpack_from(payload)
+            if flags & (IFA_F_TENTATIVE | IFA_F_DADFAILED):
+                # An IPv6 address not yet ours to use (RFC 4862, 5.4); the kernel tells when it is.
+                continue
             attributes = dict(_attributes(payload, _IFADDR.size))
             # IFA_LOCAL is the address itself; on point-to-point links IFA_ADDRESS is the far end's.
             local = attributes.get(IFA_LOCAL, attributes.get(IFA_ADDRESS))

@@ -84,6 +84,10 @@ class UdpLink:
             own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
         # When a datagram came, not when we found time for it: round trips measure the network, not this machine's load.
         own.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        if own.family == socket.AF_INET6:
+            # IPv4 has a socket of its own; our own datagrams to all nodes need not come back.
+            own.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            own.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_LOOP, 0)
         # Before Linux 5.0 datagrams come one by one.
         with contextlib.suppress(OSError):
             own.setsockopt(SOL_UDP, UDP_GRO, 1)

@@ -53,6 +53,8 @@ class RunningDaemon:
         self.file = folder / f"{name}.toml"
         self.log = folder / f"{name}.log"
         self.environment: dict[str, str] = {}
+        self.prefix: list[str] = []
+        """What starts the daemon, such as `unshare --net`."""
         self.process: subprocess.Popen[bytes] | None = None
         self.write(configuration)
 
@@ -64,7 +66,7 @@ class RunningDaemon:
         """Starts the process and waits until it answers."""
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "udp_mesh.cli.main", "run", str(self.file)],
+                [*self.prefix, sys.executable, "-m", "udp_mesh.cli.main", "run", str(self.file)],
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, **self.environment},

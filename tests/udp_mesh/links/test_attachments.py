@@ -1,11 +1,15 @@
 """Which attachments a node uses: a function of the kernel's interfaces and the operator's wishes."""
 
+import socket
+import struct
+from dataclasses import replace
+
 import pytest
 
-from udp_mesh.links.attachments import EVERY_INTERFACE, Attachment, LinkWish, choose
+from udp_mesh.links.attachments import ALL_NODES, EVERY_INTERFACE, Attachment, LinkWish, choose
 from udp_mesh.links.netlink import Interface, InterfaceAddress, NetlinkError, parse, split_messages
 
-LO = Interface("lo", 1, 65_536, True, True, False, (InterfaceAddress("127.0.0.1", 8, None),))
+LO = Interface("lo", 1, 65_536, True, True, False, False, (InterfaceAddress("127.0.0.1", 8, None),))
 BAT0 = Interface(
     "bat0",
     2,
@@ -13,11 +17,12 @@ BAT0 = Interface(
     True,
     False,
     True,
+    True,
     (InterfaceAddress("fe80::1", 64, None), InterfaceAddress("10.7.20.5", 20, "10.7.31.255")),
 )
-WLAN0 = Interface("wlan0", 3, 1500, True, False, True, (InterfaceAddress("192.168.1.20", 28, "192.168.1.31"),))
-WLAN1 = Interface("wlan1", 4, 1500, False, False, True, (InterfaceAddress("192.168.2.20", 24, "192.168.2.255"),))
-TUN0 = Interface("tun0", 5, 1400, True, False, False, (InterfaceAddress("10.9.0.2", 32, None),))
+WLAN0 = Interface("wlan0", 3, 1500, True, False, True, True, (InterfaceAddress("192.168.1.20", 28, "192.168.1.31"),))
+WLAN1 = Interface("wlan1", 4, 1500, False, False, True, True, (InterfaceAddress("192.168.2.20", 24, "192.168.2.255"),))
+TUN0 = Interface("tun0", 5, 1400, True, False, False, False, (InterfaceAddress("10.9.0.2", 32, None),))
 ALL = (LO, BAT0, WLAN0, WLAN1, TUN0)
 
 
@@ -82,7 +87,7 @@ def test_the_kernels_messages_are_read() -> None:
     link += bytes.fromhex("0000" + "0100" + "07000000" + "43100100" + "00000000")
     link += bytes.fromhex("0a000300") + b"mesh0\0\0\0" + bytes.fromhex("08000400" + "b4050000")
     assert parse(link + bytes.fromhex(ADDRESS)) == (
-        Interface("mesh0", 7, 1460, True, False, True, (InterfaceAddress("10.1.2.3", 20, "10.1.15.255"),)),
+        Interface("mesh0", 7, 1460, True, False, True, True, (InterfaceAddress("10.1.2.3", 20, "10.1.15.255"),)),
     )
 
 
@@ -90,3 +95,44 @@ def test_the_kernels_messages_are_read() -> None:
 def test_a_message_cut_short_is_an_error_not_a_guess(cut: int) -> None:
     with pytest.raises(NetlinkError):
         list(split_messages(bytes.fromhex(ADDRESS)[:cut]))
+
+
+WLAN6 = Interface(
+    "wlan6", 6, 1500, True, False, True, True,
+    (InterfaceAddress("2001:db8::6", 64, None), InterfaceAddress("fe80::6", 64, None)),
+)  # fmt: skip
+
+
+def test_where_ipv4_has_no_broadcast_address_all_ipv6_nodes_of_the_link_are_addressed() -> None:
+    expected = Attachment("wlan6", "wlan6", ("fe80::6", 8700), (ALL_NODES, 8700), 1500)
+    assert choose((LO, WLAN6), EVERY_INTERFACE, 8700) == (expected,)
+    # an interface with both is used with IPv4, as ever
+    both = replace(WLAN6, addresses=(*WLAN6.addresses, *WLAN0.addresses))
+    assert choose((both,), EVERY_INTERFACE, 8700)[0].broadcast == ("192.168.1.31", 8700)
+    # without multicast (a tunnel) neighbours must be named
+    assert choose((replace(WLAN6, can_multicast=False),), EVERY_INTERFACE, 8700) == ()
+
+
+def test_fixed_neighbours_over_ipv6_are_spoken_to_from_the_routable_address() -> None:
+    (found,) = choose((WLAN6,), (LinkWish("wlan6", broadcast=False),), 8700)
+    assert (found.address, found.broadcast) == (("2001:db8::6", 8700), None)
+
+
+def test_an_ipv6_address_wished_for_reaches_all_nodes_of_its_link() -> None:
+    (found,) = choose((LO, WLAN6), (LinkWish(address="2001:db8::6"),), 8700)
+    assert (found.device, found.broadcast) == ("wlan6", (ALL_NODES, 8700))
+    assert choose((LO, WLAN6), (LinkWish(address="::1"),), 8700) == ()
+
+
+def test_an_address_not_yet_checked_for_duplicates_is_not_used() -> None:
+    def answers(flags: int) -> bytes:
+        link = struct.pack("=BxHiII", 0, 1, 6, 0x1 | 0x40 | 0x1000, 0) + struct.pack("=HH8s", 10, 3, b"wlan6\0\0\0")
+        address = struct.pack("=BBBBI", socket.AF_INET6, 64, flags, 253, 6)
+        address += struct.pack("=HH16s", 20, 1, socket.inet_pton(socket.AF_INET6, "fe80::6"))
+        return b"".join(
+            struct.pack("=IHHII", 16 + len(body), kind, 0, 1, 0) + body for kind, body in ((16, link), (20, address))
+        )
+
+    assert [one.host for one in parse(answers(0))[0].addresses] == ["fe80::6"]
+    for flags in (0x40, 0x08, 0x48):
+        assert parse(answers(flags))[0].addresses == ()

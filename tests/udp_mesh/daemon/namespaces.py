@@ -1,0 +1,222 @@
+"""Two real daemons, each in a network namespace of its own, joined by veth pairs that come, go and change.
+
+`python -m tests.udp_mesh.daemon.namespaces SCENARIO` plays one of the functions below; it must run as root of a network
+namespace nobody else uses (`unshare --net`). Anything that is not as it should be raises.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tests.udp_mesh.daemon.processes import KEY, RATES, RunningDaemon, collect, outcomes, poll, wait_online
+
+MAP_BYTES = 3_000_000
+"""At the topic's rate limit it takes some seconds: time to change the network in the middle."""
+
+
+class Pair:
+    """Alice and bob; `join` lays a cable between them."""
+
+    def __init__(self, alice: RunningDaemon, bob: RunningDaemon) -> None:
+        self.alice, self.bob = alice, bob
+
+    def ip(self, daemon: RunningDaemon, words: str) -> None:
+        """`ip WORDS` in the daemon's namespace."""
+        assert daemon.process is not None
+        subprocess.run(["nsenter", "-t", str(daemon.process.pid), "-n", "ip", *words.split()], check=True)
+
+    def join(self, interface: str) -> None:
+        """A veth pair with one end, named so, in each namespace; both up."""
+        assert self.alice.process is not None
+        assert self.bob.process is not None
+        words = f"link add {interface} netns {self.alice.process.pid} type veth peer name {interface}"
+        subprocess.run(["ip", *words.split(), "netns", str(self.bob.process.pid)], check=True)
+        for daemon in (self.alice, self.bob):
+            self.ip(daemon, f"link set {interface} up")
+
+    def addresses(self) -> dict[str, str]:
+        """Peer -> the address its messages go to, as each daemon tells."""
+        found: dict[str, str] = {}
+        for daemon in (self.alice, self.bob):
+            with daemon.client() as client:
+                found |= {peer["name"]: peer["address"] for peer in client.request("peers")["peers"]}
+        return found
+
+    def exchange(self) -> None:
+        """Both ways, reliably, a small message and one of many fragments."""
+        for source, target in ((self.alice, self.bob), (self.bob, self.alice)):
+            with source.client() as sender, target.client() as receiver:
+                receiver.subscribe("*")
+                for topic, payload in (("status", b"ready"), ("map", bytes(100_000))):
+                    sender.publish(topic, payload, to=target.name, notify=True)
+                    (message,) = collect(receiver, 1)
+                    assert (message.source, message.topic, message.payload) == (source.name, topic, payload)
+                assert set(outcomes(sender, 2).values()) == {"delivered"}
+
+
+@contextmanager
+def pair(*more: str) -> Iterator[Pair]:
+    """Both daemons up, not yet joined; `more` is what stands in the configuration of each besides."""
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
+        folder = Path(path)
+        (folder / "key").write_text(KEY + "\n")
+        daemons = []
+        for name, own in zip(("alice", "bob"), more or ("", ""), strict=True):
+            configuration = f"""
+name = "{name}"
+key_file = "{folder}/key"
+[topics]
+status = {{ priority = 0 }}
+map = {{ priority = 7, rate_limit_bytes_per_s = 1000000 }}
+{RATES}
+{own}
+[daemon]
+socket = "{folder / name}.sock"
+state_directory = "{folder / name}"
+"""
+            daemon = RunningDaemon(folder, name, configuration)
+            # IPv6 addresses need no check for duplicates on a cable with two ends
+            no_check = "echo 0 > /proc/sys/net/ipv6/conf/default/accept_dad"
+            daemon.prefix = ["unshare", "--net", "sh", "-c", f'{no_check}; exec "$@"', "sh"]
+            daemons.append(daemon)
+        with daemons[0], daemons[1]:
+            yield Pair(*daemons)
+
+
+def met(both: Pair) -> None:
+    wait_online(both.alice, "bob")
+    wait_online(both.bob, "alice")
+
+
+# ---- scenarios
+
+
+def ipv6_only() -> None:
+    """Without any IPv4 address they find each other at all nodes of the link, lose each other, and meet again."""
+    with pair() as both:
+        both.join("mesh0")
+        met(both)
+        assert all(address.startswith("[fe80::") for address in both.addresses().values()), both.addresses()
+        both.exchange()
+        both.ip(both.alice, "link set mesh0 down")
+        wait_online(both.bob, "alice", online=False)
+        both.ip(both.alice, "link set mesh0 up")
+        met(both)
+        both.exchange()
+
+
+def ipv6_neighbours() -> None:
+    """Fixed neighbours with routable addresses, which appear after the link-local ones."""
+    link = '[[links]]\ninterface = "mesh0"\nkind = "neighbours"\n[[neighbours]]\naddress = '
+    with pair(f'{link}"fd00::2"\n', f'{link}"[fd00::1]:8700"\n') as both:
+        both.join("mesh0")
+        both.ip(both.alice, "addr add fd00::1/64 dev mesh0 nodad")
+        both.ip(both.bob, "addr add fd00::2/64 dev mesh0 nodad")
+        met(both)
+        assert both.addresses() == {"alice": "[fd00::1]:8700", "bob": "[fd00::2]:8700"}
+        both.exchange()
+
+
+def two_ipv6_links() -> None:
+    """Link-local addresses mean nothing without their interface: each link keeps to its own."""
+    with pair() as both:
+        both.join("mesh0")
+        met(both)
+        both.join("mesh1")
+        both.exchange()
+        both.ip(both.bob, "link del mesh0")
+        poll(lambda: link_of(both.alice, "bob") == "mesh1", "alice reaches bob over mesh1")
+        met(both)
+        both.exchange()
+
+
+def ipv4_beside_ipv6() -> None:
+    """An IPv4 address that appears later is used from then on."""
+    with pair() as both:
+        both.join("mesh0")
+        met(both)
+        for number, daemon in enumerate((both.alice, both.bob), 1):
+            both.ip(daemon, f"addr add 10.7.20.{number}/20 broadcast + dev mesh0")
+        wanted = {"alice": "10.7.20.1:8700", "bob": "10.7.20.2:8700"}
+        poll(lambda: both.addresses() == wanted, "both are reached over IPv4")
+        both.exchange()
+
+
+def address_changes_in_the_middle() -> None:
+    """A map under way follows bob to another address, and another subnet, and arrives once."""
+    with pair() as both:
+        both.join("mesh0")
+        for number, daemon in enumerate((both.alice, both.bob), 1):
+            both.ip(daemon, f"addr add 10.7.20.{number}/20 broadcast + dev mesh0")
+        met(both)
+        with both.alice.client() as sender, both.bob.client() as receiver:
+            receiver.subscribe("map")
+            sender.publish("map", bytes(MAP_BYTES), to="bob", notify=True)
+            under_way(both.alice, 300)
+            both.ip(both.bob, "addr del 10.7.20.2/20 dev mesh0")
+            both.ip(both.bob, "addr add 10.7.20.77/20 broadcast + dev mesh0")
+            poll(lambda: both.addresses()["bob"] == "10.7.20.77:8700", "alice follows bob")
+            under_way(both.alice, 800)
+            for number, daemon in enumerate((both.alice, both.bob), 1):
+                both.ip(daemon, "addr flush dev mesh0 scope global")
+                both.ip(daemon, f"addr add 192.168.9.{number}/28 broadcast + dev mesh0")
+            wanted = {"alice": "192.168.9.1:8700", "bob": "192.168.9.2:8700"}
+            poll(lambda: both.addresses() == wanted, "both follow into the other subnet")
+            (message,) = collect(receiver, 1)
+            assert message.payload == bytes(MAP_BYTES)
+            assert list(outcomes(sender, 1).values()) == ["delivered"]
+            assert receiver.next_frame(1.0) is None
+
+
+def interface_goes_in_the_middle() -> None:
+    """The interface is unplugged under a map and another one appears: the map goes on there."""
+    with pair() as both:
+        both.join("mesh0")
+        met(both)
+        with both.alice.client() as sender, both.bob.client() as receiver:
+            receiver.subscribe("map")
+            sender.publish("map", bytes(MAP_BYTES), to="bob", notify=True)
+            under_way(both.alice, 300)
+            both.ip(both.alice, "link del mesh0")
+            both.join("mesh1")
+            (message,) = collect(receiver, 1)
+            assert message.payload == bytes(MAP_BYTES)
+            assert list(outcomes(sender, 1).values()) == ["delivered"]
+            assert link_of(both.alice, "bob") == "mesh1"
+
+
+def link_of(daemon: RunningDaemon, peer: str) -> str | None:
+    with daemon.client() as client:
+        return next((found["link"] for found in client.request("peers")["peers"] if found["name"] == peer), None)
+
+
+def under_way(daemon: RunningDaemon, fragments: int) -> None:
+    """Waits until so many fragments have left."""
+
+    def sent() -> bool:
+        with daemon.client() as client:
+            return bool(client.request("status")["conditions"]["counters"]["fragments_sent"] >= fragments)
+
+    poll(sent, f"{fragments} fragments have left {daemon.name}")
+
+
+SCENARIOS: dict[str, Callable[[], None]] = {
+    scenario.__name__: scenario
+    for scenario in (
+        ipv6_only,
+        ipv6_neighbours,
+        two_ipv6_links,
+        ipv4_beside_ipv6,
+        address_changes_in_the_middle,
+        interface_goes_in_the_middle,
+    )
+}
+
+
+if __name__ == "__main__":
+    SCENARIOS[sys.argv[1]]()
