@@ -1,12 +1,14 @@
 """From an inventory and the fleet as it is to a plan, with everything that carrying it out will need.
 
-`prepare`: render -> gather -> one plan per node -> the fleet's order; the journal remembers what every node told.
+`prepare`: render -> gather -> one plan per node -> the rest of their meshes, where those are cut -> the fleet's order;
+the journal remembers what every node told.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 from meshctl.apply.access import Access
@@ -14,10 +16,12 @@ from meshctl.apply.gather import Seen, facts_of, gather
 from meshctl.apply.wanted import Renderer
 from meshctl.apply.whereabouts import whereabouts
 from meshctl.device.observation import Observation
+from meshctl.diagnostics import InvalidInput
+from meshctl.errors import InputError
 from meshctl.fleet import Interrupt, Observer, silent
 from meshctl.fleet.journal import Journal, LastKnown
-from meshctl.model import Fleet, Node
-from meshctl.plan import NodePlan, Plan, Verdict, Wanted, fleet_plan, node_plan
+from meshctl.model import Fleet, Node, NodeState
+from meshctl.plan import Cut, NodePlan, Plan, Verdict, Wanted, fleet_plan, node_plan
 from meshctl.plan.masking import Fingerprints
 from meshctl.plan.seen import package_of
 from meshctl.topology import mesh_macs
@@ -55,7 +59,11 @@ def prepare(
     interrupt: Interrupt | None = None,
     observer: Observer = silent,
 ) -> Prepared:
-    """The plan for these nodes. Raises InvalidInput when one of them cannot be rendered."""
+    """The plan for these nodes. Raises InvalidInput when one of them cannot be rendered.
+
+    Where a running mesh is cut by it, the rest of that mesh is looked at, too: who is far, and who cuts off whom, does
+    not show in a part of it.
+    """
     fleet = renderer.fleet
     chosen = tuple(nodes)
     first = {node.name: renderer.wanted(node) for node in chosen}
@@ -67,11 +75,45 @@ def prepare(
         interrupt=interrupt,
         observer=observer,
     )
-    journal.remember_all(
-        fleet.name, {name: facts_of(observation) for name, observation in seen.observations.items()}, time.time()
-    )
-    known = journal.last_known(fleet.name)
-    return assemble(renderer, first, seen, known, salt=salt, owner=owner, choices=choices or Choices())
+    _remember(journal, fleet, seen)
+    decided = choices or Choices()
+    single = _node_plans(renderer, first, seen, salt=salt, owner=owner, choices=decided)
+    rest = _rest_of_their_meshes(fleet, single.plans.values())
+    if rest and not (interrupt is not None and interrupt.stopping):
+        around = gather(access, rest, parallel=fleet.apply.parallel, interrupt=interrupt, observer=observer)
+        _remember(journal, fleet, around)
+        seen = replace(seen, observations={**seen.observations, **around.observations})
+        single = replace(single, around=_plans_around(renderer, around, salt, owner))
+    return _in_order(fleet, single, seen, journal.last_known(fleet.name), salt=salt, choices=decided)
+
+
+def _remember(journal: Journal, fleet: Fleet, seen: Seen) -> None:
+    facts = {name: facts_of(observation) for name, observation in seen.observations.items()}
+    journal.remember_all(fleet.name, facts, time.time())
+
+
+def _rest_of_their_meshes(fleet: Fleet, plans: Iterable[NodePlan]) -> tuple[Node, ...]:
+    """The deployed nodes beside these that share a mesh which one of these would cut, leave or come back to."""
+    planned = {plan.node: plan for plan in plans}
+    meshes = {
+        mesh
+        for plan in planned.values()
+        if plan.verdict is Verdict.CHANGE and (plan.splits or (plan.is_meshed and plan.cut > Cut.LOGIN))
+        for mesh in plan.meshes
+    }
+    members = {node.name: node for mesh in sorted(meshes) for node in fleet.members(mesh)}
+    return tuple(node for name, node in members.items() if name not in planned and node.state is NodeState.DEPLOYED)
+
+
+def _plans_around(renderer: Renderer, around: Seen, salt: bytes, owner: str) -> dict[str, NodePlan]:
+    """What would be done to these, had they been chosen, as far as it tells which cell they run."""
+    plans = {}
+    for name, observation in around.observations.items():
+        # a node that was not asked for may not be the reason why nothing can be done to the others
+        with suppress(InvalidInput, InputError):
+            wanted = renderer.wanted(renderer.fleet.nodes[name], observation)
+            plans[name] = node_plan(wanted, observation, Fingerprints(salt), owner=owner, with_firmware=False)
+    return plans
 
 
 def assemble(
@@ -85,7 +127,28 @@ def assemble(
     choices: Choices,
 ) -> Prepared:
     """The plan for what was rendered without the devices' facts (`first`) and what was seen."""
-    fleet = renderer.fleet
+    single = _node_plans(renderer, first, seen, salt=salt, owner=owner, choices=choices)
+    return _in_order(renderer.fleet, single, seen, known, salt=salt, choices=choices)
+
+
+@dataclass(frozen=True, slots=True)
+class _Single:
+    """Each node for itself; `around`: others of their meshes, to which nothing is done."""
+
+    plans: Mapping[str, NodePlan]
+    wanted: Mapping[str, Wanted] = field(repr=False)
+    around: Mapping[str, NodePlan] = field(default_factory=dict)
+
+
+def _node_plans(
+    renderer: Renderer,
+    first: Mapping[str, Wanted],
+    seen: Seen,
+    *,
+    salt: bytes,
+    owner: str,
+    choices: Choices,
+) -> _Single:
     fingerprints = Fingerprints(salt)
     wanted: dict[str, Wanted] = {}
     plans: dict[str, NodePlan] = {}
@@ -104,6 +167,19 @@ def assemble(
         if error is not None:
             made = replace(made, verdict=Verdict.REFUSED, reason=str(error), hint=error.hint)
         plans[name] = made
+    return _Single(plans, wanted)
+
+
+def _in_order(
+    fleet: Fleet,
+    single: _Single,
+    seen: Seen,
+    known: Mapping[str, LastKnown],
+    *,
+    salt: bytes,
+    choices: Choices,
+) -> Prepared:
+    plans = dict(single.plans)
     away = [name for name, made in plans.items() if made.verdict is Verdict.AWAY]
     for name, place in whereabouts(fleet, away, seen.observations, known).items():
         plans[name] = replace(plans[name], reason=f"{plans[name].reason}; {place.text(time.time())}")
@@ -112,12 +188,13 @@ def assemble(
         plans,
         seen.graph(fleet, known),
         now_s=time.time(),
+        around=single.around,
         entry=choices.entry,
         leave_behind=choices.leave_behind,
         accept_cuts=choices.accept_cuts,
-        never_meshed=[name for name in plans if name in known and known[name].facts.get("cell") == "none"],
+        never_meshed=[name for name in single.plans if name in known and known[name].facts.get("cell") == "none"],
     )
-    return Prepared(plan, wanted, seen, salt)
+    return Prepared(plan, single.wanted, seen, salt)
 
 
 def other_paths(wanted: Wanted) -> tuple[str, ...]:

@@ -29,6 +29,8 @@ LEAD_ROUND_TRIPS = 6
 LEAD_S = 2.0
 # So much of the window is kept for confirming.
 CONFIRM_SHARE = 0.25
+# The fact beside the outcome of a node that did not make it: what parts it from its mesh now.
+LEFT_BEHIND = "left_behind"
 
 
 @dataclass(slots=True)
@@ -154,7 +156,7 @@ def _settle(run: _Switch, needed: int) -> dict[str, Outcome]:
         not run.entry or any(m.name == run.entry for m in proven) or all(m.name != run.entry for m in run.members)
     )
     if len(proven) >= needed and has_entry:
-        return _keep(run, proven)
+        return _keep(run)
     absent = ", ".join(member.name for member in run.members if not member.is_proven)
     why = (
         f"{len(proven)} of {len(run.members)} met again, {needed} needed" if has_entry else "the base did not come back"
@@ -178,11 +180,14 @@ def _prove(member: Member) -> None:
         connection.close()
 
 
-def _keep(run: _Switch, proven: Sequence[Member]) -> dict[str, Outcome]:
-    """Confirm those that are there, again and again until the window's end; the others are left behind."""
+def _keep(run: _Switch) -> dict[str, Outcome]:
+    """Confirm those that are there, and those that come late, again and again until the window's end; the others are
+    left behind."""
 
     def keep(member: Member) -> None:
-        if member.attempt is None:
+        if not member.is_proven:
+            _prove(member)
+        if member.attempt is None or not member.is_proven:
             return
         try:
             member.is_confirmed = confirm(member.attempt)
@@ -191,8 +196,8 @@ def _keep(run: _Switch, proven: Sequence[Member]) -> dict[str, Outcome]:
 
     pace = Pace(run.window_s * CONFIRM_SHARE, run.work.interrupt)
     while not pace.is_over:
-        run.each([member for member in proven if not member.is_confirmed], keep)
-        if all(member.is_confirmed for member in proven):
+        run.each([member for member in run.members if not member.is_confirmed], keep)
+        if all(member.is_confirmed for member in run.members) or run.work.interrupt.leaving:
             break
         pace.pause()
     return {member.name: _kept_outcome(member) for member in run.members}
@@ -206,7 +211,8 @@ def _kept_outcome(member: Member) -> Outcome:
         member.name,
         Result.UNCERTAIN,
         f"left behind: the others are in the new cell, it goes back to the old one ({gaps})",
-        hint="reach it by cable, or take the mesh back to the old cell",
+        hint="reach it by cable and `meshctl resume`, or take the mesh back to the old cell",
+        facts={LEFT_BEHIND: ", ".join(member.job.plan.splits)},
     )
 
 

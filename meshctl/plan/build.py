@@ -18,6 +18,7 @@ def fleet_plan(
     graph: Graph,
     *,
     now_s: float,
+    around: Mapping[str, NodePlan] = MappingProxyType({}),
     entry: str = "",
     leave_behind: Iterable[str] = (),
     never_meshed: Iterable[str] = (),
@@ -25,22 +26,25 @@ def fleet_plan(
 ) -> Plan:
     """The order of work for these nodes. `entry` is the node we reach the mesh through (default: the base).
 
+    `around` are members of their meshes that nothing is done to; they tell which cell the mesh runs.
     `leave_behind` acknowledges nodes that are off during a switch of their mesh, `accept_cuts` cut vertices that may
     be flashed; `all` stands for any.
     """
     base = fleet.base_node
     stand_on = entry or (base.name if base is not None else "")
-    found = switches(fleet, plans, acknowledged=leave_behind, never_meshed=never_meshed)
-    around = Surroundings(
+    found = switches(fleet, plans, around=around, acknowledged=leave_behind, never_meshed=never_meshed)
+    surroundings = Surroundings(
         graph, stand_on, fleet.apply, MappingProxyType({node.name: node.robot for node in fleet.nodes.values()})
     )
     todo = [plan for plan in plans.values() if plan.verdict is Verdict.CHANGE]
-    stages = stages_of(todo, around, found.nodes)
+    stages = stages_of(todo, surroundings, found.nodes)
     refusal, hint = _refusal(found, plans, graph, stand_on, frozenset(accept_cuts))
     notes = [
         f"{name}: alone in its cell; it comes back to its mesh by itself ({', '.join(plans[name].splits)})"
         for name in plans
-        if plans[name].splits and not any(name in nodes for nodes in found.nodes.values())
+        if plans[name].verdict is Verdict.CHANGE
+        and plans[name].splits
+        and not any(name in nodes for nodes in found.nodes.values())
     ]
     notes += [
         f"stage {number}: {stage.nodes[0]} is a cut vertex: {', '.join(stage.cuts_off)} cannot be reached meanwhile"

@@ -61,9 +61,11 @@ def node_plan(
     after = {file.package.name: file.package for file in wanted.files if file.package is not None}
     live = cells(before.get("wireless"), before.get("network"))
     old_secrets = (secret for package in before.values() if package is not None for secret in secrets_of(package))
+    split = split_differences(live, cells(after.get("wireless"), after.get("network")))
     basis = NodePlan(
         node.name,
         Verdict.SAME,
+        splits=tuple(f"{radio}: {one}" for radio, all_of_it in split.items() for one in all_of_it),
         meshes=node.meshes,
         has_cell=bool(live),
         is_meshed=is_meshed(seen, live),
@@ -79,7 +81,6 @@ def node_plan(
     told = effects((change.path for change in files), before, after)
     if firmware is not None:
         told = (Effect("firmware", Cut.NODE, f"{firmware.from_revision} -> {firmware.to_revision}"), *told)
-    split = split_differences(live, cells(after.get("wireless"), after.get("network")))
     return replace(
         basis,
         verdict=Verdict.CHANGE if files or firmware or packages else Verdict.SAME,
@@ -87,7 +88,6 @@ def node_plan(
         packages=packages,
         files=files,
         effects=told,
-        splits=tuple(f"{radio}: {one}" for radio, all_of_it in split.items() for one in all_of_it),
         notes=seen.notes,
     )
 

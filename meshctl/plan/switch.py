@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from meshctl.model import Fleet, NodeState
 from meshctl.plan.values import NodePlan, Verdict
@@ -31,10 +32,12 @@ def switches(
     fleet: Fleet,
     plans: Mapping[str, NodePlan],
     *,
+    around: Mapping[str, NodePlan] = MappingProxyType({}),
     acknowledged: Iterable[str] = (),
     never_meshed: Iterable[str] = (),
 ) -> Switches:
-    """The switches among these plans. `never_meshed` names nodes known to be in no cell yet (fresh from their box)."""
+    """The switches among these plans. `around` are members that were seen and to which nothing is done; `never_meshed`
+    names nodes known to be in no cell yet (fresh from their box)."""
     known, fresh = set(acknowledged), set(never_meshed)
     nodes: dict[str, tuple[str, ...]] = {}
     left: dict[str, tuple[str, ...]] = {}
@@ -42,7 +45,8 @@ def switches(
     for mesh in fleet.meshes:
         members = [plans[node.name] for node in fleet.members(mesh) if node.name in plans]
         parting = [plan for plan in members if plan.splits and plan.verdict is Verdict.CHANGE]
-        staying = [plan for plan in members if plan.has_cell and not plan.splits]
+        beside = [around[node.name] for node in fleet.members(mesh) if node.name in around and node.name not in plans]
+        staying = [plan for plan in (*members, *beside) if plan.has_cell and not plan.splits]
         # the mesh is where most of its members are; a few that differ from it come back to it
         if not parting or len(staying) >= len(parting):
             continue
@@ -51,7 +55,8 @@ def switches(
         flashed = [f"{plan.node}: its firmware changes too" for plan in parting if plan.firmware is not None]
         if refused or flashed:
             blocked[mesh] = (*refused, *flashed)
-        unplanned = [node.name for node in fleet.members(mesh) if node.name not in plans]
+        there = {plan.node for plan in staying}
+        unplanned = [node.name for node in fleet.members(mesh) if node.name not in plans and node.name not in there]
         away = [plan.node for plan in members if plan.verdict is Verdict.AWAY]
         behind = tuple(
             name

@@ -76,9 +76,9 @@ class PackageStep:
 class NodePlan:
     """One node: what is done to it, in this order: firmware, packages, files.
 
-    `observed` and `wanted` are fingerprints of what was seen and what is to be; `splits` names what makes this change
-    part the node from its mesh (`channel 6 -> 11`), `meshes` which meshes that concerns; `has_cell` whether a radio is
-    configured for some mesh now, `is_meshed` whether it is part of a running one.
+    `observed` and `wanted` are fingerprints of what was seen and what is to be; `splits` names what parts
+    the cell that it runs from the wanted one (`channel 6 -> 11`), `meshes` which meshes that concerns; `has_cell`
+    whether a radio is configured for some mesh now, `is_meshed` whether it is part of a running one.
     """
 
     node: str

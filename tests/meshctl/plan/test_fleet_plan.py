@@ -54,6 +54,29 @@ def test_a_switch_of_a_part_of_the_mesh_is_refused() -> None:
     assert "would leave behind b03, b04, b05" in fleet_plan(new, some, STAR, now_s=0.0).refusal
 
 
+def test_one_that_stayed_in_the_old_cell_comes_back_alone_when_the_rest_is_seen_in_the_new_one() -> None:
+    new = fleet(channel=11)
+    stray = plans(new, {"b01": running(fleet(), "b01")})
+    others = plans(new, {name: running(new, name) for name in TEAM if name != "b01"})
+    plan = fleet_plan(new, stray, STAR, now_s=0.0, around=others)
+    assert (plan.refusal, [stage.nodes for stage in plan.stages]) == ("", [("b01",)])
+    assert plan.stages[0].kind is not StageKind.SWITCH
+
+
+def test_others_that_still_run_the_old_cell_are_not_left_behind_by_a_part_of_their_mesh() -> None:
+    new = fleet(channel=11)
+    some = plans(new, {name: running(fleet(), name) for name in TEAM[:3]})
+    others = plans(new, {name: running(fleet(), name) for name in TEAM[3:]})
+    assert "would leave behind b03, b04, b05" in fleet_plan(new, some, STAR, now_s=0.0, around=others).refusal
+
+
+def test_members_that_are_refused_in_the_old_cell_block_a_switch_however_many_they_are() -> None:
+    new = fleet(channel=11)
+    seen = {name: running(fleet(), name, uci_changes=("system.x",) if name > "b01" else ()) for name in TEAM}
+    plan = fleet_plan(new, plans(new, seen), STAR, now_s=0.0)
+    assert "changes its cell, and not every member can take part" in plan.refusal
+
+
 def test_even_a_base_that_hears_nobody_does_not_leave_its_mesh_unasked() -> None:
     new = fleet(channel=11)
     seen = {name: running(fleet(), name, neighbours=()) if name == "base" else None for name in TEAM}

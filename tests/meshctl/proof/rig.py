@@ -37,7 +37,8 @@ country: US
 operators:
   ssh_keys: ["{key}"]
 system: {{log_size_kib: {log_size}}}
-apply: {{max_down: {count}, canary: false, stop_after_failures: 100000, parallel: {parallel}}}
+apply: {{max_down: {count}, canary: false, stop_after_failures: 100000, parallel: {parallel},
+        quorum: 0.6}}
 hardware:
   box:
     board: compex,wpj344-16m

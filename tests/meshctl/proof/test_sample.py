@@ -39,3 +39,20 @@ def test_a_mesh_whose_base_fails_in_a_switch_goes_back_as_a_whole_and_then_chang
     assert (ended.code, set(ended.results.values())) == (0, {"done"}), ended.out + ended.err
     assert {rig.state_of(name, rig.current, "split") for name in everybody} == {"new"}
     rig.current = "split"
+
+
+def test_a_node_that_a_switch_leaves_behind_is_told_as_uncertain_and_a_resume_settles_it(rig: Rig) -> None:
+    assert rig.current == "split"
+    rig.fleet.break_("n001", "sever@mv -f /etc/meshctl/change/new")
+    ended = rig.meshctl("provision", "a", "--yes", "--json")
+    expected = {name: "uncertain" if name == "n001" else "done" for name in ("base", *rig.names)}
+    assert ended.results == expected, ended.out
+    (left,) = (event["text"] for event in ended.events if event["event"] == "note" and event["node"] == "n001")
+    assert "last seen" in left
+    rig.fleet.mend("n001")
+    resumed = rig.meshctl("resume", "a", "--yes")
+    assert "n001: uncertain after run" in resumed.out
+    assert "it runs what it ran before" in resumed.out
+    assert resumed.code == 0, resumed.out + resumed.err
+    assert rig.state_of("n001", "split", "a") == "new"
+    rig.current = "a"
