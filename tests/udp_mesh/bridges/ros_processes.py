@@ -15,12 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import udp_mesh
+from tests.udp_mesh.bridges.interpreters import older_interpreters
 from tests.udp_mesh.daemon.processes import RunningDaemon, poll
 from tests.udp_mesh.links.sockets import WAIT_S
 
 ROOT = Path(udp_mesh.__file__).parent.parent
 ROS_PYTHON = "/usr/bin/python3"
 DEBIAN_PACKAGES = "/usr/lib/python3/dist-packages"
+OLD_PYTHON = next(iter(older_interpreters(8)), ROS_PYTHON)
+"""Python 3.8, which ROS Noetic was made for, where there is one: Debian's rospy is pure Python."""
 ROBOT = Path(__file__).with_name("ros_robot.py")
 
 
@@ -204,7 +207,15 @@ class BridgeProcess:
         """`launch` is a launch file's path; else the module is run."""
         if launch:
             package = ROOT / "udp_mesh" / "bridges" / "ros1"
-            environment = {**self._master.environment, "ROS_PACKAGE_PATH": str(package)}
+            # The fielded package's Python part, as a robot's workspace has it on its path.
+            workspace = self._master.folder / "workspace"
+            (workspace / "udp_mesh" / "msg").mkdir(parents=True, exist_ok=True)
+            (workspace / "udp_mesh" / "__init__.py").touch()
+            environment = {
+                **self._master.environment,
+                "ROS_PACKAGE_PATH": str(package),
+                "PYTHONPATH": f"{workspace}:{DEBIAN_PACKAGES}",
+            }
             command = ["/usr/bin/roslaunch", launch]
         else:
             path = str(ROOT) if self._python == ROS_PYTHON else f"{ROOT}:{DEBIAN_PACKAGES}"

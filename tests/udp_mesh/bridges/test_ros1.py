@@ -1,4 +1,5 @@
-"""Two robots with a roscore, a daemon and a bridge each: what holds between their graphs. Needs scripts/setup-ros."""
+"""Two robots with a roscore, a daemon and a bridge each, one bridge started by roslaunch, the other in Python 3.8 where
+there is one: what holds between their graphs. Needs scripts/setup-ros."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.udp_mesh.bridges.ros_processes import BridgeProcess, Master, Robot
+from tests.udp_mesh.bridges.ros_processes import OLD_PYTHON, BridgeProcess, Master, Robot
 from tests.udp_mesh.daemon.processes import RunningDaemon, configuration, poll, wait_online
 from tests.udp_mesh.links.sockets import free_port
 
@@ -74,7 +75,7 @@ def team() -> Iterator[tuple[Side, Side]]:
             kept.enter_context(daemon)
             master = masters[name]
             master.wait()
-            bridge = BridgeProcess(master, daemon)
+            bridge = BridgeProcess(master, daemon, python=OLD_PYTHON)
             kept.callback(bridge.stop)
             if name == "alice":
                 launch = folder / "robot.launch"

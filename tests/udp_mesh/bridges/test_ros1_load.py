@@ -172,7 +172,8 @@ def test_without_a_master_what_flows_goes_on_and_what_is_new_waits(pair: tuple[M
     alice.node.publish(PLAN, "new", latch=True)
     with bob.daemon.client() as client:
         client.subscribe("plan")
-        poll(lambda: alice.node.publish(PLAN, "new", latch=True) and client.next_frame(0.2), "the plan at bob's daemon")
+        poll(lambda: alice.node.publish(PLAN, "new", latch=True) > 0, "alice's bridge as a subscriber")
+        poll(lambda: client.next_frame(1.0), "the plan at bob's daemon")
     flows(alice, bob, "without a master")
     bob.master.start()
     fresh = Robot(bob.master, "fresh")
