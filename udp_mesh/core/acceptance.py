@@ -1,12 +1,14 @@
 """Messages in: topic -> destinations -> queues, the broadcast, or an outbox; and their outcomes out.
 
-`send` decides where a message goes; `shelve` and `release_outbox` move messages between a peer's queue and its outbox
-as it goes and comes; `report_ended` turns ends into events.
+`send` decides where a message goes (a large one first waits until `pack` has compressed it, step by step); `shelve`
+and `release_outbox` move messages between a peer's queue and its outbox as it goes and comes; `report_ended` turns
+ends into events.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
-from udp_mesh.core.compression import compress
+from udp_mesh.core.compression import STEP_BYTES, Unpacked, compress
 from udp_mesh.core.departure import IP6_EXTRA_BYTES
 from udp_mesh.core.events import (
     ExpiryReason,
@@ -64,13 +66,36 @@ def send(
     message_id = MessageId(state.next_message_id)
     state.next_message_id += 1
     state.ledger.counters.messages_sent += 1
-    accepted = _accept(message_id, channel, payload, now)
+    if topic.compression and (len(payload) > STEP_BYTES or state.packing.holds(topic.name)):
+        state.packing.add(Unpacked(message_id, channel, payload, tuple(names), now))
+    else:
+        packed = compress(payload) if topic.compression else None
+        _enqueue_all(state, _accept(message_id, channel, payload, packed, now), names, now)
+    return message_id
+
+
+def pack(state: State, now: float) -> None:
+    """Compress some more of what waits for that; what is done goes on its way."""
+    done = state.packing.step()
+    if done is not None:
+        message, packed = done
+        accepted = _accept(message.message_id, message.channel, message.payload, packed, message.accepted_at)
+        _enqueue_all(state, accepted, message.names, now)
+
+
+def stop_packing(state: State, now: float) -> None:
+    """Everything goes on its way as it is."""
+    for message in state.packing.take_all():
+        accepted = _accept(message.message_id, message.channel, message.payload, None, message.accepted_at)
+        _enqueue_all(state, accepted, message.names, now)
+
+
+def _enqueue_all(state: State, accepted: Accepted, names: Sequence[str], now: float) -> None:
     if names:
         for name in names:
             enqueue(state, name, accepted, now)
     else:
         _to_all(state, accepted, now)
-    return message_id
 
 
 def _room_for(state: State, topic: Topic, names: list[str], size_bytes: int) -> Rejected | None:
@@ -87,10 +112,12 @@ def _room_for(state: State, topic: Topic, names: list[str], size_bytes: int) -> 
             continue
         outbound = peer.outbound
         if (
-            outbound.queued_bytes + size_bytes > limits.queue_bytes_per_peer
+            outbound.levels.queued_bytes + size_bytes > limits.queue_bytes_per_peer
             or len(outbound.open) >= limits.queue_messages_per_peer
         ):
             return Rejected(RejectReason.QUEUE_FULL, f"too much waits for {name}")
+    if topic.compression and state.packing.bytes + size_bytes > limits.queue_bytes_per_peer:
+        return Rejected(RejectReason.QUEUE_FULL, "too much waits to be compressed")
     if not names and state.casts.queued() >= limits.queue_messages_per_peer:
         return Rejected(RejectReason.QUEUE_FULL, "too many broadcasts wait")
     return None
@@ -107,14 +134,16 @@ def channel_of(state: State, topic: Topic, type_name: str) -> Channel | None:
     return channel
 
 
-def _accept(message_id: MessageId, channel: Channel, payload: bytes, now: float) -> Accepted:
+def _accept(
+    message_id: MessageId, channel: Channel, payload: bytes, packed: bytes | None, accepted_at: float
+) -> Accepted:
     topic = channel.topic
     flags = MessageFlag.RELIABLE if topic.reliable else MessageFlag(0)
-    packed = compress(payload) if topic.compression else None
     if packed is not None:
         flags |= MessageFlag.COMPRESSED
-    deadline = None if topic.deadline_s is None else now + topic.deadline_s
-    return Accepted(message_id, channel, payload, payload if packed is None else packed, flags, now, deadline)
+    deadline = None if topic.deadline_s is None else accepted_at + topic.deadline_s
+    body = payload if packed is None else packed
+    return Accepted(message_id, channel, payload, body, flags, accepted_at, deadline)
 
 
 def enqueue(state: State, name: str, accepted: Accepted, now: float, store_key: int | None = None) -> None:

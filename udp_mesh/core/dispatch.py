@@ -7,9 +7,10 @@ acknowledgement, a timer or a new message brings it back.
 
 from heapq import heappop
 
-from udp_mesh.core.acceptance import expire_held, report_ended
+from udp_mesh.core.acceptance import expire_held, pack, report_ended
 from udp_mesh.core.departure import leave_copies, leave_level
 from udp_mesh.core.discovery import announce
+from udp_mesh.core.intake import unpack
 from udp_mesh.core.presence import housekeep
 from udp_mesh.core.seams import Datagram
 from udp_mesh.core.session import Peer, Session
@@ -27,6 +28,7 @@ INTRODUCE_AGAIN_S = 0.25
 """Between two introductions to a peer that has not answered one."""
 
 _INFINITY = float("inf")
+_ALWAYS = float("-inf")
 
 
 def collect(state: State, now: float, max_bytes: int | None) -> list[Datagram]:
@@ -157,7 +159,7 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
     for peer in peers:
         outbound = peer.outbound
         if outbound.served:
-            outbound.book_starvation(outbound.served, now)
+            outbound.levels.book_served(outbound.served, outbound.scheduler.waiting, now)
             outbound.served = 0
         if outbound.ended:
             report_ended(state, peer, now)
@@ -209,6 +211,9 @@ def next_timer(state: State) -> float | None:
     for gate in state.gates.values():
         if gate.parked:
             at = min(at, gate.opens_at())
+    if (state.packing or state.unpacking) and not state.closed:
+        # At once, again and again; whatever else is due is done in between.
+        return _ALWAYS
     return None if at == _INFINITY or state.closed else at
 
 
@@ -251,6 +256,10 @@ def handle_timer(state: State, now: float) -> None:
     casts: list[Datagram] = []
     state.casts.leave_copies(now, casts)
     state.outgoing.extend(casts)
+    if state.packing:
+        pack(state, now)
+    if state.unpacking:
+        unpack(state, now)
     if state.housekeeping_at <= now:
         state.housekeeping_at = now + HOUSEKEEPING_S
         housekeep(state, now)

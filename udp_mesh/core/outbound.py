@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.flight import Flight, Mark, Packet
+from udp_mesh.core.levels import Levels
 from udp_mesh.core.message import Outgoing
 from udp_mesh.core.pacing import Pacer
 from udp_mesh.core.rtt import RoundTrip
@@ -23,7 +24,6 @@ from udp_mesh.core.scheduler import Scheduler
 from udp_mesh.core.settings import Rates, Settings
 from udp_mesh.core.window import AdaptiveWindow, FixedWindow, Window
 from udp_mesh.wire.frames import Ack
-from udp_mesh.wire.limits import PRIORITY_LEVELS
 
 PROBE_SOON_S = 0.025
 """Between probes in the first second of a silence: most cuts of a moving robot are that short."""
@@ -73,28 +73,6 @@ class Ended(NamedTuple):
     outcome: Outcome | ExpiryReason
 
 
-class LevelBook:
-    """What is open on one priority level, and how the level fares."""
-
-    __slots__ = ("bytes", "held_s", "messages", "order", "starved_reported", "starved_s", "starved_since")
-
-    def __init__(self) -> None:
-        self.order: deque[Outgoing] = deque()
-        """Messages in the order accepted; ended ones are dropped from its front when somebody looks."""
-        self.messages = 0
-        self.bytes = 0
-        self.starved_s = 0.0
-        self.starved_since: float | None = None
-        self.starved_reported = False
-        self.held_s = 0.0
-
-    def oldest(self) -> Outgoing | None:
-        order = self.order
-        while order and order[0].ended:
-            order.popleft()
-        return order[0] if order else None
-
-
 class Outbound:
     """The sending half of a session. Times in seconds; `ended` is fetched and cleared by the session."""
 
@@ -107,8 +85,7 @@ class Outbound:
         self.rates: Rates = settings.rates
         self.open: dict[Outgoing, None] = {}
         """Messages without an outcome, in the order accepted."""
-        self.levels = [LevelBook() for _ in range(PRIORITY_LEVELS)]
-        self.queued_bytes = 0
+        self.levels = Levels()
         self.ended: list[Ended] = []
         self.cancelled: list[int] = []
         """Wire ids given up after they had begun: the peer may forget them."""
@@ -165,13 +142,7 @@ class Outbound:
     def accept(self, message: Outgoing, now: float) -> None:
         """Take a message on: it waits on its level."""
         self.open[message] = None
-        level = self.levels[message.priority]
-        level.messages += 1
-        level.bytes += len(message.body)
-        level.order.append(message)
-        if len(level.order) > 64 + 2 * level.messages:
-            level.order = deque(waiting for waiting in level.order if not waiting.ended)
-        self.queued_bytes += len(message.body)
+        self.levels.enter(message)
         deadline = message.accepted.deadline
         if deadline is not None:
             self._deadline_serial += 1
@@ -388,18 +359,8 @@ class Outbound:
 
     def reprioritize(self) -> None:
         """Topics changed their priorities: what waits moves to its new level."""
-        if all(message.priority == message.accepted.channel.topic.priority for message in self.open):
-            return
-        for message in self.open:
-            priority = message.accepted.channel.topic.priority
-            if priority != message.priority:
-                for book, sign in ((self.levels[message.priority], -1), (self.levels[priority], 1)):
-                    book.messages += sign
-                    book.bytes += sign * len(message.body)
-                message.priority = priority
-        for priority, book in enumerate(self.levels):
-            book.order = deque(message for message in self.open if message.priority == priority)
-        self.scheduler.rebuild(list(self.open), pieces=True)
+        if self.levels.rearrange(self.open):
+            self.scheduler.rebuild(list(self.open), pieces=True)
 
     # Ends
 
@@ -431,7 +392,7 @@ class Outbound:
         self.open.pop(message, None)
         copy = message.anew()
         self.open[copy] = None
-        self.levels[copy.priority].order.append(copy)
+        self.levels.stand_last(copy)
         if copy.accepted.deadline is not None:
             self._deadline_serial += 1
             heappush(self._deadlines, (copy.accepted.deadline, self._deadline_serial, copy))
@@ -459,10 +420,7 @@ class Outbound:
     def _remove(self, message: Outgoing) -> None:
         message.ended = True
         del self.open[message]
-        level = self.levels[message.priority]
-        level.messages -= 1
-        level.bytes -= len(message.body)
-        self.queued_bytes -= len(message.body)
+        self.levels.leave(message)
 
     def _cancel(self, message: Outgoing) -> None:
         if message.wire_id is not None and message.accepted.broadcast_number is None:
@@ -476,33 +434,6 @@ class Outbound:
     def finish_all(self, outcome: Outcome | ExpiryReason) -> None:
         for message in list(self.open):
             self.finish(message, outcome)
-
-    def book_starvation(self, served: int, now: float) -> None:
-        """Levels of the mask `served` sent something; less urgent ones that wait did not."""
-        lowest = served & -served
-        waiting = self.scheduler.waiting & ~(lowest - 1)
-        mask = waiting | served
-        while mask:
-            bit = mask & -mask
-            mask ^= bit
-            book = self.levels[bit.bit_length() - 1]
-            if bit & served:
-                if book.starved_since is not None:
-                    book.starved_s += now - book.starved_since
-                    book.starved_since = None
-                    book.starved_reported = False
-            elif book.starved_since is None:
-                book.starved_since = now
-
-    def oldest_ages(self, last_priority: int, now: float) -> list[tuple[int, float]]:
-        """(priority, age of its oldest open message) of levels up to `last_priority`."""
-        ages = []
-        for priority in range(last_priority + 1):
-            level = self.levels[priority]
-            oldest = level.oldest() if level.messages else None
-            if oldest is not None:
-                ages.append((priority, now - oldest.queued_at))
-        return ages
 
     def mark(self, now: float) -> Mark:
         """The state in which the packets of one burst leave."""

@@ -38,8 +38,8 @@ def conditions(state: State, now: float) -> Conditions:
         ),
         sent_bits_per_s,
         sent_bits_per_s + sum(peer.peer_sends_bits_per_s or 0.0 for peer in peers if peer.online),
-        sum(inbound.partial_bytes for inbound in inbounds),
-        sum(outbound.queued_bytes for outbound in outbounds),
+        sum(inbound.partial_bytes + inbound.unpacking_bytes for inbound in inbounds),
+        sum(outbound.levels.queued_bytes for outbound in outbounds) + state.packing.bytes,
         state.casts.kept_bytes,
     )
 

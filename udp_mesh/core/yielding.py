@@ -49,7 +49,7 @@ class Yielding:
                 # What waits for a peer out of reach waits for no one else's airtime.
                 continue
             patience = self._rates.yield_after_s + 3 * (outbound.trip.least or 0.0)
-            for priority, age_s in outbound.oldest_ages(self._rates.urgent_priority, now):
+            for priority, age_s in outbound.levels.oldest_ages(self._rates.urgent_priority, now):
                 if age_s > patience:
                     oldest[priority] = max(age_s, oldest.get(priority, 0.0))
         self._waiting = tuple(
