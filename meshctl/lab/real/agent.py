@@ -116,7 +116,7 @@ class Agent:
     async def _execute(self, first: dict[str, Any], reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         streams = _Terminal(first["terminal"]) if first["terminal"] else _Pipes()
         loop = asyncio.get_running_loop()
-        tasks = [asyncio.ensure_future(_feed(reader, streams.input))]
+        tasks = [asyncio.ensure_future(_feed(reader, streams))]
         waiting = []
         for number, descriptor in streams.outputs:
             waiting.append(loop.create_task(_tell(number, descriptor, writer)))
@@ -135,7 +135,7 @@ class Agent:
 
 
 class _Pipes:
-    """Three pipes: what a process gets, and our ends of them."""
+    """Three pipes: what a process gets, and our ends of them. Every descriptor is closed once."""
 
     def __init__(self) -> None:
         read, self.input = os.pipe()
@@ -143,18 +143,22 @@ class _Pipes:
         err, err_end = os.pipe()
         self.theirs: tuple[int, ...] = (read, out_end, err_end)
         self.outputs: tuple[tuple[int, int], ...] = ((channel.OUTPUT, out), (channel.ERRORS, err))
-        self._ours = [self.input, out, err]
+        self._ours = {self.input, out, err}
+
+    def end_input(self) -> None:
+        """Tell the process that nothing more comes."""
+        self._ours.discard(self.input)
+        os.close(self.input)
 
     def close_theirs(self) -> None:
-        for descriptor in self.theirs:
+        descriptors, self.theirs = self.theirs, ()
+        for descriptor in descriptors:
             os.close(descriptor)
-        self.theirs = ()
 
     def close(self) -> None:
         self.close_theirs()
-        for descriptor in self._ours:
-            with contextlib.suppress(OSError):
-                os.close(descriptor)
+        while self._ours:
+            os.close(self._ours.pop())
 
 
 class _Terminal(_Pipes):
@@ -166,7 +170,10 @@ class _Terminal(_Pipes):
         self.input = ours
         self.theirs = (theirs, os.dup(theirs), os.dup(theirs))
         self.outputs = ((channel.OUTPUT, ours),)
-        self._ours = [ours]
+        self._ours = {ours}
+
+    def end_input(self) -> None:
+        """A terminal has no end of input of its own; it ends with the process."""
 
 
 async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -177,18 +184,17 @@ async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
         writer.write_eof()
 
 
-async def _feed(reader: asyncio.StreamReader, descriptor: int) -> None:
-    """Input frames into a pipe; an empty one closes it."""
+async def _feed(reader: asyncio.StreamReader, streams: _Pipes) -> None:
+    """Input frames into a process; an empty one ends them."""
     loop = asyncio.get_running_loop()
     while True:
         _, length = channel.header(await reader.readexactly(channel.HEADER_BYTES))
         content = await reader.readexactly(length)
         if not content:
-            if not os.isatty(descriptor):
-                os.close(descriptor)
+            streams.end_input()
             return
         # a pipe that is full waits in a thread of its own
-        await loop.run_in_executor(None, _write_all, descriptor, content)
+        await loop.run_in_executor(None, _write_all, streams.input, content)
 
 
 def _write_all(descriptor: int, content: bytes) -> None:

@@ -128,9 +128,10 @@ def lay_cable(place: Place, spec: FleetSpec, *, on_bench: bool) -> None:
 def operator_address(node: IPv4Interface, number: int) -> IPv4Interface:
     """The address the operator takes to speak with `node` on the bench: from the end of its network, one per node."""
     network = node.network
-    candidate = network.broadcast_address - 1 - number
-    if candidate == node.ip or candidate not in network:
-        candidate = network.network_address + 1
+    hosts = network.num_addresses - 2
+    candidate = network.broadcast_address - 1 - number % hosts
+    if candidate == node.ip:
+        candidate = network.broadcast_address - 1 - (number + 1) % hosts
     return IPv4Interface((candidate, network.prefixlen))
 
 

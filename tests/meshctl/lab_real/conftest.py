@@ -1,0 +1,162 @@
+"""One machine of real radios for all tests of this folder, taken from factory state to a working mesh once.
+
+Tests that change the fleet leave it as the inventory says, whatever that is by then. QEMU is installed by
+scripts/setup-lab when it is missing: nothing here is skipped.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from meshctl.lab.copybook import prepare
+from meshctl.lab.fleet import VirtualNode
+from meshctl.lab.real import control
+from meshctl.lab.real.fleet import RealFleet
+from meshctl.lab.real.machine import QEMU
+from meshctl.lab.twin import spec_of
+
+INVENTORY = Path(__file__).with_name("inventory")
+SETUP = Path(__file__).parents[3] / "scripts" / "setup-lab"
+# packages are fetched, then a machine under emulation boots, on a host with much else to do; at worst twice
+START_S = 900.0
+# a run of meshctl over several hops, each login of which is emulated
+COMMAND_S = 400.0
+NODES = ("base", "b01", "b02", "husky-front", "husky-rear")
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """One finished run of meshctl."""
+
+    status: int
+    text: str
+    errors: str
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.text)
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.text.splitlines() if line.startswith("{")]
+
+
+@dataclass(frozen=True, slots=True)
+class Lab:
+    """The running fleet, and the copy of the inventory that belongs to it."""
+
+    fleet: RealFleet
+    inventory: Path
+    state: Path
+
+    def meshctl(self, *words: str, expect: int | None = 0) -> Done:
+        """Run meshctl as an operator does, in a process of its own; `expect` None: any exit code."""
+        environment = {
+            **os.environ,
+            "MESHCTL_LAB": str(self.fleet.directory),
+            "MESHCTL_INVENTORY": str(self.inventory),
+            "XDG_STATE_HOME": str(self.state),
+            "COLUMNS": "200",
+        }
+        done = subprocess.run(
+            (sys.executable, "-m", "meshctl", *words),
+            env=environment, capture_output=True, text=True, timeout=COMMAND_S, check=False,
+        )  # fmt: skip
+        assert expect is None or done.returncode == expect, f"meshctl {' '.join(words)}: {done.stdout}{done.stderr}"
+        return Done(done.returncode, done.stdout, done.stderr)
+
+    def edit(self, old: str, new: str) -> None:
+        """Replace a text that the inventory holds once."""
+        file = self.inventory / "fleet.yaml"
+        text = file.read_text(encoding="utf-8")
+        assert text.count(old) == 1, f"{old!r} stands {text.count(old)} times in {file}"
+        file.write_text(text.replace(old, new), encoding="utf-8")
+
+    def node(self, name: str) -> VirtualNode:
+        return self.fleet.node(name)
+
+    def on(self, node: str, command: str) -> str:
+        """What a command on a node's console prints."""
+        return self.node(node).exec(command).check(f"{node}: {command}").stdout
+
+    def computer(self, robot: str, command: str) -> str:
+        """What a command on a robot's computer prints."""
+        done = control.run(self.fleet.directory, f"ip netns exec pc.{robot} {command}", timeout_s=120.0)
+        return done.check(f"{robot}'s computer: {command}").stdout
+
+    def answers(self, robot: str, address: str) -> bool:
+        """Whether a ping from a robot's computer is answered."""
+        words = f"ip netns exec pc.{robot} ping -c 1 -W 2 {address}"
+        return control.run(self.fleet.directory, words).exit_status == 0
+
+    def originators(self, node: str) -> dict[str, str]:
+        """The node's own batman-adv: each node it has a route to -> the next hop towards it."""
+        names = self.names()
+        known = json.loads(self.on(node, "batctl meshif bat0 originators_json"))
+        return {names[one["orig_address"]]: names[one["neigh_address"]] for one in known if one.get("best")}
+
+    def neighbours(self, node: str) -> set[str]:
+        """Whom the node's own batman-adv has heard within the last seconds."""
+        names = self.names()
+        known = json.loads(self.on(node, "batctl meshif bat0 neighbors_json"))
+        return {names[one["neigh_address"]] for one in known if one["last_seen_msecs"] < 5000}
+
+    def names(self) -> dict[str, str]:
+        """The MAC address of each node's radio -> its name."""
+        return {radio.mac: node.name for node in self.fleet.spec.nodes for radio in node.radios}
+
+    def settle(self) -> None:
+        """Wait until every node is up and the base's batman-adv has a route to every other one."""
+        others = set(NODES[1:])
+        until(lambda: all(node.is_up() for node in self.fleet.nodes), "every node to boot")
+        until(lambda: self.originators("base").keys() >= others, "routes from the base to every node")
+        until(lambda: self.answers("base-station", "10.42.0.10"), "the Husky's computer to answer")
+
+
+def until(condition: Callable[[], bool], what: str, *, wait_s: float = 180.0) -> None:
+    """Poll until `condition()`; fails naming `what`."""
+    deadline = time.monotonic() + wait_s
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {wait_s:g} s for {what}"
+        time.sleep(0.2)
+
+
+@pytest.fixture(scope="session")
+def factory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    """Five nodes fresh from their boxes, each on its bench."""
+    if shutil.which(QEMU) is None or not _apt_knows_kernels():
+        subprocess.run((SETUP,), check=True, timeout=START_S)
+    place = tmp_path_factory.mktemp("real")
+    copy = prepare(INVENTORY, place / "lab")
+    fleet = RealFleet(spec_of(copy.fleet, links=copy.links), place / "lab")
+    fleet.up(wait_s=START_S)
+    try:
+        yield Lab(fleet, copy.inventory, place / "state")
+    finally:
+        fleet.down()
+
+
+@pytest.fixture(scope="session")
+def lab(factory: Lab) -> Lab:
+    """The same, taken into the fleet on the bench and carried into the field: only the mesh leads there."""
+    factory.meshctl("bootstrap", "--yes", *NODES)
+    for name in NODES[1:]:
+        factory.node(name).plug(False)
+    factory.settle()
+    return factory
+
+
+def _apt_knows_kernels() -> bool:
+    done = subprocess.run(("apt-cache", "show", "linux-image-amd64"), capture_output=True, check=False)
+    return done.returncode == 0 and bool(done.stdout)
