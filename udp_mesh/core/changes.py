@@ -5,7 +5,7 @@ Nothing here drops an accepted message: a topic's new settings reach the message
 
 from dataclasses import fields, replace
 
-from udp_mesh.core.acceptance import channel_of, enqueue, report_ended, tell_expired
+from udp_mesh.core.acceptance import channel_of, enqueue, report_ended, stop_packing, tell_expired
 from udp_mesh.core.discovery import leads
 from udp_mesh.core.events import ExpiryReason, MessageId
 from udp_mesh.core.limiter import Gate
@@ -143,6 +143,7 @@ def close(state: State, now: float) -> None:
     """See `Node.close`."""
     if state.closed:
         return
+    stop_packing(state, now)
     for peer in state.roster.peers.values():
         if not peer.engaged:
             continue

@@ -1,6 +1,15 @@
-"""Message bodies, compressed on request of their topic and never inflated past the receiver's limit."""
+"""Message bodies, compressed on request of their topic and never inflated past the receiver's limit.
+
+Both ways go step by step, a millisecond each: whoever carries a map of 20 MB goes on with everything else in between.
+`Packing` and `Unpacking` are one body under way; `PackingQueue` is what a node still has to compress.
+"""
 
 import zlib
+from collections import deque
+from dataclasses import dataclass
+
+from udp_mesh.core.events import MessageId
+from udp_mesh.core.message import Channel
 
 LEVEL = 1
 """zlib's fastest: an embedded core compresses several times faster than a mesh carries."""
@@ -8,22 +17,159 @@ LEVEL = 1
 LEAST_BYTES = 128
 """Shorter messages gain nothing over zlib's own header."""
 
+STEP_BYTES = 1 << 16
+"""Compressed in one step: about a millisecond."""
+
+INFLATE_STEP_BYTES = 1 << 18
+"""Inflated in one step, which is faster."""
+
+
+class Packing:
+    """A payload being compressed (zlib, RFC 1950). When done, `body` is None where that is not shorter."""
+
+    __slots__ = ("_at", "_compressor", "_packed", "_payload", "_size", "body")
+
+    def __init__(self, payload: bytes) -> None:
+        self._payload = memoryview(payload)
+        self._compressor = zlib.compressobj(LEVEL)
+        self._packed: list[bytes] = []
+        self._size = 0
+        self._at = 0
+        self.body: bytes | None = None
+
+    def step(self) -> bool:
+        """Compress some more; True when done."""
+        size = len(self._payload)
+        if size < LEAST_BYTES:
+            return True
+        self._add(self._compressor.compress(self._payload[self._at : self._at + STEP_BYTES]))
+        self._at += STEP_BYTES
+        if self._size >= size:
+            return True
+        if self._at < size:
+            return False
+        self._add(self._compressor.flush())
+        if self._size < size:
+            self.body = b"".join(self._packed)
+        return True
+
+    def _add(self, packed: bytes) -> None:
+        self._packed.append(packed)
+        self._size += len(packed)
+
+
+class Unpacking:
+    """A body being inflated. When done, `payload` is None for what is not zlib, is cut short, carries a tail, or grows
+    past the limit."""
+
+    __slots__ = ("_at", "_body", "_inflater", "_limit_bytes", "_parts", "held_bytes", "payload")
+
+    def __init__(self, body: bytes, limit_bytes: int) -> None:
+        self._body = memoryview(body)
+        self._limit_bytes = limit_bytes
+        self._inflater = zlib.decompressobj()
+        self._parts: list[bytes] = []
+        self._at = 0
+        self.held_bytes = len(body)
+        """The body and what was made of it until now."""
+        self.payload: bytes | None = None
+
+    def step(self) -> bool:
+        """Inflate some more; True when done."""
+        inflater = self._inflater
+        room = INFLATE_STEP_BYTES
+        while room > 0:
+            source = inflater.unconsumed_tail
+            if not source:
+                source = bytes(self._body[self._at : self._at + STEP_BYTES])
+                self._at += len(source)
+            try:
+                part = inflater.decompress(source, room)
+            except zlib.error:
+                return True
+            room -= len(part)
+            self._parts.append(part)
+            self.held_bytes += len(part)
+            if self.held_bytes - len(self._body) > self._limit_bytes:
+                return True
+            if inflater.eof:
+                if not inflater.unused_data and self._at == len(self._body):
+                    self.payload = b"".join(self._parts)
+                return True
+            if not part and not inflater.unconsumed_tail and self._at == len(self._body):
+                # Cut short: nothing is left, and nothing comes of it.
+                return True
+        return False
+
 
 def compress(payload: bytes) -> bytes | None:
-    """The payload as zlib (RFC 1950), or None where that is not shorter."""
-    if len(payload) < LEAST_BYTES:
-        return None
-    packed = zlib.compress(payload, LEVEL)
-    return packed if len(packed) < len(payload) else None
+    """The payload as zlib, or None where that is not shorter."""
+    packing = Packing(payload)
+    while not packing.step():
+        pass
+    return packing.body
 
 
 def decompress(body: bytes, limit_bytes: int) -> bytes | None:
-    """The inverse; None for what is not zlib, is cut short, carries a tail, or grows past `limit_bytes`."""
-    inflater = zlib.decompressobj()
-    try:
-        payload = inflater.decompress(body, limit_bytes + 1)
-    except zlib.error:
-        return None
-    if len(payload) > limit_bytes or not inflater.eof or inflater.unused_data:
-        return None
-    return payload
+    """The inverse of `compress`; None as `Unpacking.payload`."""
+    unpacking = Unpacking(body, limit_bytes)
+    while not unpacking.step():
+        pass
+    return unpacking.payload
+
+
+@dataclass(frozen=True, slots=True)
+class Unpacked:
+    """A message accepted but not yet compressed; `names` are its destinations, none for all."""
+
+    message_id: MessageId
+    channel: Channel
+    payload: bytes
+    names: tuple[str, ...]
+    accepted_at: float
+
+
+class PackingQueue:
+    """What waits to be compressed: of one topic in the order accepted, of several topics the most urgent first."""
+
+    __slots__ = ("_topics", "_under_way", "bytes")
+
+    def __init__(self) -> None:
+        self._topics: dict[str, deque[Unpacked]] = {}
+        self._under_way: dict[str, Packing] = {}
+        self.bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._topics)
+
+    def holds(self, topic: str) -> bool:
+        """Whether something of this topic waits, so that what comes later must wait behind it."""
+        return topic in self._topics
+
+    def add(self, message: Unpacked) -> None:
+        self._topics.setdefault(message.channel.name, deque()).append(message)
+        self.bytes += len(message.payload)
+
+    def step(self) -> tuple[Unpacked, bytes | None] | None:
+        """Compress some more; a message and its compressed body (None: send it as it is) when one is done."""
+        name = min(self._topics, key=lambda topic: self._topics[topic][0].channel.topic.priority)
+        packing = self._under_way.get(name)
+        if packing is None:
+            packing = self._under_way[name] = Packing(self._topics[name][0].payload)
+        if not packing.step():
+            return None
+        del self._under_way[name]
+        return self._take(name), packing.body
+
+    def take_all(self) -> list[Unpacked]:
+        """Everything, as it is: the node closes."""
+        self._under_way.clear()
+        return [self._take(name) for name in list(self._topics) for _ in range(len(self._topics[name]))]
+
+    def _take(self, name: str) -> Unpacked:
+        waiting = self._topics[name]
+        message = waiting.popleft()
+        if not waiting:
+            del self._topics[name]
+        self.bytes -= len(message.payload)
+        return message

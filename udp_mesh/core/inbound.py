@@ -6,10 +6,11 @@
 """
 
 import struct
+from collections import deque
 from typing import NamedTuple
 
 from udp_mesh.core.acks import MOST_PENDING, AckState
-from udp_mesh.core.compression import decompress
+from udp_mesh.core.compression import Unpacking
 from udp_mesh.core.flight import REORDER_PACKETS
 from udp_mesh.core.reassembly import Reassembly, Verdict, Whole
 from udp_mesh.core.settings import Limits, Rates
@@ -53,6 +54,7 @@ class Inbound:
         "refusals",
         "topics",
         "unicasts",
+        "unpacking",
     )
 
     def __init__(self, rates: Rates, limits: Limits) -> None:
@@ -64,6 +66,8 @@ class Inbound:
         self.topics: dict[int, tuple[str, str]] = {}
         self.arrived: list[Arrived] = []
         self.refusals: list[Refused] = []
+        self.unpacking: deque[tuple[Unpacking, Arrived]] = deque()
+        """Whole messages still being inflated, with what is told of them but for the payload."""
         self.duplicates = 0
         self.fragments = 0
         self.over_limit = 0
@@ -73,6 +77,10 @@ class Inbound:
     @property
     def partial_bytes(self) -> int:
         return self.unicasts.bytes + self.broadcasts.bytes
+
+    @property
+    def unpacking_bytes(self) -> int:
+        return sum([unpacking.held_bytes for unpacking, _ in self.unpacking])
 
     def apply(self, rates: Rates, limits: Limits) -> None:
         self._rates, self._limits = rates, limits
@@ -167,16 +175,38 @@ class Inbound:
         if topic is None:
             self._refuse(key, RefuseReason.FORGOTTEN)
             return False
-        payload: bytes | None = whole.body
-        if head.flags & MessageFlag.COMPRESSED:
-            payload = decompress(whole.body, self._limits.message_bytes)
-            if payload is None:
-                self._refuse_for_good(key, RefuseReason.CORRUPT)
-                return False
-        assert payload is not None
         number = whole.message_id if by_broadcast else None
         to_all = by_broadcast or bool(head.flags & MessageFlag.TO_ALL)
-        self.arrived.append(Arrived(*topic, payload, head.priority, to_all, number))
+        arrived = Arrived(*topic, whole.body, head.priority, to_all, number)
+        if not head.flags & MessageFlag.COMPRESSED:
+            self.arrived.append(arrived)
+            return True
+        unpacking = Unpacking(whole.body, self._limits.message_bytes)
+        if not unpacking.step():
+            if self.unpacking_bytes + unpacking.held_bytes > self._limits.partial_bytes_per_peer:
+                self.over_limit += 1
+                self._refuse_for_good(key, RefuseReason.TOO_LARGE)
+                return False
+            self.unpacking.append((unpacking, arrived))
+            return True
+        if unpacking.payload is None:
+            self._refuse_for_good(key, RefuseReason.CORRUPT)
+            return False
+        self.arrived.append(arrived._replace(payload=unpacking.payload))
+        return True
+
+    def unpack(self) -> bool:
+        """Inflate some more of the first message that waits for it; False where it turned out to be corrupt.
+
+        Its pieces were acknowledged already: only a faulty peer compresses what cannot be inflated.
+        """
+        unpacking, arrived = self.unpacking[0]
+        if not unpacking.step():
+            return True
+        self.unpacking.popleft()
+        if unpacking.payload is None:
+            return False
+        self.arrived.append(arrived._replace(payload=unpacking.payload))
         return True
 
     def _refuse(self, key: tuple[bool, int], reason: RefuseReason) -> None:

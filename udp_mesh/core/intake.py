@@ -259,6 +259,8 @@ def _repair(state: State, session: Session, number: int, now: float) -> None:
 def _hand_over(state: State, session: Session, now: float) -> None:
     """Whole messages become events."""
     inbound = session.inbound
+    if inbound.unpacking:
+        state.unpacking[session] = None
     if not inbound.arrived:
         return
     arrived, inbound.arrived = inbound.arrived, []
@@ -274,6 +276,15 @@ def _hand_over(state: State, session: Session, now: float) -> None:
                 session.name, message.topic, message.type_name, message.payload, message.priority, message.to_all
             )
         )
+
+
+def unpack(state: State, now: float) -> None:
+    """Inflate some more of a message that is whole, of each session in turn."""
+    session = next(iter(state.unpacking))
+    del state.unpacking[session]
+    if not session.inbound.unpack():
+        state.ledger.counters.dropped_malformed += 1
+    _hand_over(state, session, now)
 
 
 def _take_broadcast(state: State, session: Session, frames: bytes, link: str, source: Address, now: float) -> None:

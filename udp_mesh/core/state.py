@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from heapq import heappush
 
 from udp_mesh.core.casts import CastQueue, Repairs
+from udp_mesh.core.compression import PackingQueue
 from udp_mesh.core.discovery import Discovery
 from udp_mesh.core.ledger import Ledger
 from udp_mesh.core.limiter import Gate
@@ -51,6 +52,9 @@ class State:
         self.outboxes = Outboxes(store)
         self.discovery = Discovery(rng, settings.rates, now)
         self.casts = CastQueue()
+        self.packing = PackingQueue()
+        self.unpacking: dict[Session, None] = {}
+        """Sessions of which a message is being inflated."""
         self.to_all = SendChannel(self.keys[0], boot_id)
         self.yielding = Yielding(settings.rates, now)
         self.repairs: dict[bytes, Repairs] = {}

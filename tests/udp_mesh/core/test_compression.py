@@ -1,0 +1,118 @@
+"""Large messages are compressed and inflated step by step: nothing waits for them but what comes behind them."""
+
+import random
+import zlib
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.udp_mesh.core.pair import World, settings
+from udp_mesh.core.compression import (
+    INFLATE_STEP_BYTES,
+    STEP_BYTES,
+    Packing,
+    Unpacking,
+    compress,
+    decompress,
+)
+from udp_mesh.core.events import ExpiryReason, MessageDelivered, MessageExpired, MessageReceived, Rejected
+from udp_mesh.core.settings import Limits, Topic
+
+TOPICS = (
+    Topic("stop", priority=0),
+    Topic("map", priority=8, compression=True),
+    Topic("tiles", priority=5, compression=True),
+)
+MAP = bytes(random.Random(1).choices(range(8), k=40 * STEP_BYTES))
+
+
+def world(**changes: object) -> World:
+    made = World(seed=2)
+    for name in ("a", "b"):
+        made.add(settings(name, *TOPICS, **changes))
+    made.run(2.0)
+    return made
+
+
+@given(st.binary(max_size=2000), st.integers(1, 200))
+def test_a_body_made_in_steps_is_what_zlib_reads(unit: bytes, times: int) -> None:
+    payload = unit * times
+    body = compress(payload)
+    assert body is None or zlib.decompress(body) == payload
+    packed = zlib.compress(payload)
+    assert decompress(packed, len(payload)) == payload
+    assert decompress(packed, max(0, len(payload) - 1)) == (None if payload else b"")
+
+
+@given(st.binary(min_size=1, max_size=300), st.integers(0, 300))
+def test_what_is_cut_short_or_carries_a_tail_is_refused(payload: bytes, cut: int) -> None:
+    packed = zlib.compress(payload * 50)
+    assert decompress(packed[: min(cut, len(packed) - 1)], 1 << 20) is None
+    assert decompress(packed + b"x", 1 << 20) is None
+
+
+def test_a_step_is_short_however_large_the_message() -> None:
+    packing = Packing(MAP)
+    steps = 1
+    while not packing.step():
+        steps += 1
+    assert steps == len(MAP) // STEP_BYTES
+    assert packing.body is not None
+    unpacking = Unpacking(packing.body, len(MAP))
+    steps = 1
+    while not unpacking.step():
+        steps += 1
+    assert steps >= len(MAP) // INFLATE_STEP_BYTES
+    assert unpacking.payload == MAP
+
+
+def test_a_bomb_grows_no_further_than_a_step_beyond_the_limit() -> None:
+    unpacking = Unpacking(zlib.compress(bytes(100 * INFLATE_STEP_BYTES)), INFLATE_STEP_BYTES)
+    while not unpacking.step():
+        pass
+    assert unpacking.payload is None
+    assert unpacking.held_bytes < 3 * INFLATE_STEP_BYTES
+
+
+def test_an_urgent_message_leaves_while_a_map_is_still_being_compressed() -> None:
+    made = world()
+    made.nodes["a"].send("map", MAP, destination="b", now=made.now)
+    assert made.nodes["a"]._state.packing.bytes == len(MAP)
+    assert made.nodes["a"].conditions(made.now).queued_bytes == len(MAP)
+    made.nodes["a"].handle_timer(made.now)
+    made.send("a", "stop", b"now", "b")
+    assert made.nodes["a"]._state.packing.bytes == len(MAP)
+    assert made.run(60.0, until=lambda: len(made.told("b", MessageReceived)) == 2)
+    topics = [event.topic for event in made.told("b", MessageReceived) if isinstance(event, MessageReceived)]
+    assert topics == ["stop", "map"]
+    assert [event for event in made.told("b", MessageReceived) if getattr(event, "payload", b"") == MAP]
+    assert made.run(5.0, until=lambda: len(made.told("a", MessageDelivered)) == 2)
+
+
+def test_messages_of_one_topic_keep_their_order_behind_one_that_is_being_compressed() -> None:
+    made = world()
+    for payload in (MAP, b"second", bytes(3 * STEP_BYTES), b"fourth"):
+        made.nodes["a"].send("map", payload, destination="b", now=made.now)
+    made.nodes["a"].send("tiles", b"more urgent", destination="b", now=made.now)
+    outbound = made.nodes["a"]._state.roster.peers["b"].outbound
+    while made.nodes["a"]._state.packing:
+        made.nodes["a"].handle_timer(made.now)
+    assert [len(message.accepted.payload) for message in outbound.open] == [11, len(MAP), 6, 3 * STEP_BYTES, 6]
+    assert made.run(60.0, until=lambda: len(made.told("a", MessageDelivered)) == 5)
+    assert len(made.told("b", MessageReceived)) == 5
+
+
+def test_what_waits_to_be_compressed_is_bounded() -> None:
+    made = world(limits=Limits(queue_bytes_per_peer=len(MAP) + 100))
+    assert not isinstance(made.nodes["a"].send("map", MAP, destination="b", now=made.now), Rejected)
+    assert isinstance(made.nodes["a"].send("map", MAP, destination="b", now=made.now), Rejected)
+
+
+def test_a_node_that_closes_ends_what_it_has_not_compressed() -> None:
+    made = world()
+    for _ in range(2):
+        made.nodes["a"].send("map", MAP, destination="b", now=made.now)
+    made.nodes["a"].handle_timer(made.now)
+    made.nodes["a"].close(made.now)
+    ended = [event for event in made.told("a", MessageExpired) if isinstance(event, MessageExpired)]
+    assert [event.reason for event in ended] == [ExpiryReason.CLOSED] * 2
