@@ -1,0 +1,57 @@
+"""A robot with a real ROS 1 master, bridge and node; the other robot's bridge is played by a client of its daemon."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+
+import pytest
+
+from tests.udp_mesh.bridges.ros_processes import BridgeProcess, Master, Robot
+from tests.udp_mesh.daemon.processes import poll, two_daemons
+from udp_mesh.bridges.exchange import TOPIC_SETTINGS, Definition, decode, encode
+from udp_mesh.bridges.types import MessageKind, TypeKey, kind_text
+from udp_mesh.client.mesh_client import Message
+
+pytestmark = pytest.mark.xdist_group("ros1")
+
+EXCHANGE_TOPIC = "bridge/ros1"
+STRING = TypeKey("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1")
+MADE = TypeKey("made_up/Thing", "0123456789abcdef" * 2)
+
+
+def test_a_real_ros_publishes_into_the_mesh_and_hears_what_comes_of_it_typed_and_opaque() -> None:
+    with two_daemons() as (alice, bob), ExitStack() as kept:
+        master = Master(alice.folder, "alice")
+        kept.callback(master.stop)
+        master.start_bare()
+        bridge = BridgeProcess(master, alice)
+        kept.callback(bridge.stop)
+        bridge.start()
+        node = Robot(master, "alice_node")
+        kept.callback(node.close)
+        client = kept.enter_context(bob.client())
+        client.subscribe("*")
+        client.request("set-topic", topic=EXCHANGE_TOPIC, values=TOPIC_SETTINGS)
+        heard: list[Message] = []
+
+        def sent() -> Message | None:
+            node.publish("/alice/mesh_comm/bob/status", "ready")
+            heard.extend(client.messages(0.1))
+            return next((message for message in heard if message.topic == "status"), None)
+
+        message = poll(sent, "the message at bob's daemon")
+        assert message.type == kind_text(MessageKind(STRING))
+        assert message.payload == b"\5\0\0\0ready"
+        told = [decode(each.payload) for each in heard if each.topic == EXCHANGE_TOPIC]
+        assert Definition(STRING, "string data\n") in [
+            each._replace(text=each.text.rstrip() + "\n") for each in told if isinstance(each, Definition)
+        ]
+        node.subscribe("/bob/mesh_comm/alice/status")
+        client.publish("status", message.payload, to="alice", type=message.type)
+        assert node.expect("data", "ready")["name"] == "/bob/mesh_comm/alice/status"
+        # Of a type that is installed nowhere; its definition comes after it.
+        node.subscribe("/bob/mesh_comm/alice/map", "*")
+        client.publish("map", b"\1\2", to="alice", type=kind_text(MessageKind(MADE)))
+        client.publish(EXCHANGE_TOPIC, encode(Definition(MADE, "uint8[2] thing\n")), to="alice", type="bridge")
+        thing = node.expect("hex", "0102")
+        assert (thing["type"], thing["md5sum"], thing["definition"]) == (*MADE, "uint8[2] thing\n")
