@@ -9,7 +9,7 @@ from udp_mesh.core.events import MessageReceived, PeerOffline, PeerOnline
 from udp_mesh.core.legacy_receive import LegacyReassembly
 from udp_mesh.core.legacy_send import LegacySender
 from udp_mesh.core.outbound import Outcome
-from udp_mesh.core.seams import Datagram
+from udp_mesh.core.seams import Datagram, RandomSource
 from udp_mesh.core.session import Peer
 from udp_mesh.core.settings import Address, LinkInfo, Neighbour, Settings
 from udp_mesh.core.state import State
@@ -33,12 +33,12 @@ class LegacyPeer:
 
     __slots__ = ("address", "broadcasts", "last_heard", "link", "neighbour", "peer", "sender", "unicasts")
 
-    def __init__(self, neighbour: Neighbour, peer: Peer, settings: Settings) -> None:
+    def __init__(self, neighbour: Neighbour, peer: Peer, settings: Settings, rng: RandomSource) -> None:
         self.neighbour = neighbour
         self.peer = peer
         self.address = neighbour.address
         self.link = neighbour.link or ""
-        self.sender = LegacySender(peer.outbound, settings.name)
+        self.sender = LegacySender(peer.outbound, settings.name, rng.getrandbits(15))
         self.unicasts = LegacyReassembly(settings.limits)
         self.broadcasts = LegacyReassembly(settings.limits)
         self.last_heard = float("-inf")
@@ -68,7 +68,7 @@ class LegacyPeers:
                 if peer is not None:
                     peer.legacy = True
                     peer.lost = False
-                    self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings)
+                    self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings, self._state.rng)
 
     def __len__(self) -> int:
         return len(self._by_host)
@@ -111,9 +111,11 @@ class LegacyPeers:
         reassembly = legacy.unicasts if piece.wants_ack else legacy.broadcasts
         message: PriorityMeshData | None = None
         keep = True
+        too_large = reassembly.over_limit
         try:
             keep, message = reassembly.add(piece, now)
         finally:
+            self._state.ledger.counters.dropped_over_limit += reassembly.over_limit - too_large
             if keep and piece.wants_ack:
                 data = encode_legacy(LegacyAck(piece.sequence, piece.position))
                 self._state.outgoing.append(Datagram(link, source, data, True))
@@ -175,6 +177,7 @@ class LegacyPeers:
                 state.outgoing.append(Datagram(link.name, legacy.neighbour.address, host, True))
 
     def _links(self, legacy: LegacyPeer) -> list[LinkInfo]:
-        links = list(self._state.links.values())
+        # The fielded format has room for an IPv4 address only.
+        links = [link for link in self._state.links.values() if ":" not in link.address[0]]
         named = [link for link in links if link.name == (legacy.neighbour.link or legacy.link)]
         return named or links

@@ -39,11 +39,12 @@ class LegacySender:
 
     __slots__ = ("_fragments", "_legs", "_own_name", "_sequence", "_sequences", "_stamp", "outbound", "silent")
 
-    def __init__(self, outbound: Outbound, own_name: str) -> None:
+    def __init__(self, outbound: Outbound, own_name: str, first_sequence: int) -> None:
+        """`first_sequence` is drawn for each run: the peer may still hold pieces of our last one (its defect 8)."""
         self.outbound = outbound
         self.silent = False
         self._own_name = own_name
-        self._sequence = 0
+        self._sequence = first_sequence % LAST_SEQUENCE
         self._stamp = 0
         self._legs: dict[tuple[int, int], _Leg] = {}
         self._sequences: dict[int, Outgoing] = {}

@@ -334,3 +334,48 @@ def test_settings_of_a_fielded_neighbour_need_its_name() -> None:
         Neighbour(OLD, legacy=True)
     assert isinstance(settings("x"), Settings)
     assert PeerOnline is not None
+
+
+def test_a_fielded_program_that_starts_anew_is_understood_although_its_numbers_start_anew() -> None:
+    old = OldRobot()
+    for sequence in (1, 2):
+        for piece in pieces(sequence, b"x" * 2000):
+            old.say(piece)
+    assert len(old.received()) == 2
+    # the second message of the next run is cut off in the middle by yet another start
+    old.now += 5.0
+    for piece in [*pieces(1, b"y" * 2000), *pieces(2, b"y" * 2000)[:1]]:
+        old.say(piece)
+    old.now += 5.0
+    for sequence in (1, 2):
+        for piece in pieces(sequence, b"z" * 2000):
+            old.say(piece)
+    assert [event.payload[:1] for event in old.received()] == [b"y", b"z", b"z"]
+
+
+def test_a_message_above_the_limit_stalls_no_fielded_sender() -> None:
+    old = OldRobot(limits=Limits(message_bytes=5000))
+    for piece in [*pieces(1, bytes(20_000)), *pieces(2, b"small")]:
+        old.say(piece)
+    assert [event.payload for event in old.received()] == [b"small"]
+    assert len([answer for answer in old.hear() if isinstance(answer, LegacyAck)]) == len(pieces(1, bytes(20_000))) + 1
+
+
+def test_a_run_of_ours_starts_at_a_number_of_its_own() -> None:
+    numbers = set()
+    for seed in range(5):
+        rng = random.Random(seed)
+        config = replace(settings("new"), neighbours=(Neighbour(OLD, name="old", legacy=True),))
+        node = Node(config, boot_id=rng.randbytes(16), rng=rng, now=0.0)
+        numbers.add(next(iter(node._legacy._by_host.values())).sender._next_sequence())
+    assert len(numbers) == 5
+    assert all(1 <= number <= LAST_SEQUENCE for number in numbers)
+
+
+def test_a_link_without_ipv4_is_not_announced_in_the_fielded_format() -> None:
+    old = OldRobot()
+    old.node.link_up(
+        LinkInfo("six", LinkKind.BROADCAST, ("fe80::1234:5678:9abc:def0", 8700), ("ff02::1", 8700)), 1000.0
+    )
+    old.now += 2.0
+    assert [beat.address for beat in old.hear() if isinstance(beat, Host)] == ["10.0.0.1"]
