@@ -28,7 +28,7 @@ from udp_mesh.core.settings import (
 from udp_mesh.crypto import Key
 from udp_mesh.daemon.toml_source import ConfigurationError, Problem, Source, Table, parse
 from udp_mesh.links.attachments import EVERY_INTERFACE, LinkWish
-from udp_mesh.wire.limits import MAX_NAME_BYTES, MAX_TOPIC_BYTES
+from udp_mesh.wire.limits import MAX_MESSAGE_BYTES, MAX_NAME_BYTES, MAX_TOPIC_BYTES
 
 DEFAULT_PATH = Path("/etc/udp-mesh/udp-mesh.toml")
 DEFAULT_SOCKET = Path("/run/udp-mesh/udp-mesh.sock")
@@ -261,6 +261,13 @@ def _read_neighbour(table: Table, port: int) -> Neighbour | None:
     if address is None:
         table.report("address", "an IP address, optionally with a port (10.0.0.2, 10.0.0.2:8700, [fd00::2]:8700)", text)
         return None
+    if ":" in address[0]:
+        if legacy:
+            table.report("address", "an IPv4 address, the only ones the fielded format knows", text)
+            return None
+        if link is None and ipaddress.ip_address(address[0]).is_link_local:
+            table.report("address", 'link = "INTERFACE" beside a link-local address', text)
+            return None
     return Neighbour(address, name, link, legacy)
 
 
@@ -307,7 +314,10 @@ def read_rates(table: Table, current: Rates | None = None) -> Rates:
 
 def _read_limits(table: Table) -> Limits:
     values = {
-        entry.name: _or(table.integer(entry.name, None, 1, 1 << 40), getattr(Limits(), entry.name))
+        entry.name: _or(
+            table.integer(entry.name, None, 1, MAX_MESSAGE_BYTES if entry.name == "message_bytes" else 1 << 40),
+            getattr(Limits(), entry.name),
+        )
         for entry in dataclasses.fields(Limits)
     }
     table.finish()

@@ -20,6 +20,7 @@ class Problem:
 
     file: str
     line: int
+    """0 where the file as a whole is meant."""
     key: str
     expected: str
     found: str
@@ -28,7 +29,8 @@ class Problem:
     def __str__(self) -> str:
         where = f"{self.key}: " if self.key else ""
         hint = f" ({self.hint})" if self.hint else ""
-        return f"{self.file}:{self.line}: {where}expected {self.expected}, found {self.found}{hint}"
+        place = f"{self.file}:{self.line}" if self.line else self.file
+        return f"{place}: {where}expected {self.expected}, found {self.found}{hint}"
 
 
 class ConfigurationError(Exception):
@@ -128,7 +130,9 @@ class Source:
 
     def report(self, path: Path, expected: str, found: str, hint: str = "") -> None:
         key = ".".join(str(part) for part in path)
-        self.problems.append(Problem(self.file, self.line(path), key, expected, found, hint))
+        problem = Problem(self.file, self.line(path), key, expected, found, hint)
+        if problem not in self.problems:
+            self.problems.append(problem)
 
 
 def parse(text: str, file: str) -> Table:

@@ -152,6 +152,25 @@ def test_a_key_file_is_all_that_is_needed(tmp_path: Path) -> None:
             "[topics]\nmap = { outbox_on_disk = true }",
             'udp-mesh.toml:3: topics.map.outbox_on_disk: expected outbox = "last" or "all" beside it, found true',
         ),
+        (
+            '[[neighbours]]\naddress = "fe80::1"',
+            'udp-mesh.toml:3: neighbours.0.address: expected link = "INTERFACE" beside a link-local address, '
+            'found "fe80::1"',
+        ),
+        (
+            '[[neighbours]]\naddress = "fd00::1"\nlegacy = true\nname = "old"',
+            "udp-mesh.toml:3: neighbours.0.address: expected an IPv4 address, the only ones the fielded format knows, "
+            'found "fd00::1"',
+        ),
+        (
+            '[[links]]\naddress = "fe80::1"',
+            "udp-mesh.toml:3: links.0.address: expected an address of one interface "
+            '(name a link-local one\'s `interface`), found "fe80::1"',
+        ),
+        (
+            "[limits]\nmessage_bytes = 99999999999",
+            "udp-mesh.toml:3: limits.message_bytes: expected an integer from 1 to 1073741824, found 99999999999",
+        ),
         ("[[links]]\nmtu = 1500", "udp-mesh.toml:2: links.0: expected either interface or address, found neither"),
         (
             '[[links]]\ninterface = "a"\n[[links]]\naddress = "10.0.0"',
@@ -212,7 +231,7 @@ def test_a_key_file_holds_one_or_two_keys(tmp_path: Path, count: int) -> None:
 
 
 def test_a_configuration_that_cannot_be_read_is_one_problem(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="expected a readable file"):
+    with pytest.raises(ConfigurationError, match=r"missing\.toml: expected a readable file"):
         load(tmp_path / "missing.toml")
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b'name = "a"\n\xff')
