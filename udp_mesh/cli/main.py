@@ -185,7 +185,7 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         example="udp-mesh pub map/diff --file map.bin --to base --wait",
     )
     publish.add_argument("topic")
-    publish.add_argument("text", nargs="?", help="the message (default: --file, or standard input)")
+    publish.add_argument("text", nargs="?", help="the message (- or nothing: --file, or standard input)")
     publish.add_argument("--file", type=Path, help="send this file's bytes (- for standard input)")
     publish.add_argument("--to", metavar="PEER", help="one peer (default: the topic's destinations, or all)")
     publish.add_argument("--type", default="", help="the message's type name, carried along")
@@ -205,7 +205,7 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         commands, "ping", traffic.ping, "measure round trips to a peer", example="udp-mesh ping base --count 5"
     )
     ping.add_argument("peer")
-    ping.add_argument("--count", type=int, default=4)
+    ping.add_argument("-c", "--count", type=int, default=4)
     ping.add_argument("--interval", type=_positive, default=1.0, metavar="SECONDS")
     ping.add_argument("--timeout", type=_positive, default=2.0, metavar="SECONDS")
     bench = _command(

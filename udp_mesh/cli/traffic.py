@@ -36,9 +36,9 @@ def publish(arguments: argparse.Namespace) -> int:
 
 
 def _payload(arguments: argparse.Namespace) -> bytes | None:
-    if arguments.text is not None:
+    if arguments.text not in (None, "-"):
         return bytes(arguments.text.encode())
-    if arguments.file is None or str(arguments.file) == "-":
+    if arguments.text == "-" or arguments.file is None or str(arguments.file) == "-":
         return sys.stdin.buffer.read()
     path: Path = arguments.file
     try:

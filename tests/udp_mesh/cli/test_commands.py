@@ -1,5 +1,6 @@
 """The command line against real daemons: what scripts rely on is exit codes and JSON."""
 
+import io
 import json
 import signal
 import socket
@@ -121,6 +122,17 @@ def test_arriving_messages_are_printed(pair: Pair, capsysbinary: pytest.CaptureF
         assert text == b"bob status p0 5 B  ready\n"
 
 
+@pytest.mark.parametrize("words", [["-"], [], ["--file", "-"]])
+def test_a_message_is_read_from_standard_input(pair: Pair, monkeypatch: pytest.MonkeyPatch, words: list[str]) -> None:
+    alice, bob = pair
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"piped")))
+    with bob.client() as client:
+        client.subscribe("status")
+        assert main(["pub", "status", *words, "--to", "bob", "--wait", "--socket", str(alice.socket)]) == Exit.OK
+        (message,) = collect(client, 1)
+    assert message.payload == b"piped"
+
+
 def test_silence_ends_an_echo_with_a_timeout(run: Run) -> None:
     assert run("echo", "nothing", "--timeout", "0.05")[0] == Exit.FAILED
 
@@ -130,7 +142,7 @@ def test_a_peer_answers_a_ping_and_a_stranger_does_not(run: Run) -> None:
     assert code == Exit.OK
     assert all(json.loads(line)["round_trip_s"] > 0 for line in text.splitlines())
     assert "2 of 2 answered" in run("ping", "bob", "--count", "2", "--interval", "0.01", "--timeout", "50")[1]
-    code, text, _ = run("ping", "nobody", "--count", "1")
+    code, text, _ = run("ping", "nobody", "-c", "1")
     assert code == Exit.FAILED
     assert "nobody" in text
 
