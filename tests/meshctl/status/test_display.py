@@ -1,0 +1,199 @@
+"""The table fits where it is shown, says what it left out, and JSON holds everything that documentation promises."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from meshctl.errors import InputError
+from meshctl.fleet.journal import LastKnown
+from meshctl.model import Fleet
+from meshctl.plan import FileChange, NodePlan, Verdict
+from meshctl.status import FleetStatus, assess
+from meshctl.status.codes import CODES
+from meshctl.status.document import as_json, preflight_json
+from meshctl.status.filters import Filter
+from meshctl.status.preflight import Check
+from meshctl.status.rows import COLUMNS, Cell
+from meshctl.status.table import layout, table_lines
+from meshctl.status.text import summary_lines, text, topic_lines
+from meshctl.status.values import Silence
+from tests.meshctl.status.fleets import CREW, HEALTHY, NOW, look_of, status_of
+
+ROOT = Path(__file__).resolve().parents[3]
+PAGE = (ROOT / "docs/status.md").read_text()
+
+
+def broken(fleet: Fleet) -> FleetStatus:
+    """Some of everything."""
+    plan = NodePlan("b01", Verdict.CHANGE, files=(FileChange("etc/config/wireless", "changed", ""),))
+    rover = replace(CREW["rover"], peers=(), drift=("differs from the inventory: etc/udp-mesh.toml",))
+    return status_of(
+        fleet,
+        {name: HEALTHY[name] for name in ("base", "b01")},
+        {"rover": rover, "station": CREW["station"]},
+        plans={"b01": plan},
+        known={
+            "rover": LastKnown("rover", NOW - 600, {"version": "23.05.5", "hops": "2", "via": "b01", "heard": "b01"})
+        },
+        silent={"rover": Silence("no answer to connect within 5 s")},
+        silent_robots={"shelf": Silence("no answer to connect within 5 s")},
+    )
+
+
+@pytest.mark.parametrize("width", [72, 80, 100, 120, 200])
+def test_no_line_is_wider_than_the_terminal(fleet: Fleet, width: int) -> None:
+    lines = text(broken(fleet), width).splitlines()
+    assert [line for line in lines if len(line) > width] == []
+
+
+def test_what_has_no_room_is_named(fleet: Fleet) -> None:
+    told = " ".join(text(broken(fleet), 80).split())
+    left_out = re.search(r"no room for (.*?): --wide", told)
+    assert left_out is not None
+    headings = text(broken(fleet), 80)
+    for heading in left_out[1].split(", "):
+        assert f"  {heading}  " not in headings.partition("name  ")[2].partition("\n")[0]
+    assert "no room for" not in text(broken(fleet))
+
+
+@given(
+    st.lists(st.tuples(st.text("abc", min_size=1, max_size=12), st.text("xyz", max_size=20)), min_size=1, max_size=5),
+    st.integers(20, 160),
+)
+def test_columns_give_way_by_rank_and_those_without_rank_stay(cells: list[tuple[str, str]], width: int) -> None:
+    rows = [
+        {column.key: Cell(name if column.key == "name" else other or "-", "s") for column in COLUMNS}
+        for name, other in cells
+    ]
+    shown = layout(rows, width)
+    kept = {column.heading for column in shown.columns}
+    assert kept.isdisjoint(shown.dropped)
+    assert kept | set(shown.dropped) == {column.heading for column in COLUMNS}
+    assert {column.heading for column in COLUMNS if not column.rank} <= kept
+    for lines in (table_lines(rows, width), table_lines(rows)):
+        assert len({len(line.split("  ")[0]) for line in lines[:1]}) == 1
+    widest = max(len(line) for line in table_lines(rows, width)[: len(rows) + 1])
+    if shown.dropped != tuple(column.heading for column in COLUMNS if column.rank):
+        assert widest <= width
+
+
+def test_a_column_nobody_has_anything_in_is_left_out_silently(fleet: Fleet) -> None:
+    status = assess(look_of(fleet), fleet.managed(), NOW)
+    assert "waits" not in text(status)
+    assert "no room" not in text(status)
+
+
+def test_the_summary_comes_first_and_the_verdict_again_after_a_long_table(fleet: Fleet) -> None:
+    status = status_of(fleet)
+    assert text(status).splitlines()[0].startswith("trio: all well")
+    long = replace(status, nodes=status.nodes * 10)
+    assert text(long).splitlines()[-1] == text(long).splitlines()[0]
+
+
+def test_one_alarm_at_many_is_one_line(fleet: Fleet) -> None:
+    status = status_of(fleet, {}, {}, silent={name: Silence("no answer") for name in fleet.nodes})
+    many = replace(status, robots=(), nodes=tuple(node for node in status.nodes if node.alarms) * 3)
+    lines = summary_lines(many)
+    assert sum("unreachable at 9" in line for line in lines) == 1
+    assert any("--alarm unreachable" in line for line in lines)
+
+
+def test_brief_leaves_out_notes_and_advice(fleet: Fleet) -> None:
+    told = text(broken(fleet), brief=True)
+    assert "->" not in told
+    assert "NOTE" not in told
+    assert "ERROR" in told
+
+
+def test_topics_are_told_per_robot_the_most_urgent_first(fleet: Fleet) -> None:
+    lines = topic_lines(status_of(fleet))
+    assert [line.split()[0] for line in lines] == ["topic", *["estop"] * 2, *["commands"] * 2, *["telemetry"] * 2]
+
+
+def test_every_alarm_has_a_code_that_is_listed_and_documented() -> None:
+    used = set()
+    for path in (ROOT / "meshctl/status").glob("*.py"):
+        for call in ast.walk(ast.parse(path.read_text())):
+            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in ("Alarm", "Silence"):
+                used |= {
+                    arg.value for arg in call.args[1:2] if isinstance(arg, ast.Constant) and isinstance(arg.value, str)
+                }
+    assert used <= set(CODES)
+    for code, meaning in CODES.items():
+        assert f"| `{code}` | {meaning} |" in PAGE, f"docs/status.md: expected a row of {code}"
+
+
+def test_every_column_is_documented() -> None:
+    for column in COLUMNS:
+        assert f"| `{column.heading}` |" in PAGE
+
+
+def documented(value: Any) -> set[str]:
+    """Every key of a JSON value."""
+    if isinstance(value, dict):
+        return set(value) | {key for inner in value.values() for key in documented(inner)}
+    return {key for inner in value for key in documented(inner)} if isinstance(value, list) else set()
+
+
+def test_every_field_of_the_json_is_documented(fleet: Fleet) -> None:
+    told = as_json(broken(fleet))
+    assert json.loads(json.dumps(told)) == told
+    kept_as_told = {key for one in (*told["nodes"], *told["robots"]) for key in one["last_known"] or {}}
+    fields = documented(told) | documented(preflight_json([Check("a", True, "b")]))
+    missing = {field for field in fields - kept_as_told if f"`{field}`" not in PAGE}
+    assert missing == set()
+
+
+def test_a_fact_that_is_not_known_is_null_and_never_zero(fleet: Fleet) -> None:
+    rover = next(node for node in as_json(broken(fleet))["nodes"] if node["name"] == "rover")
+    assert rover["answers"] is False
+    for fact in ("version", "drift", "uptime_s", "load", "memory_free", "channels", "neighbours", "hops", "quality"):
+        assert rover[fact] is None, fact
+    assert rover["last_known"]["hops"] == 2
+
+
+@pytest.mark.parametrize(
+    ("chosen", "shown"),
+    [
+        (Filter(), ["base", "station", "b01", "b02", "rover", "rover", "shelf", "shelf"]),
+        (Filter(names=("b*",)), ["base", "b01", "b02"]),
+        (Filter(groups=("beacons",)), ["b01", "b02"]),
+        (Filter(groups=("beacons",), states=("deployed",)), ["b01"]),
+        (Filter(robots=("rover",)), ["rover", "rover"]),
+        (Filter(roles=("computer",)), ["station", "rover", "shelf"]),
+        (Filter(roles=("robot", "beacon"), states=("carried",)), ["b02", "shelf"]),
+        (Filter(alarms=("unreachable",)), ["rover"]),
+        (Filter(alarms=("any",)), ["b01", "rover", "rover"]),
+        (Filter(alarms=("drift",), roles=("beacon",)), ["b01"]),
+    ],
+)
+def test_a_filter_shows_what_it_names(fleet: Fleet, chosen: Filter, shown: list[str]) -> None:
+    chosen.check(fleet)
+    assert [one.name for one in chosen.apply(fleet, broken(fleet))] == shown
+
+
+@pytest.mark.parametrize(
+    ("chosen", "hint"),
+    [
+        (Filter(names=("rovr",)), "did you mean 'rover'"),
+        (Filter(groups=("beacon",)), "did you mean 'beacons'"),
+        (Filter(roles=("radio",)), "base, robot, beacon, computer"),
+        (Filter(states=("lost",)), "carried, deployed, spare"),
+        (Filter(alarms=("unreachble",)), "did you mean 'unreachable'"),
+    ],
+)
+def test_a_filter_that_can_select_nothing_is_refused_with_what_there_is(
+    fleet: Fleet, chosen: Filter, hint: str
+) -> None:
+    with pytest.raises(InputError) as raised:
+        chosen.check(fleet)
+    assert hint in raised.value.hint
