@@ -25,6 +25,9 @@ ASK_TIMEOUT_S = 10.0
 LOOK_EVERY_S = 0.25
 # A daemon that dies at start is back within RestartSec=1 for another try: a process must have lived for longer.
 STEADY_S = 2.0
+# The bridge reads all of ROS before it can fail; a topic that it asks the daemon for shows sooner that it got through.
+BRIDGE_STEADY_S = 8.0
+BRIDGE_TOPIC = "bridge/ros1"
 # Topics are called flowing when so many messages came within so long, so that a single message is no promise of more.
 FLOW_WATCH_S = 1.0
 FLOW_MESSAGES = 2
@@ -100,12 +103,20 @@ def ill(look: Look, wanted: list[str], before: Before, now_s: float) -> str:
     ]
     if dry:
         return f"topics flowed before and receive nothing: {', '.join(dry)}"
-    young = [unit for unit in look.units if now_s - unit.started_s < STEADY_S]
+    young = [
+        unit
+        for unit in look.units
+        if now_s - unit.started_s < (BRIDGE_STEADY_S if _is_bridge(unit) and BRIDGE_TOPIC not in here else STEADY_S)
+    ]
     return f"{_called(young[0])} has only just started" if young else ""
 
 
+def _is_bridge(unit: Unit) -> bool:
+    return "ros" in unit.name
+
+
 def _called(unit: Unit) -> str:
-    return "the ROS bridge" if "ros" in unit.name else "the daemon"
+    return "the ROS bridge" if _is_bridge(unit) else "the daemon"
 
 
 def ask(*operations: str) -> list[Json]:

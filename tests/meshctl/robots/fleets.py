@@ -34,6 +34,7 @@ meshes:
 defaults: {{hardware: rocket, state: deployed}}
 nodes:
   base: {{role: base, address: 10.42.0.1}}
+apply: {{parallel: {parallel}}}
 robots:
 {robots}
 udp_mesh:
@@ -51,6 +52,7 @@ _ROBOT = """\
       address: {address}/24
       arch: {arch}
       python: {python}
+      ros: "{ros}"
       ssh: {{user: {user}, key_files: [operator]}}
 """
 
@@ -64,19 +66,21 @@ class RobotFleet:
         self.key = key_pair(directory / "operator")
         self.file = directory / "fleet.yaml"
         self.machines: dict[str, Machine] = {}
-        self._base = base
+        self.base = base
         self._lan = lan
         (directory / "keys.yaml").write_text(f'old: "{OLD_KEY}"\nnew: "{NEW_KEY}"\n')
 
     def add(self, name: str, *, opt_kib: int | None = None, start: bool = True) -> Machine:
         address = f"10.42.0.{10 + len(self.machines)}"
-        machine = Machine(self._base, self.directory / name, self._lan, address, self.key, opt_kib=opt_kib)
+        machine = Machine(self.base, self.directory / name, self._lan, address, self.key, opt_kib=opt_kib)
         self.machines[name] = machine
         if start:
             machine.start()
         return machine
 
-    def write(self, *, arch: str = "", python: str = PYTHON, user: str = "root") -> None:
+    def write(
+        self, *, arch: str = "", python: str = PYTHON, user: str = "root", ros: str = "", parallel: int = 8
+    ) -> None:
         """The inventory of all machines, with their host keys pinned."""
         robots = "".join(
             _ROBOT.format(
@@ -86,10 +90,11 @@ class RobotFleet:
                 arch=arch or _arch(),
                 python=python,
                 user=user,
+                ros=ros,
             )
             for number, (name, machine) in enumerate(self.machines.items())
         )
-        self.file.write_text(_INVENTORY.format(robots=robots))
+        self.file.write_text(_INVENTORY.format(robots=robots, parallel=parallel))
         trust = TrustStore(self.directory / "known_hosts")
         for name, machine in self.machines.items():
             trust.replace(f"robot.{name}", machine.host_key)
@@ -100,6 +105,17 @@ class RobotFleet:
         done = CliRunner().invoke(build("robots"), arguments, catch_exceptions=False)
         assert done.exit_code == exit_code, done.output
         return done.output
+
+    def root_command(self, *words: str, exit_code: int = 0) -> str:
+        """What `meshctl WORDS` prints on this inventory."""
+        option = [] if words[0] == "history" else ["-i", str(self.file)]
+        done = CliRunner().invoke(build(words[0]), [*words, *option], catch_exceptions=False)
+        assert done.exit_code == exit_code, done.output
+        return done.output
+
+    def add_topic(self, line: str) -> None:
+        """In the inventory alone."""
+        self.file.write_text(f"{self.file.read_text()}  {line}\n")
 
     def refused(self, *words: str) -> str:
         """What a command says that cannot be done as it was asked for."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from meshctl.robots.scripts.health import STEADY_S, Before, Look, Unit, flowing, ill
+from meshctl.robots.scripts.health import BRIDGE_STEADY_S, BRIDGE_TOPIC, STEADY_S, Before, Look, Unit, flowing, ill
 
 NOW_S = 1000.0
 DAEMON = Unit("udp-mesh.service", "active", "running", "success", "0", NOW_S - 60)
@@ -45,11 +45,19 @@ def test_all_that_ran_and_was_seen_before_makes_it_well() -> None:
         (_look(online=("base",)), Before(["base", "husky2"], {}, "b"), "are not seen: husky2"),
         (_look(), Before([], {"video": 5}, "a"), "topics flowed before and receive nothing: video"),
         (_look(DAEMON._replace(started_s=NOW_S - STEADY_S / 2)), NOTHING, "the daemon has only just started"),
-        (_look(DAEMON, BRIDGE._replace(started_s=NOW_S)), NOTHING, "the ROS bridge has only just started"),
+        (_look(DAEMON, BRIDGE._replace(started_s=NOW_S - STEADY_S)), NOTHING, "the ROS bridge has only just started"),
     ],
 )
 def test_what_is_not_well_is_said_in_one_line(look: Look, before: Before, reason: str) -> None:
     assert reason in _ill(look, before)
+
+
+def test_a_bridge_that_came_through_to_the_daemon_needs_no_longer_than_that() -> None:
+    seen = _look(DAEMON, BRIDGE._replace(started_s=NOW_S - STEADY_S))
+    assert _ill(seen._replace(topics=[*seen.topics, _topic(BRIDGE_TOPIC)])) == ""
+    assert _ill(_look(DAEMON, BRIDGE._replace(started_s=NOW_S - BRIDGE_STEADY_S))) == "", (
+        "there may be no ROS master yet"
+    )
 
 
 def test_a_topic_that_is_lacking_or_only_arrives_is_not_there() -> None:

@@ -1,0 +1,111 @@
+"""Runs that are cut short, and taken up again: Ctrl-C, `history`, `resume`; two operators at one robot."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import threading
+from pathlib import Path
+
+import pytest
+
+from meshctl.fleet.interrupt import Interrupt
+from meshctl.fleet.journal import lock_owner
+from tests.meshctl.device.servers import PATIENCE_S, eventually
+from tests.meshctl.robots.fleets import RobotFleet
+
+pytestmark = [pytest.mark.xdist_group("robots"), pytest.mark.timeout(600)]
+
+
+class Finger:
+    """Presses Ctrl-C so many times as soon as a file is there, each time when the one before was understood."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, there: Path, times: int) -> None:
+        self._understood = threading.Semaphore(0)
+        self._there = there
+        self._times = times
+        request = Interrupt.request
+
+        def understood(interrupt: Interrupt) -> None:
+            request(interrupt)
+            self._understood.release()
+
+        monkeypatch.setattr(Interrupt, "request", understood)
+        self._thread = threading.Thread(target=self._press)
+
+    def _press(self) -> None:
+        eventually(self._there.exists)
+        for _ in range(self._times):
+            os.kill(os.getpid(), signal.SIGINT)
+            assert self._understood.acquire(timeout=PATIENCE_S)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *exc: object) -> None:
+        self._thread.join()
+
+
+def test_an_interrupted_deploy_is_in_the_history_and_resume_takes_up_what_is_left(
+    fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("husky1", "husky2"):
+        fleet.add(name)
+    fleet.write(parallel=1)
+    with Finger(monkeypatch, fleet.directory / "husky1/upper/opt/udp-mesh/wheels", times=1):
+        told = fleet.deploy(exit_code=130)
+    assert "husky1: done" in told
+    assert "husky2: pending: interrupted before its turn" in told
+    told = fleet.root_command("history")
+    assert "robots deploy" in told
+    assert "1 done, 1 pending" in told
+    (run,) = json.loads(fleet.root_command("history", "--json"))
+    told = fleet.root_command("history", str(run["run"]))
+    for step in ("look", "send", "install", "switch"):
+        assert step in told
+    # another release meanwhile, and the same wheels without being told
+    told = fleet.root_command("resume")
+    assert "resuming run 1 (robots deploy): husky2" in told
+    assert "husky2: done: runs " in told
+    assert "run 2 left nothing to do" in fleet.root_command("resume")
+
+
+def test_whoever_leaves_at_once_finds_the_robot_whole_and_robots_that_were_off_are_taken_up(
+    fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("husky1", "husky2"):
+        fleet.add(name)
+    fleet.write()
+    fleet.machines["husky2"].stop()
+    with Finger(monkeypatch, fleet.directory / "husky1/upper/opt/udp-mesh/unproven", times=2):
+        told = fleet.deploy(exit_code=130)
+    assert "husky1: uncertain" in told
+    assert "husky2: unreachable" in told
+    fleet.machines["husky2"].start()
+    # the robot comes to the end of its switch by itself
+    eventually(lambda: bool(fleet.status()["husky1"]["well"]))
+    told = fleet.root_command("resume")
+    assert "husky1: unchanged" in told
+    assert "husky2: done: runs " in told
+
+
+def test_two_operators_at_one_robot_exclude_each_other_and_the_dead_hold_nobody(fleet: RobotFleet) -> None:
+    fleet.add("husky1")
+    fleet.write()
+    claim = 'echo "{owner} $(cut -d. -f1 /proc/uptime) $(cat /proc/sys/kernel/random/boot_id)" >/opt/udp-mesh/.claim'
+    fleet.shell("husky1", "mkdir /opt/udp-mesh && " + claim.format(owner="ann@laptop:17:4711"))
+    told = fleet.deploy(exit_code=1)
+    assert "husky1 (10.42.0.10): ann@laptop:17:4711 changes this robot" in told
+    assert "wait until it is done" in told
+
+    with subprocess.Popen(["sleep", "600"]) as other:
+        start = Path(f"/proc/{other.pid}/stat").read_text().rpartition(")")[2].split()[19]
+        dead = f"{lock_owner().rsplit(':', 2)[0]}:{other.pid}:{start}"
+        fleet.shell("husky1", claim.format(owner=dead))
+        assert f"{dead} changes this robot" in fleet.deploy(exit_code=1)
+        other.kill()
+        other.wait(PATIENCE_S)
+    assert "husky1: done: runs " in fleet.deploy()
+    assert fleet.shell("husky1", "ls /opt/udp-mesh/.claim 2>/dev/null || :") == ""

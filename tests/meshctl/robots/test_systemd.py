@@ -1,0 +1,114 @@
+"""What systemd does for the daemon: privileges, readiness, watchdog, boot; lost power in between, and a wrong clock."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+import pytest
+
+from tests.meshctl.device.servers import eventually
+from tests.meshctl.robots.fleets import RobotFleet
+
+pytestmark = [pytest.mark.xdist_group("robots"), pytest.mark.timeout(600)]
+
+# `systemd-analyze security`, in tenths of a point from 0 (locked up) to 100 (does what it likes).
+MAX_EXPOSURE = 20
+
+
+def _show(fleet: RobotFleet, *properties: str, unit: str = "udp-mesh.service") -> dict[str, str]:
+    told = fleet.shell("husky1", f"systemctl show -p {','.join(properties)} {unit}")
+    return dict(line.partition("=")[::2] for line in told.splitlines())
+
+
+def test_the_daemon_is_a_notifying_service_that_may_do_little_comes_back_when_it_hangs_and_after_a_boot(
+    fleet: RobotFleet,
+) -> None:
+    machine = fleet.add("husky1")
+    fleet.write()
+    fleet.deploy()
+    told = _show(fleet, "MainPID", "Type", "StatusText", "WatchdogUSec", "NRestarts")
+    assert told["Type"] == "notify"
+    assert told["StatusText"] == "husky1: 0 of 0 peers online", "it tells systemd how it fares"
+    pid = told["MainPID"]
+
+    process = dict(
+        line.split(":\t", 1) for line in fleet.shell("husky1", f"cat /proc/{pid}/status").splitlines() if ":\t" in line
+    )
+    account = fleet.shell("husky1", "id -u udp-mesh").strip()
+    assert set(process["Uid"].split()) == {account}
+    assert int(process["CapEff"], 16) == int(process["CapBnd"], 16) == 1 << 13, "CAP_NET_RAW and nothing else"
+    assert (process["NoNewPrivs"], process["Seccomp"]) == ("1", "2")
+    inside = f"nsenter -t {pid} -m -S {account}"
+    fleet.shell("husky1", f"! {inside} touch /opt/udp-mesh/x 2>/dev/null && ! {inside} cat /etc/shadow 2>/dev/null")
+    fleet.shell("husky1", f"! {inside} ls /root 2>/dev/null && {inside} touch /var/lib/udp-mesh/x")
+    fleet.shell("husky1", f"systemd-analyze security --no-pager --threshold={MAX_EXPOSURE} udp-mesh.service")
+
+    # it hangs
+    began = fleet.shell("husky1", "date '+%F %T'").strip()
+    fleet.shell("husky1", f"kill -STOP {pid}")
+    eventually(lambda: _show(fleet, "NRestarts", "ActiveState") == {"NRestarts": "1", "ActiveState": "active"})
+    assert _show(fleet, "MainPID")["MainPID"] != pid
+    journal = fleet.shell("husky1", f"journalctl --no-pager -u udp-mesh.service --since '{began}' -o cat")
+    assert "Watchdog timeout" in journal
+    assert fleet.status()["husky1"]["service"]["restarts"] == 1
+
+    release = fleet.status()["husky1"]["release"]
+    machine.reboot(fleet.directory / "pins")
+    eventually(lambda: bool(fleet.status()["husky1"]["well"]))
+    found = fleet.status()["husky1"]
+    assert (found["release"], found["service"]["restarts"]) == (release, 0)
+    assert "husky1: unchanged" in fleet.deploy()
+
+
+def test_power_lost_in_the_middle_of_a_switch_is_seen_and_the_next_deploy_mends_it(fleet: RobotFleet) -> None:
+    machine = fleet.add("husky1")
+    fleet.write()
+    fleet.deploy()
+    first = fleet.status()["husky1"]["release"]
+    fleet.add_topic("video: {priority: 9}")
+    marker = fleet.directory / "husky1/upper/opt/udp-mesh/unproven"
+
+    def cut() -> None:
+        while not marker.exists():
+            time.sleep(0.001)
+        machine.stop()
+
+    cutting = threading.Thread(target=cut)
+    cutting.start()
+    told = fleet.deploy(exit_code=1)
+    cutting.join()
+    assert "husky1: uncertain" in told
+    assert "finishes or undoes the switch by itself" in told
+    machine.start()
+    eventually(lambda: fleet.status()["husky1"]["answers"])
+    found = fleet.status()["husky1"]
+    assert not found["is_proven"]
+    assert "a switch was cut short" in found["remark"]
+    assert "a switch was cut short" in fleet.meshctl("diff", exit_code=1)
+    assert "husky1: done: runs " in fleet.root_command("resume")
+    found = fleet.status()["husky1"]
+    assert found["well"]
+    assert found["release"] != first
+    assert found["previous"] == first
+
+
+def test_a_clock_that_is_years_off_misleads_nothing(fleet: RobotFleet) -> None:
+    machine = fleet.add("husky1", start=False)
+    library = next(iter((fleet.base / "usr/lib").glob("*/faketime/libfaketime.so.1"))).relative_to(fleet.base)
+    faked = f"LD_PRELOAD=/{library} FAKETIME=-20y FAKETIME_DONT_FAKE_MONOTONIC=1 DONT_FAKE_MONOTONIC=1"
+    machine.write("/etc/systemd/system/udp-mesh.service.d/clock.conf", f"[Service]\nEnvironment={faked}\n")
+    machine.start()
+    fleet.tool("husky1", "date", f'#!/bin/sh\nexec env {faked} /bin/date "$@"\n')
+    fleet.add("husky2")
+    fleet.write()
+    assert int(fleet.shell("husky1", "date +%s")) < time.time() - 19 * 365 * 86_400
+    told = fleet.deploy()
+    assert "its clock is 20.0 years behind ours" in told
+    pid = fleet.shell("husky1", "systemctl show -p MainPID --value udp-mesh.service").strip()
+    assert str(library) in fleet.shell("husky1", f"cat /proc/{pid}/maps"), "the daemon, too, lives in that year"
+    eventually(lambda: all(one["online"] for one in fleet.status().values()))
+    assert "husky1: unchanged" in fleet.deploy()
+    document = json.loads(fleet.meshctl("status", "--json"))
+    assert all(one["well"] for one in document)
