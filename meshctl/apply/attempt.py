@@ -15,12 +15,14 @@ from meshctl.apply.change import change_of, new_change_id, new_nonce, services_o
 from meshctl.apply.checks import missing
 from meshctl.apply.job import Job
 from meshctl.apply.settle import Move, applied_age_s, next_move
+from meshctl.apply.waiting import Pace
 from meshctl.device import deadman
 from meshctl.device.connection import Endpoint
 from meshctl.device.deadman import Change
 from meshctl.device.errors import NodeRefused
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.observe import observe
+from meshctl.device.openwrt import root_in_ram
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.model import Secret
@@ -32,6 +34,8 @@ LOCK_SLACK_S = 60
 SETTLE_S = 3.0
 # The answer to `apply` has to be out before the change cuts the connection; one that is late is not waited for long.
 ANSWER_FIRST_S, ANSWER_S = 0.5, 15.0
+# Erasing 16 MB of NOR takes up to three minutes, more with other work beside it.
+FLASH_READY_S = 600.0
 ABSENT = ChangeStatus("absent", installed=False)
 
 
@@ -53,6 +57,8 @@ class Attempt:
     trouble: str = ""
     # decided against: from now on it is only ever taken back
     is_given_up: bool = False
+    # what it does besides files may take so long before its window begins
+    extra_s: float = 0.0
     # the one of `places` where it was met
     met: Endpoint | None = None
 
@@ -92,6 +98,7 @@ def prepare(attempt: Attempt, connection: SshConnection) -> None:
     """Bring the change there and arm it; nothing it touches has changed yet. Raises NodeRefused, NodeError."""
     job, owner = attempt.job, attempt.job.work.owner
     attempt.starts += 1
+    await_flash(job, connection)
     with job.step("stage"):
         install_switch(job, connection)
         deadman.lock(connection, owner, ttl_s=attempt.window_s + LOCK_SLACK_S)
@@ -100,6 +107,23 @@ def prepare(attempt: Attempt, connection: SshConnection) -> None:
         )
     with job.step("arm"):
         deadman.arm(connection, owner, attempt.id, nonce=attempt.nonce, window_s=attempt.window_s)
+
+
+def await_flash(job: Job, connection: SshConnection) -> None:
+    """Wait until / is in flash: at its first boot a node is in memory until its flash is formatted, and what is written
+    until then may be lost. Raises NodeError when that does not come to pass."""
+    if not job.before.root_in_ram or not root_in_ram(connection):
+        return
+    job.work.note("its flash is not ready yet (first boot): waiting", job.name)
+    pace = Pace(FLASH_READY_S, job.work.interrupt)
+    with job.step("flash ready"):
+        while root_in_ram(connection):
+            if pace.is_over or job.work.interrupt.leaving:
+                raise NodeError(
+                    f"{job.name}: its flash was not ready within {FLASH_READY_S / 60:.0f} minutes; nothing was changed",
+                    hint="switch it off and on, then run again",
+                )
+            pace.pause()
 
 
 def install_switch(job: Job, connection: SshConnection) -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from meshctl.device.observation import Observation
 from meshctl.plan import Wanted
+from meshctl.plan.packages import NO_NEEDS, Needs, missing_packages
 from meshctl.topology import NEIGHBOUR_FRESH_MS
 from meshctl.uci import Package, Section
 
@@ -22,12 +23,13 @@ NEIGHBOURS_BACK = 0.5
 @dataclass(frozen=True, slots=True)
 class Expectation:
     """What has to be there again. `neighbours` are the MACs heard before, `bases` those of the base's mesh radios;
-    empty when there were none, e.g. on the bench."""
+    empty when there were none, e.g. on the bench; `needs` are packages, where the change was about them."""
 
     wireless: Package | None = None
     network: Package | None = None
     neighbours: frozenset[str] = frozenset()
     bases: frozenset[str] = frozenset()
+    needs: Needs = NO_NEEDS
 
 
 def expectation(wanted: Wanted, before: Observation, base_macs: Iterable[str] = ()) -> Expectation:
@@ -55,6 +57,7 @@ def missing(expected: Expectation, after: Observation, *, since_s: float | None 
     fresh_ms = NEIGHBOUR_FRESH_MS if since_s is None else min(NEIGHBOUR_FRESH_MS, since_s * 1000)
     return (
         *_reload(after),
+        *_packages(expected, after),
         *_lan(expected, after),
         *_radios(expected, after),
         *_neighbours(expected, after, fresh_ms),
@@ -69,6 +72,11 @@ def _reload(after: Observation) -> tuple[str, ...]:
     if status is None:
         return ("its services are still reloading",)
     return (f"reloading its services failed with status {status}",) if status != 0 else ()
+
+
+def _packages(expected: Expectation, after: Observation) -> tuple[str, ...]:
+    lacking = missing_packages(expected.needs, after)
+    return (f"it lacks {', '.join(group[0] for group in lacking)}",) if lacking else ()
 
 
 def _lan(expected: Expectation, after: Observation) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """Carry out a plan, stage by stage: every node of it ends with exactly one outcome, in the journal as it happens.
 
-`carry_out` runs each stage's nodes together (`_one_node`: packages, then firmware or files), a switch as one. A failed
-canary, a spent failure budget or Ctrl-C stops what has not begun; what is in work comes to its own end.
+`carry_out` runs each stage's nodes together (`_one_node`: firmware, or packages and then files), a switch as one. A
+failed canary, a spent failure budget or Ctrl-C stops what has not begun; what is in work comes to its own end.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from meshctl.apply.planning import Prepared, base_macs
 from meshctl.apply.switch import switch
 from meshctl.apply.whereabouts import ask_around
 from meshctl.device.observation import Observation
+from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.fleet import (
     Event,
@@ -190,21 +191,28 @@ def _journaling(journal_run: Run) -> Observer:
 
 
 def _one_node(job: Job, images: Mapping[str, Path]) -> Outcome:
-    """Packages, then firmware or files. NodeError means that nothing (or no more than packages) was changed."""
-    access = job.work.access
-    connection = access.take(job.name) or access.open(job.node)
-    try:
-        if job.plan.packages is not None and job.plan.firmware is None:
-            install(job, connection, job.plan.packages)
-        if job.plan.firmware is None and not job.plan.files:
-            access.keep(job.name, connection)
-            return Outcome(job.name, Result.DONE)
-    except BaseException:
-        connection.close()
-        raise
+    """Firmware, or packages and then files. NodeError means that nothing was changed."""
     if job.plan.firmware is not None:
-        return flash(job, connection, images[job.node.hardware.name])
-    return configure(job, connection)
+        return flash(job, _connection(job), images[job.node.hardware.name])
+    outcome = Outcome(job.name, Result.DONE)
+    if job.plan.packages is not None:
+        outcome = install(job, _connection(job), job.plan.packages)
+    if not job.plan.files or not outcome.result.is_good:
+        return outcome
+    try:
+        return configure(job, _connection(job))
+    except NodeError as error:
+        if job.plan.packages is None:
+            raise
+        # its packages are there to stay, and a resume has only the files left to do
+        failed = outcome_of_error(job.name, error)
+        return replace(failed, result=Result.FAILED, reason=f"its packages are installed, its files not: {error}")
+
+
+def _connection(job: Job) -> SshConnection:
+    """The kept connection, or a new one to where the node is now: on the bench, if it was met there."""
+    access = job.work.access
+    return access.take(job.name) or access.open(job.node, endpoint=access.newcomers.get(job.name))
 
 
 def _switch_stage(
@@ -240,8 +248,9 @@ def _packages_first(stage: Stage, jobs: Mapping[str, Job]) -> dict[str, Outcome]
         if step is None:
             continue
         try:
-            with jobs[name].work.access.lease(jobs[name].node) as connection:
-                install(jobs[name], connection, step)
+            outcome = install(jobs[name], _connection(jobs[name]), step)
         except NodeError as error:
-            failed[name] = outcome_of_error(name, error)
+            outcome = outcome_of_error(name, error)
+        if not outcome.result.is_good:
+            failed[name] = outcome
     return failed

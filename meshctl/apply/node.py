@@ -31,7 +31,15 @@ def configure(job: Job, connection: SshConnection) -> Outcome:
     Raises NodeError only when nothing was changed on the node.
     """
     # a device that was met on the bench is known by its name from now on
-    attempt = attempt_of(job, replace(connection.endpoint, identity=job.name))
+    return carry(attempt_of(job, replace(connection.endpoint, identity=job.name)), connection)
+
+
+def carry(attempt: Attempt, connection: SshConnection) -> Outcome:
+    """Carry a change to its end. Owns `connection`, and keeps one to the node if all went well.
+
+    Raises NodeError only when nothing was changed on the node.
+    """
+    job = attempt.job
     try:
         prepare(attempt, connection)
         begin(attempt, connection)
@@ -53,7 +61,7 @@ def configure(job: Job, connection: SshConnection) -> Outcome:
 def follow(attempt: Attempt) -> Outcome:
     """Ask and do what is next until the change has ended one way or the other."""
     work = attempt.job.work
-    pace = Pace(attempt.settle_s + attempt.window_s + GRACE_AFTER_WINDOW_S, work.interrupt)
+    pace = Pace(attempt.settle_s + attempt.extra_s + attempt.window_s + GRACE_AFTER_WINDOW_S, work.interrupt)
     work.interrupt.wait(attempt.settle_s)
     while not pace.is_over:
         connection = reach(attempt)

@@ -1,42 +1,85 @@
-"""Install the packages a node lacks, from files: it has no internet. Nothing that is in use is cut by it."""
+"""Install the packages a node lacks, from files: it has no internet. Under its dead-man's switch, like every change.
+
+The files are brought to the node's memory; then its own process removes what conflicts and installs, and that is
+confirmed over a new connection once nothing is lacking and the neighbours it had are heard again. Otherwise the node
+removes what it installed and puts back what it removed. Its files change afterwards, in a change of their own.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from meshctl.apply.attempt import Attempt, await_flash
+from meshctl.apply.change import new_change_id, new_nonce
+from meshctl.apply.checks import Expectation
 from meshctl.apply.job import Job
-from meshctl.device import openwrt
+from meshctl.apply.node import carry
+from meshctl.device import deadman
+from meshctl.device.deadman import Change
 from meshctl.device.framing import quoted
-from meshctl.device.observe import observe
 from meshctl.device.ssh import SshConnection
 from meshctl.device.upload import upload
 from meshctl.errors import InputError, NodeError
+from meshctl.fleet import Outcome
 from meshctl.plan import PackageStep
-from meshctl.plan.packages import missing_packages
 
 DIRECTORY = "/tmp/meshctl/packages"
+# Unpacking packages into jffs2 takes a minute on the slowest boards, and as much again to keep what is removed.
+INSTALL_S = 300.0
+# What conflicts is the radios' supplicant: netifd sets each radio up with the one there is now.
+_WITH_THE_OTHER_SUPPLICANT = "[ ! -x /sbin/wifi ] || /sbin/wifi\n"
 
 
-def install(job: Job, connection: SshConnection, step: PackageStep) -> None:
-    """Bring the step's files there, install them, and see that nothing is missing. Raises NodeError, InputError."""
-    files = [_local(job, file) for file in step.files]
-    tool = job.before.package_tool
-    if tool is None:
-        raise NodeError(f"{job.name}: it did not tell whether it has opkg or apk")
-    with job.step("packages"):
-        there = []
-        for file in files:
-            path = f"{DIRECTORY}/{file.name}"
-            upload(connection, file, path, rate_bytes_per_s=job.work.rate_bytes_per_s, progress=job.progress)
-            there.append(path)
-        if step.remove:
-            verb = ("opkg", "remove") if tool == "opkg" else ("apk", "del")
-            connection.run(quoted(*verb, *step.remove)).check(f"{job.name}: remove {', '.join(step.remove)}")
-        openwrt.install_packages(connection, there, tool=tool)
-        connection.run(f"rm -rf {quoted(DIRECTORY)}")
-        lacking = missing_packages(job.wanted.needs, observe(connection))
-        if lacking:
-            raise NodeError(f"{job.name}: after installing it still lacks {', '.join(group[0] for group in lacking)}")
+def install(job: Job, connection: SshConnection, step: PackageStep) -> Outcome:
+    """Install the step's packages. Owns `connection`, and keeps one to the node if all went well.
+
+    Raises NodeError when nothing but its memory was changed on the node, InputError for a file that is not there.
+    """
+    try:
+        files = [_local(job, file) for file in step.files]
+        tool = job.before.package_tool
+        if tool is None:
+            raise NodeError(f"{job.name}: it did not tell whether it has opkg or apk")
+        with job.step("packages"):
+            # first, because files in memory do not outlive a boot that is yet to come to its end
+            await_flash(job, connection)
+            script = deadman.packages(tool, _bring(job, connection, files), step.remove)
+    except BaseException:
+        connection.close()
+        raise
+    return carry(_attempt(job, connection, script, takes_radios_down=bool(step.remove)), connection)
+
+
+def _bring(job: Job, connection: SshConnection, files: Sequence[Path]) -> list[str]:
+    there = []
+    # of an earlier attempt with other files, which would only fill the memory
+    names = "|".join(f"{quoted(file.name)}|.{quoted(file.name)}.*.part" for file in files)
+    connection.run(
+        f"for f in {DIRECTORY}/* {DIRECTORY}/.*; do case ${{f##*/}} in {names}) ;; *) rm -f $f ;; esac; done"
+    )
+    for file in files:
+        path = f"{DIRECTORY}/{file.name}"
+        upload(connection, file, path, rate_bytes_per_s=job.work.rate_bytes_per_s, progress=job.progress)
+        there.append(path)
+    return there
+
+
+def _attempt(job: Job, connection: SshConnection, script: str, *, takes_radios_down: bool) -> Attempt:
+    """A change of packages alone: the node stays where it is, and has to hear whom it heard."""
+    here = replace(connection.endpoint, identity=job.name)
+    expected = Expectation(neighbours=job.expected.neighbours, bases=job.expected.bases, needs=job.wanted.needs)
+    reload = _WITH_THE_OTHER_SUPPLICANT if takes_radios_down else "exit 0\n"
+    return Attempt(
+        replace(job, expected=expected),
+        Change(new_change_id(), {}, reload, extra=script),
+        new_nonce(),
+        job.node.confirm_window_s,
+        here,
+        (here,),
+        extra_s=INSTALL_S,
+    )
 
 
 def _local(job: Job, file: str) -> Path:

@@ -86,7 +86,7 @@ REASONS = {
     "abort": "it was taken back",
     "boot": "its power was cut, or it rebooted, before it was confirmed",
     "guard": "its timer was killed; its second timer took over",
-    "failed": "the files could not be put in place",
+    "failed": "the files could not be put in place, or the packages not be installed",
     "moved-on": "somebody changed a file on it meanwhile",
     "operator": "it was dropped",
 }
@@ -94,5 +94,8 @@ REASONS = {
 
 def why_it_went_back(status: ChangeStatus, missing: Sequence[str]) -> str:
     """One sentence for an outcome."""
-    reason = REASONS.get(status.last_reason, status.last_reason or "for an unknown reason")
+    word, _, rest = status.last_reason.partition("+")
+    reason = REASONS.get(word, word or "for an unknown reason")
+    if rest:
+        reason += ", and packages that it installed could not be removed"
     return f"{reason}: {'; '.join(missing)}" if missing else reason

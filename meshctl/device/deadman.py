@@ -53,6 +53,8 @@ class Change:
     restored (what services write themselves when reloaded). `expected` gives the SHA-256 a touched path must have now,
     or None for absent; the node refuses the change when it finds something else.
 
+    `extra` is POSIX sh for what a change does besides files, called as `extra keep|do|undo DIRECTORY`; see `packages`.
+
     `reload` is POSIX sh. It runs after the change and, if need be, after the way back, so it must bring the services in
     line with whatever files are there and change none itself. Its exit status should tell whether it worked: where it
     fails after a restore, the node reboots.
@@ -65,6 +67,20 @@ class Change:
     removed: tuple[str, ...] = ()
     covered: tuple[str, ...] = ()
     expected: Mapping[str, str | None] = field(default_factory=dict)
+    extra: str = ""
+
+
+def packages(tool: str, files: Iterable[str], remove: Iterable[str] = ()) -> str:
+    """A change's `extra` that installs package files which are on the node and removes packages first; undone, the node
+    has the packages that it had. `tool` is opkg or apk. Raises ValueError for words with blanks or quotes."""
+    words = {"TOOL": [tool], "FILES": list(files), "REMOVE": list(remove)}
+    if tool not in ("opkg", "apk"):
+        raise ValueError(f"expected opkg or apk, found {tool!r}")
+    for word in (*words["FILES"], *words["REMOVE"]):
+        if shlex.quote(word) != word:
+            raise ValueError(f"{word!r}: expected a path or a name without blanks and quotes")
+    lines = [f"{name}='{' '.join(given)}'" for name, given in words.items()]
+    return "\n".join([*lines, script("packages.sh")])
 
 
 def bundle(change: Change) -> bytes:
@@ -91,6 +107,7 @@ def bundle(change: Change) -> bytes:
     members: list[TarMember] = [
         TarMember("manifest", "".join(f"{line}\n" for line in lines).encode(), 0o600),
         TarMember("reload", (change.reload.rstrip("\n") + "\n").encode(), 0o600),
+        *([TarMember("extra", change.extra.encode(), 0o600)] if change.extra else []),
         *(TarMember(f"new{path}", new.content, new.mode) for path, new in sorted(change.files.items())),
         *(TarMember(f"new{path}", link_to=target) for path, target in sorted(change.links.items())),
     ]

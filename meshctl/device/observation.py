@@ -217,6 +217,8 @@ class Observation:
     load: Load | None = None
     memory: Memory | None = None
     overlay: Space | None = None
+    root_in_ram: bool | None = None
+    """Whether / is still in memory because the flash is not ready, as at a first boot."""
     tmp: Space | None = None
     macs: Mapping[str, str] | None = None
     """Interface name -> MAC address, from /sys/class/net."""

@@ -124,6 +124,7 @@ def interpret(sections: Mapping[str, Section], *, asked_at_s: float, answered_at
         load=reader.read("load", system.parse_load),
         memory=reader.read("meminfo", system.parse_meminfo),
         overlay=_space(space, "/"),
+        root_in_ram=reader.read("root", system.parse_root, required=False),
         tmp=_space(space, "/tmp"),
         macs=None if macs is None else MappingProxyType(macs),
         radios=reader.read("ubus.wireless", ubus.parse_wireless),

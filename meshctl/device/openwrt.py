@@ -1,4 +1,4 @@
-"""OpenWrt's own verbs on a node: its uptime, files, packages, firmware, reload and reboot.
+"""OpenWrt's own verbs on a node: its uptime, files, flash, firmware, reload and reboot.
 
 Each takes a `Connection` and runs one short script with absolute paths of the tools that act. What ends the connection
 (reboot, sysupgrade) is started as a process of its own and answered before it strikes.
@@ -20,8 +20,6 @@ from meshctl.device.framing import quoted
 from meshctl.device.parse.jsontext import mapping, parse_json, truth
 from meshctl.device.parse.system import parse_boot_id, parse_meminfo, parse_uptime
 
-# Unpacking packages into jffs2 takes a minute on the slowest boards.
-PACKAGES_TIMEOUT_S = 300.0
 # `sysupgrade -T` unpacks and hashes the image.
 FIRMWARE_TEST_TIMEOUT_S = 120.0
 _PATTERN = re.compile(r"/[A-Za-z0-9._/+@*?-]+")
@@ -110,21 +108,9 @@ def backup(connection: Connection) -> bytes:
     return connection.run(script).check(f"{connection.endpoint.label}: back up").stdout_bytes
 
 
-def install_packages(connection: Connection, package_files: Iterable[str], *, tool: str) -> str:
-    """Install package files that were uploaded, all in one call so that they may need each other; returns the output.
-
-    `tool` is `opkg` or `apk` (`Observation.package_tool`). Needs no network. Raises CommandFailed.
-    """
-    match tool:
-        case "opkg":
-            verb = ["opkg", "install"]
-        case "apk":
-            # files given by path are verified by meshctl's own hash, not by a repository's key
-            verb = ["apk", "add", "--no-network", "--allow-untrusted"]
-        case _:
-            raise ValueError(f"expected opkg or apk, found {tool!r}")
-    done = connection.run(f"{quoted(*verb, *package_files)} 2>&1", timeout_s=PACKAGES_TIMEOUT_S)
-    return done.check(f"{connection.endpoint.label}: install packages").stdout
+def root_in_ram(connection: Connection) -> bool:
+    """Whether / is still in memory: at a first boot it is, until the flash is ready (fstools, overlay.c)."""
+    return connection.run("grep -q '^overlayfs:/tmp/root / ' /proc/mounts").exit_status == 0
 
 
 @dataclass(frozen=True, slots=True)

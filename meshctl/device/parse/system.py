@@ -79,6 +79,12 @@ def parse_df(text: str) -> dict[str, Space] | None:
     return found or None
 
 
+def parse_root(text: str) -> bool:
+    """The lines of /proc/mounts about /: whether it is the memory that stands in for flash at a first boot (fstools,
+    overlay.c)."""
+    return any(line.startswith("overlayfs:/tmp/root / ") for line in text.splitlines())
+
+
 def parse_macs(text: str) -> dict[str, str] | None:
     """`NAME ADDRESS INDEX` lines of observe.sh as name -> address; an interface without one is left out."""
     rows = [line.split() for line in text.splitlines()]

@@ -8,15 +8,16 @@
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=2
+VERSION=3
 SELF=/usr/sbin/meshctl-deadman
-CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to)
+CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
 RUN=/tmp/meshctl           # RAM: locks and timers; a reboot forgets them, as it should
 SPARE_KIB=64               # flash that must stay free: uci, dropbear and jffs2's garbage collector write too
 GUARD_GRACE_CS=3000        # the second timer fires 30 s after the first should have
 START_LIMIT_CS=1500        # a loaded radio starts a process within 15 s, or something is wrong with it
 RELOAD_TURN_CS=1000       # reload_config takes a few seconds; a restore waits so long for one under way
+EXTRA_LIMIT_CS=36000       # what else a change does (packages, into a slow jffs2) takes a minute or two
 RELOAD_LIMIT_CS=12000      # a reload of the restored state that takes over 120 s is stuck; then reboot
 
 # by its path: a busybox that prefers its own applets would leave no way to stand in for it
@@ -243,6 +244,7 @@ stage() { # OWNER ID BUNDLE
 	w=$CHANGE.$$
 	mkdir -p "$w/new" "$w/prev" || drop "$w" flash-full "cannot make $w"
 	tar -xzf "$3" -C "$w" 2>/dev/null || drop "$w" flash-full "the bundle did not unpack"
+	: >"$w/previous"
 	{ [ -f "$w/manifest" ] && [ -f "$w/reload" ]; } || drop "$w" bad-bundle "no manifest or reload in it"
 	check_new "$w" || drop "$w" flash-full "what was unpacked is not what was sent"
 	while read -r kind mode _ expected path; do
@@ -253,6 +255,7 @@ stage() { # OWNER ID BUNDLE
 		was_as_expected "$expected" "$path" || drop "$w" moved-on "$path is not what the plan saw"
 		keep_previous "$w" "$path" >>"$w/previous" || drop "$w" flash-full "could not keep $path"
 	done <"$w/manifest"
+	extra keep "$w" || drop "$w" flash-full "could not keep the packages as they are"
 	unchanged_since_kept "$w" || drop "$w" flash-full "what was kept is not what is there"
 	for conf in "$w"/new/etc/config/*; do
 		[ ! -f "$conf" ] || uci -c "$w/new/etc/config" show "${conf##*/}" >/dev/null 2>&1 ||
@@ -319,7 +322,11 @@ nap() { sleep 0.05 2>/dev/null || :; }
 
 doze() { sleep 0.2 2>/dev/null || sleep 1; }
 
+# extra VERB DIRECTORY: what else a change does and undoes besides files; says nothing, since sessions read our answers
+extra() { [ ! -f "$2/extra" ] || sh "$2/extra" "$1" "$2" >"$RUN/extra.log" 2>&1; }
+
 put_new() {
+	extra do "$CHANGE" || return 1
 	while read -r kind _ _ _ path; do
 		case $kind in
 		file | link) mkdir -p "${path%/*}" && mv -f "$CHANGE/new$path" "$path" ;;
@@ -331,6 +338,8 @@ put_new() {
 
 # moved back, not copied: atomic for each file, and a full flash cannot stop it; what frees flash comes first
 put_previous() {
+	# it cannot stop the way back of the files: what stays is told
+	extra undo "$CHANGE" || stays=+packages-stay
 	rm -rf "$CHANGE/new"
 	while read -r kind path; do
 		case $kind in
@@ -381,10 +390,10 @@ restore() {
 	mv "$CHANGE/armed.$ID" "$CHANGE/restoring.$ID" 2>/dev/null || [ -f "$CHANGE/restoring.$ID" ] || return 0
 	sync
 	cp "$CHANGE/reload" "$RUN/restored"
-	reload_it=no
+	reload_it=no stays=''
 	[ ! -e "$TIMER/applied" ] || reload_it=yes
 	put_previous || return 0 # the marker stays: abort, the second timer and the next boot try again
-	finish restored "$1"
+	finish restored "$1$stays"
 	[ $reload_it = yes ] || return 0
 	end_reload
 	reload "$RUN/restored"
@@ -431,6 +440,7 @@ guard() { # ID DUE_CS: detached; ends the change if `watch` was killed
 	read_marker
 	[ "$ID" = "$1" ] || exit 0
 	limit=$(($2 + WINDOW * 100 + GUARD_GRACE_CS))
+	[ ! -f "$CHANGE/extra" ] || limit=$((limit + EXTRA_LIMIT_CS))
 	while now && [ $NOW -lt $limit ] && is_armed; do sleep 1; done
 	while [ -f "$CHANGE/restoring.$ID" ] && alive "$TIMER/watch.pid"; do sleep 1; done
 	{ is_armed || [ -f "$CHANGE/restoring.$ID" ]; } || exit 0
@@ -484,7 +494,11 @@ abort() { # OWNER ID
 boot() { # before anything reads the configuration, so nothing is reloaded
 	rm -rf "$RUN"/*
 	tidy
-	case $MARKER in armed | restoring) restore boot ;; esac
+	put_back=no
+	[ ! -f "$CHANGE/packages.tar" ] || put_back=yes
+	case $MARKER in armed | restoring) restore boot ;; *) return 0 ;; esac
+	# services that came back with their packages were not there when the list of what to start was made
+	[ $put_back = no ] || [ -e "$CHANGE" ] || /sbin/reboot
 }
 
 status() {

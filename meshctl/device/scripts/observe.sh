@@ -73,6 +73,7 @@ section board.json cat /etc/board.json
 section load load
 section meminfo cat /proc/meminfo
 section df df -k / /tmp
+section root grep ' / ' /proc/mounts
 section macs macs
 section ubus.wireless ubus call network.wireless status
 section ubus.interfaces ubus call network.interface dump

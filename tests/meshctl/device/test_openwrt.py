@@ -189,20 +189,8 @@ def test_what_ends_the_connection_is_answered_first(connection: Connection, node
     eventually(lambda: node.text("/harness/reboots") == "reboot\n")
 
 
-@pytest.mark.parametrize(
-    ("tool", "call"), [("opkg", "opkg install"), ("apk", "apk add --no-network --allow-untrusted")]
-)
-def test_packages_are_installed_from_files_in_one_call(
-    connection: SshConnection, node: Sandbox, tool: str, call: str
-) -> None:
-    node.put(f"/usr/bin/{tool}", NOTING + "[ ! -f /tmp/fail ] || { echo ' * no space left' >&2; exit 255; }", 0o755)
-    openwrt.install_packages(connection, ["/tmp/a.pkg", "/tmp/b c.pkg"], tool=tool)
-    assert calls(node) == [f"{call} /tmp/a.pkg /tmp/b c.pkg"]
-    node.put("/tmp/fail", "")
-    with pytest.raises(CommandFailed, match="no space left"):
-        openwrt.install_packages(connection, ["/tmp/a.pkg"], tool=tool)
-    with pytest.raises(ValueError, match="expected opkg or apk"):
-        openwrt.install_packages(connection, ["/tmp/a.pkg"], tool="dpkg")
+def test_a_root_that_is_in_flash_is_not_taken_for_one_in_memory(connection: SshConnection) -> None:
+    assert not openwrt.root_in_ram(connection)
 
 
 def test_reload_config_is_called_by_its_path(connection: SshConnection, node: Sandbox) -> None:

@@ -1,0 +1,83 @@
+# What a change does to packages, for meshctl-deadman: `sh extra keep|do|undo DIRECTORY`. Sent with TOOL (opkg or apk),
+# FILES (package files) and REMOVE (what has to go first, because it conflicts) set before it. DIRECTORY is the change's
+# own in flash: `keep` writes there what `undo` needs, so a power cut in the middle of `do` is undone, too.
+verb=$1
+dir=$2
+
+installed() {
+	case $TOOL in
+	apk) sed -n 's/^P://p' /lib/apk/db/installed ;;
+	*) awk '/^Package:/ { name = $2 } /^Status:/ && $NF != "not-installed" { print name }' /usr/lib/opkg/status ;;
+	esac
+}
+
+added() { installed | grep -vxF -f "$dir/packages.before"; }
+
+files_of() { # PACKAGE: without the leading slash
+	case $TOOL in
+	apk) apk info -L "$1" | sed '/ contains:$/d; s|^/||' ;;
+	*) opkg files "$1" | sed -n 's|^/||p' ;;
+	esac 2>/dev/null
+}
+
+# all that makes a removed package installed again: its files, the links that start it, the tool's own database
+to_keep() {
+	for package in $REMOVE; do
+		files_of "$package" | while read -r file; do
+			echo "$file"
+			case $file in etc/init.d/*) for link in /etc/rc.d/[SK][0-9][0-9]"${file##*/}"; do echo "${link#/}"; done ;; esac
+		done
+		for file in "/usr/lib/opkg/info/$package".*; do echo "${file#/}"; done
+	done
+	printf '%s\n' usr/lib/opkg/status lib/apk/db/installed lib/apk/db/scripts.tar lib/apk/db/scripts.tar.gz etc/apk/world
+}
+
+keep() {
+	installed >"$dir/packages.before" && [ -s "$dir/packages.before" ] || return 1
+	[ -n "$REMOVE" ] || return 0
+	cd / || return 1
+	set --
+	for file in $(to_keep); do
+		if [ -f "$file" ] || [ -L "$file" ]; then set -- "$@" "$file"; fi
+	done
+	tar -cf "$dir/packages.tar" "$@" && tar -tf "$dir/packages.tar" >/dev/null
+}
+
+do_it() {
+	# shellcheck disable=SC2086 # words are paths and names without blanks
+	case $TOOL in
+	apk)
+		[ -z "$REMOVE" ] || apk del $REMOVE || return 1
+		# files given by path were verified by meshctl's own hash, not by a repository's key
+		apk add --no-network --allow-untrusted $FILES || return 1
+		;;
+	*)
+		[ -z "$REMOVE" ] || opkg remove $REMOVE || return 1
+		opkg install $FILES || return 1
+		;;
+	esac
+	# they lie in memory
+	rm -f $FILES
+}
+
+undo() {
+	[ -f "$dir/packages.before" ] || return 0
+	# at boot this runs before the script that makes it; opkg's lock lies there
+	mkdir -p /var/lock
+	new=$(added | tr '\n' ' ')
+	# shellcheck disable=SC2086
+	case $TOOL$new in
+	apk?*) apk del --no-network $new ;;
+	opkg?*) opkg remove --force-depends $new ;;
+	esac
+	[ -z "$(added)" ] || return 1
+	for package in $REMOVE; do
+		installed | grep -qxF "$package" || { tar -xf "$dir/packages.tar" -C / && return; }
+	done
+}
+
+case $verb in
+keep | undo) "$verb" ;;
+do) do_it ;;
+*) exit 1 ;;
+esac
