@@ -5,11 +5,12 @@ too). `flush` makes everything put so far survive a power cut (fsync of files an
 loop; the daemon answers a publisher of such a topic after it. `load` reads what is kept, and sets aside what is
 damaged. The directory is bounded: past `limit_bytes` a message is refused and counted rather than filling the disk.
 
-A file is a JSON line with the message's fields and the payload's CRC-32, then the payload.
+A file is a line with the message's fields as JSON and the CRC-32 of these and the payload, then the payload.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
@@ -45,18 +46,18 @@ class DirectoryStore:
                 "type": message.type_name,
                 "remaining_s": message.remaining_s,
                 "bytes": len(message.payload),
-                "crc32": zlib.crc32(message.payload),
             }
         ).encode()
+        head += f" {_checksum(head, message.payload):08x}".encode()
         size = len(head) + 1 + len(message.payload)
         if self.bytes + size > self._limit_bytes:
             self.refused += 1
             log.warning("outbox-full directory=%s bytes=%d limit=%d", self._directory, self.bytes, self._limit_bytes)
             return
         path = self._path(message.key)
+        temporary = path.with_suffix(".new")
         try:
             self._directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-            temporary = path.with_suffix(".new")
             with temporary.open("wb") as file:
                 file.write(head + b"\n")
                 file.write(message.payload)
@@ -64,6 +65,9 @@ class DirectoryStore:
         except OSError as error:
             self.refused += 1
             log.error("outbox-write-failed path=%s error=%s", path, error)
+            # A full disk: what is half written must not keep it full.
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
             return
         self.bytes += size - self._sizes.get(message.key, 0)
         self._sizes[message.key] = size
@@ -85,17 +89,19 @@ class DirectoryStore:
         messages: list[StoredMessage] = []
         for path in sorted(self._directory.glob(f"*{SUFFIX}")):
             message = _read(path)
-            if message is None:
+            if message is None or self._path(message.key) != path:
                 # Kept for a person to look at, out of the way of the next start.
-                path.rename(path.with_suffix(".damaged"))
                 log.error("outbox-damaged path=%s", path)
+                with contextlib.suppress(OSError):
+                    path.rename(path.with_suffix(".damaged"))
                 continue
             size = path.stat().st_size
             self._sizes[message.key] = size
             self.bytes += size
             messages.append(message)
         for leftover in self._directory.glob("*.new"):
-            leftover.unlink()
+            with contextlib.suppress(OSError):
+                leftover.unlink()
         return messages
 
     @property
@@ -117,8 +123,11 @@ class DirectoryStore:
                 continue
             except OSError as error:
                 log.error("outbox-flush-failed path=%s error=%s", path, error)
-        if paths:
-            _sync(self._directory, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            if paths:
+                _sync(self._directory, os.O_RDONLY | os.O_DIRECTORY)
+        except OSError as error:
+            log.error("outbox-flush-failed path=%s error=%s", self._directory, error)
 
     def _path(self, key: int) -> Path:
         return self._directory / f"{key:020d}{SUFFIX}"
@@ -132,12 +141,19 @@ def _sync(path: Path, flags: int) -> None:
         os.close(descriptor)
 
 
+def _checksum(head: bytes, payload: bytes) -> int:
+    return zlib.crc32(payload, zlib.crc32(head))
+
+
 def _read(path: Path) -> StoredMessage | None:
     """The message in a file; None where it is damaged."""
     try:
-        head, _, payload = path.read_bytes().partition(b"\n")
+        line, _, payload = path.read_bytes().partition(b"\n")
+        head, _, checksum = line.rpartition(b" ")
+        if int(checksum, 16) != _checksum(head, payload):
+            return None
         fields = json.loads(head)
-        if len(payload) != fields["bytes"] or zlib.crc32(payload) != fields["crc32"]:
+        if len(payload) != fields["bytes"]:
             return None
         remaining = fields["remaining_s"]
         return StoredMessage(

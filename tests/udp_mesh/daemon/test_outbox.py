@@ -88,3 +88,72 @@ os.kill(os.getpid(), signal.SIGKILL)
     ended = subprocess.run([sys.executable, "-c", script], check=False)
     assert ended.returncode == -signal.SIGKILL
     assert [kept.key for kept in DirectoryStore(tmp_path, 1 << 20).load()] == list(range(20))
+
+
+@given(st.data())
+def test_whatever_a_torn_write_or_a_bad_disk_leaves_of_a_file_it_is_set_aside_and_the_others_load(
+    data: st.DataObject,
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        store = DirectoryStore(Path(folder), 1 << 20)
+        for key in (1, 2, 3):
+            store.put(message(key, b"payload of some length", 12.5))
+        victim = Path(folder) / f"{2:020d}.message"
+        whole = victim.read_bytes()
+        how = data.draw(st.sampled_from(["cut", "changed", "replaced", "zeros behind"]))
+        if how == "cut":
+            victim.write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1))])
+        elif how == "changed":
+            place, change = data.draw(st.integers(0, len(whole) - 1)), data.draw(st.integers(1, 255))
+            victim.write_bytes(whole[:place] + bytes([whole[place] ^ change]) + whole[place + 1 :])
+        elif how == "replaced":
+            victim.write_bytes(data.draw(st.binary(max_size=200)))
+        else:
+            victim.write_bytes(whole + bytes(data.draw(st.integers(1, 100))))
+        again = DirectoryStore(Path(folder), 1 << 20)
+        loaded = again.load()
+        # letters of the checksum may change their case
+        assert [kept.key for kept in loaded if kept != message(2, b"payload of some length", 12.5)] == [1, 3]
+        assert len(loaded) == 3 or victim.with_suffix(".damaged").exists()
+
+
+def test_a_file_under_anothers_name_is_set_aside(tmp_path: Path) -> None:
+    store = DirectoryStore(tmp_path, 1 << 20)
+    store.put(message(1))
+    copy = tmp_path / f"{7:020d}.message"
+    copy.write_bytes((tmp_path / f"{1:020d}.message").read_bytes())
+    assert [kept.key for kept in DirectoryStore(tmp_path, 1 << 20).load()] == [1]
+    assert copy.with_suffix(".damaged").exists()
+
+
+def test_a_disk_that_takes_no_more_refuses_counts_and_is_left_clean(tmp_path: Path) -> None:
+    # a limit on files' sizes fails a write in its middle, as a full disk does
+    script = f"""
+import resource
+from pathlib import Path
+from udp_mesh.core.seams import StoredMessage
+from udp_mesh.daemon.outbox import DirectoryStore
+store = DirectoryStore(Path({str(tmp_path)!r}), 1 << 30)
+resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+for key, size in enumerate((5_000, 500_000, 6_000)):
+    store.put(StoredMessage(key, "base", "map", "", bytes(size), None))
+assert store.refused == 1, store.refused
+store.flush(store.take_unflushed())
+"""
+    ended = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+    assert "outbox-write-failed" in ended.stderr
+    assert "Traceback" not in ended.stderr
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".message", ".message"]
+    assert [kept.key for kept in DirectoryStore(tmp_path, 1 << 30).load()] == [0, 2]
+
+
+def test_a_directory_that_vanished_is_told_and_made_again(tmp_path: Path) -> None:
+    store = DirectoryStore(tmp_path / "outbox", 1 << 20)
+    store.put(message(1))
+    paths = store.take_unflushed()
+    paths[0].unlink()
+    (tmp_path / "outbox").rmdir()
+    store.flush(paths)
+    store.put(message(2))
+    assert [kept.key for kept in DirectoryStore(tmp_path / "outbox", 1 << 20).load()] == [2]
