@@ -32,8 +32,10 @@ bench: setup
 	$(VENV)-bench/bin/pip install --quiet -e '.[dev,bench]'
 	$(VENV)-bench/bin/python -m benchmarks
 
+# A fleet on the kernel's own radios to practise on; `meshctl lab up` without --real starts in a second and needs no QEMU.
 lab: setup
-	$(BIN)/meshctl lab up
+	scripts/setup-lab
+	$(BIN)/meshctl lab up --real
 
 clean:
 	rm -rf $(VENV) $(VENV)-bench .mypy_cache .ruff_cache .pytest_cache .import_linter_cache dist build

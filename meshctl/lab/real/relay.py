@@ -30,7 +30,7 @@ from meshctl.lab.errors import LabError
 from meshctl.lab.forward import reset
 from meshctl.lab.real import channel, image
 from meshctl.lab.real.carry import carry_process
-from meshctl.lab.real.machine import Machine, accelerator_here, find_qemu
+from meshctl.lab.real.machine import TCG, Machine, accelerator_here, find_qemu
 from meshctl.lab.spec import load
 
 log = logging.getLogger("meshctl.lab.real.relay")
@@ -40,6 +40,7 @@ _POLL_S = 0.5
 # from QEMU's first instruction until the supervisor is there: under emulation, on a machine with much else to do
 _START_S = 180.0
 _TRIES = 2
+_ANSWER_S = 60.0
 
 
 class Relay:
@@ -197,14 +198,31 @@ def start(directory: Path, spec_text: str, token: str) -> Machine:
     for attempt in range(1, _TRIES + 1):
         try:
             machine.start(how, _START_S)
+            _wait_answer(machine, token)
             break
         except LabError as error:
+            machine.stop()
             log.error("start-failed attempt=%d reason=%s\n%s", attempt, error, error.hint)
             kept = machine.console.rename(directory / f"console.failed-{attempt}") if machine.console.exists() else None
             if attempt == _TRIES:
                 raise LabError(f"{error} ({_TRIES} times); consoles are kept: {kept}", hint=error.hint) from error
+            # what a short boot did not show, a long one may
+            how = TCG
     initrd.unlink()
     return machine
+
+
+def _wait_answer(machine: Machine, token: str) -> None:
+    """A machine that says it is ready must be reached, too. Raises LabError when it is not."""
+    try:
+        with socket.create_connection(("127.0.0.1", machine.port), timeout=_ANSWER_S) as connection:
+            connection.sendall(channel.line({"token": token, "kind": "request", "request": {"op": "status"}}))
+            if connection.recv(1):
+                return
+            reason = "it closed the connection"
+    except OSError as error:
+        reason = str(error)
+    raise LabError(f"the machine is ready and does not answer: {reason}", hint=machine.last_words())
 
 
 def main(arguments: Sequence[str]) -> int:

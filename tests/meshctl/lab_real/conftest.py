@@ -112,6 +112,17 @@ class Lab:
         known = json.loads(self.on(node, "batctl meshif bat0 neighbors_json"))
         return {names[one["neigh_address"]] for one in known if one["last_seen_msecs"] < 5000}
 
+    def hops(self) -> dict[str, int]:
+        """How many hops each node is from the base, along the next hops that the kernels would take now."""
+        towards = {name: self.originators(name).get("base", "") for name in NODES[1:]}
+        found = {"base": 0}
+        for name in NODES[1:]:
+            at, count = name, 0
+            while at != "base" and count <= len(NODES):
+                at, count = towards.get(at, "base"), count + 1
+            found[name] = count
+        return found
+
     def names(self) -> dict[str, str]:
         """The MAC address of each node's radio -> its name."""
         return {radio.mac: node.name for node in self.fleet.spec.nodes for radio in node.radios}

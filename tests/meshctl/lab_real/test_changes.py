@@ -28,6 +28,8 @@ def test_a_whole_mesh_changes_channel_and_bssid_over_itself(lab: Lab) -> None:
 def test_the_mesh_goes_back_when_some_of_it_never_arrives(lab: Lab) -> None:
     before = cells(lab)
     lab.edit("channel: 11\n", "channel: 1\n")
+    # nobody waits long for what will not come
+    lab.edit("confirm_window_s: 600", "confirm_window_s: 61")
     # at the moment of the switch b02 hears nobody any more, and the Husky nobody but itself
     lab.fleet.break_("b02", "sever@reload_config")
     done = lab.meshctl("provision", "--yes", "--json", expect=1)
@@ -37,8 +39,20 @@ def test_the_mesh_goes_back_when_some_of_it_never_arrives(lab: Lab) -> None:
     lab.node("b02").plug(False)
     until(lambda: cells(lab) == before, "every node to be in the old cell again")
     lab.edit("channel: 1\n", "channel: 11\n")
+    lab.edit("confirm_window_s: 61", "confirm_window_s: 600")
     lab.settle()
-    lab.meshctl("provision", "--check")
+    until(lambda: lab.meshctl("provision", "--check", expect=None).status == 0, "every node to be as it was")
+
+
+def test_the_running_mesh_is_changed_from_its_far_end(lab: Lab) -> None:
+    lab.edit("reconnect_s: 2.5", "reconnect_s: 5")
+    far_first = sorted(("b01", "b02", "husky-front"), key=lambda name: -lab.hops()[name])
+    assert far_first == ["husky-front", "b02", "b01"]
+    done = lab.meshctl("provision", "--yes", "--json", *far_first[::-1])
+    assert [event["node"] for event in done.events if event["event"] == "started"] == far_first
+    intervals = {lab.on(name, "batctl meshif bat0 orig_interval").strip() for name in far_first}
+    assert intervals == {lab.on("b01", "uci get network.bat0.orig_interval").strip()}
+    lab.settle()
 
 
 def test_a_power_cut_inside_the_window_leaves_the_old_configuration(lab: Lab) -> None:
@@ -50,4 +64,4 @@ def test_a_power_cut_inside_the_window_leaves_the_old_configuration(lab: Lab) ->
     lab.meshctl("provision", "--yes", "husky-rear", expect=1)
     until(lambda: lab.node("husky-rear").is_up() and lab.node("husky-rear").boot_id != boot, "the node to boot")
     until(lambda: lab.on("husky-rear", power) == before, "its old configuration")
-    lab.settle()
+    until(lambda: lab.neighbours("husky-rear") == {"b02", "husky-front"}, "its radio to be in the mesh again")
