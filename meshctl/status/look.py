@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TypeVar
 
 from meshctl.apply.access import Access
@@ -79,9 +80,9 @@ class Watcher:
         crew = tuple(robots) if self.reach is not None else ()
         jobs: dict[tuple[str, str], Callable[[], object]] = {}
         for node in asked.values():
-            jobs["node", node.name] = lambda node=node: self._observe(node)  # type: ignore[misc]
+            jobs["node", node.name] = partial(self._observe, node)
         for robot in crew:
-            jobs["robot", robot] = lambda robot=robot: self._ask(robot)  # type: ignore[misc]
+            jobs["robot", robot] = partial(self._ask, robot)
         answers = side_by_side(jobs, SIDE_BY_SIDE, progress)
         observations = {key[1]: seen for key, seen in answers.items() if isinstance(seen, Observation)}
         facts = {key[1]: told for key, told in answers.items() if isinstance(told, RobotFacts)}
@@ -121,9 +122,9 @@ class Watcher:
     def ping(self, robots: Iterable[str]) -> Pings:
         """Have each of these robots' daemons send an urgent message to each other's and back."""
         names = tuple(robots)
-        jobs: dict[str, Callable[[], object]] = {}
-        for name in names:
-            jobs[name] = lambda name=name: self._ping(name, [peer for peer in names if peer != name])  # type: ignore[misc]
+        jobs: dict[str, Callable[[], object]] = {
+            name: partial(self._ping, name, [peer for peer in names if peer != name]) for name in names
+        }
         answers = side_by_side(jobs, SIDE_BY_SIDE)
         return pings_of({name: told for name, told in answers.items() if isinstance(told, dict)})
 
@@ -132,12 +133,15 @@ class Watcher:
             return ping(host, peers)
 
     def close(self) -> None:
-        """Close the connections to robots; those to radios belong to `access`."""
+        """Close all connections, those to radios kept by `access` too, side by side: each takes a tenth of a second."""
         with self._lock:
-            kept = list(self._computers.values())
+            jobs: dict[str, Callable[[], object]] = {
+                f"{ROBOT_PREFIX}{name}": stack.close for name, (stack, _) in self._computers.items()
+            }
             self._computers.clear()
-        for stack, _ in kept:
-            stack.close()
+        for node in self.fleet.nodes:
+            jobs[node] = partial(self.access.drop, node)
+        side_by_side(jobs, len(jobs))
 
     def __enter__(self) -> Watcher:
         return self

@@ -1,0 +1,314 @@
+"""Many devices that cost little, for timing who asks them: one real OpenSSH server, and answers that were made before.
+
+In a network namespace of its own, the server holds the addresses of all radios and robots. A radio's answer to the
+observation is that of a recorded node (`tests/meshctl/device/recorded`), with its own MACs, four neighbours, a path to
+every other radio in its originator table, and the files that the inventory wants of it. A robot runs meshctl's own
+script in a real shell, and finds stand-ins for `udp-mesh` and `systemctl` that print what a daemon of a team of that
+size prints.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from meshctl.device.parse.sections import split_sections
+from meshctl.device.trust import TrustStore, parse_key
+from meshctl.inventory import load_fleet
+from meshctl.model import Secret, SecretRef
+from meshctl.render import DeviceFacts, render_node
+
+RECORDED = Path("tests/meshctl/device/recorded/23.05/mesh/observe.out")
+FIRST_HALF, SECOND_HALF, COMPUTERS = "10.42.1", "10.42.2", "10.42.3"
+TOPICS = {
+    "emergency_stop": "{priority: 0, class: emergency_stop, rate_hz: 0.1}",
+    "commands": "{priority: 1, class: command}",
+    "artifacts": "{priority: 2, class: artifact}",
+    "telemetry": "{priority: 3, class: telemetry, reliable: false, rate_hz: 2}",
+    "map_diffs": "{priority: 6, class: map}",
+    "fpv": "{priority: 9, class: video, reliable: false}",
+}
+_INVENTORY = """\
+meshctl: 1
+fleet: scale
+country: US
+operators: {{ssh_keys: ["{key}"]}}
+hardware:
+  bullet:
+    board: ubnt,bullet-m-xw
+    profile: ubnt_bullet-m-xw
+    target: ath79/generic
+    release: "23.05"
+    lan_ports: [eth0]
+    radios: {{radio0: {{path: platform/ahb/18100000.wmac, band: 2g, rated_power_dbm: 30, max_drive_dbm: 27}}}}
+meshes:
+  main: {{ssid: fleet, bssid: "02:ca:fe:00:00:01", band: 2g, channel: 6, network: 10.42.0.0/16}}
+defaults: {{hardware: bullet, state: deployed, ssh: {{key_files: [key]}}}}
+nodes:
+{nodes}robots:
+{robots}topics:
+{topics}"""
+_RADIO = """#!/bin/sh
+# Stand-in for a radio: the first line of what is sent names the nonce; the answer was made before.
+IFS= read -r first
+set -- $SSH_CONNECTION
+exec sed "s/^NONCE /${{first#N=}} /" "{root}/answers/$3"
+"""
+_DAEMON = """#!/bin/sh
+# Stand-in for udp-mesh: prints what a daemon prints, by the address that was called.
+set -- "$1" $SSH_CONNECTION
+exec cat "/opt/stand-in/$4.$1.json"
+"""
+_SYSTEMCTL = """#!/bin/sh
+# Stand-in for systemctl show: a unit that is up.
+while [ $# -gt 1 ]; do shift; done
+printf 'Id=%s\\nLoadState=loaded\\nActiveState=active\\nSubState=running\\nUnitFileState=enabled\\n' "$1"
+printf 'NRestarts=0\\nResult=success\\n'
+"""
+_ENTER = r"""
+mount --make-rprivate /
+mount --bind "$1/opt" /opt
+mount -t tmpfs tmpfs /run
+# what this machine's own shells do when they start is no part of it
+mount -t tmpfs tmpfs /root
+mkdir -p /run/sshd
+exec /usr/sbin/sshd -D -e -f "$1/sshd_config"
+"""
+
+
+@dataclass(slots=True)
+class Devices:
+    """`start` makes everything in `directory` and listens; only inside a network namespace of one's own."""
+
+    directory: Path
+    radios: int
+    robots: int
+    _server: subprocess.Popen[bytes] | None = None
+
+    @property
+    def inventory(self) -> Path:
+        return self.directory / "fleet.yaml"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return ("base", *(f"n{number:03}" for number in range(1, self.radios)))
+
+    @property
+    def crew(self) -> tuple[str, ...]:
+        return tuple(f"robot{number:02}" for number in range(1, self.robots + 1))
+
+    def address(self, number: int) -> str:
+        """Of the radio with this place in `names`."""
+        half = (self.radios + 1) // 2
+        return f"{FIRST_HALF}.{number + 1}" if number < half else f"{SECOND_HALF}.{number - half + 1}"
+
+    def start(self) -> None:
+        for prefix in (FIRST_HALF, SECOND_HALF, COMPUTERS):
+            _ip("route", "add", "local", f"{prefix}.0/24", "dev", "lo")
+        # what is sent there is never answered, as by a radio without power
+        _ip("link", "add", "nowhere", "type", "veth", "peer", "name", "void")
+        _ip("link", "set", "nowhere", "up")
+        _ip("link", "set", "void", "up")
+        for part in ("answers", "opt/stand-in", "opt/udp-mesh/releases/one/bin", "bin"):
+            (self.directory / part).mkdir(parents=True)
+        for name in ("key", "host_key"):
+            subprocess.run(
+                ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", self.directory / name], check=True, timeout=60
+            )
+        self._write_inventory()
+        self._write_radios()
+        self._write_computers()
+        trust = TrustStore(self.directory / "known_hosts")
+        host_key = parse_key((self.directory / "host_key.pub").read_text())
+        for name in (*self.names, *(f"robot.{robot}" for robot in self.crew)):
+            trust.replace(name, host_key)
+        self._listen()
+
+    def stop(self) -> None:
+        if self._server is not None:
+            # unshare takes the server and its namespace along
+            self._server.kill()
+            self._server.wait(60)
+
+    def switch_off_half(self) -> int:
+        """The second half of the radios answers nothing any more; how many those are."""
+        _ip("route", "del", "local", f"{SECOND_HALF}.0/24", "dev", "lo")
+        _ip("route", "add", f"{SECOND_HALF}.0/24", "dev", "nowhere")
+        return self.radios // 2
+
+    def _write_inventory(self) -> None:
+        nodes = "".join(
+            f"  {name}: {{role: {'base' if number == 0 else 'beacon'}, address: {self.address(number)}}}\n"
+            for number, name in enumerate(self.names)
+        )
+        robots = "".join(
+            f"  {robot}: {{computer: {{address: {COMPUTERS}.{number}/16, ssh: {{user: root, key_files: [key]}}}}}}\n"
+            for number, robot in enumerate(self.crew, 1)
+        )
+        topics = "".join(f"  {name}: {text}\n" for name, text in TOPICS.items())
+        key = (self.directory / "key.pub").read_text().strip()
+        self.inventory.write_text(_INVENTORY.format(key=key, nodes=nodes, robots=robots, topics=topics))
+
+    def _write_radios(self) -> None:
+        fleet = load_fleet(self.inventory)
+        recorded = {
+            name: section.body.decode() for name, section in split_sections(RECORDED.read_bytes(), "NONCE").items()
+        }
+        kept = {name: body for name, body in recorded.items() if not name.startswith("config ")}
+        for number, name in enumerate(self.names):
+            files = render_node(fleet, name, _no_secret, device_facts=DeviceFacts("")).files
+            sections = {**kept, **_place(number, self.radios), **dict(_files(files))}
+            answer = "".join(f"NONCE begin {key}\n{body}\nNONCE end 0\n" for key, body in sections.items())
+            (self.directory / "answers" / self.address(number)).write_text(answer)
+
+    def _write_computers(self) -> None:
+        root = self.directory
+        release = root / "opt/udp-mesh/releases/one"
+        (root / "opt/udp-mesh/current").symlink_to("releases/one")
+        (release / "wheels").write_text(f"{'0' * 64}  stand-in.whl\n")
+        (release / "manifest").write_text(f"{'0' * 64}  etc/udp-mesh.toml\n")
+        programs = {
+            release / "bin/udp-mesh": _DAEMON,
+            root / "bin/systemctl": _SYSTEMCTL,
+            root / "bin/radio": _RADIO.format(root=root),
+        }
+        for path, text in programs.items():
+            path.write_text(text)
+            path.chmod(0o755)
+        for number, robot in enumerate(self.crew, 1):
+            for word, told in (("status", self._status(robot)), ("topics", {"topics": self._topics()})):
+                (root / "opt/stand-in" / f"{COMPUTERS}.{number}.{word}.json").write_text(json.dumps(told))
+
+    def _status(self, robot: str) -> dict[str, Any]:
+        queues = [{"priority": priority, "messages": 0, "bytes": 0, "oldest_s": 0.0} for priority in (0, 3, 6)]
+        peers = [
+            {
+                "name": other, "online": True, "legacy": False, "address": f"{COMPUTERS}.{number}:8700",
+                "link": "mesh0", "online_for_s": 3000.0, "heard_ago_s": 0.4, "round_trip_s": 0.012,
+                "least_round_trip_s": 0.004, "loss": 0.02, "sent_bits_per_s": 120000.0,
+                "delivered_bits_per_s": 110000.0, "received_bits_per_s": 118000.0, "capacity_bits_per_s": 6e6,
+                "window_packets": 8.0, "in_flight_packets": 1, "retransmitted_packets": 12, "queues": queues,
+                "outbox_messages": 0, "outbox_bytes": 0,
+            }
+            for number, other in enumerate(self.crew, 1)
+            if other != robot
+        ]  # fmt: skip
+        return {
+            "version": "0.1.0", "wire_version": 1, "uptime_s": 3600.0, "unkeyed": True, "keys": [],
+            "conditions": {"name": robot, "peers": peers, "counters": {}, "queued_bytes": 0},
+        }  # fmt: skip
+
+    @staticmethod
+    def _topics() -> list[dict[str, Any]]:
+        return [
+            {
+                "name": name, "priority": int(text.split("priority: ")[1].split(",")[0]), "configured": True,
+                "sent_messages": 100, "received_messages": 1900, "sent_ago_s": 0.3, "received_ago_s": 0.2,
+            }
+            for name, text in TOPICS.items()
+        ]  # fmt: skip
+
+    def _listen(self) -> None:
+        root = self.directory
+        settings = (
+            f"HostKey {root}/host_key",
+            f"AuthorizedKeysFile {root}/key.pub",
+            "ListenAddress 0.0.0.0",
+            "StrictModes no",
+            "UsePAM no",
+            "UseDNS no",
+            "PidFile none",
+            "PermitRootLogin yes",
+            "MaxStartups 1000",
+            f"SetEnv PATH={root}/bin:/usr/sbin:/usr/bin:/sbin:/bin",
+            f"Match LocalAddress {FIRST_HALF}.0/24,{SECOND_HALF}.0/24",
+            f"ForceCommand {root}/bin/radio",
+        )
+        (root / "sshd_config").write_text("".join(f"{line}\n" for line in settings))
+        command = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc", "sh", "-ec", _ENTER, "sshd"]
+        log = root / "log"
+        with log.open("wb") as output:
+            self._server = subprocess.Popen([*command, str(root)], stdout=output, stderr=output)
+        deadline = time.monotonic() + 60
+        while b"listening on" not in log.read_bytes():
+            if self._server.poll() is not None or time.monotonic() > deadline:
+                raise RuntimeError(f"the SSH server did not start: {log.read_text()}")
+            time.sleep(0.05)
+
+
+def programs_missing() -> tuple[str, ...]:
+    """What has to be installed first."""
+    return tuple(name for name in ("sshd", "ssh-keygen", "unshare", "ip") if not shutil.which(name, path=_PATH))
+
+
+_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
+
+
+def _ip(*words: str) -> None:
+    subprocess.run(["ip", *words], check=True, timeout=60, env={"PATH": _PATH})
+
+
+def _mac(number: int) -> str:
+    return f"02:15:6d:00:{number >> 8:02x}:{number & 255:02x}"
+
+
+def _place(number: int, count: int) -> dict[str, str]:
+    """The sections that tell a radio's place in a ring where each hears the two on either side."""
+    mac = _mac(number)
+    around = sorted({(number + step) % count for step in (-2, -1, 1, 2)} - {number})
+    seen = {"hard_ifindex": 7, "hard_ifname": "mesh0", "last_seen_msecs": 120}
+    originators: list[Mapping[str, object]] = []
+    for other in range(count):
+        if other != number:
+            ways = sorted(around, key=lambda way: min((way - other) % count, (other - way) % count))
+            originators += [
+                {**seen, "orig_address": _mac(other), "neigh_address": _mac(way), "tq": max(10, 250 - 40 * place),
+                 **({"best": True} if place == 0 else {})}
+                for place, way in enumerate(ways)
+            ]  # fmt: skip
+    stations = "".join(
+        f"Station {_mac(other)} (on mesh0)\n\tinactive time:\t40 ms\n\trx bytes:\t12400312\n\ttx bytes:\t3300121\n"
+        f"\ttx packets:\t22113\n\ttx retries:\t911\n\ttx failed:\t3\n\tsignal:  \t-58 [-60, -62] dBm\n"
+        f"\ttx bitrate:\t144.4 MBit/s MCS 15 short GI\n\trx bitrate:\t130.0 MBit/s MCS 15\n"
+        for other in around
+    )
+    return {
+        "clock": f"{time.time():.0f}\n",
+        "macs": f"bat0 66:0f:2c:9e:01:0e 9\nbr-lan 00:15:6d:00:00:0e 8\neth0 00:15:6d:00:00:0e 2\nmesh0 {mac} 7\n",
+        "iw.dev": (
+            f"phy#0\n\tInterface mesh0\n\t\tifindex 7\n\t\twdev 0x2\n\t\taddr {mac}\n\t\tssid fleet\n\t\ttype IBSS\n"
+            "\t\tchannel 6 (2437 MHz), width: 20 MHz, center1: 2437 MHz\n\t\ttxpower 27.00 dBm\n"
+        ),
+        "iw.stations mesh0": stations,
+        "batctl.neighbors_json bat0": json.dumps([{**seen, "neigh_address": _mac(other)} for other in around]) + "\n",
+        "batctl.originators_json bat0": json.dumps(originators) + "\n",
+        "uci.changes": "",
+        "packages": "batctl-default 2023.1-1\nkmod-batman-adv 5.15.167+2023.1-openwrt-3\niw-full 5.19-1\n",
+    }
+
+
+def _files(files: Any) -> Iterator[tuple[str, str]]:
+    """What the inventory wants, as the sections in which a node tells it."""
+    for file in files:
+        text = file.content.decode()
+        if file.path.startswith("etc/config/"):
+            yield f"config {file.path.removeprefix('etc/config/')}", text
+        else:
+            path = f"/{file.path}"
+            letters = "".join(
+                letter if file.mode & (1 << (8 - place)) else "-" for place, letter in enumerate("rwxrwxrwx")
+            )
+            yield f"mode {path}", f"-{letters}    1 0        0            {len(text)} Jan  1 00:00 {path}\n"
+            yield f"hash {path}", f"{hashlib.sha256(file.content).hexdigest()}  {path}\n"
+            yield f"text {path}", text
+
+
+def _no_secret(ref: SecretRef) -> Secret:
+    raise AssertionError(f"no secret is in this inventory: {ref}")

@@ -1,0 +1,165 @@
+"""How long `meshctl status` takes for a fleet: `python -m benchmarks.status_scale [--radios 50,200] [--robots 20]`.
+
+The devices are those of `status_fleet`: a real SSH server in a network namespace of its own, answers made before. The
+command runs as its users run it, in a process of its own, over real connections:
+
+- a look at the radios alone, and one at radios and robots, with new connections to everybody;
+- the looks after the first of `--watch`, whose connections stand;
+- a look while half of the radios are off: what is sent to them is lost, as over the air.
+
+Devices and meshctl share this machine's processors, so the seconds have the server's work in them; the processor
+seconds are meshctl's own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.status_fleet import Devices, programs_missing
+
+RESULTS = Path(__file__).with_name("results") / "status_scale.jsonl"
+RUNS = 3
+LOOKS_WATCHED = 4
+
+
+def run(command: Sequence[str], environ: Mapping[str, str]) -> tuple[float, float, dict[str, Any]]:
+    """Wall and processor seconds of a status, and what it told."""
+    began = time.monotonic()
+    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
+        process = subprocess.Popen(command, env=dict(environ), stdin=subprocess.DEVNULL, stdout=output, stderr=errors)
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        took_s = time.monotonic() - began
+        output.seek(0)
+        errors.seek(0)
+        text = output.read()
+        if not text:
+            raise RuntimeError(f"status ended with {process.returncode}: {errors.read().decode()[-2000:]}")
+    return took_s, used.ru_utime + used.ru_stime, json.loads(text)
+
+
+def repeated(command: Sequence[str], environ: Mapping[str, str], answering: int) -> dict[str, float]:
+    """The median of several runs. Raises RuntimeError unless exactly so many devices answered in each."""
+    walls, processors = [], []
+    for _ in range(RUNS):
+        wall_s, cpu_s, told = run(command, environ)
+        devices = [*told["nodes"], *told["robots"]]
+        answered = sum(one["answers"] for one in devices)
+        if answered != answering:
+            why = {one["silent_because"] for one in devices if not one["answers"]}
+            raise RuntimeError(f"{answered} of {len(devices)} answered, expected {answering}: {why}")
+        walls.append(wall_s)
+        processors.append(cpu_s)
+    return {"seconds": statistics.median(walls), "cpu_s": statistics.median(processors), "answering": answering}
+
+
+def watched(command: Sequence[str], environ: Mapping[str, str]) -> dict[str, float]:
+    """The looks after the first one of `--watch`, as the command itself timed them."""
+    with subprocess.Popen(
+        [*command, "--watch", "1"],
+        env=dict(environ),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        looks = [json.loads(process.stdout.readline()) for _ in range(LOOKS_WATCHED)]
+        process.send_signal(signal.SIGINT)
+        process.wait(60)
+    return {"seconds": statistics.median(look["took_s"] for look in looks[1:])}
+
+
+def measure(radios: int, robots: int) -> dict[str, Any]:
+    """Every figure for one fleet, its base among the radios."""
+    with tempfile.TemporaryDirectory(prefix="status-scale-") as directory:
+        devices = Devices(Path(directory, "fleet"), radios, robots)
+        devices.directory.mkdir()
+        ours = {name: value for name, value in os.environ.items() if not name.startswith("MESHCTL_")}
+        environ = {**ours, "XDG_STATE_HOME": str(Path(directory, "state")), "SSH_AUTH_SOCK": ""}
+        command = [sys.executable, "-m", "meshctl", "status", "--json", "-i", str(devices.inventory)]
+        devices.start()
+        try:
+            alone = repeated([*command, "--no-robots"], environ, radios)
+            both = repeated(command, environ, radios + robots)
+            again = watched(command, environ)
+            off = devices.switch_off_half()
+            half = repeated(command, environ, radios + robots - off)
+        finally:
+            devices.stop()
+    return {"radios": radios, "robots": robots, "alone": alone, "both": both, "again": again, "half": half}
+
+
+_ROWS = {
+    "alone": "radios alone, all answer",
+    "both": "radios and robots, all answer",
+    "again": "the same, connections kept (`--watch`)",
+    "half": "half of the radios off",
+}
+
+
+def table(results: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown."""
+    lines = [
+        "| radios | robots | look | seconds | processor seconds of meshctl |",
+        "| ---: | ---: | --- | ---: | ---: |",
+    ]
+    for result in results:
+        for key, what in _ROWS.items():
+            took = result[key]
+            processor = f"{took['cpu_s']:.1f}" if "cpu_s" in took else ""
+            lines.append(f"| {result['radios']} | {result['robots']} | {what} | {took['seconds']:.1f} | {processor} |")
+    return "\n".join(lines)
+
+
+def in_own_network(radios: int, robots: int) -> dict[str, Any]:
+    """`measure` in a process of its own, in a network where only the fleet's own addresses are."""
+    inner = 'ip link set lo up && exec "$@"'
+    command = ["unshare", "--net", "sh", "-ec", inner, "sh", sys.executable, "-m", "benchmarks.status_scale"]
+    done = subprocess.run([*command, "--inside", f"{radios},{robots}"], stdout=subprocess.PIPE, check=True)
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.status_scale", description=__doc__)
+    parser.add_argument("--radios", default="50,200")
+    parser.add_argument("--robots", type=int, default=20)
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--tables", action="store_true", help="only print the table of what was measured")
+    parser.add_argument("--inside", default="", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.inside:
+        radios, robots = map(int, arguments.inside.split(","))
+        print(json.dumps(measure(radios, robots)))
+        return
+    if arguments.tables:
+        results = [json.loads(line) for line in arguments.results.read_text().splitlines()]
+    else:
+        if missing := programs_missing():
+            parser.error(f"it needs {', '.join(missing)}")
+        machine = {"python": platform.python_version(), "machine": platform.machine(), "cores": os.cpu_count()}
+        results = [
+            {**machine, **in_own_network(radios, arguments.robots)} for radios in map(int, arguments.radios.split(","))
+        ]
+        arguments.results.parent.mkdir(parents=True, exist_ok=True)
+        arguments.results.write_text("".join(json.dumps(result) + "\n" for result in results))
+    first = results[0]
+    print(f"Python {first['python']}, {first['machine']}, {first['cores']} cores for meshctl and all devices\n")
+    print(table(results))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,260 @@
+"""`meshctl status`, `preflight` and `topology` as their users run them, over a virtual fleet's real SSH."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import pty
+import re
+import select
+import shlex
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from meshctl.inventory import load_fleet
+from meshctl.lab.fleet import VirtualFleet
+from meshctl.lab.spec import FleetSpec, LinkSpec, Medium, NodeSpec
+from meshctl.model import Secret, SecretRef
+from meshctl.render import render_node
+
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
+
+PATIENCE_S = 120.0
+NAMES = ("base", "b01", "b02")
+INVENTORY = """\
+meshctl: 1
+fleet: looked-at
+country: US
+operators: {{ssh_keys: ["{key}"]}}
+hardware:
+  box:
+    board: compex,wpj344-16m
+    profile: compex_wpj344-16m
+    target: ath79/generic
+    release: "23.05"
+    lan_ports: [eth0]
+    radios: {{radio0: {{path: platform/ahb/18100000.wmac, band: 2g, rated_power_dbm: 30, max_drive_dbm: 27}}}}
+meshes:
+  main: {{ssid: looked-at, bssid: "02:ca:fe:00:00:01", band: 2g, channel: 6, network: 10.42.0.0/24{encryption}}}
+defaults: {{hardware: box, state: deployed, ssh: {{key_files: [key]}}}}
+nodes:
+  base: {{role: base, address: 10.42.0.1}}
+  b01: {{role: beacon, address: 10.42.0.2}}
+  b02: {{role: beacon, address: 10.42.0.3}}
+robots:
+  rover: {{computer: {{address: 10.42.0.20/24}}}}
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """A fleet whose nodes run what the inventory says, and meshctl over it."""
+
+    fleet: VirtualFleet
+    directory: Path
+
+    def command(self, *words: str, inventory: str = "fleet.yaml") -> list[str]:
+        return [sys.executable, "-m", "meshctl", *words, "-i", str(self.directory / inventory)]
+
+    @property
+    def environ(self) -> dict[str, str]:
+        ours = {name: value for name, value in os.environ.items() if not name.startswith("MESHCTL_")}
+        lab, state = str(self.fleet.directory), str(self.directory / "state")
+        return {**ours, "MESHCTL_LAB": lab, "XDG_STATE_HOME": state, "SSH_AUTH_SOCK": "", "TERM": "xterm"}
+
+    def run(self, *words: str, inventory: str = "fleet.yaml", timeout: str = "60") -> subprocess.CompletedProcess[str]:
+        """A command to its end. The deadline for a silent node is generous: this machine may be slow."""
+        given = ["--timeout", timeout] if words[0] in ("status", "preflight", "topology") else []
+        return subprocess.run(
+            self.command(*words, *given, inventory=inventory),
+            env=self.environ,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S * 2,
+        )
+
+    def status(self, *words: str, inventory: str = "fleet.yaml") -> dict[str, Any]:
+        done = self.run("status", "--json", *words, inventory=inventory)
+        told = json.loads(done.stdout)
+        assert done.returncode == told["exit_code"], done.stderr
+        return {**told, "by_name": {node["name"]: node for node in told["nodes"]}}
+
+
+def no_secret(ref: SecretRef) -> Secret:
+    raise AssertionError(f"no secret is in this inventory: {ref}")
+
+
+def until(condition: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {PATIENCE_S:g} s for {what}"
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    directory = tmp_path_factory.mktemp("looked-at")
+    key = Ed25519PrivateKey.generate()
+    private = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.OpenSSH, serialization.NoEncryption()
+    )
+    (directory / "key").write_bytes(private)
+    (directory / "key").chmod(0o600)
+    public = key.public_key().public_bytes(serialization.Encoding.OpenSSH, serialization.PublicFormat.OpenSSH).decode()
+    (directory / "fleet.yaml").write_text(INVENTORY.format(key=f"{public} test", encryption=""))
+    secret = ", encryption: psk2+ccmp, key: {env: NOT_SET_HERE}"
+    (directory / "secret.yaml").write_text(INVENTORY.format(key=f"{public} test", encryption=secret))
+    nodes = tuple(NodeSpec(name, medium=Medium.BASE, host_key_types=("ed25519",)) for name in NAMES)
+    links = (LinkSpec("base", "b01", tq=250, signal_dbm=-55), LinkSpec("b01", "b02", tq=200, signal_dbm=-70))
+    with VirtualFleet(FleetSpec("looked-at", nodes, links), directory / "lab") as fleet:
+        loaded = load_fleet(directory / "fleet.yaml")
+        for name in NAMES:
+            lines = []
+            for file in render_node(loaded, name, no_secret).files:
+                target = shlex.quote(f"/{file.path}")
+                lines.append(f"mkdir -p $(dirname {target}); printf %s {shlex.quote(file.content.decode())} >{target}")
+                lines.append(f"chmod {file.mode:o} {target}")
+            fleet.node(name).exec("\n".join([*lines, "sync", "reload_config"])).check(f"set up {name}")
+        bench = Bench(fleet, directory)
+        until(lambda: bench.run("trust", "--yes").returncode == 0, "the host keys")
+        yield bench
+
+
+@pytest.fixture
+def bench(standing: Bench) -> Iterator[Bench]:
+    """Whole again afterwards."""
+    hears = {"base": {"b01"}, "b01": {"base", "b02"}, "b02": {"b01"}}
+
+    def is_whole() -> bool:
+        heard = {n["name"]: {one["name"] for one in n["neighbours"] or ()} for n in standing.status()["nodes"]}
+        return heard == hears
+
+    until(is_whole, "the line of three")
+    yield standing
+    standing.fleet.mend()
+    for name in NAMES:
+        standing.fleet.node(name).wait_up()
+
+
+def test_a_whole_fleet_is_all_well_and_compared_with_the_inventory(bench: Bench) -> None:
+    told = bench.status()
+    assert {name: node["drift"] for name, node in told["by_name"].items()} == {name: [] for name in NAMES}
+    assert (told["by_name"]["b02"]["hops"], told["by_name"]["b02"]["via"]) == (2, "b01")
+    done = bench.run("status")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("looked-at: all well")
+    # no packet leaves for an address that somebody else's machine may have
+    assert "a virtual fleet has none" in done.stdout
+
+
+def test_a_node_without_power_is_shown_as_it_was(bench: Bench) -> None:
+    bench.fleet.break_("b02", "off")
+    told = bench.status()
+    assert told["exit_code"] == 3
+    last = told["by_name"]["b02"]["last_known"]
+    assert (last["hops"], last["via"], last["heard"]) == (2, "b01", ["b01"])
+    (alarm,) = told["by_name"]["b02"]["alarms"]
+    assert alarm["code"] == "unreachable"
+    assert "behind b01" in alarm["hint"]
+
+
+def test_a_node_with_another_host_key_is_told_while_the_others_are_looked_at(bench: Bench) -> None:
+    bench.fleet.break_("b01", "host-key")
+    told = bench.status()
+    assert [alarm["code"] for alarm in told["by_name"]["b01"]["alarms"]] == ["host-key"]
+    assert told["by_name"]["base"]["answers"]
+    bench.run("trust", "b01", "--replace", "--yes")
+    assert bench.status()["by_name"]["b01"]["answers"]
+
+
+def test_filters_show_less_and_only_asks_less(bench: Bench) -> None:
+    assert set(bench.status("--role", "beacon")["by_name"]) == {"b01", "b02"}
+    only = bench.status("b02", "--only")
+    assert (set(only["by_name"]), only["by_name"]["b02"]["hops"]) == ({"b02"}, None)
+
+
+def test_a_fleet_is_shown_without_its_secrets(bench: Bench) -> None:
+    told = bench.status(inventory="secret.yaml")
+    assert all(node["answers"] and node["drift"] is None for node in told["nodes"])
+    (alarm,) = [alarm for alarm in told["alarms"] if alarm["code"] == "not-compared"]
+    assert "NOT_SET_HERE" in alarm["text"]
+
+
+def test_preflight_is_a_go_for_a_whole_fleet_and_a_no_go_with_its_reason_for_a_broken_one(bench: Bench) -> None:
+    assert bench.run("preflight").stdout.splitlines()[-1] == "GO"
+    bench.fleet.break_("base", "off")
+    done = bench.run("preflight", "--json")
+    told = json.loads(done.stdout)
+    assert (done.returncode, told["go"]) == (1, False)
+    assert "base does not answer" in next(check["reason"] for check in told["checks"] if check["check"] == "base")
+
+
+def test_topology_draws_the_line(bench: Bench) -> None:
+    done = bench.run("topology")
+    assert done.returncode == 0, done.stderr
+    assert [line.split()[-3 if "old" in line else 0] for line in done.stdout.splitlines()[:1]] == ["base"]
+    assert json.loads(bench.run("topology", "--json").stdout)["entry"] == "base"
+
+
+def test_whoever_leaves_a_look_need_not_wait_for_the_silent(bench: Bench) -> None:
+    bench.fleet.break_("b01", "ssh-hang")
+    with subprocess.Popen(
+        bench.command("status", "--timeout", "3600", "--watch", "1", "--json"),
+        env=bench.environ,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        journal = bench.directory / "state/meshctl/journal.sqlite-wal"
+        until(lambda: journal.exists() or process.poll() is not None, "the look to begin")
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, told.splitlines()[-1:]) == (130, ["interrupted"])
+
+
+def test_watch_draws_what_fits_follows_the_window_and_leaves_the_screen_as_it_was(bench: Bench) -> None:
+    process, terminal = pty.fork()
+    if process == 0:
+        os.execve(sys.executable, bench.command("status", "--watch", "1", "--timeout", "60"), bench.environ)
+    told = b""
+
+    def reads(pattern: str) -> bool:
+        nonlocal told
+        ready, _, _ = select.select([terminal], [], [], 0.05)
+        if ready:
+            told += os.read(terminal, 65536)
+        return re.search(pattern, told.decode(errors="replace"), re.DOTALL) is not None
+
+    try:
+        resize(terminal, 60, 160)
+        until(lambda: reads("looked-at: .*all well.*Ctrl-C ends"), "a page")
+        assert b"disk free" in told
+        told = b""
+        resize(terminal, 8, 72)
+        until(lambda: reads(r"\.\.\. \d+ more lines"), "a page for the smaller window")
+        told = b""
+        os.write(terminal, b"\x03")
+        until(lambda: reads(r"\x1b\[\?1049l.*b02 +beacon"), "the end")
+    finally:
+        _, status = os.waitpid(process, 0)
+        os.close(terminal)
+    assert os.waitstatus_to_exitcode(status) == 130
+
+
+def resize(terminal: int, lines: int, columns: int) -> None:
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
