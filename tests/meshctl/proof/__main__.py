@@ -1,6 +1,6 @@
 """`python -m tests.meshctl.proof`: run the proofs, write every case to a JSONL file, print the tables.
 
-Parts: apply, kill, flash, crowd. `--table FILE` prints the tables of an earlier run.
+Parts: apply, kill, flash, flash-kill, crowd. `--table FILE` prints the tables of an earlier run.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from tests.meshctl.proof.kills import Case
 from tests.meshctl.proof.matrix import apply_matrix, firmware, flash_matrix, kill_matrix, table
 from tests.meshctl.proof.rig import Rig
 
-PARTS = ("apply", "kill", "flash", "crowd")
+PARTS = ("apply", "kill", "flash", "flash-kill", "crowd")
+# Every one of them tells about ten words in a flash; two at once show what the other one's step does to it.
+FLASHED_AT_ONCE = 2
 
 
 def main() -> int:
@@ -29,6 +31,7 @@ def main() -> int:
     parser.add_argument("--nodes", type=int, default=8, help="nodes struck at once")
     parser.add_argument("--crowd", type=int, default=200, help="nodes of the big fleet")
     parser.add_argument("--every", type=int, default=1, help="strike at every so many steps")
+    parser.add_argument("--first", type=int, default=1, help="begin at this word of meshctl (kill, flash-kill)")
     parser.add_argument("--table", type=Path, help="print the tables of this file, run nothing")
     chosen = parser.parse_args()
     if chosen.table is not None:
@@ -57,11 +60,15 @@ def _run(part: str, chosen: argparse.Namespace, out: TextIO, directory: Path) ->
         case "kill":
             with Rig(directory, chosen.nodes) as rig:
                 _take_in(rig)
-                kill_matrix(rig, tell, every=chosen.every)
+                kill_matrix(rig, tell, every=chosen.every, first=chosen.first)
         case "flash":
             with Rig(directory, chosen.nodes, firmware=firmware(directory)) as rig:
                 _take_in(rig)
                 flash_matrix(rig, tell)
+        case "flash-kill":
+            with Rig(directory, FLASHED_AT_ONCE, firmware=firmware(directory)) as rig:
+                _take_in(rig)
+                kill_matrix(rig, tell, every=chosen.every, first=chosen.first, verb="flash")
         case "crowd":
             with Rig(directory, chosen.crowd) as rig:
                 began = time.monotonic()

@@ -80,12 +80,17 @@ def apply_matrix(rig: Rig, tell: Callable[[Case, str], None], *, every: int = 1)
             there, other = other, there
 
 
-def kill_matrix(rig: Rig, tell: Callable[[Case, str], None], *, every: int = 1) -> None:
-    """meshctl killed at every `every`-th of its words (node begun, step, progress, outcome)."""
+def kill_matrix(
+    rig: Rig, tell: Callable[[Case, str], None], *, every: int = 1, first: int = 1, verb: str = "apply"
+) -> None:
+    """meshctl killed at every `every`-th of its words (node begun, step, progress, outcome), from the `first` on.
+
+    Over a rig with firmware each run is a flash, and `verb` says so.
+    """
     there, other = "a", "b"
-    words, is_killed = 1, True
+    words, is_killed = first, True
     while is_killed:
-        cases = strike_meshctl(rig, words, old=there, new=other)
+        cases = strike_meshctl(rig, words, old=there, new=other, verb=verb)
         is_killed = any(case.outcome == "killed" for case in cases)
         for case in cases if is_killed else ():
             tell(case, case.step)

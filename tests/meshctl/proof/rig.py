@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from meshctl.inventory import load_fleet
 from meshctl.lab.fleet import VirtualFleet
-from meshctl.lab.spec import FleetSpec, LinkSpec, Medium, NodeSpec
+from meshctl.lab.spec import MESH_PACKAGES, FleetSpec, LinkSpec, Medium, NodeSpec
 from meshctl.model import Secret, SecretRef
 from meshctl.render import DeviceFacts, render_node
 from meshctl.uci import parse
@@ -98,7 +98,10 @@ class Rig:
     count: int
     window_s: int = 10
     parallel: int = 8
+    # further lines of the hardware profile, by inventory
     firmware: Mapping[str, str] = field(default_factory=dict)
+    # what is baked into the images
+    packages: tuple[str, ...] = MESH_PACKAGES
     # whether meshctl is told of the virtual fleet; without, it goes by addresses and cables as in the field
     is_told_of_lab: bool = True
     fleet: VirtualFleet = field(init=False)
@@ -130,7 +133,12 @@ class Rig:
             self.inventory(variant).write_text(text, encoding="utf-8")
         names = ["base", *self.names]
         nodes = tuple(
-            NodeSpec(name, medium=Medium.BASE if name == "base" else Medium.BENCH, host_key_types=("ed25519",))
+            NodeSpec(
+                name,
+                medium=Medium.BASE if name == "base" else Medium.BENCH,
+                host_key_types=("ed25519",),
+                packages=self.packages,
+            )
             for name in names
         )
         links = tuple(LinkSpec("base", name) for name in self.names)

@@ -37,6 +37,17 @@ def test_no_cut_at_any_step_of_a_flash_strands_a_node(tmp_path_factory: pytest.T
     assert bad == []
 
 
+def test_killing_meshctl_at_any_of_its_words_in_a_flash_strands_no_node(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    bad: list[Case] = []
+    directory = tmp_path_factory.mktemp("flash-kill")
+    with Rig(directory, 2, firmware=firmware(directory)) as rig:
+        assert rig.take_in("a").code == 0
+        kill_matrix(rig, lambda case, phase: None if case.holds else bad.append(case), verb="flash")
+    assert bad == []
+
+
 def test_of_two_hundred_nodes_every_outcome_is_right_and_none_is_lost(tmp_path_factory: pytest.TempPathFactory) -> None:
     with Rig(tmp_path_factory.mktemp("crowd"), 200) as rig:
         assert rig.take_in("a").code == 0

@@ -1,0 +1,77 @@
+"""Devices whose images lack what a mesh needs, one of them in its first boot: packages, then files, then a mesh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from meshctl.lab.images import opkg_package
+from tests.meshctl.proof.rig import Rig
+
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab"), pytest.mark.timeout(600)]
+
+PACKAGES = {"kmod-batman-adv": (), "batctl-default": ("kmod-batman-adv",)}
+# As the kernel shows it while / is in memory (fstools, overlay.c); the shell that mounts it, and what the node runs
+# already, stand below it and see no difference. It goes when the file in the node's directory goes.
+FIRST_BOOT = """
+busybox=/rom/lab/genuine/busybox
+$busybox mount -t tmpfs overlayfs:/tmp/root /
+(while [ -e /lab/node/first-boot ]; do $busybox sleep 0.1; done; $busybox umount /) >/dev/null 2>&1 </dev/null &
+"""
+
+
+def files(directory: Path) -> str:
+    """The package files, as a line of the hardware profile."""
+    directory.mkdir(parents=True)
+    for name, needs in PACKAGES.items():
+        (directory / f"{name}_1_mips_24kc.ipk").write_bytes(opkg_package(name, "1", {}, depends=needs))
+    return f"    package_files: [{', '.join(f'{name}_1_mips_24kc.ipk' for name in PACKAGES)}]"
+
+
+def test_packages_come_first_a_flash_that_is_not_ready_is_waited_for_and_netifd_learns_batman(tmp_path: Path) -> None:
+    line = files(tmp_path / "rig")
+    with Rig(tmp_path / "rig", 1, firmware=dict.fromkeys(("a", "b", "split"), line), packages=()) as rig:
+        rig.wait_all_up()
+        mark = rig.fleet.directory / "nodes" / "n001" / "first-boot"
+        mark.touch()
+        rig.fleet.node("n001").exec(FIRST_BOOT)
+        with rig.start("bootstrap", "a", "--yes") as process:
+            assert process.stdout is not None
+            said = []
+            for text in process.stdout:
+                said.append(text)
+                if "its flash is not ready yet" in text:
+                    # nothing is written to a node whose flash would lose it
+                    assert "n001: stage\n" not in said
+                    mark.unlink()
+            assert process.stderr is not None
+            trouble = process.stderr.read()
+        assert process.returncode == 0, "".join(said) + trouble
+        assert "n001: flash ready\n" in said
+        for name in ("base", "n001"):
+            steps = [text.split(": ")[1].strip() for text in said if text.startswith(f"{name}: ")]
+            assert [step for step in steps if step in ("packages", "stage", "prove")] == [
+                "packages",
+                *("stage", "prove"),
+                *("stage", "prove"),
+            ]
+            node = rig.fleet.node(name)
+            assert "kmod-batman-adv - 1" in node.exec("opkg list-installed").stdout
+            # netifd had started without it
+            assert '"batadv"' in node.exec("ubus call network get_proto_handlers").stdout
+        assert rig.meshctl("provision", "a", "--check", "--json").verdicts == {"base": "same", "n001": "same"}
+
+
+def test_a_package_that_cannot_be_installed_leaves_the_node_as_it_was(tmp_path: Path) -> None:
+    line = files(tmp_path / "rig")
+    (tmp_path / "rig" / "batctl-default_1_mips_24kc.ipk").write_bytes(
+        opkg_package("batctl-default", "1", {}, depends=("absent",))
+    )
+    with Rig(tmp_path / "rig", 1, firmware=dict.fromkeys(("a", "b", "split"), line), packages=()) as rig:
+        rig.wait_all_up()
+        node = rig.fleet.node("n001")
+        before = node.exec("opkg list-installed; cat /etc/config/*").stdout
+        ended = rig.meshctl("bootstrap", "a", "n001", "--yes", "--json")
+        assert ended.results == {"n001": "rolled back"}, ended.out + ended.err
+        assert node.exec("opkg list-installed; cat /etc/config/*").stdout == before
