@@ -31,8 +31,9 @@ log = logging.getLogger(__name__)
 
 BUFFER_BYTES = 1 << 24
 """rospy's receive buffer: with its own 64 kB large images lag ever further behind."""
-QUEUE_MESSAGES, QUEUE_BYTES = 100, 16 << 20
-"""What waits at most for one slow subscriber of a topic: a hundred messages, fewer of large ones, but at least one."""
+QUEUE_MESSAGES, QUEUE_BYTES = 10_000, 4 << 20
+"""What waits at most for one slow subscriber of a topic: bursts of small messages whole, of images the last few; at
+least one message."""
 
 MASTER_ERRORS = (rosgraph.MasterException, OSError, xmlrpc.client.Error, http.client.HTTPException)
 """What a call to a master that is gone, or going, raises."""

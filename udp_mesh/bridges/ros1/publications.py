@@ -19,8 +19,8 @@ FIRST_HOLD_S = 2.0
 """How long the first messages of a new topic wait for subscribers who were there before it."""
 LOOK_S = 0.05
 """Between two looks whether those subscribers have connected."""
-MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 100, 16 << 20
-"""Per topic, until it is advertised: some seconds of telemetry, half a second of images; the oldest are dropped."""
+MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 1000, 16 << 20
+"""Per topic, until it is advertised: seconds of telemetry, half a second of images; the oldest are dropped."""
 
 
 class Outgoing(NamedTuple):
