@@ -14,7 +14,7 @@ from meshctl.status.alarms import WEAK_QUALITY, some
 from meshctl.status.pings import Pings
 from meshctl.status.robots import takes_part
 from meshctl.status.topics import is_urgent
-from meshctl.status.values import Alarm, FleetStatus, Health, NodeStatus, RobotStatus
+from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus
 
 # More reasons than this make a line that nobody reads; `meshctl status` has them all.
 REASONS_SHOWN = 4
@@ -69,7 +69,8 @@ def _alarm_check(
 
 
 def _told(name: str, alarms: Iterable[Alarm], codes: Iterable[str]) -> str:
-    found = ", ".join(alarm.text for alarm in alarms if alarm.code in codes)
+    """What a note says stops nobody."""
+    found = ", ".join(alarm.text for alarm in alarms if alarm.code in codes and alarm.level > Level.NOTE)
     return f"{name}: {found}" if found else ""
 
 
@@ -139,7 +140,7 @@ _CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
     _alarm_check("changes", "no change is under way", "change"),
     _alarm_check("radios", "every radio is in its cell", "radio", "join", "channel", "alone", "bridge"),
     _quality,
-    _alarm_check("resources", "memory, flash and load allow it", "memory", "flash", "load"),
+    _alarm_check("resources", "memory and flash suffice", "memory", "flash"),
     _strangers,
 )
 
@@ -213,5 +214,5 @@ _ROBOT_CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
     _urgent_topics,
     _alarm_check("queues", "no urgent message waits", "urgent-queue", "restarts", robots=True),
     _alarm_check("topics", "every topic flows", "topic-undeclared", "topic-silent", "topic-not-arriving", robots=True),
-    _alarm_check("computers", "disk, memory, load and clock allow it", "disk", "memory", "load", "clock", robots=True),
+    _alarm_check("computers", "disk, memory and clock allow it", "disk", "memory", "clock", robots=True),
 )

@@ -23,7 +23,9 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from typer.testing import CliRunner, Result
 
+from meshctl.cli.main import build
 from meshctl.inventory import load_fleet
 from meshctl.lab.fleet import VirtualFleet
 from meshctl.lab.spec import FleetSpec, LinkSpec, Medium, NodeSpec
@@ -71,26 +73,25 @@ class Bench:
 
     @property
     def environ(self) -> dict[str, str]:
-        ours = {name: value for name, value in os.environ.items() if not name.startswith("MESHCTL_")}
+        foreign = ("MESHCTL_", "SSH_AUTH_SOCK", "COLUMNS")
+        ours = {name: value for name, value in os.environ.items() if not name.startswith(foreign)}
         lab, state = str(self.fleet.directory), str(self.directory / "state")
-        return {**ours, "MESHCTL_LAB": lab, "XDG_STATE_HOME": state, "SSH_AUTH_SOCK": "", "TERM": "xterm"}
+        return {**ours, "MESHCTL_LAB": lab, "XDG_STATE_HOME": state, "TERM": "xterm"}
 
-    def run(self, *words: str, inventory: str = "fleet.yaml", timeout: str = "60") -> subprocess.CompletedProcess[str]:
+    def run(self, *words: str, inventory: str = "fleet.yaml") -> Result:
         """A command to its end. The deadline for a silent node is generous: this machine may be slow."""
-        given = ["--timeout", timeout] if words[0] in ("status", "preflight", "topology") else []
-        return subprocess.run(
-            self.command(*words, *given, inventory=inventory),
-            env=self.environ,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE_S * 2,
-        )
+        given = ["--timeout", "60"] if words[0] in ("status", "preflight", "topology") else []
+        arguments = [*words, *given, "-i", str(self.directory / inventory)]
+        environ: dict[str, str | None] = {
+            **dict.fromkeys(("MESHCTL_INVENTORY", "SSH_AUTH_SOCK", "COLUMNS")),
+            **self.environ,
+        }
+        return CliRunner().invoke(build(words[0]), arguments, env=environ, catch_exceptions=False)
 
     def status(self, *words: str, inventory: str = "fleet.yaml") -> dict[str, Any]:
         done = self.run("status", "--json", *words, inventory=inventory)
         told = json.loads(done.stdout)
-        assert done.returncode == told["exit_code"], done.stderr
+        assert done.exit_code == told["exit_code"], done.stderr
         return {**told, "by_name": {node["name"]: node for node in told["nodes"]}}
 
 
@@ -130,7 +131,7 @@ def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
                 lines.append(f"chmod {file.mode:o} {target}")
             fleet.node(name).exec("\n".join([*lines, "sync", "reload_config"])).check(f"set up {name}")
         bench = Bench(fleet, directory)
-        until(lambda: bench.run("trust", "--yes").returncode == 0, "the host keys")
+        until(lambda: bench.run("trust", "--yes").exit_code == 0, "the host keys")
         yield bench
 
 
@@ -155,7 +156,7 @@ def test_a_whole_fleet_is_all_well_and_compared_with_the_inventory(bench: Bench)
     assert {name: node["drift"] for name, node in told["by_name"].items()} == {name: [] for name in NAMES}
     assert (told["by_name"]["b02"]["hops"], told["by_name"]["b02"]["via"]) == (2, "b01")
     done = bench.run("status")
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.exit_code, done.stderr) == (0, "")
     assert done.stdout.startswith("looked-at: all well")
     # no packet leaves for an address that somebody else's machine may have
     assert "a virtual fleet has none" in done.stdout
@@ -195,18 +196,19 @@ def test_a_fleet_is_shown_without_its_secrets(bench: Bench) -> None:
 
 
 def test_preflight_is_a_go_for_a_whole_fleet_and_a_no_go_with_its_reason_for_a_broken_one(bench: Bench) -> None:
-    assert bench.run("preflight").stdout.splitlines()[-1] == "GO"
+    told = bench.run("preflight").stdout
+    assert told.splitlines()[-1] == "GO", told
     bench.fleet.break_("base", "off")
     done = bench.run("preflight", "--json")
-    told = json.loads(done.stdout)
-    assert (done.returncode, told["go"]) == (1, False)
-    assert "base does not answer" in next(check["reason"] for check in told["checks"] if check["check"] == "base")
+    broken = json.loads(done.stdout)
+    assert (done.exit_code, broken["go"]) == (1, False)
+    assert "base does not answer" in next(check["reason"] for check in broken["checks"] if check["check"] == "base")
 
 
 def test_topology_draws_the_line(bench: Bench) -> None:
     done = bench.run("topology")
-    assert done.returncode == 0, done.stderr
-    assert [line.split()[-3 if "old" in line else 0] for line in done.stdout.splitlines()[:1]] == ["base"]
+    assert done.exit_code == 0, done.stderr
+    assert [line.split()[0] for line in done.stdout.splitlines()[:3]] == ["base", "`-", "`-"]
     assert json.loads(bench.run("topology", "--json").stdout)["entry"] == "base"
 
 

@@ -85,6 +85,12 @@ def test_a_fleet_without_its_secrets_is_a_no_go_that_names_them(fleet: Fleet) ->
     assert "env:KEY is not set" in found["configuration"].reason
 
 
+def test_a_busy_computer_is_a_note_and_stops_nobody(fleet: Fleet) -> None:
+    rover = CREW["rover"]
+    busy = replace(rover, computer=replace(rover.computer, load=(40.0, 9.0, 3.0)))
+    assert stopped(checks(fleet, {**CREW, "rover": busy})) == []
+
+
 def test_robots_that_were_not_asked_are_told_and_not_judged(fleet: Fleet) -> None:
     status = replace(
         status_of(fleet, robots={}, known=KNOWN), robots=(), alarms=(Alarm(Level.NOTE, "robots-unasked", "not asked"),)
