@@ -86,6 +86,10 @@ class Discovery:
         self._interval_s = self.interval_s(settings, sessions, now)
         self._last_at = now
         self.next_at = now + self._interval_s * (1 - JITTER * self._rng.random())
+        heard = self._heard(sessions, now)
+        if self._to_answer:
+            # More new nodes than one heartbeat can list: the others are not kept waiting for the next regular one.
+            self.hurry(len(sessions), now)
         return Heartbeat(
             settings.name,
             VERSION,
@@ -96,7 +100,7 @@ class Discovery:
             min(0xFFFFFFFF, int(sent_bytes_per_s)),
             0,
             next_cast,
-            self._heard(sessions, now),
+            heard,
             waiting,
         )
 

@@ -108,3 +108,16 @@ def test_nodes_tell_each_other_what_they_send_and_what_arrives() -> None:
     later = world.nodes["a"].conditions(world.now)
     assert next(peer for peer in later.peers if peer.name == "b").arrived_bits_per_s is None
     assert world.nodes["c"].conditions(world.now).heard_bits_per_s < 20_000
+
+
+def test_new_nodes_that_one_heartbeat_cannot_list_are_listed_soon() -> None:
+    discovery = Discovery(random.Random(1), RATES, 0.0)
+    rng, listed, now = random.Random(2), set[bytes](), 0.0
+    strangers = [Session("b", rng.randbytes(16), bytes(16), (KEY,), settings("b")) for _ in range(300)]
+    for session in strangers:
+        discovery.answer(session, len(strangers), now)
+    while len(listed) < len(strangers):
+        now = discovery.next_at
+        listed.update(discovery.compose(settings("a"), strangers, (), 0, 0.0, now).heard)
+    # four heartbeats at the pace of a meeting, not of a regular round of ten seconds
+    assert now < 5 * len(strangers) / (MEETING_HASTE * RATES.heartbeats_heard_per_s)
