@@ -215,15 +215,15 @@ class BridgeProcess:
     def start(self, *, launch: str = "", arguments: Sequence[str] = ()) -> None:
         """`launch` is a launch file's path; else the module is run."""
         if launch:
-            package = ROOT / "udp_mesh" / "bridges" / "ros1"
-            # The fielded package's Python part, as a robot's workspace has it on its path.
-            workspace = self._master.folder / "workspace"
-            (workspace / "udp_mesh" / "msg").mkdir(parents=True, exist_ok=True)
-            (workspace / "udp_mesh" / "__init__.py").touch()
+            # The fielded package, as a robot's workspace has it on its paths.
+            fielded = self._master.folder / "workspace" / "udp_mesh"
+            (fielded / "msg").mkdir(parents=True, exist_ok=True)
+            (fielded / "__init__.py").touch()
+            (fielded / "package.xml").write_text("<package><name>udp_mesh</name></package>")
             environment = {
                 **self._master.environment,
-                "ROS_PACKAGE_PATH": str(package),
-                "PYTHONPATH": f"{workspace}:{DEBIAN_PACKAGES}",
+                "ROS_PACKAGE_PATH": f"{fielded}:/usr/share",
+                "PYTHONPATH": f"{fielded.parent}:{DEBIAN_PACKAGES}",
             }
             command = ["/usr/bin/roslaunch", launch]
         else:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.udp_mesh.bridges.ros_processes import OLD_PYTHON, BridgeProcess, Master, Robot
+from tests.udp_mesh.bridges.ros_processes import OLD_PYTHON, ROOT, BridgeProcess, Master, Robot
 from tests.udp_mesh.daemon.processes import RunningDaemon, configuration, poll, wait_online
 from tests.udp_mesh.links.sockets import free_port
 
@@ -33,7 +33,7 @@ FIELDED = {
 
 LAUNCH = """
 <launch>
-  <include file="$(find udp_mesh)/launch/rudp_mesh_node.launch">
+  <include file="{place}/launch/rudp_mesh_node.launch">
     <arg name="mesh_data_port" value="8700"/>
     <arg name="mesh_interface" value="wlan0"/>
     <arg name="mesh_hostname" value="alice"/>
@@ -46,7 +46,8 @@ LAUNCH = """
   </include>
 </launch>
 """
-"""A fielded robot's own launch file, every argument given; the socket's place is the only new one."""
+"""A fielded robot's own launch file, every argument given. Its include is the line that changes; the socket's place is
+the test's."""
 
 pytestmark = [pytest.mark.proof, pytest.mark.xdist_group("ros1")]
 
@@ -79,7 +80,7 @@ def team() -> Iterator[tuple[Side, Side]]:
             kept.callback(bridge.stop)
             if name == "alice":
                 launch = folder / "robot.launch"
-                launch.write_text(LAUNCH.format(socket=daemon.socket))
+                launch.write_text(LAUNCH.format(place=ROOT / "udp_mesh/bridges/ros1", socket=daemon.socket))
                 bridge.start(launch=str(launch))
             else:
                 bridge.start()
