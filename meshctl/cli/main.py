@@ -19,7 +19,9 @@ from meshctl import __version__
 from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.errors import ExitCode, MeshctlError
 
-_EPILOG = "Start with `meshctl init DIR`, or `meshctl lab up` for a virtual fleet to practise on."
+_EPILOG = """Start with `meshctl init DIR`, or `meshctl lab up` for a virtual fleet to practise on.
+
+Exit codes: 0 well, 1 something to act on, 2 could not run, 3 needed nodes do not answer, 130 interrupted."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
