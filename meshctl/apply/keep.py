@@ -38,6 +38,11 @@ MAX_FILES, MAX_BYTES = 4000, 64 << 20
 # What the dead-man's switch takes: absolute paths of at least two parts, of plain characters, and not its own state.
 _PATH = re.compile(r"(/[A-Za-z0-9._+@-]+){2,}")
 _OWN = ("/etc/meshctl/change", "/etc/meshctl/last", "/tmp/", "/var/", "/dev/", "/proc/", "/sys/")
+# From 24.10 on sysupgrade puts a script into every archive that disables, at the next boot, what was disabled when it
+# was taken (base-files, sbin/sysupgrade). It is no file of the node's, nothing would undo what it does, and the boot
+# hook of the dead-man's switch may be among what it names: it is told, not put back. So is whatever else waits there.
+_ONCE_AT_BOOT = "/etc/uci-defaults/"
+_DISABLES = re.compile(r"^\s*/etc/init\.d/(\S+) disable\s*$", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +55,8 @@ class Backup:
     taken_s: float
     packages: tuple[str, ...]
     files: Mapping[str, NewFile] = field(repr=False)
+    # services that did not start at boot then
+    disabled: tuple[str, ...] = ()
 
 
 def fetch(connection: SshConnection, node: str, seen: Observation) -> bytes:
@@ -99,13 +106,16 @@ def _add(tar: tarfile.TarFile, name: str, content: bytes, mode: int) -> None:
 def read_backup(data: bytes, file: str) -> Backup:
     """What `fetch` wrote. Raises InputError naming the file and what is wrong with it."""
     files: dict[str, NewFile] = {}
+    disabled: list[str] = []
     info: dict[str, object] | None = None
     for member, content in _members(data, file):
         if member.name == INFO_NAME:
             info = _info(content, file)
         elif member.isreg():
             path = "/" + member.name.removeprefix("./").lstrip("/")
-            if _PATH.fullmatch(path) and ".." not in path.split("/") and not path.startswith(_OWN):
+            if path.startswith(_ONCE_AT_BOOT):
+                disabled += _DISABLES.findall(content.decode("utf-8", "replace"))
+            elif _PATH.fullmatch(path) and ".." not in path.split("/") and not path.startswith(_OWN):
                 files[path] = NewFile(content, member.mode & 0o7777)
     if info is None:
         raise InputError(f"{file}: no {INFO_NAME} in it", hint="expected a file that `meshctl backup` wrote")
@@ -120,6 +130,7 @@ def read_backup(data: bytes, file: str) -> Backup:
         float(taken) if isinstance(taken, int | float) else 0.0,
         tuple(str(name) for name in packages) if isinstance(packages, list) else (),
         files,
+        tuple(disabled),
     )
 
 

@@ -117,6 +117,8 @@ def _restore(opened: Session, name: str, saved: Backup) -> Outcome:
                         raise Refused(problem)
                     for package in lacking_packages(saved, seen):
                         work.note(f"package {package} was installed then and is not now", name)
+                    if saved.disabled:
+                        work.note(f"disabled then, and left as they are: {', '.join(saved.disabled)}", name)
                     plan = NodePlan(name, Verdict.CHANGE, effects=(Effect("everything", Cut.MESH, "restored"),))
                     job = Job(work, node, plan, opened.renderer.wanted(node, seen), seen, Expectation())
                 except BaseException:

@@ -49,6 +49,13 @@ def test_paths_that_must_not_be_written_are_left_out(path: str) -> None:
     assert set(saved((path, b"x")).files) == {"/etc/config/network"}
 
 
+def test_what_would_disable_services_at_the_next_boot_is_told_and_not_put_back() -> None:
+    script = b"/etc/init.d/odhcpd disable\n/etc/init.d/meshctl-deadman disable\n\nexit 0\n"
+    backup = saved(("./etc/uci-defaults/10_disable_services", script))
+    assert set(backup.files) == {"/etc/config/network"}
+    assert backup.disabled == ("odhcpd", "meshctl-deadman")
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [

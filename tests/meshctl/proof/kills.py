@@ -18,6 +18,9 @@ from tests.meshctl.proof.rig import Ended, Rig
 
 # After its window a node puts its files back and reloads.
 SLACK_S = 5.0
+# Verdicts of nodes that meshctl sees, and how long it may take a flashed one to boot on a busy machine.
+SEEN = ("same", "change")
+REST_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,17 +105,28 @@ def strike_meshctl(rig: Rig, words: int, *, old: str, new: str, verb: str = "app
 
 
 def _last_word(run: Ended, name: str) -> str:
-    told = [event for event in run.events if event.get("node") == name]
+    told = [event for event in run.events if event.get("node") == name and event["event"] != "note"]
     return str(told[-1].get("text") or told[-1]["event"]) if told else "before it"
+
+
+def _verdicts(rig: Rig, struck: Mapping[str, tuple[str, str]], new: str) -> dict[str, str]:
+    """What meshctl sees of the nodes once they have come to rest without anybody's help.
+
+    Whoever is under its dead-man's switch does while meshctl looks (it clears what a dead meshctl left); whoever has
+    just begun to be flashed is up for another moment, then gone for a while.
+    """
+    deadline = time.monotonic() + REST_S
+    while True:
+        verdicts = rig.meshctl("provision", new, "--check", "--json").verdicts
+        if all(verdicts.get(name) in SEEN for name in struck) or time.monotonic() > deadline:
+            return verdicts
 
 
 def _afterwards(
     rig: Rig, struck: Mapping[str, tuple[str, str]], run: Ended, *, old: str, new: str, verb: str
 ) -> list[Case]:
     rig.wait_all_up()
-    # whoever is still under its dead-man's switch is let come to rest: looking clears what a dead meshctl left
-    seen = rig.meshctl("provision", new, "--check", "--json")
-    verdicts = seen.verdicts
+    verdicts = _verdicts(rig, struck, new)
     states = {name: rig.state_of(name, old, new) for name in struck}
     resumed = rig.meshctl("resume", new, "--yes", "--json")
     if resumed.code != 0 and not resumed.results:
@@ -125,7 +139,7 @@ def _afterwards(
             name,
             run.results.get(name, "killed"),
             states[name],
-            verdicts.get(name) in ("same", "change"),
+            verdicts.get(name) in SEEN,
             rig.state_of(name, old, new) == "new",
         )
         for name, (kind, step) in struck.items()
