@@ -37,7 +37,7 @@ from meshctl.robots.reach import Reach, chosen_robots
 from meshctl.robots.wheels import stock_units
 
 Robots = Annotated[list[str] | None, typer.Argument(help="Robots, or patterns such as 'husky*'; default: all.")]
-Named = Annotated[list[str], typer.Argument(help="Robots, or patterns such as 'husky*'.")]
+Named = Annotated[list[str], typer.Argument(metavar="ROBOTS", help="Robots, or patterns such as 'husky*'.")]
 Wheels = Annotated[
     Path | None,
     typer.Option("--wheels", help="Directory with the wheels the robots need; without it pip downloads them here."),

@@ -52,6 +52,7 @@ _HINTS = {
     "service": "`meshctl robots logs` shows why",
     "check": "the release is not installed; what runs there was not touched",
     "account": "look at /etc/passwd there, and whether its disk is writable",
+    "no-release": "`meshctl robots deploy` brings what the inventory says",
     "damaged": "deploy again; if it happens again, look at the disk",
 }
 

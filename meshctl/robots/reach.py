@@ -14,10 +14,10 @@ from pathlib import Path
 from meshctl.apply.access import Access
 from meshctl.apply.bootstrap import Recorder
 from meshctl.device.connection import Connection, Credentials, Endpoint
-from meshctl.device.errors import AuthenticationRefused
+from meshctl.device.errors import AuthenticationRefused, HostKeyChanged, HostKeyUnknown
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import HostKey, HostKeyPolicy
-from meshctl.errors import InputError
+from meshctl.errors import InputError, NodeError, Unreachable
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Secret
 from meshctl.robots.host import Host, SshHost, become_root
@@ -72,10 +72,8 @@ class Reach:
                 connection = connect(
                     endpoint, credentials=credentials, trust=trust, deadlines=self.access.deadlines, via=via
                 )
-            except AuthenticationRefused as error:
-                # the device layer knows radios, whose keys are in another place
-                hint = f"put your public key into ~{endpoint.user}/.ssh/authorized_keys there (ssh-copy-id), or name"
-                error.hint = f"{hint} another in robots.{robot}.computer.ssh"
+            except NodeError as error:
+                error.hint = _remedy(error, robot, endpoint) or error.hint
                 raise
             yield stack.enter_context(connection)
 
@@ -104,6 +102,23 @@ class Reach:
     def _path(self, text: str) -> Path:
         path = Path(text).expanduser()
         return path if path.is_absolute() else Path(self.fleet.base) / path
+
+
+def _remedy(error: NodeError, robot: str, endpoint: Endpoint) -> str:
+    """What helps with a computer, where the device layer knows radios; empty for what is the same."""
+    match error:
+        case AuthenticationRefused():
+            keys = f"put your public key into ~{endpoint.user}/.ssh/authorized_keys there (ssh-copy-id)"
+            return f"{keys}, or name another in robots.{robot}.computer.ssh"
+        case HostKeyUnknown():
+            return f"compare it with the computer's own, then run `meshctl robots trust {robot}`"
+        case HostKeyChanged():
+            again = f"`meshctl robots trust --replace {robot}` once you know"
+            return f"another computer, a new installation, or an attack; {again}"
+        case Unreachable():
+            return f"is it on, does sshd run there, and is robots.{robot}.computer right?"
+        case _:
+            return ""
 
 
 def chosen_robots(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[str, ...]:

@@ -53,7 +53,7 @@ _ROBOT = """\
       arch: {arch}
       python: {python}
       ros: "{ros}"
-      ssh: {{user: {user}, key_files: [operator]}}
+      ssh: {{user: {user}, key_files: [operator]{jump}}}
 """
 
 
@@ -67,19 +67,26 @@ class RobotFleet:
         self.file = directory / "fleet.yaml"
         self.machines: dict[str, Machine] = {}
         self.base = base
-        self._lan = lan
+        self.lan = lan
         (directory / "keys.yaml").write_text(f'old: "{OLD_KEY}"\nnew: "{NEW_KEY}"\n')
 
     def add(self, name: str, *, opt_kib: int | None = None, start: bool = True) -> Machine:
         address = f"10.42.0.{10 + len(self.machines)}"
-        machine = Machine(self.base, self.directory / name, self._lan, address, self.key, opt_kib=opt_kib)
+        machine = Machine(self.base, self.directory / name, self.lan, address, self.key, opt_kib=opt_kib)
         self.machines[name] = machine
         if start:
             machine.start()
         return machine
 
     def write(
-        self, *, arch: str = "", python: str = PYTHON, user: str = "root", ros: str = "", parallel: int = 8
+        self,
+        *,
+        arch: str = "",
+        python: str = PYTHON,
+        user: str = "root",
+        ros: str = "",
+        jump: str = "",
+        parallel: int = 8,
     ) -> None:
         """The inventory of all machines, with their host keys pinned."""
         robots = "".join(
@@ -91,6 +98,7 @@ class RobotFleet:
                 python=python,
                 user=user,
                 ros=ros,
+                jump=f", jump: {jump}" if jump else "",
             )
             for number, (name, machine) in enumerate(self.machines.items())
         )

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from meshctl.lab.namespaces import CLONE_NEWNET, setns, unshare
 from tests.meshctl.device.servers import PATIENCE_S
 
-OPERATOR = "10.42.0.1"
+OPERATOR = "10.42.0.250"
 # Of a cable's two ends: the longest name the kernel takes is 15 characters.
 _CABLE = "cable{number}"
 
@@ -23,24 +23,30 @@ _CABLE = "cable{number}"
 class Lan:
     """The bridge. `plug_in` gives a new machine's namespace a cable; `close` takes it all down."""
 
-    def __init__(self) -> None:
-        self._namespaces = [_new_namespace()]
+    def __init__(self, operator: str = OPERATOR) -> None:
+        self._namespaces: list[int] = []
+        self._own = _path(self._keep(_new_namespace()))
+        self._cables = 0
         self._run("ip", "link", "set", "lo", "up")
         self._run("ip", "link", "add", "lan", "type", "bridge")
-        self._run("ip", "addr", "add", f"{OPERATOR}/24", "brd", "+", "dev", "lan")
+        self._run("ip", "addr", "add", f"{operator}/24", "brd", "+", "dev", "lan")
         self._run("ip", "link", "set", "lan", "up")
 
     def plug_in(self, address: str) -> str:
         """A new network namespace with this address on its `eth0`; the path to enter it by."""
-        there = _new_namespace()
-        cable = _CABLE.format(number=len(self._namespaces))
-        self._namespaces.append(there)
-        self._run("ip", "link", "add", cable, "type", "veth", "peer", "name", "eth0", "netns", _path(there))
-        self._run("ip", "link", "set", cable, "master", "lan", "up")
+        there = _path(self._keep(_new_namespace()))
         self._run("ip", "link", "set", "lo", "up", at=there)
-        self._run("ip", "addr", "add", f"{address}/24", "brd", "+", "dev", "eth0", at=there)
-        self._run("ip", "link", "set", "eth0", "up", at=there)
-        return _path(there)
+        self.connect(there, address, "eth0")
+        return there
+
+    def connect(self, there: str, address: str, interface: str) -> None:
+        """One more cable, to a namespace that has others."""
+        self._cables += 1
+        cable = _CABLE.format(number=self._cables)
+        self._run("ip", "link", "add", cable, "type", "veth", "peer", "name", interface, "netns", there)
+        self._run("ip", "link", "set", cable, "master", "lan", "up")
+        self._run("ip", "addr", "add", f"{address}/24", "brd", "+", "dev", interface, at=there)
+        self._run("ip", "link", "set", interface, "up", at=there)
 
     @contextmanager
     def inside(self) -> Iterator[None]:
@@ -57,9 +63,12 @@ class Lan:
         while self._namespaces:
             os.close(self._namespaces.pop())
 
-    def _run(self, *words: str, at: int | None = None) -> None:
-        there = _path(self._namespaces[0] if at is None else at)
-        subprocess.run(["nsenter", f"--net={there}", *words], check=True, timeout=PATIENCE_S)
+    def _keep(self, namespace: int) -> int:
+        self._namespaces.append(namespace)
+        return namespace
+
+    def _run(self, *words: str, at: str = "") -> None:
+        subprocess.run(["nsenter", f"--net={at or self._own}", *words], check=True, timeout=PATIENCE_S)
 
 
 def _new_namespace() -> int:

@@ -47,12 +47,13 @@ class Machine:
         self._directory = directory
         self._key = key
         self._opt_kib = opt_kib
-        self._network = lan.plug_in(address)
+        self.network = lan.plug_in(address)
         self._process: subprocess.Popen[bytes] | None = None
         self._cgroup = _cgroup_root() / f"{self.name}-{os.getpid()}-{id(self):x}"
         for name in ("upper", "work", "root"):
             (directory / name).mkdir(parents=True)
         self.write("/etc/hostname", f"{self.name}\n")
+        self.write("/etc/hosts", f"127.0.0.1 localhost\n127.0.1.1 {self.name}\n")
         self.write("/root/.ssh/authorized_keys", key.with_suffix(".pub").read_text())
         host_key = directory / "host_key"
         key_pair(host_key)
@@ -85,7 +86,7 @@ class Machine:
         argv: list[str | Path] = [
             # nothing of it outlives the tests, however they end
             *("setpriv", "--pdeathsig", "KILL", "sh", "-c", enter, "enter", self._cgroup),
-            *("nsenter", f"--net={self._network}", "unshare", *namespaces),
+            *("nsenter", f"--net={self.network}", "unshare", *namespaces),
             *("sh", _BOOT, self._base, self._directory, str(self._opt_kib or ""), sys.base_prefix),
         ]
         self._process = subprocess.Popen(

@@ -1,7 +1,4 @@
-"""Deploy over a real OpenSSH server: install, again, upgrade, failure and the way back, repair, removal.
-
-The service runs under a stand-in for systemctl; everything else is real.
-"""
+"""Deploy over a real OpenSSH server and systemd: install, again, upgrade, failure and the way back, repair, removal."""
 
 from __future__ import annotations
 
@@ -9,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.meshctl.device.servers import eventually
 from tests.meshctl.robots.fleets import RobotFleet
 from tests.meshctl.robots.wheels import own_wheel_with
 
@@ -110,3 +108,39 @@ def test_what_was_changed_by_hand_or_cut_short_is_seen_and_mended(fleet: RobotFl
     assert "husky1: done: removed" in fleet.meshctl("uninstall", "husky1", "--purge")
     assert fleet.shell("husky1", "ls -d /opt/udp-mesh /var/lib/udp-mesh 2>/dev/null || :") == ""
     fleet.shell("husky1", "! id udp-mesh 2>/dev/null")
+
+
+_TALK = """\
+import time
+from udp_mesh.client.mesh_client import MeshClient
+with MeshClient() as mesh:
+    while True:
+        mesh.publish("status", b"here", to="husky1")
+        time.sleep(0.1)
+"""
+
+
+@pytest.mark.proof
+def test_a_release_that_peers_see_and_whose_topics_no_longer_flow_goes_back(
+    fleet: RobotFleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("husky1", "husky2"):
+        fleet.add(name)
+    fleet.write()
+    fleet.deploy()
+    fleet.shell("husky2", f"cat >/root/talk.py <<'END'\n{_TALK}END")
+    there = "PYTHONPATH=/opt/udp-mesh/current/lib $(cat /opt/udp-mesh/current/python) /root/talk.py"
+    fleet.shell("husky2", f"systemd-run --unit talk sh -c 'exec env {there}'")
+
+    def heard() -> int:
+        (status,) = (topic for topic in fleet.status()["husky1"]["topics"] if topic["name"] == "status")
+        return int(status["received_messages"])
+
+    eventually(lambda: heard() > 0)
+    first = fleet.status()["husky1"]["release"]
+    deaf = own_wheel_with(tmp_path, "daemon/service.py", "count.received_messages += 1", "count.received_messages += 0")
+    monkeypatch.setattr("meshctl.robots.wheels.own_wheel", lambda: deaf)
+    told = fleet.deploy("husky1", "--wait", "15", exit_code=1)
+    assert "husky1: rolled back: topics flowed before and receive nothing: status" in told
+    assert fleet.status()["husky1"]["release"] == first
+    eventually(lambda: heard() > 0)

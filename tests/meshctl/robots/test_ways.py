@@ -1,0 +1,49 @@
+"""Ways to a robot: its packages through pip, and itself through its radio."""
+
+from __future__ import annotations
+
+import pytest
+
+from meshctl.device.trust import TrustStore
+from tests.meshctl.robots.fleets import RobotFleet
+from tests.meshctl.robots.lan import Lan
+from tests.meshctl.robots.machine import Machine
+
+pytestmark = [pytest.mark.xdist_group("robots"), pytest.mark.timeout(600)]
+
+
+def test_a_robot_behind_its_radio_gets_packages_that_pip_fetched_once(
+    fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inner = Lan("10.42.1.1")
+    try:
+        # the radio stands in both networks and forwards nothing by itself
+        radio = Machine(fleet.base, fleet.directory / "radio", fleet.lan, "10.42.0.1", fleet.key)
+        inner.connect(radio.network, "10.42.1.2", "eth1")
+        fleet.machines["radio"] = radio
+        radio.start()
+        robot = Machine(fleet.base, fleet.directory / "husky1", inner, "10.42.1.10", fleet.key)
+        fleet.machines["husky1"] = robot
+        with inner.inside():
+            robot.start()
+        del fleet.machines["radio"]
+        fleet.write(jump="base")
+        TrustStore(fleet.directory / "known_hosts").replace("base", radio.host_key)
+        assert not robot.answers, "there is no other way to it"
+
+        monkeypatch.setenv("PIP_NO_INDEX", "1")
+        monkeypatch.setenv("PIP_FIND_LINKS", str(fleet.directory / "nothing"))
+        told = fleet.meshctl("deploy", "--key", str(fleet.key), exit_code=1)
+        assert "pip could not fetch wheels for CPython" in told
+        assert "without internet give the wheels: --wheels DIR" in told
+        monkeypatch.setenv("PIP_FIND_LINKS", str(fleet.wheels))
+        told = fleet.meshctl("deploy", "--key", str(fleet.key))
+        assert "husky1: done: runs " in told
+        # in the field there is neither pip nor its index
+        monkeypatch.setenv("PIP_FIND_LINKS", str(fleet.directory / "nothing"))
+        assert "husky1: unchanged" in fleet.meshctl("deploy", "--key", str(fleet.key))
+        assert "pinned" in fleet.meshctl("trust", "--yes")
+    finally:
+        fleet.stop()
+        radio.stop()
+        inner.close()
