@@ -65,5 +65,9 @@ def topology(
         addresses={node.name: str(node.address.ip) for node in fleet.nodes.values()},
         routing=routing.value,
     )
-    typer.echo(FORMATS["json" if as_json else form.value](picture))
+    drawn = FORMATS["json" if as_json else form.value](picture)
+    if drawn:
+        typer.echo(drawn)
+    if not look.observations:
+        typer.echo("nobody answered: meshctl status says why", err=True)
     raise typer.Exit(ExitCode.OK if look.observations or not nodes else ExitCode.UNREACHABLE)

@@ -44,10 +44,23 @@ def _unasked(status: FleetStatus) -> str:
     return next((alarm.text for alarm in status.alarms if alarm.code == "robots-unasked"), "")
 
 
-def _check(name: str, bad: Iterable[str], good: str) -> Check:
+def _check(name: str, bad: Iterable[str], good: str, asked: tuple[int, int] | None = None) -> Check:
+    """A go with the reason `good` unless something is `bad`. `asked` is how many of how many gave an answer: where
+    nobody did, nothing is known, which is no go."""
     told = list(bad)
+    if asked is not None and not told:
+        answered, count = asked
+        if not answered:
+            return Check(name, False, "nobody answers who could tell")
+        good += f" ({answered} of {count} tell)" if answered < count else ""
     more = f"; and {len(told) - REASONS_SHOWN} more" if len(told) > REASONS_SHOWN else ""
     return Check(name, not told, "; ".join(told[:REASONS_SHOWN]) + more if told else good)
+
+
+def _asked(devices: Sequence[NodeStatus | RobotStatus]) -> tuple[int, int]:
+    """How many answered, of those who are on or should be."""
+    expected = [one for one in devices if one.health is not Health.OFF]
+    return sum(not one.silent_because for one in expected), len(expected)
 
 
 def _plural(count: int, what: str) -> str:
@@ -63,7 +76,7 @@ def _alarm_check(
         devices: Sequence[NodeStatus | RobotStatus] = status.robots if robots else status.nodes
         bad = [_told(one.name, one.alarms, codes) for one in devices]
         everywhere = [alarm.text for alarm in status.alarms if is_fleetwide and alarm.code in codes]
-        return _check(name, [*everywhere, *(text for text in bad if text)], good)
+        return _check(name, [*everywhere, *(text for text in bad if text)], good, _asked(devices))
 
     return check
 
@@ -116,14 +129,13 @@ def _quality(fleet: Fleet, status: FleetStatus) -> Check:
     deployed = [node for node in status.nodes if node.hops and node.quality is not None]
     weak = [f"{n.name}: {n.quality:.0%} to the base" for n in deployed if n.quality and n.quality < WEAK_QUALITY]
     worst = min((node.quality for node in deployed if node.quality is not None), default=None)
-    return _check(
-        "links", weak, "no path to measure" if worst is None else f"every path carries, the weakest {worst:.0%}"
-    )
+    good = "no path to measure" if worst is None else f"every path carries, the weakest {worst:.0%}"
+    return _check("links", weak, good, _asked(status.nodes))
 
 
 def _strangers(fleet: Fleet, status: FleetStatus) -> Check:
     found = [f"{some(status.strangers)} in the mesh"] if status.strangers else []
-    return _check("strangers", found, "nobody else heard")
+    return _check("strangers", found, "nobody else heard", _asked(status.nodes))
 
 
 _CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
@@ -188,7 +200,9 @@ def _urgent_topics(fleet: Fleet, status: FleetStatus) -> Check:
         for topic in robot.topics
         if topic.name in urgent and topic.code == "undeclared"
     ]
-    return _check("urgent topics", bad, f"{some(tuple(urgent))} declared everywhere")
+    daemons = [robot for robot in _crew(status) if robot.facts is not None and robot.facts.answers]
+    asked = (len(daemons), len(_crew(status)))
+    return _check("urgent topics", bad, f"{some(tuple(urgent))} declared everywhere", asked)
 
 
 def _delivery(fleet: Fleet, status: FleetStatus, pings: Pings) -> Check:
@@ -207,7 +221,7 @@ def _delivery(fleet: Fleet, status: FleetStatus, pings: Pings) -> Check:
 
 _ROBOT_CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
     _daemons,
-    _alarm_check("one release", "the same version and configuration on all", "drift", "version", robots=True),
+    _alarm_check("one release", "the same version and configuration", "drift", "version", robots=True),
     _alarm_check("keys", "all open what all seal", "key", "unkeyed", robots=True),
     _alarm_check("ROS bridges", "up where one belongs", "ros-bridge", robots=True),
     _peers,

@@ -85,6 +85,19 @@ def test_a_fleet_without_its_secrets_is_a_no_go_that_names_them(fleet: Fleet) ->
     assert "env:KEY is not set" in found["configuration"].reason
 
 
+def test_what_nobody_could_tell_is_no_go(fleet: Fleet) -> None:
+    status = status_of(fleet, {}, {}, known=KNOWN)
+    found = {check.name: check for check in preflight(fleet, status, Pings())}
+    assert not any(check.is_go for check in found.values() if check.name != "beacons")
+    assert found["radios"].reason == "nobody answers who could tell"
+
+
+def test_how_many_could_tell_is_said_where_some_could_not(fleet: Fleet) -> None:
+    status = status_of(fleet, {name: HEALTHY[name] for name in ("base", "b01")}, known=KNOWN)
+    found = {check.name: check for check in preflight(fleet, status, DELIVERED)}
+    assert found["identity"].reason == "every radio is the one it should be (2 of 3 tell)"
+
+
 def test_a_busy_computer_is_a_note_and_stops_nobody(fleet: Fleet) -> None:
     rover = CREW["rover"]
     busy = replace(rover, computer=replace(rover.computer, load=(40.0, 9.0, 3.0)))
