@@ -145,20 +145,22 @@ def main() -> None:
         radios, robots = map(int, arguments.inside.split(","))
         print(json.dumps(measure(radios, robots)))
         return
-    if arguments.tables:
-        results = [json.loads(line) for line in arguments.results.read_text().splitlines()]
-    else:
+    known = (
+        [json.loads(line) for line in arguments.results.read_text().splitlines()] if arguments.results.exists() else []
+    )
+    results = {(result["radios"], result["robots"]): result for result in known}
+    if not arguments.tables:
         if missing := programs_missing():
             parser.error(f"it needs {', '.join(missing)}")
         machine = {"python": platform.python_version(), "machine": platform.machine(), "cores": os.cpu_count()}
-        results = [
-            {**machine, **in_own_network(radios, arguments.robots)} for radios in map(int, arguments.radios.split(","))
-        ]
-        arguments.results.parent.mkdir(parents=True, exist_ok=True)
-        arguments.results.write_text("".join(json.dumps(result) + "\n" for result in results))
-    first = results[0]
+        for radios in map(int, arguments.radios.split(",")):
+            results[radios, arguments.robots] = {**machine, **in_own_network(radios, arguments.robots)}
+            arguments.results.parent.mkdir(parents=True, exist_ok=True)
+            arguments.results.write_text("".join(json.dumps(result) + "\n" for result in results.values()))
+    rows = [results[key] for key in sorted(results)]
+    first = rows[0]
     print(f"Python {first['python']}, {first['machine']}, {first['cores']} cores for meshctl and all devices\n")
-    print(table(results))
+    print(table(rows))
 
 
 if __name__ == "__main__":
