@@ -1,12 +1,16 @@
 """Time and processor time per node: `meshctl provision` against the same files pushed by ansible-core.
 
-`python -m benchmarks.provisioning [--nodes 10,50,200] [--results FILE]` starts a virtual fleet of each size, takes it
-in, and then changes every node twice: from configuration `a` to `b` by meshctl, and from `b` back to `a` by ansible's
-`raw` and `script` modules (dropbear has no SFTP and the nodes have no Python). Both use as many connections at once,
-and neither waits for one node before the next. What they do is not the same: ansible writes the files, reloads and
-looks that they are there; meshctl also observes first, keeps the previous state under a dead-man's switch, proves the
+`python -m benchmarks.provisioning [--nodes 10,50,200] [--results FILE] [--tables]` starts a virtual fleet of each size,
+takes it in, and then changes every node twice: from configuration `a` to `b` by meshctl, and from `b` back to `a` by
+ansible's `raw` and `script` modules (dropbear has no SFTP and the nodes have no Python). Both use as many connections
+at once, and neither waits for one node before the next. What they do is not the same: ansible writes the files, reloads
+and looks that they are there; meshctl also observes first, keeps the previous state under a dead-man's switch, proves the
 node reachable by a new connection, checks its mesh, and confirms. The nodes run on the same machine, so wall time is
 theirs too; processor time is the tool's own.
+
+It runs unattended: every command has a limit (`LIMIT_S`, `LIMIT_PER_NODE_S`), a size that fails is told and the next
+one begun, and each size is written down as soon as it is measured. It needs ansible-core beside this interpreter (the
+extra `bench`).
 """
 
 from __future__ import annotations
@@ -17,20 +21,26 @@ import json
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from meshctl.errors import MeshctlError
 from meshctl.lab.fleet import VirtualFleet
 from meshctl.render import DeviceFacts
 from tests.meshctl.proof.rig import Rig
 
 RESULTS = Path(__file__).with_name("results") / "provisioning.jsonl"
+ANSIBLE = Path(sys.executable).with_name("ansible-playbook")
 FORKS = 8
+# Several times what either tool took on two cores; beyond it something hangs.
+LIMIT_S, LIMIT_PER_NODE_S = 120.0, 15.0
 PLAYBOOK = """\
 - hosts: all
   gather_facts: false
@@ -41,13 +51,23 @@ PLAYBOOK = """\
 """
 
 
-def ran(command: Sequence[str], environ: Mapping[str, str]) -> dict[str, float]:
-    """Run to its end; seconds of wall and processor time, of the process and all that it waited for."""
+def ran(command: Sequence[str], environ: Mapping[str, str], limit_s: float) -> dict[str, float]:
+    """Run to its end; seconds of wall and processor time, of the process and all that it waited for.
+
+    Raises RuntimeError when it fails, or has not ended after `limit_s`.
+    """
     began = time.monotonic()
     with tempfile.TemporaryFile() as output:
         process = subprocess.Popen(command, env=dict(environ), stdin=subprocess.DEVNULL, stdout=output, stderr=output)
-        _, status, used = os.wait4(process.pid, 0)
+        limit = threading.Timer(limit_s, process.kill)
+        limit.start()
+        try:
+            _, status, used = os.wait4(process.pid, 0)
+        finally:
+            limit.cancel()
         process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode == -signal.SIGKILL:
+            raise RuntimeError(f"{command[0]} had not ended after {limit_s:.0f} s")
         if process.returncode:
             output.seek(0)
             raise RuntimeError(f"{command[0]} ended with {process.returncode}:\n{output.read().decode()[-3000:]}")
@@ -56,7 +76,11 @@ def ran(command: Sequence[str], environ: Mapping[str, str]) -> dict[str, float]:
 
 def by_meshctl(rig: Rig, variant: str) -> dict[str, float]:
     command = [sys.executable, "-m", "meshctl", "provision", "--yes", "--json", "-i", str(rig.inventory(variant))]
-    return ran([*command, "--key", str(rig.directory / "key")], rig.environ)
+    return ran([*command, "--key", str(rig.directory / "key")], rig.environ, limit_s(rig))
+
+
+def limit_s(rig: Rig) -> float:
+    return LIMIT_S + LIMIT_PER_NODE_S * (rig.count + 1)
 
 
 def by_ansible(rig: Rig, variant: str) -> dict[str, float]:
@@ -88,9 +112,8 @@ def by_ansible(rig: Rig, variant: str) -> dict[str, float]:
         "ANSIBLE_HOME": str(place / "home"),
         "LC_ALL": "C.UTF-8",
     }
-    program = Path(sys.executable).with_name("ansible-playbook")
-    command = [str(program), "-i", str(place / "hosts.json"), "--forks", str(FORKS), str(place / "play.yaml")]
-    return ran(command, environ)
+    command = [str(ANSIBLE), "-i", str(place / "hosts.json"), "--forks", str(FORKS), str(place / "play.yaml")]
+    return ran(command, environ, limit_s(rig))
 
 
 def script(files: Mapping[str, bytes]) -> str:
@@ -145,20 +168,38 @@ def table(results: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.provisioning", description=__doc__)
     parser.add_argument("--nodes", default="10,50,200")
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--tables", action="store_true", help="only print the table of what was measured")
     arguments = parser.parse_args()
-    results = []
+    if arguments.tables:
+        print(table(recorded(arguments.results)))
+        return 0
+    if not ANSIBLE.exists():
+        parser.error(f"{ANSIBLE} is not there: install the extra `bench` beside this interpreter")
+    failed = 0
     for count in map(int, arguments.nodes.split(",")):
-        results.append(measure(count))
+        try:
+            result = measure(count)
+        except (RuntimeError, MeshctlError, subprocess.TimeoutExpired) as error:
+            failed += 1
+            print(f"{count} nodes: {error}", file=sys.stderr, flush=True)
+            continue
         arguments.results.parent.mkdir(parents=True, exist_ok=True)
         with arguments.results.open("a") as file:
-            file.write(json.dumps(results[-1]) + "\n")
-        print(table(results[-1:]), flush=True)
-    print(table(results))
+            file.write(json.dumps(result) + "\n")
+        print(table([result]), flush=True)
+    print(table(recorded(arguments.results)))
+    return 1 if failed else 0
+
+
+def recorded(path: Path) -> list[dict[str, Any]]:
+    """The latest measurement of each size."""
+    lines = path.read_text().splitlines() if path.exists() else []
+    return list({result["nodes"]: result for result in map(json.loads, lines)}.values())
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -212,7 +212,7 @@ def _paced(data: bytes, rate_bytes_per_s: float, sleep: Callable[[float], None])
 # A leftover writer may have added to the end; where bytes are missing instead, the hash tells.
 #
 # sync is the whole machine's, on purpose: `sync FILE` needs busybox's FEATURE_SYNC_FANCY, which OpenWrt leaves out, and
-# `fsync FILE` secures the content but not the rename. A radio has little else that is unwritten: its logs are in memory.
+# `fsync FILE` secures the content but not the rename. A radio has little else that is unwritten: logs are in memory.
 _FINISH = """\
 p={partial} t={target}
 dd if=/dev/null of="$p" bs=1 seek={size} 2>/dev/null || exit 1

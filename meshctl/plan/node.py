@@ -7,19 +7,19 @@ that differ, what their reload cuts, and what would part the node from its mesh.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from meshctl.device.observation import Observation
-from meshctl.model import Node
-from meshctl.plan.cell import cells, split_differences
+from meshctl.model import Node, Release
+from meshctl.plan.cell import Cell, cells, split_differences
 from meshctl.plan.effects import effects
 from meshctl.plan.firmware import firmware_step
 from meshctl.plan.masking import Fingerprints, masked_text, secrets_of
 from meshctl.plan.objections import objection
 from meshctl.plan.packages import NO_NEEDS, Needs, package_step
 from meshctl.plan.seen import file_info, fingerprint_texts, is_meshed, packages_seen, parsed, text_of
-from meshctl.plan.values import Cut, Effect, FileChange, NodePlan, Verdict
+from meshctl.plan.values import Cut, Effect, FileChange, FirmwareStep, NodePlan, Verdict
 from meshctl.render import MARKER_PATH, RenderedFile
 from meshctl.uci import Package
 
@@ -61,7 +61,8 @@ def node_plan(
     after = {file.package.name: file.package for file in wanted.files if file.package is not None}
     live = cells(before.get("wireless"), before.get("network"))
     old_secrets = (secret for package in before.values() if package is not None for secret in secrets_of(package))
-    split = split_differences(live, cells(after.get("wireless"), after.get("network")))
+    live_after = cells(after.get("wireless"), after.get("network"))
+    split = split_differences(live, live_after)
     basis = NodePlan(
         node.name,
         Verdict.SAME,
@@ -88,8 +89,20 @@ def node_plan(
         packages=packages,
         files=files,
         effects=told,
-        notes=seen.notes,
+        notes=(*seen.notes, *_cautions(wanted, live_after, firmware)),
     )
+
+
+def _cautions(wanted: Wanted, cells_to_come: Mapping[str, Cell], firmware: FirmwareStep | None) -> tuple[str, ...]:
+    """What may go wrong although nothing forbids it."""
+    is_adhoc = any(cell.mode == "adhoc" for cell in cells_to_come.values())
+    if wanted.node.release < Release.V25_12 or not is_adhoc:
+        return ()
+    # their scripts take `mcast_rate` for a list (docs/facts/openwrt-checked.md); without it broadcasts go at 1 Mbit/s
+    caution = "some 25.12 builds join no ad-hoc cell with a multicast rate (MC334)"
+    if firmware is None:
+        return (f"{caution}: if this is one, the node goes back by itself",)
+    return (f"{caution}, and a flash is not undone: flash one node on the bench first",)
 
 
 def file_changes(files: Sequence[RenderedFile], seen: Observation) -> tuple[FileChange, ...]:

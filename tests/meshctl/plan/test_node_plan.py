@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 
 from meshctl.device.observation import BoardInfo, ChangeStatus, ReleaseInfo
-from meshctl.plan import Cut, Verdict
+from meshctl.model import Release
+from meshctl.plan import Cut, Verdict, node_plan
 from meshctl.plan.masking import Fingerprints
-from tests.meshctl.plan.support import PASS_PHRASE, factory, fleet, planned, running, wanted
+from tests.meshctl.plan.support import FINGERPRINTS, PASS_PHRASE, factory, fleet, planned, running, wanted
 
 
 def test_a_node_that_runs_what_is_wanted_has_nothing_to_do() -> None:
@@ -139,3 +140,16 @@ def test_a_fingerprint_depends_on_the_files_and_the_salt_and_not_on_order() -> N
     assert one.of({"a": "1", "b": "2"}) != one.of({"a": "12", "b": ""})
     assert one.of({"a": "1"}) != Fingerprints(b"pepper").of({"a": "1"})
     assert one.of({"a": "key x"}, ["x"]) != one.of({"a": "key y"}, ["y"])
+
+
+def test_an_ad_hoc_cell_on_25_12_is_planned_with_a_word_of_caution() -> None:
+    team = fleet()
+    node = team.nodes["b01"]
+    new = replace(node, hardware=replace(node.hardware, release=Release.V25_12))
+    seen = replace(factory(team, "b01"), release=ReleaseInfo("OpenWrt", "25.12.0", "r1", "ath79/generic"))
+    plan = node_plan(replace(wanted(team, "b01"), node=new), seen, FINGERPRINTS)
+    assert plan.notes == (
+        "some 25.12 builds join no ad-hoc cell with a multicast rate (MC334): if this is one, "
+        "the node goes back by itself",
+    )
+    assert planned(team, "b01", factory(team, "b01")).notes == ()
