@@ -5,8 +5,8 @@ takes it in, and then changes every node twice: from configuration `a` to `b` by
 ansible's `raw` and `script` modules (dropbear has no SFTP and the nodes have no Python). Both use as many connections
 at once, and neither waits for one node before the next. What they do is not the same: ansible writes the files, reloads
 and looks that they are there; meshctl also observes first, keeps the previous state under a dead-man's switch, proves
-the node reachable by a new connection, checks its mesh, and confirms. The nodes run on the same machine, so wall time is
-theirs too; processor time is the tool's own.
+the node reachable by a new connection, checks its mesh, and confirms. The nodes run on the same machine, so wall time
+is theirs too; processor time is the tool's own.
 
 It runs unattended: every command has a limit (`LIMIT_S`, `LIMIT_PER_NODE_S`), a size that fails is told and the next
 one begun, and each size is written down as soon as it is measured. It needs ansible-core beside this interpreter (the

@@ -70,7 +70,7 @@ def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
         setting.observer,
         setting.interrupt,
         setting.owner,
-        remember=lambda name, seen: setting.journal.remember(fleet.name, name, facts_of(seen), seen.answered_at_s),
+        remember=lambda name, seen: setting.run.remember(fleet.name, name, facts_of(seen), seen.answered_at_s),
         rate_bytes_per_s=setting.rate_bytes_per_s,
     )
     outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _without_work(fleet, made))}

@@ -12,9 +12,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 from meshctl.apply.access import Access
-from meshctl.apply.gather import Seen, facts_of, gather
+from meshctl.apply.gather import Seen, facts_of, gather, known_macs
 from meshctl.apply.wanted import Renderer
-from meshctl.apply.whereabouts import whereabouts
+from meshctl.apply.whereabouts import WITNESSES, whereabouts
 from meshctl.device.observation import Observation
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
@@ -78,7 +78,9 @@ def prepare(
     _remember(journal, fleet, seen)
     decided = choices or Choices()
     single = _node_plans(renderer, first, seen, salt=salt, owner=owner, choices=decided)
-    rest = _rest_of_their_meshes(fleet, single.plans.values())
+    rest = _rest_of_their_meshes(fleet, single.plans.values()) or _witnesses(
+        fleet, single.plans.values(), journal.last_known(fleet.name)
+    )
     if rest and not (interrupt is not None and interrupt.stopping):
         around = gather(access, rest, parallel=fleet.apply.parallel, interrupt=interrupt, observer=observer)
         _remember(journal, fleet, around)
@@ -103,6 +105,23 @@ def _rest_of_their_meshes(fleet: Fleet, plans: Iterable[NodePlan]) -> tuple[Node
     }
     members = {node.name: node for mesh in sorted(meshes) for node in fleet.members(mesh)}
     return tuple(node for name, node in members.items() if name not in planned and node.state is NodeState.DEPLOYED)
+
+
+def _witnesses(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[str, LastKnown]) -> tuple[Node, ...]:
+    """Who may tell of those that do not answer: the neighbours they had when they were last seen, and the base."""
+    chosen = {plan.node: plan for plan in plans}
+    macs = known_macs(fleet, known)
+    away = [name for name, plan in chosen.items() if plan.verdict is Verdict.AWAY]
+    near = [
+        macs[mac]
+        for name in away
+        if name in known
+        for mac in known[name].facts.get("neighbours", "").split()
+        if mac in macs
+    ]
+    base = [fleet.base_node.name] if away and fleet.base_node is not None else []
+    names = [name for name in dict.fromkeys((*near, *base)) if name not in chosen]
+    return tuple(fleet.nodes[name] for name in names[:WITNESSES])
 
 
 def _plans_around(renderer: Renderer, around: Seen, salt: bytes, owner: str) -> dict[str, NodePlan]:

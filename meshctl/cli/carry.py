@@ -146,6 +146,8 @@ def carry_out_plan(
             outcomes = carry_out(prepared, setting)
     finally:
         run.end(str(totals(outcomes.values())) if outcomes else "could not run")
+    if run.trouble:
+        typer.echo(f"the journal is incomplete: {run.trouble}", err=True)
     _sum_up(outcomes, run.id, as_json=as_json)
     raise typer.Exit(exit_for(outcomes.values(), opened.interrupt))
 

@@ -16,7 +16,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -154,6 +154,10 @@ class Journal:
                     raise
                 self._database.execute("COMMIT")
             except sqlite3.Error as error:
+                # a COMMIT that found the disk full may have left its transaction open
+                if self._database.in_transaction:
+                    with suppress(sqlite3.Error):
+                        self._database.execute("ROLLBACK")
                 raise MeshctlError(f"{self.path}: cannot write the journal: {error}") from error
 
     def __enter__(self) -> Journal:
@@ -240,17 +244,35 @@ class Journal:
 
 
 class Run:
-    """One run being written. Steps and outcomes may come from several threads."""
+    """One run being written. Steps and outcomes may come from several threads.
+
+    A journal that cannot be written any more (a full disk) stops no work on nodes: a change that is armed has to be
+    confirmed. `trouble` is the first thing that could not be written; what is missing counts as not done to a resume.
+    """
 
     def __init__(self, journal: Journal, run_id: int) -> None:
         self._journal = journal
         self.id = run_id
+        self.trouble = ""
+
+    @contextmanager
+    def _tolerant(self) -> Iterator[None]:
+        try:
+            yield
+        except MeshctlError as error:
+            self.trouble = self.trouble or str(error)
+
+    def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
+        """Keep what a node told in the course of this run."""
+        with self._tolerant():
+            self._journal.remember(fleet, node, facts, seen_s)
 
     @contextmanager
     def step(self, node: str, name: str) -> Iterator[None]:
         """Record a step and how long it took; a step without an end was cut short by our own death."""
         began_s, clock = time.time(), time.monotonic()
-        with self._journal._write() as database:
+        row: int | None = None
+        with self._tolerant(), self._journal._write() as database:
             row = database.execute(
                 "INSERT INTO steps (run, node, step, began_s) VALUES (?, ?, ?, ?)", (self.id, node, name, began_s)
             ).lastrowid
@@ -261,14 +283,14 @@ class Run:
             result = f"failed: {error}" if isinstance(error, MeshctlError) else f"failed: {type(error).__name__}"
             raise
         finally:
-            with self._journal._write() as database:
+            with self._tolerant(), self._journal._write() as database:
                 database.execute(
                     "UPDATE steps SET duration_s = ?, result = ? WHERE id = ?",
                     (round(time.monotonic() - clock, 3), result, row),
                 )
 
     def finish_node(self, outcome: Outcome) -> None:
-        with self._journal._write() as database:
+        with self._tolerant(), self._journal._write() as database:
             database.execute(
                 "INSERT INTO outcomes (run, node, result, reason, began_s, duration_s, facts)"
                 " VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7) ON CONFLICT (run, node)"
@@ -285,7 +307,7 @@ class Run:
             )
 
     def end(self, result: str) -> None:
-        with self._journal._write() as database:
+        with self._tolerant(), self._journal._write() as database:
             database.execute("UPDATE runs SET ended_s = ?, result = ? WHERE id = ?", (time.time(), result, self.id))
 
 

@@ -119,3 +119,17 @@ def test_our_own_process_lives_and_a_later_one_with_the_same_pid_is_another() ->
     assert process_lives(own)
     assert not process_lives(own + "1")
     assert process_lives("elsewhere:1:1")
+
+
+def test_a_journal_that_cannot_be_written_any_more_stops_no_work_and_is_told(path: Path) -> None:
+    with Journal(path) as journal:
+        run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
+        journal._database.execute("PRAGMA query_only = ON")
+        with run.step("a", "arm"):
+            pass
+        run.remember("f", "a", {"boot_id": "1"}, 5.0)
+        run.finish_node(Outcome("a", Result.DONE))
+        run.end("1 done")
+        assert "cannot write the journal" in run.trouble
+        # a resume looks at the node again
+        assert journal.unfinished(run.id) == ("a",)
