@@ -243,18 +243,18 @@ def _seconds(value: float | None) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.discovery", description=__doc__)
-    parser.add_argument("--nodes", default="2,10,50,200,1000")
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--nodes", default="2,10,50,200,1000", help="sizes (1,000 take some gigabytes and tens of minutes)")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="sizes that are there already are not run again")
     arguments = parser.parse_args()
-    results = []
     arguments.results.parent.mkdir(parents=True, exist_ok=True)
-    with arguments.results.open("w") as file:
-        for word in arguments.nodes.split(","):
-            results.append(measure(int(word)))
-            file.write(json.dumps(results[-1]) + "\n")
-            file.flush()
-            print(table(results).splitlines()[-1], f"{results[-1]['processor_s']:.0f} s of processor", flush=True)
-    print(table(results))
+    kept = arguments.results.read_text().splitlines() if arguments.results.exists() else []
+    results = {one["nodes"]: one for one in map(json.loads, kept)}
+    for word in arguments.nodes.split(","):
+        if int(word) not in results:
+            results[int(word)] = one = measure(int(word))
+            with arguments.results.open("a") as file:
+                file.write(json.dumps(one) + "\n")
+    print(table([one for _, one in sorted(results.items())]))
 
 
 if __name__ == "__main__":
