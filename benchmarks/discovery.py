@@ -243,7 +243,9 @@ def _seconds(value: float | None) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.discovery", description=__doc__)
-    parser.add_argument("--nodes", default="2,10,50,200,1000", help="sizes (1,000 take some gigabytes and tens of minutes)")
+    parser.add_argument(
+        "--nodes", default="2,10,50,200,1000", help="sizes; 1,000 take some gigabytes and tens of minutes"
+    )
     parser.add_argument("--results", type=Path, default=RESULTS, help="sizes that are there already are not run again")
     arguments = parser.parse_args()
     arguments.results.parent.mkdir(parents=True, exist_ok=True)
