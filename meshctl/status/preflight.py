@@ -63,20 +63,27 @@ def _asked(devices: Sequence[NodeStatus | RobotStatus]) -> tuple[int, int]:
     return sum(not one.silent_because for one in expected), len(expected)
 
 
+def _asked_daemons(status: FleetStatus) -> tuple[int, int]:
+    """How many daemons answered, of those that take part."""
+    crew = _crew(status)
+    return sum(robot.facts is not None and robot.facts.answers for robot in crew), len(crew)
+
+
 def _plural(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def _alarm_check(
-    name: str, good: str, *codes: str, robots: bool = False, is_fleetwide: bool = False
+    name: str, good: str, *codes: str, robots: bool = False, daemons: bool = False, is_fleetwide: bool = False
 ) -> Callable[[Fleet, FleetStatus], Check]:
-    """A check that nobody has one of these alarms."""
+    """A check that nobody has one of these alarms; `daemons` when only a robot's daemon could tell."""
 
     def check(fleet: Fleet, status: FleetStatus) -> Check:
-        devices: Sequence[NodeStatus | RobotStatus] = status.robots if robots else status.nodes
+        devices: Sequence[NodeStatus | RobotStatus] = status.robots if robots or daemons else status.nodes
+        asked = _asked_daemons(status) if daemons else _asked(devices)
         bad = [_told(one.name, one.alarms, codes) for one in devices]
         everywhere = [alarm.text for alarm in status.alarms if is_fleetwide and alarm.code in codes]
-        return _check(name, [*everywhere, *(text for text in bad if text)], good, _asked(devices))
+        return _check(name, [*everywhere, *(text for text in bad if text)], good, asked)
 
     return check
 
@@ -200,9 +207,7 @@ def _urgent_topics(fleet: Fleet, status: FleetStatus) -> Check:
         for topic in robot.topics
         if topic.name in urgent and topic.code == "undeclared"
     ]
-    daemons = [robot for robot in _crew(status) if robot.facts is not None and robot.facts.answers]
-    asked = (len(daemons), len(_crew(status)))
-    return _check("urgent topics", bad, f"{some(tuple(urgent))} declared everywhere", asked)
+    return _check("urgent topics", bad, f"{some(tuple(urgent))} declared everywhere", _asked_daemons(status))
 
 
 def _delivery(fleet: Fleet, status: FleetStatus, pings: Pings) -> Check:
@@ -222,11 +227,11 @@ def _delivery(fleet: Fleet, status: FleetStatus, pings: Pings) -> Check:
 _ROBOT_CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
     _daemons,
     _alarm_check("one release", "the same version and configuration", "drift", "version", robots=True),
-    _alarm_check("keys", "all open what all seal", "key", "unkeyed", robots=True),
+    _alarm_check("keys", "all open what all seal", "key", "unkeyed", daemons=True),
     _alarm_check("ROS bridges", "up where one belongs", "ros-bridge", robots=True),
     _peers,
     _urgent_topics,
-    _alarm_check("queues", "no urgent message waits", "urgent-queue", "restarts", robots=True),
-    _alarm_check("topics", "every topic flows", "topic-undeclared", "topic-silent", "topic-not-arriving", robots=True),
+    _alarm_check("queues", "no urgent message waits", "urgent-queue", "restarts", daemons=True),
+    _alarm_check("topics", "every topic flows", "topic-undeclared", "topic-silent", "topic-not-arriving", daemons=True),
     _alarm_check("computers", "disk, memory and clock allow it", "disk", "memory", "clock", robots=True),
 )

@@ -153,9 +153,8 @@ def preflight_text(checks: Iterable[Check], width: int | None = None, paint: Pai
     for check in listed:
         word, style = ("go   ", "ok") if check.is_go else ("NO-GO", "error")
         lead = f"{word}  {check.name.ljust(room)} "
-        parts = (
-            [check.reason] if width is None else textwrap.wrap(check.reason, max(width, _LEAST_WIDTH) - len(lead) - 1)
-        )
+        room_left = None if width is None else max(width, _LEAST_WIDTH) - len(lead) - 1
+        parts = [check.reason] if room_left is None else textwrap.wrap(check.reason, room_left, break_on_hyphens=False)
         for index, part in enumerate(parts or [""]):
             lines.append(f"{paint(word, style)}{lead[5:]} {part}" if index == 0 else f"{' ' * len(lead)} {part}")
     verdict = ("GO", "ok") if all(check.is_go for check in listed) else ("NO-GO", "error")
