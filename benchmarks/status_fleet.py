@@ -3,8 +3,8 @@
 In a network namespace of its own, the server holds the addresses of all radios and robots. A radio's answer to the
 observation is that of a recorded node (`tests/meshctl/device/recorded`), with its own MACs, four neighbours, a path to
 every other radio in its originator table, and the files that the inventory wants of it. A robot runs meshctl's own
-script in a real shell, and finds stand-ins for `udp-mesh` and `systemctl` that print what a daemon of a team of that
-size prints.
+script in a real shell, and finds stand-ins for `systemctl` and for the daemon that tell what those of a team of that
+size tell.
 """
 
 from __future__ import annotations
@@ -62,9 +62,13 @@ set -- $SSH_CONNECTION
 exec sed "s/^NONCE /${{first#N=}} /" "{root}/answers/$3"
 """
 _DAEMON = """#!/bin/sh
-# Stand-in for udp-mesh: prints what a daemon prints, by the address that was called.
-set -- "$1" $SSH_CONNECTION
-exec cat "/opt/stand-in/$4.$1.json"
+# Stand-in for the release's Python asking the daemon: what it would tell, by the address that was called.
+set -- $SSH_CONNECTION
+for word in status topics; do
+	echo "== $word"
+	cat "/opt/stand-in/$3.$word.json"
+	echo
+done
 """
 _SYSTEMCTL = """#!/bin/sh
 # Stand-in for systemctl show: a unit that is up.
@@ -173,9 +177,10 @@ class Devices:
         release = root / "opt/udp-mesh/releases/one"
         (root / "opt/udp-mesh/current").symlink_to("releases/one")
         (release / "wheels").write_text(f"{'0' * 64}  stand-in.whl\n")
+        (release / "python").write_text(f"{root}/bin/python\n")
         (release / "manifest").write_text(f"{'0' * 64}  etc/udp-mesh.toml\n")
         programs = {
-            release / "bin/udp-mesh": _DAEMON,
+            root / "bin/python": _DAEMON,
             root / "bin/systemctl": _SYSTEMCTL,
             root / "bin/radio": _RADIO.format(root=root),
         }
