@@ -89,6 +89,7 @@ def _decide(opened: Session, item: Shown, *, may_replace: bool, yes: bool, quiet
         if not typer.confirm("  Is this what the node itself shows?"):
             return False
     opened.trust.replace(name, item.key)
+    say(f"{line}: pinned now")
     return True
 
 
