@@ -1,8 +1,8 @@
 """From what nodes tell about their neighbours to one graph of the mesh.
 
-Each node that answered gives a `Report` (its own mesh MACs, whom it hears); `neighbours_of` turns the MACs a report
-hears into nodes, each once; `observed_graph` makes both directions of a link into one; `seen_by` tells who still hears a
-node that does not answer.
+Each node that answered gives a `Report` (its own mesh MACs, whom it hears); `neighbours_of` turns the MACs it hears into
+nodes, each once; `observed_graph` makes both directions of a link into one; `seen_by` tells who still hears a node that
+does not answer.
 """
 
 from __future__ import annotations
@@ -51,9 +51,7 @@ def names_by_mac(reports: Iterable[Report], known_macs: Mapping[str, str]) -> di
     return names
 
 
-def neighbours_of(
-    report: Report, names: Mapping[str, str], *, fresh_ms: int = NEIGHBOUR_FRESH_MS
-) -> dict[str, Heard]:
+def neighbours_of(report: Report, names: Mapping[str, str], *, fresh_ms: int = NEIGHBOUR_FRESH_MS) -> dict[str, Heard]:
     """Whom a node hears now: neighbour -> the best of that neighbour's radios, for it carries the traffic.
 
     `names` maps lower-case MACs to nodes; a MAC that nobody owns stands for itself. Neighbours not heard for longer
