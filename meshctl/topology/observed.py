@@ -1,8 +1,8 @@
 """From what nodes tell about their neighbours to one graph of the mesh.
 
-Each node that answered gives a `Report` (its own mesh MACs, whom it hears); `neighbours_of` turns the MACs it hears into
-nodes, each once; `observed_graph` makes both directions of a link into one; `seen_by` tells who still hears a node that
-does not answer.
+Each node that answered gives a `Report` (its own mesh MACs, whom it hears); `neighbours_of` turns the MACs it hears
+into nodes, each once; `observed_graph` makes both directions of a link into one; `seen_by` tells who still hears a node
+that does not answer.
 """
 
 from __future__ import annotations
