@@ -160,7 +160,7 @@ def uninstall_command(
 
 
 @app.command("trust")
-@with_crew("robots", "inventory")
+@with_crew("robots", "inventory", "key")
 def trust_command(
     crew: Crew,
     change: Annotated[bool, typer.Option("--replace", help="Also take keys that differ from the pinned ones.")] = False,
@@ -181,7 +181,7 @@ def _trusted(crew: Crew, robot: str, *, change: bool, yes: bool) -> bool:
     try:
         shown = crew.reach.shown_key(robot)
     except NodeError as error:
-        typer.echo(f"{robot}: {error}")
+        typer.echo(f"{robot}: {error}" + (f"\n  hint: {error.hint}" if error.hint else ""))
         return False
     assert shown is not None, "a completed handshake has shown a key"
     pinned = crew.opened.trust.pinned(name)

@@ -96,7 +96,9 @@ class Reach:
             with self._connected(robot, Credentials(use_agent=False), recorder):
                 return recorder.key
         except AuthenticationRefused:
-            # expected: what was asked for has come before
+            # expected of the computer, which has shown its key before; the radio on the way must let us in
+            if recorder.key is None:
+                raise
             return recorder.key
 
     def _path(self, text: str) -> Path:
