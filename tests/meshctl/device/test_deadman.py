@@ -454,7 +454,7 @@ ABSENT = """
 """
 
 
-@pytest.mark.parametrize("name", ["deadman.sh", "observe.sh", "deadman.init"])
+@pytest.mark.parametrize("name", ["deadman.sh", "observe.sh", "deadman.init", "packages.sh"])
 def test_the_scripts_use_no_tool_that_openwrt_leaves_out(name: str) -> None:
     code = re.sub(r"^\s*#.*$", "", script(name), flags=re.MULTILINE)
     called = set(
