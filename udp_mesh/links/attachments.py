@@ -40,8 +40,8 @@ class LinkWish:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """One socket's place: bound to `device`, at `address`. `broadcast` is the address that reaches everybody, None where
-    neighbours are fixed."""
+    """One socket's place: bound to `device`, at `address`; with fixed neighbours nothing reaches all, `broadcast` is
+    None."""
 
     name: str
     device: str
