@@ -1,4 +1,4 @@
-"""Status and preflight over robots whose computers, systemd and daemons are real (tests/meshctl/robots)."""
+"""`meshctl status` and `preflight` over robots whose computers, systemd and daemons are real."""
 
 from __future__ import annotations
 
@@ -9,10 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from meshctl.cli.main import build
-from tests.meshctl.robots.conftest import base, fleet, wheels
 from tests.meshctl.robots.fleets import RobotFleet
-
-__all__ = ["base", "fleet", "wheels"]
 
 pytestmark = [pytest.mark.xdist_group("robots"), pytest.mark.timeout(600)]
 
