@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -24,15 +25,39 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return repack(tmp_path_factory.mktemp("wheels"))
 
 
+@pytest.fixture(scope="session")
+def seed(base: Path, wheels: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a deploy leaves of its packages, made by one."""
+    directory = tmp_path_factory.mktemp("seed")
+    with pytest.MonkeyPatch.context() as patch, _running(base, wheels, directory, patch) as fleet:
+        fleet.add("husky1", fresh=True)
+        fleet.write()
+        fleet.deploy()
+        fleet.shell("husky1", "cd /opt/udp-mesh && systemctl stop udp-mesh && rm -rf releases current .lock")
+    kept = directory / "husky1/upper/opt/udp-mesh"
+    (directory / "kept/opt").mkdir(parents=True)
+    kept.rename(directory / "kept/opt/udp-mesh")
+    return directory / "kept"
+
+
 @pytest.fixture
-def fleet(base: Path, wheels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RobotFleet]:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    monkeypatch.delenv("SSH_AUTH_SOCK", raising=False)
-    monkeypatch.delenv("MESHCTL_INVENTORY", raising=False)
-    monkeypatch.delenv("MESHCTL_SUDO_PASSWORD", raising=False)
+def fleet(
+    base: Path, wheels: Path, seed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[RobotFleet]:
+    with _running(base, wheels, tmp_path, monkeypatch, seed) as running:
+        yield running
+
+
+@contextmanager
+def _running(
+    base: Path, wheels: Path, directory: Path, patch: pytest.MonkeyPatch, seed: Path | None = None
+) -> Iterator[RobotFleet]:
+    patch.setenv("XDG_CACHE_HOME", str(directory / "cache"))
+    patch.setenv("XDG_STATE_HOME", str(directory / "state"))
+    for name in ("SSH_AUTH_SOCK", "MESHCTL_INVENTORY", "MESHCTL_SUDO_PASSWORD"):
+        patch.delenv(name, raising=False)
     lan = Lan()
-    running = RobotFleet(tmp_path, wheels, base, lan)
+    running = RobotFleet(directory, wheels, base, lan, seed)
     try:
         with lan.inside():
             yield running

@@ -60,19 +60,23 @@ _ROBOT = """\
 class RobotFleet:
     """`add` robots, then `write` the inventory, then run meshctl's commands on it."""
 
-    def __init__(self, directory: Path, wheels: Path, base: Path, lan: Lan) -> None:
+    def __init__(self, directory: Path, wheels: Path, base: Path, lan: Lan, seed: Path | None = None) -> None:
+        """`seed` is what lies over Debian on robots that are not fresh."""
         self.directory = directory
         self.wheels = wheels
         self.key = key_pair(directory / "operator")
         self.file = directory / "fleet.yaml"
         self.machines: dict[str, Machine] = {}
         self.base = base
+        self.seed = seed
         self.lan = lan
         (directory / "keys.yaml").write_text(f'old: "{OLD_KEY}"\nnew: "{NEW_KEY}"\n')
 
-    def add(self, name: str, *, opt_kib: int | None = None, start: bool = True) -> Machine:
+    def add(self, name: str, *, opt_kib: int | None = None, start: bool = True, fresh: bool = False) -> Machine:
+        """A robot that had an earlier release, so that packages need not travel and be compiled; or a `fresh` one."""
         address = f"10.42.0.{10 + len(self.machines)}"
-        machine = Machine(self.base, self.directory / name, self.lan, address, self.key, opt_kib=opt_kib)
+        seed = None if fresh or opt_kib else self.seed
+        machine = Machine(self.base, self.directory / name, self.lan, address, self.key, opt_kib=opt_kib, seed=seed)
         self.machines[name] = machine
         if start:
             machine.start()

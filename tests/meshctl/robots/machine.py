@@ -36,14 +36,24 @@ def debian() -> Path:
 
 
 class Machine:
-    """One computer: `root` of the operator's key logs in at `address`. `opt_kib` gives /opt a small disk of its own."""
+    """One computer: `root` of the operator's key logs in at `address`. `opt_kib` gives /opt a small disk of its own;
+    what is in `seed` lies over the Debian in `base`."""
 
     def __init__(
-        self, base: Path, directory: Path, lan: Lan, address: str, key: Path, *, opt_kib: int | None = None
+        self,
+        base: Path,
+        directory: Path,
+        lan: Lan,
+        address: str,
+        key: Path,
+        *,
+        opt_kib: int | None = None,
+        seed: Path | None = None,
     ) -> None:
         self.name = directory.name
         self.address = address
         self._base = base
+        self._lower = str(base) if seed is None else f"{seed}:{base}"
         self._directory = directory
         self._key = key
         self._opt_kib = opt_kib
@@ -87,7 +97,7 @@ class Machine:
             # nothing of it outlives the tests, however they end
             *("setpriv", "--pdeathsig", "KILL", "sh", "-c", enter, "enter", self._cgroup),
             *("nsenter", f"--net={self.network}", "unshare", *namespaces),
-            *("sh", _BOOT, self._base, self._directory, str(self._opt_kib or ""), sys.base_prefix),
+            *("sh", _BOOT, self._lower, self._directory, str(self._opt_kib or ""), sys.base_prefix),
         ]
         self._process = subprocess.Popen(
             argv,

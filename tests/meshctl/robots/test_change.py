@@ -10,7 +10,8 @@ from meshctl.inventory import load_fleet
 from tests.meshctl.device.servers import eventually
 from tests.meshctl.robots.fleets import RobotFleet
 
-pytestmark = [pytest.mark.xdist_group("robots"), pytest.mark.timeout(600)]
+# the first one may have to wait until the machines are built
+pytestmark = pytest.mark.timeout(600)
 
 
 def _boots(fleet: RobotFleet) -> dict[str, str]:

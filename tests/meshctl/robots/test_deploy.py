@@ -10,7 +10,8 @@ from tests.meshctl.device.servers import eventually
 from tests.meshctl.robots.fleets import RobotFleet
 from tests.meshctl.robots.wheels import own_wheel_with
 
-pytestmark = [pytest.mark.xdist_group("robots"), pytest.mark.timeout(600)]
+# the first one may have to wait until the machines are built
+pytestmark = pytest.mark.timeout(600)
 
 # What a second deploy must leave as it is: every file with its time, and the process.
 _EVERYTHING = (
@@ -19,7 +20,7 @@ _EVERYTHING = (
 
 
 def test_a_first_deploy_installs_and_starts_and_a_second_changes_nothing(fleet: RobotFleet) -> None:
-    fleet.add("husky1")
+    fleet.add("husky1", fresh=True)
     fleet.write()
     assert "nothing is installed" in fleet.meshctl("diff", exit_code=1, wheels=True)
     assert "husky1: done: runs " in fleet.deploy()

@@ -16,7 +16,8 @@ from meshctl.fleet.journal import lock_owner
 from tests.meshctl.device.servers import PATIENCE_S, eventually
 from tests.meshctl.robots.fleets import RobotFleet
 
-pytestmark = [pytest.mark.xdist_group("robots"), pytest.mark.timeout(600)]
+# the first one may have to wait until the machines are built
+pytestmark = pytest.mark.timeout(600)
 
 
 class Finger:
@@ -51,8 +52,8 @@ class Finger:
 def test_an_interrupted_deploy_is_in_the_history_and_resume_takes_up_what_is_left(
     fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("husky1", "husky2"):
-        fleet.add(name)
+    fleet.add("husky1", fresh=True)
+    fleet.add("husky2")
     fleet.write(parallel=1)
     with Finger(monkeypatch, fleet.directory / "husky1/upper/opt/udp-mesh/wheels", times=1):
         told = fleet.deploy(exit_code=130)
@@ -72,6 +73,7 @@ def test_an_interrupted_deploy_is_in_the_history_and_resume_takes_up_what_is_lef
     assert "run 2 left nothing to do" in fleet.root_command("resume")
 
 
+@pytest.mark.proof
 def test_whoever_leaves_at_once_finds_the_robot_whole_and_robots_that_were_off_are_taken_up(
     fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -95,7 +97,7 @@ def test_two_operators_at_one_robot_exclude_each_other_and_the_dead_hold_nobody(
     fleet.add("husky1")
     fleet.write()
     claim = 'echo "{owner} $(cut -d. -f1 /proc/uptime) $(cat /proc/sys/kernel/random/boot_id)" >/opt/udp-mesh/.claim'
-    fleet.shell("husky1", "mkdir /opt/udp-mesh && " + claim.format(owner="ann@laptop:17:4711"))
+    fleet.shell("husky1", "mkdir -p /opt/udp-mesh && " + claim.format(owner="ann@laptop:17:4711"))
     told = fleet.deploy(exit_code=1)
     assert "husky1 (10.42.0.10): ann@laptop:17:4711 changes this robot" in told
     assert "wait until it is done" in told

@@ -6,7 +6,8 @@ import pytest
 
 from tests.meshctl.robots.fleets import RobotFleet
 
-pytestmark = [pytest.mark.xdist_group("robots"), pytest.mark.timeout(600)]
+# the first one may have to wait until the machines are built
+pytestmark = pytest.mark.timeout(600)
 
 _NOTHING = "ls -A /opt /etc/systemd/system"
 

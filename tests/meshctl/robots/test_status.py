@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 from meshctl.cli.main import build
 from tests.meshctl.robots.fleets import RobotFleet
 
-pytestmark = [pytest.mark.xdist_group("robots"), pytest.mark.timeout(600)]
+# the first one may have to wait until the machines are built
+pytestmark = pytest.mark.timeout(600)
 
 
 def told(fleet: RobotFleet, *words: str) -> dict[str, Any]:

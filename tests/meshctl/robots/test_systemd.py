@@ -11,7 +11,8 @@ import pytest
 from tests.meshctl.device.servers import eventually
 from tests.meshctl.robots.fleets import RobotFleet
 
-pytestmark = [pytest.mark.xdist_group("robots"), pytest.mark.timeout(600)]
+# the first one may have to wait until the machines are built
+pytestmark = pytest.mark.timeout(600)
 
 # `systemd-analyze security`, in tenths of a point from 0 (locked up) to 100 (does what it likes).
 MAX_EXPOSURE = 20
@@ -94,6 +95,7 @@ def test_power_lost_in_the_middle_of_a_switch_is_seen_and_the_next_deploy_mends_
     assert found["previous"] == first
 
 
+@pytest.mark.proof
 def test_a_clock_that_is_years_off_misleads_nothing(fleet: RobotFleet) -> None:
     machine = fleet.add("husky1", start=False)
     library = next(iter((fleet.base / "usr/lib").glob("*/faketime/libfaketime.so.1"))).relative_to(fleet.base)

@@ -9,7 +9,8 @@ from tests.meshctl.robots.fleets import RobotFleet
 from tests.meshctl.robots.lan import Lan
 from tests.meshctl.robots.machine import Machine
 
-pytestmark = [pytest.mark.xdist_group("robots"), pytest.mark.timeout(600)]
+# the first one may have to wait until the machines are built
+pytestmark = pytest.mark.timeout(600)
 
 
 def test_a_robot_behind_its_radio_gets_packages_that_pip_fetched_once(
