@@ -144,8 +144,7 @@ def test_a_fingerprint_depends_on_the_files_and_the_salt_and_not_on_order() -> N
 
 def test_an_ad_hoc_cell_on_25_12_is_planned_with_a_word_of_caution() -> None:
     team = fleet()
-    node = team.nodes["b01"]
-    new = replace(node, hardware=replace(node.hardware, release=Release.V25_12))
+    new = replace(team.nodes["b01"], release=Release.V25_12)
     seen = replace(factory(team, "b01"), release=ReleaseInfo("OpenWrt", "25.12.0", "r1", "ath79/generic"))
     plan = node_plan(replace(wanted(team, "b01"), node=new), seen, FINGERPRINTS)
     assert plan.notes == (
