@@ -312,7 +312,8 @@ def test_netifd_knows_the_protocols_that_were_there_when_it_started(fleet: Virtu
     node.exec("opkg remove kmod-batman-adv && /etc/init.d/network restart").check("forget")
     assert "batadv" not in json.loads(node.exec("ubus call network get_proto_handlers").stdout)
     node.exec("cat >/tmp/k.ipk", stdin=opkg_package("kmod-batman-adv", "1", {})).check("put it there")
-    again = node.exec("opkg install /tmp/k.ipk >/dev/null; ubus call network reload; ubus call network get_proto_handlers")
+    handlers = "ubus call network get_proto_handlers"
+    again = node.exec(f"opkg install /tmp/k.ipk >/dev/null; ubus call network reload; {handlers}")
     assert "batadv" not in json.loads(again.stdout)
     restarted = node.exec("ubus call network restart; ubus call network get_proto_handlers")
     assert "batadv" in json.loads(restarted.stdout)
