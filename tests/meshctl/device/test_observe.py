@@ -206,7 +206,8 @@ def test_the_script_runs_on_the_real_ash_and_tells_what_is_there(connection: Ssh
     assert len(seen.authorized_keys) == 1
     assert seen.mesh is None
     assert seen.change is not None
-    assert (seen.change.state, seen.change.version) == ("idle", "2")
+    assert (seen.change.state, seen.change.version) == ("idle", "3")
+    assert seen.root_in_ram is False
     secret, large, nowhere, init = (seen.files[path] for path in paths)
     assert secret is not None
     assert (secret.mode, secret.text) == (0o600, None)
@@ -298,3 +299,9 @@ def test_batman_v_tables_give_throughput() -> None:
     )
     (neighbour,) = batctl.parse_neighbours_text(near) or ()
     assert (neighbour.mac, neighbour.ifname, neighbour.last_seen_ms) == ("02:00:00:00:00:02", "mesh0", 460)
+
+
+def test_a_root_in_memory_is_told_from_one_in_flash() -> None:
+    ram = "/dev/root /rom squashfs ro 0 0\noverlayfs:/tmp/root / overlay rw,noatime 0 0\n"
+    assert system.parse_root(ram)
+    assert not system.parse_root(ram.replace("overlayfs:/tmp/root", "overlayfs:/overlay"))
