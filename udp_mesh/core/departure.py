@@ -91,7 +91,7 @@ def leave_level(
     urgent_level = priority <= outbound.rates.urgent_priority
     level_pace = outbound.window.packets_per_s()
     used = 0
-    mark = outbound.mark(now)
+    mark = outbound.mark(now, urgent=urgent_level)
     while used < room_bytes:
         run = outbound.scheduler.peek(priority)
         if run is None:
@@ -141,7 +141,12 @@ def leave_copies(outbound: Outbound, way: Way, now: float, out: list[Datagram]) 
             continue
         run = Run(message, position, 1, again=True)
         _leave(
-            outbound, way, [(message, position)], [*_frames(outbound, run, now, ack_now=True)], outbound.mark(now), out
+            outbound,
+            way,
+            [(message, position)],
+            [*_frames(outbound, run, now, ack_now=True)],
+            outbound.mark(now, urgent=True),
+            out,
         )
 
 

@@ -2,7 +2,8 @@
 
 Packet numbers grow by one and are never used twice, so the packets stand in a queue by number and an acknowledgement's
 bitmap walks it from the front: mostly a run of ones that is taken off in one go. A packet is lost when
-`reorder_packets` later ones arrived; one that arrives after all teaches a larger number.
+`reorder_packets` later ones arrived; one that arrives after all teaches a larger number. Urgent packets overtake others
+in a radio's queues (wifi's access categories), so their arrival says nothing about less urgent ones sent before them.
 """
 
 from collections import OrderedDict, deque
@@ -32,6 +33,7 @@ class Mark(NamedTuple):
     """When the last of those had been sent."""
     limited: bool
     """The application, not the window, decided how much was sent."""
+    urgent: bool = False
 
 
 class Packet(NamedTuple):
@@ -46,15 +48,28 @@ class Packet(NamedTuple):
 class Flight:
     """`outstanding` counts the packets neither acknowledged nor lost."""
 
-    __slots__ = ("_lost", "_packets", "base", "outstanding", "reorder_packets", "spurious")
+    __slots__ = (
+        "_largest_other",
+        "_lost",
+        "_packets",
+        "_timed_out",
+        "base",
+        "outstanding",
+        "reorder_packets",
+        "spurious",
+    )
 
     def __init__(self) -> None:
         self.base = 0
         """Number of the packet at the front of the queue."""
         self._packets: deque[Packet | None] = deque()
+        self._largest_other = -1
+        """Largest number of a packet that was not urgent and arrived."""
         self.outstanding = 0
         self.reorder_packets = REORDER_PACKETS
         self._lost: OrderedDict[int, tuple[Packet, bool]] = OrderedDict()
+        self._timed_out: list[int] = []
+        """Numbers of urgent packets called lost by their age, of which no acknowledgement has told yet."""
         self.spurious = 0
 
     @property
@@ -98,13 +113,19 @@ class Flight:
             self.outstanding -= len(acknowledged) - corrected
             return acknowledged, lost, newest
         reorder = self.reorder_packets
+        for behind in range(count):
+            packet = packets[count - 1 - behind]
+            if packet is not None and received >> behind & 1 and not packet.mark.urgent:
+                self._largest_other = max(self._largest_other, largest - behind)
+                break
+        ahead = largest - self._largest_other
         while count:
             packet = packets[0]
             behind = count - 1
             if packet is not None:
                 if received >> behind & 1:
                     acknowledged.append(packet)
-                elif behind >= reorder:
+                elif behind >= (reorder if packet.mark.urgent else reorder + ahead):
                     lost.append(packet)
                     self._remember(largest - behind, packet, overtaken=True)
                 else:
@@ -121,6 +142,14 @@ class Flight:
         self.outstanding -= len(acknowledged) - corrected + len(lost)
         return acknowledged, lost, newest
 
+    def confirm_timed_out(self, largest: int, received: int) -> int:
+        """How many urgent packets that timed out were lost indeed, as this acknowledgement tells."""
+        told = largest - self.reorder_packets
+        lost = 0
+        while self._timed_out and self._timed_out[0] <= told:
+            lost += not received >> (largest - self._timed_out.pop(0)) & 1
+        return lost
+
     def give_up(self) -> list[Packet]:
         """Everything on its way counts as lost (the peer is silent); an acknowledgement may still correct that."""
         lost = [packet for packet in self._packets if packet is not None]
@@ -129,6 +158,8 @@ class Flight:
                 self._remember(number, packet, overtaken=False)
         self.base += len(self._packets)
         self._packets.clear()
+        # A silence is a cut, which says nothing of the loss on the way.
+        self._timed_out.clear()
         self.outstanding = 0
         return lost
 
@@ -137,6 +168,8 @@ class Flight:
         lost = [packet for packet in self._packets if packet is not None]
         self._packets.clear()
         self._lost.clear()
+        self._largest_other = -1
+        self._timed_out.clear()
         self.base = number
         self.outstanding = 0
         return lost
@@ -161,6 +194,8 @@ class Flight:
                     break
                 lost.append(packet)
                 self._remember(self.base, packet, overtaken=False)
+                if packet.mark.urgent:
+                    self._timed_out.append(self.base)
             packets.popleft()
             self.base += 1
         self.outstanding -= len(lost)

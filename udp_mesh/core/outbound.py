@@ -175,7 +175,10 @@ class Outbound:
     def acknowledge(self, ack: Ack, now: float) -> None:
         """Book an acknowledgement of the peer."""
         flight = self.flight
-        acknowledged, lost, newest = flight.acknowledge(ack.largest, ack.received << 1 | 1)
+        received = ack.received << 1 | 1
+        # Sparse traffic has too few successors to lose packets otherwise.
+        timed_out = flight.confirm_timed_out(ack.largest, received) if ack.largest < flight.next_number else 0
+        acknowledged, lost, newest = flight.acknowledge(ack.largest, received)
         if acknowledged:
             # What was acknowledged late, all at once, says nothing about the rate of the link.
             after_silence = self.struggling or self.silent_since is not None
@@ -210,13 +213,14 @@ class Outbound:
             )
         if lost:
             self._put_back(lost)
-        total = len(acknowledged) + len(lost)
+        lost_packets = len(lost) + timed_out
+        total = len(acknowledged) + lost_packets
         if total:
             if self.loss >= self.rates.twice_loss:
                 self.send_twice = True
             elif self.loss < self.rates.twice_loss / 4:
                 self.send_twice = False
-            self.loss += (len(lost) - self.loss * total) / max(total, LOSS_MEMORY_PACKETS)
+            self.loss += (lost_packets - self.loss * total) / max(total, LOSS_MEMORY_PACKETS)
 
     def _book_arrivals(self, packets: Iterable[Packet]) -> None:
         for packet in packets:
@@ -435,8 +439,8 @@ class Outbound:
         for message in list(self.open):
             self.finish(message, outcome)
 
-    def mark(self, now: float) -> Mark:
+    def mark(self, now: float, *, urgent: bool = False) -> Mark:
         """The state in which the packets of one burst leave."""
         if not self.flight.outstanding and not self.struggling and self.silent_since is None:
             self.delivered_at = self.delivered_sent_at = self.last_progress = now
-        return Mark(now, self.delivered_packets, self.delivered_at, self.delivered_sent_at, self.limited)
+        return Mark(now, self.delivered_packets, self.delivered_at, self.delivered_sent_at, self.limited, urgent)

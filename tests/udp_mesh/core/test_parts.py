@@ -141,6 +141,42 @@ def test_every_packet_is_acknowledged_or_lost_as_a_plain_model_says(plan: list[t
             assert received(state, index)
 
 
+URGENT = Mark(0.0, 0, 0.0, 0.0, False, urgent=True)
+
+
+def test_urgent_packets_that_overtake_others_in_the_radio_are_no_sign_of_loss() -> None:
+    flight = Flight()
+    bulk = [Packet(MARK, outgoing(1, 1), 0), Packet(MARK, outgoing(1, 1), 1)]
+    for number in range(2):
+        flight.add(number, bulk[number])
+    for number in range(2, 8):
+        flight.add(number, Packet(URGENT, outgoing(1, 1), number))
+    acknowledged, lost, _ = flight.acknowledge(7, 0b111111)
+    assert len(acknowledged) == 6
+    assert lost == []
+    # Three later ones of its own kind are.
+    for number in range(8, 12):
+        flight.add(number, Packet(MARK, outgoing(1, 1), number))
+    assert flight.acknowledge(11, 0b1111111111)[1] == bulk
+
+
+def test_a_lost_urgent_packet_is_noticed_by_the_urgent_ones_behind_it() -> None:
+    flight = Flight()
+    for number in range(5):
+        flight.add(number, Packet(URGENT, outgoing(1, 1), number))
+    assert [packet.position for packet in flight.acknowledge(4, 0b1111)[1]] == [0]
+
+
+def test_urgent_packets_that_timed_out_count_as_lost_once_an_acknowledgement_says_so() -> None:
+    flight = Flight()
+    for number in range(8):
+        flight.add(number, Packet(URGENT, outgoing(1, 1), number))
+        flight.lose_before(1.0)
+    # 0, 2, 4 and 6 arrived; of 5 and 7 it is too early to tell.
+    assert flight.confirm_timed_out(7, 0b10101010) == 2
+    assert flight.confirm_timed_out(7, 0b10101010) == 0
+
+
 def received(state: AckState, number: int) -> bool:
     behind = state.largest - number
     return behind >= 0 and bool(state.received >> behind & 1)
