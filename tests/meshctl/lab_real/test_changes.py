@@ -6,7 +6,7 @@ import pytest
 
 from tests.meshctl.lab_real.conftest import NODES, Lab, until
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
 
 def cells(lab: Lab) -> set[str]:

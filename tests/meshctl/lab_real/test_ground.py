@@ -10,7 +10,7 @@ import pytest
 
 from tests.meshctl.lab_real.conftest import Lab, until
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
 # 80 m are heard, 160 m are not
 AIR = "air: {tx_power_dbm: 33, exponent: 4.4}\n"
