@@ -229,7 +229,7 @@ def test_whoever_leaves_a_look_need_not_wait_for_the_silent(bench: Bench) -> Non
     assert (process.returncode, told.splitlines()[-1:]) == (130, ["interrupted"])
 
 
-# It failed once in a run of everything, for a reason not found yet: it tells what it saw, and stays out of CI until then.
+# It failed once in a run of everything, for a reason not found yet: it tells what it saw, and is a proof until then.
 @pytest.mark.proof
 def test_watch_draws_what_fits_follows_the_window_and_leaves_the_screen_as_it_was(bench: Bench) -> None:
     process, terminal = pty.fork()
