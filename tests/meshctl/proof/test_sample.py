@@ -28,6 +28,7 @@ def test_after_meshctl_was_killed_every_node_is_old_or_new_and_a_resume_finishes
     assert [case.object() for case in cases if not case.holds] == []
 
 
+@pytest.mark.proof
 def test_a_mesh_whose_base_fails_in_a_switch_goes_back_as_a_whole_and_then_changes_as_a_whole(rig: Rig) -> None:
     everybody = ("base", *rig.names)
     rig.fleet.break_("base", "power-cut@reload_config")
@@ -38,11 +39,8 @@ def test_a_mesh_whose_base_fails_in_a_switch_goes_back_as_a_whole_and_then_chang
     ended = rig.meshctl("resume", "split", "--yes", "--json")
     assert (ended.code, set(ended.results.values())) == (0, {"done"}), ended.out + ended.err
     assert {rig.state_of(name, rig.current, "split") for name in everybody} == {"new"}
+    # On the way back one node is left behind: it is told as uncertain, and a resume settles it.
     rig.current = "split"
-
-
-def test_a_node_that_a_switch_leaves_behind_is_told_as_uncertain_and_a_resume_settles_it(rig: Rig) -> None:
-    assert rig.current == "split"
     rig.fleet.break_("n001", "sever@mv -f /etc/meshctl/change/new")
     ended = rig.meshctl("provision", "a", "--yes", "--json")
     expected = {name: "uncertain" if name == "n001" else "done" for name in ("base", *rig.names)}
