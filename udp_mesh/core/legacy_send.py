@@ -8,7 +8,7 @@ fragments.
 from dataclasses import dataclass
 
 from udp_mesh.core.message import Outgoing
-from udp_mesh.core.outbound import PROBE_S, PROBE_SOON_S, Outbound, Outcome
+from udp_mesh.core.outbound import PROBE_S, Outbound, Outcome
 from udp_mesh.core.seams import Datagram
 from udp_mesh.core.settings import Address
 from udp_mesh.wire.legacy import LegacyPayload, PriorityMeshData, encode_legacy, encode_mesh_data, fragment_legacy
@@ -22,6 +22,9 @@ LAST_SEQUENCE = 0x7FFF
 
 TRIES_BEFORE_SILENT = 3
 """Tries of one fragment after which only single probes leave."""
+
+LEAST_PATIENCE_S = 0.025
+"""Before a fragment is sent again at the earliest: fielded programs answer when their interpreter gets to it."""
 
 
 @dataclass(slots=True)
@@ -104,7 +107,7 @@ class LegacySender:
         return min(leg.sent_at + self._patience(leg) for leg in self._legs.values())
 
     def _patience(self, leg: _Leg) -> float:
-        timeout = max(PROBE_SOON_S / 2, self.outbound.trip.timeout(0.0))
+        timeout = max(LEAST_PATIENCE_S, self.outbound.trip.timeout(0.0))
         return min(PROBE_S, timeout * (1 << min(leg.tries - 1, 3)))
 
     def _resend(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
