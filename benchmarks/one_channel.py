@@ -26,6 +26,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from benchmarks.tables import row, verdict
 from udp_mesh.core.events import Event, MessageDelivered, MessageReceived, Rejected
 from udp_mesh.core.settings import Rates, Settings, Topic
 from udp_mesh.sim.medium import BEST_EFFORT_SLOTS, FRAME_BYTES, IP_UDP_BYTES, SLOT_S, Channel
@@ -279,14 +280,6 @@ def results_of(*, quick: bool) -> Iterator[dict[str, Any]]:
             yield hops(loss, bulk=bulk)
     for every in (10,) if quick else (1, 2, 4, 8, 10, 16):
         yield acknowledgements(every, 20e6)
-
-
-def row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def verdict(met: bool) -> str:
-    return "met" if met else "**missed**"
 
 
 def tables(results: Sequence[dict[str, Any]]) -> str:

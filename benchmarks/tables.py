@@ -34,6 +34,10 @@ def row(cells: Iterable[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+def verdict(met: bool) -> str:
+    return "met" if met else "**missed**"
+
+
 def shown(figure: str, value: float | None) -> str:
     if value is None:
         return "none"
@@ -71,6 +75,6 @@ def report(results: Sequence[Mapping[str, Any]]) -> str:
         sign = ">=" if goal.at_least is not None else "<="
         goals.append(
             row([goal.set, goal.cell, heading, f"{sign} {bound * factor:g}", shown(goal.figure, value),
-                 "met" if met else "**missed**"])
+                 verdict(met)])
         )  # fmt: skip
     return "\n\n".join([*parts, "### goals\n\n" + "\n".join(goals)]) + "\n"

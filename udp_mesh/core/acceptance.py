@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from udp_mesh.core.compression import STEP_BYTES, Unpacked, compress
-from udp_mesh.core.departure import IP6_EXTRA_BYTES
+from udp_mesh.core.departure import header_bytes
 from udp_mesh.core.events import (
     ExpiryReason,
     MessageDelivered,
@@ -23,8 +23,8 @@ from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Accepted, Channel, Outgoing
 from udp_mesh.core.outbound import Outcome
 from udp_mesh.core.session import Peer
-from udp_mesh.core.settings import LinkInfo, Outbox, Topic
-from udp_mesh.core.state import IP_UDP_BYTES, State
+from udp_mesh.core.settings import Outbox, Topic
+from udp_mesh.core.state import State
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
 from udp_mesh.wire.codec import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
 from udp_mesh.wire.frames import MessageFlag
@@ -170,17 +170,13 @@ def enqueue(state: State, name: str, accepted: Accepted, now: float, store_key: 
 def _to_all(state: State, accepted: Accepted, now: float) -> None:
     topic = accepted.channel.topic
     accepted = replace(accepted, flags=accepted.flags | MessageFlag.TO_ALL)
-    room = min((link.mtu - _headers(link) for link in state.links.values()), default=0)
+    room = min((link.mtu - header_bytes(link.address) for link in state.links.values()), default=0)
     fits = state.broadcasts() and _broadcast_bytes(accepted) <= room
     if fits:
         state.casts.push(accepted)
     for peer in list(state.roster.peers.values()):
         if (peer.online and (not fits or peer.legacy)) or (not peer.online and topic.outbox is not Outbox.NONE):
             enqueue(state, peer.name, accepted, now)
-
-
-def _headers(link: LinkInfo) -> int:
-    return IP_UDP_BYTES + (IP6_EXTRA_BYTES if ":" in link.address[0] else 0)
 
 
 def _broadcast_bytes(accepted: Accepted) -> int:

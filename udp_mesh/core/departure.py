@@ -45,6 +45,11 @@ _WIDE = struct.Struct(">BII")
 _NARROW_POSITIONS = 65_536
 
 
+def header_bytes(address: Address) -> int:
+    """IP and UDP headers of a datagram to or from this address."""
+    return IP_UDP_BYTES + (IP6_EXTRA_BYTES if ":" in address[0] else 0)
+
+
 class Way:
     """How datagrams reach the peer now: link, address, sealing, sizes."""
 
@@ -65,9 +70,8 @@ class Way:
 
     def lead(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
         """Datagrams go this way from now on; messages already begun keep their fragments where these still fit."""
-        headers = IP_UDP_BYTES + (IP6_EXTRA_BYTES if ":" in address[0] else 0)
         self.link, self.address = link, address
-        self.room_bytes = mtu - headers - LONG_OVERHEAD_BYTES
+        self.room_bytes = mtu - header_bytes(address) - LONG_OVERHEAD_BYTES
         self.fragment_bytes = min(fragment_bytes, self.room_bytes - FRAGMENT_WIDE_BYTES)
 
     def seal(self, frames: bytes) -> tuple[int, bytes]:

@@ -8,7 +8,7 @@ acknowledgement, a timer or a new message brings it back.
 from heapq import heappop
 
 from udp_mesh.core.acceptance import expire_held, pack, report_ended
-from udp_mesh.core.departure import leave_copies, leave_level
+from udp_mesh.core.departure import IP_UDP_BYTES, leave_copies, leave_level
 from udp_mesh.core.discovery import announce
 from udp_mesh.core.intake import unpack
 from udp_mesh.core.presence import housekeep
@@ -50,7 +50,7 @@ def collect(state: State, now: float, max_bytes: int | None) -> list[Datagram]:
     if out:
         counters = state.ledger.counters
         counters.datagrams_sent += len(out)
-        counters.bytes_sent += sum([len(datagram[2]) for datagram in out]) + 28 * len(out)
+        counters.bytes_sent += sum([len(datagram[2]) for datagram in out]) + IP_UDP_BYTES * len(out)
     return out
 
 

@@ -27,9 +27,6 @@ from udp_mesh.crypto import Key, Keyring, SendChannel
 HOUSEKEEPING_S = 0.5
 """Between two rounds through all peers: offline, purges, starvation."""
 
-IP_UDP_BYTES = 28
-"""IPv4 and UDP headers, counted in wire bytes."""
-
 
 def live_keys(settings: Settings) -> tuple[Key, ...]:
     """The keys of the settings, or the key everyone knows."""
