@@ -26,7 +26,9 @@ from meshctl.fleet.outcome import Outcome, Result
 
 SCHEMA_VERSION = 1
 # Two processes may write at once; each transaction takes milliseconds, so this is far more than ever needed.
-BUSY_TIMEOUT_S = 60.0
+BUSY_TIMEOUT_S = 20.0
+# In the middle of a run nodes wait to be confirmed: a journal that somebody holds is written to later.
+STEP_TIMEOUT_S = 1.0
 _RUN_COLUMNS = "id, command, fleet, inventory, owner, process, plan, began_s, ended_s, result"
 _SCHEMA = """
 CREATE TABLE runs (
@@ -46,6 +48,10 @@ CREATE TABLE nodes (
     fleet TEXT NOT NULL, node TEXT NOT NULL, seen_s REAL NOT NULL, facts TEXT NOT NULL, PRIMARY KEY (fleet, node)
 ) STRICT;
 """
+_REMEMBER = (
+    "INSERT INTO nodes (fleet, node, seen_s, facts) VALUES (?1, ?2, ?3, ?4) ON CONFLICT (fleet, node)"
+    " DO UPDATE SET seen_s = ?3, facts = ?4 WHERE ?3 >= seen_s"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +110,7 @@ class Journal:
                 path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False
             )
         except (OSError, sqlite3.Error) as error:
-            raise MeshctlError(f"{path}: cannot open the journal: {error}") from error
+            raise MeshctlError(f"{path}: cannot open the journal: {error}", hint=_hint(error)) from error
         try:
             self._enter_wal()
             self._database.execute("PRAGMA synchronous = NORMAL")
@@ -114,9 +120,9 @@ class Journal:
             self._database.close()
             if isinstance(error, MeshctlError):
                 raise
-            raise MeshctlError(
-                f"{path}: not a journal of meshctl: {error}", hint="move the file away and run again"
-            ) from error
+            what = "cannot open the journal" if _hint(error) else "not a journal of meshctl"
+            hint = _hint(error) or "move the file away and run again"
+            raise MeshctlError(f"{path}: {what}: {error}", hint=hint) from error
 
     def _enter_wal(self) -> None:
         # Two processes that create the file at once: SQLite answers "locked" here without waiting.
@@ -124,16 +130,19 @@ class Journal:
         while True:
             try:
                 self._database.execute("PRAGMA journal_mode = WAL")
-            except sqlite3.OperationalError:
-                if time.monotonic() > deadline:
+            except sqlite3.OperationalError as error:
+                if not _is_held(error) or time.monotonic() > deadline:
                     raise
                 time.sleep(0.01)
             else:
                 return
 
     def _create(self) -> None:
+        # whoever only reads waits for no writer
+        if self._version() == SCHEMA_VERSION:
+            return
         with self._write() as database:
-            (version,) = database.execute("PRAGMA user_version").fetchone()
+            version = self._version()
             if version == 0:
                 for statement in _SCHEMA.split(";\n"):
                     if statement.strip():
@@ -142,10 +151,14 @@ class Journal:
             elif version != SCHEMA_VERSION:
                 raise MeshctlError(f"{self.path}: journal of version {version}, expected {SCHEMA_VERSION}")
 
+    def _version(self) -> int:
+        return int(self._database.execute("PRAGMA user_version").fetchone()[0])
+
     @contextmanager
-    def _write(self) -> Iterator[sqlite3.Connection]:
+    def _write(self, wait_s: float = BUSY_TIMEOUT_S) -> Iterator[sqlite3.Connection]:
         with self._lock:
             try:
+                self._database.execute(f"PRAGMA busy_timeout = {round(wait_s * 1000)}")
                 self._database.execute("BEGIN IMMEDIATE")
                 try:
                     yield self._database
@@ -158,7 +171,7 @@ class Journal:
                 if self._database.in_transaction:
                     with suppress(sqlite3.Error):
                         self._database.execute("ROLLBACK")
-                raise MeshctlError(f"{self.path}: cannot write the journal: {error}") from error
+                raise MeshctlError(f"{self.path}: cannot write the journal: {error}", hint=_hint(error)) from error
 
     def __enter__(self) -> Journal:
         return self
@@ -225,11 +238,7 @@ class Journal:
 
     def remember_all(self, fleet: str, facts: Mapping[str, Mapping[str, str]], seen_s: float) -> None:
         with self._write() as database:
-            database.executemany(
-                "INSERT INTO nodes (fleet, node, seen_s, facts) VALUES (?1, ?2, ?3, ?4) ON CONFLICT (fleet, node)"
-                " DO UPDATE SET seen_s = ?3, facts = ?4 WHERE ?3 >= seen_s",
-                [(fleet, node, seen_s, json.dumps(dict(told), sort_keys=True)) for node, told in facts.items()],
-            )
+            database.executemany(_REMEMBER, [_sighting(fleet, node, told, seen_s) for node, told in facts.items()])
 
     def last_known(self, fleet: str) -> dict[str, LastKnown]:
         rows = self._read("SELECT node, seen_s, facts FROM nodes WHERE fleet = ? ORDER BY node", (fleet,))
@@ -246,36 +255,43 @@ class Journal:
 class Run:
     """One run being written. Steps and outcomes may come from several threads.
 
-    A journal that cannot be written any more (a full disk) stops no work on nodes: a change that is armed has to be
-    confirmed. `trouble` is the first thing that could not be written; what is missing counts as not done to a resume.
+    A journal that cannot be written (a full disk, another process that holds it) stops no work on nodes: a change that
+    is armed has to be confirmed. What it does not take is kept, and written with what comes next.
     """
 
     def __init__(self, journal: Journal, run_id: int) -> None:
         self._journal = journal
+        self._guard = threading.Lock()
+        self._owed: list[tuple[str, tuple[object, ...]]] = []
         self.id = run_id
+        # why the journal lacks something; what it lacks counts as not done to a resume
         self.trouble = ""
 
-    @contextmanager
-    def _tolerant(self) -> Iterator[None]:
-        try:
-            yield
-        except MeshctlError as error:
-            self.trouble = self.trouble or str(error)
+    def _put(self, statement: str, *values: object, wait_s: float = STEP_TIMEOUT_S) -> None:
+        with self._guard:
+            # whoever could not write waits no second time before the end
+            patience_s = 0.0 if self._owed and wait_s <= STEP_TIMEOUT_S else wait_s
+            self._owed.append((statement, values))
+            try:
+                with self._journal._write(patience_s) as database:
+                    for owed in self._owed:
+                        database.execute(*owed)
+            except MeshctlError as error:
+                self.trouble = str(error)
+            else:
+                self._owed.clear()
+                self.trouble = ""
 
     def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
         """Keep what a node told in the course of this run."""
-        with self._tolerant():
-            self._journal.remember(fleet, node, facts, seen_s)
+        self._put(_REMEMBER, *_sighting(fleet, node, facts, seen_s))
 
     @contextmanager
     def step(self, node: str, name: str) -> Iterator[None]:
         """Record a step and how long it took; a step without an end was cut short by our own death."""
         began_s, clock = time.time(), time.monotonic()
-        row: int | None = None
-        with self._tolerant(), self._journal._write() as database:
-            row = database.execute(
-                "INSERT INTO steps (run, node, step, began_s) VALUES (?, ?, ?, ?)", (self.id, node, name, began_s)
-            ).lastrowid
+        key = (self.id, node, name, began_s)
+        self._put("INSERT INTO steps (run, node, step, began_s) VALUES (?, ?, ?, ?)", *key)
         result = "done"
         try:
             yield
@@ -283,32 +299,54 @@ class Run:
             result = f"failed: {error}" if isinstance(error, MeshctlError) else f"failed: {type(error).__name__}"
             raise
         finally:
-            with self._tolerant(), self._journal._write() as database:
-                database.execute(
-                    "UPDATE steps SET duration_s = ?, result = ? WHERE id = ?",
-                    (round(time.monotonic() - clock, 3), result, row),
-                )
-
-    def finish_node(self, outcome: Outcome) -> None:
-        with self._tolerant(), self._journal._write() as database:
-            database.execute(
-                "INSERT INTO outcomes (run, node, result, reason, began_s, duration_s, facts)"
-                " VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7) ON CONFLICT (run, node)"
-                " DO UPDATE SET result = ?3, reason = ?4, duration_s = ?6, facts = ?7",
-                (
-                    self.id,
-                    outcome.node,
-                    outcome.result.value,
-                    outcome.reason,
-                    time.time() - outcome.duration_s,
-                    outcome.duration_s,
-                    json.dumps(dict(outcome.facts), sort_keys=True),
-                ),
+            took_s = round(time.monotonic() - clock, 3)
+            self._put(
+                "UPDATE steps SET duration_s = ?, result = ? WHERE run = ? AND node = ? AND step = ? AND began_s = ?",
+                *(took_s, result, *key),
             )
 
+    def finish_node(self, outcome: Outcome) -> None:
+        self._put(
+            "INSERT INTO outcomes (run, node, result, reason, began_s, duration_s, facts)"
+            " VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7) ON CONFLICT (run, node)"
+            " DO UPDATE SET result = ?3, reason = ?4, duration_s = ?6, facts = ?7",
+            *(self.id, outcome.node, outcome.result.value, outcome.reason),
+            *(time.time() - outcome.duration_s, outcome.duration_s, json.dumps(dict(outcome.facts), sort_keys=True)),
+        )
+
     def end(self, result: str) -> None:
-        with self._tolerant(), self._journal._write() as database:
-            database.execute("UPDATE runs SET ended_s = ?, result = ? WHERE id = ?", (time.time(), result, self.id))
+        ended = (time.time(), result, self.id)
+        self._put("UPDATE runs SET ended_s = ?, result = ? WHERE id = ?", *ended, wait_s=BUSY_TIMEOUT_S)
+
+
+def _sighting(fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> tuple[object, ...]:
+    return fleet, node, seen_s, json.dumps(dict(facts), sort_keys=True)
+
+
+# SQLite's primary result codes (sqlite.org/rescode.html); the bits above these eight tell more about the same.
+_PRIMARY = 0xFF
+_HELD = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
+_NO_ROOM = (
+    *(sqlite3.SQLITE_FULL, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN),
+    *(sqlite3.SQLITE_IOERR, sqlite3.SQLITE_PERM),
+)
+
+
+def _primary(error: Exception) -> int:
+    return int(getattr(error, "sqlite_errorcode", 0)) & _PRIMARY
+
+
+def _is_held(error: Exception) -> bool:
+    return _primary(error) in _HELD
+
+
+def _hint(error: Exception) -> str:
+    """What to do when the file cannot be used; empty when the file itself is at fault."""
+    if _is_held(error):
+        return "another process holds it: `fuser` with its path names that process"
+    if isinstance(error, OSError) or _primary(error) in _NO_ROOM:
+        return "XDG_STATE_HOME=DIR keeps it elsewhere, on a disk with room that can be written"
+    return ""
 
 
 def default_path(environ: Mapping[str, str]) -> Path:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import sqlite3
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -133,3 +136,59 @@ def test_a_journal_that_cannot_be_written_any_more_stops_no_work_and_is_told(pat
         assert "cannot write the journal" in run.trouble
         # a resume looks at the node again
         assert journal.unfinished(run.id) == ("a",)
+
+
+@contextmanager
+def held_by_another(path: Path) -> Iterator[sqlite3.Connection]:
+    with closing(sqlite3.connect(path, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        yield other
+
+
+def test_what_a_held_journal_does_not_take_is_written_as_soon_as_it_is_free(path: Path) -> None:
+    with Journal(path) as journal:
+        run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a", "b"))
+        with held_by_another(path):
+            with run.step("a", "arm"):
+                run.remember("f", "a", {"boot_id": "1"}, 5.0)
+            run.finish_node(Outcome("a", Result.DONE))
+            assert "locked" in run.trouble
+            assert journal.steps(run.id) == ()
+        run.finish_node(Outcome("b", Result.DONE))
+        run.end("2 done")
+        assert run.trouble == ""
+        assert [(step.step, step.result) for step in journal.steps(run.id)] == [("arm", "done")]
+        assert [outcome.result for outcome in journal.outcomes(run.id)] == [Result.DONE, Result.DONE]
+        assert journal.last_known("f")["a"].facts == {"boot_id": "1"}
+
+
+def test_a_full_disk_loses_nothing_once_there_is_room_again(path: Path) -> None:
+    with Journal(path) as journal:
+        run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
+        database = journal._database
+        (pages,) = database.execute("PRAGMA page_count").fetchone()
+        database.execute(f"PRAGMA max_page_count = {pages}")
+        run.finish_node(Outcome("a", Result.FAILED, "x" * 100_000))
+        assert "full" in run.trouble
+        database.execute("PRAGMA max_page_count = 100000")
+        run.end("1 failed")
+        assert (run.trouble, journal.outcomes(run.id)[0].result) == ("", Result.FAILED)
+
+
+def test_a_journal_that_another_process_holds_can_be_read_and_says_who_to_look_for(
+    path: Path,
+) -> None:
+    Journal(path).close()
+    with held_by_another(path), Journal(path) as journal:
+        assert journal.runs() == ()
+        with pytest.raises(MeshctlError, match="locked") as told, journal._write(0.0):
+            pass
+        assert "fuser" in told.value.hint
+
+
+def test_a_journal_that_cannot_be_written_is_not_called_damaged(path: Path) -> None:
+    path.parent.mkdir(parents=True)
+    path.mkdir()
+    with pytest.raises(MeshctlError, match="cannot open the journal") as told:
+        Journal(path)
+    assert "XDG_STATE_HOME" in told.value.hint
