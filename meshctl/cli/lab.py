@@ -14,7 +14,8 @@ from meshctl.errors import InputError
 from meshctl.lab.breaks import BREAKS
 from meshctl.lab.console import run_shell
 from meshctl.lab.copybook import prepare
-from meshctl.lab.fleet import VirtualFleet
+from meshctl.lab.errors import LabError
+from meshctl.lab.fleet import VirtualFleet, end
 from meshctl.lab.images import firmware_image
 from meshctl.lab.real.fleet import RealFleet
 from meshctl.lab.twin import spec_of
@@ -67,9 +68,11 @@ def down(directory: LabDirectory = None) -> None:
 
     Example: meshctl lab down
     """
-    fleet = VirtualFleet.attach(lab_directory(directory))
-    fleet.down()
-    typer.echo(f"{fleet.spec.name} is down")
+    place = lab_directory(directory)
+    name = end(place)
+    if not name:
+        raise LabError(f"no virtual fleet runs in {place}", hint="meshctl lab up starts one")
+    typer.echo(f"{name} is down")
 
 
 @app.command("status")

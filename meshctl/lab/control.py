@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import os
 import re
 import socket
@@ -23,6 +24,7 @@ from meshctl.lab.warden import MESSAGE_BYTES
 if TYPE_CHECKING:
     from meshctl.lab.supervisor import Supervisor
 
+log = logging.getLogger("meshctl.lab.control")
 _NAME = "control.sock"
 
 
@@ -98,14 +100,26 @@ class Operations:
 
     async def answer(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
         """The answer to one request; what went wrong is one, too."""
+        asked = request.get("op")
         try:
-            if request["op"] == "exec":
-                return await self.execute(request["node"], request["command"], descriptors)
-            result = getattr(self, request.pop("op"))(**request)
-            if asyncio.iscoroutine(result):
-                result = await result
+            return await self.carry_out(request, descriptors)
         except MeshctlError as error:
             return {"error": str(error), "hint": error.hint}
+        except Exception as error:
+            # a fault of the lab's own: whoever asked hears of it, the log has the whole, and the fleet goes on
+            log.exception("request-failed op=%s", asked)
+            return {
+                "error": f"the lab failed at {asked!r}: {type(error).__name__}: {error}",
+                "hint": "its log has more",
+            }
+
+    async def carry_out(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
+        """What the request asks for. Raises MeshctlError for what the fleet refuses, anything for a fault of ours."""
+        if request["op"] == "exec":
+            return await self.execute(request["node"], request["command"], descriptors)
+        result = getattr(self, request.pop("op"))(**request)
+        if asyncio.iscoroutine(result):
+            result = await result
         return result or {}
 
     def status(self) -> dict[str, Any]:

@@ -32,6 +32,8 @@ from meshctl.lab.state import Power
 # how often a waiting caller asks again
 _POLL_S = 0.05
 _LOG_LINES = 15
+# then its supervisor, and all nodes with it, is ended by force
+_DOWN_S = 30.0
 
 
 class VirtualNode:
@@ -237,21 +239,7 @@ class VirtualFleet:
 
         Returns quietly when no fleet runs there.
         """
-        try:
-            pid = int(self.ask("status")["pid"])
-        except LabError:
-            return
-        watched = os.pidfd_open(pid)
-        try:
-            self.ask("down")
-            deadline = time.monotonic() + 30
-            while not _has_ended(watched):
-                if time.monotonic() > deadline:
-                    signal.pidfd_send_signal(watched, signal.SIGKILL)
-                time.sleep(_POLL_S)
-        finally:
-            os.close(watched)
-        if self._process is not None:
+        if end(self.directory) and self._process is not None:
             self._process.wait()
 
     # -- nodes, addresses, links --
@@ -311,6 +299,25 @@ class VirtualFleet:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.down()
+
+
+def end(directory: Path) -> str:
+    """End the fleet that runs in `directory`, whatever version started it; its name, or nothing when none runs."""
+    try:
+        status = request(directory, {"op": "status"})
+    except LabError:
+        return ""
+    watched = os.pidfd_open(int(status["pid"]))
+    try:
+        request(directory, {"op": "down"})
+        deadline = time.monotonic() + _DOWN_S
+        while not _has_ended(watched):
+            if time.monotonic() > deadline:
+                signal.pidfd_send_signal(watched, signal.SIGKILL)
+            time.sleep(_POLL_S)
+    finally:
+        os.close(watched)
+    return str(status["fleet"])
 
 
 def wait_for(condition: Callable[[], bool], what: str, wait_s: float) -> None:

@@ -191,8 +191,18 @@ def dump(spec: FleetSpec) -> str:
 
 
 def load(text: str) -> FleetSpec:
-    """The spec that `dump` wrote."""
-    data = json.loads(text)
+    """The spec that `dump` wrote. Raises InputError for the text of a fleet that another version of meshctl started."""
+    try:
+        return _loaded(json.loads(text))
+    except (KeyError, TypeError, ValueError) as error:
+        found = f"nothing under {error}" if isinstance(error, KeyError) else str(error)
+        raise InputError(
+            f"spec.json of the lab's fleet: expected what this version of meshctl writes, found {found}",
+            hint="the fleet was started by another version: `meshctl lab down`, then start it anew",
+        ) from error
+
+
+def _loaded(data: dict[str, Any]) -> FleetSpec:
     nodes = tuple(
         NodeSpec(
             **{

@@ -81,10 +81,10 @@ class RealOperations(Operations):
         super().__init__(fleet)
         self._real = fleet
 
-    async def answer(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
+    async def carry_out(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
         if request["op"] == "machine":
             return await self._machine(request["command"], descriptors)
-        return await super().answer(request, descriptors)
+        return await super().carry_out(request, descriptors)
 
     async def _machine(self, command: str, descriptors: list[int]) -> dict[str, Any]:
         source, out, err = descriptors
