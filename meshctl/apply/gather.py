@@ -20,7 +20,8 @@ from meshctl.device.observe import observe
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError, Unreachable
 from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
-from meshctl.fleet.journal import LastKnown, is_dead
+from meshctl.fleet.journal import LastKnown
+from meshctl.fleet.process import is_dead
 from meshctl.model import Fleet, Node
 from meshctl.topology import Graph, Report, mesh_macs, observed_graph, report_of
 

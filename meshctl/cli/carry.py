@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import secrets
-import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -12,7 +11,9 @@ import typer
 
 from meshctl.apply.execute import Setting, carry_out
 from meshctl.apply.planning import Choices, Prepared, prepare
+from meshctl.cli.asking import must_agree
 from meshctl.cli.session import Session, chosen, exit_for, progress_for
+from meshctl.cli.streams import unheard
 from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Outcome, totals
 from meshctl.plan import Plan, Verdict
@@ -97,9 +98,7 @@ def ask_and_carry_out(
     if not as_json:
         show(prepared.plan, brief=brief)
     if not prepared.plan.is_empty and not prepared.plan.refusal and not yes:
-        if not sys.stdin.isatty():
-            raise InputError("nobody can be asked here", hint="look at the plan, then run again with --yes")
-        typer.confirm(question(prepared.plan), abort=True)
+        must_agree(question(prepared.plan))
     carry_out_plan(opened, prepared, command, choices.with_firmware, as_json=as_json, rate=rate, choices=choices)
 
 
@@ -147,8 +146,11 @@ def carry_out_plan(
     finally:
         run.end(str(totals(outcomes.values())) if outcomes else "could not run")
     if run.trouble:
-        typer.echo(f"the journal is incomplete: {run.trouble}", err=True)
-    _sum_up(outcomes, run.id, as_json=as_json)
+        with unheard():
+            typer.echo(f"the journal is incomplete: {run.trouble}", err=True)
+    # a reader that is gone (`| head`, a closed terminal) changes nothing about how it ended
+    with unheard():
+        _sum_up(outcomes, run.id, as_json=as_json)
     raise typer.Exit(exit_for(outcomes.values(), opened.interrupt))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +13,7 @@ from meshctl.apply.checks import Expectation
 from meshctl.apply.gather import facts_of, observe_cleared
 from meshctl.apply.job import Job, Work
 from meshctl.apply.keep import Backup, fetch, lacking_packages, objection_to, put_back, read_backup
+from meshctl.cli.asking import must_agree
 from meshctl.cli.carry import Refused
 from meshctl.cli.options import InventoryPath
 from meshctl.cli.plan import Yes
@@ -87,10 +87,8 @@ def restore(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         (there,) = chosen(opened.fleet, [node])[:1]
         if not yes:
-            if not sys.stdin.isatty():
-                raise InputError("nobody can be asked here", hint="run again with --yes")
             taken = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(saved.taken_s))
-            typer.confirm(f"Make {there.name} what it was on {taken}?", abort=True)
+            must_agree(f"Make {there.name} what it was on {taken}?")
         outcome = _restore(opened, there.name, saved)
     raise typer.Exit(exit_for([outcome], opened.interrupt))
 

@@ -17,6 +17,7 @@ import typer
 
 from meshctl import __version__
 from meshctl.cli.commands import COMMANDS, Entry
+from meshctl.cli.streams import unheard
 from meshctl.errors import ExitCode, MeshctlError
 
 _EPILOG = """Start with `meshctl init DIR`, or `meshctl lab up` for a virtual fleet to practise on.
@@ -29,12 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     completing = os.environ.get("COMP_WORDS", "").split()[1:] if "_MESHCTL_COMPLETE" in os.environ else []
     meant = next((word for word in completing or words if not word.startswith("-")), "")
-    try:
-        build(meant)(args=words, prog_name="meshctl")
-    except BrokenPipeError:
-        # the reader (`| head`) has seen enough; keep the interpreter from complaining about stdout at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(ExitCode.OK)
+    build(meant)(args=words, prog_name="meshctl")
 
 
 def build(meant: str) -> typer.Typer:
@@ -106,8 +102,13 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
             if error.hint:
                 typer.echo(f"hint: {error.hint}", err=True)
             raise typer.Exit(int(error.exit_code)) from None
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, typer.Abort):
             typer.echo("interrupted", err=True)
             raise typer.Exit(int(ExitCode.INTERRUPTED)) from None
+        except BrokenPipeError:
+            # the reader (`| head`) has seen enough
+            with unheard():
+                raise
+            raise typer.Exit from None
 
     return run

@@ -1,14 +1,13 @@
-"""`meshctl plan`, `apply`, `provision`, `resume`, `history`."""
+"""`meshctl plan`, `apply`, `provision`, `resume`."""
 
 from __future__ import annotations
 
 import json
-import os
 import time
+from collections.abc import Iterable
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -16,9 +15,9 @@ from meshctl.apply.planning import Choices
 from meshctl.apply.resumed import settled
 from meshctl.cli.carry import ask_and_carry_out, carry_out_plan, checked, choices_of, prepared_for, show, write_text
 from meshctl.cli.options import AsJson, InventoryPath
-from meshctl.cli.session import KeyFiles, Lab, Nodes, session
+from meshctl.cli.session import KeyFiles, Lab, Nodes, Session, session
 from meshctl.errors import ExitCode, InputError
-from meshctl.fleet.journal import Journal, RunRecord, default_path
+from meshctl.fleet.journal import Journal, RunRecord
 from meshctl.plan.saved import SavedPlan, as_agreed, dump, load
 
 NoFirmware = Annotated[bool, typer.Option("--no-firmware", help="Leave the firmware as it is.")]
@@ -115,6 +114,8 @@ def resume(
     run: Annotated[int | None, typer.Argument(help="Number of the run; default: the last one that left work.")] = None,
     inventory: InventoryPath = Path(),
     yes: Yes = False,
+    leave_behind: LeaveBehind = "",
+    accept_cut: AcceptCut = "",
     rate: Rate = None,
     brief: Brief = False,
     as_json: AsJson = False,
@@ -126,23 +127,26 @@ def resume(
     Example: meshctl resume --yes
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        record = _to_resume(opened.journal, opened.fleet.name, run)
+        record, left = _to_resume(opened.journal, opened.fleet.name, run)
         if record.command.startswith("robots "):
             from meshctl.cli.robots_work import take_up
 
             raise take_up(opened, inventory, record, as_json=as_json)
-        managed = {node.name for node in opened.fleet.managed()}
-        names = [name for name in opened.journal.unfinished(record.id) if name in managed]
+        if record.command == "restore":
+            hint = f"`meshctl restore {' '.join(left)} FILE` again, or `meshctl provision` for what the inventory says"
+            raise InputError(f"run {record.id} put a backup back, which the inventory does not know", hint=hint)
+        names = _still_managed(opened, left)
         if not names:
             typer.echo(f"run {record.id} left nothing to do")
             return
         if not as_json:
             typer.echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")
         told = json.loads(record.plan).get("choices", {}) if record.plan else {}
+        added = choices_of(False, leave_behind, accept_cut)
         choices = Choices(
             bool(told.get("with_firmware", True)),
-            tuple(told.get("leave_behind", ())),
-            tuple(told.get("accept_cuts", ())),
+            (*told.get("leave_behind", ()), *added.leave_behind),
+            (*told.get("accept_cuts", ()), *added.accept_cuts),
         )
         prepared = prepared_for(opened, names, choices)
         for name, text in settled(record.id, opened.journal.outcomes(record.id), prepared).items():
@@ -151,87 +155,27 @@ def resume(
         ask_and_carry_out(opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
 
 
-def _to_resume(journal: Journal, fleet: str, run_id: int | None) -> RunRecord:
-    if run_id is not None:
-        record = journal.run(run_id)
-        if record is None or record.fleet != fleet:
-            raise InputError(f"there is no run {run_id} of fleet {fleet}", hint="`meshctl history` lists the runs")
-    else:
-        record = next(iter(journal.runs(fleet=fleet, limit=1)), None)
-        if record is None:
+def _to_resume(journal: Journal, fleet: str, run_id: int | None) -> tuple[RunRecord, tuple[str, ...]]:
+    """The run, and the nodes of it to take up."""
+    left = journal.left(fleet)
+    number = run_id if run_id is not None else next(iter(left), None)
+    if number is None:
+        latest = next(iter(journal.runs(fleet=fleet, limit=1)), None)
+        if latest is None:
             raise InputError(f"there is no run of fleet {fleet} to resume", hint="`meshctl provision` begins one")
+        return latest, ()
+    record = journal.run(number)
+    if record is None or record.fleet != fleet:
+        raise InputError(f"there is no run {number} of fleet {fleet}", hint="`meshctl history` lists the runs")
     if not record.is_over:
         raise InputError(f"run {record.id} is still under way ({record.owner})", hint="wait for it, or interrupt it")
-    return record
+    return record, left.get(number, ()) if run_id is None else journal.unfinished(number)
 
 
-def history(
-    run: Annotated[int | None, typer.Argument(help="Number of a run, to see its nodes and steps.")] = None,
-    node: Annotated[str | None, typer.Option("--node", help="Only the steps of this node.")] = None,
-    limit: Annotated[int, typer.Option("--limit", "-n", help="How many runs to list.")] = 20,
-    as_json: AsJson = False,
-) -> None:
-    """Show earlier runs; with a run's number its nodes, steps, outcomes and durations.
-
-    Example: meshctl history 12 --node b03
-    """
-    with Journal(default_path(os.environ)) as journal:
-        if run is None:
-            _list_runs(journal, limit, as_json=as_json)
-        else:
-            _show_run(journal, run, node, as_json=as_json)
-
-
-def _list_runs(journal: Journal, limit: int, *, as_json: bool) -> None:
-    records = journal.runs(limit=limit)
-    if as_json:
-        typer.echo(json.dumps([_run_object(record) for record in records], indent=1))
-        return
-    for record in records:
-        typer.echo(f"{record.id:>5}  {_moment(record.began_s)}  {record.command:<17} {record.fleet:<16} {record.state}")
-    if not records:
-        typer.echo("no runs yet")
-
-
-def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool) -> None:
-    record = journal.run(run_id)
-    if record is None:
-        raise InputError(f"there is no run {run_id}", hint="`meshctl history` lists the runs")
-    outcomes = [outcome for outcome in journal.outcomes(run_id) if node in (None, outcome.node)]
-    steps = journal.steps(run_id, node)
-    if as_json:
-        told = {
-            **_run_object(record),
-            "outcomes": [{"node": o.node, "result": o.result.value, "reason": o.reason} for o in outcomes],
-            "steps": [
-                {"node": s.node, "step": s.step, "began_s": s.began_s, "duration_s": s.duration_s, "result": s.result}
-                for s in steps
-            ],
-        }
-        typer.echo(json.dumps(told, indent=1))
-        return
-    typer.echo(f"run {record.id}: {record.command} of {record.fleet} by {record.owner}, {_moment(record.began_s)}")
-    typer.echo(f"  {record.inventory}: {record.state}")
-    for outcome in outcomes:
-        typer.echo(f"{outcome}" + (f" ({outcome.duration_s:.1f} s)" if outcome.duration_s else ""))
-        for step in steps:
-            if step.node == outcome.node:
-                took = "cut short" if step.duration_s is None else f"{step.duration_s:.2f} s"
-                typer.echo(f"  {step.step:<10} {took:>10}  {step.result if step.result != 'done' else ''}".rstrip())
-
-
-def _run_object(record: RunRecord) -> dict[str, Any]:
-    return {
-        "run": record.id,
-        "command": record.command,
-        "fleet": record.fleet,
-        "inventory": record.inventory,
-        "owner": record.owner,
-        "began_s": record.began_s,
-        "ended_s": record.ended_s,
-        "state": record.state,
-    }
-
-
-def _moment(seconds: float) -> str:
-    return datetime.fromtimestamp(seconds).astimezone().isoformat(sep=" ", timespec="seconds")
+def _still_managed(opened: Session, names: Iterable[str]) -> list[str]:
+    """Those that the inventory still has; the others are told."""
+    managed = {node.name for node in opened.fleet.managed()}
+    wanted = list(names)
+    if gone := [name for name in wanted if name not in managed]:
+        typer.echo(f"left out, since the inventory does not manage them any more: {', '.join(gone)}", err=True)
+    return [name for name in wanted if name in managed]

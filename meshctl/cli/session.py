@@ -22,7 +22,8 @@ from meshctl.apply.wanted import Renderer
 from meshctl.device.trust import TrustStore
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Interrupt, Outcome, totals
-from meshctl.fleet.journal import Journal, default_path, lock_owner
+from meshctl.fleet.journal import Journal, default_path
+from meshctl.fleet.process import lock_owner
 from meshctl.inventory import load_fleet
 from meshctl.inventory.secrets import SecretStore
 from meshctl.inventory.suggest import did_you_mean
@@ -121,15 +122,15 @@ def chosen(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[Node, ...]:
 
 def progress_for(count: int, *, as_json: bool) -> Progress:
     """Live lines on a terminal, JSON lines for programs, plain lines elsewhere."""
-    from meshctl.report.progress import JsonProgress, LiveProgress, PlainProgress
+    from meshctl.report.progress import Aside, JsonProgress, LiveProgress, PlainProgress
 
     if as_json:
-        return JsonProgress(sys.stdout)
+        return Aside(JsonProgress(sys.stdout))
     if sys.stdout.isatty():
         from rich.console import Console
 
-        return LiveProgress(Console(), count)
-    return PlainProgress(sys.stdout)
+        return Aside(LiveProgress(Console(), count))
+    return Aside(PlainProgress(sys.stdout))
 
 
 def exit_for(outcomes: Iterable[Outcome], interrupt: Interrupt) -> ExitCode:

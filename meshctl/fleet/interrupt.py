@@ -2,6 +2,7 @@
 
 The first one stops taking up new nodes and lets those in work come to their end (a change that is armed is confirmed
 or undone within seconds). The second one leaves at once: what is armed goes back by itself, the journal says so.
+A terminal that is closed counts as one.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 
@@ -33,10 +34,15 @@ class Interrupt:
         """Ask once to stop, twice to leave."""
         if self._stop.is_set():
             self._leave.set()
-            self._said("leaving now: what is armed on a node goes back by itself; `meshctl resume` takes it up again")
+            self._tell("leaving now: what is armed on a node goes back by itself; `meshctl resume` takes it up again")
         else:
             self._stop.set()
-            self._said("stopping: finishing the nodes in work, taking up no more (again to leave at once)")
+            self._tell("stopping: finishing the nodes in work, taking up no more (again to leave at once)")
+
+    def _tell(self, text: str) -> None:
+        # whoever closed the terminal hears nothing more, and the work still has to come to its end
+        with suppress(OSError):
+            self._said(text)
 
     def wait(self, timeout_s: float) -> bool:
         """Sleep until the second request, at most `timeout_s`; True when it came."""
@@ -44,13 +50,15 @@ class Interrupt:
 
     @contextmanager
     def on_signals(self, say: Callable[[str], None]) -> Iterator[None]:
-        """Within this block SIGINT and SIGTERM are requests. Only in the main thread."""
+        """Within this block SIGINT, SIGTERM and SIGHUP are requests. Only in the main thread."""
         self._said = say
 
         def handle(number: int, frame: FrameType | None) -> None:
             self.request()
 
-        previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        # nohup has it ignored, and means it
+        hangup = () if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (signal.SIGHUP,)
+        previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM, *hangup)}
         try:
             yield
         finally:

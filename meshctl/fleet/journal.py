@@ -7,11 +7,7 @@ it readable). `Journal.begin` opens a run; `Run.step`, `Run.finish_node` and `Ru
 
 from __future__ import annotations
 
-import getpass
 import json
-import os
-import re
-import socket
 import sqlite3
 import threading
 import time
@@ -23,6 +19,7 @@ from typing import Any
 
 from meshctl.errors import MeshctlError
 from meshctl.fleet.outcome import Outcome, Result
+from meshctl.fleet.process import owner, process_lives, this_process
 
 SCHEMA_VERSION = 1
 # Two processes may write at once; each transaction takes milliseconds, so this is far more than ever needed.
@@ -199,11 +196,13 @@ class Journal:
             )
         return Run(self, run_id)
 
-    def runs(self, *, fleet: str | None = None, limit: int = 20) -> tuple[RunRecord, ...]:
-        """The latest runs, newest first."""
+    def runs(self, *, fleet: str | None = None, node: str | None = None, limit: int = 20) -> tuple[RunRecord, ...]:
+        """The latest runs (of a fleet, with a node), newest first."""
         rows = self._read(
-            f"SELECT {_RUN_COLUMNS} FROM runs WHERE ?1 IS NULL OR fleet = ?1 ORDER BY id DESC LIMIT ?2",
-            (fleet, limit),
+            f"SELECT {_RUN_COLUMNS} FROM runs WHERE (?1 IS NULL OR fleet = ?1)"
+            " AND (?2 IS NULL OR EXISTS (SELECT 1 FROM outcomes WHERE run = id AND node = ?2))"
+            " ORDER BY id DESC LIMIT ?3",
+            (fleet, node, limit),
         )
         return tuple(RunRecord(*row) for row in rows)
 
@@ -231,6 +230,25 @@ class Journal:
     def unfinished(self, run_id: int) -> tuple[str, ...]:
         """The nodes of a run that a resume has to take up, in the run's order."""
         return tuple(outcome.node for outcome in self.outcomes(run_id) if not outcome.result.is_settled)
+
+    def left(self, fleet: str) -> dict[int, tuple[str, ...]]:
+        """Run -> the nodes that it left unfinished and no later run took up; the newest run first.
+
+        Runs of `robots` and those of radios do not count as each other's successors.
+        """
+        rows = self._read(
+            "SELECT run, node, outcomes.result FROM outcomes JOIN runs ON id = run WHERE fleet = ?1 AND NOT EXISTS"
+            " (SELECT 1 FROM outcomes AS later JOIN runs AS after ON after.id = later.run WHERE after.fleet = ?1"
+            " AND later.node = outcomes.node AND after.id > runs.id"
+            " AND (after.command LIKE 'robots %') = (runs.command LIKE 'robots %'))"
+            " ORDER BY run DESC, outcomes.rowid",
+            (fleet,),
+        )
+        left: dict[int, tuple[str, ...]] = {}
+        for run_id, node, result in rows:
+            if not Result(result).is_settled:
+                left[run_id] = (*left.get(run_id, ()), node)
+        return left
 
     def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
         """Keep what a node told; an older sighting never replaces a newer one."""
@@ -354,43 +372,3 @@ def default_path(environ: Mapping[str, str]) -> Path:
     state = environ.get("XDG_STATE_HOME", "")
     root = Path(state) if state.startswith("/") else Path(environ.get("HOME", "~")).expanduser() / ".local" / "state"
     return root / "meshctl" / "journal.sqlite"
-
-
-def owner() -> str:
-    """`user@host`: who holds a lock or began a run."""
-    try:
-        user = getpass.getuser()
-    except (KeyError, OSError):
-        user = str(os.getuid())
-    return f"{user}@{socket.gethostname()}"
-
-
-def lock_owner() -> str:
-    """Names this process to the locks on nodes: `user@host:pid:start`, with nothing but letters, digits and @._:+-."""
-    return re.sub(r"[^A-Za-z0-9@._:+-]", "-", f"{owner().partition('@')[0]}@{this_process()}")
-
-
-def is_dead(lock: str) -> bool:
-    """Whether a lock's owner was a process of this machine that has ended: nobody will ever give it back."""
-    return bool(lock) and not process_lives(lock.partition("@")[2])
-
-
-def this_process() -> str:
-    """`host:pid:start`, where start tells a process from a later one with the same pid."""
-    return f"{socket.gethostname()}:{os.getpid()}:{_start_ticks(os.getpid())}"
-
-
-def process_lives(process: str) -> bool:
-    """Whether the process that wrote a run still runs; one on another host counts as alive, we cannot know."""
-    host, _, rest = process.rpartition(":")
-    host, _, pid = host.rpartition(":")
-    return host != socket.gethostname() or (pid.isdigit() and _start_ticks(int(pid)) == rest)
-
-
-def _start_ticks(pid: int) -> str:
-    """Field 22 of /proc/PID/stat (proc(5)), empty for a process that is not there."""
-    try:
-        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return ""
-    return text.rpartition(")")[2].split()[19]

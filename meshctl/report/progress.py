@@ -1,14 +1,16 @@
 """A run while it goes on: one live line per node in work on a terminal, plain lines elsewhere, JSON lines for scripts.
 
-Each class is an observer of `meshctl.fleet` events and guards itself with a lock, since events come from threads.
+Each class is an observer of `meshctl.fleet` events and guards itself with a lock, since events come from threads;
+`Aside` lets one of them write from a thread of its own.
 """
 
 from __future__ import annotations
 
 import json
+import queue
 import threading
 from collections import Counter
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from types import TracebackType
 from typing import Protocol, TextIO
 
@@ -164,3 +166,41 @@ class LiveProgress(Progress):
         ended = sum(self._counts.values())
         counts = ", ".join(f"{self._counts[result]} {result.value}" for result in Result if self._counts[result])
         return Group(*lines, Text(f"{ended}/{self._total} nodes" + (f": {counts}" if counts else ""), "bold"))
+
+
+class Aside(Progress):
+    """Shows events from a thread of its own, so that no node's work waits for a screen.
+
+    A reader that stands still (a pager, Ctrl-S) holds up nothing but the lines; one that is gone (a closed terminal,
+    `| head`) only ends them. An armed change would run out meanwhile, or its worker die of the failed write.
+    """
+
+    def __init__(self, shown: Progress) -> None:
+        self._shown = shown
+        self._events: queue.SimpleQueue[Event | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._show, name="progress", daemon=True)
+
+    def __enter__(self) -> Aside:
+        self._shown.__enter__()
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._events.put(None)
+        self._thread.join()
+        with suppress(*_UNREAD):
+            self._shown.__exit__(kind, error, trace)
+
+    def __call__(self, event: Event) -> None:
+        self._events.put(event)
+
+    def _show(self) -> None:
+        with suppress(*_UNREAD):
+            while (event := self._events.get()) is not None:
+                self._shown(event)
+
+
+# EPIPE and EIO; rich makes SystemExit of the former
+_UNREAD = (OSError, SystemExit)

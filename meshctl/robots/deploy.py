@@ -15,7 +15,7 @@ from pathlib import Path
 from meshctl.device.errors import ConnectionLost, Timeout
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome, Result
-from meshctl.fleet.journal import is_dead
+from meshctl.fleet.process import is_dead
 from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.robots.bundle import ROS_1, Bundle, bundle, has_bridge
 from meshctl.robots.host import Host, Refused

@@ -13,7 +13,8 @@ import pytest
 
 from meshctl.errors import MeshctlError, NodeError
 from meshctl.fleet import Outcome, Result
-from meshctl.fleet.journal import Journal, default_path, process_lives, this_process
+from meshctl.fleet.journal import Journal, default_path
+from meshctl.fleet.process import process_lives, this_process
 
 
 @pytest.fixture
@@ -33,6 +34,22 @@ def test_every_node_of_a_run_is_pending_until_it_has_an_outcome(path: Path) -> N
         ]
         assert journal.outcomes(run.id)[1].facts == {"revision": "r1"}
         assert journal.unfinished(run.id) == ("a", "c")
+
+
+def test_what_a_run_left_stands_until_a_later_run_takes_it_up(path: Path) -> None:
+    with Journal(path) as journal:
+        first = journal.begin("provision", fleet="f", inventory="inv", nodes=("a", "b", "c"))
+        first.finish_node(Outcome("a", Result.UNREACHABLE))
+        second = journal.begin("provision", fleet="f", inventory="inv", nodes=("b",))
+        second.finish_node(Outcome("b", Result.DONE))
+        journal.begin("robots deploy", fleet="f", inventory="inv", nodes=("a",))
+        journal.begin("provision", fleet="other", inventory="inv", nodes=("c",))
+        assert journal.left("f") == {3: ("a",), 1: ("a", "c")}
+        third = journal.begin("resume", fleet="f", inventory="inv", nodes=("a", "c"))
+        third.finish_node(Outcome("a", Result.DONE))
+        third.finish_node(Outcome("c", Result.FAILED))
+        assert journal.left("f") == {5: ("c",), 3: ("a",)}
+        assert [run.id for run in journal.runs(fleet="f", node="b")] == [2, 1]
 
 
 def test_steps_tell_what_failed_and_what_was_cut_short(path: Path) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 import json
+import threading
 
 from rich.console import Console
 
 from meshctl.fleet import Event, EventKind, Outcome, Result
-from meshctl.report.progress import JsonProgress, LiveProgress, PlainProgress
+from meshctl.report.progress import Aside, JsonProgress, LiveProgress, PlainProgress
 
 GONE = Outcome("b01", Result.ROLLED_BACK, "no neighbour came back", hint="look at its antenna", duration_s=12.34)
 EVENTS = [
@@ -53,3 +54,33 @@ def test_live_lines_keep_outcomes_and_count_them() -> None:
     shown = console.file.getvalue()
     assert "b01: rolled back: no neighbour came back (12.3 s)" in shown
     assert "1/2 nodes: 1 rolled back" in shown
+
+
+def test_a_reader_that_stands_still_holds_up_no_work() -> None:
+    may_write = threading.Event()
+
+    class Slow(io.StringIO):
+        def write(self, text: str) -> int:
+            may_write.wait()
+            return super().write(text)
+
+    out = Slow()
+    with Aside(PlainProgress(out)) as progress:
+        for event in EVENTS:
+            progress(event)
+        assert out.getvalue() == ""
+        may_write.set()
+    assert len(out.getvalue().splitlines()) == 4
+
+
+def test_a_reader_that_is_gone_ends_the_lines_and_no_work() -> None:
+    class Closed(io.StringIO):
+        def write(self, text: str) -> int:
+            raise BrokenPipeError
+
+    for make in (PlainProgress, JsonProgress):
+        out = Closed()
+        with Aside(make(out)) as progress:
+            for event in EVENTS:
+                progress(event)
+        assert out.getvalue() == ""

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from meshctl.fleet.interrupt import Interrupt
-from meshctl.fleet.journal import lock_owner
+from meshctl.fleet.process import lock_owner
 from tests.meshctl.device.servers import PATIENCE_S, eventually
 from tests.meshctl.robots.fleets import RobotFleet
 
