@@ -26,7 +26,9 @@ from meshctl.model import Node
 def trust(
     nodes: Nodes = None,
     inventory: InventoryPath = Path(),
-    change: Annotated[bool, typer.Option("--replace", help="Also take keys that differ from the pinned ones.")] = False,
+    change: Annotated[
+        bool, typer.Option("--replace", "--replace-key", help="Also take keys that differ from the pinned ones.")
+    ] = False,
     yes: Annotated[
         bool, typer.Option("--yes", "-y", help="Pin without asking; compare the fingerprints first.")
     ] = False,
@@ -95,7 +97,11 @@ def _decide(opened: Session, item: Shown, *, may_replace: bool, yes: bool, quiet
 
 def run(
     words: Annotated[
-        list[str], typer.Argument(help="Nodes or patterns, then -- and the command; without nodes: on all.")
+        list[str],
+        typer.Argument(
+            metavar="NODES -- COMMAND",
+            help="Nodes or patterns, then -- and the command; without nodes: on all.",
+        ),
     ],
     inventory: InventoryPath = Path(),
     timeout: Annotated[float, typer.Option("--timeout", help="Seconds that a node may take.")] = 60.0,
@@ -104,6 +110,8 @@ def run(
     lab: Lab = None,
 ) -> None:
     """Run a shell command on nodes, in parallel.
+
+    Exit code: 0 when it ends with 0 on every node, else 1; 3 when no node answers.
 
     Example: meshctl run 'husky*' -- uptime
     """
@@ -159,14 +167,20 @@ def _print(name: str, stdout: str, stderr: str, *, as_json: bool, status: int) -
 
 def ssh(
     node: Annotated[str, typer.Argument(help="Name of the node.")],
-    command: Annotated[list[str] | None, typer.Argument(help="A command to run there instead of a shell.")] = None,
+    command: Annotated[
+        list[str] | None, typer.Argument(help="After --: a command to run there instead of a shell.")
+    ] = None,
     inventory: InventoryPath = Path(),
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
     """Log in to a node with the system's ssh, trusting what the fleet trusts.
 
+    Exit code: that of ssh.
+
     Example: meshctl ssh b03
+
+    Example: meshctl ssh b03 -- logread -f
     """
     program = shutil.which("ssh")
     if program is None:

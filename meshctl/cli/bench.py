@@ -50,7 +50,9 @@ def bootstrap(
     at: At = None,
     interface: Interfaces = None,
     inventory: InventoryPath = Path(),
-    replace_key: Annotated[bool, typer.Option("--replace-key", help="Take a device whose host key is new.")] = False,
+    replace_key: Annotated[
+        bool, typer.Option("--replace-key", "--replace", help="Take a device whose host key is new.")
+    ] = False,
     yes: Yes = False,
     no_firmware: NoFirmware = False,
     rate: Rate = None,

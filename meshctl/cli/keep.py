@@ -15,7 +15,7 @@ from meshctl.apply.job import Job, Work
 from meshctl.apply.keep import Backup, fetch, lacking_packages, objection_to, put_back, read_backup
 from meshctl.cli.asking import must_agree
 from meshctl.cli.carry import Refused
-from meshctl.cli.options import InventoryPath
+from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.plan import Yes
 from meshctl.cli.session import KeyFiles, Lab, Nodes, Session, chosen, exit_for, progress_for, session
 from meshctl.errors import InputError
@@ -27,6 +27,7 @@ def backup(
     nodes: Nodes = None,
     out: Annotated[Path, typer.Option("--out", help="Directory to write NODE-TIME.tgz to.")] = Path("backups"),
     inventory: InventoryPath = Path(),
+    as_json: AsJson = False,
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
@@ -45,13 +46,13 @@ def backup(
             with opened.access.lease(wanted[name]) as connection:
                 seen = observe_cleared(connection, (), opened.interrupt)
                 data = fetch(connection, name, seen)
-            opened.journal.remember(opened.fleet.name, name, facts_of(seen), seen.answered_at_s)
             path = out / f"{name}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(seen.answered_at_s))}.tgz"
             _write_private(path, data)
+            opened.journal.remember(opened.fleet.name, name, facts_of(seen), seen.answered_at_s)
             return Outcome(name, Result.DONE, str(path))
 
         with (
-            progress_for(len(wanted), as_json=False) as progress,
+            progress_for(len(wanted), as_json=as_json) as progress,
             opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)),
         ):
             ended = run(
@@ -61,10 +62,16 @@ def backup(
 
 
 def _write_private(path: Path, data: bytes) -> None:
+    # half a backup must not look like one
+    part = path.with_name(f".{path.name}.part")
     try:
-        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+        with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
             file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
     except OSError as error:
+        part.unlink(missing_ok=True)
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
 
 
@@ -73,6 +80,7 @@ def restore(
     file: Annotated[Path, typer.Argument(help="A file that `meshctl backup` wrote.")],
     inventory: InventoryPath = Path(),
     yes: Yes = False,
+    as_json: AsJson = False,
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
@@ -89,11 +97,11 @@ def restore(
         if not yes:
             taken = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(saved.taken_s))
             must_agree(f"Make {there.name} what it was on {taken}?")
-        outcome = _restore(opened, there.name, saved)
+        outcome = _restore(opened, there.name, saved, as_json=as_json)
     raise typer.Exit(exit_for([outcome], opened.interrupt))
 
 
-def _restore(opened: Session, name: str, saved: Backup) -> Outcome:
+def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Outcome:
     node = opened.fleet.nodes[name]
     journal_run = opened.journal.begin(
         "restore", fleet=opened.fleet.name, inventory=opened.inventory, nodes=(name,), plan=""
@@ -101,7 +109,7 @@ def _restore(opened: Session, name: str, saved: Backup) -> Outcome:
     ended: dict[str, Outcome] = {}
     try:
         with (
-            progress_for(1, as_json=False) as progress,
+            progress_for(1, as_json=as_json) as progress,
             opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)),
         ):
             work = Work(opened.fleet, opened.access, journal_run, progress, opened.interrupt, opened.owner)

@@ -11,7 +11,7 @@ import typer
 from meshctl.cli import lab_ground
 from meshctl.cli.options import AsJson, LabDirectory, lab_directory
 from meshctl.errors import InputError
-from meshctl.lab.breaks import BREAKS
+from meshctl.lab.breaks import BREAKS, parse, told
 from meshctl.lab.console import run_shell
 from meshctl.lab.copybook import prepare
 from meshctl.lab.errors import LabError
@@ -111,13 +111,25 @@ def shell(
     raise typer.Exit(run_shell(fleet, fleet.node(node).name, " ".join(command or ())))
 
 
-@app.command("break", help="Break something.\n\n" + "\n\n".join(f"{one.value}: {text}" for one, text in BREAKS.items()))
+_BREAK_HELP = "\n\n".join(
+    (
+        "Break something, now or at a step; `meshctl lab mend` undoes it.",
+        *(f"{one.value}: {text}" for one, text in BREAKS.items()),
+        "Example: meshctl lab break b03 'power-cut@reload_config'",
+        "Example: meshctl lab break b01-b02 link-down",
+    )
+)
+
+
+@app.command("break", help=_BREAK_HELP)
 def break_(
     where: Where,
     what: Annotated[str, typer.Argument(help="What happens to it, some with @STEP: power-cut@7, power-cut@flash.")],
     directory: LabDirectory = None,
 ) -> None:
+    order = parse(what)
     VirtualFleet.attach(lab_directory(directory)).break_(where, what)
+    typer.echo(f"{where}: {told(order)}")
 
 
 @app.command("mend")

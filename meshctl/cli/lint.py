@@ -32,7 +32,7 @@ class Format(StrEnum):
 
 
 class Threshold(StrEnum):
-    """The least severity that makes the exit status 1."""
+    """The least severity that makes the exit code 1."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -45,7 +45,7 @@ def lint(
         typer.Argument(help="Inventories: YAML files or directories. Default: $MESHCTL_INVENTORY or here."),
     ] = None,
     format: Annotated[Format, typer.Option("--format", "-f", help="How to write the findings.")] = Format.TEXT,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write to this file.")] = None,
+    output: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write to this file.")] = None,
     select: Annotated[
         list[str] | None, typer.Option(help="Only rules whose code starts so: MC3, or MC342,MC343.")
     ] = None,
@@ -64,9 +64,9 @@ def lint(
 ) -> None:
     """Check inventories across all layers.
 
-    Exit status: 0 clean, 1 findings, 2 could not run. Notes alone do not count, unless --fail-on note.
+    Exit code: 0 clean, 1 findings, 2 could not run. Notes alone do not count, unless --fail-on note.
 
-    Example: meshctl lint inventory/ --format sarif --output lint.sarif
+    Example: meshctl lint inventory/ --format sarif --out lint.sarif
     """
     if explain is not None:
         typer.echo(_explained(explain), nl=False)

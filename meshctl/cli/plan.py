@@ -27,7 +27,7 @@ LeaveBehind = Annotated[
 AcceptCut = Annotated[
     str, typer.Option("--accept-cut", help="Cut vertices (a,b,...; or all) that may be flashed nevertheless.")
 ]
-Brief = Annotated[bool, typer.Option("--brief", help="Do not show what changes inside the files.")]
+Brief = Annotated[bool, typer.Option("--brief/--full", help="Whether to leave out what changes inside the files.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
 Rate = Annotated[float | None, typer.Option("--rate", help="Upload at most so many kilobytes per second to a node.")]
 

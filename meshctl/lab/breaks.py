@@ -63,6 +63,20 @@ class Order:
     step: str = ""
 
 
+def told(order: Order) -> str:
+    """What happens now, or what will and when, for whoever ordered it."""
+    text = BREAKS[order.what].partition(" (@STEP")[0]
+    if not order.step:
+        return text
+    if order.step == "flash":
+        return f"{text}; in the middle of its next flash"
+    return f"{text}; " + (
+        f"at command {order.step} that it runs from now on"
+        if order.step.isdecimal()
+        else f"before the first command whose words hold {order.step!r}"
+    )
+
+
 def parse(text: str) -> Order:
     """`power-cut@7` -> Order. Raises InputError naming the words there are."""
     word, _, step = text.partition("@")

@@ -56,6 +56,13 @@ def test_every_node_of_a_big_fleet_is_a_few_hops_away() -> None:
 def test_breaks_are_words_and_some_take_a_step() -> None:
     assert breaks.parse("power-cut@7") == Order(Break.CUT, "7")
     assert breaks.parse("full-flash") == Order(Break.FULL_FLASH)
+    assert breaks.told(Order(Break.FULL_FLASH)) == "no space left in flash but 8 KiB"
+    assert breaks.told(Order(Break.CUT, "7")).endswith(
+        "what was not synced is lost; at command 7 that it runs from now on"
+    )
+    assert breaks.told(Order(Break.SEVER, "uci commit")).endswith(
+        "before the first command whose words hold 'uci commit'"
+    )
     assert set(breaks.BREAKS) == set(Break)
     with pytest.raises(InputError, match="explode"):
         breaks.parse("explode")
