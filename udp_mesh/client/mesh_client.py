@@ -82,7 +82,7 @@ class FrameReader:
                 break
             with memoryview(buffer) as view:
                 frames.append(
-                    (_parse_header(bytes(view[body : body + head_bytes])), bytes(view[body + head_bytes : end]))
+                    (parse_header(bytes(view[body : body + head_bytes])), bytes(view[body + head_bytes : end]))
                 )
             start = end
             self._needed = _LENGTHS.size
@@ -90,7 +90,8 @@ class FrameReader:
         return frames
 
 
-def _parse_header(raw: bytes) -> Header:
+def parse_header(raw: bytes) -> Header:
+    """The header in these bytes. Raises MeshError ("bad-frame") where they are no JSON object."""
     try:
         header = json.loads(raw.decode("utf-8"))
     except (ValueError, RecursionError) as error:

@@ -2,7 +2,7 @@
 
 A connection hands each request to the service and writes what the service gives back. What a slow reader does not
 fetch is bounded: past `CLIENT_BACKLOG_BYTES` messages for it are dropped, and it is told how many once it reads
-again. Other readers and the mesh never wait for it.
+again; past `REPLIES_BACKLOG_BYTES` more its own requests wait. Other readers and the mesh never wait for it.
 """
 
 from __future__ import annotations
@@ -13,15 +13,19 @@ import logging
 import os
 import socket
 import stat
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, cast
 
-from udp_mesh.client.mesh_client import Frame, FrameReader, Header, MeshError, encode_frame
+from udp_mesh.client.mesh_client import Frame, Header, encode_frame
+from udp_mesh.daemon.request_frames import BadFrame, RequestReader
 
 log = logging.getLogger(__name__)
 
 CLIENT_BACKLOG_BYTES = 32 << 20
 """Bytes written to one client and not yet read by it: a stopped subscriber. A few of the largest usual messages."""
+REPLIES_BACKLOG_BYTES = 4 << 20
+"""Bytes of replies beyond that: a program that asks without end and never reads the answers."""
 MAX_CLIENTS = 128
 """Connections at a time: a program that leaks them must not take the daemon's descriptors."""
 
@@ -49,7 +53,7 @@ class Client(asyncio.Protocol):
 
     def __init__(self, server: LocalServer) -> None:
         self._server = server
-        self._reader = FrameReader(server.max_payload_bytes)
+        self._reader = RequestReader(server.max_payload_bytes)
         self._transport: asyncio.Transport | None = None
         self._dropped = 0
 
@@ -116,14 +120,14 @@ class Client(asyncio.Protocol):
         self._server.clients.add(self)
 
     def data_received(self, data: bytes) -> None:
-        try:
-            frames = self._reader.feed(data)
-        except MeshError as error:
-            self.refuse(None, error.code, str(error))
-            self.close()
-            return
-        for frame in frames:
-            self._handle(frame)
+        for frame in self._reader.feed(data):
+            if isinstance(frame, BadFrame):
+                self.refuse(*frame)
+            else:
+                self._handle(frame)
+        transport = self._transport
+        if transport is not None and transport.get_write_buffer_size() > CLIENT_BACKLOG_BYTES + REPLIES_BACKLOG_BYTES:
+            transport.pause_reading()
 
     def _handle(self, frame: Frame) -> None:
         header, payload = frame
@@ -133,6 +137,9 @@ class Client(asyncio.Protocol):
             self.refuse(header.get("id"), error.code, str(error))
 
     def resume_writing(self) -> None:
+        # What was written is read, all but a few kilobytes.
+        if self._transport is not None:
+            self._transport.resume_reading()
         if self._dropped:
             self._report_dropped()
 
@@ -145,7 +152,9 @@ class Client(asyncio.Protocol):
 class LocalServer:
     """The listening socket and its connections."""
 
-    def __init__(self, requests: Requests, path: Path, *, mode: int, group: str | None, max_payload_bytes: int) -> None:
+    def __init__(
+        self, requests: Requests, path: Path, *, mode: int, group: str | None, max_payload_bytes: Callable[[], int]
+    ) -> None:
         self.requests = requests
         self.clients: set[Client] = set()
         self.max_payload_bytes = max_payload_bytes

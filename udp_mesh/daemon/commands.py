@@ -38,6 +38,11 @@ def _text(header: Header, key: str) -> str:
     value = header.get(key)
     if not isinstance(value, str) or not value:
         raise RequestError("bad-request", f"{key}: expected text, found {value!r}")
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:
+        # JSON can name half of a surrogate pair, which is no text
+        raise RequestError("bad-request", f"{key}: expected Unicode text, found {value!r}") from error
     return value
 
 
@@ -70,9 +75,7 @@ def _refusal(error: ConfigurationError) -> RequestError:
 def publish(service: Service, client: Client, header: Header, payload: bytes) -> Header | Awaitable[Header]:
     topic, destination = _text(header, "topic"), _optional_text(header, "to")
     notify = client if header.get("notify") else None
-    type_name = header.get("type", "")
-    if not isinstance(type_name, str):
-        raise RequestError("bad-request", f"type: expected text, found {type_name!r}")
+    type_name = _text(header, "type") if header.get("type") else ""
     message = service.publish(topic, payload, destination, type_name, notify)
     if isinstance(message, int):
         return {"message": message}

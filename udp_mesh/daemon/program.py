@@ -45,7 +45,7 @@ async def run(configuration: Configuration) -> None:
         daemon.socket,
         mode=daemon.socket_mode,
         group=daemon.socket_group,
-        max_payload_bytes=configuration.settings.limits.message_bytes,
+        max_payload_bytes=lambda: service.settings.limits.message_bytes,
     )
     metrics = None
     if daemon.metrics_address is not None:

@@ -1,7 +1,9 @@
 """Two real daemons: messages, changes at run time, metrics, recording, and hostile local programs."""
 
 import json
+import os
 import random
+import select
 import shutil
 import socket
 import subprocess
@@ -17,6 +19,7 @@ from tests.udp_mesh.daemon.processes import RunningDaemon, collect, outcomes, po
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
 from udp_mesh.client import MeshClient, MeshError, mesh_client
 from udp_mesh.client.mesh_client import encode_frame
+from udp_mesh.core.settings import Limits
 from udp_mesh.daemon.configuration import CONDITIONS_TOPIC
 
 Pair = tuple[RunningDaemon, RunningDaemon]
@@ -118,6 +121,53 @@ def test_a_program_that_sends_anything_disturbs_nobody(pair: Pair, raw: bytes) -
             continue
     with pair[0].client() as client:
         client.request("peers")
+
+
+def test_a_message_above_the_limit_is_refused_and_the_connection_goes_on(pair: Pair) -> None:
+    alice, bob = pair
+    limit = Limits().message_bytes
+    with alice.client() as sender, bob.client() as receiver:
+        receiver.subscribe("map")
+        with pytest.raises(MeshError) as caught:
+            sender.publish("map", bytes(limit + 1), to="bob")
+        assert caught.value.code == "too-large"
+        sender.publish("map", bytes(limit + 1), to="bob", wait=False)
+        frame = sender.next_frame(WAIT_S)
+        assert frame is not None
+        assert (frame[0]["event"], frame[0]["code"]) == ("rejected", "too-large")
+        sender.publish("map", b"fits", to="bob")
+        assert collect(receiver, 1)[0].payload == b"fits"
+
+
+def test_a_program_that_asks_without_reading_stops_being_answered_until_it_reads(pair: Pair) -> None:
+    # an id comes back in the answer: a long one makes the answers long
+    request, taken = encode_frame({"op": "neighbours", "id": "x" * 60_000}), 0
+    with socket.socket(socket.AF_UNIX) as hostile:
+        hostile.connect(str(pair[0].socket))
+        hostile.setblocking(False)
+        before, rest = resident_bytes(pair[0]), request
+        while poll_writable(hostile):
+            sent = hostile.send(rest)
+            taken += sent
+            rest = rest[sent:] or request
+            assert taken < 200 << 20, "it is answered without end"
+        assert taken > 32 << 20
+        assert resident_bytes(pair[0]) < before + (100 << 20)
+        with pair[0].client() as client:
+            client.request("peers")
+        hostile.setblocking(True)
+        while taken > 0:
+            taken -= len(hostile.recv(1 << 20))
+
+
+def resident_bytes(daemon: RunningDaemon) -> int:
+    assert daemon.process is not None
+    return int(Path(f"/proc/{daemon.process.pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def poll_writable(program: socket.socket) -> bool:
+    """Whether the daemon takes more of this program within a second of its doing nothing else."""
+    return bool(select.select([], [program], [], 1.0)[1])
 
 
 def test_a_subscriber_that_does_not_read_loses_messages_and_is_told_how_many(pair: Pair) -> None:

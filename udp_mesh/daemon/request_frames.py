@@ -1,0 +1,96 @@
+"""Bytes of a local program in any pieces -> its requests, and what in them is none (docs/local-api.md, "Frames").
+
+A frame that cannot be taken costs its sender that frame only: its lengths say where the next one begins, so what is too
+long is read past without being kept, and the connection goes on.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import NamedTuple
+
+from udp_mesh.client.mesh_client import MAX_HEADER_BYTES, Frame, Header, MeshError, parse_header
+
+_LENGTHS = struct.Struct(">II")
+
+
+class BadFrame(NamedTuple):
+    """A frame that is no request: whom to answer (None: nobody asked for a reply, or nobody can tell), and why."""
+
+    request_id: int | float | str | None
+    code: str
+    text: str
+
+
+class RequestReader:
+    """The reading half of one connection. Holds at most one frame within the limits."""
+
+    def __init__(self, max_payload_bytes: Callable[[], int]) -> None:
+        """`max_payload_bytes` is asked for each frame: the limit may change while the daemon runs."""
+        self._buffer = bytearray()
+        self._needed = _LENGTHS.size
+        """Bytes from the start of the frame at the front that must be here before it is looked at again."""
+        self._passed_over = 0
+        """Bytes still to come of a frame that was refused."""
+        self._max_payload_bytes = max_payload_bytes
+
+    def feed(self, data: bytes) -> list[Frame | BadFrame]:
+        """What these bytes complete, in order."""
+        if self._passed_over:
+            count = min(self._passed_over, len(data))
+            self._passed_over -= count
+            data = data[count:]
+        buffer = self._buffer
+        buffer += data
+        found: list[Frame | BadFrame] = []
+        start = 0
+        while len(buffer) - start >= self._needed:
+            head_bytes, payload_bytes = _LENGTHS.unpack_from(buffer, start)
+            body = start + _LENGTHS.size
+            payload = body + head_bytes
+            end = payload + payload_bytes
+            most = self._max_payload_bytes()
+            if head_bytes > MAX_HEADER_BYTES:
+                expected = f"a header of at most {MAX_HEADER_BYTES} bytes"
+                found.append(BadFrame(None, "bad-frame", f"expected {expected}, found {head_bytes}"))
+            elif payload_bytes > most:
+                if len(buffer) < payload:
+                    self._needed = payload - start
+                    break
+                text = f"expected a payload of at most {most} bytes, found {payload_bytes}"
+                found.append(_refused(bytes(buffer[body:payload]), text))
+            elif len(buffer) < end:
+                self._needed = end - start
+                break
+            else:
+                found.append(_taken(bytes(buffer[body:payload]), bytes(memoryview(buffer)[payload:end])))
+            self._needed = _LENGTHS.size
+            self._passed_over = max(0, end - len(buffer))
+            start = min(end, len(buffer))
+        del buffer[:start]
+        return found
+
+
+def _taken(head: bytes, payload: bytes) -> Frame | BadFrame:
+    try:
+        return _header(head), payload
+    except MeshError as error:
+        return BadFrame(None, error.code, str(error))
+
+
+def _refused(head: bytes, text: str) -> BadFrame:
+    """A frame whose payload is not taken; its header tells whom to answer."""
+    try:
+        return BadFrame(_header(head).get("id"), "too-large", text)
+    except MeshError as error:
+        return BadFrame(None, error.code, str(error))
+
+
+def _header(raw: bytes) -> Header:
+    """As `parse_header`, with an id that can be sent back."""
+    header = parse_header(raw)
+    request_id = header.get("id")
+    if isinstance(request_id, bool) or not isinstance(request_id, int | float | str | None):
+        raise MeshError("bad-frame", "id: expected a number or text, found something else")
+    return header
