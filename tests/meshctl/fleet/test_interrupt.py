@@ -22,7 +22,8 @@ def handled(number: signal.Signals, before: signal.Handlers) -> Iterator[None]:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_asks_to_stop_and_a_second_one_to_leave(number: signal.Signals) -> None:
-    interrupt, said = Interrupt(), []
+    interrupt = Interrupt()
+    said: list[str] = []
     with handled(number, signal.Handlers.SIG_DFL), interrupt.on_signals(said.append):
         signal.raise_signal(number)
         assert (interrupt.stopping, interrupt.leaving) == (True, False)
