@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from ipaddress import IPv4Address
@@ -19,6 +20,9 @@ from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import HostKeyPolicy, TrustStore
 from meshctl.errors import InputError, Unreachable
 from meshctl.model import Fleet, Node
+
+# Closing waits for the connection's thread, up to two seconds where the other side is gone: a fleet's wait together.
+CLOSED_AT_ONCE = 32
 
 
 class Locate(Protocol):
@@ -153,19 +157,25 @@ class Access:
             kept.close()
 
     def close(self) -> None:
-        """Close every connection, those through another node first."""
+        """Close every connection side by side, those through another node before what they go through."""
         with self._lock:
-            every = [*self._kept.values(), *self._jumps.values()]
+            kept, jumps = list(self._kept.values()), list(self._jumps.values())
             self._kept.clear()
             self._jumps.clear()
-        for connection in every:
-            connection.close()
+        _close(kept)
+        _close(jumps)
 
     def __enter__(self) -> Access:
         return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()
+
+
+def _close(connections: Iterable[SshConnection]) -> None:
+    with ThreadPoolExecutor(CLOSED_AT_ONCE, "close") as pool:
+        for _ in pool.map(SshConnection.close, connections):
+            pass
 
 
 def _key_path(text: str, fleet: Fleet) -> Path:

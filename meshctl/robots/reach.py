@@ -5,6 +5,8 @@ Host keys are pinned in the fleet's own file under `robot.NAME`, since a node ma
 
 from __future__ import annotations
 
+import getpass
+import socket
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -41,7 +43,8 @@ class Reach:
     def endpoint(self, robot: str) -> Endpoint:
         computer = computer_of(self.fleet, robot)
         host = computer.ssh.host or str(computer.address.ip)
-        return Endpoint(host, computer.ssh.port, computer.ssh.user, identity=f"robot.{robot}")
+        user = computer.ssh.user or operators_name(robot)
+        return Endpoint(host, computer.ssh.port, user, identity=f"robot.{robot}")
 
     @contextmanager
     def host(
@@ -73,7 +76,8 @@ class Reach:
                     endpoint, credentials=credentials, trust=trust, deadlines=self.access.deadlines, via=via
                 )
             except NodeError as error:
-                error.hint = _remedy(error, robot, endpoint) or error.hint
+                is_user_written = bool(computer_of(self.fleet, robot).ssh.user)
+                error.hint = _remedy(error, robot, endpoint, is_user_written=is_user_written) or error.hint
                 raise
             yield stack.enter_context(connection)
 
@@ -106,17 +110,34 @@ class Reach:
         return path if path.is_absolute() else Path(self.fleet.base) / path
 
 
-def _remedy(error: NodeError, robot: str, endpoint: Endpoint) -> str:
+def operators_name(robot: str) -> str:
+    """Who logs in where the inventory names nobody: the operator, as OpenSSH has it. Raises InputError for a process
+    without a name, as in a container."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError, ImportError):
+        place = f"robots.{robot}.computer.ssh.user"
+        raise InputError(
+            f"{place}: names nobody, and whoever runs this has no name either", hint=f"write {place}"
+        ) from None
+
+
+def _remedy(error: NodeError, robot: str, endpoint: Endpoint, *, is_user_written: bool) -> str:
     """What helps with a computer, where the device layer knows radios; empty for what is the same."""
+    place = f"robots.{robot}.computer.ssh"
     match error:
         case AuthenticationRefused():
             keys = f"put your public key into ~{endpoint.user}/.ssh/authorized_keys there (ssh-copy-id)"
-            return f"{keys}, or name another in robots.{robot}.computer.ssh"
+            if is_user_written:
+                return f"{keys}, or name another in {place}"
+            return f"the inventory names no user, so {endpoint.user} was tried, your own: write {place}.user, or {keys}"
         case HostKeyUnknown():
             return f"compare it with the computer's own, then run `meshctl robots trust {robot}`"
         case HostKeyChanged():
             again = f"`meshctl robots trust --replace {robot}` once you know"
             return f"another computer, a new installation, or an attack; {again}"
+        case Unreachable() if isinstance(error.__cause__, socket.gaierror):
+            return f"no address is known here for {endpoint.host}: write one into {place}.host, or take that away"
         case Unreachable():
             return f"is it on, does sshd run there, and is robots.{robot}.computer right?"
         case _:

@@ -133,15 +133,11 @@ class Watcher:
             return ping(host, peers)
 
     def close(self) -> None:
-        """Close all connections, those to radios kept by `access` too, side by side: each takes a tenth of a second."""
+        """Close the connections to computers, side by side. Those to radios are `access`'s to close."""
         with self._lock:
-            jobs: dict[str, Callable[[], object]] = {
-                f"{ROBOT_PREFIX}{name}": stack.close for name, (stack, _) in self._computers.items()
-            }
+            jobs: dict[str, Callable[[], object]] = {name: stack.close for name, (stack, _) in self._computers.items()}
             self._computers.clear()
-        for node in self.fleet.nodes:
-            jobs[node] = partial(self.access.drop, node)
-        side_by_side(jobs, len(jobs))
+        side_by_side(jobs, SIDE_BY_SIDE)
 
     def __enter__(self) -> Watcher:
         return self
