@@ -1,12 +1,14 @@
 """`python -m tests.meshctl.proof`: run the proofs, write every case to a JSONL file, print the tables.
 
-Parts: apply, kill, flash, flash-kill, crowd. `--table FILE` prints the tables of an earlier run.
+Parts: apply, kill, flash, flash-kill, crowd. `--minutes` ends a part early and says with which `--first` the next call
+goes on. `--table FILE` prints the tables of earlier runs, and with `--fill PAGE` puts them there.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import tempfile
 import time
@@ -15,7 +17,7 @@ from typing import Any, TextIO
 
 from tests.meshctl.proof.crowd import hurt_and_provision
 from tests.meshctl.proof.kills import Case
-from tests.meshctl.proof.matrix import apply_matrix, firmware, flash_matrix, kill_matrix, table
+from tests.meshctl.proof.matrix import apply_matrix, filled, firmware, flash_matrix, kill_matrix, table
 from tests.meshctl.proof.rig import Rig
 
 PARTS = ("apply", "kill", "flash", "flash-kill", "crowd")
@@ -31,11 +33,13 @@ def main() -> int:
     parser.add_argument("--nodes", type=int, default=8, help="nodes struck at once")
     parser.add_argument("--crowd", type=int, default=200, help="nodes of the big fleet")
     parser.add_argument("--every", type=int, default=1, help="strike at every so many steps")
-    parser.add_argument("--first", type=int, default=1, help="begin at this word of meshctl (kill, flash-kill)")
+    parser.add_argument("--first", type=int, default=1, help="begin at this batch (apply) or word of meshctl (kills)")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="begin nothing more after so many (not crowd)")
     parser.add_argument("--table", type=Path, help="print the tables of this file, run nothing")
+    parser.add_argument("--fill", type=Path, help="with --table: the page to put its rows into")
     chosen = parser.parse_args()
     if chosen.table is not None:
-        return _report(chosen.table)
+        return _report(chosen.table, chosen.fill)
     with chosen.out.open("a", encoding="utf-8") as out, tempfile.TemporaryDirectory(prefix="proof-") as home:
         for part in chosen.parts or PARTS:
             _run(part, chosen, out, Path(home) / part)
@@ -52,15 +56,18 @@ def _run(part: str, chosen: argparse.Namespace, out: TextIO, directory: Path) ->
         if not case.holds:
             sys.stderr.write(f"does not hold: {case}\n")
 
+    deadline = time.monotonic() + 60.0 * chosen.minutes
+    where = {"every": chosen.every, "first": chosen.first, "is_enough": lambda: time.monotonic() > deadline}
+    following = 0
     match part:
         case "apply":
             with Rig(directory, chosen.nodes) as rig:
                 _take_in(rig)
-                apply_matrix(rig, tell, every=chosen.every)
+                following = apply_matrix(rig, tell, **where)
         case "kill":
             with Rig(directory, chosen.nodes) as rig:
                 _take_in(rig)
-                kill_matrix(rig, tell, every=chosen.every, first=chosen.first)
+                following = kill_matrix(rig, tell, **where)
         case "flash":
             with Rig(directory, chosen.nodes, firmware=firmware(directory)) as rig:
                 _take_in(rig)
@@ -68,7 +75,7 @@ def _run(part: str, chosen: argparse.Namespace, out: TextIO, directory: Path) ->
         case "flash-kill":
             with Rig(directory, FLASHED_AT_ONCE, firmware=firmware(directory)) as rig:
                 _take_in(rig)
-                kill_matrix(rig, tell, every=chosen.every, first=chosen.first, verb="flash")
+                following = kill_matrix(rig, tell, verb="flash", **where)
         case "crowd":
             with Rig(directory, chosen.crowd) as rig:
                 began = time.monotonic()
@@ -77,6 +84,8 @@ def _run(part: str, chosen: argparse.Namespace, out: TextIO, directory: Path) ->
                 write({"part": part, **first, **hurt_and_provision(rig, share=0.05, old="a", new="b")})
         case _:
             raise SystemExit(f"no part is called {part!r}: expected {', '.join(PARTS)}")
+    if following:
+        sys.stderr.write(f"{part}: go on with --first {following}\n")
 
 
 def _take_in(rig: Rig) -> None:
@@ -85,9 +94,11 @@ def _take_in(rig: Rig) -> None:
         raise SystemExit(f"the fleet could not be taken in: {taken.out} {taken.err}")
 
 
-def _report(path: Path) -> int:
+def _report(path: Path, page: Path | None = None) -> int:
     records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     cases = [record for record in records if record["part"] != "crowd"]
+    if page is not None:
+        page.write_text(filled(page.read_text(encoding="utf-8"), table(cases)), encoding="utf-8")
     sys.stdout.writelines(f"{line}\n" for line in table(cases))
     for record in records:
         if record["part"] == "crowd":

@@ -1,7 +1,8 @@
 """The whole kill matrix: every command a node runs during an apply, every step of a flash, every word of meshctl.
 
 `recorded` lists the commands of one undisturbed run; `apply_matrix` and `flash_matrix` strike at them, a batch of
-nodes at a time, `kill_matrix` at meshctl, all going back and forth between two states; `table` sums up.
+nodes at a time, `kill_matrix` at meshctl, all going back and forth between two states; `table` sums up, and `filled`
+puts that into a page.
 """
 
 from __future__ import annotations
@@ -17,6 +18,13 @@ from tests.meshctl.proof.kills import Case, strike_meshctl, strike_nodes
 from tests.meshctl.proof.rig import Rig
 
 T = TypeVar("T")
+IsEnough = Callable[[], bool]
+
+
+def never() -> bool:
+    """For a matrix that is gone through to its end."""
+    return False
+
 
 # A command that begins a phase, in the order in which they come; what comes before the first is `observe`.
 PHASES = (
@@ -67,35 +75,51 @@ def recorded(rig: Rig, new: str) -> list[str]:
     return commands
 
 
-def apply_matrix(rig: Rig, tell: Callable[[Case, str], None], *, every: int = 1) -> None:
-    """Power and links cut at every `every`-th command of an apply."""
-    commands = recorded(rig, "b")
-    phases = phases_of(commands)
+def apply_matrix(
+    rig: Rig, tell: Callable[[Case, str], None], *, every: int = 1, first: int = 1, is_enough: IsEnough = never
+) -> int:
+    """Power and links cut at every `every`-th command of an apply, from the `first` batch on; the next, or 0."""
+    phases = phases_of(recorded(rig, "b"))
     there, other = "b", "a"
-    for kind in ("power-cut", "sever"):
-        for batch in _batches(_struck(phases, every), rig.count):
-            steps = {name: str(number) for name, number in zip(rig.names, batch, strict=False)}
-            for case in strike_nodes(rig, steps, kind, old=there, new=other):
-                tell(case, phases[int(case.step) - 1])
-            there, other = other, there
+    batches = [
+        (kind, batch) for kind in ("power-cut", "sever") for batch in _batches(_struck(phases, every), rig.count)
+    ]
+    for number, (kind, batch) in enumerate(batches[first - 1 :], first):
+        if is_enough():
+            return number
+        steps = {name: str(step) for name, step in zip(rig.names, batch, strict=False)}
+        for case in strike_nodes(rig, steps, kind, old=there, new=other):
+            tell(case, phases[int(case.step) - 1])
+        there, other = other, there
+    return 0
 
 
 def kill_matrix(
-    rig: Rig, tell: Callable[[Case, str], None], *, every: int = 1, first: int = 1, verb: str = "apply"
-) -> None:
-    """meshctl killed at every `every`-th of its words (node begun, step, progress, outcome), from the `first` on.
+    rig: Rig,
+    tell: Callable[[Case, str], None],
+    *,
+    every: int = 1,
+    first: int = 1,
+    verb: str = "apply",
+    is_enough: IsEnough = never,
+) -> int:
+    """meshctl killed at every `every`-th of its words (node begun, step, progress, outcome), from the `first` on; the
+    next word, or 0.
 
     Over a rig with firmware each run is a flash, and `verb` says so.
     """
     there, other = "a", "b"
     words, is_killed = first, True
     while is_killed:
+        if is_enough():
+            return words
         cases = strike_meshctl(rig, words, old=there, new=other, verb=verb)
         is_killed = any(case.outcome == "killed" for case in cases)
         for case in cases if is_killed else ():
             tell(case, case.step)
         there, other = other, there
         words += every
+    return 0
 
 
 def flash_matrix(rig: Rig, tell: Callable[[Case, str], None]) -> None:
@@ -156,3 +180,24 @@ def table(records: Iterable[Mapping[str, object]]) -> Iterator[str]:
         away = sum(not case["reachable"] for case in cases)
         left = sum(not case["resumed"] for case in cases)
         yield (f"| {verb} | {kind} | {phase} | {len(cases)} | {old} | {new} | {bricked} | {mixed} | {away} | {left} |")
+
+
+def filled(page: str, rows: Iterable[str]) -> str:
+    """The page with these rows of `table` in place of those about the same work and strike; others stay."""
+    new = [row for row in rows if not row.startswith(("| work", "| ---"))]
+    anew = {_subject(row) for row in new}
+    lines = page.splitlines(keepends=True)
+    head = next(number for number, line in enumerate(lines) if line.startswith("| work |"))
+    end = next(number for number, line in enumerate(lines[head:], head) if not line.startswith("|"))
+    kept = [line for line in lines[head + 2 : end] if _subject(line) not in anew]
+    told = sorted([*(f"{row}\n" for row in new), *kept], key=lambda row: _ORDER.index(_subject(row)))
+    return "".join([*lines[: head + 2], *told, *lines[end:]])
+
+
+# flash and power-cut, for instance; in the order of the page
+_ORDER = [(work, struck) for work in ("apply", "flash") for struck in ("power-cut", "sever", "kill meshctl")]
+
+
+def _subject(row: str) -> tuple[str, str]:
+    _, work, struck, *_ = (cell.strip() for cell in row.split("|"))
+    return work, struck

@@ -232,6 +232,17 @@ class Rig:
                 if stream is not None:
                     yield member.name, stream.read()
 
+    def settle(self) -> None:
+        """Mended, up and wholly on `current`, whatever was done before or left undone."""
+        self.fleet.mend()
+        self.wait_all_up()
+        other = "b" if self.current == "a" else "a"
+        if any(self.state_of(name, other, self.current) != "new" for name in ("base", *self.names)):
+            self.current = "a"
+            ended = self.meshctl("provision", "a", "--yes", "--json")
+            if ended.code != 0:
+                raise AssertionError(f"the fleet cannot be brought back: {ended.out} {ended.err}")
+
     def wait_all_up(self) -> None:
         for name in ("base", *self.names):
             self.fleet.node(name).wait_up(wait_s=120.0)
