@@ -23,7 +23,7 @@ from pathlib import Path
 import meshctl
 from meshctl.lab import rom
 from meshctl.lab.errors import LabError
-from meshctl.lab.real import cpio, kernel_modules, packages
+from meshctl.lab.real import cpio, debian, kernel_modules, packages
 
 _HERE = Path(__file__).resolve().parent
 _PACKAGE = Path(meshctl.__file__).resolve().parent
@@ -98,8 +98,10 @@ def _recipe() -> str:
 def _build_base(cache: Path, place: Path) -> None:
     with tempfile.TemporaryDirectory(prefix="building-", dir=cache) as folder:
         work = Path(folder)
-        resolved = packages.resolve(work)
-        packages.download(resolved, work, cache / "archives")
+        apt = packages.Apt(work, debian.sources(cache))
+        packages.update(apt)
+        resolved = packages.resolve(apt)
+        packages.download(resolved, apt, cache / "archives")
         packages.unpack(resolved, cache / "archives", work / "root")
         packages.unpack_kernel(resolved, cache / "archives", work / "kernel")
         root, made = work / "root", work / "made"

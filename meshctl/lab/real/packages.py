@@ -1,14 +1,15 @@
 """Debian's packages for the machine: resolved and downloaded by apt, unpacked by dpkg-deb, installed nowhere.
 
-`resolve` asks apt against an empty dpkg status, so that what is installed on this machine does not count; `download`
-fetches what the cache lacks; `unpack` lays the files into a directory. No step needs root.
+`update` fetches apt's lists where the host has none of Debian's (`debian.sources`); `resolve` asks apt against an empty
+dpkg status, so that what is installed on this machine does not count; `download` fetches what the cache lacks; `unpack`
+lays the files into a directory. No step needs root.
 """
 
 from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,6 +48,9 @@ _LEFT_OUT = (
 )  # fmt: skip
 # a mirror that answers is quick; one that does not must not hold a start for ever
 _DOWNLOAD_S = 300.0
+_HINT = (
+    "scripts/setup-lab prepares the host; the packages are Debian's (bookworm), MESHCTL_LAB_DEBIAN names another mirror"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,28 +61,60 @@ class Resolved:
     kernel: str
 
 
-def resolve(work: Path) -> Resolved:
-    """What `PACKAGES` and the kernel mean today. `work` is a directory of the caller's.
+@dataclass(frozen=True, slots=True)
+class Apt:
+    """apt as this module calls it: `work` is a directory of the caller's, `sources` are `debian.sources`."""
 
-    Raises LabError when apt has no lists, or its sources are not Debian's.
-    """
-    empty = work / "empty"
+    work: Path
+    sources: Mapping[str, str]
+
+    def get(self, archives: Path, *words: str, folder: Path | None = None) -> str:
+        """`apt-get` with its archives in `archives`; what it prints. Raises LabError."""
+        return _run(("apt-get", *self._options(archives), *words), folder)
+
+    def cache(self, *words: str) -> str:
+        return _run(("apt-cache", *self._options(self.work), *words))
+
+    def _options(self, archives: Path) -> tuple[str, ...]:
+        status = self.work / "status"
+        status.touch()
+        options = {
+            **self.sources,
+            "Dir::State::status": status,
+            "Dir::Cache::archives": archives,
+            "Dir::Cache::pkgcache": "",
+            "Dir::Cache::srcpkgcache": "",
+            "Debug::NoLocking": "1",
+            "APT::Sandbox::User": "",
+        }
+        return tuple(word for name, value in options.items() for word in ("-o", f"{name}={value}"))
+
+
+def update(apt: Apt) -> None:
+    """Fetch the lists that belong to `apt.sources`; the host's own are its own business."""
+    if apt.sources:
+        apt.get(apt.work, "-qq", "update")
+
+
+def resolve(apt: Apt) -> Resolved:
+    """What `PACKAGES` and the kernel mean today. Raises LabError when apt has no lists of Debian's."""
+    empty = apt.work / "empty"
     (empty / "partial").mkdir(parents=True, exist_ok=True)
-    listed = _apt(work, empty, "-qq", "--print-uris", "--no-install-recommends", "install", *PACKAGES)
+    listed = apt.get(empty, "-qq", "--print-uris", "--no-install-recommends", "install", *PACKAGES)
     archives = [line.split()[1] for line in listed.splitlines() if line.startswith("'")]
-    depends = _run(("apt-cache", "depends", KERNEL_META))
+    depends = apt.cache("depends", KERNEL_META)
     kernels = [line.split()[-1] for line in depends.splitlines() if "Depends: linux-image-" in line]
     if not kernels:
-        raise LabError(f"apt knows no kernel behind {KERNEL_META}", hint="the lab's machine needs Debian's sources")
+        raise LabError(f"apt knows no kernel behind {KERNEL_META}", hint=_HINT)
     return Resolved(tuple(name for name in archives if not name.startswith(_UNNEEDED)), kernels[0])
 
 
-def download(resolved: Resolved, work: Path, cache: Path) -> None:
+def download(resolved: Resolved, apt: Apt, cache: Path) -> None:
     """Put the packages that are not there yet into the directory `cache`."""
     (cache / "partial").mkdir(parents=True, exist_ok=True)
-    _apt(work, cache, "-qq", "-y", "--no-install-recommends", "--download-only", "install", *PACKAGES)
+    apt.get(cache, "-qq", "-y", "--no-install-recommends", "--download-only", "install", *PACKAGES)
     if not list(cache.glob(f"{resolved.kernel}_*.deb")):
-        _apt(work, cache, "-qq", "download", resolved.kernel, folder=cache)
+        apt.get(cache, "-qq", "download", resolved.kernel, folder=cache)
 
 
 def unpack(resolved: Resolved, cache: Path, root: Path) -> None:
@@ -104,21 +140,6 @@ def _unpack_one(archive: Path, root: Path) -> None:
         raise LabError(f"{archive} cannot be unpacked: {error}", hint="remove it: the next start fetches it") from error
 
 
-def _apt(work: Path, archives: Path, *words: str, folder: Path | None = None) -> str:
-    status = work / "status"
-    status.touch()
-    options = {
-        "Dir::State::status": status,
-        "Dir::Cache::archives": archives,
-        "Dir::Cache::pkgcache": "",
-        "Dir::Cache::srcpkgcache": "",
-        "Debug::NoLocking": "1",
-        "APT::Sandbox::User": "",
-    }
-    pairs = [word for name, value in options.items() for word in ("-o", f"{name}={value}")]
-    return _run(("apt-get", *pairs, *words), folder=folder)
-
-
 def _run(words: Sequence[str], folder: Path | None = None) -> str:
     if shutil.which(words[0]) is None:
         raise LabError(f"the lab's machine is made of Debian packages, and {words[0]} is not here")
@@ -130,6 +151,6 @@ def _run(words: Sequence[str], folder: Path | None = None) -> str:
         complaint = (done.stderr.strip() or done.stdout.strip()).splitlines()
         raise LabError(
             f"{words[0]} failed for the lab's machine: {complaint[-1] if complaint else done.returncode}",
-            hint="apt-get update; the sources must be Debian's (bookworm)",
+            hint=_HINT,
         )
     return done.stdout
