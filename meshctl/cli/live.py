@@ -2,6 +2,9 @@
 
 `live` looks in a daemon thread and draws in the main one: at every answer, at every change of the window's size, and
 once a second, since ages grow. The page has the terminal's other screen, so what stood there before comes back.
+
+Signals do nothing themselves but ring the bell that the drawing waits for: a handler that wrote to the terminal could
+come in the middle of what is being written.
 """
 
 from __future__ import annotations
@@ -68,9 +71,10 @@ def live(
     looks = _Looks(take, period_s, writer)
     thread = threading.Thread(target=looks.run, name="looks", daemon=True)
     try:
-        with _screen(out, writer):
+        with _screen(out, writer) as screen:
             thread.start()
             while looks.failure is None:
+                screen.give_and_take()
                 _draw(draw, looks.latest, out, size())
                 ready, _, _ = select.select([reader], [], [], _REDRAW_S)
                 if ready:
@@ -110,9 +114,41 @@ def page(lines: list[str], height: int) -> str:
     return _HOME + f"{_END_OF_LINE}\r\n".join(lines) + _END_OF_LINE + _END_OF_PAGE
 
 
+@dataclass(slots=True)
+class _Screen:
+    """The terminal's other screen. `is_stopping`: Ctrl-Z was pressed; `is_resumed`: somebody else may have drawn."""
+
+    out: TextIO
+    is_stopping: bool = False
+    is_resumed: bool = False
+
+    def enter(self) -> None:
+        self.out.write(_ENTER)
+
+    def leave(self) -> None:
+        self.out.write(_LEAVE)
+        self.out.flush()
+
+    def give_and_take(self) -> None:
+        """Gives the terminal back for as long as the process is stopped, and takes it again."""
+        if self.is_stopping:
+            self.is_stopping = False
+            self.leave()
+            handler = signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+            # returns when somebody lets us go on; at once where nobody could, as in a session of our own (POSIX.1,
+            # orphaned process group)
+            os.kill(os.getpid(), signal.SIGTSTP)
+            signal.signal(signal.SIGTSTP, handler)
+            self.is_resumed = True
+        if self.is_resumed:
+            self.is_resumed = False
+            self.enter()
+
+
 @contextmanager
-def _screen(out: TextIO, bell: int) -> Iterator[None]:
-    """The other screen. Window changes ring the bell; SIGTERM and a stop (Ctrl-Z) give the first screen back."""
+def _screen(out: TextIO, bell: int) -> Iterator[_Screen]:
+    """The other screen, for as long as the block runs. Window changes ring the bell; SIGTERM ends the process."""
+    screen = _Screen(out)
 
     def resized(number: int, frame: FrameType | None) -> None:
         _ring(bell)
@@ -121,14 +157,11 @@ def _screen(out: TextIO, bell: int) -> Iterator[None]:
         raise SystemExit(128 + number)
 
     def stopped(number: int, frame: FrameType | None) -> None:
-        out.write(_LEAVE)
-        out.flush()
-        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
-        os.kill(os.getpid(), signal.SIGTSTP)
+        screen.is_stopping = True
+        _ring(bell)
 
     def resumed(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGTSTP, stopped)
-        out.write(_ENTER)
+        screen.is_resumed = True
         _ring(bell)
 
     handlers = {
@@ -138,11 +171,10 @@ def _screen(out: TextIO, bell: int) -> Iterator[None]:
         signal.SIGCONT: resumed,
     }
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-    out.write(_ENTER)
+    screen.enter()
     try:
-        yield
+        yield screen
     finally:
-        out.write(_LEAVE)
-        out.flush()
+        screen.leave()
         for number, handler in before.items():
             signal.signal(number, handler)

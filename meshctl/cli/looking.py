@@ -1,7 +1,7 @@
 """What `status`, `preflight` and `topology` share: a `Watcher` over everything, who is asked, and how wide to write.
 
-`watcher` opens the fleet and finds a way to its radios and robots; `glance` takes one look, with its progress told on a
-terminal.
+`watcher` opens the fleet and finds a way to its radios and robots, for a command `with_everybody` by its options;
+`glance` takes one look, with its progress told on a terminal.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +17,10 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.robots_crew import sudo_password
-from meshctl.cli.session import Session, session
+from meshctl.cli.options import InventoryPath
+from meshctl.cli.robots_crew import AskSudo, sudo_password
+from meshctl.cli.session import KeyFiles, Lab, Session, session
+from meshctl.cli.shared import Options, opening
 from meshctl.device.connection import Deadlines
 from meshctl.model import Fleet, Node
 from meshctl.robots.reach import Reach
@@ -41,6 +43,15 @@ Timeout = Annotated[
 ]
 NoRobots = Annotated[bool, typer.Option("--no-robots", help="Ask the radios alone, not the robots' computers.")]
 
+# Of commands that look: the options by which `watcher` opens everybody.
+_SHARED: Options = {
+    "inventory": (InventoryPath, Path()),
+    "no_robots": (NoRobots, False),
+    "timeout": (Timeout, CONNECT_S),
+    "ask_sudo": (AskSudo, False),
+    "key": (KeyFiles, None),
+    "lab": (Lab, None),
+}
 _COLOURS = {
     "ok": {"fg": "green"},
     "degraded": {"fg": "yellow", "bold": True},
@@ -74,20 +85,25 @@ def watcher(
     *,
     key: Iterable[Path] | None,
     lab: Path | None,
-    timeout_s: float = CONNECT_S,
+    timeout: float = CONNECT_S,
     ask_sudo: bool = False,
-    with_robots: bool = True,
+    no_robots: bool = False,
 ) -> Iterator[Everybody]:
     """Open all of it, and close it in the end. Raises InvalidInput, InputError, MeshctlError."""
-    password = sudo_password(ask_sudo) if with_robots else None
+    password = None if no_robots else sudo_password(ask_sudo)
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        opened.access.deadlines = _deadlines(timeout_s)
-        robots, unasked = _robots(opened, with_robots)
+        opened.access.deadlines = _deadlines(timeout)
+        robots, unasked = _robots(opened, not no_robots)
         reach = Reach(opened.fleet, opened.access, lambda: password) if robots else None
         with Watcher(
             opened.fleet, opened.renderer, opened.access, opened.journal, opened.owner, reach, unasked
         ) as watching:
             yield Everybody(opened, watching, tuple(opened.fleet.managed()), robots)
+
+
+def with_everybody(command: Callable[..., None]) -> Callable[..., None]:
+    """A command that takes `everybody` and options of its own becomes one that has those of looking, and opens them."""
+    return opening("everybody", watcher, _SHARED)(command)
 
 
 def _deadlines(connect_s: float) -> Deadlines:
@@ -109,18 +125,24 @@ def _robots(opened: Session, with_robots: bool) -> tuple[tuple[str, ...], str]:
     return (), "the robots' computers were not asked: a virtual fleet has none"
 
 
-def glance(everybody: Everybody, nodes: Iterable[Node] | None = None, robots: Iterable[str] | None = None) -> Look:
-    """One look at these (default: everybody)."""
+def glance(
+    everybody: Everybody,
+    nodes: Iterable[Node] | None = None,
+    robots: Iterable[str] | None = None,
+    *,
+    is_told: bool = True,
+) -> Look:
+    """One look at these (default: everybody); `is_told` is how far it is, where the terminal is not a page's."""
     return everybody.watcher.look(
         everybody.nodes if nodes is None else nodes,
         everybody.robots if robots is None else robots,
-        _progress(),
+        _progress(is_told=is_told),
     )
 
 
-def _progress() -> Progress:
+def _progress(*, is_told: bool) -> Progress:
     """A line that counts up on a terminal, and is gone in the end."""
-    if not sys.stderr.isatty():
+    if not (is_told and sys.stderr.isatty()):
         return lambda done, count: None
 
     def tell(done: int, count: int) -> None:

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 import time
-from pathlib import Path
 
 import typer
 
-from meshctl.cli.looking import CONNECT_S, NoRobots, Timeout, glance, line_width, paint_of, watcher
-from meshctl.cli.options import AsJson, InventoryPath
-from meshctl.cli.robots_crew import AskSudo
-from meshctl.cli.session import KeyFiles, Lab
+from meshctl.cli.looking import Everybody, glance, line_width, paint_of, with_everybody
+from meshctl.cli.options import AsJson
 from meshctl.errors import ExitCode
 from meshctl.status import assess
 from meshctl.status import preflight as checks_of
@@ -21,32 +18,22 @@ from meshctl.status.robots import takes_part
 from meshctl.status.text import preflight_text
 
 
-def preflight(
-    inventory: InventoryPath = Path(),
-    no_robots: NoRobots = False,
-    timeout: Timeout = CONNECT_S,
-    as_json: AsJson = False,
-    ask_sudo: AskSudo = False,
-    key: KeyFiles = None,
-    lab: Lab = None,
-) -> None:
+@with_everybody
+def preflight(everybody: Everybody, as_json: AsJson = False) -> None:
     """Go or no-go for the run: one line per check, with the reason. Urgent messages are really sent between all robots.
 
     Exit code: 0 go, 1 no-go, 2 could not look.
 
     Example: meshctl preflight
     """
-    with watcher(
-        inventory, key=key, lab=lab, timeout_s=timeout, ask_sudo=ask_sudo, with_robots=not no_robots
-    ) as everybody:
-        found = assess(glance(everybody), everybody.nodes, time.time(), everybody.robots)
-        everybody.opened.journal.remember_all(everybody.fleet.name, facts_to_keep(found), time.time())
-        talking = [
-            robot.name
-            for robot in found.robots
-            if takes_part(robot.state) and robot.facts is not None and robot.facts.answers
-        ]
-        checks = checks_of(everybody.fleet, found, everybody.watcher.ping(talking))
+    found = assess(glance(everybody), everybody.nodes, time.time(), everybody.robots)
+    everybody.opened.journal.remember_all(everybody.fleet.name, facts_to_keep(found), time.time())
+    talking = [
+        robot.name
+        for robot in found.robots
+        if takes_part(robot.state) and robot.facts is not None and robot.facts.answers
+    ]
+    checks = checks_of(everybody.fleet, found, everybody.watcher.ping(talking))
     is_go = all(check.is_go for check in checks)
     typer.echo(
         json.dumps(preflight_json(checks), indent=2) if as_json else preflight_text(checks, line_width(), paint_of())

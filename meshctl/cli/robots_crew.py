@@ -15,15 +15,16 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any
 
 import typer
 
 from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.session import KeyFiles, Session, exit_for, progress_for, session
+from meshctl.cli.shared import opening
 from meshctl.device.connection import Connection
 from meshctl.errors import InputError, MeshctlError
 from meshctl.fleet import Event, EventKind, Observer, Outcome, Tee, outcome_of_error, run, silent, totals
@@ -188,33 +189,10 @@ def crew_in(
 def with_crew(*shared: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A command of a crew and options of its own becomes one that also has these shared options, and opens the crew."""
 
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        hints = get_type_hints(command, include_extras=True)
-        own = [
-            each.replace(annotation=hints[each.name])
-            for each in inspect.signature(command).parameters.values()
-            if each.name != "crew"
-        ]
-        keyword = inspect.Parameter.KEYWORD_ONLY
-        ours = [
-            inspect.Parameter(name, keyword, default=default, annotation=kind)
-            for name, (kind, default) in _SHARED.items()
-            if name in shared
-        ]
+    def opened(**given: Any) -> AbstractContextManager[Crew]:
+        return crew_of(**{"robots" if name == "named" else name: value for name, value in given.items()})
 
-        def run_command(**given: Any) -> None:
-            of_crew = {"robots" if name == "named" else name: given.pop(name) for name in shared}
-            with crew_of(**of_crew) as crew:
-                command(crew, **given)
-
-        parameters = [each.replace(kind=keyword) for each in own] + ours
-        run_command.__name__, run_command.__doc__ = command.__name__, command.__doc__
-        # what typer reads of a function
-        run_command.__annotations__ = {each.name: each.annotation for each in parameters}
-        vars(run_command)["__signature__"] = inspect.Signature(parameters)
-        return run_command
-
-    return decorate
+    return opening("crew", opened, {name: option for name, option in _SHARED.items() if name in shared})
 
 
 def sudo_password(ask: bool) -> Secret | None:

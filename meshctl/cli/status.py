@@ -7,16 +7,14 @@ import os
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 from typing import Annotated
 
 import typer
 
 from meshctl.cli.live import live
-from meshctl.cli.looking import CONNECT_S, Everybody, NoRobots, Timeout, glance, line_width, paint_of, watcher
-from meshctl.cli.options import AsJson, InventoryPath
-from meshctl.cli.robots_crew import AskSudo
-from meshctl.cli.session import KeyFiles, Lab
+from meshctl.cli.looking import Everybody, glance, line_width, paint_of, with_everybody
+from meshctl.cli.options import AsJson
 from meshctl.errors import ExitCode
 from meshctl.status import FleetStatus, assess
 from meshctl.status.assess import Look
@@ -30,9 +28,10 @@ Names = Annotated[
 ]
 
 
+@with_everybody
 def status(
+    everybody: Everybody,
     names: Names = None,
-    inventory: InventoryPath = Path(),
     watch: Annotated[
         float | None,
         typer.Option("--watch", "-w", min=1.0, metavar="S", help="Look again every S seconds; Ctrl-C ends."),
@@ -50,12 +49,7 @@ def status(
     ] = False,
     topics: Annotated[bool, typer.Option("--topics", help="Add when each topic was last sent and received.")] = False,
     wide: Annotated[bool, typer.Option("--wide", help="All columns, however wide the terminal.")] = False,
-    no_robots: NoRobots = False,
-    timeout: Timeout = CONNECT_S,
     as_json: AsJson = False,
-    ask_sudo: AskSudo = False,
-    key: KeyFiles = None,
-    lab: Lab = None,
 ) -> None:
     """Show every radio and every robot: does it answer, is it as the inventory says, whom does it hear, what is wrong.
 
@@ -68,18 +62,15 @@ def status(
     Example: meshctl status --alarm any
     """
     chosen = Filter(*(tuple(values or ()) for values in (names, group, robot, role, state, alarm)))
-    with watcher(
-        inventory, key=key, lab=lab, timeout_s=timeout, ask_sudo=ask_sudo, with_robots=not no_robots
-    ) as everybody:
-        chosen.check(everybody.fleet)
-        view = _View(everybody, chosen, only, topics, wide)
-        if watch is None:
-            found = view.status(view.look(), time.time())
-            typer.echo(json.dumps(status_json(found), indent=2) if as_json else view.text(found))
-            raise typer.Exit(found.exit_code)
-        if as_json or not sys.stdout.isatty():
-            _follow(view, watch, as_json)
-        _watch(view, watch)
+    chosen.check(everybody.fleet)
+    view = _View(everybody, chosen, only, topics, wide)
+    if watch is None:
+        found = view.status(view.look(), time.time())
+        typer.echo(json.dumps(status_json(found), indent=2) if as_json else view.text(found))
+        raise typer.Exit(found.exit_code)
+    if as_json or not sys.stdout.isatty():
+        _follow(view, watch, as_json)
+    _watch(view, watch)
 
 
 class _View:
@@ -95,9 +86,10 @@ class _View:
         self._nodes = tuple(n for n in everybody.nodes if not only or chosen.takes_node(n))
         self._robots = tuple(name for name in everybody.robots if not only or chosen.takes_robot(fleet, name))
 
-    def look(self) -> Look:
-        """Ask, and remember what was told."""
-        look = replace(glance(self._everybody, self._nodes, self._robots), is_partial=self._is_partial)
+    def look(self, *, is_told: bool = True) -> Look:
+        """Ask, and remember what was told; `is_told`: count the answers on the terminal."""
+        look = glance(self._everybody, self._nodes, self._robots, is_told=is_told)
+        look = replace(look, is_partial=self._is_partial)
         whole = assess(look, self._nodes, time.time(), self._robots)
         self._everybody.opened.journal.remember_all(self._everybody.fleet.name, facts_to_keep(whole), time.time())
         return look
@@ -134,7 +126,7 @@ def _watch(view: _View, period_s: float) -> None:
             lines = [*view.text(status, size.columns, brief=True).splitlines(), *footer]
         return lines
 
-    latest = live(view.look, draw, period_s, sys.stdout)
+    latest = live(partial(view.look, is_told=False), draw, period_s, sys.stdout)
     if latest is not None:
         typer.echo(view.text(view.status(latest, time.time())))
     raise typer.Exit(ExitCode.INTERRUPTED)

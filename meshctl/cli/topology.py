@@ -45,7 +45,7 @@ def topology(
 
     Example: meshctl topology --format dot | dot -Tsvg > mesh.svg
     """
-    with watcher(inventory, key=key, lab=lab, timeout_s=timeout, with_robots=False) as everybody:
+    with watcher(inventory, key=key, lab=lab, timeout=timeout, no_robots=True) as everybody:
         fleet = everybody.fleet
         if mesh and mesh not in fleet.meshes:
             hint = did_you_mean(mesh, fleet.meshes) or f"it has {', '.join(fleet.meshes)}"
