@@ -3,8 +3,7 @@
 `run` connects, subscribes, says `on_up`, hands every frame to `on_frame`, and starts over when the daemon is gone.
 `publish` may be called from any thread; `request` uses a second connection, so that no reply waits behind messages.
 
-What the daemon refuses is counted, and told once per REPORT_S: thirty images a second must not become as many lines. A
-frame that is longer than the daemon takes ends the connection, so the length that did is not tried again.
+What the daemon refuses is counted, and told once per REPORT_S: thirty images a second must not become as many lines.
 """
 
 from __future__ import annotations
@@ -40,9 +39,6 @@ class MeshPort:
         """Messages that could not be handed over: no daemon, or the daemon refused them."""
         self._told_at: float | None = None
         self._untold = 0
-        self._longest = 0
-        self._too_long: int | None = None
-        self._cut = False
 
     def run(self, stop: threading.Event, on_up: Callable[[], None], on_frame: Callable[[Frame], None]) -> None:
         """Until `stop`. `on_up` is called after every connect, on this thread, as is `on_frame`."""
@@ -52,10 +48,7 @@ class MeshPort:
                 with MeshClient(self._path) as client:
                     client.subscribe(*self._patterns)
                     client.request("events")
-                    if not self._cut:
-                        # Another start of the daemon, perhaps with another limit.
-                        self._too_long = None
-                    self._client, self._longest, self._cut = client, 0, False
+                    self._client = client
                     log.info("daemon-connected socket=%s", self._path)
                     told = False
                     on_up()
@@ -75,8 +68,6 @@ class MeshPort:
     def _take(self, frame: Frame, on_frame: Callable[[Frame], None]) -> None:
         header = frame[0]
         if header.get("event") == "rejected":
-            if header.get("code") == "bad-frame":
-                self._too_long, self._cut = self._longest, True
             self._refuse("{}: {}".format(header.get("code"), header.get("error")))
         elif header.get("event") == "dropped":
             log.warning("messages-lost count=%s this program read too slowly", header.get("messages"))
@@ -98,10 +89,6 @@ class MeshPort:
         if client is None:
             self._refuse("{}: no daemon".format(topic))
             return False
-        if self._too_long is not None and len(payload) >= self._too_long:
-            self._refuse("{}: {} bytes are more than the daemon takes".format(topic, len(payload)))
-            return False
-        self._longest = max(self._longest, len(payload))
         try:
             client.publish(topic, payload, to=peer, type=type_text, wait=False)
             return True

@@ -1,8 +1,8 @@
 """The ROS 1 bridge: the daemon's connection and the ROS graph, joined by the relay.
 
 Three kinds of threads meet here: rospy's (one per connection), the port's, and `main`'s, which every TICK_S looks after
-what changed: topics, peers, the master. The relay is entered under one lock; its effects run outside of it. Of these
-only `main`'s waits for the master, so that what flows goes on flowing while there is none.
+what changed: topics, peers, the master. Of these only `main`'s waits for the master, so that what flows goes on flowing
+while there is none.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Callable
 import rosgraph
 import rospy
 
-from udp_mesh.bridges.exchange import TOPIC_SETTINGS
+from udp_mesh.bridges.joint import Joint
 from udp_mesh.bridges.names import (
     Route,
     outbound_name,
@@ -27,10 +27,9 @@ from udp_mesh.bridges.names import (
     undeclared_route,
 )
 from udp_mesh.bridges.port import CONDITIONS_TOPIC, MeshPort
-from udp_mesh.bridges.relay import Effect, Note, Relay, ToMesh, ToRos
+from udp_mesh.bridges.relay import Relay, ToRos
 from udp_mesh.bridges.ros1.graph import MASTER_ERRORS, Graph, Parameters, log_to_ros, parameters
-from udp_mesh.bridges.types import TypeKey
-from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError, as_message
+from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 
 log = logging.getLogger(__name__)
 
@@ -48,62 +47,37 @@ class Bridge:
     def __init__(self, port: MeshPort, own: str, given: Parameters) -> None:
         self._port = port
         self._own = own
-        self._relay = Relay(own, EXCHANGE_TOPIC, ros_version=1, nonce=os.urandom(16))
-        self._lock = threading.Lock()
         self._look_soon = threading.Event()
         self._hosts = {str(host) for host in given.host_list}
         listed, problems = parse_topic_list(given.topic_list)
         for problem in problems:
             log.error("parameter-refused %s", problem)
-        self._wanted = {topic.topic: {"priority": topic.priority} for topic in listed}
-        self._wanted.setdefault(ANY, {"priority": 1})
+        wanted = {topic.topic: {"priority": topic.priority} for topic in listed}
+        wanted.setdefault(ANY, {"priority": 1})
+        relay = Relay(own, EXCHANGE_TOPIC, ros_version=1, nonce=os.urandom(16))
+        self._joint = Joint(port, relay, self._to_ros, wanted)
         self._master_gone = False
-        self._graph = Graph(self._from_ros, "/{}/".format(ros_word(own)), self._set_window)
+        self._graph = Graph(self._joint.from_ros, "/{}/".format(ros_word(own)), self._set_window)
 
     def start(self, stop: threading.Event) -> None:
         """Begins to publish; until `stop`."""
         self._graph.start(stop)
 
-    def _run(self, effects: list[Effect]) -> None:
-        for effect in effects:
-            if isinstance(effect, ToMesh):
-                self._port.publish(effect.topic, effect.payload, effect.peer, effect.type)
-            elif isinstance(effect, ToRos):
-                self._graph.publish(effect)
-            elif isinstance(effect, Note):
-                log.warning("%s", effect.text)
+    def _to_ros(self, message: ToRos) -> None:
+        self._graph.publish(message)
 
     # What happens
 
-    def _from_ros(
-        self, route: Route, publisher: str, key: TypeKey, definition: str, latched: bool, payload: bytes
-    ) -> None:
-        with self._lock:
-            effects = self._relay.from_ros(route, publisher, key, definition, latched, payload)
-        self._run(effects)
-
     def daemon_up(self) -> None:
         """The port calls this after each connect. Raises MeshError."""
-        self._learn()
-        online = [peer for peer, is_online in self._port.peers().items() if is_online]
-        with self._lock:
-            effects = self._relay.started(online)
-        self._run(effects)
+        self._joint.daemon_up()
         self._look_soon.set()
 
     def from_daemon(self, frame: Frame) -> None:
         """The port calls this for each frame."""
-        message, header = as_message(frame), frame[0]
+        self._joint.from_daemon(frame)
+        header = frame[0]
         event = header.get("event")
-        effects: list[Effect] = []
-        with self._lock:
-            if message is not None:
-                effects = self._relay.from_mesh(
-                    message.source, message.topic, message.type, message.payload, time.monotonic()
-                )
-            elif event == "peer-online":
-                effects = self._relay.peer_online(str(header["peer"]))
-        self._run(effects)
         if event == "conditions":
             self._graph.publish_conditions(header["conditions"], json.dumps(header["conditions"], sort_keys=True))
         elif event == "peer-online":
@@ -122,9 +96,7 @@ class Bridge:
         looked_at = 0.0
         while not stop.wait(TICK_S):
             now = time.monotonic()
-            with self._lock:
-                effects = self._relay.tick(now)
-            self._run(effects)
+            self._joint.tick(now)
             if self._look_soon.is_set() or now - looked_at >= LOOK_S:
                 self._look_soon.clear()
                 looked_at = now
@@ -141,7 +113,7 @@ class Bridge:
             self._master_gone = True
             return
         try:
-            topics, undeclared = self._learn(), self._port.takes_undeclared()
+            topics, undeclared = self._joint.learn(), self._port.takes_undeclared()
             peers = {*self._port.peers(), *self._hosts}
         except MeshError as error:
             log.debug("daemon-unreachable %s", error)
@@ -151,13 +123,6 @@ class Bridge:
         if undeclared:
             self._add_undeclared(table, peers)
         self._graph.listen(table)
-
-    def _learn(self) -> dict[str, tuple[str, ...]]:
-        """The daemon's topics, ours among them. Raises MeshError."""
-        topics = self._port.ensure_topics({EXCHANGE_TOPIC: TOPIC_SETTINGS, **self._wanted})
-        with self._lock:
-            self._relay.topics_are(topics)
-        return topics
 
     def _add_undeclared(self, table: dict[str, Route], peers: set[str]) -> None:
         try:

@@ -23,13 +23,13 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosidl_runtime_py.utilities import get_message
 
-from udp_mesh.bridges.exchange import TOPIC_SETTINGS
+from udp_mesh.bridges.joint import Joint
 from udp_mesh.bridges.names import Route, ros_word, routes
 from udp_mesh.bridges.port import MeshPort
-from udp_mesh.bridges.relay import Effect, Note, Relay, ToMesh, ToRos
+from udp_mesh.bridges.relay import Relay, ToRos
 from udp_mesh.bridges.ros2.quality import Quality, parse_quality, quality_text, ros2_name, shared
 from udp_mesh.bridges.types import TypeKey
-from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError, as_message
+from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 
 log = logging.getLogger(__name__)
 
@@ -68,8 +68,8 @@ class Bridge:
 
     def __init__(self, node: Any, port: MeshPort, own: str) -> None:
         self._node, self._port, self._own = node, port, own
-        self._relay = Relay(own, EXCHANGE_TOPIC, ros_version=2, nonce=os.urandom(16))
-        self._lock = threading.Lock()
+        relay = Relay(own, EXCHANGE_TOPIC, ros_version=2, nonce=os.urandom(16))
+        self._joint = Joint(port, relay, self._to_ros)
         self._arrived: Deque[ToRos] = deque(maxlen=MAX_ARRIVED)
         self._subscriptions: dict[str, tuple[TypeKey, Any]] = {}
         self._publishers: dict[str, tuple[TypeKey, Any]] = {}
@@ -77,50 +77,26 @@ class Bridge:
         self._wake = node.create_guard_condition(self.publish_arrived)
         node.create_timer(LOOK_S, self.look)
 
-    def _run(self, effects: list[Effect]) -> None:
-        for effect in effects:
-            if isinstance(effect, ToMesh):
-                self._port.publish(effect.topic, effect.payload, effect.peer, effect.type)
-            elif isinstance(effect, ToRos):
-                self._arrived.append(effect)
-                self._wake.trigger()
-            elif isinstance(effect, Note):
-                log.warning("%s", effect.text)
+    def _to_ros(self, message: ToRos) -> None:
+        self._arrived.append(message)
+        self._wake.trigger()
 
     # The port's thread
 
     def daemon_up(self) -> None:
         """The port calls this after each connect. Raises MeshError."""
-        self._learn()
-        online = [peer for peer, is_online in self._port.peers().items() if is_online]
-        with self._lock:
-            effects = self._relay.started(online)
-        self._run(effects)
+        self._joint.daemon_up()
 
     def from_daemon(self, frame: Frame) -> None:
         """The port calls this for each frame."""
-        message, header = as_message(frame), frame[0]
-        effects: list[Effect] = []
-        with self._lock:
-            if message is not None:
-                now = time.monotonic()
-                effects = self._relay.from_mesh(message.source, message.topic, message.type, message.payload, now)
-            elif header.get("event") == "peer-online":
-                effects = self._relay.peer_online(str(header["peer"]))
-        self._run(effects)
-
-    def _learn(self) -> dict[str, tuple[str, ...]]:
-        topics = self._port.ensure_topics({EXCHANGE_TOPIC: TOPIC_SETTINGS})
-        with self._lock:
-            self._relay.topics_are(topics)
-        return topics
+        self._joint.from_daemon(frame)
 
     # The executor's thread
 
     def look(self) -> None:
         """Every LOOK_S: topics, peers, and what is published under our names."""
         try:
-            topics, peers = self._learn(), self._port.peers()
+            topics, peers = self._joint.learn(), self._port.peers()
         except MeshError as error:
             log.debug("daemon-unreachable %s", error)
             return
@@ -148,9 +124,7 @@ class Bridge:
             self._node.destroy_subscription(known[1])
 
         def arrived(data: bytes) -> None:
-            with self._lock:
-                effects = self._relay.from_ros(route, name, key, "", quality.latched, bytes(data))
-            self._run(effects)
+            self._joint.from_ros(route, name, key, "", quality.latched, bytes(data))
 
         # The graph does not tell depths; ten messages bridge what the executor is busy with.
         wanted = profile(quality._replace(depth=10))
