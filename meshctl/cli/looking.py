@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -151,13 +150,6 @@ def _progress(*, is_told: bool) -> Progress:
         sys.stderr.flush()
 
     return tell
-
-
-def line_width(*, wide: bool = False) -> int | None:
-    """The terminal's, or COLUMNS; None where nobody wants lines broken."""
-    if wide or not (sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdecimal()):
-        return None
-    return shutil.get_terminal_size().columns
 
 
 def paint_of() -> Paint:

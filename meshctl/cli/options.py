@@ -1,8 +1,10 @@
-"""Options that many commands share."""
+"""Options that many commands share, and the width that all of them write to."""
 
 from __future__ import annotations
 
 import os
+import shutil
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -30,3 +32,10 @@ def lab_directory(given: Path | None) -> Path:
         return given
     home = os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()
     return Path(home) / "meshctl" / "lab"
+
+
+def line_width(*, wide: bool = False) -> int | None:
+    """The terminal's, or COLUMNS; None where nobody wants lines broken."""
+    if wide or not (sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdecimal()):
+        return None
+    return shutil.get_terminal_size().columns

@@ -7,8 +7,8 @@ import time
 
 import typer
 
-from meshctl.cli.looking import Everybody, glance, line_width, paint_of, with_everybody
-from meshctl.cli.options import AsJson
+from meshctl.cli.looking import Everybody, glance, paint_of, with_everybody
+from meshctl.cli.options import AsJson, line_width
 from meshctl.errors import ExitCode
 from meshctl.status import assess
 from meshctl.status import preflight as checks_of

@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from meshctl.cli.options import line_width
 from meshctl.cli.robots_change import rotate_key_command, topic_app
 from meshctl.cli.robots_crew import Crew, end, with_crew
 from meshctl.cli.robots_work import SERVICE_TIMEOUT_S, begin
@@ -87,7 +88,7 @@ def status_command(crew: Crew) -> None:
 
     outcomes = crew.on_each(work)
     rows = [found.get(name, RobotFacts(name, trouble=one.reason)) for name, one in outcomes.items()]
-    typer.echo(json.dumps([facts_object(one) for one in rows], indent=2) if crew.as_json else table(rows))
+    typer.echo(json.dumps([facts_object(one) for one in rows], indent=2) if crew.as_json else table(rows, line_width()))
     raise typer.Exit(exit_for(outcomes.values(), crew.opened.interrupt))
 
 

@@ -13,8 +13,8 @@ from typing import Annotated
 import typer
 
 from meshctl.cli.live import live
-from meshctl.cli.looking import Everybody, glance, line_width, paint_of, with_everybody
-from meshctl.cli.options import AsJson
+from meshctl.cli.looking import Everybody, glance, paint_of, with_everybody
+from meshctl.cli.options import AsJson, line_width
 from meshctl.errors import ExitCode
 from meshctl.status import FleetStatus, assess
 from meshctl.status.assess import Look

@@ -5,27 +5,51 @@ Pure.
 
 from __future__ import annotations
 
+import sys
+import textwrap
 from collections.abc import Iterable
 
 from meshctl.robots.bundle import UNIT_NAME, Bundle
 from meshctl.robots.facts import RobotFacts
 from meshctl.robots.target import Facts, changed_files
 
-_HEADINGS = ("robot", "service", "release", "version", "up", "peers", "queued", "last message", "load", "keys", "")
+_HEADINGS = ("robot", "service", "release", "version", "up", "peers", "queued", "last message", "load", "keys")
+# On a narrow terminal these go first, in this order: `--json` has them all.
+_GIVE_WAY = ("load", "release", "keys", "version", "last message", "up")
+_GAP = "  "
 
 
-def table(rows: Iterable[RobotFacts]) -> str:
-    """One line a robot: what runs, for how long, whom it sees, what waits, when it last heard or said something."""
-    lines = [_HEADINGS, *(_row(one) for one in rows)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(_HEADINGS))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
-    )
+def table(rows: Iterable[RobotFacts], width: int | None = None) -> str:
+    """One line a robot: what runs, for how long, whom it sees, what waits, when it last heard or said something; below
+    them what is wrong. No line of the table is longer than `width` where columns can be left out for it."""
+    robots = list(rows)
+    lines = [_HEADINGS, *(_row(one) for one in robots)]
+    widths = {name: max(len(line[at]) for line in lines) for at, name in enumerate(_HEADINGS)}
+    shown = list(_HEADINGS)
+    for name in _GIVE_WAY:
+        if width is None or sum(widths[one] + len(_GAP) for one in shown) - len(_GAP) <= width:
+            break
+        shown.remove(name)
+    drawn = [
+        _GAP.join(
+            cell.ljust(widths[name]) for name, cell in zip(_HEADINGS, line, strict=True) if name in shown
+        ).rstrip()
+        for line in lines
+    ]
+    for one in robots:
+        if one.trouble or one.remark:
+            drawn += textwrap.wrap(
+                f"{one.robot}: {one.trouble or one.remark}", width or sys.maxsize, subsequent_indent=_GAP
+            )
+    if len(shown) < len(_HEADINGS):
+        left_out = ", ".join(name for name in _HEADINGS if name not in shown)
+        drawn += textwrap.wrap(f"no room for {left_out}: --json has them", width or sys.maxsize)
+    return "\n".join(drawn)
 
 
 def _row(one: RobotFacts) -> tuple[str, ...]:
     if one.trouble:
-        return (one.robot, "?", *[""] * (len(_HEADINGS) - 3), one.trouble)
+        return (one.robot, "?", *["-"] * (len(_HEADINGS) - 2))
     load = one.computer.load
     return (
         one.robot,
@@ -38,7 +62,6 @@ def _row(one: RobotFacts) -> tuple[str, ...]:
         _last_message(one),
         f"{load[0]:.1f}" if load else "-",
         "UNKEYED" if one.unkeyed else " ".join(key[:8] for key in one.keys) or "-",
-        one.remark,
     )
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from meshctl.model import Fleet, NodeState, Role
-from meshctl.status.alarms import WEAK_QUALITY, some
+from meshctl.status.alarms import some
 from meshctl.status.pings import Pings
 from meshctl.status.robots import takes_part
 from meshctl.status.topics import is_urgent
@@ -134,7 +134,7 @@ def _silence(one: NodeStatus | RobotStatus) -> str:
 
 def _quality(fleet: Fleet, status: FleetStatus) -> Check:
     deployed = [node for node in status.nodes if node.hops and node.quality is not None]
-    weak = [f"{n.name}: {n.quality:.0%} to the base" for n in deployed if n.quality and n.quality < WEAK_QUALITY]
+    weak = [text for node in status.nodes if (text := _told(node.name, node.alarms, ("no-path", "weak")))]
     worst = min((node.quality for node in deployed if node.quality is not None), default=None)
     good = "no path to measure" if worst is None else f"every path carries, the weakest {worst:.0%}"
     return _check("links", weak, good, _asked(status.nodes))

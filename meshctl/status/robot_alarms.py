@@ -128,7 +128,8 @@ def _peers(seen: RobotSeen) -> Iterator[Alarm]:
         return
     missing = [name for name in seen.daemons if name not in seen.facts.online and name in seen.fleet.robots]
     if missing:
-        told = f"does not hear {', '.join(missing)} of {len(seen.daemons)} robots whose daemons run"
+        others = len(seen.daemons)
+        told = f"does not hear {', '.join(missing)}" + (f", of {others} whose daemons run" if others > 1 else "")
         yield Alarm(Level.ERROR, "peers", told, "look at the radios between them: meshctl topology")
 
 

@@ -20,7 +20,8 @@ from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus,
 SINGLE_ALARMS = 3
 # After a table longer than this its verdict is told once more, for the first one has left the screen.
 ROWS_ON_A_SCREEN = 20
-_LEAST_WIDTH = 40
+# A text beside a lead is not squeezed into less.
+_LEAST_ROOM = 20
 _VERDICTS = {
     ExitCode.OK: ("all well", "ok"),
     ExitCode.FINDINGS: ("DEGRADED", "degraded"),
@@ -42,7 +43,7 @@ def text(
     lines = [*summary_lines(status, width, paint, brief=brief), ""]
     lines += table_lines([row(one) for one in devices], width, paint) or ["nobody to show"]
     if topics:
-        lines += ["", *topic_lines(status)]
+        lines += ["", *topic_lines(status, width)]
     if len(devices) > ROWS_ON_A_SCREEN:
         lines += ["", verdict_line(status, paint)]
     return "\n".join(lines)
@@ -114,15 +115,21 @@ def _alarm_lines(status: FleetStatus, width: int | None, paint: Paint, brief: bo
 
 def _wrapped(lead: str, told: str, width: int | None, paint: Paint, style: str) -> Iterator[str]:
     """`lead` painted, then the text beside it, broken where the terminal ends."""
-    room = None if width is None else max(width, _LEAST_WIDTH) - len(lead) - 1
-    indent = "   " if told.startswith("-> ") else ""
+    first, *others = _beside(f"{lead} ", told, width, "   " if told.startswith("-> ") else "")
+    yield f"{paint(lead, style)}{first[len(lead) :]}"
+    yield from others
+
+
+def _beside(lead: str, told: str, width: int | None, indent: str = "") -> list[str]:
+    """The text beside `lead`, in as many lines as it takes, later ones `indent`ed further."""
+    room = None if width is None else max(width - len(lead), _LEAST_ROOM)
     parts = [told] if room is None else textwrap.wrap(told, room, subsequent_indent=indent, break_on_hyphens=False)
-    for index, part in enumerate(parts):
-        yield f"{paint(lead, style)} {part}" if index == 0 else f"{' ' * len(lead)} {part}"
+    first, *others = parts or [""]
+    return [f"{lead}{first}", *(f"{' ' * len(lead)}{part}" for part in others)]
 
 
-def topic_lines(status: FleetStatus) -> list[str]:
-    """Per topic and robot: when it last sent and received, and what is wrong."""
+def topic_lines(status: FleetStatus, width: int | None = None) -> list[str]:
+    """Per topic and robot: when it last sent and received, and what is wrong, which may take several lines."""
     rows = [("topic", "priority", COMPUTER, "sent", "received", "")]
     for robot in status.robots:
         for topic in robot.topics:
@@ -137,8 +144,12 @@ def topic_lines(status: FleetStatus) -> list[str]:
                 )
             )
     rows = [rows[0], *sorted(rows[1:], key=lambda cells: (cells[1] == "-", cells[1].rjust(3), cells[0]))]
-    widths = [max(len(cells[column]) for cells in rows) for column in range(len(rows[0]))]
-    return ["  ".join(c.ljust(w) for c, w in zip(cells, widths, strict=True)).rstrip() for cells in rows]
+    widths = [max(len(cells[column]) for cells in rows) for column in range(len(rows[0]) - 1)]
+    lines = []
+    for *cells, trouble in rows:
+        lead = "".join(f"{cell.ljust(room)}  " for cell, room in zip(cells, widths, strict=True))
+        lines += [line.rstrip() for line in _beside(lead, trouble, width)]
+    return lines
 
 
 def _ago(age_s: float | None) -> str:
@@ -146,16 +157,14 @@ def _ago(age_s: float | None) -> str:
 
 
 def preflight_text(checks: Iterable[Check], width: int | None = None, paint: Paint = plain) -> str:
-    """`GO` or `NO-GO`, one line per check."""
+    """One line per check, and in the end, where it is still seen, `GO` or `NO-GO` with the checks that say so."""
     listed: Sequence[Check] = tuple(checks)
     room = max((len(check.name) for check in listed), default=0)
     lines = []
     for check in listed:
         word, style = ("go   ", "ok") if check.is_go else ("NO-GO", "error")
-        lead = f"{word}  {check.name.ljust(room)} "
-        room_left = None if width is None else max(width, _LEAST_WIDTH) - len(lead) - 1
-        parts = [check.reason] if room_left is None else textwrap.wrap(check.reason, room_left, break_on_hyphens=False)
-        for index, part in enumerate(parts or [""]):
-            lines.append(f"{paint(word, style)}{lead[5:]} {part}" if index == 0 else f"{' ' * len(lead)} {part}")
-    verdict = ("GO", "ok") if all(check.is_go for check in listed) else ("NO-GO", "error")
-    return "\n".join([*lines, paint(*verdict)])
+        first, *others = _beside(f"{word}  {check.name.ljust(room)}  ", check.reason, width)
+        lines += [f"{paint(word, style)}{first[len(word) :]}", *others]
+    failed = [check.name for check in listed if not check.is_go]
+    lines += list(_wrapped("NO-GO:", ", ".join(failed), width, paint, "error")) if failed else [paint("GO", "ok")]
+    return "\n".join(lines)

@@ -145,3 +145,13 @@ def test_the_table_tells_queues_by_priority_and_the_youngest_message() -> None:
     assert "p9: 3" in told
     assert "status 0 s ago" in told
     assert "1/2" in told
+
+
+def test_a_narrow_terminal_shows_fewer_columns_and_names_them_and_every_trouble() -> None:
+    away = RobotFacts("husky9", trouble="husky9 (10.42.0.19): no answer to connect within 5 s: is it on?")
+    for width in (60, 80, 100, 200):
+        lines = table([_facts(), away], width).splitlines()
+        assert [line for line in lines if len(line) > width] == []
+        assert "husky9: husky9 (10.42.0.19): no answer" in " ".join(lines)
+        assert lines[0].split()[:2] == ["robot", "service"]
+        assert ("no room for" in " ".join(lines)) == (width < 100)

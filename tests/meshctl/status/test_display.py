@@ -17,14 +17,14 @@ from meshctl.errors import InputError
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
 from meshctl.plan import FileChange, NodePlan, Verdict
-from meshctl.status import FleetStatus, assess
+from meshctl.status import FleetStatus, assess, preflight
 from meshctl.status.codes import CODES
 from meshctl.status.document import as_json, preflight_json
 from meshctl.status.filters import Filter
 from meshctl.status.preflight import Check
 from meshctl.status.rows import COLUMNS, Cell
 from meshctl.status.table import layout, table_lines
-from meshctl.status.text import summary_lines, text, topic_lines
+from meshctl.status.text import preflight_text, summary_lines, text, topic_lines
 from meshctl.status.values import Silence
 from tests.meshctl.status.fleets import CREW, HEALTHY, NOW, look_of, status_of
 
@@ -51,8 +51,21 @@ def broken(fleet: Fleet) -> FleetStatus:
 
 @pytest.mark.parametrize("width", [72, 80, 100, 120, 200])
 def test_no_line_is_wider_than_the_terminal(fleet: Fleet, width: int) -> None:
-    lines = text(broken(fleet), width).splitlines()
+    status = broken(fleet)
+    silent = [
+        replace(topic, trouble="has sent nothing for 12 min, of all the topics there are")
+        for topic in status.robots[0].topics
+    ]
+    status = replace(status, robots=(replace(status.robots[0], topics=tuple(silent)), *status.robots[1:]))
+    lines = text(status, width, topics=True).splitlines()
+    lines += preflight_text(preflight(fleet, status), width).splitlines()
     assert [line for line in lines if len(line) > width] == []
+
+
+def test_a_preflight_ends_with_its_verdict_and_what_stands_against_it(fleet: Fleet) -> None:
+    told = preflight_text(preflight(fleet, broken(fleet)))
+    assert told.splitlines()[-1].startswith("NO-GO: robot radios, beacons, configuration, ")
+    assert preflight_text([Check("base", True, "answers")]).splitlines()[-1] == "GO"
 
 
 def test_what_has_no_room_is_named(fleet: Fleet) -> None:

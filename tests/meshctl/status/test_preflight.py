@@ -14,7 +14,7 @@ from meshctl.status.document import preflight_json
 from meshctl.status.pings import Pings, parse_pings, pings_of
 from meshctl.status.text import preflight_text
 from meshctl.status.values import Alarm, Level
-from tests.meshctl.status.fleets import CREW, HEALTHY, NOW, status_of, told
+from tests.meshctl.status.fleets import CREW, HEALTHY, NOW, seen, status_of, told
 
 KNOWN = {"b02": LastKnown("b02", NOW - 60, {})}
 DELIVERED = Pings({("station", "rover"): 0.01, ("rover", "station"): 0.02})
@@ -61,6 +61,21 @@ def test_a_robot_whose_daemon_is_down_is_a_no_go_with_the_reason(fleet: Fleet) -
     found = checks(fleet, {**CREW, "rover": rover}, Pings())
     assert "rover: its daemon is failed (exit-code)" in found["daemons"].reason
     assert {"daemons", "delivery"} <= set(stopped(found))
+
+
+def test_a_radio_without_a_path_or_with_one_that_carries_nothing_is_a_no_go(fleet: Fleet) -> None:
+    islands = {
+        **HEALTHY,
+        "base": seen("base", {"rover": 1}),
+        "b01": seen("b01", {}),
+        "rover": seen("rover", {"base": 1}),
+    }
+    found = checks(fleet, observations=islands)
+    assert "links" in stopped(found)
+    assert "rover: path to the base carries 0%" in found["links"].reason
+    islands = {**HEALTHY, "b01": seen("b01", {"rover": 200})}
+    islands["base"] = seen("base", {"b02": 200})
+    assert "no path through the mesh" in checks(fleet, observations=islands)["links"].reason
 
 
 def test_robots_that_do_not_hear_each_other_are_a_no_go(fleet: Fleet) -> None:
