@@ -66,12 +66,14 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool)
         return
     typer.echo(f"run {record.id}: {record.command} of {record.fleet} by {record.owner}, {_moment(record.began_s)}")
     typer.echo(f"  {record.inventory}: {record.state}")
+    width = max((len(step.step) for step in steps), default=0)
     for outcome in outcomes:
         typer.echo(f"{outcome}" + (f" ({outcome.duration_s:.1f} s)" if outcome.duration_s else ""))
         for step in steps:
             if step.node == outcome.node:
                 took = "cut short" if step.duration_s is None else f"{step.duration_s:.2f} s"
-                typer.echo(f"  {step.step:<10} {took:>10}  {step.result if step.result != 'done' else ''}".rstrip())
+                result = "" if step.result == "done" else step.result
+                typer.echo(f"  {step.step:<{width}} {took:>10}  {result}".rstrip())
 
 
 def _run_object(record: RunRecord) -> dict[str, Any]:

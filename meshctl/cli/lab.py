@@ -142,6 +142,7 @@ def mend(
     Example: meshctl lab mend b03
     """
     VirtualFleet.attach(lab_directory(directory)).mend(where)
+    typer.echo(f"{where or 'everything'}: mended")
 
 
 lab_ground.register(app)

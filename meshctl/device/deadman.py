@@ -251,9 +251,22 @@ def _verb(connection: Connection, verb: str, *words: str, timeout_s: float | Non
         return answer.values
     if answer.code:
         raise NodeRefused(
-            f"{connection.endpoint.label}: {verb}: {answer.text}", code=answer.code, exit_status=done.exit_status
+            f"{connection.endpoint.label}: {verb}: {answer.text}",
+            code=answer.code,
+            exit_status=done.exit_status,
+            hint=_HINTS.get(answer.code, ""),
         )
     raise _unreadable(connection, verb, done)
+
+
+# What to do about a refusal whose text does not tell; by its word (docs/device-scripts.md).
+_HINTS = {
+    "locked": "wait for the other one to end, or for the lock to run out",
+    "flash-full": "`meshctl run NODE -- du -ak /overlay` shows what takes the room",
+    "moved-on": "somebody changed it meanwhile: plan again",
+    # a lock lives in /tmp: one that is gone was outlived, or there was no room to write it
+    "not-locked": "is its memory full? `meshctl run NODE -- df -k /tmp` tells; a reboot empties it",
+}
 
 
 def _unreadable(connection: Connection, verb: str, done: Completed) -> CommandFailed:

@@ -172,7 +172,7 @@ class TrustStore:
                 f"{endpoint.label}: no host key is pinned; it shows {key.fingerprint} ({key.key_type})",
                 fingerprint=key.fingerprint,
                 key_type=key.key_type,
-                hint="compare it with the node's own, then run `meshctl trust`",
+                hint=f"compare it with the node's own, then run `meshctl trust {endpoint.pin_name}`",
             )
         raise HostKeyChanged(
             f"{endpoint.label}: the host key changed: pinned {', '.join(pin.fingerprint for pin in pinned)}, "
@@ -180,7 +180,8 @@ class TrustStore:
             fingerprint=key.fingerprint,
             key_type=key.key_type,
             pinned=tuple(pin.fingerprint for pin in pinned),
-            hint="another device, a flash meshctl did not do, or an attack; `meshctl trust --replace` once you know",
+            hint="another device, a flash meshctl did not do, or an attack; "
+            f"`meshctl trust {endpoint.pin_name} --replace` once you know",
         )
 
     def add(self, name: str, *keys: HostKey) -> None:

@@ -42,7 +42,7 @@ BREAKS: dict[Break, str] = {
     Break.FULL_FLASH: "no space left in flash but 8 KiB",
     Break.FULL_MEMORY: "/tmp full and 2 MiB of memory left",
     Break.WRONG_BOARD: "the node says it is another board (from its next boot on)",
-    Break.HOST_KEY: "the SSH host keys are other ones",
+    Break.HOST_KEY: "the SSH host keys are other ones, and stay so",
     Break.FOREIGN_DELTA: "somebody left an uncommitted UCI change",
     Break.CLOCK: "the clock is ten years back",
     Break.SSH_HANG: "SSH connections are accepted and then nothing happens",
