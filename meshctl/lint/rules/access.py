@@ -1,4 +1,4 @@
-"""Who may log in: operators' keys, host keys, passwords (MC421 to MC431)."""
+"""Who may log in: operators' keys, host keys, passwords (MC421 to MC432)."""
 
 from __future__ import annotations
 
@@ -243,3 +243,20 @@ def known_hosts_invalid(fleet: Fleet, context: LintContext) -> Iterator[Finding]
         parse_pins(text or "", source=fleet.operators.known_hosts)
     except InputError as error:
         yield Finding(("operators", "known_hosts"), str(error), "lines of NAME TYPE BASE64")
+
+
+@fleet_rule(
+    "MC432",
+    Severity.NOTE,
+    "A computer has no user to log in as",
+    why="""Whoever runs meshctl then logs in by their own name, which the robot may not know: what one operator deploys
+    the next cannot even look at.""",
+    mend="Name the robot's own user in `computer.ssh.user`.",
+    failing="robots: {husky1: {computer: {ssh: {user: <removed>}}}}",
+    passing="robots: {husky1: {computer: {ssh: {user: robot}}}}",
+)
+def computer_without_user(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        if robot.computer is not None and not robot.computer.ssh.user:
+            path = ("robots", robot.name, "computer", "ssh", "user")
+            yield Finding(path, "each operator logs in by their own name", "the robot's own user", "none")
