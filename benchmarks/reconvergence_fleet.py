@@ -53,8 +53,8 @@ _ROUNDS = 6
 _WINDOW_ROUNDS = 64
 # a pause is over when telemetry has flowed for so long after it
 _FLOWED_S = 4.0
-# so long without one means that telemetry had taken the other way in the last moment
-_NO_PAUSE_S = 20.0
+# telemetry stops at once when its relay does: so long without a pause, it had taken the other way in the last moment
+_NO_PAUSE_S = 8.0
 _PAUSE_S = 90.0
 _POLL_S = 0.3
 
