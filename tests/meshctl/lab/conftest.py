@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import paramiko
@@ -14,6 +13,7 @@ from meshctl.device.connection import Endpoint
 from meshctl.lab.fleet import VirtualFleet, VirtualNode
 from meshctl.lab.spec import FleetSpec, LinkSpec, Medium, NodeSpec
 from meshctl.model import Release
+from tests.waiting import until
 
 # one kind of host key: making RSA keys would take most of the tests' time
 KEYS = ("ed25519",)
@@ -113,14 +113,6 @@ def restore(node: VirtualNode) -> None:
 
 def in_mesh(fleet: VirtualFleet) -> set[str]:
     return {node["name"] for node in fleet.status()["nodes"] if node["in_mesh"]}
-
-
-def until(condition: Callable[[], bool], what: str, *, wait_s: float = 60.0) -> None:
-    """Poll until `condition()`; fails naming `what`."""
-    deadline = time.monotonic() + wait_s
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {wait_s:g} s for {what}"
-        time.sleep(0.02)
 
 
 def connect(endpoint: Endpoint) -> paramiko.Transport:

@@ -16,7 +16,8 @@ from meshctl.errors import InputError
 from meshctl.lab.errors import LabError
 from meshctl.lab.fleet import VirtualFleet
 from meshctl.lab.spec import FleetSpec, LinkSpec, Medium, NodeSpec
-from tests.meshctl.lab.conftest import KEYS, answers, until
+from tests.meshctl.lab.conftest import KEYS, answers
+from tests.waiting import until
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
 

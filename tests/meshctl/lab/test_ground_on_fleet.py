@@ -20,7 +20,8 @@ from meshctl.lab.ground import Ground, Place, Wall, links_of
 from meshctl.lab.quality import tq_of
 from meshctl.lab.spec import LinkSpec
 from meshctl.lab.state import Power
-from tests.meshctl.lab.conftest import answers, in_mesh, until
+from tests.meshctl.lab.conftest import answers, in_mesh
+from tests.waiting import until
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
 

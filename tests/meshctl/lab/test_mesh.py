@@ -10,7 +10,8 @@ import paramiko
 import pytest
 
 from meshctl.lab.fleet import VirtualFleet
-from tests.meshctl.lab.conftest import MESH, answers, connect, in_mesh, run, until
+from tests.meshctl.lab.conftest import MESH, answers, connect, in_mesh, run
+from tests.waiting import until
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
 

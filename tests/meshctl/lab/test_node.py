@@ -12,7 +12,8 @@ from meshctl.lab.fleet import VirtualFleet, VirtualNode
 from meshctl.lab.images import firmware_image, opkg_package
 from meshctl.lab.state import Power
 from meshctl.model import Release
-from tests.meshctl.lab.conftest import answers, connect, flash_text, run, until
+from tests.meshctl.lab.conftest import answers, connect, flash_text, run
+from tests.waiting import until
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
 

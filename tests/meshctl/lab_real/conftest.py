@@ -11,7 +11,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from meshctl.lab.real import control
 from meshctl.lab.real.fleet import RealFleet
 from meshctl.lab.real.machine import QEMU
 from meshctl.lab.twin import spec_of
+from tests import waiting
 
 INVENTORY = Path(__file__).with_name("inventory")
 SETUP = Path(__file__).parents[3] / "scripts" / "setup-lab"
@@ -150,12 +150,9 @@ class Lab:
         until(lambda: self.answers("base-station", "10.42.0.10"), "the Husky's computer to answer")
 
 
-def until(condition: Callable[[], bool], what: str, *, wait_s: float = 180.0) -> None:
-    """Poll until `condition()`; fails naming `what`."""
-    deadline = time.monotonic() + wait_s
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {wait_s:g} s for {what}"
-        time.sleep(0.2)
+def until(condition: Callable[[], bool], what: str) -> None:
+    """`waiting.until`, as long and as seldom as befits machines that QEMU emulates."""
+    waiting.until(condition, what, wait_s=180.0, look_s=0.2)
 
 
 @pytest.fixture(scope="session")
