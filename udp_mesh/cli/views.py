@@ -16,7 +16,7 @@ def peers_view(peers: list[Json]) -> str:
     rows = [
         [
             peer["name"] + (" (fielded)" if peer["legacy"] else ""),
-            "online" if peer["online"] else "OFFLINE",
+            "ONE WAY" if peer["one_way"] else "online" if peer["online"] else "OFFLINE",
             duration(peer["online_for_s"] if peer["online"] else peer["heard_ago_s"]),
             peer["address"] or "-",
             peer["link"] or "-",
@@ -75,7 +75,13 @@ def status_view(status: Json) -> str:
     else:
         lines.append("NO LINK: no configured interface is up with an address")
     lines += [f"link {name} FAILED: {reason}" for name, reason in status["link_failures"].items()]
-    lines += ["", peers_view(conditions["peers"]), ""]
+    lines += ["", peers_view(conditions["peers"])]
+    lines += [
+        f"{stranger['name']} at {stranger['address']} on {stranger['link']} is heard and DOES NOT HEAR US, "
+        f"for {duration(stranger['heard_for_s'])}"
+        for stranger in conditions["strangers"]
+    ]
+    lines.append("")
     lines.append(
         f"channel: {rate(conditions['sent_bits_per_s'])} sent here, {rate(conditions['heard_bits_per_s'])} by all heard"
     )

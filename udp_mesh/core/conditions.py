@@ -21,6 +21,17 @@ class QueueConditions:
 
 
 @dataclass(frozen=True, slots=True)
+class Stranger:
+    """A node that is heard and does not hear us: no peer, since nothing would reach it."""
+
+    name: str
+    address: Address
+    link: str
+    met_at: float
+    last_heard: float
+
+
+@dataclass(frozen=True, slots=True)
 class PeerConditions:
     """One peer. Rates are over the last second; times in seconds; None where nothing was measured yet."""
 
@@ -53,6 +64,8 @@ class PeerConditions:
     queues: tuple[QueueConditions, ...]
     outbox_messages: int
     outbox_bytes: int
+    one_way: bool
+    """It is heard, and its heartbeats say that it does not hear us; if that lasts it is not online."""
 
 
 @dataclass(slots=True)
@@ -99,3 +112,4 @@ class Conditions:
     partial_bytes: int
     queued_bytes: int
     repair_bytes: int
+    strangers: tuple[Stranger, ...]

@@ -156,7 +156,10 @@ def _take_frames(state: State, session: Session, frames: list[Frame], number: in
                 if frame.largest < session.way.channel.next_number:
                     session.way.confirmed = session.knows_us = True
                     session.peer_receives = (frame.receive_rate, now)
+                    arrived_before = outbound.delivered_packets
                     outbound.acknowledge(frame, now)
+                    if outbound.delivered_packets > arrived_before:
+                        session.hears_us()
                     report_ended(state, peer, now)
                     state.ready[peer] = None
                 if frame.waiting:
@@ -348,7 +351,7 @@ def _take_long(
         return
     if not introduced:
         if beat is not None:
-            greet(state, session, beat, link, source, now)
+            greet(state, session, beat, link, source, now, to_all=True)
         for frame in decoded:
             if isinstance(frame, Bye) and session.proven:
                 leave(state, session, now)
@@ -358,7 +361,7 @@ def _take_long(
         follow(state, session, link, source, now)
         prove(state, session, now)
     if beat is not None:
-        greet(state, session, beat, link, source, now)
+        greet(state, session, beat, link, source, now, to_all=False)
     if not session.proven or session.peer is None:
         return
     heard(state, session, link, source, now)

@@ -2,8 +2,8 @@
 
 1. `greet` takes a heartbeat: a stranger is remembered and answered; one that lists us is proven.
 2. `prove` makes a session its name's session: online, or restarted; a retired run that still speaks is a conflict.
-3. `heard` keeps an online peer online and follows it to new addresses.
-4. `housekeep` finds the silent ones: offline, then lost; their messages go to the outbox or end.
+3. `heard` keeps an online peer online and follows it to new addresses; one that does not hear us stays offline.
+4. `housekeep` finds the silent and the deaf ones: offline, then lost; their messages go to the outbox or end.
 """
 
 from udp_mesh.core.acceptance import release_outbox, report_ended, shelve
@@ -34,8 +34,11 @@ REPORT_AGAIN_S = 60.0
 """The same conflict, mismatch or incompatibility is reported once in this time."""
 
 
-def greet(state: State, session: Session, beat: Heartbeat, link: str, source: Address, now: float) -> None:
-    """An authentic heartbeat of a session, perhaps a recording until the session is proven."""
+def greet(
+    state: State, session: Session, beat: Heartbeat, link: str, source: Address, now: float, *, to_all: bool
+) -> None:
+    """An authentic heartbeat of a session (to all, or to us alone), perhaps a recording until the session is
+    proven."""
     session.learn(beat, now)
     session.last_heard = now
     if not beat.min_version <= VERSION <= beat.max_version:
@@ -44,8 +47,10 @@ def greet(state: State, session: Session, beat: Heartbeat, link: str, source: Ad
             state.ledger.tell(Incompatible(session.name, source, session.versions))
         return
     lists_us = state.boot_id[:HEARD_TAG_BYTES] in beat.heard
-    if lists_us:
-        session.knows_us = True
+    if to_all:
+        session.take_list(beat.heard, state.boot_id[:HEARD_TAG_BYTES], now)
+    elif lists_us:
+        session.hears_us()
     if not session.proven:
         if (link, source) == (session.way.link, session.way.address):
             session.way.heard_at = now
@@ -122,6 +127,8 @@ def heard(state: State, session: Session, link: str, source: Address, now: float
     peer = session.peer
     if peer is None or peer.session is not session:
         conflict(state, session, source, now)
+        return
+    if session.unheard_since is not None:
         return
     if not peer.online:
         come_online(state, peer, session, now)
@@ -207,9 +214,11 @@ def _look_at(state: State, peer: Peer, now: float) -> None:
         return
     rates = state.settings.rates
     quiet_s = now - session.last_heard
-    if peer.online and quiet_s > max(rates.offline_s, MISSED_HEARTBEATS * session.interval_s):
+    deaf_s = now - session.unheard_since if session.unheard_since is not None else 0.0
+    patience_s = max(rates.offline_s, MISSED_HEARTBEATS * session.interval_s)
+    if peer.online and max(quiet_s, deaf_s) > patience_s:
         go_offline(state, peer, now, left=False)
-    if not peer.online and not peer.lost and quiet_s > rates.peer_lost_s:
+    if not peer.online and not peer.lost and max(quiet_s, deaf_s) > rates.peer_lost_s:
         peer.lost = True
         if peer.engaged:
             peer.outbound.finish_all(Outcome.PEER_LOST)

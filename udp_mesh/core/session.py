@@ -11,7 +11,7 @@ from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.settings import Settings
 from udp_mesh.crypto import TO_ALL, Key, ReceiveChannel, SendChannel
 from udp_mesh.wire.frames import Ack, Frame, Heartbeat, Waiting
-from udp_mesh.wire.limits import HEARD_TAG_BYTES
+from udp_mesh.wire.limits import HEARD_TAG_BYTES, MAX_HEARD
 
 STALE_PATH_S = 2.0
 """A path not heard for this long is left for one that is: two heartbeats."""
@@ -110,6 +110,8 @@ class Session:
         "introduced_at",
         "knows_us",
         "last_heard",
+        "lists_us",
+        "met_at",
         "meters",
         "name",
         "owed",
@@ -118,6 +120,7 @@ class Session:
         "peer_sends",
         "proven",
         "received_bytes",
+        "unheard_since",
         "versions",
         "way",
     )
@@ -129,6 +132,12 @@ class Session:
         self.proven = False
         self.knows_us = False
         """It listed us as heard, or answered us: introductions need no name any more."""
+        self.met_at: float | None = None
+        """When its first heartbeat was heard."""
+        self.lists_us = False
+        """Its heartbeats to all have listed us: from one that no longer does something follows."""
+        self.unheard_since: float | None = None
+        """Since when they list us no more and it acknowledges nothing: only its way to us works."""
         self.introduced_at = float("-inf")
         self.last_heard = float("-inf")
         self.meters = Meters(0.0)
@@ -162,6 +171,19 @@ class Session:
             self.way.channel = SendChannel(keys[0], own_boot, self.boot_id)
             self.way.channel.next_number = channel.next_number
 
+    def hears_us(self) -> None:
+        """It lists us, or acknowledged what left lately."""
+        self.knows_us = True
+        self.unheard_since = None
+
+    def take_list(self, heard: tuple[bytes, ...], own_tag: bytes, now: float) -> None:
+        """What a heartbeat to all says of whether we are heard; a full list may have had no room for us."""
+        if own_tag in heard:
+            self.lists_us = True
+            self.hears_us()
+        elif self.lists_us and self.unheard_since is None and len(heard) < MAX_HEARD:
+            self.unheard_since = now
+
     def owe(self, frame: Frame) -> None:
         """A small frame leaves with the next datagrams."""
         if len(self.owed) < OWED_FRAMES:
@@ -179,6 +201,8 @@ class Session:
 
     def learn(self, beat: Heartbeat, now: float) -> None:
         """What a heartbeat says about its sender."""
+        if self.met_at is None:
+            self.met_at = now
         self.peer_sends = (beat.send_rate, now)
         self.interval_s = beat.interval_ms / 1000
         self.versions = (beat.min_version, beat.max_version)

@@ -1,16 +1,20 @@
 """Conditions out: a snapshot of peers, queues and counters, from what the other parts measured."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
-from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions
+from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions, Stranger
 from udp_mesh.core.discovery import MISSED_HEARTBEATS
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.outbound import Outbound
-from udp_mesh.core.session import Peer
+from udp_mesh.core.session import Peer, Session
 from udp_mesh.core.state import State
 
 TOLD_FOR_S = 2.0
 """What an acknowledgement says about rates holds for the second it averages, and one more."""
+
+STRANGE_AFTER_S = 3.0
+"""A node heard for so long without hearing us is told of; meeting takes a fraction of that."""
 
 
 def conditions(state: State, now: float) -> Conditions:
@@ -41,7 +45,20 @@ def conditions(state: State, now: float) -> Conditions:
         sum(inbound.partial_bytes + inbound.unpacking_bytes for inbound in inbounds),
         sum(outbound.levels.queued_bytes for outbound in outbounds) + state.packing.bytes,
         state.casts.kept_bytes,
+        tuple(_strangers(state, now)),
     )
+
+
+def _strangers(state: State, now: float) -> Iterator[Stranger]:
+    for session in sorted(state.roster.not_current(), key=lambda session: session.name):
+        met_at, way = session.met_at, session.way
+        if session.proven or met_at is None or now - met_at < STRANGE_AFTER_S or not _alive(session, now):
+            continue
+        yield Stranger(session.name, way.address, way.link, met_at, session.last_heard)
+
+
+def _alive(session: Session, now: float) -> bool:
+    return now - session.last_heard < MISSED_HEARTBEATS * session.interval_s
 
 
 def _peer(state: State, peer: Peer, outbound: Outbound, now: float) -> PeerConditions:
@@ -73,6 +90,7 @@ def _peer(state: State, peer: Peer, outbound: Outbound, now: float) -> PeerCondi
         _queues(outbound, now),
         held_messages,
         held_bytes,
+        session is not None and session.unheard_since is not None and _alive(session, now),
     )
 
 

@@ -89,6 +89,16 @@ def conditions_json(conditions: Conditions) -> Json:
         "partial_bytes": conditions.partial_bytes,
         "queued_bytes": conditions.queued_bytes,
         "repair_bytes": conditions.repair_bytes,
+        "strangers": [
+            {
+                "name": stranger.name,
+                "address": show_address(stranger.address),
+                "link": stranger.link,
+                "heard_for_s": round(conditions.now - stranger.met_at, 3),
+                "heard_ago_s": round(conditions.now - stranger.last_heard, 3),
+            }
+            for stranger in conditions.strangers
+        ],
     }
 
 

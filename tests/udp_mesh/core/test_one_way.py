@@ -1,0 +1,81 @@
+"""A link of which one direction works: nobody is called online who cannot be reached, and every message ends."""
+
+from tests.udp_mesh.core.pair import World, settings
+from udp_mesh.core.events import (
+    MessageDelivered,
+    MessagePeerLost,
+    MessageReceived,
+    PeerOffline,
+    PeerOnline,
+)
+from udp_mesh.core.settings import Outbox, Topic
+
+TOPICS = (Topic("map"), Topic("art", outbox=Outbox.ALL))
+
+
+def met(seed: int) -> World:
+    world = World(seed=seed)
+    for name in ("a", "b"):
+        world.add(settings(name, *TOPICS))
+    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    world.run(3.0)
+    return world
+
+
+def peer(world: World, name: str) -> tuple[bool, bool]:
+    """(online, one way) as the node holds its only peer."""
+    (found,) = world.nodes[name].conditions(world.now).peers
+    return found.online, found.one_way
+
+
+def test_a_peer_that_is_heard_and_does_not_hear_us_goes_offline_and_returns() -> None:
+    world = met(1)
+    world.pipes[("a", "b")].up = False
+    world.send("a", "map", bytes(5000), "b")
+    world.send("a", "art", b"found", "b")
+    assert world.run(20.0, until=lambda: peer(world, "a") == (True, True))
+    assert world.run(20.0, until=lambda: bool(world.told("a", PeerOffline)))
+    assert peer(world, "a") == (False, True)
+    assert world.told("b", PeerOffline)
+    world.run(10.0)
+    assert len(world.told("a", PeerOnline)) == 1
+    # while it waits what b sends is taken: that way works
+    world.send("b", "map", b"one way", "a")
+    world.pipes[("a", "b")].up = True
+    assert world.run(10.0, until=lambda: len(world.told("a", PeerOnline)) == 2)
+    assert world.run(5.0, until=lambda: len(world.told("a", MessageDelivered)) == 2)
+    assert peer(world, "a") == (True, False)
+    assert len(world.told("b", MessageReceived)) == 2
+
+
+def test_what_no_outbox_keeps_for_a_peer_that_never_hears_us_again_is_told_as_lost() -> None:
+    world = met(2)
+    world.pipes[("a", "b")].up = False
+    world.send("a", "map", bytes(5000), "b")
+    assert world.run(120.0, until=lambda: bool(world.told("a", MessagePeerLost)))
+    assert len(world.told("a", MessagePeerLost)) == 1
+    assert not world.told("a", MessageDelivered)
+
+
+def test_a_node_that_never_heard_us_is_no_peer_and_is_told_of_as_a_stranger() -> None:
+    world = World(seed=3)
+    for name in ("a", "b"):
+        world.add(settings(name, *TOPICS))
+    world.pipes[("a", "b")].up = False
+    world.run(10.0)
+    conditions = world.nodes["a"].conditions(world.now)
+    assert not conditions.peers
+    assert [(stranger.name, stranger.address) for stranger in conditions.strangers] == [("b", ("10.0.0.2", 8700))]
+    assert not world.nodes["b"].conditions(world.now).strangers
+    world.pipes[("a", "b")].up = True
+    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    assert not world.nodes["a"].conditions(world.now).strangers
+
+
+def test_losses_of_half_of_all_datagrams_call_nobody_offline() -> None:
+    world = met(4)
+    for way in world.pipes.values():
+        way.loss = 0.5
+    world.run(300.0)
+    assert not world.told("a", PeerOffline)
+    assert not world.told("b", PeerOffline)
