@@ -22,6 +22,7 @@ from udp_mesh.core.events import (
 from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Accepted, Channel, Outgoing
 from udp_mesh.core.outbound import Outcome
+from udp_mesh.core.outbox import Held
 from udp_mesh.core.session import Peer
 from udp_mesh.core.settings import Outbox, Topic
 from udp_mesh.core.state import State
@@ -151,8 +152,7 @@ def enqueue(state: State, name: str, accepted: Accepted, now: float, store_key: 
     topic = accepted.channel.topic
     peer = state.roster.peer(name, state.settings)
     if peer is None or ((not peer.online) and topic.outbox is not Outbox.NONE):
-        for held, reason in state.outboxes.hold(name, accepted, now, store_key):
-            tell_expired(state, name, held.accepted, reason)
+        _hold(state, name, Held(accepted, store_key), now)
         return
     message = Outgoing(accepted, topic.priority, reliable=topic.reliable)
     message.store_key = store_key
@@ -192,14 +192,38 @@ def shelve(state: State, peer: Peer, now: float) -> None:
     for message in list(peer.outbound.open) if peer.engaged else ():
         if message.accepted.channel.topic.outbox is Outbox.NONE or message.accepted.broadcast_number is not None:
             continue
-        peer.outbound.withdraw(message)
-        for held, reason in state.outboxes.hold(peer.name, message.accepted, now, message.store_key):
-            tell_expired(state, peer.name, held.accepted, reason)
+        # best effort is not remembered for long over there, and fielded programs know no numbers of ours
+        resumable = message.begun and message.reliable and not peer.legacy
+        peer.outbound.withdraw(message, to_resume=resumable)
+        begun = message if resumable else None
+        _hold(state, peer.name, Held(message.accepted, message.store_key, begun, peer.outbound.epoch), now)
+
+
+def _hold(state: State, name: str, new: Held, now: float) -> None:
+    for held, reason in state.outboxes.hold(name, new, now):
+        _give_up_held(state, name, held, reason)
+
+
+def _give_up_held(state: State, name: str, held: Held, reason: ExpiryReason) -> None:
+    """An outbox no longer keeps this one; what the peer has of it, it may forget."""
+    peer = state.roster.peers.get(name)
+    if held.begun is not None and peer is not None and held.epoch == peer.outbound.epoch:
+        peer.outbound.cancel(held.begun)
+    tell_expired(state, name, held.accepted, reason)
 
 
 def release_outbox(state: State, peer: Peer, now: float) -> None:
     """The peer is in reach: what waited for it is queued, oldest first."""
     for held in state.outboxes.release(peer.name):
+        begun, session = held.begun, peer.session
+        if begun is not None and held.epoch == peer.outbound.epoch:
+            if session is not None and begun.fragment_bytes <= session.way.fragment_bytes:
+                begun.store_key = held.store_key
+                peer.outbound.resume(begun, now)
+                state.ready[peer] = None
+                state.arm(peer)
+                continue
+            peer.outbound.cancel(begun)
         enqueue(state, peer.name, held.accepted, now, held.store_key)
 
 
@@ -242,4 +266,4 @@ def tell_expired(state: State, peer: str, accepted: Accepted, reason: ExpiryReas
 def expire_held(state: State, now: float) -> None:
     """Messages in outboxes whose deadline passed."""
     for peer, held in state.outboxes.expire(now):
-        tell_expired(state, peer, held.accepted, ExpiryReason.DEADLINE)
+        _give_up_held(state, peer, held, ExpiryReason.DEADLINE)

@@ -89,17 +89,20 @@ class Flight:
     def acknowledge(self, largest: int, received: int) -> tuple[list[Packet], list[Packet], Packet | None]:
         """Packets newly acknowledged, packets now lost, and packet `largest` if this is the first word of it.
 
-        `received` as in `AckState`. An acknowledgement of what was never sent says nothing.
+        `received` as in `AckState`. An acknowledgement of what was never sent says nothing. One of a packet called lost
+        too early is the first word of it, too: without it a path that became slow would never be measured.
         """
         packets = self._packets
         base = self.base
         count = largest - base + 1
         acknowledged: list[Packet] = []
         lost: list[Packet] = []
+        late: Packet | None = None
         if self._lost and largest < self.next_number:
+            late = self._lost[largest][0] if largest in self._lost else None
             self._correct(largest, received, acknowledged)
         if count <= 0 or count > len(packets):
-            return acknowledged, lost, None
+            return acknowledged, lost, late
         newest = packets[count - 1]
         corrected = len(acknowledged)
         ones = (1 << count) - 1

@@ -108,6 +108,16 @@ class Outgoing:
         copy.store_key = self.store_key
         return copy
 
+    def resumed(self) -> "Outgoing":
+        """The same message under its number, with what of it is known to have arrived. This one must be marked
+        ended."""
+        copy = Outgoing(self.accepted, self.accepted.channel.topic.priority, reliable=self.reliable)
+        copy.store_key = self.store_key
+        assert self.wire_id is not None
+        copy.begin(self.wire_id, self.fragment_bytes, self.first_bytes)
+        copy.arrived, copy.missing, copy.next_position = self.arrived, self.missing, self.next_position
+        return copy
+
     @property
     def begun(self) -> bool:
         return self.wire_id is not None

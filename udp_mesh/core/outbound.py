@@ -14,6 +14,7 @@ from enum import Enum
 from heapq import heappop, heappush
 from typing import NamedTuple
 
+from udp_mesh.core.bursts import RETURN_BURST_PACKETS, Bursts
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.flight import Flight, Mark, Packet
 from udp_mesh.core.levels import Levels
@@ -43,9 +44,6 @@ QUIET_S = 0.02
 
 EXPIRE_EVERY_S = 0.005
 """Between two looks for packets that timed out."""
-
-RETURN_BURST_PACKETS = 10
-"""What leaves at once when a silent peer is heard without acknowledging (the way to it may still be cut)."""
 
 LOSS_MEMORY_PACKETS = 256
 """Packets over which loss is smoothed."""
@@ -92,6 +90,8 @@ class Outbound:
         self.announced: set[int] = set()
         """Numbers of topics that the peer knows by name."""
         self.next_wire_id = 0
+        self.epoch = 0
+        """Counts the runs of the peer: wire ids of earlier ones mean nothing to this one."""
         self.copies: list[tuple[float, int, Outgoing, int]] = []
         """Heap of (when, serial, message, position) of urgent pieces to be sent again unless acknowledged by then."""
         self._copy_serial = 0
@@ -107,6 +107,7 @@ class Outbound:
         self.expired_at = float("-inf")
         self.probe_credit = 0
         self.probed_at = float("-inf")
+        self._bursts = Bursts()
         self.last_progress = 0.0
         self.limited = True
         """The application, not window or pacing, decides how much leaves."""
@@ -286,7 +287,7 @@ class Outbound:
 
     def timeout(self) -> float:
         """Silence after which the oldest packet counts as lost."""
-        return min(PROBE_S, self.trip.timeout(self.rates.ack_delay_s))
+        return self.trip.timeout(self.rates.ack_delay_s, PROBE_S)
 
     def handle_timer(self, now: float) -> None:
         while self._deadlines and self._deadlines[0][0] <= now:
@@ -352,12 +353,15 @@ class Outbound:
     def heard(self, now: float) -> None:
         """Something authentic came from the peer. After a silence a first burst leaves, the rest when it is
         acknowledged."""
-        if self.silent_since is not None and now >= self.probed_at + PROBE_SOON_S * 0.99:
+        if self.silent_since is None or now < self.probed_at + PROBE_SOON_S * 0.99:
+            return
+        if self._bursts.due(now):
             self.allow_probe(now)
             self.probe_credit = min(RETURN_BURST_PACKETS, int(self.window.packets))
 
     def _end_silence(self) -> None:
         self.silent_since = None
+        self._bursts.reset()
         self.probe_credit = 0
         self.scheduler.set_aside(self.rates.urgent_priority)
 
@@ -376,6 +380,7 @@ class Outbound:
         self.copies.clear()
         self.cancelled.clear()
         self.next_wire_id = 0
+        self.epoch += 1
         self.silent_since = None
         self.struggling = False
         self.probe_credit = 0
@@ -411,22 +416,31 @@ class Outbound:
             return
         self._remove(message)
         if message.begun and outcome is not Outcome.DELIVERED and outcome is not Outcome.SENT:
-            self._cancel(message)
+            self.cancel(message)
         self.ended.append(Ended(message, outcome))
 
-    def withdraw(self, message: Outgoing) -> None:
-        """The message leaves without an outcome: an outbox keeps it."""
+    def withdraw(self, message: Outgoing, *, to_resume: bool = False) -> None:
+        """The message leaves without an outcome: an outbox keeps it, `to_resume` it under its number."""
         if not message.ended:
             self._remove(message)
-            if message.begun:
-                self._cancel(message)
+            if message.begun and not to_resume:
+                self.cancel(message)
+
+    def resume(self, message: Outgoing, now: float) -> None:
+        """Take a withdrawn message on again where it stopped."""
+        copy = message.resumed()
+        self.accept(copy, now)
+        for position in range(copy.next_position):
+            if not copy.arrived[position]:
+                self.scheduler.push_again(copy, position)
 
     def _remove(self, message: Outgoing) -> None:
         message.ended = True
         del self.open[message]
         self.levels.leave(message)
 
-    def _cancel(self, message: Outgoing) -> None:
+    def cancel(self, message: Outgoing) -> None:
+        """The peer is told to forget what it has of this one."""
         if message.wire_id is not None and message.accepted.broadcast_number is None:
             self.cancelled.append(message.wire_id)
 

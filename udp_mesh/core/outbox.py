@@ -1,12 +1,13 @@
 """Messages held for peers that are offline, as their topic's outbox says: none, the last, or all within a bound.
 
 A message on disk stays there until its outcome is known, not only until it is sent: a crash in between sends it again.
+One that had begun to leave keeps its number, so that a peer which had all of it before the cut does not take it twice.
 """
 
 from dataclasses import dataclass
 
 from udp_mesh.core.events import ExpiryReason
-from udp_mesh.core.message import Accepted
+from udp_mesh.core.message import Accepted, Outgoing
 from udp_mesh.core.seams import Store, StoredMessage
 from udp_mesh.core.settings import Outbox
 
@@ -17,6 +18,10 @@ class Held:
 
     accepted: Accepted
     store_key: int | None
+    begun: Outgoing | None = None
+    """What has left of it, where the peer may have it."""
+    epoch: int = 0
+    """`Outbound.epoch` in which it began."""
 
 
 class Outboxes:
@@ -38,10 +43,9 @@ class Outboxes:
         self._next_key = max((message.key for message in stored), default=-1) + 1
         return stored
 
-    def hold(
-        self, peer: str, accepted: Accepted, now: float, store_key: int | None = None
-    ) -> list[tuple[Held, ExpiryReason]]:
+    def hold(self, peer: str, new: Held, now: float) -> list[tuple[Held, ExpiryReason]]:
         """Keep a message; returns those that had to go for it (perhaps this one)."""
+        accepted = new.accepted
         topic = accepted.channel.topic
         kept = self._held.setdefault(peer, [])
         same = [held for held in kept if held.accepted.channel.topic.name == topic.name]
@@ -59,12 +63,12 @@ class Outboxes:
         for held, _ in gone:
             self._remove(kept, held)
         if len(accepted.payload) > topic.outbox_bytes:
-            gone.append((Held(accepted, store_key), ExpiryReason.OUTBOX_FULL))
-            self.settle(store_key)
+            gone.append((new, ExpiryReason.OUTBOX_FULL))
+            self.settle(new.store_key)
             return gone
-        if store_key is None and topic.outbox_on_disk and self._store is not None:
-            store_key = self._put(peer, accepted, now)
-        kept.append(Held(accepted, store_key))
+        if new.store_key is None and topic.outbox_on_disk and self._store is not None:
+            new.store_key = self._put(peer, accepted, now)
+        kept.append(new)
         self.bytes += len(accepted.payload)
         return gone
 

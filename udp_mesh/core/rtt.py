@@ -18,6 +18,10 @@ STANDING_WINDOW_S = 0.020
 INITIAL_TIMEOUT_S = 0.25
 """Until the first sample: the longest wait between probes of a silent peer."""
 
+SLOW_ROUND_TRIPS = 2.0
+"""Round trips that an answer is always waited for: to send all again before it can be acknowledged would keep a slow
+path as slow as it is."""
+
 TIMER_GRAIN_S = 0.005
 """Added to timeouts: drivers and radios are late by this much without anything being lost."""
 
@@ -55,11 +59,13 @@ class RoundTrip:
         self._least.append((now, round_trip_s))
         self.least = round_trip_s
 
-    def timeout(self, ack_delay_s: float) -> float:
-        """How long after the last progress the oldest packet or its acknowledgement must be lost."""
+    def timeout(self, ack_delay_s: float, most_s: float = float("inf")) -> float:
+        """How long after the last progress the oldest packet or its acknowledgement must be lost; at most `most_s` on
+        a path that is not slow itself."""
         if self.smoothed is None:
-            return INITIAL_TIMEOUT_S
-        return self.smoothed + max(4 * self.variation, TIMER_GRAIN_S) + ack_delay_s
+            return min(most_s, INITIAL_TIMEOUT_S)
+        timeout_s = self.smoothed + max(4 * self.variation, TIMER_GRAIN_S) + ack_delay_s
+        return min(timeout_s, max(most_s, SLOW_ROUND_TRIPS * self.smoothed))
 
 
 def _minimum(samples: deque[tuple[float, float]], value: float, now: float, window_s: float) -> float:

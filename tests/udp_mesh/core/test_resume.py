@@ -1,0 +1,97 @@
+"""A message that an outbox takes back in the middle keeps its number: who had all of it does not get it twice."""
+
+from hypothesis import given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
+
+from tests.udp_mesh.core.pair import World, settings
+from udp_mesh.core.events import MessageDelivered, MessageExpired, MessageReceived, PeerOffline, PeerOnline
+from udp_mesh.core.settings import Limits, Outbox, Topic
+
+ART = Topic("art", outbox=Outbox.ALL)
+
+
+def met(*topics: Topic, **changes: object) -> World:
+    world = World(seed=1)
+    for name in ("a", "b"):
+        world.add(settings(name, *topics, **changes))
+    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    return world
+
+
+def cut(world: World, *ways: tuple[str, str]) -> None:
+    for way in ways:
+        world.pipes[way].up = False
+
+
+def heal(world: World) -> None:
+    for way in world.pipes.values():
+        way.up = True
+    assert world.run(20.0, until=lambda: all(peer.online for peer in world.nodes["a"].conditions(world.now).peers))
+
+
+@examples(max_examples=15)
+@given(st.integers(1, 60_000), st.floats(0.0, 0.08))
+def test_a_cut_at_any_moment_delivers_a_message_once(size_bytes: int, after_s: float) -> None:
+    world = met(ART)
+    world.send("a", "art", bytes(size_bytes), "b")
+    world.run(after_s)
+    # what had left arrives, and is not acknowledged any more
+    cut(world, ("b", "a"))
+    world.run(0.02)
+    cut(world, ("a", "b"))
+    assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))
+    heal(world)
+    assert world.run(10.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    world.run(3.0)
+    assert len(world.told("a", MessageDelivered)) == 1
+    assert len(world.told("b", MessageReceived)) == 1
+
+
+def test_what_had_arrived_of_a_large_message_is_not_sent_again() -> None:
+    world = met(ART)
+    world.send("a", "art", bytes(2_000_000), "b")
+    world.run(1.0)
+    cut(world, *world.pipes)
+    assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))
+    heal(world)
+    assert world.run(10.0, until=lambda: bool(world.told("b", MessageReceived)))
+    assert (
+        world.pipes[("a", "b")].carried_bytes < 2_700_000
+    )  # with the probes of ten seconds; all of it again would be 3.2 MB
+
+
+def test_a_peer_that_restarted_gets_the_message_anew() -> None:
+    world = met(ART)
+    world.send("a", "art", bytes(500_000), "b")
+    world.run(0.2)
+    cut(world, *world.pipes)
+    assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))
+    world.add(settings("b", ART))
+    heal(world)
+    assert world.run(10.0, until=lambda: bool(world.told("b", MessageReceived) and world.told("a", MessageDelivered)))
+    assert len(world.told("b", MessageReceived)) == 1
+
+
+def test_a_peer_that_forgot_its_pieces_meanwhile_gets_the_message_anew() -> None:
+    world = met(ART)
+    world.send("a", "art", bytes(500_000), "b")
+    world.run(0.2)
+    cut(world, *world.pipes)
+    world.run(400.0)
+    heal(world)
+    assert world.run(10.0, until=lambda: bool(world.told("b", MessageReceived) and world.told("a", MessageDelivered)))
+    assert len(world.told("b", MessageReceived)) == 1
+
+
+def test_a_message_that_expires_in_the_outbox_frees_what_the_peer_had_of_it() -> None:
+    world = met(Topic("art", outbox=Outbox.ALL, deadline_s=40.0), limits=Limits())
+    world.send("a", "art", bytes(500_000), "b")
+    world.run(0.2)
+    cut(world, *world.pipes)
+    world.run(60.0)
+    assert len(world.told("a", MessageExpired)) == 1
+    assert world.nodes["b"].conditions(world.now).partial_bytes > 0
+    heal(world)
+    assert world.run(5.0, until=lambda: world.nodes["b"].conditions(world.now).partial_bytes == 0)
+    assert not world.told("b", MessageReceived)
