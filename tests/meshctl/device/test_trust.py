@@ -84,6 +84,7 @@ def test_a_known_key_passes_an_unknown_one_and_a_changed_one_do_not(tmp_path: Pa
     with pytest.raises(HostKeyChanged, match=r"b03 .*changed") as caught:
         trust.check(B03, key(2))
     assert caught.value.pinned == (key(1).fingerprint,)
+    assert "`meshctl trust b03 --replace`" in caught.value.hint
 
 
 def test_a_node_may_have_a_key_of_each_type_but_not_a_new_type_unasked(tmp_path: Path) -> None:
