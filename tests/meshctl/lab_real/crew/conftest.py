@@ -1,0 +1,68 @@
+"""A second machine of real radios: everything encrypted, a robot whose node has two radios, a spare in its box."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from meshctl.lab.copybook import prepare
+from meshctl.lab.real.fleet import RealFleet
+from meshctl.lab.twin import spec_of
+from tests.meshctl.lab_real.conftest import SETUP, START_S, Lab, until
+
+INVENTORY = Path(__file__).with_name("inventory")
+FIELDED = ("base", "b01", "b02", "husky")
+KEYS = {"main": "a word that all of them know", "fast": "and another one for five gigahertz"}
+
+
+@dataclass(frozen=True, slots=True)
+class Crew(Lab):
+    """The running fleet; `spare` stays on its bench, fresh from the box."""
+
+    def write_keys(self, **keys: str) -> None:
+        """What the meshes' keys are from now on; a node has them once it is provisioned."""
+        lines = "".join(f"{mesh}: {key}\n" for mesh, key in {**KEYS, **keys}.items())
+        (self.inventory.parent / "keys.yaml").write_text(lines, encoding="utf-8")
+
+    def settle(self) -> None:
+        """Wait until every fielded node is up and the base's batman-adv has a route to every other one."""
+        others = set(FIELDED[1:])
+        until(lambda: all(self.node(name).is_up() for name in FIELDED), "every node to boot")
+        until(lambda: self.originators("base").keys() >= others, "routes from the base to every node")
+        until(lambda: self.answers("base-station", "10.42.0.10"), "the Husky's computer to answer")
+
+    def stations(self, name: str, interface: str) -> dict[str, bool]:
+        """Whom a radio of the node knows, and whether each has proven that it knows the key."""
+        names = self.names()
+        told: dict[str, bool] = {}
+        mac = ""
+        for line in self.on(name, f"iw dev {interface} station dump").splitlines():
+            words = line.split()
+            if line.startswith("Station"):
+                mac = words[1]
+            elif words[0] == "authorized:":
+                told[names[mac]] = words[1] == "yes"
+        return told
+
+
+@pytest.fixture(scope="session")
+def crew(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Crew]:
+    """The fielded nodes taken in on the bench and carried out: only the mesh leads to them."""
+    subprocess.run((SETUP,), check=True, timeout=START_S)
+    place = tmp_path_factory.mktemp("crew")
+    copy = prepare(INVENTORY, place / "lab")
+    fleet = RealFleet(spec_of(copy.fleet, links=copy.links), place / "lab").up(wait_s=START_S)
+    try:
+        made = Crew(fleet, copy.inventory, place / "state")
+        made.write_keys()
+        made.meshctl("bootstrap", "--yes", *FIELDED)
+        for name in FIELDED[1:]:
+            fleet.node(name).plug(False)
+        made.settle()
+        yield made
+    finally:
+        fleet.down()
