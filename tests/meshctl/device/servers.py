@@ -12,7 +12,6 @@ import re
 import shutil
 import socket
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -22,6 +21,7 @@ from meshctl.device.connection import Credentials, Deadlines, Endpoint
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import HostKey, TrustStore, parse_key
 from tests.meshctl.device.sandbox import Sandbox
+from tests.waiting import until
 
 # Generous on purpose: a busy machine may be slow, and a test passes as soon as the thing is true.
 PATIENCE_S = 90.0
@@ -29,11 +29,7 @@ PATIENCE_S = 90.0
 
 def eventually(what: Callable[[], bool], *, patience_s: float = PATIENCE_S) -> None:
     """Poll until `what()` holds."""
-    deadline = time.monotonic() + patience_s
-    while not what():
-        if time.monotonic() > deadline:
-            raise AssertionError(f"did not come true within {patience_s:g} s")
-        time.sleep(0.02)
+    until(what, "it to come true", wait_s=patience_s)
 
 
 def free_port() -> int:
