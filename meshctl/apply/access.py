@@ -174,7 +174,7 @@ class Access:
 
 def _close(connections: Iterable[SshConnection]) -> None:
     with ThreadPoolExecutor(CLOSED_AT_ONCE, "close") as pool:
-        for _ in pool.map(SshConnection.close, connections):
+        for _ in pool.map(lambda connection: connection.close(), connections):
             pass
 
 
