@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jsonschema  # type: ignore[import-untyped]
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -164,6 +165,19 @@ def test_every_field_of_the_json_is_documented(fleet: Fleet) -> None:
     fields = documented(told) | documented(preflight_json([Check("a", True, "b")]))
     missing = {field for field in fields - kept_as_told if f"`{field}`" not in PAGE}
     assert missing == set()
+
+
+def test_the_json_is_as_its_schema_says(fleet: Fleet) -> None:
+    schema = json.loads((ROOT / "docs/status.schema.json").read_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    is_valid = jsonschema.Draft202012Validator(schema).validate
+    asked = {"robots_unasked": "--no-robots", "robots": {}}
+    statuses = (status_of(fleet), broken(fleet), status_of(fleet, {}, {}), status_of(fleet, **asked))
+    for status in statuses:
+        is_valid(as_json(status))
+        is_valid(preflight_json(preflight(fleet, status)))
+    with pytest.raises(jsonschema.ValidationError):
+        is_valid({**as_json(statuses[0]), "a field nobody wrote down": 1})
 
 
 def test_a_fact_that_is_not_known_is_null_and_never_zero(fleet: Fleet) -> None:
