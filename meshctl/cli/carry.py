@@ -148,6 +148,9 @@ def carry_out_plan(
     if run.trouble:
         with unheard():
             typer.echo(f"the journal is incomplete: {run.trouble}", err=True)
+            typer.echo(
+                "hint: what it lacks counts as not done, so `meshctl resume` looks at those nodes again", err=True
+            )
     # a reader that is gone (`| head`, a closed terminal) changes nothing about how it ended
     with unheard():
         _sum_up(outcomes, run.id, as_json=as_json)

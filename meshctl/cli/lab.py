@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,6 +19,7 @@ from meshctl.lab.errors import LabError
 from meshctl.lab.fleet import VirtualFleet, end
 from meshctl.lab.images import firmware_image
 from meshctl.lab.real.fleet import RealFleet
+from meshctl.lab.releases import facts
 from meshctl.lab.twin import spec_of
 from meshctl.model import Release
 from meshctl.resources import shipped
@@ -177,15 +179,19 @@ def image(
     board: Annotated[str, typer.Argument(help="Board name, such as compex,wpj344-16m.")],
     out: Annotated[Path, typer.Argument(help="The file to write.")],
     package: Annotated[list[str] | None, typer.Option("--package", help="Baked in beside the mesh's own.")] = None,
+    revision: Annotated[str, typer.Option("--revision", help="Build; default: the one nodes start with.")] = "",
 ) -> None:
-    """Write a firmware image that virtual nodes can be flashed with, checked as a real one is.
+    """Write a firmware image for virtual nodes, checked as a real one is, and tell its line in the inventory.
 
-    Example: meshctl lab image 24.10 compex,wpj344-16m wpj344.bin
+    Example: meshctl lab image 23.05 compex,wpj344-16m wpj344.bin --revision r24107-0123456789
     """
+    named = revision or facts(release).revision
+    content = firmware_image(release, board=board, extra=tuple(package or ()), revision=named)
     try:
-        out.write_bytes(firmware_image(release, board=board, extra=tuple(package or ())))
+        out.write_bytes(content)
     except OSError as error:
-        raise InputError(f"{out} cannot be written: {error.strerror}") from error
+        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+    typer.echo(f"firmware: {{image: {out.name}, sha256: {hashlib.sha256(content).hexdigest()}, revision: {named}}}")
 
 
 def _plug(directory: Path | None, names: list[str] | None, plugged: bool) -> None:
