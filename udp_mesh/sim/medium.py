@@ -2,15 +2,16 @@
 
 A datagram joins its station's finite queue; the station waits for silence, backs off a random number of slots, and
 sends the frame to the next hop, again and again up to `attempts` times as 802.11 does; every station in earshot keeps
-quiet meanwhile. The next hop queues it in turn. Routes follow the least expected number of transmissions and are
-looked at anew every `route_s`, which stands for the mesh layer's own reconnect time. A broadcast is flooded: each
-station sends it on once, `broadcast_repeats` times, without acknowledgement.
+quiet meanwhile. The count of slots stands still while others send and goes on after them, so that nobody waits much
+longer than the others (IEEE 802.11-2020, 10.3.4.3). The next hop queues the frame in turn. Routes follow the least
+expected number of transmissions and are looked at anew every `route_s`, which stands for the mesh layer's own reconnect
+time. A broadcast is flooded: each station sends it on once, `broadcast_repeats` times, without acknowledgement.
 
 Each station has two queues, as wifi's access categories for video and best effort (IEEE 802.11, EDCA; every 802.11n
 radio has them, and our daemon marks urgent datagrams for the first): urgent frames do not stand behind others and
 draw from fewer slots. `access_categories=False` is a radio without them.
 
-Not modelled: hidden stations, capture, rate adaptation.
+Not modelled: collisions, hidden stations, capture, rate adaptation.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ FRAME_BYTES = 68
 SLOT_S = 9e-6
 BEST_EFFORT_SLOTS = (1, 16)
 VIDEO_SLOTS = (0, 8)
+# of a slot: sums of floats fall this short of whole numbers
+_ROUNDING = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +84,9 @@ class _Queue:
     slots: tuple[int, int]
     frames: deque[Frame] = field(default_factory=deque)
     is_waiting: bool = False
+    backoff_slots: int | None = None
+    """Still to be counted down before the frame at the front may leave; None: not drawn yet."""
+    counting_from_s: float = 0.0
 
 
 class _Station:
@@ -88,7 +94,8 @@ class _Station:
         self.name = name
         self.urgent = _Queue(self, VIDEO_SLOTS)
         self.other = _Queue(self, BEST_EFFORT_SLOTS)
-        self.quiet_until_s = 0.0
+        self.quiet_from_s = self.quiet_until_s = 0.0
+        """The latest time in which others could be heard sending."""
         self.is_on = True
         self.flooded: deque[int] = deque(maxlen=512)
 
@@ -167,23 +174,29 @@ class Medium:
         self._contend(queue)
 
     def _contend(self, queue: _Queue) -> None:
-        """Try at the next silence, after a random number of slots."""
+        """Try at the next silence, after a random number of slots, or what is left of it."""
         if queue.is_waiting or not queue.frames:
             return
         queue.is_waiting = True
         first, window = queue.slots
-        backoff_s = (first + self._rng.randrange(window)) * SLOT_S
-        start_s = max(self._agenda.now, queue.station.quiet_until_s) + backoff_s
-        self._agenda.at(start_s, lambda: self._turn(queue))
+        if queue.backoff_slots is None:
+            queue.backoff_slots = self._rng.randrange(window)
+        queue.counting_from_s = max(self._agenda.now, queue.station.quiet_until_s) + first * SLOT_S
+        self._agenda.at(queue.counting_from_s + queue.backoff_slots * SLOT_S, partial(self._turn, queue))
 
     def _turn(self, queue: _Queue) -> None:
         queue.is_waiting = False
         station = queue.station
         if not queue.frames or not station.is_on:
+            queue.backoff_slots = None
             return
         if station.quiet_until_s > self._agenda.now:
+            assert queue.backoff_slots is not None
+            counted = (station.quiet_from_s - queue.counting_from_s) / SLOT_S
+            queue.backoff_slots -= min(queue.backoff_slots, max(0, int(counted + _ROUNDING)))
             self._contend(queue)
             return
+        queue.backoff_slots = None
         self._look_around()
         frame = queue.frames.popleft()
         if frame.to is None:
@@ -197,15 +210,19 @@ class Medium:
         size = len(frame.data) + IP_UDP_BYTES + FRAME_BYTES
         took_s = times * (size * 8 / self._channel.rate + self._channel.overhead_s)
         end_s = self._agenda.now + took_s
-        station.quiet_until_s = end_s
+        self._keep_quiet(station, end_s)
         for name in self._heard[station.name]:
-            other = self._stations[name]
-            other.quiet_until_s = max(other.quiet_until_s, end_s)
+            self._keep_quiet(self._stations[name], end_s)
         self.counts.transmissions += times
         self.counts.bytes += size * times
         self.counts.airtime_s += took_s
         self.counts.airtime_s_of[station.name] = self.counts.airtime_s_of.get(station.name, 0.0) + took_s
         return end_s + self._channel.hop_delay_s
+
+    def _keep_quiet(self, station: _Station, end_s: float) -> None:
+        if station.quiet_until_s <= self._agenda.now:
+            station.quiet_from_s = self._agenda.now
+        station.quiet_until_s = max(station.quiet_until_s, end_s)
 
     def _forward(self, station: _Station, frame: Frame) -> None:
         assert frame.to is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 
 from udp_mesh.sim.agenda import Agenda
@@ -172,3 +173,14 @@ def test_each_stations_airtime_is_counted() -> None:
     counts = line.medium.counts
     assert counts.airtime_s_of["a"] > counts.airtime_s_of["b"] > 0
     assert sum(counts.airtime_s_of.values()) == counts.airtime_s
+
+
+def test_who_waited_while_another_sent_waits_less_the_next_time() -> None:
+    line = Line("ab", rate=1e6, queue_frames=10_000)
+    for _ in range(400):
+        line.medium.send("a", "b", bytes(1000))
+        line.medium.send("b", "a", bytes(1000))
+    line.agenda.run_until(3.0)
+    runs = [len(list(group)) for _, group in itertools.groupby(line.stations)]
+    # a count that began anew each time would let one of two stations send eight times in a row now and then
+    assert max(runs) <= 6
