@@ -1,4 +1,4 @@
-"""Shared set-up of all tests: the hypothesis profiles.
+"""Shared set-up of all tests: the hypothesis profiles, and a word of what cannot be tested here.
 
 `fast` (the default) is derandomized, so that a run on a busy machine tests the same cases as any other run and no
 deadline depends on the clock. `deep` draws new cases and many more of them: `HYPOTHESIS_PROFILE=deep make test`.
@@ -6,10 +6,23 @@ deadline depends on the clock. `deep` draws new cases and many more of them: `HY
 
 import os
 
+import pytest
 from hypothesis import HealthCheck, settings
+
+from tests.udp_mesh.bridges.interpreters import NEEDS_ROS, ROS_PYTHON, expects_ros
 
 settings.register_profile(
     "fast", derandomize=True, deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.register_profile("deep", deadline=None, max_examples=2000, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fast"))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Nothing is left out without a word."""
+    if not expects_ros():
+        terminalreporter.section("not tested here")
+        terminalreporter.line(
+            f"ROS 1: {ROS_PYTHON} has no rospy and rosmaster, so tests/udp_mesh/bridges/test_ros1_quick.py was not"
+            f" collected. scripts/setup-ros installs them (Debian, Ubuntu); {NEEDS_ROS}=1 makes it fail instead."
+        )

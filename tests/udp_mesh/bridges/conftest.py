@@ -1,16 +1,26 @@
-"""The quick case with a real ROS 1 is collected where there is one (scripts/setup-ros); the proofs insist on it."""
+"""The quick case with a real ROS 1 is collected where there is one (scripts/setup-ros); the proofs insist on it. A test
+that fails shows the last words of all processes it ran."""
 
-import subprocess
-from pathlib import Path
+from __future__ import annotations
 
-ROS_PYTHON = "/usr/bin/python3"
+from collections.abc import Generator
+
+import pytest
+
+from tests.udp_mesh.bridges.interpreters import expects_ros
+from tests.udp_mesh.bridges.ros_processes import FOLDERS
+
+collect_ignore = [] if expects_ros() else ["test_ros1_quick.py"]
+
+LAST_WORDS = 3000
 
 
-def has_ros() -> bool:
-    if not Path(ROS_PYTHON).exists():
-        return False
-    asked = [ROS_PYTHON, "-c", "import rospy, rosmaster, std_msgs"]
-    return subprocess.run(asked, capture_output=True, check=False).returncode == 0
-
-
-collect_ignore = [] if has_ros() else ["test_ros1_quick.py"]
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    if report.failed:
+        for log in sorted(log for folder in FOLDERS if folder.is_dir() for log in folder.glob("*.log")):
+            report.sections.append((log.name, log.read_text(errors="replace")[-LAST_WORDS:]))
+    return report

@@ -1,7 +1,8 @@
-"""Older Pythons of the machine a test runs on."""
+"""Other Pythons of the machine a test runs on: older ones, and ROS's."""
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 import subprocess
@@ -19,3 +20,22 @@ def older_interpreters(*minors: int) -> list[str]:
     return [
         path for path in found if subprocess.run([path, "-c", ""], capture_output=True, check=False).returncode == 0
     ]
+
+
+ROS_PYTHON = "/usr/bin/python3"
+"""The system's: Debian and Ubuntu have ROS 1 as packages of it (scripts/setup-ros)."""
+NEEDS_ROS = "MESHCTL_TESTS_NEED_ROS"
+
+
+@functools.cache
+def has_ros() -> bool:
+    """Whether the system's Python has a ROS 1 with a master."""
+    if not Path(ROS_PYTHON).exists():
+        return False
+    asked = [ROS_PYTHON, "-c", "import rospy, rosmaster, std_msgs"]
+    return subprocess.run(asked, capture_output=True, check=False).returncode == 0
+
+
+def expects_ros() -> bool:
+    """Whether tests of a real ROS 1 are to be run: where there is one, and where somebody says that there is."""
+    return has_ros() or bool(os.environ.get(NEEDS_ROS))

@@ -15,16 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import udp_mesh
-from tests.udp_mesh.bridges.interpreters import older_interpreters
+from tests.udp_mesh.bridges.interpreters import ROS_PYTHON, older_interpreters
 from tests.udp_mesh.daemon.processes import RunningDaemon, poll
 from tests.udp_mesh.links.sockets import WAIT_S
 
 ROOT = Path(udp_mesh.__file__).parent.parent
-ROS_PYTHON = "/usr/bin/python3"
 DEBIAN_PACKAGES = "/usr/lib/python3/dist-packages"
 OLD_PYTHON = next(iter(older_interpreters(8)), ROS_PYTHON)
 """Python 3.8, which ROS Noetic was made for, where there is one: Debian's rospy is pure Python."""
 ROBOT = Path(__file__).with_name("ros_robot.py")
+FOLDERS: set[Path] = set()
+"""Where logs of masters, bridges, daemons and nodes are, for the report of a test that fails."""
+TOLD_LINES = 20
+"""Of what a node said, where it did not say what it should."""
 
 
 def free_tcp_port() -> int:
@@ -51,6 +54,7 @@ class Master:
     def __init__(self, folder: Path, name: str, inside: Sequence[str] = ()) -> None:
         self.name = name
         self.folder = folder
+        FOLDERS.add(folder)
         self.inside = tuple(inside)
         self.port = free_tcp_port()
         self.log = folder / f"{name}-roscore.log"
@@ -113,18 +117,21 @@ class Master:
 
 
 class Robot:
-    """A node in a robot's ROS graph."""
+    """A node in a robot's ROS graph; its own words are in a log beside the master's."""
 
     def __init__(self, master: Master, name: str) -> None:
-        self.process = subprocess.Popen(
-            [*master.inside, ROS_PYTHON, str(ROBOT), name],
-            env=master.environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
+        self.log = master.folder / f"{master.name}-{name}.log"
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [*master.inside, ROS_PYTHON, str(ROBOT), name],
+                env=master.environment,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+            )
         self._lines: deque[dict[str, Any]] = deque()
+        self._changing = threading.Lock()
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
         self.expect("ready")
@@ -133,7 +140,9 @@ class Robot:
         assert self.process.stdout is not None
         for line in self.process.stdout:
             if line.startswith("{"):
-                self._lines.append(json.loads(line))
+                told = json.loads(line)
+                with self._changing:
+                    self._lines.append(told)
 
     def _tell(self, **command: object) -> None:
         assert self.process.stdin is not None
@@ -144,17 +153,23 @@ class Robot:
         """Waits for a line with this field (and value); takes it out."""
 
         def found() -> dict[str, Any] | None:
-            for line in list(self._lines):
-                if field in line and (value is None or line[field] == value):
-                    self._lines.remove(line)
-                    return line
+            with self._changing:
+                for line in self._lines:
+                    if field in line and (value is None or line[field] == value):
+                        self._lines.remove(line)
+                        return line
+            assert self.process.poll() is None, f"the node has ended: {self.log.read_text()}"
             return None
 
-        return poll(found, f"{field} = {value!r}, so far {list(self._lines)}")
+        try:
+            return poll(found, f"{field} = {value!r}")
+        except AssertionError as error:
+            raise AssertionError(f"{error}; so far {list(self._lines)[-TOLD_LINES:]}; {self.log.read_text()}") from None
 
     def received(self) -> list[dict[str, Any]]:
         """Messages that came and were not taken."""
-        return [line for line in list(self._lines) if "name" in line]
+        with self._changing:
+            return [line for line in self._lines if "name" in line]
 
     def subscribe(self, name: str, type_name: str = "std_msgs/String", **more: object) -> None:
         """Waits until the subscriber is registered."""

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from benchmarks.link.laboratory import INTERFACE, Laboratory, Link, laboratory
 from tests.udp_mesh.bridges.ros_processes import BridgeProcess, Master, Robot
-from tests.udp_mesh.daemon.processes import KEY, RATES, RunningDaemon, poll, wait_online
+from tests.udp_mesh.daemon.processes import KEY, PATIENT_RATES, RunningDaemon, poll, wait_online
 
 LOSSY = Link(rate=20e6, delay_ms=5.0, loss=0.05)
 """Loss in both directions, acknowledgements included."""
@@ -39,7 +39,7 @@ class RobotsDaemon(RunningDaemon):
         super().__init__(
             folder,
             name,
-            f'name = "{name}"\nkey_file = "{key}"\n[[links]]\ninterface = "{INTERFACE}"\n{topics}{RATES}'
+            f'name = "{name}"\nkey_file = "{key}"\n[[links]]\ninterface = "{INTERFACE}"\n{topics}{PATIENT_RATES}'
             f'[daemon]\nsocket = "{folder / name}.sock"\nstate_directory = "{folder / name}"\n',
         )
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.udp_mesh.bridges.ros_processes import OLD_PYTHON, ROOT, BridgeProcess, Master, Robot
-from tests.udp_mesh.daemon.processes import RunningDaemon, configuration, poll, wait_online
+from tests.udp_mesh.daemon.processes import PATIENT_RATES, RunningDaemon, configuration, poll, wait_online
 from tests.udp_mesh.links.sockets import free_port
 
 HEADER = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
@@ -72,7 +72,8 @@ def team() -> Iterator[tuple[Side, Side]]:
             kept.callback(master.stop)
             master.start(wait=False)
         for name, own, other in (("alice", 1, 2), ("bob", 2, 1)):
-            daemon = RunningDaemon(folder, name, configuration(folder, name, own, [other], port))
+            text = configuration(folder, name, own, [other], port, rates=PATIENT_RATES)
+            daemon = RunningDaemon(folder, name, text)
             kept.enter_context(daemon)
             master = masters[name]
             master.wait()
@@ -184,7 +185,8 @@ def test_the_fielded_status_messages_and_service_need_no_package(team: tuple[Sid
     assert entry["md5sum"] == "b444fcd5e93804f9d8148d66d10b2520"
     assert 'host: "bob"' in entry["text"]
     assert 'mac: "127.0.3.2"' in entry["text"]
-    assert alice.robot.call("/alice/getHosts") == {"hosts": ["bob"], "macs": ["127.0.3.2"]}
+    bob_alone = {"hosts": ["bob"], "macs": ["127.0.3.2"]}
+    poll(lambda: alice.robot.call("/alice/getHosts") == bob_alone, "bob from the service")
 
 
 def test_the_networks_conditions_are_a_topic(team: tuple[Side, Side]) -> None:
