@@ -9,10 +9,11 @@ from __future__ import annotations
 import re
 import threading
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from meshctl.apply.change import change_of, new_change_id, new_nonce, services_of
 from meshctl.apply.checks import missing
+from meshctl.apply.forget import Forgetting
 from meshctl.apply.job import Job
 from meshctl.apply.settle import Move, applied_age_s, next_move
 from meshctl.apply.waiting import Pace
@@ -59,8 +60,14 @@ class Attempt:
     is_given_up: bool = False
     # what it does besides files may take so long before its window begins
     extra_s: float = 0.0
+    # its radio starts anew with it
+    takes_radios_down: bool = False
     # the one of `places` where it was met
     met: Endpoint | None = None
+    forgetting: Forgetting = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self.forgetting = Forgetting(self.job)
 
     @property
     def new(self) -> Endpoint:
@@ -91,6 +98,7 @@ def attempt_of(job: Job, old: Endpoint, *, window_s: int | None = None) -> Attem
         window_s or job.node.confirm_window_s,
         old,
         job.work.access.places(job.node),
+        takes_radios_down=job.plan.cut >= Cut.MESH,
     )
 
 
@@ -140,6 +148,7 @@ def begin(attempt: Attempt, connection: SshConnection, *, at_uptime_s: float | N
     The change may cut this very connection, so an answer that does not come soon is not waited for: the window is
     running. Raises NodeRefused, Unreachable.
     """
+    attempt.forgetting.begins()
     patience = threading.Timer(min(ANSWER_S, attempt.window_s / 4), connection.close)
     patience.daemon = True
     patience.start()
@@ -171,6 +180,8 @@ def look(attempt: Attempt, connection: SshConnection) -> Move:
     job = attempt.job
     attempt.last = observe(connection)
     age_s = applied_age_s(attempt.status)
+    if age_s is not None:
+        attempt.forgetting.stands()
     attempt.gaps = missing(job.expected, attempt.last, since_s=age_s)
     if age_s is not None and age_s < attempt.settle_s:
         attempt.gaps = (*attempt.gaps, "it has not settled yet")

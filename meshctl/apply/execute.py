@@ -72,6 +72,7 @@ def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
         setting.owner,
         remember=lambda name, seen: setting.run.remember(fleet.name, name, facts_of(seen), seen.answered_at_s),
         rate_bytes_per_s=setting.rate_bytes_per_s,
+        around=prepared.seen.observations,
     )
     outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _without_work(fleet, made))}
     for outcome in outcomes.values():

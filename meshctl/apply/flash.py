@@ -16,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from meshctl.apply.attempt import LOCK_SLACK_S, install_switch
+from meshctl.apply.forget import Forgetting
 from meshctl.apply.job import Job
 from meshctl.apply.waiting import Pace
 from meshctl.device import deadman, openwrt
@@ -56,8 +57,9 @@ def checked_image(profile: HardwareProfile) -> Path:
 
 def flash(job: Job, connection: SshConnection, image: Path) -> Outcome:
     """Flash a node and prove it. Owns `connection`. Raises NodeError only while nothing on the node has stopped."""
+    forgetting = Forgetting(job)
     try:
-        marker = _send(job, connection, image)
+        marker = _send(job, connection, image, forgetting)
     except NodeError:
         with suppress(NodeError):
             deadman.unlock(connection, job.work.owner)
@@ -65,10 +67,10 @@ def flash(job: Job, connection: SshConnection, image: Path) -> Outcome:
     finally:
         connection.close()
     with job.step("flash"):
-        return _await_return(job, marker)
+        return _await_return(job, marker, forgetting)
 
 
-def _send(job: Job, connection: SshConnection, image: Path) -> str:
+def _send(job: Job, connection: SshConnection, image: Path, forgetting: Forgetting) -> str:
     """Everything up to the moment sysupgrade starts; returns the marker that the new system will hold."""
     size = image.stat().st_size
     with job.step("check"):
@@ -97,6 +99,8 @@ def _send(job: Job, connection: SshConnection, image: Path) -> str:
         upload(connection, archive(job.wanted, keys, marker), ARCHIVE_PATH, mode=0o600)
     recipe = job.node.hardware.recovery or "none is written down in its hardware profile"
     job.work.note(f"if it does not come back: {recipe}", job.name)
+    forgetting.beforehand(for_s=RETURN_S)
+    forgetting.begins()
     openwrt.start_sysupgrade(connection, IMAGE_PATH, ARCHIVE_PATH)
     return marker
 
@@ -134,7 +138,7 @@ def _tar(files: Iterable[tuple[str, bytes, int]], links: Iterable[tuple[str, str
     return out.getvalue()
 
 
-def _await_return(job: Job, marker: str) -> Outcome:
+def _await_return(job: Job, marker: str, forgetting: Forgetting) -> Outcome:
     """Look for the node until it is back and proven, or it is clear that it will not be."""
     pace = Pace(RETURN_S, job.work.interrupt)
     trouble = ""
@@ -147,9 +151,11 @@ def _await_return(job: Job, marker: str) -> Outcome:
                 connection.close()
         except NodeError as error:
             trouble = str(error)
+            forgetting.while_silent()
         else:
             job.work.remember(job.name, seen)
             if seen.boot_id != job.before.boot_id:
+                forgetting.when_back(went_back=False)
                 return _verdict(job, seen, marker)
             if pace.elapsed_s > START_S:
                 return Outcome(

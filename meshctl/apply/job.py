@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from meshctl.apply.access import Access
 from meshctl.apply.checks import Expectation
@@ -20,7 +20,7 @@ from meshctl.plan import NodePlan, Wanted
 @dataclass(frozen=True, slots=True)
 class Work:
     """What all nodes of a run share. `owner` names this process to the locks on the nodes; `remember` keeps what a
-    node told, for later."""
+    node told, for later; `around` is what the nodes of their meshes told before anything was changed."""
 
     fleet: Fleet
     access: Access
@@ -30,6 +30,7 @@ class Work:
     owner: str
     remember: Callable[[str, Observation], None] = lambda name, seen: None
     rate_bytes_per_s: float | None = None
+    around: Mapping[str, Observation] = field(default_factory=dict)
 
     def note(self, text: str, node: str = "") -> None:
         self.observer(Event(EventKind.NOTE, node, time.time(), text))

@@ -179,6 +179,7 @@ def put_back(job: Job, connection: SshConnection, backup: Backup) -> Outcome:
         job.node.confirm_window_s,
         connection.endpoint,
         job.work.access.places(job.node, address),
+        takes_radios_down=True,
     )
     try:
         prepare(attempt, connection)

@@ -2,7 +2,8 @@
 
 `configure` sends the change over the connection at hand and begins it, then follows the node's own dead-man's switch
 over new connections (`follow`) until the change is confirmed or undone. A cut at any point ends in the same loop: it
-asks the node what is, and does what is next.
+asks the node what is, and does what is next. While the node is silent, and once it is back, its neighbours are asked to
+forget the radio it had (`forget`).
 """
 
 from __future__ import annotations
@@ -42,6 +43,8 @@ def carry(attempt: Attempt, connection: SshConnection) -> Outcome:
     job = attempt.job
     try:
         prepare(attempt, connection)
+        if attempt.takes_radios_down:
+            attempt.forgetting.beforehand(for_s=_limit_s(attempt))
         begin(attempt, connection)
     except Unreachable as error:
         # how far it came, the node itself will tell
@@ -61,10 +64,11 @@ def carry(attempt: Attempt, connection: SshConnection) -> Outcome:
 def follow(attempt: Attempt) -> Outcome:
     """Ask and do what is next until the change has ended one way or the other."""
     work = attempt.job.work
-    pace = Pace(attempt.settle_s + attempt.extra_s + attempt.window_s + GRACE_AFTER_WINDOW_S, work.interrupt)
+    pace = Pace(_limit_s(attempt), work.interrupt)
     work.interrupt.wait(attempt.settle_s)
     while not pace.is_over:
-        connection = reach(attempt)
+        with attempt.forgetting.beside():
+            connection = reach(attempt)
         if connection is not None:
             try:
                 outcome = _move(attempt, connection)
@@ -75,7 +79,11 @@ def follow(attempt: Attempt) -> Outcome:
             if attempt.last is not None:
                 work.remember(attempt.job.name, attempt.last)
             if outcome is not None:
+                if _has_started_its_radio_anew(attempt, outcome):
+                    attempt.forgetting.when_back(went_back=outcome.result is Result.ROLLED_BACK)
                 return outcome
+        else:
+            attempt.forgetting.while_silent()
         if work.interrupt.leaving:
             break
         pace.pause()
@@ -125,6 +133,18 @@ def _go_on(attempt: Attempt, connection: SshConnection, move: Move) -> Outcome |
         release(attempt, connection)
         return Outcome(name, Result.REFUSED, str(refusal), hint=refusal.hint)
     return None
+
+
+def _limit_s(attempt: Attempt) -> float:
+    """Within this time the change has been confirmed or undone."""
+    return attempt.settle_s + attempt.extra_s + attempt.window_s + GRACE_AFTER_WINDOW_S
+
+
+def _has_started_its_radio_anew(attempt: Attempt, outcome: Outcome) -> bool:
+    if outcome.result not in (Result.DONE, Result.ROLLED_BACK):
+        return False
+    has_rebooted = attempt.last is not None and attempt.last.boot_id != attempt.job.before.boot_id
+    return attempt.takes_radios_down or has_rebooted
 
 
 def _out_of_sight(attempt: Attempt) -> Outcome:

@@ -79,6 +79,7 @@ def _attempt(job: Job, connection: SshConnection, script: str, *, takes_radios_d
         here,
         (here,),
         extra_s=INSTALL_S,
+        takes_radios_down=takes_radios_down,
     )
 
 

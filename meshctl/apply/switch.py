@@ -42,6 +42,7 @@ class Member:
     clock: Clocked | None = None
     failure: Outcome | None = None
     is_scheduled: bool = False
+    is_silent: bool = False
     is_proven: bool = False
     is_confirmed: bool = False
 
@@ -151,6 +152,7 @@ def _settle(run: _Switch, needed: int) -> dict[str, Outcome]:
         proven = [member for member in run.members if member.is_proven]
         if len(proven) == len(run.members) or pace.is_over or run.work.interrupt.leaving:
             break
+        _have_forgotten(run, proven)
         pace.pause()
     has_entry = (
         not run.entry or any(m.name == run.entry for m in proven) or all(m.name != run.entry for m in run.members)
@@ -165,9 +167,22 @@ def _settle(run: _Switch, needed: int) -> dict[str, Outcome]:
     return _undo(run, why)
 
 
+def _have_forgotten(run: _Switch, proven: Sequence[Member]) -> None:
+    """Where a cell keeps its channel and BSSID, a node that changed early still hears one that changes late, and may
+    come to know its old radio."""
+    names = {member.name for member in proven}
+
+    def ask(member: Member) -> None:
+        if member.attempt is not None and member.is_silent:
+            member.attempt.forgetting.while_silent(names)
+
+    run.each(run.members, ask)
+
+
 def _prove(member: Member) -> None:
     attempt = member.attempt
     connection = None if attempt is None else reach(attempt)
+    member.is_silent = connection is None
     if attempt is None or connection is None:
         return
     try:

@@ -1,4 +1,4 @@
-# iw's stand-in, the printing part.
+# iw's stand-in, the printing part. A station that is deleted is known again from its next beacon, which is at once.
 BEGIN { FS = "\t" }
 function describe(indent, face,    width, type) {
 	type = face[2] == "adhoc" ? "IBSS" : face[2] == "mesh" ? "mesh point" : face[2] == "sta" ? "managed" : "AP"
@@ -23,15 +23,24 @@ FILENAME ~ /iw$/ {
 	}
 	if (face[1] != device) next
 	found = 1
+	type = face[2]
 	if (verb == "info") { printf "Interface %s\n", device; describe("\t", face) }
 	if (verb == "link") {
 		if (face[11] && face[2] == "adhoc") printf "Joined IBSS %s (on %s)\n\tSSID: %s\n\tfreq: %d\n", face[9], device, face[8], face[5]
 		else print "Not connected."
 	}
 }
-FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" {
+FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" && act == "del" { if ($3 == mac) known = 1; next }
+FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" && (act == "dump" || $3 == mac) {
+	known = 1
 	printf "Station %s (on %s)\n\tinactive time:\t%d ms\n\trx bytes:\t96000\n\trx packets:\t1200\n\ttx bytes:\t88000\n\ttx packets:\t1100\n\ttx retries:\t12\n\ttx failed:\t0\n\trx drop misc:\t0\n", $3, device, $5
 	printf "\tsignal:  \t%d [%d, %d] dBm\n\tsignal avg:\t%d [%d, %d] dBm\n", $4, $4 - 2, $4 - 4, $4, $4 - 2, $4 - 4
 	printf "\ttx bitrate:\t%.1f MBit/s MCS 15 short GI\n\trx bitrate:\t%.1f MBit/s MCS 15 short GI\n\texpected throughput:\t%.2fMbps\n\tauthorized:\tyes\n\tauthenticated:\tyes\n\tassociated:\tyes\n\tconnected time:\t60 seconds\n", $6, $6, $6 * 0.4
 }
-END { if (device != "" && !found) { print "command failed: No such device (-19)" > "/dev/stderr"; exit 237 } }
+function fail(text, number) { printf "command failed: %s (-%d)\n", text, number > "/dev/stderr"; exit 256 - number }
+END {
+	if (device != "" && !found) fail("No such device", 19)
+	# ad-hoc cells: Linux 5.7 and later; 19.07 has the wireless stack of 4.19
+	if (verb == "station" && act == "del" && type == "adhoc" && series == "19.07") fail("Operation not supported", 95)
+	if (verb == "station" && act != "dump" && !known) fail("No such file or directory", 2)
+}
