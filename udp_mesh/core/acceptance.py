@@ -23,12 +23,12 @@ from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Accepted, Channel, Outgoing
 from udp_mesh.core.outbound import Outcome
 from udp_mesh.core.outbox import Held
-from udp_mesh.core.session import Peer
+from udp_mesh.core.session import Peer, Session
 from udp_mesh.core.settings import Outbox, Topic
 from udp_mesh.core.state import State
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
 from udp_mesh.wire.codec import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
-from udp_mesh.wire.frames import MessageFlag
+from udp_mesh.wire.frames import Feature, MessageFlag
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
 
 ANNOUNCE_BYTES = 5
@@ -154,6 +154,8 @@ def enqueue(state: State, name: str, accepted: Accepted, now: float, store_key: 
     if peer is None or ((not peer.online) and topic.outbox is not Outbox.NONE):
         _hold(state, name, Held(accepted, store_key), now)
         return
+    if peer.session is not None and not inflates(peer.session):
+        accepted = unpacked(accepted)
     message = Outgoing(accepted, topic.priority, reliable=topic.reliable)
     message.store_key = store_key
     outbound = peer.outbound
@@ -167,9 +169,24 @@ def enqueue(state: State, name: str, accepted: Accepted, now: float, store_key: 
     state.arm(peer)
 
 
+def inflates(session: Session) -> bool:
+    """Whether the peer takes compressed messages."""
+    return bool(session.features & Feature.ZLIB)
+
+
+def unpacked(accepted: Accepted) -> Accepted:
+    """The message as it was accepted."""
+    if not accepted.flags & MessageFlag.COMPRESSED:
+        return accepted
+    return replace(accepted, body=accepted.payload, flags=accepted.flags & ~MessageFlag.COMPRESSED)
+
+
 def _to_all(state: State, accepted: Accepted, now: float) -> None:
     topic = accepted.channel.topic
     accepted = replace(accepted, flags=accepted.flags | MessageFlag.TO_ALL)
+    sessions = [peer.session for peer in state.roster.online() if peer.session is not None]
+    if not all(map(inflates, sessions)):
+        accepted = unpacked(accepted)
     room = min((link.mtu - header_bytes(link.address) for link in state.links.values()), default=0)
     fits = state.broadcasts() and _broadcast_bytes(accepted) <= room
     if fits:

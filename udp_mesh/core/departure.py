@@ -53,7 +53,7 @@ def header_bytes(address: Address) -> int:
 class Way:
     """How datagrams reach the peer now: link, address, sealing, sizes."""
 
-    __slots__ = ("address", "channel", "confirmed", "fragment_bytes", "heard_at", "link", "room_bytes")
+    __slots__ = ("address", "channel", "confirmed", "fragment_bytes", "heard_at", "link", "mtu", "room_bytes")
 
     def __init__(self, channel: SendChannel) -> None:
         self.channel = channel
@@ -63,6 +63,8 @@ class Way:
         self.address: Address = ("", 0)
         self.heard_at = float("-inf")
         """When the peer was last heard from this address."""
+        self.mtu = 0
+        """Bytes of the largest IP packet."""
         self.room_bytes = 0
         """Frames that fit one datagram."""
         self.fragment_bytes = 0
@@ -70,7 +72,7 @@ class Way:
 
     def lead(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
         """Datagrams go this way from now on; messages already begun keep their fragments where these still fit."""
-        self.link, self.address = link, address
+        self.link, self.address, self.mtu = link, address, mtu
         self.room_bytes = mtu - header_bytes(address) - LONG_OVERHEAD_BYTES
         self.fragment_bytes = min(fragment_bytes, self.room_bytes - FRAGMENT_WIDE_BYTES)
 

@@ -17,6 +17,8 @@ from udp_mesh.wire.frames import Feature, Heartbeat, Waiting
 from udp_mesh.wire.header import VERSION
 from udp_mesh.wire.limits import MAX_HEARD
 
+OWN_FEATURES = Feature.ZLIB | Feature.REPAIR
+
 ANSWER_WITHIN_S = 0.1
 """A new node is answered within this, after a random part of it, so that a team does not answer all at once."""
 
@@ -94,7 +96,7 @@ class Discovery:
             settings.name,
             VERSION,
             VERSION,
-            int(Feature.ZLIB | Feature.REPAIR),
+            int(OWN_FEATURES),
             min(65_535, int(self._interval_s * 1000)),
             min(65_535, sum(1 for session in sessions if session.peer is not None and session.peer.online)),
             min(0xFFFFFFFF, int(sent_bytes_per_s)),

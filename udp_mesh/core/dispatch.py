@@ -9,7 +9,7 @@ from heapq import heappop
 
 from udp_mesh.core.acceptance import expire_held, pack, report_ended
 from udp_mesh.core.departure import IP_UDP_BYTES, leave_copies, leave_level
-from udp_mesh.core.discovery import announce
+from udp_mesh.core.discovery import OWN_FEATURES, announce
 from udp_mesh.core.intake import unpack
 from udp_mesh.core.presence import housekeep
 from udp_mesh.core.seams import Datagram
@@ -95,7 +95,7 @@ def _introduction(state: State, session: Session) -> Heartbeat:
         settings.name,
         VERSION,
         VERSION,
-        0,
+        int(OWN_FEATURES),
         min(65_535, int(settings.rates.heartbeat_sparse_s * 1000)),
         0,
         0,
@@ -239,7 +239,9 @@ def handle_timer(state: State, now: float) -> None:
                 session.inbound.acks.now_wanted = True
                 session.inbound.acks.due_at = None
                 state.owe(session)
-            if outbound.silent_since is not None and outbound.probe_credit and not outbound.scheduler.waiting:
+            # Beside a full piece, which the path may be too narrow for, as well as in place of one.
+            alone = not outbound.scheduler.waiting or outbound.path_size.in_doubt
+            if outbound.silent_since is not None and outbound.probe_credit and alone:
                 session.owe(Ping(state.rng.getrandbits(64)))
                 state.owe(session)
         state.ready[peer] = None

@@ -153,6 +153,15 @@ class TopicStarved:
     waited_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class PathNarrowed:
+    """Small datagrams reach the peer, full ones do not: it gets fragments of `fragment_bytes` in packets of `mtu`."""
+
+    peer: str
+    mtu: int
+    fragment_bytes: int
+
+
 Event = (
     PeerOnline
     | PeerOffline
@@ -166,4 +175,5 @@ Event = (
     | MessageExpired
     | MessagePeerLost
     | TopicStarved
+    | PathNarrowed
 )

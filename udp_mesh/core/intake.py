@@ -22,6 +22,7 @@ from udp_mesh.wire.frames import (
     Ack,
     Bye,
     Cancel,
+    Delivered,
     Fragment,
     Frame,
     Heartbeat,
@@ -173,15 +174,21 @@ def _take_frames(state: State, session: Session, frames: list[Frame], number: in
                     _take_refusal(state, session, frame)
                     report_ended(state, peer, now)
                     state.ready[peer] = None
+            case Delivered(message_ids, broadcast_ids):
+                if not broadcast_ids:
+                    outbound.told_delivered(message_ids)
+                    report_ended(state, peer, now)
             case Nack(message_id):
                 _repair(state, session, message_id, now)
             case Ping(token):
                 session.owe(Pong(token, 0))
                 state.owe(session)
+            case Pong():
+                outbound.path_size.small_arrived(now)
             case Bye():
                 leave(state, session, now)
             case _:
-                # Pongs count as being heard; heartbeats are taken where introductions are.
+                # Heartbeats are taken where introductions are.
                 pass
     _hand_over(state, session, now)
     if not wants_ack:

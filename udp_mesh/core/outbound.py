@@ -20,6 +20,7 @@ from udp_mesh.core.flight import Flight, Mark, Packet
 from udp_mesh.core.levels import Levels
 from udp_mesh.core.message import Outgoing
 from udp_mesh.core.pacing import Pacer
+from udp_mesh.core.path_size import PathSize
 from udp_mesh.core.rtt import RoundTrip
 from udp_mesh.core.scheduler import Scheduler
 from udp_mesh.core.settings import Rates, Settings
@@ -108,6 +109,7 @@ class Outbound:
         self.probe_credit = 0
         self.probed_at = float("-inf")
         self._bursts = Bursts()
+        self.path_size = PathSize()
         self.last_progress = 0.0
         self.limited = True
         """The application, not window or pacing, decides how much leaves."""
@@ -187,6 +189,8 @@ class Outbound:
             self.struggling = False
             if self.silent_since is not None:
                 self._end_silence()
+            if self.path_size.in_doubt:
+                self.path_size.arrived(acknowledged, now)
             self._book_arrivals(acknowledged)
             if self.overdue:
                 self._settle_overdue()
@@ -213,6 +217,7 @@ class Outbound:
                 now=now,
             )
         if lost:
+            self.path_size.lost(lost)
             self._put_back(lost)
         lost_packets = len(lost) + timed_out
         total = len(acknowledged) + lost_packets
@@ -326,6 +331,7 @@ class Outbound:
                 self._put_back((packet,))
             else:
                 self.overdue.append(packet)
+            self.path_size.lost((packet,))
         if self.overdue and not self.scheduler.waiting:
             self._settle_overdue()
 
@@ -347,7 +353,9 @@ class Outbound:
     def _set_aside(self) -> None:
         """Everything on its way waits again, urgent messages behind those still to come."""
         self._settle_overdue()
-        self._put_back(self.flight.give_up())
+        given_up = self.flight.give_up()
+        self.path_size.lost(given_up)
+        self._put_back(given_up)
         self.scheduler.set_aside(self.rates.urgent_priority)
 
     def heard(self, now: float) -> None:
@@ -448,6 +456,13 @@ class Outbound:
         """The open message of this number (copies of casts are numbered apart); a search, for rare answers."""
         own = (message for message in self.open if message.accepted.broadcast_number is None)
         return next((message for message in own if message.wire_id == wire_id), None)
+
+    def told_delivered(self, wire_ids: Iterable[int]) -> None:
+        """The peer says it has these whole, whatever it acknowledged; a search, for peers of another make."""
+        known = set(wire_ids)
+        for message in list(self.open):
+            if message.wire_id in known and message.accepted.broadcast_number is None:
+                self.finish(message, Outcome.DELIVERED)
 
     def finish_all(self, outcome: Outcome | ExpiryReason) -> None:
         for message in list(self.open):

@@ -8,17 +8,20 @@
 
 from udp_mesh.core.acceptance import release_outbox, report_ended, shelve
 from udp_mesh.core.casts import Repairs
+from udp_mesh.core.departure import Way
 from udp_mesh.core.discovery import MISSED_HEARTBEATS
 from udp_mesh.core.events import (
     Incompatible,
     NameConflict,
+    PathNarrowed,
     PeerAddressChanged,
     PeerOffline,
     PeerOnline,
     PeerRestarted,
     TopicStarved,
 )
-from udp_mesh.core.outbound import Outcome
+from udp_mesh.core.outbound import Outbound, Outcome
+from udp_mesh.core.path_size import NARROWER_MTUS, WIDEN_AFTER_S
 from udp_mesh.core.roster import Arrival
 from udp_mesh.core.session import STALE_PATH_S, Peer, Session
 from udp_mesh.core.settings import Address
@@ -167,9 +170,32 @@ def follow(state: State, session: Session, link: str, source: Address, now: floa
     if not first and session.proven and session.peer is not None:
         state.ledger.tell(PeerAddressChanged(session.name, old, source, link))
     if outbound is not None and way.fragment_bytes < before:
-        for message in list(outbound.open):
-            if message.begun and message.fragment_bytes > way.fragment_bytes:
-                outbound.send_anew(message)
+        _fit(outbound, way)
+
+
+def _fit(outbound: Outbound, way: Way) -> None:
+    """What was cut into larger fragments than the way carries now begins anew."""
+    for message in list(outbound.open):
+        if message.begun and min(len(message.body), message.fragment_bytes) > way.fragment_bytes:
+            outbound.cancel(message)
+            outbound.send_anew(message)
+
+
+def _measure_path(state: State, peer: Peer, session: Session, now: float) -> None:
+    """Smaller fragments where full ones do not get through; after a long time, full ones again."""
+    outbound, way = peer.outbound, session.way
+    size, info = outbound.path_size, state.links.get(way.link)
+    narrower = [mtu for mtu in NARROWER_MTUS if mtu < way.mtu]
+    if size.too_narrow and narrower:
+        way.lead(way.link, way.address, narrower[0], state.settings.fragment_bytes)
+        size.reset()
+        size.narrowed_at = now
+        state.ledger.tell(PathNarrowed(peer.name, way.mtu, way.fragment_bytes))
+        _fit(outbound, way)
+        state.ready[peer] = None
+    elif size.narrowed_at is not None and now - size.narrowed_at > WIDEN_AFTER_S and info is not None:
+        size.narrowed_at = None
+        way.lead(way.link, way.address, info.mtu, state.settings.fragment_bytes)
 
 
 def leave(state: State, session: Session, now: float) -> None:
@@ -230,6 +256,7 @@ def _look_at(state: State, peer: Peer, now: float) -> None:
         session.meters.received.feed(session.received_bytes, now)
     if peer.engaged:
         _report_starved(state, peer, now)
+        _measure_path(state, peer, session, now)
         session.meters.sent.feed(peer.outbound.sent_bytes, now)
         session.meters.delivered.feed(peer.outbound.delivered_bytes, now)
 

@@ -1,0 +1,118 @@
+"""A node of another make, written from docs/wire-format.md alone, and a real daemon understand each other."""
+
+import json
+import os
+import random
+import socket
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.udp_mesh.daemon.processes import KEY, RunningDaemon, collect, configuration, outcomes, wait_online
+from tests.udp_mesh.links.sockets import WAIT_S, free_port
+from tests.udp_mesh.wire.foreign_peer import COMPRESSED, FLAG_TO_ALL, ZLIB, Channel, FleetKey, ForeignNode, Parser
+from tests.udp_mesh.wire.make_vectors import FOLDER
+from udp_mesh.client import MeshClient
+
+pytestmark = pytest.mark.xdist_group("udp_mesh_daemons")
+
+TOPICS = "packed = { priority = 6, compression = true }\ncast = { priority = 4, repair = true }"
+
+
+@pytest.fixture(scope="module")
+def daemon() -> Iterator[RunningDaemon]:
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
+        folder = Path(path)
+        with RunningDaemon(folder, "alice", configuration(folder, "alice", 1, [7], free_port(), topics=TOPICS)) as one:
+            yield one
+
+
+@pytest.fixture(params=[0, ZLIB])
+def foreign(daemon: RunningDaemon, request: pytest.FixtureRequest) -> Iterator[ForeignNode]:
+    """One that the daemon has met; it goes with a good-bye."""
+    with daemon.client() as client:
+        host, port = client.request("status")["links"][0]["address"].split(":")
+    with socket.socket(type=socket.SOCK_DGRAM) as own:
+        own.bind(("127.0.3.7", int(port)))
+        name = f"foreign{request.param}-{os.urandom(4).hex()}"
+        node = ForeignNode(bytes.fromhex(KEY), name, own, (host, int(port)), request.param)
+        assert node.run(lambda: node.peer("alice"), WAIT_S)
+        with daemon.client() as client:
+            assert node.run(lambda: node.name in online(client), WAIT_S)
+        yield node
+        node.bye()
+        wait_online(daemon, node.name, online=False)
+
+
+def online(client: MeshClient) -> list[str]:
+    return [peer["name"] for peer in client.request("peers")["peers"] if peer["online"]]
+
+
+def test_published_datagrams_and_frames_are_what_another_make_writes_and_reads() -> None:
+    kinds = ("hello", "broadcast", "introduction", "data")
+    for vector in json.loads((FOLDER / "sealed.json").read_text()):
+        boots = [bytes.fromhex(vector[name] or "00" * 16) for name in ("sender_boot", "receiver_boot")]
+        channel = Channel(FleetKey(bytes.fromhex(vector["fleet_key"])), *boots)
+        sealed = channel.seal(kinds.index(vector["title"]), bytes.fromhex(vector["frames"]), vector["packet_number"])
+        assert sealed.hex() == vector["datagram"]
+    for vector in json.loads((FOLDER / "frames.json").read_text()).values():
+        assert len(Parser(bytes.fromhex(vector["hex"])).frames()) == len(vector["frames"])
+
+
+def test_it_takes_messages_of_any_size_and_the_daemon_knows(daemon: RunningDaemon, foreign: ForeignNode) -> None:
+    noise = random.Random(1).randbytes(60_000)
+    payloads = {"status": b"", "map": noise, "packed": b"again and " * 3000}
+    with daemon.client() as client:
+        for topic, payload in payloads.items():
+            client.publish(topic, payload, to=foreign.name, type="a/Type", notify=True)
+        assert foreign.run(lambda: len(foreign.arrived) == len(payloads), WAIT_S)
+        foreign.run(lambda: False, 0.1)
+        assert set(outcomes(client, len(payloads)).values()) == {"delivered"}
+    assert {one.topic: one.payload for one in foreign.arrived} == payloads
+    assert {one.type_name for one in foreign.arrived} == {"a/Type"}
+    # compression is used only towards who announces it
+    packed = next(one for one in foreign.arrived if one.topic == "packed")
+    assert bool(packed.flags & COMPRESSED) == bool(foreign.features & ZLIB)
+
+
+def test_what_it_sends_arrives_once_and_is_acknowledged(daemon: RunningDaemon, foreign: ForeignNode) -> None:
+    alice = foreign.peer("alice")
+    assert alice is not None
+    payloads = [b"", b"x", random.Random(2).randbytes(50_000)]
+    with daemon.client() as client:
+        client.subscribe("*")
+        numbers = [foreign.send(alice, "from-abroad", payload, size=700) for payload in payloads]
+        assert foreign.run(lambda: all(number in alice.ends for number in numbers), WAIT_S)
+        assert {alice.ends[number] for number in numbers} == {"delivered"}
+        found = collect(client, len(payloads))
+        assert sorted(message.payload for message in found) == sorted(payloads)
+        assert {(message.source, message.topic, message.type) for message in found} == {
+            (foreign.name, "from-abroad", "foreign/Type")
+        }
+        # whole messages sent again are acknowledged again, and delivered no second time
+        for number in numbers:
+            alice.ends.pop(number)
+        alice.next_id = 0
+        for payload in payloads:
+            foreign.send(alice, "from-abroad", payload, size=700)
+        assert foreign.run(lambda: all(number in alice.ends for number in numbers), WAIT_S)
+        foreign.send(alice, "from-abroad", b"last")
+        foreign.run(lambda: not alice.under_way, WAIT_S)
+        assert collect(client, 1)[0].payload == b"last"
+
+
+def test_messages_to_all_go_both_ways(daemon: RunningDaemon, foreign: ForeignNode) -> None:
+    with daemon.client() as client:
+        client.subscribe("*")
+        foreign.broadcast("shout", b"hear me")
+        foreign.run(lambda: False, 0.05)
+        (message,) = collect(client, 1)
+        assert (message.topic, message.payload, message.broadcast) == ("shout", b"hear me", True)
+        client.publish("cast", b"short")
+        assert foreign.run(lambda: len(foreign.arrived) == 1, WAIT_S)
+        client.publish("cast", bytes(5000))
+        assert foreign.run(lambda: len(foreign.arrived) == 2, WAIT_S)
+        assert [one.payload for one in foreign.arrived] == [b"short", bytes(5000)]
+    assert all(one.flags & FLAG_TO_ALL for one in foreign.arrived)
