@@ -21,7 +21,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Accepted, Channel, Outgoing
-from udp_mesh.core.outbound import Outcome
+from udp_mesh.core.open_messages import Outcome
 from udp_mesh.core.outbox import Held
 from udp_mesh.core.session import Peer, Session
 from udp_mesh.core.settings import Outbox, Topic

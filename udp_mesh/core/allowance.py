@@ -1,9 +1,11 @@
 """How many packets may leave for one peer now, and when to look again.
 
-1. `permitted`: what the window leaves room for, plus what the link should have delivered while acknowledgements are
-   late, plus the excess of urgent pieces; for the rest no more than the pacing allows. A silent peer gets probes alone.
-2. `look_again`: when nothing may leave, the time at which the pacing, or a still missing acknowledgement, changes that.
-3. `ack_spacing`: how often packets ask for an acknowledgement, which is what makes one late.
+1. `window_room`: what the window leaves room for, plus what the link should have delivered while acknowledgements are
+   late.
+2. `permitted`: that, plus the excess of urgent pieces; for the rest no more than the pacing allows. A silent peer gets
+   probes alone.
+3. `look_again`: when nothing may leave, the time at which the pacing, or a still missing acknowledgement, changes that.
+4. `ack_spacing`: how often packets ask for an acknowledgement, which is what makes one late.
 
 Acknowledgements go missing in bursts and come late from a process that was not scheduled; a window that waits for them
 leaves the link idle. For some tens of milliseconds the link is presumed to go on as it did.
@@ -28,37 +30,8 @@ PRESUMED_FOR_S = 0.03
 """So long the link is presumed to go on delivering; what its packets then wait is bounded by it."""
 
 
-def permitted(outbound: Outbound, now: float, packets_per_s: float | None, *, urgent: bool) -> int:
-    """Packets that may leave now; `packets_per_s` is the pacing, which urgent pieces do not wait for."""
-    if outbound.silent_since is not None:
-        return outbound.probe_credit
-    packets = _room(outbound, now)
-    if urgent:
-        packets += outbound.rates.urgent_excess_packets
-    else:
-        packets = min(packets, outbound.pacer.allowance(now, packets_per_s))
-    return max(packets, outbound.probe_credit)
-
-
-def look_again(outbound: Outbound, now: float, packets_per_s: float | None) -> float | None:
-    """When more may leave although nothing arrives until then; None: only an acknowledgement changes anything."""
-    if outbound.silent_since is not None:
-        return None
-    if _room(outbound, now) > 0:
-        return outbound.pacer.wake_at(packets_per_s)
-    late_at = _late_at(outbound)
-    if outbound.struggling or now >= late_at + PRESUMED_FOR_S or not outbound.window.presumable():
-        return None
-    return max(now, late_at) + outbound.rates.pace_quantum_s
-
-
-def ack_spacing(outbound: Outbound) -> int:
-    """Packets between two that ask for an acknowledgement at once."""
-    often = max(LOSSY_ACK_SPACING, 1.0 - LOSS_WEIGHT * outbound.loss)
-    return max(2, min(MOST_ACK_SPACING, int(outbound.window.packets * ACK_SPACING * often)))
-
-
-def _room(outbound: Outbound, now: float) -> int:
+def window_room(outbound: Outbound, now: float) -> int:
+    """Packets for which the window has room; below 0 where more are on their way."""
     window = outbound.window
     packets = window.packets
     if outbound.struggling:
@@ -71,6 +44,36 @@ def _room(outbound: Outbound, now: float) -> int:
         if late_s > 0 and window.presumable():
             packets += (window.capacity() or 0.0) * min(late_s, PRESUMED_FOR_S)
     return int(packets) - outbound.flight.outstanding
+
+
+def permitted(outbound: Outbound, room: int, now: float, packets_per_s: float | None, *, urgent: bool) -> int:
+    """Packets that may leave now; `packets_per_s` is the pacing, which urgent pieces do not wait for."""
+    if outbound.silent_since is not None:
+        return outbound.probe_credit
+    packets = room
+    if urgent:
+        packets += outbound.rates.urgent_excess_packets
+    else:
+        packets = min(packets, outbound.pacer.allowance(now, packets_per_s))
+    return max(packets, outbound.probe_credit)
+
+
+def look_again(outbound: Outbound, room: int, now: float, packets_per_s: float | None) -> float | None:
+    """When more may leave although nothing arrives until then; None: only an acknowledgement changes anything."""
+    if outbound.silent_since is not None:
+        return None
+    if room > 0:
+        return outbound.pacer.wake_at(packets_per_s)
+    late_at = _late_at(outbound)
+    if outbound.struggling or now >= late_at + PRESUMED_FOR_S or not outbound.window.presumable():
+        return None
+    return max(now, late_at) + outbound.rates.pace_quantum_s
+
+
+def ack_spacing(outbound: Outbound) -> int:
+    """Packets between two that ask for an acknowledgement at once."""
+    often = max(LOSSY_ACK_SPACING, 1.0 - LOSS_WEIGHT * outbound.loss)
+    return max(2, min(MOST_ACK_SPACING, int(outbound.window.packets * ACK_SPACING * often)))
 
 
 def _late_at(outbound: Outbound) -> float:

@@ -169,12 +169,14 @@ class Repairs:
             # Casts from before we met are not for us.
             self._expected = next_number
             return
+        if next_number <= self._expected:
+            return
         for number in range(max(self._expected, next_number - MOST_MISSING), next_number):
             if number not in received:
                 at = now + ASK_AFTER_S * (0.5 + self._rng.random())
                 self._missing[number] = (at, 0)
                 self.next_at = min(self.next_at, at)
-        self._expected = max(self._expected, next_number)
+        self._expected = next_number
 
     def received(self, number: int, now: float, received: RangeSet) -> None:
         """A cast with repair arrived."""

@@ -6,14 +6,14 @@ last fragments, small messages, pieces sent again) is built frame by frame, smal
 """
 
 import struct
-from heapq import heappop
 
-from udp_mesh.core.allowance import ack_spacing, look_again, permitted
+from udp_mesh.core.allowance import ack_spacing, look_again, permitted, window_room
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.flight import Mark, Packet
 from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Outgoing
-from udp_mesh.core.outbound import Outbound, Outcome
+from udp_mesh.core.open_messages import Outcome
+from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.scheduler import Run
 from udp_mesh.core.seams import Datagram
 from udp_mesh.core.settings import Address
@@ -104,10 +104,11 @@ def leave_level(
             break
         urgent = urgent_level and not run.stale
         pace = None if urgent else level_pace
-        most = permitted(outbound, now, pace, urgent=urgent)
+        room = window_room(outbound, now)
+        most = permitted(outbound, room, now, pace, urgent=urgent)
         if most <= 0:
             outbound.limited = False
-            if not urgent and (again := look_again(outbound, now, pace)) is not None:
+            if not urgent and (again := look_again(outbound, room, now, pace)) is not None:
                 outbound.wake_at = again
             break
         message = run.message
@@ -141,9 +142,8 @@ def leave_level(
 
 def leave_copies(outbound: Outbound, way: Way, now: float, out: list[Datagram]) -> None:
     """Second copies of small urgent messages whose time has come and that were not acknowledged meanwhile."""
-    while outbound.copies and outbound.copies[0][0] <= now:
-        _, _, message, position = heappop(outbound.copies)
-        if message.ended or message.arrived[position] or outbound.silent_since is not None:
+    for message, position in outbound.copies.due(now, outbound.overdue_s()):
+        if outbound.silent_since is not None:
             continue
         run = Run(message, position, 1, again=True)
         _leave(
@@ -236,7 +236,7 @@ def _leave_one(outbound: Outbound, way: Way, run: Run, urgent: bool, mark: Mark,
         if ack_now:
             outbound.since_ack_wanted = 0
         room -= size
-        if urgent and message.small and outbound.send_twice:
+        if urgent and message.small and not next_run.again:
             outbound.copy_later(message, next_run.position, now)
         if not message.reliable and last:
             outbound.finish(message, Outcome.SENT)

@@ -15,7 +15,7 @@ from udp_mesh.core.presence import REPORT_AGAIN_S, follow, greet, heard, leave, 
 from udp_mesh.core.session import Session
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
-from udp_mesh.crypto import TO_ALL, OpenError, ReceiveChannel, ReplayError, UnknownKeyError, check_long
+from udp_mesh.crypto import TO_ALL, Key, OpenError, ReceiveChannel, ReplayError, UnknownKeyError, check_long
 from udp_mesh.wire.codec import decode
 from udp_mesh.wire.errors import DecodeError, UnknownVersionError
 from udp_mesh.wire.frames import (
@@ -329,30 +329,26 @@ def _take_long(
     """A hello or an introduction; raises the decoder's and the cipher's errors."""
     if header.boot_id == state.boot_id:
         return
-    key = next((key for key in state.keys if key.key_id == header.key_id), None)
-    if key is None:
-        raise UnknownKeyError(header.key_id)
+    key = _key(state, header.key_id)
     check_long(key, data, header)
     session = state.roster.sessions.get(header.boot_id)
     introduced = header.kind is Kind.INTRODUCTION
     if session is not None:
-        channels = session.data_channels if introduced else session.broadcast_channels
-        channel = next(channel for channel in channels if channel.key == key)
+        channel = _channel(session.data_channels if introduced else session.broadcast_channels, key)
         number, frames = channel.open_long(data, header)
         decoded = decode(frames)
-        beat = next((frame for frame in decoded if isinstance(frame, Heartbeat)), None)
+        beat = _beat(decoded)
     else:
         channel = ReceiveChannel(key, header.boot_id, state.boot_id if introduced else TO_ALL)
         number, frames = channel.open_long(data, header)
         decoded = decode(frames)
-        beat = next((frame for frame in decoded if isinstance(frame, Heartbeat)), None)
+        beat = _beat(decoded)
         if beat is None:
             # An introduction without a name: its sender believes that we know it. Its heartbeats will tell.
             state.ledger.counters.dropped_unproven += 1
             return
         session = state.roster.stranger(beat.name, header.boot_id, state.keys, state.settings)
-        known = session.data_channels if introduced else session.broadcast_channels
-        next(entry for entry in known if entry.key == key).window.accept(number)
+        _channel(session.data_channels if introduced else session.broadcast_channels, key).window.accept(number)
     if beat is not None and beat.name != session.name:
         state.ledger.counters.dropped_malformed += 1
         return
@@ -378,6 +374,28 @@ def _take_long(
     # The sender writes long headers until it is answered.
     session.inbound.acks.now_wanted = True
     state.owe(session)
+
+
+def _key(state: State, key_id: bytes) -> Key:
+    for key in state.keys:
+        if key.key_id == key_id:
+            return key
+    raise UnknownKeyError(key_id)
+
+
+def _channel(channels: list[ReceiveChannel], key: Key) -> ReceiveChannel:
+    """The session's channel under a live key."""
+    for channel in channels:
+        if channel.key is key or channel.key == key:
+            return channel
+    raise UnknownKeyError(key.key_id)
+
+
+def _beat(frames: list[Frame]) -> Heartbeat | None:
+    for frame in frames:
+        if isinstance(frame, Heartbeat):
+            return frame
+    return None
 
 
 def _report_mismatch(state: State, link: str, source: Address, now: float) -> None:

@@ -8,7 +8,7 @@ from udp_mesh.core.acceptance import release_outbox, report_ended, shelve
 from udp_mesh.core.events import MessageReceived, PeerOffline, PeerOnline
 from udp_mesh.core.legacy_receive import LegacyReassembly
 from udp_mesh.core.legacy_send import LegacySender
-from udp_mesh.core.outbound import Outcome
+from udp_mesh.core.open_messages import Outcome
 from udp_mesh.core.seams import Datagram, RandomSource
 from udp_mesh.core.session import Peer
 from udp_mesh.core.settings import Address, LinkInfo, Neighbour, Settings

@@ -8,7 +8,8 @@ fragments.
 from dataclasses import dataclass
 
 from udp_mesh.core.message import Outgoing
-from udp_mesh.core.outbound import PROBE_S, Outbound, Outcome
+from udp_mesh.core.open_messages import Outcome
+from udp_mesh.core.outbound import PROBE_S, Outbound
 from udp_mesh.core.seams import Datagram
 from udp_mesh.core.settings import Address
 from udp_mesh.wire.legacy import LegacyPayload, PriorityMeshData, encode_legacy, encode_mesh_data, fragment_legacy

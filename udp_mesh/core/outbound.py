@@ -5,26 +5,24 @@
 3. `handle_timer` probes when acknowledgements stay away: first one packet; then the peer is *silent*, everything
    on its way is waiting again, and single probes leave: window and rate model stay as they were.
 4. `heard` ends the silence; `restart` begins anew with a peer that forgot everything.
-5. `finish` gives each message its one outcome.
+Which messages are open, and the one outcome of each, is the book of `open_messages`.
 """
 
-from collections import deque
 from collections.abc import Iterable
-from enum import Enum
-from heapq import heappop, heappush
-from typing import NamedTuple
 
+from udp_mesh.core.adaptive import AdaptiveWindow
 from udp_mesh.core.bursts import RETURN_BURST_PACKETS, Bursts
+from udp_mesh.core.copies import OVERDUE_ROUND_TRIPS, Copies
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.flight import Flight, Mark, Packet
-from udp_mesh.core.levels import Levels
 from udp_mesh.core.message import Outgoing
+from udp_mesh.core.open_messages import OpenMessages, Outcome
 from udp_mesh.core.pacing import Pacer
 from udp_mesh.core.path_size import PathSize
-from udp_mesh.core.rtt import RoundTrip
+from udp_mesh.core.rtt import INITIAL_TIMEOUT_S, RoundTrip
 from udp_mesh.core.scheduler import Scheduler
 from udp_mesh.core.settings import Rates, Settings
-from udp_mesh.core.window import AdaptiveWindow, FixedWindow, Window
+from udp_mesh.core.window import FixedWindow, Window
 from udp_mesh.wire.frames import Ack
 
 PROBE_SOON_S = 0.025
@@ -50,52 +48,30 @@ LOSS_MEMORY_PACKETS = 256
 """Packets over which loss is smoothed."""
 
 
-COPY_ROUND_TRIPS = 1.1
-"""Round trips after which the answer to an urgent piece, asked for at once, is overdue."""
-
-LOSSY = 0.1
-LOSSY_COPY_S = 0.02
-"""From this loss on two copies are often lost together: the third does not wait longer than this for the answer."""
+OTHERS_TELL_S = 1.0
+"""So long the round trip of packets that are not urgent is the one that counts."""
 
 
-class Outcome(Enum):
-    """How a message ended, besides expiring."""
-
-    DELIVERED = 1
-    SENT = 2
-    """Best effort: it left, no outcome is reported."""
-    PEER_LOST = 3
-
-
-class Ended(NamedTuple):
-    message: Outgoing
-    outcome: Outcome | ExpiryReason
-
-
-class Outbound:
-    """The sending half of a session. Times in seconds; `ended` is fetched and cleared by the session."""
+class Outbound(OpenMessages):
+    """The sending half of a session. Times in seconds."""
 
     def __init__(self, settings: Settings) -> None:
+        super().__init__()
         self.trip = RoundTrip()
+        self.urgent_trip = RoundTrip()
+        """Of urgent packets alone: in a radio's queues they pass others (wifi's access categories)."""
+        self._other_sampled_at = float("-inf")
         self.window: Window = AdaptiveWindow(self.trip)
         self.pacer = Pacer(settings.rates.pace_quantum_s)
         self.flight = Flight()
         self.scheduler = Scheduler()
         self.rates: Rates = settings.rates
-        self.open: dict[Outgoing, None] = {}
-        """Messages without an outcome, in the order accepted."""
-        self.levels = Levels()
-        self.ended: list[Ended] = []
-        self.cancelled: list[int] = []
-        """Wire ids given up after they had begun: the peer may forget them."""
         self.announced: set[int] = set()
         """Numbers of topics that the peer knows by name."""
         self.next_wire_id = 0
         self.epoch = 0
         """Counts the runs of the peer: wire ids of earlier ones mean nothing to this one."""
-        self.copies: list[tuple[float, int, Outgoing, int]] = []
-        """Heap of (when, serial, message, position) of urgent pieces to be sent again unless acknowledged by then."""
-        self._copy_serial = 0
+        self.copies = Copies()
         self.served = 0
         """Mask of levels from which something left in this round."""
         self.wake_at = float("inf")
@@ -125,10 +101,6 @@ class Outbound:
         self.retransmitted = 0
         self.sent_packets = 0
         self.sent_bytes = 0
-        self._deadlines: list[tuple[float, int, Outgoing]] = []
-        self._deadline_serial = 0
-        self._kept: dict[str, deque[Outgoing]] = {}
-        """Open messages of topics that keep only the last few."""
         self.apply(settings)
 
     def apply(self, settings: Settings) -> None:
@@ -144,34 +116,13 @@ class Outbound:
 
     def accept(self, message: Outgoing, now: float) -> None:
         """Take a message on: it waits on its level."""
-        self.open[message] = None
-        self.levels.enter(message)
-        deadline = message.accepted.deadline
-        if deadline is not None:
-            self._deadline_serial += 1
-            heappush(self._deadlines, (deadline, self._deadline_serial, message))
-        keep_last = message.accepted.channel.topic.keep_last
-        if keep_last is not None:
-            self._replace_older(message, keep_last)
+        self.take_on(message)
         if not self.flight.outstanding and self.silent_since is None:
             self.last_progress = now
         if self.silent_since is not None and message.priority <= self.rates.urgent_priority:
             # A fresh urgent message is itself the best probe: what waited until now stands behind it.
             self.allow_probe(now)
         self.scheduler.push(message)
-
-    def _replace_older(self, message: Outgoing, keep_last: int) -> None:
-        kept = self._kept.setdefault(message.accepted.channel.topic.name, deque())
-        while kept and kept[0].ended:
-            kept.popleft()
-        kept.append(message)
-        alive = [older for older in kept if not older.ended and not older.superseded]
-        for older in alive[: max(0, len(alive) - keep_last)]:
-            if not older.begun:
-                self.finish(older, ExpiryReason.SUPERSEDED)
-            elif older.small:
-                # Its pieces may be arriving right now: it ends as what becomes of them.
-                older.superseded = True
 
     # Acknowledgements
 
@@ -195,11 +146,13 @@ class Outbound:
             if self.overdue:
                 self._settle_overdue()
             rate: float | None = None
+            largest = -1
             count = len(acknowledged)
             self.delivered_packets += count
             if newest is not None:
                 mark = newest.mark
-                self.trip.sample(max(1e-5, now - mark.sent_at - ack.delay_us * 1e-6), now)
+                if self._sample(max(1e-5, now - mark.sent_at - ack.delay_us * 1e-6), now, urgent=mark.urgent):
+                    largest = ack.largest
                 elapsed = max(now - mark.delivered_at, mark.sent_at - mark.delivered_sent_at)
                 if elapsed > 0 and not after_silence:
                     rate = (self.delivered_packets - mark.delivered) / elapsed
@@ -208,7 +161,7 @@ class Outbound:
             limited = newest is None or newest.mark.limited
             self.window.acknowledged(
                 count,
-                ack.largest,
+                largest,
                 flight.next_number,
                 flight.outstanding,
                 rate,
@@ -227,6 +180,17 @@ class Outbound:
             elif self.loss < self.rates.twice_loss / 4:
                 self.send_twice = False
             self.loss += (lost_packets - self.loss * total) / max(total, LOSS_MEMORY_PACKETS)
+
+    def _sample(self, round_trip_s: float, now: float, *, urgent: bool) -> bool:
+        """Whether this round trip tells of the queue by which the window goes."""
+        if urgent:
+            self.urgent_trip.sample(round_trip_s, now)
+            if now < self._other_sampled_at + OTHERS_TELL_S:
+                return False
+        else:
+            self._other_sampled_at = now
+        self.trip.sample(round_trip_s, now)
+        return True
 
     def _book_arrivals(self, packets: Iterable[Packet]) -> None:
         for packet in packets:
@@ -263,14 +227,21 @@ class Outbound:
             self.scheduler.push_again(message, position)
 
     def copy_later(self, message: Outgoing, position: int, now: float) -> None:
-        """A small urgent piece left over a lossy way: again soon, and once more when its answer should be here."""
-        delays = [self.rates.twice_gap_s]
-        if self.trip.smoothed is not None:
-            overdue_s = COPY_ROUND_TRIPS * self.trip.smoothed + self.rates.twice_gap_s
-            delays.append(min(overdue_s, LOSSY_COPY_S) if self.loss >= LOSSY else overdue_s)
-        for delay in delays:
-            self._copy_serial += 1
-            heappush(self.copies, (now + delay, self._copy_serial, message, position))
+        """A small urgent piece left for the first time."""
+        self.copies.later(
+            message,
+            position,
+            now,
+            gap_s=self.rates.twice_gap_s,
+            twice=self.send_twice,
+            loss=self.loss,
+            overdue_s=self.overdue_s(),
+        )
+
+    def overdue_s(self) -> float:
+        """How long the answer to an urgent piece may take."""
+        smoothed = self.urgent_trip.smoothed or self.trip.smoothed
+        return INITIAL_TIMEOUT_S if smoothed is None else OVERDUE_ROUND_TRIPS * smoothed + self.rates.twice_gap_s
 
     # Silence
 
@@ -282,12 +253,13 @@ class Outbound:
                 at = self.probed_at + self._probe_every(self.silent_since)
         elif self.flight.outstanding:
             at = self._expiry_at()
-        if self._deadlines and (at is None or self._deadlines[0][0] < at):
-            at = self._deadlines[0][0]
+        deadline = self.next_deadline()
+        if deadline is not None and (at is None or deadline < at):
+            at = deadline
         if self.wake_at != float("inf") and (at is None or self.wake_at < at):
             at = self.wake_at
-        if self.copies and (at is None or self.copies[0][0] < at):
-            at = self.copies[0][0]
+        if self.copies and (at is None or self.copies.next_at() < at):
+            at = self.copies.next_at()
         return at
 
     def timeout(self) -> float:
@@ -295,9 +267,7 @@ class Outbound:
         return self.trip.timeout(self.rates.ack_delay_s, PROBE_S)
 
     def handle_timer(self, now: float) -> None:
-        while self._deadlines and self._deadlines[0][0] <= now:
-            message = heappop(self._deadlines)[2]
-            self.finish(message, ExpiryReason.DEADLINE)
+        self.expire(now)
         if self.wake_at <= now:
             self.wake_at = float("inf")
         if self.silent_since is not None:
@@ -378,7 +348,7 @@ class Outbound:
         if self.levels.rearrange(self.open):
             self.scheduler.rebuild(list(self.open), pieces=True)
 
-    # Ends
+    # Anew
 
     def restart(self, now: float) -> None:
         """The peer runs anew (or must be told anew): every open message begins again under new numbers."""
@@ -396,43 +366,13 @@ class Outbound:
         messages = list(self.open)
         self.open.clear()
         for message in messages:
-            self._begin_anew(message)
+            self.begin_anew(message)
         self.scheduler.rebuild(list(self.open), pieces=False)
 
     def send_anew(self, message: Outgoing) -> None:
         """The peer forgot the pieces it had of this one."""
         self.announced.discard(message.accepted.channel.number)
-        self.scheduler.push(self._begin_anew(message))
-
-    def _begin_anew(self, message: Outgoing) -> Outgoing:
-        message.ended = True
-        self.open.pop(message, None)
-        copy = message.anew()
-        self.open[copy] = None
-        self.levels.stand_last(copy)
-        if copy.accepted.deadline is not None:
-            self._deadline_serial += 1
-            heappush(self._deadlines, (copy.accepted.deadline, self._deadline_serial, copy))
-        kept = self._kept.get(copy.accepted.channel.topic.name)
-        if kept is not None:
-            kept.append(copy)
-        return copy
-
-    def finish(self, message: Outgoing, outcome: Outcome | ExpiryReason) -> None:
-        """The one outcome of a message; later ones are ignored."""
-        if message.ended:
-            return
-        self._remove(message)
-        if message.begun and outcome is not Outcome.DELIVERED and outcome is not Outcome.SENT:
-            self.cancel(message)
-        self.ended.append(Ended(message, outcome))
-
-    def withdraw(self, message: Outgoing, *, to_resume: bool = False) -> None:
-        """The message leaves without an outcome: an outbox keeps it, `to_resume` it under its number."""
-        if not message.ended:
-            self._remove(message)
-            if message.begun and not to_resume:
-                self.cancel(message)
+        self.scheduler.push(self.begin_anew(message))
 
     def resume(self, message: Outgoing, now: float) -> None:
         """Take a withdrawn message on again where it stopped."""
@@ -441,32 +381,6 @@ class Outbound:
         for position in range(copy.next_position):
             if not copy.arrived[position]:
                 self.scheduler.push_again(copy, position)
-
-    def _remove(self, message: Outgoing) -> None:
-        message.ended = True
-        del self.open[message]
-        self.levels.leave(message)
-
-    def cancel(self, message: Outgoing) -> None:
-        """The peer is told to forget what it has of this one."""
-        if message.wire_id is not None and message.accepted.broadcast_number is None:
-            self.cancelled.append(message.wire_id)
-
-    def by_wire_id(self, wire_id: int) -> Outgoing | None:
-        """The open message of this number (copies of casts are numbered apart); a search, for rare answers."""
-        own = (message for message in self.open if message.accepted.broadcast_number is None)
-        return next((message for message in own if message.wire_id == wire_id), None)
-
-    def told_delivered(self, wire_ids: Iterable[int]) -> None:
-        """The peer says it has these whole, whatever it acknowledged; a search, for peers of another make."""
-        known = set(wire_ids)
-        for message in list(self.open):
-            if message.wire_id in known and message.accepted.broadcast_number is None:
-                self.finish(message, Outcome.DELIVERED)
-
-    def finish_all(self, outcome: Outcome | ExpiryReason) -> None:
-        for message in list(self.open):
-            self.finish(message, outcome)
 
     def mark(self, now: float, *, urgent: bool = False) -> Mark:
         """The state in which the packets of one burst leave."""

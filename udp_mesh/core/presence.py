@@ -20,7 +20,8 @@ from udp_mesh.core.events import (
     PeerRestarted,
     TopicStarved,
 )
-from udp_mesh.core.outbound import Outbound, Outcome
+from udp_mesh.core.open_messages import Outcome
+from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.path_size import NARROWER_MTUS, WIDEN_AFTER_S
 from udp_mesh.core.roster import Arrival
 from udp_mesh.core.session import STALE_PATH_S, Peer, Session
@@ -43,6 +44,7 @@ def greet(
     """An authentic heartbeat of a session (to all, or to us alone), perhaps a recording until the session is
     proven."""
     session.learn(beat, now)
+    state.crowd.told(session.boot_id, beat.send_rate, now)
     session.last_heard = now
     if not beat.min_version <= VERSION <= beat.max_version:
         if now - state.incompatible_reported.get(session.boot_id, float("-inf")) > REPORT_AGAIN_S:
@@ -221,11 +223,16 @@ def go_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
 def housekeep(state: State, now: float) -> None:
     """A round: all peers with traffic, and of the others as many as one round bears."""
     state.sent.feed(state.ledger.counters.bytes_sent, now)
+    queue_share = state.crowd.queue_share(state.sent.per_s(now), now)
     peers = list(state.roster.peers.values())
     start = state.look_from if state.look_from < len(peers) else 0
     state.look_from = start + LOOKED_AT_PER_ROUND
-    for place, peer in enumerate(peers):
-        if peer.engaged or start <= place < state.look_from:
+    engaged = [peer for peer in peers if peer.engaged]
+    for peer in engaged:
+        peer.outbound.window.queue_share = queue_share
+        _look_at(state, peer, now)
+    for peer in peers[start : state.look_from]:
+        if not peer.engaged:
             _look_at(state, peer, now)
     for session in state.roster.not_current():
         if now - session.last_heard > state.settings.rates.offline_s:

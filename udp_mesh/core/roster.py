@@ -28,7 +28,17 @@ class Arrival(Enum):
 class Roster:
     """`tags` maps a short header's tag to the channels it may mean, unicast and broadcast apart."""
 
-    __slots__ = ("_limits", "_strangers", "broadcast_tags", "data_tags", "own_boot", "own_name", "peers", "sessions")
+    __slots__ = (
+        "_aside",
+        "_limits",
+        "_strangers",
+        "broadcast_tags",
+        "data_tags",
+        "own_boot",
+        "own_name",
+        "peers",
+        "sessions",
+    )
 
     def __init__(self, settings: Settings, own_boot: bytes) -> None:
         self.own_name = settings.name
@@ -37,6 +47,8 @@ class Roster:
         self.sessions: dict[bytes, Session] = {}
         self.peers: dict[str, Peer] = {}
         self._strangers: dict[bytes, None] = {}
+        self._aside: dict[bytes, Session] = {}
+        """Sessions that are no peer's, by boot id."""
         self.data_tags: dict[int, list[tuple[ReceiveChannel, Session]]] = {}
         self.broadcast_tags: dict[int, list[tuple[ReceiveChannel, Session]]] = {}
 
@@ -55,7 +67,7 @@ class Roster:
         while len(self._strangers) >= self._limits.strangers:
             self.forget(self.sessions[next(iter(self._strangers))])
         session = Session(name, boot_id, self.own_boot, keys, settings)
-        self.sessions[boot_id] = session
+        self.sessions[boot_id] = self._aside[boot_id] = session
         self._strangers[boot_id] = None
         self._enter_tags(session)
         return session
@@ -85,13 +97,17 @@ class Roster:
                 del peer.retired[oldest]
                 if oldest in self.sessions:
                     self.forget(self.sessions[oldest])
+            if old.boot_id in self.sessions:
+                self._aside[old.boot_id] = old
         peer.session = session
         session.peer = peer
+        self._aside.pop(session.boot_id, None)
 
     def forget(self, session: Session) -> None:
         """Drop a session and its channels."""
         self.sessions.pop(session.boot_id, None)
         self._strangers.pop(session.boot_id, None)
+        self._aside.pop(session.boot_id, None)
         for table, channels in (
             (self.data_tags, session.data_channels),
             (self.broadcast_tags, session.broadcast_channels),
@@ -113,9 +129,7 @@ class Roster:
 
     def not_current(self) -> list[Session]:
         """Strangers, and runs of a name that another one replaced."""
-        return [
-            session for session in self.sessions.values() if session.peer is None or session.peer.session is not session
-        ]
+        return list(self._aside.values())
 
     def online(self) -> list[Peer]:
         return [peer for peer in self.peers.values() if peer.online]

@@ -10,6 +10,7 @@ from heapq import heappush
 
 from udp_mesh.core.casts import CastQueue, Repairs
 from udp_mesh.core.compression import PackingQueue
+from udp_mesh.core.crowd import Crowd
 from udp_mesh.core.discovery import Discovery
 from udp_mesh.core.ledger import Ledger
 from udp_mesh.core.limiter import Gate
@@ -45,6 +46,7 @@ class State:
         self.roster = Roster(settings, boot_id)
         self.sent = Meter(now)
         """Wire bytes of this node, to everybody."""
+        self.crowd = Crowd()
         self.ledger = Ledger(settings.limits.events)
         self.outboxes = Outboxes(store)
         self.discovery = Discovery(rng, settings.rates, now)

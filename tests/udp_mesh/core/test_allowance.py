@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.udp_mesh.core.test_links import Run
-from udp_mesh.core.allowance import PRESUMED_FOR_S, ack_spacing, permitted
+from udp_mesh.core.allowance import PRESUMED_FOR_S, ack_spacing, permitted, window_room
 from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.settings import Settings
 
@@ -21,7 +21,7 @@ def busy_outbound(**link: object) -> tuple[Outbound, float]:
 
 
 def room(outbound: Outbound, now: float) -> int:
-    return permitted(outbound, now, None, urgent=True)
+    return permitted(outbound, window_room(outbound, now), now, None, urgent=True)
 
 
 def test_late_acknowledgements_do_not_stop_the_link() -> None:
