@@ -200,6 +200,19 @@ def _leave_casts(state: State, priority: int, now: float, out: list[Datagram]) -
     )
 
 
+def has_datagrams(state: State) -> bool:
+    """See `Node.has_datagrams`."""
+    return bool(state.owing or state.ready or state.outgoing or state.casts.waiting)
+
+
+def is_quiet(state: State, until: float) -> bool:
+    """See `Node.is_quiet`."""
+    if has_datagrams(state) or state.ledger.waits:
+        return False
+    at = next_timer(state)
+    return at is None or at >= until
+
+
 def next_timer(state: State) -> float | None:
     """See `Node.next_timer`."""
     timers = state.timers

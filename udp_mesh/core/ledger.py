@@ -26,6 +26,11 @@ class Ledger:
             self._drop_one()
         self._events.append(event)
 
+    @property
+    def waits(self) -> bool:
+        """Whether an event is to be fetched."""
+        return bool(self._events)
+
     def next_event(self) -> Event | None:
         return self._events.popleft() if self._events else None
 

@@ -44,7 +44,7 @@ class Node:
     def datagrams_to_send(self, now: float, *, max_bytes: int | None = None) -> list[Datagram]:
         """The datagrams that leave now, most urgent first, about 64 KiB at most per call (`max_bytes`, if given).
 
-        Call again until the list is empty. With `max_bytes` a driver whose socket is full asks for less.
+        Call again while it `has_datagrams`. With `max_bytes` a driver whose socket is full asks for less.
         """
         out = dispatch.collect(self._state, now, max_bytes)
         if self._legacy:
@@ -63,6 +63,18 @@ class Node:
         dispatch.handle_timer(self._state, now)
         if self._legacy:
             self._legacy.handle_timer(now)
+
+    @property
+    def has_datagrams(self) -> bool:
+        """Whether `datagrams_to_send` may return something; False right after it returned all there was."""
+        return bool(self._legacy) or dispatch.has_datagrams(self._state)
+
+    def is_quiet(self, until: float) -> bool:
+        """Whether nothing is to be sent, told or done before `until`: the driver may leave the node alone.
+
+        True after most datagrams of a bulk, of which only every few ask for an answer.
+        """
+        return not self._legacy and dispatch.is_quiet(self._state, until)
 
     def next_event(self) -> Event | None:
         """The oldest event not yet fetched."""

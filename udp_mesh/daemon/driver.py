@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 
 DRAIN_DATAGRAMS = 256
 """Datagrams read per wake-up before timers and sending get their turn (3 ms of work)."""
+FRESH_S = 0.0003
+"""A datagram that came so shortly before the look is the only one, but at rates at which a look more costs nothing."""
 CLOCK_READING_S = 50e-6
 """Two clocks read within this belong together."""
 LONGEST_LOOK_S = 0.5
@@ -73,6 +75,8 @@ class Driver:
         self._blocked: dict[str, deque[Datagram]] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = 0.0
+        self._due = float("-inf")
+        """When the node wanted attention, as of the last pump: what comes in later only wants it later."""
         self._refresh: asyncio.TimerHandle | None = None
         self._pump_requested = False
         self.closed = False
@@ -201,13 +205,15 @@ class Driver:
 
     def _readable(self, link: UdpLink) -> None:
         self._drain(link)
-        self._pump()
+        if self._timer is None or not self.node.is_quiet(self._timer_at):
+            self._pump()
 
     def _drain(self, link: UdpLink) -> None:
         """Hands what waits to the core, each datagram with the time it arrived; then `_now` is the time of the look."""
         self._looked_at = self._read_clocks()
         self._link_name = link.attachment.name
-        link.receive(self._deliver, DRAIN_DATAGRAMS)
+        assert self._wall_offset is not None
+        link.receive(self._deliver, DRAIN_DATAGRAMS, self._looked_at + self._wall_offset - FRESH_S)
         self._now = max(self._now, self._looked_at)
 
     def _read_clocks(self) -> float:
@@ -253,12 +259,12 @@ class Driver:
         finally:
             # A bug that raises is the loop's to report; the robot's messages go on.
             if not completed and not self.closed:
+                self._due = float("-inf")
                 self._schedule(self._clock() + RECOVERY_S)
 
     def _pump_once(self) -> None:
         now = self._tell()
-        due = self.node.next_timer()
-        if due is not None and due <= now:
+        if self._due <= now:
             self.node.handle_timer(now)
         more = self._transmit_all()
         self._report_events()
@@ -266,6 +272,7 @@ class Driver:
             self._pump_soon()
         self.wakeups += 1
         due = self.node.next_timer()
+        self._due = float("inf") if due is None else due
         if due is not None:
             self._schedule(due)
 
@@ -298,6 +305,8 @@ class Driver:
                 self._transmit(name, batch[start:end] if end - start < len(batch) else batch)
                 start = end
             sent += sum(len(datagram.data) for datagram in batch)
+            if not self.node.has_datagrams:
+                return False
         return True
 
     def _transmit(self, name: str, datagrams: list[Datagram]) -> None:

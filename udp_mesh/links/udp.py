@@ -101,9 +101,11 @@ class UdpLink:
     def fileno(self) -> int:
         return self._socket.fileno()
 
-    def receive(self, deliver: Deliver, limit: int) -> int:
+    def receive(self, deliver: Deliver, limit: int, fresh_from: float = float("inf")) -> int:
         """Hands up to about `limit` waiting datagrams to `deliver`; returns how many. Our own broadcasts are left out.
 
+        One that came after `fresh_from` (seconds since 1970) is taken for the last: what came with it is left to the
+        next look, since to ask for more that is not there costs as much as to receive.
         The bytes handed over are overwritten by the next call: who keeps them copies them.
         """
         count, buffer, own = 0, self._buffer, self.attachment.address
@@ -131,6 +133,8 @@ class UdpLink:
             if size <= segment:
                 deliver(buffer[:size], address, arrived)
                 count += 1
+                if arrived > fresh_from:
+                    break
                 continue
             for start in range(0, size, segment):
                 deliver(buffer[start : min(start + segment, size)], address, arrived)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.udp_mesh.links.sockets import Out, free_port, open_link, receive
-from udp_mesh.links.attachments import Attachment
+from udp_mesh.links.attachments import Address, Attachment
 from udp_mesh.links.udp import MAX_SEGMENTS, UdpLink
 
 ALICE, BOB = "127.0.1.2", "127.0.1.3"
@@ -153,3 +153,20 @@ def test_ipv6_neighbours_are_reached() -> None:
         assert far.recvfrom(10)[0] == b"six"
         far.sendto(b"back", ("::1", port))
         assert receive(link, 1)[0][0] == b"back"
+
+
+def test_a_datagram_that_came_just_now_is_taken_for_the_last_and_the_next_look_finds_the_rest(
+    pair: tuple[UdpLink, UdpLink],
+) -> None:
+    alice, bob = pair
+    for size in (10, 20, 30):
+        assert alice.send([Out(bytes(size), bob.attachment.address)]) == 1
+    found: list[int] = []
+
+    def deliver(data: memoryview, source: Address, arrived: float) -> None:
+        found.append(len(data))
+
+    assert bob.receive(deliver, 64, fresh_from=0.0) == 1
+    assert bob.system_calls == 1
+    assert bob.receive(deliver, 64) == 2
+    assert found == [10, 20, 30]

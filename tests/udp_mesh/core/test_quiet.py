@@ -1,0 +1,49 @@
+"""A node that calls itself quiet has nothing to send, to tell or to do, so a driver may leave it alone."""
+
+from __future__ import annotations
+
+from tests.udp_mesh.core.pair import World, settings
+from udp_mesh.core.settings import Topic
+
+TOPICS = (Topic("stop", priority=0), Topic("map", priority=9, compression=True))
+
+
+class Watched(World):
+    """Asks each node before every look at it whether the look is needed."""
+
+    looks = quiet = 0
+
+    def _pump(self, name: str) -> None:
+        node = self.nodes[name]
+        due = node.next_timer()
+        told = len(self.events[name])
+        is_quiet = node.is_quiet(self.now)
+        sent: list[object] = []
+        self.tap = lambda source, datagram, now: sent.append(datagram)
+        super()._pump(name)
+        self.looks += 1
+        if is_quiet:
+            self.quiet += 1
+            assert not sent
+            assert len(self.events[name]) == told
+            assert due is None or due >= self.now
+        # packets that the pacing holds back wait for a timer, not for another call
+        assert not node.has_datagrams
+
+
+def test_a_quiet_node_misses_nothing_when_it_is_left_alone() -> None:
+    world = Watched(seed=3)
+    for name in ("a", "b"):
+        world.add(settings(name, *TOPICS))
+    world.run(2.0)
+    for pipe in world.pipes.values():
+        pipe.loss = 0.1
+    world.send("a", "map", bytes(range(256)) * 4000, "b")
+
+    def stop() -> None:
+        world.send("b", "stop", b"now", "a")
+
+    for number in range(40):
+        world.at(world.now + 0.05 * number, stop)
+    world.run(4.0)
+    assert world.quiet > 0.2 * world.looks
