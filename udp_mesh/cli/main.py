@@ -18,7 +18,7 @@ Command = Callable[[argparse.Namespace], int]
 
 EPILOG = """\
 exit codes: 0 done, 1 refused or no answer, 2 wrong usage, 3 no daemon at the socket,
-4 problems in the configuration, 5 a message was not delivered
+4 problems in the configuration, 5 a message was not delivered, 130 interrupted
 
 examples:
   udp-mesh check udp-mesh.toml && udp-mesh run udp-mesh.toml
@@ -27,6 +27,16 @@ examples:
   udp-mesh echo 'map/*'
   udp-mesh set topic video priority=9 reliable=false keep_last=1
 """
+
+ENDLESS: tuple[Command, ...] = (
+    serve.run_daemon,
+    inspect.status,
+    inspect.peers,
+    inspect.topics,
+    inspect.events,
+    traffic.echo,
+)
+"""To interrupt these is how they end; the others have not done what they were asked for."""
 
 FORWARDED = {"report": "udp_mesh.report", "sim": "udp_mesh.sim"}
 """Commands with arguments of their own: the package's `main(argv)` gets them."""
@@ -50,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.close()
         return Exit.FAILED
     except KeyboardInterrupt:
-        return Exit.OK
+        return Exit.OK if command in ENDLESS else Exit.INTERRUPTED
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -232,7 +242,7 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def _positive(text: str) -> float:
     value = float(text)
-    if value <= 0:
+    if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"expected a positive number, found {text}")
     return value
 

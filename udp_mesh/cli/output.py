@@ -21,6 +21,8 @@ class Exit(IntEnum):
     """The configuration has problems; each is on standard error."""
     NOT_DELIVERED = 5
     """A message ended as expired or peer lost."""
+    INTERRUPTED = 130
+    """Ctrl-C before it was done: 128 and the signal's number, as shells count."""
 
 
 def say(text: str) -> None:

@@ -54,7 +54,8 @@ def _await_outcomes(mesh: MeshClient, numbers: list[int | None], arguments: argp
     while waiting:
         frame = mesh.next_frame(max(0.0, deadline - time.monotonic()))
         if frame is None:
-            complain(f"{len(waiting)} message(s) have no outcome within {arguments.wait:g} s")
+            hint = "" if arguments.to else " (one to all that fits a datagram has none: name a peer with --to)"
+            complain(f"{len(waiting)} message(s) have no outcome within {arguments.wait:g} s{hint}")
             return Exit.NOT_DELIVERED
         fields = frame[0]
         if fields.get("event") != "outcome":

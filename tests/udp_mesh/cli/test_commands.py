@@ -66,6 +66,24 @@ def test_a_watch_repeats_until_it_is_interrupted(pair: Pair) -> None:
     assert uptimes[1] > uptimes[0]
 
 
+def test_a_wait_that_is_interrupted_is_no_success(pair: Pair) -> None:
+    words = ["ping", "bob", "-c", "1000", "--json", "--socket", str(pair[0].socket)]
+    program = subprocess.Popen([sys.executable, "-m", "udp_mesh.cli.main", *words], stdout=subprocess.PIPE)
+    with program:
+        assert program.stdout is not None
+        program.stdout.readline()
+        program.send_signal(signal.SIGINT)
+        assert program.wait(WAIT_S) == Exit.INTERRUPTED
+
+
+@pytest.mark.parametrize("period", ["0", "-1", "nan", "inf", "soon"])
+def test_a_watch_has_a_finite_period(period: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["status", f"--watch={period}"])
+    assert ended.value.code == Exit.USAGE
+    assert "--watch" in capsys.readouterr().err
+
+
 def test_a_message_is_sent_and_its_outcome_decides_the_exit_code(run: Run, pair: Pair) -> None:
     with pair[1].client() as receiver:
         receiver.subscribe("status")
