@@ -248,8 +248,11 @@ def switched(robot: str, release: str, told: str) -> Outcome:
 def roll_back(host: Host, robot: str, order: Order) -> Outcome:
     """Go back to the release before, which stays installed for this."""
     facts = probe(host, order.fleet, robot)
-    if not facts.previous or facts.previous not in facts.releases:
-        hint = "`meshctl robots deploy` brings what the inventory says"
+    hint = "`meshctl robots deploy` brings what the inventory says"
+    if facts.previous and facts.previous not in facts.releases:
+        told = f"{host.label}: the release before, {facts.previous}, is damaged there, or gone"
+        raise Refused(told, code="no-release", hint=hint)
+    if not facts.previous:
         raise Refused(
             f"{host.label}: there is no release before {facts.current or 'this'}", code="no-release", hint=hint
         )

@@ -7,7 +7,7 @@ in on standard input before anything else and is never part of a command line.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from meshctl.device.connection import Completed, Connection, Endpoint
@@ -50,6 +50,7 @@ _HINTS = {
     "moved": "look with `meshctl robots diff`, then run the command again",
     "not-installed": "`meshctl robots deploy` installs it",
     "service": "`meshctl robots logs` shows why",
+    "masked": "ask who did, then `systemctl unmask` it there",
     "check": "the release is not installed; what runs there was not touched",
     "account": "look at /etc/passwd there, and whether its disk is writable",
     "no-release": "`meshctl robots deploy` brings what the inventory says",
@@ -83,6 +84,37 @@ class SshHost(Host):
         return upload(self.connection, content, path, mode=mode).sent
 
 
+# No greeting says this. What a computer's shell start-up files, sudo's lecture or its resolver say comes before it.
+_BEGINS = "== meshctl begins"
+
+
+class PastGreeting(Connection):
+    """A connection whose scripts' output begins where they do: robots greet whoever logs in (~/.bashrc, sudo)."""
+
+    def __init__(self, inner: Connection) -> None:
+        self._inner = inner
+
+    @property
+    def endpoint(self) -> Endpoint:
+        return self._inner.endpoint
+
+    def run(self, script: str, *, stdin: bytes | Iterable[bytes] = b"", timeout_s: float | None = None) -> Completed:
+        said = quoted("echo", _BEGINS)
+        done = self._inner.run(f"{said}; {said} >&2\n{script}", stdin=stdin, timeout_s=timeout_s)
+        return replace(
+            done, stdout_bytes=_past_greeting(done.stdout_bytes), stderr_bytes=_past_greeting(done.stderr_bytes)
+        )
+
+    def close(self) -> None:
+        self._inner.close()
+
+
+def _past_greeting(said: bytes) -> bytes:
+    """What comes after the line _BEGINS; all of it where the script never began, for then it tells why."""
+    before, line, after = said.partition(f"{_BEGINS}\n".encode())
+    return after if line else before
+
+
 class AsRoot(Connection):
     """A connection whose scripts run as root through sudo; `password` None where sudo asks for none."""
 
@@ -112,39 +144,45 @@ def _chained(first: bytes, rest: Iterable[bytes]) -> Iterable[bytes]:
     yield from rest
 
 
-# Tells how the login becomes root: `root`, `free` (sudo asks nothing), `password`, `no-sudo`.
+# Tells how the login becomes root: `root`, `free` (sudo asks nothing), `password`, `no-sudo`, or `tty` (sudoers has
+# requiretty).
 _HOW = """\
 if [ "$(id -u)" = 0 ]; then echo root
 elif ! command -v sudo >/dev/null 2>&1; then echo no-sudo
-elif sudo -k -n true 2>/dev/null; then echo free
-else echo password; fi
+elif why=$(LC_ALL=C sudo -k -n true 2>&1); then echo free
+else case $why in *tty*) echo tty ;; *) echo password ;; esac; fi
 """
 
 
 def become_root(connection: Connection, password: Callable[[], Secret | None]) -> Connection:
-    """The connection itself for root, or one that goes through sudo. Raises CommandFailed where neither works.
+    """Scripts run by it run as root, through sudo if need be, and say nothing but what they say themselves.
 
-    `password` is asked for only where sudo wants one; None means there is none to give.
+    `password` is asked for only where sudo wants one; None means there is none to give. Raises CommandFailed where
+    there is no way to become root.
     """
     label, user = connection.endpoint.label, connection.endpoint.user
+    itself = PastGreeting(connection)
     if user == "root":
-        return connection
-    how = connection.run(_HOW).check(f"{label}: become root").stdout.strip()
+        return itself
+    how = itself.run(_HOW).check(f"{label}: become root").stdout.strip()
     match how:
         case "root":
-            return connection
+            return itself
         case "free":
-            return AsRoot(connection, None)
+            return PastGreeting(AsRoot(connection, None))
         case "password":
             given = password()
             if given is None:
                 hint = "give it with --ask-sudo or MESHCTL_SUDO_PASSWORD, or let sudo ask for none"
                 raise CommandFailed(f"{label}: sudo wants a password for {user}", exit_status=1, hint=hint)
-            elevated = AsRoot(connection, given)
+            elevated = PastGreeting(AsRoot(connection, given))
             if elevated.run("id -u").stdout.strip() != "0":
                 hint = "check the password, and that the user may use sudo"
                 raise CommandFailed(f"{label}: sudo does not let {user} become root", exit_status=1, hint=hint)
             return elevated
+        case "tty":
+            hint = f"write `Defaults:{user} !requiretty` into a file in /etc/sudoers.d there"
+            raise CommandFailed(f"{label}: sudo there works on a terminal only", exit_status=1, hint=hint)
         case _:
             hint = "log in as root, or install sudo there"
             raise CommandFailed(f"{label}: {user} is not root and there is no sudo", exit_status=1, hint=hint)

@@ -24,7 +24,7 @@ SPARE_KIB = 32 << 10
 @dataclass(frozen=True, slots=True)
 class Facts:
     """`files` are hash by path of the current release as its manifest lists them; `damaged` are paths that are no
-    longer so. `python` is None where there is none that runs."""
+    longer so. `releases` and `trees` are those that are whole. `python` is None where there is none that runs."""
 
     arch: str = ""
     now_s: float = 0.0
@@ -41,6 +41,7 @@ class Facts:
     missing_modules: tuple[str, ...] = ()
     free_kib: int = 0
     is_writable: bool = False
+    runs_programs: bool = True
     current: str = ""
     previous: str = ""
     releases: tuple[str, ...] = ()
@@ -67,6 +68,11 @@ class Facts:
     def runs(self) -> bool:
         """Whether all its units do, and will at the next boot."""
         return bool(self.units) and all(tuple(state) == ("active", "enabled") for _, *state in self.units)
+
+    @property
+    def masked(self) -> tuple[str, ...]:
+        """Units that somebody there has forbidden to start (`systemctl mask`), for good or until the next boot."""
+        return tuple(unit for unit, _, enabled in self.services if enabled.startswith("masked"))
 
     @property
     def is_sound(self) -> bool:
@@ -100,6 +106,7 @@ def parse_facts(text: str) -> Facts:
         missing_modules=tuple(many.get("no_module", ())),
         free_kib=_number(one.get("free_kib", "")),
         is_writable=one.get("writable") == "yes",
+        runs_programs=one.get("noexec") != "yes",
         current=one.get("current", ""),
         previous=one.get("previous", ""),
         releases=tuple(many.get("release", ())),
@@ -177,6 +184,11 @@ def objections(facts: Facts, *, robot: str, arch: str, python: str) -> Iterator[
     yield from _python_objections(facts, robot, python)
     if not facts.is_writable:
         yield "its disk is read-only", "remount it, or look at its log for disk errors"
+    if not facts.runs_programs:
+        yield "/opt is mounted noexec: nothing there can be started", "remount it with exec, and mend /etc/fstab"
+    if facts.masked:
+        hint = f"ask who did, then `systemctl unmask {' '.join(facts.masked)}` there"
+        yield f"somebody has masked {' and '.join(facts.masked)} there", hint
 
 
 def _python_objections(facts: Facts, robot: str, python: str) -> Iterator[tuple[str, str]]:

@@ -62,6 +62,15 @@ mesh() { "$root/current/bin/udp-mesh" "$@"; }
 # ours: the units that are installed here, the daemon's first.
 ours() { for service in $unit $bridge_unit; do [ ! -e "$units/$service" ] || echo "$service"; done; }
 
+# none_masked: what somebody has forbidden to start (`systemctl mask`) is started by none of us.
+none_masked() {
+	for service in $unit $bridge_unit; do
+		case $(systemctl is-enabled "$service" 2>/dev/null) in
+		masked*) die masked "somebody has masked $service there" ;;
+		esac
+	done
+}
+
 # health WORD...: what health.py, which stands in $health_program, tells in the Python of the current release.
 health() {
 	read -r python 2>/dev/null <"$root/current/python" || return 1

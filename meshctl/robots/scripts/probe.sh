@@ -33,21 +33,40 @@ there=$root
 while [ ! -d "$there" ]; do there=$(dirname "$there"); done
 echo "free_kib=$(df -Pk "$there" | awk 'END { print $(NF - 2) }')"
 [ -w "$there" ] && echo writable=yes || echo writable=no
+# the mount that holds it is the last one named for the longest path above it
+awk -v there="$(readlink -f "$there")/" '
+	{ place = $5 == "/" ? "/" : $5 "/" }
+	index(there, place) == 1 && length(place) >= longest { longest = length(place); options = "," $6 "," }
+	END { if (options ~ /,noexec,/) print "noexec=yes" }
+' /proc/self/mountinfo 2>/dev/null
 
-echo "current=$(release_of current)"
+# a release is whole when it and its packages are as they were put there; one that is not is brought anew
+is_whole() { (cd "$1" 2>/dev/null && sha256sum -c --quiet "$2") >/dev/null 2>&1; }
+has_whole_tree() { case $whole in *" $(basename "$(readlink "$1/lib")") "*) ;; *) return 1 ;; esac }
+current=$(release_of current) whole=' '
+echo "current=$current"
 echo "previous=$(release_of previous)"
-for release in "$root"/releases/*; do [ ! -d "$release" ] || echo "release=${release##*/}"; done
-for tree in "$root"/trees/*; do [ ! -d "$tree" ] || echo "tree=${tree##*/}"; done
+for tree in "$root"/trees/*; do
+	is_whole "$tree" .sums || continue
+	whole="$whole${tree##*/} "
+	echo "tree=${tree##*/}"
+done
+for release in "$root"/releases/*; do
+	! is_whole "$release" manifest || ! has_whole_tree "$release" || echo "release=${release##*/}"
+done
 [ ! -e "$root/unproven" ] && echo proven=yes || echo proven=no
-if [ -e "$root/current/manifest" ]; then
-	sed 's/^/file=/' "$root/current/manifest"
+if [ -n "$current" ]; then
+	sed 's/^/file=/' "$root/current/manifest" 2>/dev/null || echo damaged=manifest
 	# what was changed by hand, or by a failing disk
-	(cd "$root/current" && sha256sum -c manifest 2>/dev/null) | sed -n 's/: FAILED.*//p' | sed 's/^/damaged=/'
-	(cd "$root/current/lib" && sha256sum -c .sums 2>/dev/null) | sed -n 's/: FAILED.*//p' | sed 's|^|damaged=lib/|'
+	(cd "$root/current" && sha256sum -c manifest) 2>/dev/null | sed -n 's/: FAILED.*//p' | sed 's/^/damaged=/'
+	[ -e "$root/current/lib/.sums" ] || echo damaged=lib
+	has_whole_tree "$root/current" ||
+		(cd "$root/current/lib" && sha256sum -c .sums) 2>/dev/null | sed -n 's/: FAILED.*//p' | sed 's|^|damaged=lib/|'
 	for service in $unit $bridge_unit; do
 		[ ! -e "$root/current/$service" ] || cmp -s "$root/current/$service" "$units/$service" ||
 			echo "damaged=$units/$service"
 	done
+	id "$account" >/dev/null 2>&1 || echo "damaged=the user $account"
 fi
 for service in $unit $bridge_unit; do
 	echo "unit=$service $(systemctl is-active "$service" 2>/dev/null) $(systemctl is-enabled "$service" 2>/dev/null)"

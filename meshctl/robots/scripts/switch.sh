@@ -4,6 +4,7 @@
 id=$1 how=$2 wait_s=$3
 trap '' HUP INT PIPE
 alone
+none_masked
 [ -d "$root/releases/$id" ] || die no-release "release $id is not installed here"
 was=$(release_of current)
 # a switch that was cut short has proved nothing: what ran before it is still what to go back to

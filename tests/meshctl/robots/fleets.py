@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +155,21 @@ class RobotFleet:
     def stop(self) -> None:
         for machine in self.machines.values():
             machine.stop()
+
+
+USER_PASSWORD = "two words"
+
+
+def give_user(machine: Machine, key: str, rule: str, *, home: str = "/tmp", shell: str = "/bin/sh") -> None:
+    """A user `robot` with the operator's key, who may use sudo by this rule."""
+    made = subprocess.run(["openssl", "passwd", "-6", USER_PASSWORD], capture_output=True, text=True, check=True)
+    machine.append("/etc/passwd", f"robot:x:1500:1500::{home}:{shell}\n")
+    machine.append("/etc/group", "robot:x:1500:\n")
+    machine.append("/etc/shadow", f"robot:{made.stdout.strip()}:19000:0:99999:7:::\n")
+    machine.write("/etc/robot-keys", key)
+    machine.write("/etc/ssh/sshd_config.d/robot.conf", "Match User robot\nAuthorizedKeysFile /etc/robot-keys\n")
+    if rule:
+        machine.write("/etc/sudoers.d/robot", f"robot ALL=(ALL) {rule}\n", 0o440)
 
 
 def _arch() -> str:

@@ -97,6 +97,10 @@ def test_what_was_changed_by_hand_or_cut_short_is_seen_and_mended(fleet: RobotFl
     assert f"husky1: done: runs {release}" in fleet.deploy()
     assert "as the inventory says" in fleet.meshctl("diff")
 
+    fleet.shell("husky1", "rm /opt/udp-mesh/current/manifest")
+    assert "changed on the robot: manifest" in fleet.meshctl("diff", exit_code=1)
+    assert f"husky1: done: runs {release}" in fleet.deploy()
+
     # power was cut in the middle of a switch
     fleet.shell("husky1", f"echo {release} >/opt/udp-mesh/unproven")
     assert not fleet.status()["husky1"]["well"]

@@ -2,29 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-
 import pytest
 
-from tests.meshctl.robots.fleets import RobotFleet
-from tests.meshctl.robots.machine import Machine
+from tests.meshctl.robots.fleets import USER_PASSWORD, RobotFleet, give_user
 
 # the first one may have to wait until the machines are built
 pytestmark = pytest.mark.timeout(600)
-
-_PASSWORD = "two words"
-
-
-def _give_user(machine: Machine, key: str, rule: str) -> None:
-    """A user `robot` with the operator's key, who may use sudo by this rule."""
-    made = subprocess.run(["openssl", "passwd", "-6", _PASSWORD], capture_output=True, text=True, check=True)
-    machine.append("/etc/passwd", "robot:x:1500:1500::/tmp:/bin/sh\n")
-    machine.append("/etc/group", "robot:x:1500:\n")
-    machine.append("/etc/shadow", f"robot:{made.stdout.strip()}:19000:0:99999:7:::\n")
-    machine.write("/etc/robot-keys", key)
-    machine.write("/etc/ssh/sshd_config.d/robot.conf", "Match User robot\nAuthorizedKeysFile /etc/robot-keys\n")
-    if rule:
-        machine.write("/etc/sudoers.d/robot", f"robot ALL=(ALL) {rule}\n", 0o440)
 
 
 def test_sudo_serves_with_and_without_a_password_and_a_wrong_one_changes_nothing(
@@ -33,7 +16,7 @@ def test_sudo_serves_with_and_without_a_password_and_a_wrong_one_changes_nothing
     key = fleet.key.with_suffix(".pub").read_text()
     for name, rule in (("husky1", "NOPASSWD: ALL"), ("husky2", "ALL"), ("husky3", ""), ("husky4", "ALL")):
         machine = fleet.add(name, start=False)
-        _give_user(machine, key if name != "husky4" else "", rule)
+        give_user(machine, key if name != "husky4" else "", rule)
         machine.start()
     fleet.write(user="robot")
     told = fleet.deploy(exit_code=1)
@@ -47,6 +30,6 @@ def test_sudo_serves_with_and_without_a_password_and_a_wrong_one_changes_nothing
     assert "husky2 (10.42.0.11): sudo does not let robot become root" in told
     assert "husky3 (10.42.0.12): sudo does not let robot become root" in told
     assert fleet.shell("husky2", "ls -A /opt/udp-mesh") == "trees\nwheels\n", "as it was before"
-    monkeypatch.setenv("MESHCTL_SUDO_PASSWORD", _PASSWORD)
+    monkeypatch.setenv("MESHCTL_SUDO_PASSWORD", USER_PASSWORD)
     assert "husky2: done: runs " in fleet.deploy("husky2")
     assert "2 unchanged" in fleet.deploy("husky1", "husky2")

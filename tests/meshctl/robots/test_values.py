@@ -112,6 +112,10 @@ def test_a_fitting_computer_meets_no_objection_and_every_misfit_is_told_at_once(
         "wrong CPU: the inventory says x86_64, it is aarch64",
         "wrong Python: python3 is 3.8.10, udp_mesh needs 3.11 or newer",
     ]
+    assert _reasons(parse_facts(f"{PROBED}noexec=yes\nunit=udp-mesh-ros1.service inactive masked\n")) == [
+        "/opt is mounted noexec: nothing there can be started",
+        "somebody has masked udp-mesh-ros1.service there",
+    ]
     assert _reasons(parse_facts("")) != [], "a probe that says nothing is no consent"
 
 

@@ -1,0 +1,125 @@
+"""Computers as robotics teams have them: talkative, half deleted, forbidden, mounted oddly. Each is served, or refused
+with its reason, and never left between two releases."""
+
+from __future__ import annotations
+
+import getpass
+
+import pytest
+
+from tests.meshctl.robots.fleets import USER_PASSWORD, RobotFleet, give_user
+
+# the first one may have to wait until the machines are built
+pytestmark = pytest.mark.timeout(600)
+
+_HALF_DELETED = (
+    "rm -r /opt/udp-mesh/trees",
+    "rm /opt/udp-mesh/current/manifest",
+    "rm -r /opt/udp-mesh/current/etc",
+    "rm /opt/udp-mesh/current",
+    "rm -r /opt/udp-mesh/releases",
+    "rm /etc/systemd/system/udp-mesh.service && systemctl daemon-reload",
+    "systemctl stop udp-mesh && userdel udp-mesh",
+)
+_GREETING = """\
+echo 'ROS_MASTER_URI=http://husky1:11311'
+echo current=husky
+echo free
+echo placed
+echo 'Welcome!' >&2
+"""
+
+
+@pytest.mark.proof
+def test_a_half_deleted_installation_is_seen_and_made_whole_by_one_deploy(fleet: RobotFleet) -> None:
+    fleet.add("husky1")
+    fleet.write()
+    fleet.deploy()
+    release = fleet.status()["husky1"]["release"]
+    for damage in _HALF_DELETED:
+        fleet.shell("husky1", damage)
+        assert "as the inventory says" not in fleet.meshctl("diff", exit_code=1), damage
+        assert f"husky1: done: runs {release}" in fleet.deploy(), damage
+        assert "as the inventory says" in fleet.meshctl("diff"), damage
+        assert fleet.status()["husky1"]["well"], damage
+        assert fleet.shell("husky1", "ls /opt/udp-mesh/releases") == f"{release}\n", damage
+    fleet.add_topic("video: {priority: 9}")
+    fleet.deploy()
+    fleet.shell("husky1", "rm /opt/udp-mesh/previous/topics")
+    told = fleet.meshctl("rollback", exit_code=1)
+    assert f"the release before, {release}, is damaged there, or gone" in told
+    assert fleet.status()["husky1"]["well"]
+
+
+def test_what_a_computer_says_to_whoever_logs_in_confuses_nothing(
+    fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    key = fleet.key.with_suffix(".pub").read_text()
+    for name, rule in (("husky1", "NOPASSWD: ALL"), ("husky2", "ALL")):
+        machine = fleet.add(name, start=False)
+        give_user(machine, key, rule, home="/home/robot", shell="/bin/bash")
+        machine.write("/home/robot/.bashrc", _GREETING)
+        machine.write("/root/.bashrc", _GREETING)
+        machine.append("/etc/sudoers", "Defaults lecture=always\n")
+        # its own name does not resolve, which sudo says on every call
+        machine.write("/etc/hosts", "127.0.0.1 localhost\n")
+        machine.write("/etc/motd", "current=motd\n")
+        machine.start()
+        fleet.shell(name, "mount --bind /home /home && mount -o remount,bind,noexec /home")
+        fleet.shell(name, "mount -t tmpfs -o size=4k tmpfs /tmp && ! head -c 1M /dev/zero >/tmp/full")
+    fleet.write(user="robot")
+    told = fleet.deploy(exit_code=1)
+    assert "husky1: done: runs " in told
+    assert "husky2 (10.42.0.11): sudo wants a password for robot" in told
+    monkeypatch.setenv("MESHCTL_SUDO_PASSWORD", "wrong")
+    assert "sudo does not let robot become root" in fleet.deploy("husky2", exit_code=1)
+    monkeypatch.setenv("MESHCTL_SUDO_PASSWORD", USER_PASSWORD)
+    assert "husky2: done: runs " in fleet.deploy("husky2")
+    assert "2 unchanged" in fleet.deploy()
+    assert all(one["well"] for one in fleet.status().values())
+    fleet.write(user="root")
+    assert "2 unchanged" in fleet.deploy()
+    assert "husky1: done: removed" in fleet.meshctl("uninstall", "husky1")
+
+
+def test_what_somebody_there_has_forbidden_is_refused_and_left_as_it_was(fleet: RobotFleet) -> None:
+    fleet.add("husky1")
+    fleet.write()
+    fleet.deploy()
+    fleet.add_topic("video: {priority: 9}")
+    before = fleet.status()["husky1"]["release"]
+    fleet.shell("husky1", "systemctl stop udp-mesh && ln -sf /dev/null /etc/systemd/system/udp-mesh.service")
+    fleet.shell("husky1", "systemctl daemon-reload")
+    told = fleet.deploy(exit_code=1)
+    assert "husky1: refused: somebody has masked udp-mesh.service there" in told
+    assert "systemctl unmask udp-mesh.service" in told
+    assert "somebody has masked udp-mesh.service there" in fleet.meshctl("restart", exit_code=1)
+    assert fleet.shell("husky1", "systemctl is-enabled udp-mesh || :") == "masked\n"
+    fleet.shell("husky1", "systemctl unmask udp-mesh")
+    fleet.shell("husky1", "mount --bind /opt /opt && mount -o remount,bind,noexec /opt")
+    assert "/opt is mounted noexec" in fleet.deploy(exit_code=1)
+    assert fleet.status()["husky1"]["release"] == before
+    fleet.shell("husky1", "umount -l /opt")
+    assert "husky1: done: runs " in fleet.deploy()
+    assert fleet.status()["husky1"]["previous"] == before
+
+
+def test_a_computer_whose_name_does_not_resolve_or_which_has_no_user_for_us_is_told_as_that(fleet: RobotFleet) -> None:
+    fleet.add("husky1")
+    fleet.write()
+    named = fleet.file.read_text()
+    fleet.file.write_text(named.replace("ssh: {user: root,", "ssh: {host: husky1.invalid, user: root,"))
+    told = fleet.deploy(exit_code=3)
+    assert "no address is known here for husky1.invalid: write one into robots.husky1.computer.ssh.host" in told
+    fleet.file.write_text(named.replace("ssh: {user: root,", "ssh: {"))
+    assert fleet.file.read_text() != named
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LOGNAME", "alice")
+        told = fleet.deploy(exit_code=1)
+        assert "let alice in with none of" in told
+        assert (
+            "the inventory names no user, so alice was tried, your own: write robots.husky1.computer.ssh.user" in told
+        )
+        patch.setenv("LOGNAME", "root")
+        assert getpass.getuser() == "root"
+        assert "husky1: done: runs " in fleet.deploy()
