@@ -494,6 +494,8 @@ abort() { # OWNER ID
 boot() { # before anything reads the configuration, so nothing is reloaded
 	rm -rf "$RUN"/*
 	tidy
+	# for packages.sh
+	export BOOTING=yes
 	put_back=no
 	[ ! -f "$CHANGE/packages.tar" ] || put_back=yes
 	case $MARKER in armed | restoring) restore boot ;; *) return 0 ;; esac

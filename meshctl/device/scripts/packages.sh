@@ -72,8 +72,18 @@ undo() {
 	esac
 	[ -z "$(added)" ] || return 1
 	for package in $REMOVE; do
-		installed | grep -qxF "$package" || { tar -xf "$dir/packages.tar" -C / && return; }
+		installed | grep -qxF "$package" || { tar -xf "$dir/packages.tar" -C / && start_again && return; }
 	done
+}
+
+# Removing them stopped what they run, and a link starts it at the next boot only. At boot it is not started: the
+# machine is about to boot once more.
+start_again() {
+	[ -z "$BOOTING" ] || return 0
+	for service in $(tar -tf "$dir/packages.tar" | sed -n 's|^etc/rc\.d/S[0-9][0-9]||p'); do
+		"/etc/init.d/$service" start
+	done
+	return 0
 }
 
 case $verb in

@@ -38,11 +38,14 @@ remove)
 		awk -v name="$name" 'BEGIN { RS = ""; ORS = "\n\n" } $2 != name' $db >$db.new
 		mv $db.new $db
 		rm -f "/usr/bin/$name"
+		# as its prerm does
+		[ "$name" != wpad-basic ] || { /etc/init.d/wpad stop && rm -f /etc/init.d/wpad /etc/rc.d/S19wpad; }
 	done
 	;;
-files) printf 'Package %s (1) is installed on root and has the following files:\n/usr/bin/%s\n' "$1" "$1" ;;
+files) [ "$1" != wpad-basic ] || echo /etc/init.d/wpad; printf 'Package %s (1) is installed on root and has the following files:\n/usr/bin/%s\n' "$1" "$1" ;;
 esac
 """
+WPAD = "#!/bin/sh\necho $1 >>/harness/wpad\n"
 APK = r"""#!/bin/sh
 db=/lib/apk/db/installed
 verb=$1
@@ -77,6 +80,9 @@ def with_opkg(node: Sandbox) -> None:
     node.put("/usr/bin/opkg", OPKG, 0o755)
     node.put(STATUS, "".join(f"Package: {name}\nStatus: install ok installed\n\n" for name in sorted(BEFORE)))
     node.put("/usr/bin/wpad-basic", "the old one\n", 0o755)
+    node.put("/etc/init.d/wpad", WPAD, 0o755)
+    node.path("/etc/rc.d").mkdir(parents=True, exist_ok=True)
+    node.path("/etc/rc.d/S19wpad").symlink_to("../init.d/wpad")
     for file in FILES:
         node.put(file, "")
 
@@ -122,6 +128,14 @@ def test_unconfirmed_packages_are_removed_and_those_removed_put_back(node: Sandb
     assert last(node) == ("c1", "restored", "timeout")
 
 
+def test_what_a_package_runs_is_started_again_when_it_is_put_back(node: Sandbox) -> None:
+    with_opkg(node)
+    applied(node, window_s="1", wanted=change())
+    assert node.text("/harness/wpad") == "stop\n"
+    eventually(lambda: state(node) == "idle" and not node.processes())
+    assert node.text("/harness/wpad") == "stop\nstart\n"
+
+
 def test_files_and_packages_of_one_change_go_and_come_back_together(node: Sandbox) -> None:
     with_opkg(node)
     applied(node, wanted=change(touches_files=True))
@@ -157,6 +171,7 @@ def test_a_power_cut_in_the_middle_of_an_installation_is_undone_by_the_boot(node
     assert last(node) == ("c1", "restored", "boot")
     # services that came back with their packages start with the next boot
     assert node.text("/harness/reboots") == "reboot\n"
+    assert node.text("/harness/wpad") == "stop\n"
 
 
 def test_staging_and_dropping_a_change_of_packages_touches_none(node: Sandbox) -> None:
