@@ -23,6 +23,10 @@ from meshctl.device.parse.system import parse_boot_id, parse_meminfo, parse_upti
 # `sysupgrade -T` unpacks and hashes the image.
 FIRMWARE_TEST_TIMEOUT_S = 120.0
 _PATTERN = re.compile(r"/[A-Za-z0-9._/+@*?-]+")
+# sysupgrade's own lines have the date before them from 21.02 on (lib/upgrade/common.sh, v).
+_STAMP = re.compile(r"^.{,60} upgrade: ")
+# its advice to flash such an image all the same
+_FORCE_IT = "Use sysupgrade -F"
 # Between the answer and the deed, so that the answer arrives.
 ACT_AFTER_S = 1
 
@@ -139,13 +143,13 @@ def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
     )
     done = connection.run(script, timeout_s=FIRMWARE_TEST_TIMEOUT_S)
     lines = done.check(f"{connection.endpoint.label}: test the firmware").stdout.splitlines()
-    said = [line[5:].strip() for line in lines if line.startswith("said ")]
+    said = [_STAMP.sub("", line[5:]).strip() for line in lines if line.startswith("said ")]
     told = mapping(parse_json(next((line[5:] for line in lines if line.startswith("json ")), "")))
     memory = parse_meminfo(done.stdout)
     # procd refuses `-f` for such an image, only after `sysupgrade` has begun; -T does not look at it
     bare = told.get("allow_backup") is False
     passed = "status 0" in lines and (not told or truth(told.get("valid"))) and not bare
-    reason = "; ".join(line for line in said if line) or "sysupgrade -T failed"
+    reason = "; ".join(line for line in said if line and not line.startswith(_FORCE_IT)) or "sysupgrade -T failed"
     if bare:
         reason = "it takes over no configuration from the running system"
     return FirmwareCheck(

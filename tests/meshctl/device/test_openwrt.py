@@ -28,7 +28,10 @@ SYSUPGRADE = (
     + """
 case $1 in
 -b) echo backup >"$2" ;;
--T) if [ "$2" = -n ] && grep -q good "$3"; then exit 0; else echo "Device x not supported by this image"; exit 1; fi ;;
+-T) if [ "$2" = -n ] && grep -q good "$3"; then exit 0; else 
+	echo "Sun Nov 22 03:21:04 UTC 2026 upgrade: Device x not supported by this image" >&2
+	echo "Sun Nov 22 03:21:04 UTC 2026 upgrade: Use sysupgrade -F to override this check" >&2
+	echo "Image check failed." >&2; exit 1; fi ;;
 esac
 """
 )
@@ -166,7 +169,7 @@ def test_an_image_is_judged_by_sysupgrade_and_by_procd(connection: SshConnection
     node.put("/tmp/good.bin", "good")
     node.put("/tmp/bad.bin", "wrong board")
     bad = openwrt.check_firmware(connection, "/tmp/bad.bin")
-    assert (bad.valid, bad.reason) == (False, "Device x not supported by this image")
+    assert (bad.valid, bad.reason) == (False, "Device x not supported by this image; Image check failed.")
     assert bad.available_bytes is not None
     without_procd = openwrt.check_firmware(connection, "/tmp/good.bin")
     assert (without_procd.valid, without_procd.tests) == (True, {})
