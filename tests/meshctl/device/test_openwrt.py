@@ -28,7 +28,7 @@ SYSUPGRADE = (
     + """
 case $1 in
 -b) echo backup >"$2" ;;
--T) if [ "$2" = -n ] && grep -q good "$3"; then exit 0; else 
+-T) if [ "$2" = -n ] && grep -q good "$3"; then exit 0; else
 	echo "Sun Nov 22 03:21:04 UTC 2026 upgrade: Device x not supported by this image" >&2
 	echo "Sun Nov 22 03:21:04 UTC 2026 upgrade: Use sysupgrade -F to override this check" >&2
 	echo "Image check failed." >&2; exit 1; fi ;;

@@ -42,7 +42,10 @@ remove)
 		[ "$name" != wpad-basic ] || { /etc/init.d/wpad stop && rm -f /etc/init.d/wpad /etc/rc.d/S19wpad; }
 	done
 	;;
-files) [ "$1" != wpad-basic ] || echo /etc/init.d/wpad; printf 'Package %s (1) is installed on root and has the following files:\n/usr/bin/%s\n' "$1" "$1" ;;
+files)
+	[ "$1" != wpad-basic ] || echo /etc/init.d/wpad
+	printf 'Package %s (1) is installed on root and has the following files:\n/usr/bin/%s\n' "$1" "$1"
+	;;
 esac
 """
 WPAD = "#!/bin/sh\necho $1 >>/harness/wpad\n"
