@@ -252,9 +252,7 @@ def handle_timer(state: State, now: float) -> None:
                 session.inbound.acks.now_wanted = True
                 session.inbound.acks.due_at = None
                 state.owe(session)
-            # Beside a full piece, which the path may be too narrow for, as well as in place of one.
-            alone = not outbound.scheduler.waiting or outbound.path_size.in_doubt
-            if outbound.silent_since is not None and outbound.probe_credit and alone:
+            if outbound.probes_small(now):
                 session.owe(Ping(state.rng.getrandbits(64)))
                 state.owe(session)
         state.ready[peer] = None

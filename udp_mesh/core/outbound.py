@@ -320,6 +320,19 @@ class Outbound(OpenMessages):
         self.probe_credit = 1
         self._set_aside()
 
+    def probes_small(self, now: float) -> bool:
+        """Whether the probe just allowed shall be a ping: nothing waits, or full pieces may be too large for the path
+        (then one probe in a few, once the silence is no short cut)."""
+        if self.silent_since is None or not self.probe_credit:
+            return False
+        if not self.scheduler.waiting:
+            return True
+        long_since = now - self.silent_since > PROBE_SOON_FOR_S
+        if long_since and self.path_size.ask():
+            self.probe_credit = 0
+            return True
+        return False
+
     def _set_aside(self) -> None:
         """Everything on its way waits again, urgent messages behind those still to come."""
         self._settle_overdue()

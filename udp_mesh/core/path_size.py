@@ -20,6 +20,9 @@ LOST_PER_ROUND = 2
 """At least eight full pieces in more than a second: with half of all datagrams lost that happens once in some hundred
 times, and costs a tenth of the rate until `WIDEN_AFTER_S`."""
 
+PROBES_PER_SMALL = LOST_PER_ROUND + 1
+"""Of the probes of a silent peer one in so many is small: a round takes the others."""
+
 WIDEN_AFTER_S = 600.0
 """The larger size is tried again (RFC 8899's PMTU_RAISE_TIMER)."""
 
@@ -33,13 +36,14 @@ LEAST_FULL_BYTES = 450
 class PathSize:
     """What is known about one peer's path. `narrowed_at` is when it was last taken for narrower."""
 
-    __slots__ = ("_lost", "_round_at", "_rounds", "narrowed_at")
+    __slots__ = ("_asked", "_lost", "_round_at", "_rounds", "narrowed_at")
 
     def __init__(self) -> None:
         self._lost = 0
         """Full pieces lost in this round."""
         self._rounds = 0
         self._round_at = 0.0
+        self._asked = 0
         self.narrowed_at: float | None = None
 
     @property
@@ -51,6 +55,11 @@ class PathSize:
     def too_narrow(self) -> bool:
         """Full pieces do not get through."""
         return self._rounds >= ROUNDS
+
+    def ask(self) -> bool:
+        """Whether the next probe shall be small."""
+        self._asked += 1
+        return self.in_doubt and not self._asked % PROBES_PER_SMALL
 
     def reset(self) -> None:
         """A full piece arrived, or their size is another from now on."""
