@@ -57,13 +57,22 @@ _LEARN_BATMAN = (
 )
 
 
+# bat0 that was made anew knows nobody behind it, and tells the mesh of the node's own address only once the node has
+# sent something through it. Where br-lan has other ports, nothing makes it: its link never went down. Meanwhile the
+# batman-adv of others answers ARP requests for it out of memory, for 5 minutes (BATADV_DAT_ENTRY_TIMEOUT,
+# net/batman-adv/main.h), so nobody calls aloud either. Loop avoidance holds broadcasts for half a minute, but not what
+# goes to one station. So the node speaks to whom it was just spoken to by, each second until bat0 is surely there.
+SPEAK_FRAMES = 60
+_SPEAK = f'[ -z "$SSH_CONNECTION" ] || ping -c {SPEAK_FRAMES} "${{SSH_CONNECTION%% *}}" >/dev/null 2>&1 </dev/null &'
+
+
 def reload_script(paths: set[str], services: tuple[str, ...]) -> str:
     """POSIX sh that makes the node take up changed files; reload_config reloads the services whose package changed."""
     lines = ["status=0"]
     if any(package_of(path) is not None for path in paths):
         lines.append("reload_config || status=$?")
     if "etc/config/network" in paths:
-        lines += _LEARN_BATMAN
+        lines += [*_LEARN_BATMAN, _SPEAK]
     lines += [f"/etc/init.d/{service} restart || status=$?" for service in services]
     return "\n".join([*lines, "exit $status"]) + "\n"
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import subprocess
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from meshctl.apply.change import change_of, new_change_id, new_nonce, reload_script
+from meshctl.apply.change import SPEAK_FRAMES, change_of, new_change_id, new_nonce, reload_script
 from meshctl.device.deadman import bundle
 from tests.meshctl.plan.support import PASS_PHRASE, factory, fleet, planned, running, wanted
 
@@ -71,8 +73,35 @@ def test_netifd_starts_anew_where_it_does_not_know_batman_adv_yet(
     script = script.replace("/etc/config/network", str(tmp_path / "network"))
     script = script.replace("/etc/init.d/network restart", "echo restarts")
     stands_in = f"reload_config() {{ :; }}\nubus() {{ {known}; }}\n"
-    done = subprocess.run(["sh", "-c", stands_in + script], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["sh", "-c", stands_in + script], env={"PATH": "/usr/bin:/bin"}, capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stdout.strip()) == (0, "restarts" if restarts else "")
+
+
+@pytest.mark.parametrize(
+    ("client", "pings"),
+    [({"SSH_CONNECTION": "10.42.0.2 51000 10.42.0.11 22"}, [f"-c {SPEAK_FRAMES} 10.42.0.2"]), ({}, [])],
+)
+def test_a_node_whose_network_changes_speaks_to_whom_it_was_spoken_to_by_and_waits_for_no_answer(
+    tmp_path: Path, client: dict[str, str], pings: list[str]
+) -> None:
+    (tmp_path / "ping").write_text(f'#!/bin/sh\nread -r _ <"{tmp_path}/go"\necho "$@" >>"{tmp_path}/pings"\n')
+    (tmp_path / "ping").chmod(0o755)
+    os.mkfifo(tmp_path / "go")
+    script = "reload_config() { :; }\n" + reload_script({"etc/config/network"}, ())
+    environ = {"PATH": f"{tmp_path}:/usr/bin:/bin", **client}
+    # it ends although the ping has not
+    subprocess.run(["sh", "-c", script], env=environ, check=True, timeout=60)
+    if pings:
+        (tmp_path / "go").write_text("\n")
+    log = tmp_path / "pings"
+    deadline = time.monotonic() + 60
+    while pings and not (log.exists() and log.read_text()):
+        assert time.monotonic() < deadline, "it did not speak"
+        time.sleep(0.01)
+    assert (log.read_text().splitlines() if log.exists() else []) == pings
+    assert "ping" not in reload_script({"etc/config/wireless"}, ())
 
 
 def test_ids_and_nonces_never_repeat() -> None:
