@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
-import pty
-import re
-import select
 import shlex
 import signal
-import struct
 import subprocess
 import sys
-import termios
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,10 +24,11 @@ from meshctl.lab.fleet import VirtualFleet
 from meshctl.lab.spec import FleetSpec, LinkSpec, Medium, NodeSpec
 from meshctl.model import Secret, SecretRef
 from meshctl.render import render_node
+from tests.meshctl.status.terminal import PATIENCE_S, Terminal
+from tests.waiting import until
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
 
-PATIENCE_S = 120.0
 NAMES = ("base", "b01", "b02")
 INVENTORY = """\
 meshctl: 1
@@ -73,7 +67,7 @@ class Bench:
 
     @property
     def environ(self) -> dict[str, str]:
-        foreign = ("MESHCTL_", "SSH_AUTH_SOCK", "COLUMNS")
+        foreign = ("MESHCTL_", "SSH_AUTH_SOCK", "COLUMNS", "LINES")
         ours = {name: value for name, value in os.environ.items() if not name.startswith(foreign)}
         lab, state = str(self.fleet.directory), str(self.directory / "state")
         return {**ours, "MESHCTL_LAB": lab, "XDG_STATE_HOME": state, "TERM": "xterm"}
@@ -97,13 +91,6 @@ class Bench:
 
 def no_secret(ref: SecretRef) -> Secret:
     raise AssertionError(f"no secret is in this inventory: {ref}")
-
-
-def until(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {PATIENCE_S:g} s for {what}"
-        time.sleep(0.05)
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +118,7 @@ def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
                 lines.append(f"chmod {file.mode:o} {target}")
             fleet.node(name).exec("\n".join([*lines, "sync", "reload_config"])).check(f"set up {name}")
         bench = Bench(fleet, directory)
-        until(lambda: bench.run("trust", "--yes").exit_code == 0, "the host keys")
+        until(lambda: bench.run("trust", "--yes").exit_code == 0, "the host keys", wait_s=PATIENCE_S)
         yield bench
 
 
@@ -144,7 +131,7 @@ def bench(standing: Bench) -> Iterator[Bench]:
         heard = {n["name"]: {one["name"] for one in n["neighbours"] or ()} for n in standing.status()["nodes"]}
         return heard == hears
 
-    until(is_whole, "the line of three")
+    until(is_whole, "the line of three", wait_s=PATIENCE_S)
     yield standing
     standing.fleet.mend()
     for name in NAMES:
@@ -223,47 +210,23 @@ def test_whoever_leaves_a_look_need_not_wait_for_the_silent(bench: Bench) -> Non
         text=True,
     ) as process:
         journal = bench.directory / "state/meshctl/journal.sqlite-wal"
-        until(lambda: journal.exists() or process.poll() is not None, "the look to begin")
+        until(lambda: journal.exists() or process.poll() is not None, "the look to begin", wait_s=PATIENCE_S)
         process.send_signal(signal.SIGINT)
         _, told = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, told.splitlines()[-1:]) == (130, ["interrupted"])
 
 
-# It failed once in a run of everything, for a reason not found yet: it tells what it saw, and is a proof until then.
-@pytest.mark.proof
 def test_watch_draws_what_fits_follows_the_window_and_leaves_the_screen_as_it_was(bench: Bench) -> None:
-    process, terminal = pty.fork()
-    if process == 0:
-        os.execve(sys.executable, bench.command("status", "--watch", "1", "--timeout", "60"), bench.environ)
-    told = b""
-
-    def reads(pattern: str) -> bool:
-        nonlocal told
-        ready, _, _ = select.select([terminal], [], [], 0.05)
-        if ready:
-            told += os.read(terminal, 65536)
-        return re.search(pattern, told.decode(errors="replace"), re.DOTALL) is not None
-
-    ended = False
-    try:
-        resize(terminal, 60, 160)
-        until(lambda: reads("looked-at: .*all well.*Ctrl-C ends"), "a page")
-        assert b"disk free" in told
-        told = b""
-        resize(terminal, 8, 72)
-        until(lambda: reads(r"\.\.\. \d+ more lines"), "a page for the smaller window")
-        told = b""
-        os.write(terminal, b"\x03")
-        until(lambda: reads(r"\x1b\[\?1049l.*b02 +beacon"), "the end")
-        ended = True
-    finally:
-        if not ended:
-            sys.stderr.write(f"the terminal showed last: {told[-4000:]!r}\n")
-            os.kill(process, signal.SIGKILL)
-        _, status = os.waitpid(process, 0)
-        os.close(terminal)
-    assert os.waitstatus_to_exitcode(status) == 130
-
-
-def resize(terminal: int, lines: int, columns: int) -> None:
-    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
+    watch = bench.command("status", "--watch", "1", "--timeout", "60")
+    with Terminal(watch, bench.environ, lines=60, columns=160) as terminal:
+        shown = terminal.shows("looked-at: .*all well.*Ctrl-C ends", "a page")
+        assert "disk free" in shown
+        # a count of answers would stand in the page
+        assert "answered or given up" not in shown
+        terminal.forget()
+        terminal.resize(8, 72)
+        terminal.shows(r"\.\.\. \d+ more lines", "a page for the smaller window")
+        terminal.forget()
+        terminal.press(b"\x03")
+        terminal.shows(r"\x1b\[\?1049l.*b02 +beacon", "the screen from before, with what was seen last")
+        assert terminal.exit_code() == 130
