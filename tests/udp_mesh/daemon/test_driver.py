@@ -12,8 +12,9 @@ from udp_mesh import Node
 from udp_mesh.core.events import MessageDelivered
 from udp_mesh.core.seams import Datagram
 from udp_mesh.daemon.driver import BLOCKED_DATAGRAMS
+from udp_mesh.links.attachments import Address
 from udp_mesh.links.netlink import NetlinkError
-from udp_mesh.links.udp import Outgoing, UdpLink
+from udp_mesh.links.udp import Deliver, Outgoing, UdpLink
 
 PAYLOAD = bytes(range(256)) * 2000
 
@@ -61,9 +62,11 @@ def test_a_step_of_the_wall_clock_does_not_disturb_the_transport(
     async def body(alice: Node, bob: Node) -> None:
         real = UdpLink.receive
 
-        def receive(self: UdpLink, deliver: object, limit: int) -> int:
-            assert callable(deliver)
-            return real(self, lambda data, source, arrived: deliver(data, source, arrived + step_s), limit)
+        def receive(self: UdpLink, deliver: Deliver, limit: int, fresh_from: float) -> int:
+            def step(data: memoryview, source: Address, arrived: float) -> None:
+                deliver(data, source, arrived + step_s)
+
+            return real(self, step, limit, fresh_from - step_s)
 
         monkeypatch.setattr(UdpLink, "receive", receive)
         assert isinstance(await alice.deliver("map", PAYLOAD, to="bob"), MessageDelivered)
