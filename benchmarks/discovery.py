@@ -35,7 +35,7 @@ from udp_mesh.sim.agenda import Agenda
 # All receivers of a broadcast open it with one key and decode the same bytes to the same frozen frames: one processor,
 # which plays them all, does it once, and 1,000 robots that know each other fit into its memory.
 intake.decode = functools.lru_cache(maxsize=64)(intake.decode)  # type: ignore[attr-defined]
-intake.parse_header = functools.lru_cache(maxsize=64)(intake.parse_header)  # type: ignore[attr-defined]
+intake.parse_header = functools.lru_cache(maxsize=64)(intake.parse_header)  # type: ignore[assignment, attr-defined]
 channel.AESGCM = functools.lru_cache(maxsize=4096)(channel.AESGCM)  # type: ignore[assignment, attr-defined]
 
 RESULTS = Path(__file__).with_name("results") / "discovery.jsonl"
