@@ -81,7 +81,8 @@ def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
     budget = FailureBudget(fleet.apply.stop_after_failures)
     stopped = ""
     for stage in plan.stages:
-        reason = stopped or ("interrupted before its turn" if setting.interrupt.stopping else "")
+        # a canary that was left in the middle is no canary that failed
+        reason = "interrupted before its turn" if setting.interrupt.stopping else stopped
         if reason:
             ended = {name: Outcome(name, Result.PENDING, reason) for name in stage.nodes}
             for outcome in ended.values():
