@@ -29,6 +29,7 @@ from udp_mesh.core.state import State
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
 from udp_mesh.wire.codec import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
 from udp_mesh.wire.frames import Feature, MessageFlag
+from udp_mesh.wire.legacy import LEGACY_OVERHEAD_BYTES
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
 
 ANNOUNCE_BYTES = 5
@@ -188,6 +189,8 @@ def _to_all(state: State, accepted: Accepted, now: float) -> None:
     if not all(map(inflates, sessions)):
         accepted = unpacked(accepted)
     room = min((link.mtu - header_bytes(link.address) for link in state.links.values()), default=0)
+    if any(neighbour.legacy for neighbour in state.settings.neighbours):
+        room -= LEGACY_OVERHEAD_BYTES
     fits = state.broadcasts() and _broadcast_bytes(accepted) <= room
     if fits:
         state.casts.push(accepted)

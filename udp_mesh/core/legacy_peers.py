@@ -19,6 +19,7 @@ from udp_mesh.wire.legacy import (
     LegacyAck,
     LegacyPayload,
     PriorityMeshData,
+    cover,
     decode_legacy,
     encode_legacy,
 )
@@ -132,6 +133,14 @@ class LegacyPeers:
                     not piece.wants_ack,
                 )
             )
+
+    def covered(self, out: list[Datagram]) -> list[Datagram]:
+        """The datagrams, those to all in a cover that fielded programs take for one of theirs."""
+        to_all = {link.broadcast for link in self._state.links.values()} | {None}
+        return [
+            datagram._replace(data=cover(datagram.data)) if datagram.destination in to_all else datagram
+            for datagram in out
+        ]
 
     def leave(self, now: float, out: list[Datagram]) -> None:
         """Fragments that may leave now."""

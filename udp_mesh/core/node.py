@@ -13,6 +13,7 @@ from udp_mesh.core.seams import Datagram, RandomSource, Store
 from udp_mesh.core.settings import Address, LinkInfo, Settings
 from udp_mesh.core.state import State
 from udp_mesh.wire.header import MARK
+from udp_mesh.wire.legacy import uncover
 from udp_mesh.wire.limits import BOOT_ID_BYTES
 
 
@@ -36,6 +37,10 @@ class Node:
 
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
         """Take in one datagram. Bad bytes are counted and dropped; this never raises because of what was received."""
+        if len(data) and data[0] < MARK:
+            covered = uncover(data)
+            if covered is not None:
+                data = covered
         if len(data) and data[0] < MARK and self._legacy:
             self._legacy.receive(data, link, source, now)
         else:
@@ -48,6 +53,7 @@ class Node:
         """
         out = dispatch.collect(self._state, now, max_bytes)
         if self._legacy:
+            out = self._legacy.covered(out)
             self._legacy.leave(now, out)
         return out
 

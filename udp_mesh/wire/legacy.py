@@ -87,6 +87,26 @@ class PriorityMeshData:
     frame_id: str = ""
 
 
+_COVER = _HEADER.pack(LegacyType.ACK, 0xFFFF, 0xFFFFFFFF, 0, 0)[:-2]
+"""An acknowledgement of a message that nobody sends: unicast numbers end at 0x7fff, and broadcasts are never
+acknowledged."""
+
+
+def cover(data: bytes) -> bytes:
+    """A datagram of ours that may reach fielded programs: in the payload of an acknowledgement they ignore.
+
+    A datagram of another type than theirs, which a broadcast would bring them, ends them.
+    """
+    return _COVER + struct.pack("<H", len(data)) + data + b"\x00"
+
+
+def uncover(data: bytes | memoryview) -> bytes | memoryview | None:
+    """What `cover` was given; None where this is something else."""
+    if len(data) < LEGACY_OVERHEAD_BYTES or bytes(data[: len(_COVER)]) != _COVER:
+        return None
+    return data[_HEADER.size : -1]
+
+
 def is_legacy(data: bytes | memoryview) -> bool:
     """Whether the first byte is a type of the fielded format."""
     return len(data) >= LEGACY_OVERHEAD_BYTES and data[0] in (1, 2, 4, 5)

@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import pytest
 
-from tests.udp_mesh.core.pair import KEY, World, pair, settings
+from tests.udp_mesh.core.pair import BROADCAST, KEY, World, pair, settings
 from udp_mesh.core.events import (
     Event,
     MessageDelivered,
     MessageReceived,
     NameConflict,
+    PeerOffline,
     PeerOnline,
     Rejected,
     RejectReason,
@@ -59,7 +60,7 @@ class OldRobot:
         out: list[Datagram] = []
         while datagrams := self.node.datagrams_to_send(self.now):
             out.extend(datagrams)
-        return [decode_legacy(datagram.data) for datagram in out if datagram.data[0] < 0x80]
+        return [decode_legacy(datagram.data) for datagram in out if datagram.destination == OLD]
 
     def hear_payloads(self) -> list[LegacyPayload]:
         return [datagram for datagram in self.hear() if isinstance(datagram, LegacyPayload)]
@@ -179,6 +180,40 @@ def test_defect_4_an_unknown_type_is_counted_and_dropped(kind: int) -> None:
     old.node.receive(bytes(raw), "mesh", OLD, old.now)
     old.say(pieces(2, b"fine")[0])
     assert [event.payload for event in old.received()] == [b"fine"]
+
+
+def test_defect_4_nothing_that_is_sent_to_all_ends_a_fielded_program() -> None:
+    world = World(seed=9)
+    fielded = Neighbour(("10.0.0.50", 8700), name="old", legacy=True)
+    topic = Topic("cast", repair=True)
+    world.add(settings("a", topic, neighbours=(fielded,)))
+    world.add(settings("b", topic))
+    to_all: list[Datagram] = []
+
+    def tap(name: str, datagram: Datagram, now: float) -> None:
+        if name == "a" and datagram.destination in (None, BROADCAST):
+            to_all.append(datagram)
+
+    world.tap = tap
+    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    for size in (0, 100, 1300, 1380, 1400, 3000):
+        world.send("a", "cast", bytes(size))
+        world.run(0.5)
+    world.nodes["a"].close(world.now)
+    world.run(0.1)
+    assert len(to_all) > 10
+    for datagram in to_all:
+        assert decode_legacy(datagram.data) == LegacyAck(0xFFFF, 0xFFFFFFFF)
+        assert len(datagram.data) <= 1500 - 28
+    assert [len(event.payload) for event in world.told("b", MessageReceived) if isinstance(event, MessageReceived)] == [
+        0,
+        100,
+        1300,
+        1380,
+        1400,
+        3000,
+    ]
+    assert world.told("b", PeerOffline)
 
 
 def test_defect_5_a_name_is_not_believed_as_announced() -> None:

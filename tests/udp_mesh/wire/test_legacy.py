@@ -8,17 +8,20 @@ from hypothesis import strategies as st
 
 from udp_mesh.wire.errors import DecodeError
 from udp_mesh.wire.legacy import (
+    LEGACY_OVERHEAD_BYTES,
     Host,
     LegacyAck,
     LegacyDatagram,
     LegacyPayload,
     PriorityMeshData,
+    cover,
     decode_legacy,
     decode_mesh_data,
     encode_legacy,
     encode_mesh_data,
     fragment_legacy,
     is_legacy,
+    uncover,
 )
 
 words = st.text(st.characters(min_codepoint=0x21, max_codepoint=0x7E), min_size=1, max_size=15).filter(
@@ -109,3 +112,16 @@ def test_defect_3_a_position_past_the_total_is_refused() -> None:
 def test_defect_4_an_unknown_type_is_bad_bytes_like_any_other() -> None:
     with pytest.raises(DecodeError, match="expected 1, 2, 4 or 5, found 9"):
         decode_legacy(struct.pack("<BHIIH", 9, 1, 0, 1, 1) + b"x\x00")
+
+
+@given(st.binary(max_size=1500))
+def test_what_is_covered_is_an_acknowledgement_to_fielded_programs_and_itself_to_us(data: bytes) -> None:
+    covered = cover(data)
+    assert decode_legacy(covered) == LegacyAck(0xFFFF, 0xFFFFFFFF)
+    assert uncover(covered) == data
+    assert len(covered) == len(data) + LEGACY_OVERHEAD_BYTES
+
+
+@given(st.binary(max_size=40))
+def test_anything_else_is_not_uncovered(data: bytes) -> None:
+    assert data[:11] == cover(b"")[:11] or uncover(data) is None
