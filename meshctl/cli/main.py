@@ -30,7 +30,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     completing = os.environ.get("COMP_WORDS", "").split()[1:] if "_MESHCTL_COMPLETE" in os.environ else []
     meant = next((word for word in completing or words if not word.startswith("-")), "")
-    build(meant)(args=words, prog_name="meshctl")
+    try:
+        build(meant)(args=words, prog_name="meshctl")
+    except KeyboardInterrupt:
+        # while the command was being imported, which takes seconds on a busy machine
+        typer.echo("interrupted", err=True)
+        sys.exit(int(ExitCode.INTERRUPTED))
 
 
 def build(meant: str) -> typer.Typer:

@@ -97,3 +97,15 @@ def test_a_reader_that_has_seen_enough_is_no_failure() -> None:
         process.stdout.close()
         assert process.stderr is not None
         assert (process.stderr.read(), process.wait()) == ("", 0)
+
+
+def test_ctrl_c_before_the_command_has_begun_is_told_as_any_other(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(meant: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(root, "build", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        root.main(["plan"])
+    assert (ended.value.code, capsys.readouterr().err) == (130, "interrupted\n")
