@@ -26,6 +26,7 @@ TO_ALL = bytes(16)
 RELIABLE, COMPRESSED, FLAG_TO_ALL, REPAIR = 1, 2, 4, 8
 ZLIB, REPAIRS = 1, 2
 UNREPAIRED_FROM = 1 << 31
+COVER = bytes.fromhex("02ffffffffffff00000000")
 HELLO_S, RESEND_S, HEARD_FOR_S = 0.2, 0.5, 0.7
 
 Address = tuple[str, int]
@@ -295,6 +296,8 @@ class ForeignNode:
         return number
 
     def take(self, datagram: bytes, address: Address) -> None:
+        if datagram.startswith(COVER):
+            datagram = datagram[13:-1]
         if len(datagram) < 23 or datagram[0] & 0xF0 != 0x90:
             return
         kind = datagram[0] & 15

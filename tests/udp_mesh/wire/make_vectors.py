@@ -37,6 +37,7 @@ from udp_mesh.wire.legacy import (
     LegacyDatagram,
     LegacyPayload,
     PriorityMeshData,
+    cover,
     encode_legacy,
     encode_mesh_data,
 )
@@ -78,6 +79,8 @@ LEGACY: dict[str, LegacyDatagram] = {
 }
 
 MESH_DATA = PriorityMeshData("ugv1", "std_msgs/String", 0, "status", b"\x02\x00\x00\x00ok", 7, 1_580_000_000, 5, "base")
+
+COVERED = b"\x90 any datagram to all"
 
 
 def describe(value: object) -> object:
@@ -138,6 +141,7 @@ def make_legacy() -> object:
     return {
         "datagrams": datagrams,
         "message": {"message": describe(MESH_DATA), "hex": encode_mesh_data(MESH_DATA).hex()},
+        "covered": {"datagram": COVERED.hex(), "hex": cover(COVERED).hex()},
     }
 
 
