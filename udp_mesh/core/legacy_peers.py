@@ -101,6 +101,7 @@ class LegacyPeers:
         legacy.address = source
         legacy.sender.heard()
         peer = legacy.peer
+        peer.fielded_way = (source, link, now)
         peer.lost = False
         if not peer.online:
             peer.online = True

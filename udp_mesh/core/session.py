@@ -8,7 +8,7 @@ from udp_mesh.core.departure import Way
 from udp_mesh.core.inbound import Inbound
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.outbound import Outbound
-from udp_mesh.core.settings import Settings
+from udp_mesh.core.settings import Address, Settings
 from udp_mesh.crypto import TO_ALL, Key, ReceiveChannel, SendChannel
 from udp_mesh.wire.frames import Ack, Frame, Heartbeat, Waiting
 from udp_mesh.wire.limits import HEARD_TAG_BYTES, MAX_HEARD
@@ -41,6 +41,7 @@ class Peer:
         "_settings",
         "conflict_reported_at",
         "engaged",
+        "fielded_way",
         "held_until",
         "left",
         "legacy",
@@ -64,6 +65,8 @@ class Peer:
         self.online = False
         self.left = False
         self.legacy = False
+        self.fielded_way: tuple[Address, str, float] | None = None
+        """Address and link from which a fielded program was heard last, and when."""
         self.lost = True
         """Silent for `peer_lost_s`, or never heard: nothing waits for it but in an outbox."""
         self.online_since: float | None = None

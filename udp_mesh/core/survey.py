@@ -8,6 +8,7 @@ from udp_mesh.core.discovery import MISSED_HEARTBEATS
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.session import Peer, Session
+from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
 
 TOLD_FOR_S = 2.0
@@ -67,14 +68,15 @@ def _peer(state: State, peer: Peer, outbound: Outbound, now: float) -> PeerCondi
     capacity = outbound.window.capacity()
     fragment_bytes = session.way.fragment_bytes if session is not None else state.settings.fragment_bytes
     meters = session.meters if session is not None else None
+    address, link, last_heard = _way(peer)
     return PeerConditions(
         peer.name,
         peer.online,
         peer.legacy,
-        session.way.address if session is not None and session.way.link else None,
-        session.way.link if session is not None and session.way.link else None,
+        address,
+        link,
         peer.online_since,
-        session.last_heard if session is not None else None,
+        last_heard,
         outbound.trip.smoothed,
         outbound.trip.least,
         outbound.loss,
@@ -92,6 +94,15 @@ def _peer(state: State, peer: Peer, outbound: Outbound, now: float) -> PeerCondi
         held_bytes,
         session is not None and session.unheard_since is not None and _alive(session, now),
     )
+
+
+def _way(peer: Peer) -> tuple[Address | None, str | None, float | None]:
+    """Address, link and when something last came from there."""
+    session = peer.session
+    if session is not None:
+        way = session.way
+        return (way.address, way.link, session.last_heard) if way.link else (None, None, session.last_heard)
+    return peer.fielded_way or (None, None, None)
 
 
 def _queues(outbound: Outbound, now: float) -> tuple[QueueConditions, ...]:

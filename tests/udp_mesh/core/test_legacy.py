@@ -111,6 +111,12 @@ def test_messages_of_a_fielded_peer_arrive_and_are_acknowledged() -> None:
     assert (event.source, event.topic, event.payload, event.priority) == ("old", "chat", b"x" * 4000, 4)
 
 
+def test_where_a_fielded_peer_was_heard_is_told() -> None:
+    old = OldRobot()
+    (peer,) = old.node.conditions(old.now + 2).peers
+    assert (peer.name, peer.online, peer.address, peer.link, peer.last_heard) == ("old", True, OLD, "mesh", old.now)
+
+
 def test_a_broadcast_of_a_fielded_peer_arrives_without_an_acknowledgement() -> None:
     old = OldRobot()
     old.say(pieces(0x8001, b"all", wants_ack=False)[0])
