@@ -50,12 +50,19 @@ class _Running:
 class Warden:
     """Serves requests on `channel` until the supervisor closes it.
 
-    `put_devices` gives a new node (its process number) its network devices before its process 1 begins.
+    `put_devices` gives a new node (its process number) its network devices before its process 1 begins; `take_devices`
+    is told the network namespace of a node that has just ended, as a descriptor.
     """
 
-    def __init__(self, channel: socket.socket, put_devices: Callable[[Container, int], None] | None = None) -> None:
+    def __init__(
+        self,
+        channel: socket.socket,
+        put_devices: Callable[[Container, int], None] | None = None,
+        take_devices: Callable[[int], None] | None = None,
+    ) -> None:
         self._channel = channel
         self._put_devices = put_devices
+        self._take_devices = take_devices
         self._selector = selectors.DefaultSelector()
         self._nodes: dict[str, _Running] = {}
 
@@ -134,6 +141,8 @@ class Warden:
         self._selector.unregister(running.pidfd)
         _, status = os.waitpid(running.pid, 0)
         reason = os.read(report, 4096).decode("utf-8", "replace") if _readable(report) else ""
+        if self._take_devices is not None:
+            self._take_devices(running.network)
         for descriptor in (running.pidfd, running.network, report):
             os.close(descriptor)
         self._tell({"event": "exit", "node": name, "status": os.waitstatus_to_exitcode(status), "reason": reason})

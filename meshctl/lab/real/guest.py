@@ -124,7 +124,7 @@ def main(arguments: Sequence[str]) -> int:
         hardware.put_devices(places[container.name], pid)
 
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    fork_warden(lambda: Warden(theirs, put_devices), theirs, close=ours)
+    fork_warden(lambda: Warden(theirs, put_devices, hardware.take_devices), theirs, close=ours)
     try:
         asyncio.run(RealSupervisor(spec, directory, ours).run())
     except LabError as error:

@@ -7,6 +7,7 @@ mac80211_hwsim's, moved into its namespace at every boot and back by the kernel 
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import time
@@ -20,11 +21,13 @@ from meshctl.lab.errors import LabError
 from meshctl.lab.spec import FleetSpec, LanSpec, Medium
 from meshctl.lab.state import label_mac
 
+log = logging.getLogger("meshctl.lab.real.hardware")
 # the kernel takes a dead namespace apart in the background; under emulation that can take seconds
-_RADIOS_BACK_S = 30.0
+_RADIOS_BACK_S = 60.0
 _POLL_S = 0.02
 _PHYS = Path("/sys/class/ieee80211")
 _GROUPS = Path("/sys/kernel/debug/ieee80211")
+_ORPHAN_RETRIES = Path("/proc/sys/net/ipv4/tcp_orphan_retries")
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +114,26 @@ def put_devices(place: Place, pid: int) -> None:
         for interface in (_PHYS / phy / "device" / "net").glob("*"):
             run(("iw", "dev", interface.name, "del"))
         run(("iw", "phy", phy, "set", "netns", str(pid)))
+
+
+def take_devices(network: int) -> None:
+    """Let the network of a node that has ended (a descriptor) go soon, and its radios with it.
+
+    Connections whose processes are dead say farewell to nobody, eight times by default, and keep it a minute and more.
+    """
+    home = os.open("/proc/self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        ns.setns(network, ns.CLONE_NEWNET)
+        try:
+            # the file is that of the network that the process is in
+            _ORPHAN_RETRIES.write_text("1\n", encoding="ascii")
+        except OSError as error:
+            # then it takes a while longer
+            log.warning("connections-kept reason=%s", error)
+        finally:
+            ns.setns(home, ns.CLONE_NEWNET)
+    finally:
+        os.close(home)
 
 
 def lay_cable(place: Place, spec: FleetSpec, *, on_bench: bool) -> None:
