@@ -1,17 +1,23 @@
 """Ctrl-C as a value that work can look at.
 
 The first one stops taking up new nodes and lets those in work come to their end (a change that is armed is confirmed
-or undone within seconds). The second one leaves at once: what is armed goes back by itself, the journal says so.
-A terminal that is closed counts as one.
+or undone within seconds). The second one leaves as soon as waits end that cannot be cut short: what is armed goes back
+by itself, the journal says so. The third one ends the process where it stands, which nodes and journal survive as they
+survive its death. A terminal that is closed counts as one.
 """
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
+from typing import NoReturn
+
+# 128 + SIGINT, as shells report it
+ENDED = 130
 
 
 class Interrupt:
@@ -34,7 +40,10 @@ class Interrupt:
         """Ask once to stop, twice to leave."""
         if self._stop.is_set():
             self._leave.set()
-            self._tell("leaving now: what is armed on a node goes back by itself; `meshctl resume` takes it up again")
+            self._tell(
+                "leaving: what is armed on a node goes back by itself; `meshctl resume` takes it up again "
+                "(a third time to end without waiting for any connection)"
+            )
         else:
             self._stop.set()
             self._tell("stopping: finishing the nodes in work, taking up no more (again to leave at once)")
@@ -54,6 +63,11 @@ class Interrupt:
         self._said = say
 
         def handle(number: int, frame: FrameType | None) -> None:
+            if number == signal.SIGHUP and self.stopping:
+                # a closed terminal's shell says it once more
+                return
+            if self.leaving:
+                _end()
             self.request()
 
         # nohup has it ignored, and means it
@@ -64,3 +78,10 @@ class Interrupt:
         finally:
             for number, handler in previous.items():
                 signal.signal(number, handler)
+
+
+def _end() -> NoReturn:
+    """Without waiting for threads, some of which wait for sockets; live lines have hidden the cursor."""
+    with suppress(OSError):
+        os.write(2, b"\x1b[?25hended\n" if os.isatty(2) else b"ended\n")
+    os._exit(ENDED)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -20,7 +22,7 @@ def handled(number: signal.Signals, before: signal.Handlers) -> Iterator[None]:
         signal.signal(number, was)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_asks_to_stop_and_a_second_one_to_leave(number: signal.Signals) -> None:
     interrupt = Interrupt()
     said: list[str] = []
@@ -30,6 +32,14 @@ def test_a_signal_asks_to_stop_and_a_second_one_to_leave(number: signal.Signals)
         signal.raise_signal(number)
         assert interrupt.leaving
     assert len(said) == 2
+
+
+def test_a_closed_terminal_asks_to_stop_however_often_it_is_told() -> None:
+    interrupt = Interrupt()
+    with handled(signal.SIGHUP, signal.Handlers.SIG_DFL), interrupt.on_signals(lambda text: None):
+        signal.raise_signal(signal.SIGHUP)
+        signal.raise_signal(signal.SIGHUP)
+    assert (interrupt.stopping, interrupt.leaving) == (True, False)
 
 
 def test_under_nohup_a_closed_terminal_asks_for_nothing() -> None:
@@ -47,3 +57,14 @@ def test_a_request_counts_where_nobody_can_be_told_any_more() -> None:
     with handled(signal.SIGHUP, signal.Handlers.SIG_DFL), interrupt.on_signals(closed):
         signal.raise_signal(signal.SIGHUP)
     assert interrupt.stopping
+
+
+def test_a_third_signal_ends_the_process_whatever_its_threads_wait_for() -> None:
+    script = (
+        "import signal, threading; from meshctl.fleet import Interrupt\n"
+        "threading.Thread(target=threading.Event().wait).start()\n"
+        "with Interrupt().on_signals(print):\n"
+        "    for _ in range(3): signal.raise_signal(signal.SIGINT)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (130, "ended\n")
