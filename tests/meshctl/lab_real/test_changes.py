@@ -66,6 +66,8 @@ def test_the_running_mesh_is_changed_from_its_far_end(lab: Lab) -> None:
 
 def test_a_radio_that_starts_anew_is_heard_again_by_those_before_it_and_those_behind_it(lab: Lab) -> None:
     lab.edit("  b[01-02]: {role: beacon,", "  b[01-02]: {role: beacon, radios: {radio0: {tx_power_dbm: 20}},")
+    # who has not spoken for minutes may be known to nobody, and then is not asked
+    until(lambda: "1 packets received" in lab.on("b01", "ping -c 1 -W 5 10.42.0.2 || true"), "b01 to be known")
     last = lab.provision("b02")[-1]
     steps = [event["text"] for event in last if event["event"] == "step"]
     assert steps.index("neighbours watch it") < steps.index("apply")
