@@ -32,7 +32,3 @@ class Pace:
         """Sleep a while, less when somebody wants to leave."""
         self.interrupt.wait(min(self._pause_s, max(0.0, self.limit_s - self.elapsed_s)))
         self._pause_s = min(self._pause_s * GROWTH, LONGEST_PAUSE_S)
-
-    def hurry(self) -> None:
-        """Something has changed: look again soon."""
-        self._pause_s = FIRST_PAUSE_S

@@ -126,11 +126,6 @@ def pivot_root(new_root: str) -> None:
     os.chdir("/")
 
 
-def set_hostname(name: str) -> None:
-    encoded = name.encode()
-    _check(_libc.sethostname(encoded, len(encoded)), "sethostname")
-
-
 def die_with_parent() -> None:
     """Have the kernel kill this process when the thread that made it ends (prctl(2), PR_SET_PDEATHSIG)."""
     _check(_libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0), "prctl(PR_SET_PDEATHSIG)")

@@ -47,18 +47,8 @@ class Release(Enum):
         return self >= Release.V21_02
 
     @property
-    def rejects_input_by_default(self) -> bool:
-        """The stock firewall's `defaults input` is REJECT (23.05 and later)."""
-        return self >= Release.V23_05
-
-    @property
     def has_ed25519(self) -> bool:
         """dropbear knows ed25519 keys (21.02 and later); 19.07 has RSA with SHA-1 only."""
-        return self >= Release.V21_02
-
-    @property
-    def has_batctl_json(self) -> bool:
-        """batctl prints JSON (2021.1, so 21.02 and later)."""
         return self >= Release.V21_02
 
 

@@ -122,7 +122,6 @@ class LiveProgress(Progress):
     """A line per node in work that changes in place, with outcomes scrolling above and totals below."""
 
     def __init__(self, console: Console, total: int) -> None:
-        self._console = console
         self._total = total
         self._lock = threading.Lock()
         self._in_work: dict[str, tuple[str, float | None]] = {}
