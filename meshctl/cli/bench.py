@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 import socket
+from collections.abc import Mapping
 from dataclasses import replace as with_changes
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from meshctl.apply.bootstrap import BenchPlace, Found, find_node, look_around, plan_arrivals
+from meshctl.apply.bootstrap import FACTORY_ADDRESS, BenchPlace, Found, find_node, look_around, plan_arrivals
 from meshctl.apply.replace import give_up, heir_of, identity_edits, succeed
 from meshctl.cli.carry import SALT_BYTES, ask_and_carry_out, choices_of
 from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
-from meshctl.cli.session import KeyFiles, Lab, Session, session
-from meshctl.errors import ExitCode, InputError
-from meshctl.fleet import Outcome
-from meshctl.inventory.edit import Editor, save, set_node
+from meshctl.cli.session import KeyFiles, Lab, Session, exit_for, session
+from meshctl.errors import ExitCode, InputError, MeshctlError
+from meshctl.fleet import Outcome, Result
+from meshctl.inventory.edit import Change, Editor, save, set_node
 from meshctl.model import Node, NodeState
 from meshctl.report.progress import outcome_text
 
+Changes = tuple[Change, ...]
+
 # Stands for a device that is in no inventory yet.
 BENCH = "bench"
+SILENT_HINT = f"is it plugged in, on for a minute, and has this machine an address in {FACTORY_ADDRESS}'s network?"
 
 At = Annotated[
     list[str] | None,
@@ -84,7 +89,7 @@ def bootstrap(
             for name, item in arrivals.found.items():
                 typer.echo(f"{name}: found at {item.place.endpoint.label}, host key {item.key.fingerprint}")
         if not arrivals.found:
-            raise typer.Exit(ExitCode.UNREACHABLE if arrivals.outcomes else ExitCode.OK)
+            raise typer.Exit(exit_for(arrivals.outcomes, opened.interrupt))
         prepared = plan_arrivals(
             opened.renderer,
             arrivals,
@@ -103,8 +108,9 @@ def bootstrap(
 
 def _complain(outcome: Outcome) -> None:
     typer.echo(f"{outcome_text(outcome)}", err=True)
-    if outcome.hint:
-        typer.echo(f"  hint: {outcome.hint}", err=True)
+    hint = outcome.hint or (SILENT_HINT if outcome.result is Result.UNREACHABLE else "")
+    if hint:
+        typer.echo(f"  hint: {hint}", err=True)
 
 
 def _spots(at: list[str], interfaces: list[str]) -> list[BenchPlace]:
@@ -176,9 +182,7 @@ def replace(
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
         node = find_node(opened.fleet, old)
-        spare = None if new == BENCH else find_node(opened.fleet, new)
-        if spare is not None and (spare.name == node.name or spare.state is not NodeState.SPARE):
-            raise InputError(f"{spare.name} is {spare.state.value}: expected a spare", hint="`meshctl inventory state`")
+        spare = _spare(opened, node, new)
         spots = _spots([at] if at else [], [interface] if interface else []) or [BenchPlace()][: spare is None]
         place = with_changes(spots[0], node=node.name) if spots else None
         fleet = heir_of(opened.fleet, node, spare)
@@ -211,14 +215,43 @@ def replace(
             if status != ExitCode.OK:
                 give_up(opened.trust, node, successor)
         if status == ExitCode.OK:
-            _write_identity(inventory, node, spare, successor.arrivals.found[node.name])
-            if spare is not None:
-                opened.trust.forget(spare.name)
+            changes = _learn_identity(opened, inventory, node, spare, successor.arrivals.found[node.name])
+            typer.echo("".join(change.diff() for change in changes), nl=False, err=as_json)
         raise typer.Exit(status)
 
 
-def _write_identity(inventory: Path, node: Node, spare: Node | None, found: Found) -> None:
+def _spare(opened: Session, old: Node, new: str) -> Node | None:
+    """None for a device that is in no inventory."""
+    if new == BENCH:
+        return None
+    spare = find_node(opened.fleet, new)
+    if spare.name == old.name:
+        raise InputError(f"{spare.name} cannot take over from itself")
+    if spare.state is not NodeState.SPARE:
+        hint = f"`meshctl inventory state {spare.name} spare`, if it is one"
+        raise InputError(f"{spare.name} is {spare.state.value}: expected a spare", hint=hint)
+    return spare
+
+
+def _learn_identity(opened: Session, inventory: Path, node: Node, spare: Node | None, found: Found) -> Changes:
+    """Into the inventory and the pins. Raises InputError that says what to write there, when it cannot be written."""
     mine, theirs = identity_edits(node, spare, found.seen)
+    if spare is not None:
+        opened.trust.forget(spare.name)
+    try:
+        return _write_identity(inventory, node, spare, found, mine, theirs)
+    except MeshctlError as error:
+        both = {node.name: dict(mine), **({spare.name: dict(theirs)} if spare is not None else {})}
+        edits = {name: edit for name, edit in both.items() if edit}
+        raise InputError(
+            f"{node.name} runs on its new device, but the inventory could not learn of it: {error}",
+            hint=f"mend it, then write under `nodes`: {json.dumps(edits)}",
+        ) from error
+
+
+def _write_identity(
+    inventory: Path, node: Node, spare: Node | None, found: Found, mine: Mapping[str, Any], theirs: Mapping[str, Any]
+) -> Changes:
     editor = Editor.open(inventory, environ=os.environ)
     # the spare's entry first: two nodes with one MAC would be refused
     if spare is not None:
@@ -231,6 +264,5 @@ def _write_identity(inventory: Path, node: Node, spare: Node | None, found: Foun
     if node.host_keys:
         set_node(editor, node.name, {"host_keys": [found.key.text]})
     changes = editor.changes()
-    for change in changes:
-        typer.echo(change.diff(), nl=False)
     save(changes)
+    return changes

@@ -37,9 +37,14 @@ def init(
 
     Example: meshctl init my-fleet && meshctl lint my-fleet
     """
-    files = write_starter(directory, _public_key(ssh_key))
+    key = _public_key(ssh_key)
+    files = write_starter(directory, key)
     for file in files:
         typer.echo(f"wrote {file}")
+    if not key:
+        typer.echo(
+            "no public key was found in ~/.ssh: enter yours as operators.ssh_keys, or nobody may log in", err=True
+        )
     typer.echo(f"next: edit it, then `meshctl lint {directory}`")
 
 

@@ -74,7 +74,8 @@ def apply(
     try:
         text = plan_file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{plan_file}: cannot be read: {error}") from error
+        what = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{plan_file}: cannot be read: {what}") from error
     saved = load(text, str(plan_file))
     with session(inventory, key_files=key or (), lab=lab) as opened:
         if saved.plan.fleet != opened.fleet.name:
@@ -137,7 +138,7 @@ def resume(
             raise InputError(f"run {record.id} put a backup back, which the inventory does not know", hint=hint)
         names = _still_managed(opened, left)
         if not names:
-            typer.echo(f"run {record.id} left nothing to do")
+            typer.echo(f"run {record.id} left nothing to do", err=as_json)
             return
         if not as_json:
             typer.echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")

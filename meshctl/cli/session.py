@@ -115,7 +115,8 @@ def chosen(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[Node, ...]:
     for pattern in wanted:
         if not any(fnmatchcase(name, pattern) for name in managed):
             raise InputError(
-                f"no managed node of {fleet.name} is called {pattern!r}", hint=did_you_mean(pattern, managed)
+                f"no managed node of {fleet.name} is called {pattern!r}",
+                hint=did_you_mean(pattern, managed) or "`meshctl inventory list` shows all",
             )
     return tuple(node for name, node in managed.items() if any(fnmatchcase(name, pattern) for pattern in wanted))
 

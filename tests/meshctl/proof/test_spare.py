@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -13,12 +14,13 @@ pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab"), pytest.mark.timeo
 
 
 def test_a_spare_takes_over_a_dead_nodes_name_address_and_pin(tmp_path: Path) -> None:
-    with Rig(tmp_path, 2) as rig:
+    with Rig(tmp_path, 3) as rig:
         taken = rig.take_in("a")
         assert taken.code == 0, taken.out + taken.err
         inventory = rig.inventory("spare")
         text = rig.inventory("a").read_text(encoding="utf-8")
-        inventory.write_text(text + "  n002: {state: spare, label: S1}\n", encoding="utf-8")
+        spares = "".join(f"  n00{number}: {{state: spare, label: S{number}}}\n" for number in (2, 3))
+        inventory.write_text(text + spares, encoding="utf-8")
         alive = rig.meshctl("replace", "spare", "n001", "n002", "--yes", "--json")
         assert "still answers" in alive.err
         rig.fleet.break_("n001", "off")
@@ -26,5 +28,20 @@ def test_a_spare_takes_over_a_dead_nodes_name_address_and_pin(tmp_path: Path) ->
         assert (replaced.code, replaced.results) == (0, {"n001": "done"}), replaced.out + replaced.err
         assert rig.fleet.node("n002").address == "10.42.1.1"
         fleet = load_fleet(inventory)
-        assert (fleet.nodes["n001"].label, fleet.nodes["n002"].state.value) == ("S1", "retired")
+        assert (fleet.nodes["n001"].label, fleet.nodes["n002"].state.value) == ("S2", "retired")
         assert rig.meshctl("provision", "spare", "n001", "--check", "--json").verdicts == {"n001": "same"}
+        # its successor dies, too, and somebody breaks the inventory while the next one takes over
+        rig.fleet.break_("n002", "off")
+        good = inventory.read_text(encoding="utf-8")
+        with rig.start("replace", "spare", "n001", "n003", "--yes", "--json") as process:
+            assert process.stdout is not None
+            for line in process.stdout:
+                if json.loads(line)["event"] == "step":
+                    inventory.write_text(good + "nonsense: [", encoding="utf-8")
+            assert process.stderr is not None
+            trouble = process.stderr.read()
+        assert process.returncode == 2, trouble
+        assert "n001 runs on its new device, but the inventory could not learn of it" in trouble
+        assert '{"n001": {"label": "S3"}, "n003": {"state": "retired"}}' in trouble
+        inventory.write_text(good, encoding="utf-8")
+        assert rig.fleet.node("n003").address == "10.42.1.1"
