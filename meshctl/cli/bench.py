@@ -108,7 +108,8 @@ def bootstrap(
 
 def _complain(outcome: Outcome) -> None:
     typer.echo(f"{outcome_text(outcome)}", err=True)
-    hint = outcome.hint or (SILENT_HINT if outcome.result is Result.UNREACHABLE else "")
+    is_silent = outcome.result is Result.UNREACHABLE and FACTORY_ADDRESS in outcome.node
+    hint = outcome.hint or (SILENT_HINT if is_silent else "")
     if hint:
         typer.echo(f"  hint: {hint}", err=True)
 

@@ -64,15 +64,6 @@ def test_a_backup_brings_back_what_was(rig: Rig) -> None:
     assert "the backup is of n001, not of n002" in wrong.err
 
 
-def test_a_device_with_another_host_key_is_no_unreachable_one_and_is_taken_when_told_so(rig: Rig) -> None:
-    rig.fleet.break_("n001", "host-key")
-    refused = rig.meshctl("bootstrap", rig.current, "n001", "--yes", "--json")
-    assert refused.code == 1, refused.err
-    assert "--replace-key" in refused.err
-    taken = rig.meshctl("bootstrap", rig.current, "n001", "--replace-key", "--yes", "--json")
-    assert (taken.code, taken.results) == (0, {"n001": "unchanged"}), taken.out + taken.err
-
-
 def test_a_command_runs_on_all_nodes_and_a_failure_is_told(rig: Rig) -> None:
     done = rig.meshctl("run", rig.current, "n*", command=["grep", "^node=", "/etc/meshctl/node"])
     assert (done.code, sorted(done.out.splitlines())) == (0, [f"{name}: node={name}" for name in rig.names])
