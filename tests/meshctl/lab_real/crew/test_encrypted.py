@@ -105,10 +105,10 @@ def test_who_does_not_know_the_key_stays_outside(crew: Crew) -> None:
     crew.settle()
 
 
-def test_the_whole_mesh_takes_new_keys_over_itself(crew: Crew) -> None:
-    crew.write_keys(main="the new word of all", fast="the new one for five gigahertz")
-    last = crew.provision()[-1]
-    assert {event["outcome"]["result"] for event in last if event["event"] == "finished"} == {"done"}
-    assert keys(crew) == {"main": {"the new word of all"}, "fast": {"the new one for five gigahertz"}}
+def test_the_whole_mesh_takes_a_new_key_over_itself(crew: Crew) -> None:
+    crew.write_keys(main="the new word of all")
+    last = crew.provision(*FIELDED)[-1]
+    assert {event["outcome"]["result"] for event in last if event["event"] == "finished"} <= {"done", "unchanged"}
+    assert keys(crew) == {"main": {"the new word of all"}, "fast": {KEYS["fast"]}}
     crew.settle()
-    until(lambda: all_are_let_in(crew), "every neighbour to be authorized with the new keys")
+    until(lambda: all_are_let_in(crew), "every neighbour to be authorized with the new key")
