@@ -122,6 +122,7 @@ class AdaptiveWindow:
     """The law of the module's docstring."""
 
     __slots__ = (
+        "_alone",
         "_drained_at",
         "_empty_rounds",
         "_full_capacity",
@@ -153,6 +154,7 @@ class AdaptiveWindow:
         self.phase = Phase.STARTUP
         self._latest_four: deque[float] = deque(maxlen=4)
         self._rates: deque[tuple[float, float]] = deque()
+        self._alone = 0
         self._round_ends = 0
         self._updated_at = 0.0
         self._drained_at = 0.0
@@ -204,6 +206,7 @@ class AdaptiveWindow:
         rate: float | None,
         *,
         limited: bool,
+        ahead: int,
         loss: float,
         now: float,
     ) -> None:
@@ -214,8 +217,10 @@ class AdaptiveWindow:
         if rate is not None:
             self._saw_rate(rate, limited=limited, now=now)
         self._latest_four.append(trip.latest)
-        if limited and len(self._latest_four) == 4 and min(self._latest_four) > 1.15 * trip.least + START_QUEUE_S:
-            # So little was on its way that none of this is our queue: the path itself is longer now.
+        self._alone = self._alone + 1 if ahead < LEAST_WINDOW - 1 else 0
+        if limited and self._alone >= 4 and min(self._latest_four) > 1.15 * trip.least + START_QUEUE_S:
+            # None of the four found more of ours on its way than a drain leaves: the path itself is longer now. (An
+            # application that pauses says nothing of that: a link that became slow still holds what it sent before.)
             trip.forget_least(min(self._latest_four), now)
         if self.phase is Phase.DRAIN:
             if in_flight <= self.packets:

@@ -34,6 +34,14 @@ class Mark(NamedTuple):
     limited: bool
     """The application, not the window, decided how much was sent."""
     urgent: bool = False
+    first: int = 0
+    """Number of the burst's first packet."""
+    outstanding: int = 0
+    """Packets that were on their way when it left."""
+
+    def ahead_of(self, number: int) -> int:
+        """Packets of ours that were on their way when packet `number` of the burst left."""
+        return self.outstanding + number - self.first
 
 
 class Packet(NamedTuple):

@@ -147,6 +147,7 @@ class Outbound(OpenMessages):
                 self._settle_overdue()
             rate: float | None = None
             largest = -1
+            ahead = 0
             count = len(acknowledged)
             self.delivered_packets += count
             if newest is not None:
@@ -157,6 +158,7 @@ class Outbound(OpenMessages):
                 if elapsed > 0 and not after_silence:
                     rate = (self.delivered_packets - mark.delivered) / elapsed
                 self.delivered_sent_at = mark.sent_at
+                ahead = mark.ahead_of(ack.largest)
             self.delivered_at = now
             limited = newest is None or newest.mark.limited
             self.window.acknowledged(
@@ -166,6 +168,7 @@ class Outbound(OpenMessages):
                 flight.outstanding,
                 rate,
                 limited=limited,
+                ahead=ahead,
                 loss=self.loss,
                 now=now,
             )
@@ -399,4 +402,13 @@ class Outbound(OpenMessages):
         """The state in which the packets of one burst leave."""
         if not self.flight.outstanding and not self.struggling and self.silent_since is None:
             self.delivered_at = self.delivered_sent_at = self.last_progress = now
-        return Mark(now, self.delivered_packets, self.delivered_at, self.delivered_sent_at, self.limited, urgent)
+        return Mark(
+            now,
+            self.delivered_packets,
+            self.delivered_at,
+            self.delivered_sent_at,
+            self.limited,
+            urgent,
+            self.flight.next_number,
+            self.flight.outstanding,
+        )

@@ -30,10 +30,12 @@ class Window(Protocol):
         rate: float | None,
         *,
         limited: bool,
+        ahead: int,
         loss: float,
         now: float,
     ) -> None:
-        """`count` packets were newly acknowledged, up to number `largest`; `rate` is a delivery rate sample."""
+        """`count` packets were newly acknowledged, up to number `largest`; `rate` is a delivery rate sample.
+        When the newest of them left, `ahead` others were on their way; its burst was `limited` by the application."""
         ...
 
     def capacity(self) -> float | None:
@@ -66,6 +68,7 @@ class FixedWindow:
         rate: float | None,
         *,
         limited: bool,
+        ahead: int,
         loss: float,
         now: float,
     ) -> None:

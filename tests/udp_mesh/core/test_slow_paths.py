@@ -14,6 +14,8 @@ TOPICS = (Topic("status", priority=0), Topic("map", priority=7), Topic("video", 
     [
         # a full queue of this link holds six seconds
         (200e3, 0.01, 1.5),
+        # the pauses of an application that sends on and on say nothing of the queue
+        (1e6, 0.01, 0.1),
         (20e6, 0.8, 0.9),
     ],
 )
