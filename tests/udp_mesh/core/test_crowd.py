@@ -48,7 +48,9 @@ def settled_queue(share: float, loss: float) -> float:
         now += 1 / rate
         trip.sample(max(base, window.packets / rate), now)
         in_flight = int(window.packets)
-        window.acknowledged(1, number, number + in_flight, in_flight, rate, limited=False, ahead=in_flight, loss=loss, now=now)
+        window.acknowledged(
+            1, number, number + in_flight, in_flight, rate, limited=False, ahead=in_flight, loss=loss, now=now
+        )
     return window.packets - base * rate
 
 
