@@ -2,15 +2,16 @@
 
 `switch`: every node is prepared and armed (`_prepare`); each is given the same moment, as its own uptime measured just
 before (`_schedule`), so no clock has to be right; then all are looked for in the new cell (`_gather_again`). When all
-have proven themselves they are confirmed; at the last moment a quorum with the base among it is enough. Otherwise those
-that can be reached are taken back, the farthest first, and the others go back by their own timers.
+have proven themselves they are confirmed; at the last moment a quorum of each mesh with the base among it is enough.
+Otherwise those that can be reached are taken back, the farthest first, and the others go back by their own timers.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -50,6 +51,11 @@ class Member:
     def name(self) -> str:
         return self.job.name
 
+    @property
+    def meshes(self) -> tuple[str, ...]:
+        """The meshes whose cell it changes."""
+        return self.job.plan.parted_from
+
 
 @dataclass(slots=True)
 class _Switch:
@@ -80,9 +86,23 @@ def switch(work: Work, jobs: Sequence[Job], *, quorum: float, parallel: int, ent
         _schedule(run)
         if not all(member.is_scheduled for member in members):
             return _call_off(run, "the switch was called off: not every node took the moment")
-        needed = max(1, math.ceil(quorum * len(members)))
-        work.note(f"{len(members)} nodes change at one moment; {needed} of them have to meet again")
+        needed = needed_of(members, quorum)
+        told = ", ".join(f"{count} of mesh {mesh}" if len(needed) > 1 else f"{count}" for mesh, count in needed.items())
+        work.note(f"{len(members)} nodes change at one moment; {told} of them have to meet again")
         return _settle(run, needed)
+
+
+def needed_of(members: Iterable[Member], quorum: float) -> dict[str, int]:
+    """How many nodes of each changing mesh have to meet again."""
+    counts = Counter(mesh for member in members for mesh in member.meshes)
+    return {mesh: max(1, math.ceil(quorum * count)) for mesh, count in counts.items()}
+
+
+def missing_of(proven: Iterable[Member], needed: Mapping[str, int]) -> str:
+    """Which meshes are short of nodes; empty when each has as many as it needs."""
+    there = Counter(mesh for member in proven for mesh in member.meshes)
+    short = {mesh: count for mesh, count in needed.items() if there[mesh] < count}
+    return "; ".join(f"{there[mesh]} of mesh {mesh} met again, {count} needed" for mesh, count in short.items())
 
 
 def _prepare(run: _Switch, member: Member) -> None:
@@ -143,7 +163,7 @@ def _call_off(run: _Switch, reason: str) -> dict[str, Outcome]:
     return {member.name: member.failure or Outcome(member.name, Result.PENDING, reason) for member in run.members}
 
 
-def _settle(run: _Switch, needed: int) -> dict[str, Outcome]:
+def _settle(run: _Switch, needed: Mapping[str, int]) -> dict[str, Outcome]:
     """Look for everybody in the new cell until all are there or it is time to decide; then decide, once."""
     pace = Pace(run.window_s * (1 - CONFIRM_SHARE), run.work.interrupt)
     run.work.interrupt.wait(max(member.attempt.settle_s for member in run.members if member.attempt is not None))
@@ -157,12 +177,10 @@ def _settle(run: _Switch, needed: int) -> dict[str, Outcome]:
     has_entry = (
         not run.entry or any(m.name == run.entry for m in proven) or all(m.name != run.entry for m in run.members)
     )
-    if len(proven) >= needed and has_entry:
+    why = missing_of(proven, needed) if has_entry else "the base did not come back"
+    if not why:
         return _keep(run)
     absent = ", ".join(member.name for member in run.members if not member.is_proven)
-    why = (
-        f"{len(proven)} of {len(run.members)} met again, {needed} needed" if has_entry else "the base did not come back"
-    )
     run.work.note(f"{why}; without {absent}: everything goes back")
     return _undo(run, why)
 

@@ -7,7 +7,7 @@ that differ, what their reload cuts, and what would part the node from its mesh.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from meshctl.device.observation import Observation
@@ -67,6 +67,7 @@ def node_plan(
         node.name,
         Verdict.SAME,
         splits=tuple(f"{radio}: {one}" for radio, all_of_it in split.items() for one in all_of_it),
+        parted_from=_parted_from(node, split),
         meshes=node.meshes,
         has_cell=bool(live),
         is_meshed=is_meshed(seen, live),
@@ -91,6 +92,15 @@ def node_plan(
         effects=told,
         notes=(*seen.notes, *_cautions(wanted, live_after, firmware)),
     )
+
+
+def _parted_from(node: Node, radios: Iterable[str]) -> tuple[str, ...]:
+    """The meshes of these radios, or all of the node's when one of the radios is not in the inventory."""
+    mesh_of = {radio.name: radio.mesh for radio in node.radios}
+    names = set(radios)
+    if not names <= set(mesh_of):
+        return node.meshes
+    return tuple(dict.fromkeys(mesh for name, mesh in mesh_of.items() if name in names and mesh is not None))
 
 
 def _cautions(wanted: Wanted, cells_to_come: Mapping[str, Cell], firmware: FirmwareStep | None) -> tuple[str, ...]:

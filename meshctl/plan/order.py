@@ -29,7 +29,7 @@ class Surroundings:
 def stages_of(
     plans: Iterable[NodePlan], around: Surroundings, switches: Mapping[str, Sequence[str]] | None = None
 ) -> tuple[Stage, ...]:
-    """The stages for all plans with something to do. `switches` maps a mesh to the nodes that change cell together."""
+    """The stages for all plans with something to do. `switches` maps meshes to the nodes that change cell together."""
     switched = {name for nodes in (switches or {}).values() for name in nodes}
     todo = [plan for plan in plans if plan.node not in switched]
     rank = {name: position for position, name in enumerate(around.graph.farthest_first(around.entry))}
@@ -60,10 +60,11 @@ def _switch(mesh: str, nodes: Sequence[str], around: Surroundings) -> Stage:
     last = [name for name in nodes if name == around.entry]
     names = sorted((name for name in nodes if name != around.entry), key=lambda name: (order.get(name, -1), name))
     count = len(nodes)
+    what = f"meshes {mesh} change their cells" if "," in mesh else f"mesh {mesh} changes its cell"
     return Stage(
         StageKind.SWITCH,
         (*names, *last),
-        f"mesh {mesh} changes its cell: {count} node{'s' if count > 1 else ''} at one moment, undone everywhere unless "
+        f"{what}: {count} node{'s' if count > 1 else ''} at one moment, undone everywhere unless "
         f"{around.policy.quorum:.0%} of them meet again",
         mesh=mesh,
     )

@@ -28,7 +28,7 @@ from meshctl.plan.values import (
 )
 
 FORMAT = "meshctl-plan"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +116,7 @@ def _node(data: Mapping[str, Any]) -> NodePlan:
         files=tuple(FileChange(**{key: str(text) for key, text in change.items()}) for change in data["files"]),
         effects=tuple(Effect(str(item["service"]), Cut(item["cut"]), str(item["why"])) for item in data["effects"]),
         splits=_texts(data["splits"]),
+        parted_from=_texts(data["parted_from"]),
         meshes=_texts(data["meshes"]),
         has_cell=bool(data["has_cell"]),
         is_meshed=bool(data["is_meshed"]),

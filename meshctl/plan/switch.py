@@ -2,7 +2,7 @@
 
 A mesh whose members already run the cell to come takes strays back one by one. Otherwise all members that run another
 cell change together, at one moment; members that do not answer would stay behind in the old cell, so they have to be
-acknowledged by name.
+acknowledged by name. A node's files change all at once: meshes that share a changing node are one switch.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ ALL = "all"
 
 @dataclass(frozen=True, slots=True)
 class Switches:
-    """`nodes`: mesh -> the nodes that change cell together. `left_behind`: mesh -> members that are off, not
-    acknowledged. `blocked`: mesh -> members that answer and yet cannot take part, with the reason."""
+    """`nodes`: mesh, or meshes (`main, far`) -> the nodes that change cell together. `left_behind`: mesh -> members
+    that are off, not acknowledged. `blocked`: mesh -> members that answer and yet cannot take part, with the reason."""
 
     nodes: Mapping[str, tuple[str, ...]]
     left_behind: Mapping[str, tuple[str, ...]]
@@ -44,9 +44,9 @@ def switches(
     blocked: dict[str, tuple[str, ...]] = {}
     for mesh in fleet.meshes:
         members = [plans[node.name] for node in fleet.members(mesh) if node.name in plans]
-        parting = [plan for plan in members if plan.splits and plan.verdict is Verdict.CHANGE]
+        parting = [plan for plan in members if mesh in plan.parted_from and plan.verdict is Verdict.CHANGE]
         beside = [around[node.name] for node in fleet.members(mesh) if node.name in around and node.name not in plans]
-        staying = [plan for plan in (*members, *beside) if plan.has_cell and not plan.splits]
+        staying = [plan for plan in (*members, *beside) if plan.has_cell and mesh not in plan.parted_from]
         # the mesh is where most of its members are; a few that differ from it come back to it
         if not parting or len(staying) >= len(parting):
             continue
@@ -65,4 +65,15 @@ def switches(
         )
         if behind and ALL not in known:
             left[mesh] = behind
-    return Switches(nodes, left, blocked)
+    return Switches(_joined(nodes), left, blocked)
+
+
+def _joined(switching: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """Switches that share nodes as one, named after all of their meshes."""
+    joined: list[tuple[tuple[str, ...], tuple[str, ...]]] = []
+    for mesh, nodes in switching.items():
+        sharing = [switch for switch in joined if set(switch[1]) & set(nodes)]
+        joined = [switch for switch in joined if switch not in sharing]
+        meshes = (*(name for names, _ in sharing for name in names), mesh)
+        joined.append((meshes, tuple(dict.fromkeys((*(node for _, old in sharing for node in old), *nodes)))))
+    return {", ".join(meshes): nodes for meshes, nodes in joined}

@@ -77,8 +77,8 @@ class NodePlan:
     """One node: what is done to it, in this order: firmware, packages, files.
 
     `observed` and `wanted` are fingerprints of what was seen and what is to be; `splits` names what parts
-    the cell that it runs from the wanted one (`channel 6 -> 11`), `meshes` which meshes that concerns; `has_cell`
-    whether a radio is configured for some mesh now, `is_meshed` whether it is part of a running one.
+    the cell that it runs from the wanted one (`channel 6 -> 11`), `parted_from` which of its `meshes` that concerns;
+    `has_cell` whether a radio is configured for some mesh now, `is_meshed` whether it is part of a running one.
     """
 
     node: str
@@ -90,6 +90,7 @@ class NodePlan:
     files: tuple[FileChange, ...] = ()
     effects: tuple[Effect, ...] = ()
     splits: tuple[str, ...] = ()
+    parted_from: tuple[str, ...] = ()
     meshes: tuple[str, ...] = ()
     has_cell: bool = False
     is_meshed: bool = False
@@ -116,7 +117,8 @@ class StageKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Nodes in work together; the next stage begins when all of them have ended. `mesh` is set for a SWITCH."""
+    """Nodes in work together; the next stage begins when all of them have ended. `mesh` is set for a SWITCH:
+    one mesh, or all that change with it (`main, far`)."""
 
     kind: StageKind
     nodes: tuple[str, ...]

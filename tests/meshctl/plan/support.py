@@ -65,6 +65,37 @@ def fleet(*, channel: int = 6, max_down: int = 1, canary: bool = False, firmware
         return load_fleet(path)
 
 
+@cache
+def two_meshes(*, channel: int = 6, far_channel: int = 36) -> Fleet:
+    """A base and b01 in mesh `main`, b03 and b04 in mesh `far`, b02 in both."""
+    text = INVENTORY.format(channel=channel, max_down=1, canary="false", firmware="")
+    head, nodes = text.split("defaults:")
+    radio = "radio1: {path: platform/ahb/18100000.pcie, band: 5g, rated_power_dbm: 30, max_drive_dbm: 27}"
+    head = head.replace("max_drive_dbm: 27}\n", f"max_drive_dbm: 27}}\n      {radio}\n", 1)
+    head += f"""  far:
+    ssid: far
+    bssid: 02:ca:fe:00:00:02
+    band: 5g
+    channel: {far_channel}
+    encryption: psk2+ccmp
+    key: {{env: MESH_KEY}}
+    network: 10.42.0.0/24
+"""
+    main, far = "{radio1: {mesh: null}}", "{radio0: {mesh: null}}"
+    nodes = f"""defaults: {{hardware: box, state: deployed}}
+nodes:
+  base: {{role: base, address: 10.42.0.1, radios: {main}}}
+  b01: {{role: beacon, address: 10.42.0.101, radios: {main}}}
+  b02: {{role: beacon, address: 10.42.0.102}}
+  b03: {{role: beacon, address: 10.42.0.103, radios: {far}}}
+  b04: {{role: beacon, address: 10.42.0.104, radios: {far}}}
+"""
+    with TemporaryDirectory() as directory:
+        path = Path(directory) / "fleet.yaml"
+        path.write_text(head + nodes, encoding="utf-8")
+        return load_fleet(path)
+
+
 def secret(ref: SecretRef) -> Secret:
     return Secret(PASS_PHRASE)
 

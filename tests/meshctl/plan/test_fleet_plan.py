@@ -12,7 +12,7 @@ from meshctl.errors import InputError
 from meshctl.model import Fleet, Node, NodeState
 from meshctl.plan import Plan, StageKind, Verdict, fleet_plan
 from meshctl.plan.saved import SavedPlan, dump, load, moved_on
-from tests.meshctl.plan.support import PASS_PHRASE, SALT, factory, fleet, graph, planned, plans, running
+from tests.meshctl.plan.support import PASS_PHRASE, SALT, factory, fleet, graph, planned, plans, running, two_meshes
 
 TEAM = ("base", "b01", "b02", "b03", "b04", "b05")
 STAR = graph(*(f"base-{name}" for name in TEAM[1:]))
@@ -33,6 +33,24 @@ def test_another_channel_is_one_switch_of_the_whole_mesh() -> None:
     plan = changed_channel()
     assert [(stage.kind, set(stage.nodes)) for stage in plan.stages] == [(StageKind.SWITCH, set(TEAM))]
     assert plan.refusal == ""
+
+
+def switches_of(new: Fleet) -> list[tuple[str, set[str]]]:
+    """The switches that lead from both meshes as they are to `new`."""
+    seen = {name: running(two_meshes(), name) for name in new.nodes}
+    stages = fleet_plan(new, plans(new, seen), graph("base-b01", "b01-b02", "b02-b03", "b03-b04"), now_s=0.0).stages
+    assert all(stage.kind is StageKind.SWITCH for stage in stages)
+    return [(stage.mesh, set(stage.nodes)) for stage in stages]
+
+
+def test_meshes_that_share_a_changing_node_are_one_switch() -> None:
+    everybody = {"base", "b01", "b02", "b03", "b04"}
+    assert switches_of(two_meshes(channel=11, far_channel=40)) == [("main, far", everybody)]
+
+
+def test_a_node_of_two_meshes_switches_with_the_one_that_changes() -> None:
+    assert switches_of(two_meshes(channel=11)) == [("main", {"base", "b01", "b02"})]
+    assert switches_of(two_meshes(far_channel=40)) == [("far", {"b02", "b03", "b04"})]
 
 
 def test_a_switch_never_leaves_anybody_behind_unasked() -> None:
@@ -147,7 +165,7 @@ def test_a_saved_plan_reads_back_equal_and_holds_no_secret() -> None:
     ("damage", "message"),
     [
         (lambda document: document.update(format="other"), "expected a plan written by"),
-        (lambda document: document.update(version=9), "expected a plan of version 1, found 9"),
+        (lambda document: document.update(version=9), "expected a plan of version 2, found 9"),
         (lambda document: document.pop("stages"), "'stages' is missing"),
         (lambda document: document["nodes"][0].update(verdict="maybe"), "'maybe' is not a valid Verdict"),
         (lambda document: document["stages"][0].update(nodes=["b99"]), "stages name b99"),
