@@ -39,10 +39,13 @@ class Renderer:
 
 
 def device_facts(seen: Observation | None) -> DeviceFacts:
-    """What has to be carried over from the device: `system.compat_version`, which sysupgrade compares."""
-    system = None if seen is None else packages_seen(("etc/config/system",), seen)["system"]
-    sections = () if system is None else system.of_type("system")
-    return DeviceFacts(next((text for section in sections if (text := section.get("compat_version"))), ""))
+    """What has to be carried over from the device (`meshctl.render.facts`)."""
+    if seen is None:
+        return DeviceFacts()
+    paths = ("etc/config/network", "etc/config/system", "etc/config/wireless")
+    packages = {name: package for name, package in packages_seen(paths, seen).items() if package is not None}
+    sections = packages["system"].of_type("system") if "system" in packages else ()
+    return DeviceFacts(next((text for section in sections if (text := section.get("compat_version"))), ""), packages)
 
 
 def _groups(fleet: Fleet, node: Node, packages: Iterable[str]) -> tuple[tuple[str, ...], ...]:

@@ -151,6 +151,7 @@ def _hardware(name: str, document: HardwareDocument, root: MappingNode) -> Hardw
         package_files=tuple(document.package_files),
         confirm_window_s=document.confirm_window_s,
         recovery=document.recovery,
+        switch_vlans=tuple(document.switch_vlans.items()),
     )
 
 

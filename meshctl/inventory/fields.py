@@ -22,6 +22,7 @@ _WHOLE = re.compile(r"[-+]?[0-9]{1,15}")
 _REAL = re.compile(r"[-+]?(?:[0-9]{1,15}(?:\.[0-9]{0,15})?|\.[0-9]{1,15})(?:[eE][-+]?[0-9]{1,2})?")
 _FLAGS = {"true": True, "false": False, "yes": True, "no": False, "on": True, "off": False}
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
+_SWITCH_PORTS = "[0-9]{1,2}t?( [0-9]{1,2}t?)*"
 _MAC = re.compile(r"[0-9A-Fa-f]{2}(?:[:-][0-9A-Fa-f]{2}){5}")
 
 
@@ -80,6 +81,19 @@ def _country(value: str) -> str:
     if re.fullmatch("[A-Z]{2}", value):
         return value
     raise wrong("a country code of two capital letters such as US")
+
+
+def _vlan(value: str) -> str:
+    # swconfig's drivers take VLANs 1 to 127 or to 4094; 802.1Q has no more
+    if re.fullmatch("[1-9][0-9]{0,3}", value) and int(value) <= 4094:
+        return value
+    raise wrong("a VLAN from 1 to 4094")
+
+
+def _switch_ports(value: str) -> str:
+    if re.fullmatch(_SWITCH_PORTS, value):
+        return value
+    raise wrong("numbers of ports, 't' behind a tagged one, such as 3 0t")
 
 
 def _address(value: object) -> IPv4Address:
@@ -144,6 +158,13 @@ Country = Annotated[
     BeforeValidator(_text),
     AfterValidator(_country),
     WithJsonSchema({"type": "string", "pattern": "^[A-Z]{2}$"}),
+]
+VlanId = Annotated[str, BeforeValidator(_text), AfterValidator(_vlan)]
+SwitchPorts = Annotated[
+    str,
+    BeforeValidator(_text),
+    AfterValidator(_switch_ports),
+    WithJsonSchema({"type": "string", "pattern": f"^{_SWITCH_PORTS}$"}),
 ]
 Version = Annotated[int, BeforeValidator(_version), WithJsonSchema({"const": FORMAT_VERSION})]
 Window = Annotated[

@@ -59,7 +59,8 @@ class Firmware:
 @dataclass(frozen=True, slots=True)
 class HardwareProfile:
     """`board` is what the device calls itself (`ubus call system board`: `compex,wpj344-16m`), `profile` the
-    ImageBuilder's name (`compex_wpj344-16m`), `target` e.g. `ath79/generic`; `lan_ports` are bridged into the LAN."""
+    ImageBuilder's name (`compex_wpj344-16m`), `target` e.g. `ath79/generic`; `lan_ports` are bridged into the LAN;
+    `switch_vlans` are the VLANs of `switch0` with their ports (`("1", "3 0t")`) where swconfig drives it."""
 
     name: str
     board: str
@@ -75,6 +76,7 @@ class HardwareProfile:
     package_files: tuple[str, ...] = ()
     confirm_window_s: int = 120
     recovery: str = ""
+    switch_vlans: tuple[tuple[str, str], ...] = ()
 
     def radio(self, name: str) -> RadioHardware | None:
         return next((radio for radio in self.radios if radio.name == name), None)

@@ -7,27 +7,20 @@ our UCI parser, and looks the same however its template is laid out.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
 
 from meshctl import uci
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.model import MASK, Fleet, Node, Secret, SecretRef
 from meshctl.render.extra import with_extra
+from meshctl.render.facts import NO_FACTS, DeviceFacts, with_kept
 from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, RenderedFile, replace_secrets
 from meshctl.render.templates import NOT_UCI, TemplateFile, Templates
 from meshctl.resolve import Intent, resolve
 
 # A WEP key has 5 letters; what is shorter, such as the index in wireless' `key '1'`, is no secret.
 _SHORTEST_SECRET = 5
-
-
-@dataclass(frozen=True, slots=True)
-class DeviceFacts:
-    """What only the device knows and its new configuration keeps: system.compat_version, which sysupgrade reads."""
-
-    compat_version: str = ""
 
 
 class UnknownNode(InvalidInput):
@@ -91,9 +84,10 @@ def render(intent: Intent, templates: Templates, device_facts: DeviceFacts | Non
 
     Raises InvalidInput for a template that fails, or whose text is no UCI.
     """
-    context = {"intent": intent, "device": device_facts or DeviceFacts()}
-    files = list(_files(intent, templates, context))
-    config_hash = _config_hash(files)
+    facts = device_facts or NO_FACTS
+    files = list(_files(intent, templates, facts))
+    # what the device brought itself is no part of what the hash names
+    config_hash = _config_hash(files if facts == NO_FACTS else list(_files(intent, templates, NO_FACTS)))
     marker = f"fleet={intent.fleet}\nnode={intent.node}\nconfig={config_hash}\n"
     files.append(RenderedFile(MARKER_PATH, 0o644, marker.encode(), marker))
     return Rendered(
@@ -106,7 +100,8 @@ def render(intent: Intent, templates: Templates, device_facts: DeviceFacts | Non
     )
 
 
-def _files(intent: Intent, templates: Templates, context: Mapping[str, object]) -> Iterator[RenderedFile]:
+def _files(intent: Intent, templates: Templates, facts: DeviceFacts) -> Iterator[RenderedFile]:
+    context = {"intent": intent, "device": facts}
     packages: dict[str, uci.Package] = {}
     for file in templates.files(intent.backend, intent.operator_parts):
         text = templates.text(file, intent.backend, intent.operator_parts, context)
@@ -115,7 +110,8 @@ def _files(intent: Intent, templates: Templates, context: Mapping[str, object]) 
             packages[package.name] = package
         else:
             yield _file(file.path, text, 0o755 if file.is_executable else 0o644, intent.secrets, None)
-    for name, package in with_extra(packages, intent).items():
+    for name, written in with_extra(packages, intent).items():
+        package = with_kept(written, facts)
         yield _file(CONFIG_FOLDER + name, uci.dump(package), 0o644, intent.secrets, package)
 
 
@@ -147,26 +143,16 @@ def _written_secrets(package: uci.Package) -> Iterator[Secret]:
 
 
 def _config_hash(files: list[RenderedFile]) -> str:
-    """SHA-256 over every file but for what the device brought itself, with each secret replaced by its fingerprint.
+    """SHA-256 over every file, with each secret replaced by its fingerprint.
 
     The hash is shown to everybody and kept in logs, so it must not let anyone try passwords against it cheaply.
     """
     digest = hashlib.sha256()
     for file in sorted(files, key=lambda file: file.path):
-        content = replace_secrets(_without_facts(file), file.secrets, _fingerprint).encode()
+        content = replace_secrets(file.content.decode(), file.secrets, _fingerprint).encode()
         digest.update(f"{file.path}\0{file.mode:o}\0{len(content)}\0".encode())
         digest.update(content)
     return digest.hexdigest()
-
-
-def _without_facts(file: RenderedFile) -> str:
-    if file.package is None or file.package.name != "system":
-        return file.content.decode()
-    sections = tuple(
-        uci.Section(s.type, s.name, {name: value for name, value in s.options.items() if name != "compat_version"})
-        for s in file.package.sections
-    )
-    return uci.dump(uci.Package("system", sections))
 
 
 # One derivation per key and process: about 50 ms each.

@@ -74,13 +74,15 @@ class BatmanInterface:
 
 @dataclass(frozen=True, slots=True)
 class Lan:
-    """The bridge that joins the node's wired ports with its mesh; it carries the management address."""
+    """The bridge that joins the node's wired ports with its mesh; it carries the management address. `switch_vlans` are
+    the VLANs of `switch0` and their ports, empty where no swconfig drives it or where only the device knows them."""
 
     bridge: str
     ports: tuple[str, ...]
     address: IPv4Interface
     gateway: IPv4Address | None
     mtu: int
+    switch_vlans: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -190,7 +190,7 @@ def _lan(node: Node, primary: Mesh | None, masters: dict[str, str], radios: tupl
             case Backend.MESHMERIZE:
                 pass
     mtu = primary.lan_mtu if primary is not None else 1500
-    return Lan(BRIDGE, tuple(dict.fromkeys(ports)), node.address, node.gateway, mtu)
+    return Lan(BRIDGE, tuple(dict.fromkeys(ports)), node.address, node.gateway, mtu, node.hardware.switch_vlans)
 
 
 def _ssh_port(node: Node) -> int:

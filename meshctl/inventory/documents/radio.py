@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument
-from meshctl.inventory.fields import Flag, Mac, Name, Network, Real, ReleaseName, Text, Whole
+from meshctl.inventory.fields import Flag, Mac, Name, Network, Real, ReleaseName, SwitchPorts, Text, VlanId, Whole
 from meshctl.model import AntennaKind, Backend, Band, Encryption, MeshMode
 
 
@@ -62,6 +62,8 @@ class HardwareDocument(Document):
     """Its radios by the names of their UCI sections."""
     lan_ports: tuple[Text, ...]
     """Ports that are bridged into the LAN, from `/etc/board.json`; `[]` for none."""
+    switch_vlans: dict[VlanId, SwitchPorts] = Field(default_factory=dict)
+    """VLANs of `switch0` where swconfig drives it (ports such as eth0.1), with their ports: `{1: "3 0t"}`."""
     memory_mib: Whole = Field(default=64, ge=8, le=1_048_576)
     """RAM in MiB."""
     flash_mib: Whole = Field(default=8, ge=4, le=1_048_576)

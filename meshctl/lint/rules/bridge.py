@@ -1,4 +1,4 @@
-"""Bridging into the robot's LAN: ports, loops, confirm windows, the firewall (MC521 to MC529)."""
+"""Bridging into the robot's LAN: ports, loops, confirm windows, the firewall (MC521 to MC530)."""
 
 from __future__ import annotations
 
@@ -208,8 +208,8 @@ def port_of_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "A bridge port and a VLAN of it are both bridged",
     why="eth0 carries eth0.1: with both in the bridge, frames of the VLAN come in twice and go round.",
     mend="List the VLANs, or the port.",
-    failing="hardware: {rocket: {lan_ports: [eth0, eth0.1]}}",
-    passing="hardware: {rocket: {lan_ports: [eth0.1, eth0.2]}}",
+    failing="hardware: {rocket: {lan_ports: [eth0, eth0.1], switch_vlans: {1: 3 0t}}}",
+    passing="hardware: {rocket: {lan_ports: [eth0.1, eth0.2], switch_vlans: {1: 3 0t, 2: 2 0t}}}",
 )
 def port_and_vlan(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for place, ports in _port_lists(fleet):
@@ -253,3 +253,30 @@ def extra_checked(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             if rest.rpartition(".")[2] in _CHECKED.get(package, ()):
                 path = ("nodes", node.name, "extra_uci", key)
                 yield Finding(path, "set behind the checks", "the inventory's own key", key)
+
+
+@fleet_rule(
+    "MC530",
+    Severity.WARNING,
+    "A VLAN port without the switch behind it",
+    why="""A port such as eth0.1 leads through a switch that swconfig drives, and /etc/config/network holds which of the
+    switch's ports belong to it. A node that is provisioned keeps what it has; an image built with the rendered files
+    has none, and nothing makes it any more: after its first boot the wired ports are dead.""",
+    mend="""Copy the sections `switch_vlan` of a new device's /etc/config/network into `switch_vlans` of the hardware:
+    `{1: "3 0t", 2: "2 0t"}`. Where the VLAN belongs to a switch outside the box, suppress this finding.""",
+    failing="hardware: {rocket: {lan_ports: [eth0.1]}}",
+    passing="hardware: {rocket: {lan_ports: [eth0.1], switch_vlans: {1: 3 0t}}}",
+)
+def vlan_without_switch(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        if "switch_vlan" in node.extra_uci.values():
+            continue
+        layout = dict(node.hardware.switch_vlans)
+        for index, port in enumerate(node.lan_ports):
+            _, dot, vlan = port.rpartition(".")
+            if not dot or vlan in layout:
+                continue
+            is_own = node.lan_ports != node.hardware.lan_ports
+            place = ("nodes", node.name) if is_own else ("hardware", node.hardware.name)
+            found = f"VLANs {listed(list(layout))}" if layout else "none"
+            yield Finding((*place, "lan_ports", str(index)), f"{port} needs it", f"VLAN {vlan} in switch_vlans", found)

@@ -58,7 +58,14 @@ def mesh(**changes: Any) -> Mesh:
 def hardware(release: Release, **changes: Any) -> HardwareProfile:
     """A WPJ344 with a radio in each band."""
     usual = HardwareProfile(
-        "wpj344", "compex,wpj344-16m", "compex_wpj344-16m", "ath79/generic", release, (RADIO_2G, RADIO_5G), ("eth0.1",)
+        "wpj344",
+        "compex,wpj344-16m",
+        "compex_wpj344-16m",
+        "ath79/generic",
+        release,
+        (RADIO_2G, RADIO_5G),
+        ("eth0.1",),
+        switch_vlans=(("1", "3 0t"), ("2", "2 0t")),
     )
     return replace(usual, **changes)
 
