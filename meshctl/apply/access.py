@@ -14,7 +14,8 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Protocol
 
-from meshctl.device.connection import Credentials, Deadlines, Endpoint
+from meshctl.device.authentication import own_keys
+from meshctl.device.connection import Credentials, Deadlines, Endpoint, OwnKey
 from meshctl.device.errors import ConnectionLost
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import HostKeyPolicy, TrustStore
@@ -56,6 +57,7 @@ class Access:
     # nodes met through one interface of this machine, by node: their new address is looked for there first
     interfaces: dict[str, str] = field(default_factory=dict)
     _kept: dict[str, SshConnection] = field(default_factory=dict, repr=False)
+    _own_keys: dict[Credentials, tuple[OwnKey, ...]] = field(default_factory=dict, repr=False)
     _jumps: dict[str, SshConnection] = field(default_factory=dict, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _jump_lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
@@ -75,6 +77,14 @@ class Access:
         named = tuple(_key_path(text, self.fleet) for text in node.ssh.key_files)
         is_new = endpoint is not None and endpoint == self.newcomers.get(node.name)
         return Credentials(key_files=(*self.key_files, *named), use_agent=self.use_agent, empty_password=is_new)
+
+    def own_keys(self, node: Node) -> tuple[OwnKey, ...]:
+        """What we can log in to this node with once it is provisioned. Raises InputError for an unusable key file."""
+        credentials = self.credentials(node)
+        with self._lock:
+            if credentials not in self._own_keys:
+                self._own_keys[credentials] = own_keys(credentials)
+            return self._own_keys[credentials]
 
     def open(
         self,

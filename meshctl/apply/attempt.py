@@ -20,7 +20,7 @@ from meshctl.apply.waiting import Pace
 from meshctl.device import deadman
 from meshctl.device.connection import Endpoint
 from meshctl.device.deadman import Change
-from meshctl.device.errors import NodeRefused
+from meshctl.device.errors import AuthenticationRefused, NodeRefused
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.observe import observe
 from meshctl.device.openwrt import root_in_ram
@@ -56,6 +56,8 @@ class Attempt:
     gaps: tuple[str, ...] = ()
     last: Observation | None = None
     trouble: str = ""
+    # that it let nobody in, since it was last seen with the change in force
+    shut_out: str = ""
     # decided against: from now on it is only ever taken back
     is_given_up: bool = False
     # what it does besides files may take so long before its window begins
@@ -168,6 +170,8 @@ def reach(attempt: Attempt) -> SshConnection | None:
             connection = job.work.access.open(job.node, endpoint=endpoint)
         except NodeError as error:
             attempt.trouble = str(error)
+            if isinstance(error, AuthenticationRefused):
+                attempt.shut_out = attempt.trouble
             continue
         if endpoint in attempt.places:
             attempt.met = endpoint
@@ -181,6 +185,7 @@ def look(attempt: Attempt, connection: SshConnection) -> Move:
     attempt.last = observe(connection)
     age_s = applied_age_s(attempt.status)
     if age_s is not None:
+        attempt.shut_out = ""
         attempt.forgetting.stands()
     attempt.gaps = missing(job.expected, attempt.last, since_s=age_s)
     if age_s is not None and age_s < attempt.settle_s:

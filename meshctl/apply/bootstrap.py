@@ -202,6 +202,7 @@ def _pin(trust: TrustStore, name: str, key: HostKey, *, replace_keys: bool) -> N
 
 def plan_arrivals(
     renderer: Renderer,
+    access: Access,
     arrivals: Arrivals,
     known: Mapping[str, LastKnown],
     *,
@@ -212,4 +213,4 @@ def plan_arrivals(
     """The plan that provisions the devices that were found."""
     first = {name: renderer.wanted(item.node) for name, item in arrivals.found.items()}
     seen = Seen({name: item.seen for name, item in arrivals.found.items()}, {})
-    return assemble(renderer, first, seen, known, salt=salt, owner=owner, choices=choices or Choices())
+    return assemble(renderer, access, first, seen, known, salt=salt, owner=owner, choices=choices or Choices())

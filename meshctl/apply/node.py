@@ -103,7 +103,7 @@ def _move(attempt: Attempt, connection: SshConnection) -> Outcome | None:
             return Outcome(name, Result.DONE)
         case Move.WENT_BACK:
             release(attempt, connection)
-            return Outcome(name, Result.ROLLED_BACK, why_it_went_back(attempt.status, attempt.gaps))
+            return Outcome(name, Result.ROLLED_BACK, why_it_went_back(attempt.status, attempt.gaps, attempt.shut_out))
         case Move.FOREIGN:
             status = attempt.status
             return Outcome(name, Result.REFUSED, f"a change of {status.owner} is {status.state} on it")

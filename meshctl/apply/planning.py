@@ -77,7 +77,7 @@ def prepare(
     )
     _remember(journal, fleet, seen)
     decided = choices or Choices()
-    single = _node_plans(renderer, first, seen, salt=salt, owner=owner, choices=decided)
+    single = _node_plans(renderer, access, first, seen, salt=salt, owner=owner, choices=decided)
     rest = _rest_of_their_meshes(fleet, single.plans.values()) or _witnesses(
         fleet, single.plans.values(), journal.last_known(fleet.name)
     )
@@ -137,6 +137,7 @@ def _plans_around(renderer: Renderer, around: Seen, salt: bytes, owner: str) -> 
 
 def assemble(
     renderer: Renderer,
+    access: Access,
     first: Mapping[str, Wanted],
     seen: Seen,
     known: Mapping[str, LastKnown],
@@ -146,7 +147,7 @@ def assemble(
     choices: Choices,
 ) -> Prepared:
     """The plan for what was rendered without the devices' facts (`first`) and what was seen."""
-    single = _node_plans(renderer, first, seen, salt=salt, owner=owner, choices=choices)
+    single = _node_plans(renderer, access, first, seen, salt=salt, owner=owner, choices=choices)
     return _in_order(renderer.fleet, single, seen, known, salt=salt, choices=choices)
 
 
@@ -161,6 +162,7 @@ class _Single:
 
 def _node_plans(
     renderer: Renderer,
+    access: Access,
     first: Mapping[str, Wanted],
     seen: Seen,
     *,
@@ -181,6 +183,7 @@ def _node_plans(
             away=seen.away.get(name, ""),
             owner=owner,
             with_firmware=choices.with_firmware,
+            own_keys=None if observation is None else access.own_keys(want.node),
         )
         error = seen.refused.get(name)
         if error is not None:

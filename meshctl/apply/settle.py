@@ -92,10 +92,12 @@ REASONS = {
 }
 
 
-def why_it_went_back(status: ChangeStatus, missing: Sequence[str]) -> str:
-    """One sentence for an outcome."""
+def why_it_went_back(status: ChangeStatus, missing: Sequence[str], shut_out: str = "") -> str:
+    """One sentence for an outcome. `shut_out` is that it let nobody in while the change was in force: what was missing
+    was then seen too late, after it went back."""
     word, _, rest = status.last_reason.partition("+")
     reason = REASONS.get(word, word or "for an unknown reason")
     if rest:
         reason += ", and packages that it installed could not be removed"
-    return f"{reason}: {'; '.join(missing)}" if missing else reason
+    details = shut_out or "; ".join(missing)
+    return f"{reason}: {details}" if details else reason

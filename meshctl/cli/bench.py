@@ -92,6 +92,7 @@ def bootstrap(
             raise typer.Exit(exit_for(arrivals.outcomes, opened.interrupt))
         prepared = plan_arrivals(
             opened.renderer,
+            opened.access,
             arrivals,
             opened.journal.last_known(opened.fleet.name),
             salt=secrets.token_bytes(SALT_BYTES),
@@ -203,6 +204,7 @@ def replace(
         try:
             prepared = plan_arrivals(
                 opened.renderer,
+                opened.access,
                 successor.arrivals,
                 opened.journal.last_known(opened.fleet.name),
                 salt=secrets.token_bytes(SALT_BYTES),

@@ -15,7 +15,7 @@ import paramiko
 from cryptography.exceptions import UnsupportedAlgorithm
 from paramiko.pkey import PKey, UnknownKeyType
 
-from meshctl.device.connection import Credentials
+from meshctl.device.connection import Credentials, OwnKey
 from meshctl.device.legacy_rsa import with_sha1
 from meshctl.errors import InputError
 from meshctl.model import Secret
@@ -60,6 +60,12 @@ def attempts(credentials: Credentials, *, legacy_rsa_sha1: bool) -> Iterator[tup
     finally:
         if agent is not None:
             agent.close()
+
+
+def own_keys(credentials: Credentials) -> tuple[OwnKey, ...]:
+    """The public parts of all keys that would be tried. Raises InputError for a key file that cannot be used."""
+    with attempts(credentials, legacy_rsa_sha1=False) as tries:
+        return tuple(OwnKey(one.name, one.key.get_name(), one.key.asbytes()) for one in tries if one.key is not None)
 
 
 def load_key(path: Path, passphrase: Secret | None) -> PKey:

@@ -6,8 +6,10 @@ of this package (`observe`, `upload`, `openwrt`, `deadman`) takes one and knows 
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
 from typing import Protocol
 
@@ -59,6 +61,30 @@ class Credentials:
     password: Secret | None = None
     empty_password: bool = False
     passphrase: Secret | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class OwnKey:
+    """The public part of a key that we can log in with: `name` says where it is (`key PATH`, `agent key COMMENT`)."""
+
+    name: str
+    key_type: str
+    blob: bytes
+
+    @property
+    def base64(self) -> str:
+        """As it stands in authorized_keys."""
+        return b64encode(self.blob).decode()
+
+    @property
+    def fingerprint(self) -> str:
+        """`SHA256:...`, as `ssh-keygen -l` shows it."""
+        return fingerprint_of(self.blob)
+
+
+def fingerprint_of(blob: bytes) -> str:
+    """`SHA256:...` of a public key's blob (RFC 4253 section 6.6): base64 without padding."""
+    return "SHA256:" + b64encode(sha256(blob).digest()).decode().rstrip("=")
 
 
 @dataclass(frozen=True, slots=True)

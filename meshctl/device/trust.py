@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from meshctl.device.connection import Endpoint
+from meshctl.device.connection import Endpoint, fingerprint_of
 from meshctl.device.errors import HostKeyChanged, HostKeyUnknown
 from meshctl.errors import InputError
 
@@ -36,7 +36,7 @@ class HostKey:
     @property
     def fingerprint(self) -> str:
         """`SHA256:...`, as `ssh-keygen -l` and newer dropbearkey show it (base64 without padding)."""
-        return "SHA256:" + base64.b64encode(hashlib.sha256(self.blob).digest()).decode().rstrip("=")
+        return fingerprint_of(self.blob)
 
     @property
     def text(self) -> str:

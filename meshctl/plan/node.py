@@ -10,11 +10,13 @@ import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from meshctl.device.connection import OwnKey
 from meshctl.device.observation import Observation
 from meshctl.model import Node, Release
 from meshctl.plan.cell import Cell, cells, split_differences
 from meshctl.plan.effects import effects
 from meshctl.plan.firmware import firmware_step
+from meshctl.plan.lockout import lockout
 from meshctl.plan.masking import Fingerprints, masked_text, secrets_of
 from meshctl.plan.objections import objection
 from meshctl.plan.packages import NO_NEEDS, Needs, package_step
@@ -48,8 +50,10 @@ def node_plan(
     away: str = "",
     owner: str = "",
     with_firmware: bool = True,
+    own_keys: Sequence[OwnKey] | None = None,
 ) -> NodePlan:
-    """The plan of one node. `seen` None means it did not answer, `away` says why; `owner` is who we are to its lock."""
+    """The plan of one node. `seen` None means it did not answer, `away` says why; `owner` is who we are to its lock,
+    `own_keys` what we log in with (None: not asked)."""
     node = wanted.node
     target = fingerprints.of(
         {file.path: f"{file.mode:o} " + file.content.decode("utf-8", "surrogateescape") for file in wanted.files},
@@ -80,6 +84,9 @@ def node_plan(
     if problem is not None:
         return replace(basis, verdict=Verdict.REFUSED, reason=problem.reason, hint=problem.hint)
     files = file_changes(wanted.files, seen)
+    shut_out = None if own_keys is None or not (files or firmware) else lockout(node, wanted.files, own_keys)
+    if shut_out is not None:
+        return replace(basis, verdict=Verdict.REFUSED, reason=shut_out.reason, hint=shut_out.hint)
     told = effects((change.path for change in files), before, after)
     if firmware is not None:
         told = (Effect("firmware", Cut.NODE, f"{firmware.from_revision} -> {firmware.to_revision}"), *told)

@@ -91,3 +91,9 @@ def test_a_person_reads_why_it_went_back() -> None:
     assert why_it_went_back(status, ()) == "its power was cut, or it rebooted, before it was confirmed"
     late = replace(status, last_reason="timeout")
     assert why_it_went_back(late, ("its LAN is down",)) == "it was not confirmed in time: its LAN is down"
+
+
+def test_that_it_let_nobody_in_counts_more_than_what_was_missing_afterwards() -> None:
+    late = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
+    told = why_it_went_back(late, ("its LAN is down",), "b01: let root in with none of: key a")
+    assert told == "it was not confirmed in time: b01: let root in with none of: key a"

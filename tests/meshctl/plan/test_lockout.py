@@ -1,0 +1,67 @@
+"""A plan that would shut meshctl itself out is refused before anything is sent."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import replace
+
+from meshctl.device.connection import OwnKey
+from meshctl.model import Release
+from meshctl.plan import Verdict
+from meshctl.plan.lockout import lockout
+from tests.meshctl.plan.support import factory, fleet, planned, running, wanted
+
+TEAM = fleet()
+AUTHORIZED = TEAM.operators.ssh_keys[0]
+OURS = OwnKey("agent key alice", "ssh-ed25519", base64.b64decode(AUTHORIZED.split()[1]))
+OTHER = OwnKey("key /home/bob/.ssh/id_ed25519", "ssh-ed25519", b"\0\0\0\x0bssh-ed25519\0\0\0 " + bytes(32))
+
+
+def test_a_change_is_planned_where_one_of_our_keys_is_let_in() -> None:
+    assert planned(TEAM, "b01", factory(TEAM, "b01"), own_keys=(OTHER, OURS)).verdict is Verdict.CHANGE
+
+
+def test_a_change_that_lets_in_none_of_our_keys_is_refused_with_both_lists() -> None:
+    plan = planned(TEAM, "b01", factory(TEAM, "b01"), own_keys=(OTHER,))
+    assert plan.verdict is Verdict.REFUSED
+    assert f"it gets the keys {OURS.fingerprint} (alice)" in plan.reason
+    assert f"{OTHER.fingerprint} ({OTHER.name})" in plan.reason
+    assert "operators.ssh_keys" in plan.hint
+    assert plan.files == ()
+
+
+def test_without_any_key_nothing_is_begun() -> None:
+    plan = planned(TEAM, "b01", factory(TEAM, "b01"), own_keys=())
+    assert plan.verdict is Verdict.REFUSED
+    assert plan.reason.endswith("the keys we have: none")
+
+
+def test_a_node_to_which_nothing_is_done_needs_none_of_our_keys() -> None:
+    assert planned(TEAM, "b01", running(TEAM, "b01"), own_keys=()).verdict is Verdict.SAME
+
+
+def test_where_the_keys_were_not_asked_for_nothing_is_said() -> None:
+    assert planned(TEAM, "b01", factory(TEAM, "b01")).verdict is Verdict.CHANGE
+
+
+def test_1907_lets_in_rsa_alone() -> None:
+    want = wanted(TEAM, "b01")
+    old = replace(want.node, release=Release.V19_07)
+    assert lockout(want.node, want.files, (OURS,)) is None
+    refused = lockout(old, want.files, (OURS,))
+    assert refused is not None
+    assert "the keys we have that OpenWrt 19.07 knows: none" in refused.reason
+
+
+def test_another_user_than_root_has_keys_of_its_own() -> None:
+    want = wanted(TEAM, "b01")
+    node = replace(want.node, ssh=replace(want.node.ssh, user="admin"))
+    assert lockout(node, want.files, ()) is None
+
+
+def test_a_line_that_is_no_key_is_told_as_one() -> None:
+    want = wanted(TEAM, "b01")
+    files = tuple(replace(f, content=b"ssh-rsa AAAA! x\n") if "authorized" in f.path else f for f in want.files)
+    refused = lockout(want.node, files, ())
+    assert refused is not None
+    assert "it gets the keys one that cannot be read" in refused.reason
