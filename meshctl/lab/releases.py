@@ -35,6 +35,7 @@ _COMMON = (
     "busybox",
     "dnsmasq",
     "dropbear",
+    "hostapd-common",
     "iw",
     "iwinfo",
     "kernel",
@@ -60,7 +61,8 @@ def image_packages(release: Release, extra: tuple[str, ...]) -> tuple[str, ...]:
     """The packages of an image: the release's own and `extra`, whose `wpad-*` takes the place of wpad-basic."""
     known = _FACTS[release]
     tool = ("apk-mbedtls",) if release.package_tool is PackageTool.APK else ("opkg",)
-    own = (*_COMMON, known.firewall)
+    scripts = ("wifi-scripts",) if release >= Release.V24_10 else ()
+    own = (*_COMMON, *scripts, known.firewall)
     supplicant = () if any(name.startswith("wpad") for name in extra) else ("wpad-basic-mbedtls",)
     return tuple(sorted({*own, *tool, *supplicant, *extra}))
 

@@ -23,6 +23,7 @@ from meshctl.plan.packages import NO_NEEDS, Needs, package_step
 from meshctl.plan.seen import file_info, fingerprint_texts, is_meshed, packages_seen, parsed, text_of
 from meshctl.plan.values import Cut, Effect, FileChange, FirmwareStep, NodePlan, Verdict
 from meshctl.render import MARKER_PATH, RenderedFile
+from meshctl.resolve import wireless_scripts
 from meshctl.uci import Package
 
 PUBLIC_FILES = (MARKER_PATH, "etc/dropbear/authorized_keys")
@@ -97,7 +98,7 @@ def node_plan(
         packages=packages,
         files=files,
         effects=told,
-        notes=(*seen.notes, *_cautions(wanted, live_after, firmware)),
+        notes=(*seen.notes, *_cautions(wanted, live_after, firmware), *_lacking_scripts(node, seen, basis, firmware)),
     )
 
 
@@ -120,6 +121,19 @@ def _cautions(wanted: Wanted, cells_to_come: Mapping[str, Cell], firmware: Firmw
     if firmware is None:
         return (f"{caution}: if this is one, the node goes back by itself",)
     return (f"{caution}, and a flash is not undone: flash one node on the bench first",)
+
+
+def _lacking_scripts(node: Node, seen: Observation, basis: NodePlan, firmware: FirmwareStep | None) -> tuple[str, ...]:
+    """That the radio's own scripts are not all there. A node that is in its mesh has them, by whatever name."""
+    package = wireless_scripts(node.release)
+    if package is None or firmware is not None or seen.packages is None or package in seen.packages:
+        return ()
+    if basis.is_meshed or not node.meshes:
+        return ()
+    return (
+        f"it lacks {package}: without its /usr/share/hostap/wdev.uc OpenWrt {node.release} brings up no mesh "
+        "interface, encrypted or not; if so, the node goes back by itself. Build the image with it",
+    )
 
 
 def file_changes(files: Sequence[RenderedFile], seen: Observation) -> tuple[FileChange, ...]:

@@ -4,7 +4,15 @@ from meshctl.resolve.airtime import originator_airtime
 from meshctl.resolve.intent import BatmanInterface, Intent, Lan, Login, MeshInterface, RadioIntent
 from meshctl.resolve.intervals import MEASURED_HEAL_S, Intervals, UnreachableTarget, batman_intervals, heal_s
 from meshctl.resolve.node import resolve
-from meshctl.resolve.packages import FULL_SUPPLICANTS, Need, PackagePlan, package_needs, package_plan, supplicant_need
+from meshctl.resolve.packages import (
+    FULL_SUPPLICANTS,
+    Need,
+    PackagePlan,
+    package_needs,
+    package_plan,
+    supplicant_need,
+    wireless_scripts,
+)
 
 __all__ = [
     "FULL_SUPPLICANTS",
@@ -26,4 +34,5 @@ __all__ = [
     "package_plan",
     "resolve",
     "supplicant_need",
+    "wireless_scripts",
 ]

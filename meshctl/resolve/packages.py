@@ -86,6 +86,17 @@ def supplicant_need(mesh: Mesh, release: Release) -> Need | None:
     return Need((preferred, *rest), f"mesh {mesh.name} is {what}, which wpad-basic cannot join")
 
 
+def wireless_scripts(release: Release) -> str | None:
+    """The package with /usr/share/hostap/wdev.uc, without which netifd's mac80211.sh brings up no mesh interface,
+    encrypted or not. kmod-mac80211 depends on it, so only an image put together by hand lacks it. None: no such file.
+
+    Source: package/network/services/hostapd/Makefile (23.05), package/network/config/wifi-scripts (main).
+    """
+    if release >= Release.V24_10:
+        return "wifi-scripts"
+    return "hostapd-common" if release >= Release.V23_05 else None
+
+
 def stock_supplicant(release: Release) -> str:
     """The supplicant in the release's stock images, which conflicts with a full one."""
     if release >= Release.V23_05:

@@ -129,7 +129,7 @@ def running(
         uptime_s=500.0,
         macs={"eth0": "02:00:00:00:00:10"},
         neighbours=tuple(MeshNeighbour(mac, "mesh0", 100) for mac in neighbours),
-        packages={name: "1" for group in want.needs.any_of for name in group},
+        packages={"hostapd-common": "1"} | {name: "1" for group in want.needs.any_of for name in group},
         uci=uci,
         uci_changes=(),
         files=files,

@@ -145,10 +145,33 @@ def test_a_fingerprint_depends_on_the_files_and_the_salt_and_not_on_order() -> N
 def test_an_ad_hoc_cell_on_25_12_is_planned_with_a_word_of_caution() -> None:
     team = fleet()
     new = replace(team.nodes["b01"], release=Release.V25_12)
-    seen = replace(factory(team, "b01"), release=ReleaseInfo("OpenWrt", "25.12.0", "r1", "ath79/generic"))
+    stock = factory(team, "b01")
+    seen = replace(
+        stock,
+        release=ReleaseInfo("OpenWrt", "25.12.0", "r1", "ath79/generic"),
+        packages={**(stock.packages or {}), "wifi-scripts": "1"},
+    )
     plan = node_plan(replace(wanted(team, "b01"), node=new), seen, FINGERPRINTS)
     assert plan.notes == (
         "some 25.12 builds join no ad-hoc cell with a multicast rate (MC334): if this is one, "
         "the node goes back by itself",
     )
     assert planned(team, "b01", factory(team, "b01")).notes == ()
+
+
+def test_a_node_without_the_radios_own_scripts_is_planned_with_a_word_of_caution() -> None:
+    team = fleet()
+    stock = factory(team, "b01")
+    bare = {name: version for name, version in (stock.packages or {}).items() if name != "hostapd-common"}
+    (note,) = planned(team, "b01", replace(stock, packages=bare)).notes
+    assert note.startswith("it lacks hostapd-common: without its /usr/share/hostap/wdev.uc OpenWrt 23.05 brings up no")
+    assert planned(team, "b01", replace(stock, packages=None)).notes == ()
+
+
+def test_a_node_that_is_in_its_mesh_has_what_it_needs() -> None:
+    team = fleet()
+    seen = running(team, "b01")
+    other = {name: text for name, text in (seen.uci or {}).items() if name != "firewall"}
+    bare = {name: version for name, version in (seen.packages or {}).items() if name != "hostapd-common"}
+    plan = planned(team, "b01", replace(seen, uci=other, packages=bare))
+    assert (plan.verdict, plan.notes) == (Verdict.CHANGE, ())
