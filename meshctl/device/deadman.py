@@ -264,8 +264,8 @@ _HINTS = {
     "locked": "wait for the other one to end, or for the lock to run out",
     "flash-full": "`meshctl run NODE -- du -ak /overlay` shows what takes the room",
     "moved-on": "somebody changed it meanwhile: plan again",
-    # a lock lives in /tmp: one that is gone was outlived, or there was no room to write it
-    "not-locked": "is its memory full? `meshctl run NODE -- df -k /tmp` tells; a reboot empties it",
+    "not-locked": "it has run out, or the node rebooted: run again",
+    "tmp-full": "`meshctl run NODE -- du -ak /tmp` shows what takes the room; a reboot empties it",
 }
 
 

@@ -8,7 +8,7 @@
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=3
+VERSION=4
 SELF=/usr/sbin/meshctl-deadman
 CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
@@ -69,7 +69,15 @@ write_lock() { # OWNER TTL_CS
 	next=$((LOCK_N + 1))
 	now
 	read -r this_boot </proc/sys/kernel/random/boot_id
-	echo "$1 $((NOW + $2)) $this_boot" >"$RUN/new.$$"
+	line="$1 $((NOW + $2)) $this_boot"
+	written=''
+	echo "$line" 2>/dev/null >"$RUN/new.$$"
+	read -r written 2>/dev/null <"$RUN/new.$$"
+	# a lock that names nobody is none; that is what giving it back asks for
+	[ "$written" = "$line" ] || [ "$2" -eq 0 ] || {
+		rm -f "$RUN/new.$$"
+		refuse tmp-full "no room in $RUN to write the lock"
+	}
 	ln "$RUN/new.$$" "$RUN/lock.$next" 2>/dev/null
 	made=$?
 	rm -f "$RUN/new.$$"

@@ -431,6 +431,43 @@ def test_a_flash_that_fills_up_later_does_not_stop_the_way_back(node: Sandbox) -
     assert is_before(node.path("/tmp/after"))
 
 
+def on_small_memory(node: Sandbox, script: str) -> list[str]:
+    """The lines that `script` says where /tmp/meshctl has 16 KiB; `fill` takes what is left."""
+    start = "mkdir -p /tmp/meshctl && mount -t tmpfs -o size=16k tmpfs /tmp/meshctl || exit 9\n"
+    done = node.run("sh", "-c", f"{start}fill() {{ cat /dev/zero >/tmp/meshctl/filler 2>/dev/null; }}\n{script}")
+    assert done.returncode != 9, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_a_lock_that_could_not_be_written_is_refused(node: Sandbox) -> None:
+    first, second = on_small_memory(
+        node,
+        f"""
+        fill
+        /usr/sbin/meshctl-deadman lock {OWNER} 60
+        rm /tmp/meshctl/filler
+        /usr/sbin/meshctl-deadman lock {OWNER} 60
+        """,
+    )
+    assert first == "refused tmp-full no room in /tmp/meshctl to write the lock"
+    assert second.startswith("ok")
+
+
+def test_a_lock_is_given_back_although_memory_is_full(node: Sandbox) -> None:
+    *_, given_back, taken = on_small_memory(
+        node,
+        f"""
+        /usr/sbin/meshctl-deadman lock {OWNER} 6000
+        fill
+        /usr/sbin/meshctl-deadman unlock {OWNER}
+        rm /tmp/meshctl/filler
+        /usr/sbin/meshctl-deadman lock somebody@else 60
+        """,
+    )
+    assert given_back == "ok"
+    assert taken == "ok lock_owner=somebody@else"
+
+
 def test_the_same_change_gives_the_same_bundle_and_mistakes_are_told_before_it_travels() -> None:
     assert bundle(change()) == bundle(change())
     for files in (
