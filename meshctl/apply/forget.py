@@ -20,7 +20,7 @@ import threading
 import time
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 
 from meshctl.apply.job import Job
@@ -161,6 +161,9 @@ class Forgetting:
     # those who do it by themselves, and may not be reached while the node is silent
     _watching: frozenset[str] = frozenset()
     _asked_s: list[float] = field(default_factory=list)
+    # what has been told: a node that is flashed is silent for minutes, and asked about again and again
+    _told_steps: set[str] = field(default_factory=set)
+    _told_names: set[str] = field(default_factory=set)
     # since when its radio may have started anew: for the first time, and because it went back
     _began_s: float | None = None
     _kept_until_s: float | None = None
@@ -221,15 +224,19 @@ class Forgetting:
         age_s = time.monotonic() - since_s
         scripts = {name: forget_script(self._holders[name], older_than_s=age_s) for name in names}
         did = self._ask("neighbours forget it", scripts)
-        if did:
-            self.job.work.note(f"{_listed(did)} forgot its radio, to hear it anew", self.job.name)
+        news = [name for name in did if name not in self._told_names]
+        if news:
+            self._told_names.update(news)
+            self.job.work.note(f"{_listed(news)} forgot its radio, to hear it anew", self.job.name)
 
     def _ask(self, step: str, scripts: Mapping[str, str]) -> tuple[str, ...]:
-        """Run each node's script, all at once; the names of those that printed something."""
+        """Run each node's script, all at once; the names of those that printed something. The step is told once."""
         if not scripts or self.job.work.interrupt.leaving:
             return ()
+        telling = nullcontext() if step in self._told_steps else self.job.step(step)
+        self._told_steps.add(step)
         with (
-            self.job.step(step),
+            telling,
             ThreadPoolExecutor(max_workers=len(scripts), thread_name_prefix="forget") as pool,
         ):
             answers = pool.map(self._ask_one, scripts, scripts.values())

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from hypothesis import given
@@ -17,6 +20,7 @@ from meshctl.apply.forget import (
     LONGEST_PAUSE_S,
     MOST_ASKED,
     Entry,
+    Forgetting,
     behind,
     by_holder,
     entries_of,
@@ -24,6 +28,7 @@ from meshctl.apply.forget import (
     next_ask_s,
     watch_script,
 )
+from meshctl.apply.job import Job
 from meshctl.device.observation import Observation, Originator, Station, WirelessLink
 from tests.meshctl.plan.support import fleet, running
 from tests.meshctl.proof.rig import Rig
@@ -80,6 +85,40 @@ def test_a_silent_node_has_its_neighbours_asked_at_once_and_then_ever_more_seldo
     assert next_ask_s([]) < 0
     assert pauses == pytest.approx(sorted(pauses))
     assert all(FIRST_PAUSE_S - 1e-6 <= pause <= LONGEST_PAUSE_S + 1e-6 for pause in pauses)
+
+
+def test_a_node_that_is_silent_for_long_is_told_of_once_however_often_its_neighbours_are_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    steps: list[str] = []
+    notes: list[str] = []
+    scripts: list[str] = []
+
+    @contextmanager
+    def step(name: str) -> Iterator[None]:
+        steps.append(name)
+        yield
+
+    def answer(script: str, *, timeout_s: float) -> SimpleNamespace:
+        scripts.append(script)
+        return SimpleNamespace(stdout=f"{MAC}\n")
+
+    connection = SimpleNamespace(run=answer, close=lambda: None)
+    work = SimpleNamespace(
+        around={"b02": itself(MAC), "b01": knows("b01", ("mesh0", MAC))},
+        interrupt=SimpleNamespace(leaving=False),
+        access=SimpleNamespace(take=lambda name: connection, keep=lambda name, kept: None),
+        note=lambda text, node: notes.append(text),
+    )
+    forgetting = Forgetting(cast("Job", SimpleNamespace(name="b02", work=work, step=step)))
+    monkeypatch.setattr("meshctl.apply.forget.next_ask_s", lambda asked_s: float("-inf"))
+    forgetting.begins()
+    for _ in range(5):
+        forgetting.while_silent()
+    forgetting.when_back(went_back=False)
+    assert len(scripts) == 6
+    assert steps == ["neighbours forget it"]
+    assert notes == ["b01 forgot its radio, to hear it anew"]
 
 
 def hop(name: str, mac: str, next_hop: str, *, best: bool = True) -> Observation:
