@@ -83,6 +83,22 @@ def test_an_orderly_reboot_keeps_everything_but_ram(node: VirtualNode) -> None:
     assert node.exec("cat /etc/file; ls /tmp/file").stdout == "here\n"
 
 
+def test_a_radio_that_its_configuration_does_not_name_is_added_at_every_boot_and_switched_off(
+    node: VirtualNode,
+) -> None:
+    stock = node.exec("cat /etc/config/wireless").stdout
+    assert stock.count("config wifi-device") == stock.count("option disabled '1'") > 0
+    forget = "uci delete wireless.radio0; uci delete wireless.default_radio0; uci commit wireless; sync"
+    node.exec(forget).check("forget radio0")
+    assert "radio0" not in node.exec("cat /etc/config/wireless").stdout
+    node.reboot()
+    again = node.exec("cat /etc/config/wireless").stdout
+    assert again.count("config wifi-device") == stock.count("config wifi-device")
+    assert "option ssid 'OpenWrt'" in again
+    node.reboot()
+    assert node.exec("cat /etc/config/wireless").stdout == again
+
+
 def test_init_scripts_run_in_order_at_boot_when_enabled(node: VirtualNode) -> None:
     script = "#!/bin/sh /etc/rc.common\\nSTART={start}\\nboot() {{ echo {name} >>/tmp/order; }}\\n"
     for name, start in (("late", 97), ("early", 11), ("never", 50)):
