@@ -10,7 +10,7 @@ from meshctl.model import Fleet, Node, Secret, SecretRef
 from meshctl.plan import Wanted
 from meshctl.plan.packages import Needs
 from meshctl.plan.seen import packages_seen
-from meshctl.render import DeviceFacts, Templates, render
+from meshctl.render import DeviceFacts, Templates, render, with_switch
 from meshctl.resolve import package_needs, resolve
 
 
@@ -29,7 +29,7 @@ class Renderer:
     def wanted(self, node: Node, seen: Observation | None = None) -> Wanted:
         """One node's files and packages. Raises InvalidInput for values that cannot be written down."""
         intent = resolve(self.fleet, node, self.secrets)
-        rendered = render(intent, self.templates, device_facts(seen))
+        rendered = render(intent, self.templates, device_facts(node, seen))
         return Wanted(
             node,
             rendered.files,
@@ -38,12 +38,17 @@ class Renderer:
         )
 
 
-def device_facts(seen: Observation | None) -> DeviceFacts:
-    """What has to be carried over from the device (`meshctl.render.facts`)."""
+def device_facts(node: Node, seen: Observation | None) -> DeviceFacts:
+    """What has to be carried over from the device (`meshctl.render.facts`).
+
+    Where its ports are VLANs of a switch (eth0.1) whose layout its configuration has lost, its board tells.
+    """
     if seen is None:
         return DeviceFacts()
     paths = ("etc/config/network", "etc/config/system", "etc/config/wireless")
     packages = {name: package for name, package in packages_seen(paths, seen).items() if package is not None}
+    if "network" in packages and seen.board is not None and any("." in port for port in node.lan_ports):
+        packages["network"] = with_switch(packages["network"], seen.board.switch_vlans)
     sections = packages["system"].of_type("system") if "system" in packages else ()
     return DeviceFacts(next((text for section in sections if (text := section.get("compat_version"))), ""), packages)
 

@@ -33,6 +33,8 @@ class BoardInfo:
     # /etc/board.json .network.lan: `ports` or the single `device`/`ifname`
     lan_ports: tuple[str, ...] = ()
     label_mac: str = ""
+    # .switch: (switch, VLAN, its ports as UCI has them) of switches that swconfig drives
+    switch_vlans: tuple[tuple[str, str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -155,9 +155,15 @@ def _board(reader: _Reader) -> tuple[BoardInfo | None, ReleaseInfo | None]:
     if not board_name and told is None:
         return None, release
     model = reader.read("model", str.strip, required=False) or ""
-    ports, label = reader.read("board.json", ubus.parse_board_json) or ((), "")
+    written = reader.read("board.json", ubus.parse_board_json) or BoardInfo("")
     board = told or BoardInfo(board_name="")
-    return replace(board, board_name=board_name, model=board.model or model, lan_ports=ports, label_mac=label), release
+    return replace(
+        written,
+        board_name=board_name,
+        model=board.model or model,
+        hostname=board.hostname,
+        kernel=board.kernel,
+    ), release
 
 
 def _space(space: Mapping[str, Space], path: str) -> Space | None:

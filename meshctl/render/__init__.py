@@ -9,7 +9,7 @@ from meshctl.render.compare import (
     compare_nodes,
 )
 from meshctl.render.daemon import daemon_config, daemon_keys
-from meshctl.render.facts import DeviceFacts
+from meshctl.render.facts import DeviceFacts, with_switch
 from meshctl.render.imagebuilder import ImageFolder, folder_files, image_folders
 from meshctl.render.node import UnknownNode, render, render_fleet, render_node, render_nodes
 from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, RenderedFile
@@ -39,6 +39,7 @@ __all__ = [
     "render_fleet",
     "render_node",
     "render_nodes",
+    "with_switch",
     "write_folder",
     "write_node",
 ]

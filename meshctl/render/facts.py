@@ -11,7 +11,7 @@ What is replaced all the same, because a mesh node lives without it: other inter
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -33,6 +33,22 @@ class DeviceFacts:
 
 
 NO_FACTS = DeviceFacts()
+
+
+def with_switch(network: Package, vlans: Iterable[tuple[str, str, str]]) -> Package:
+    """A node's own package `network` with the layout of its switches (switch, VLAN, ports), as config_generate writes
+    it, where it has lost every trace of them."""
+    if any(section.type in _SWITCH for section in network.sections):
+        return network
+    layout = tuple(vlans)
+    switches = (
+        Section("switch", None, {"name": name, "reset": "1", "enable_vlan": "1"})
+        for name in dict.fromkeys(name for name, _, _ in layout)
+    )
+    members = (
+        Section("switch_vlan", None, {"device": name, "vlan": vlan, "ports": ports}) for name, vlan, ports in layout
+    )
+    return Package(network.name, (*network.sections, *switches, *members))
 
 
 def with_kept(package: Package, facts: DeviceFacts) -> Package:

@@ -76,14 +76,22 @@ def parse_interfaces(text: str) -> tuple[NetInterface, ...] | None:
     )
 
 
-def parse_board_json(text: str) -> tuple[tuple[str, ...], str] | None:
-    """/etc/board.json: the LAN's ports, and the MAC address printed on the label where the board knows it.
+def parse_board_json(text: str) -> BoardInfo | None:
+    """/etc/board.json: the LAN's ports, the MAC address printed on the label where the board knows it, and switches.
 
-    `ports` where there are several, else `device` (21.02 and later) or `ifname` (19.07).
+    `ports` where there are several, else `device` (21.02 and later) or `ifname` (19.07). A switch's VLANs are the
+    places of its `roles`, counted from 1 (base-files, `config_generate`).
     """
     told = mapping(parse_json(text))
     if not told:
         return None
     lan = mapping(mapping(told.get("network")).get("lan"))
     ports = next((found for key in ("ports", "device", "ifname") if (found := strings(lan.get(key)))), ())
-    return ports, string(mapping(told.get("system")).get("label_macaddr")).lower()
+    vlans = tuple(
+        (name, str(vlan), string(role.get("ports")))
+        for name, switch in mapping(told.get("switch")).items()
+        for vlan, role in enumerate(maps(mapping(switch).get("roles")), 1)
+        if string(role.get("ports"))
+    )
+    label = string(mapping(told.get("system")).get("label_macaddr")).lower()
+    return BoardInfo("", lan_ports=ports, label_mac=label, switch_vlans=vlans)

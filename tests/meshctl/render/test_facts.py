@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from meshctl.model import Fleet, Release
-from meshctl.render import DeviceFacts, Rendered, Templates, render_node
+from meshctl.render import DeviceFacts, Rendered, Templates, render_node, with_switch
 from meshctl.uci import Package, Section, parse
 from tests.meshctl.render import fleets
 
@@ -152,6 +152,23 @@ def test_the_same_layout_in_the_inventory_and_on_the_node_is_the_same() -> None:
     known, kept = render(fleets.fleet(), network=NETWORK), render(box(), network=NETWORK)
     both = [sections(item, "network", "switch", "switch_vlan") for item in (known, kept)]
     assert both[0] == both[1]
+
+
+LAYOUT = (("switch0", "1", "3 0t"), ("switch0", "2", "2 0t"))
+
+
+def test_a_switch_that_lost_its_layout_gets_the_one_that_config_generate_writes() -> None:
+    stock = parse(NETWORK, "network")
+    lost = Package("network", tuple(s for s in stock.sections if not s.type.startswith("switch")))
+    found = with_switch(lost, LAYOUT)
+    kept = [s for s in stock.sections if s.type in ("switch", "switch_vlan")]
+    assert [s for s in found.sections if s.type.startswith("switch")] == kept
+    assert with_switch(lost, ()) == lost
+
+
+def test_a_switch_that_has_a_layout_keeps_it_whatever_its_board_says() -> None:
+    stock = parse(NETWORK, "network")
+    assert with_switch(stock, (("switch0", "1", "0 1 2 3"),)) == stock
 
 
 def test_lights_and_gpio_switches_stay_and_nothing_else_of_system() -> None:
