@@ -53,6 +53,8 @@ def render(
     builds = (
         [(item, _write_build(item, imagebuilder)) for item in image_folders(fleet, rendered)] if imagebuilder else []
     )
+    if imagebuilder:
+        _warn_of_dead_ports(fleet, rendered)
     if as_json:
         typer.echo(json.dumps(_report(rendered, folders, builds), indent=2, ensure_ascii=False))
     elif out is None and imagebuilder is None:
@@ -62,6 +64,18 @@ def render(
             typer.echo(f"{node}: {folder}")
         for build, folder in builds:
             typer.echo(f"{build.name}: cd IMAGEBUILDER && sh {(folder / 'build.sh').resolve()}")
+
+
+def _warn_of_dead_ports(fleet: Fleet, rendered: Iterable[Rendered]) -> None:
+    """An image brings its own /etc/config/network, so its first boot writes no layout of the switch there."""
+    dead = {item.node: fleet.nodes[item.node].unswitched_ports for item in rendered}
+    for node, ports in dead.items():
+        if ports:
+            typer.echo(
+                f"{node}: with this image {', '.join(ports)} may have no port behind it: "
+                "the inventory knows no switch_vlans of its hardware (MC530)",
+                err=True,
+            )
 
 
 def _secrets(fleet: Fleet) -> Callable[[SecretRef], Secret]:

@@ -112,6 +112,14 @@ class Node:
     gateway: IPv4Address | None = None
 
     @property
+    def unswitched_ports(self) -> tuple[str, ...]:
+        """Ports such as eth0.1 whose VLAN no switch has, as far as the inventory knows."""
+        if "switch_vlan" in self.extra_uci.values():
+            return ()
+        vlans = {vlan for vlan, _ in self.hardware.switch_vlans}
+        return tuple(port for port in self.lan_ports if "." in port and port.rpartition(".")[2] not in vlans)
+
+    @property
     def meshes(self) -> tuple[str, ...]:
         """The names of the meshes its radios join, each once, in the radios' order."""
         return tuple(dict.fromkeys(radio.mesh for radio in self.radios if radio.mesh is not None))

@@ -98,7 +98,12 @@ def node_plan(
         packages=packages,
         files=files,
         effects=told,
-        notes=(*seen.notes, *_cautions(wanted, live_after, firmware), *_lacking_scripts(node, seen, basis, firmware)),
+        notes=(
+            *seen.notes,
+            *_cautions(wanted, live_after, firmware),
+            *_tagged_ports(node, seen, after.get("network")),
+            *_lacking_scripts(node, seen, basis, firmware),
+        ),
     )
 
 
@@ -121,6 +126,18 @@ def _cautions(wanted: Wanted, cells_to_come: Mapping[str, Cell], firmware: Firmw
     if firmware is None:
         return (f"{caution}: if this is one, the node goes back by itself",)
     return (f"{caution}, and a flash is not undone: flash one node on the bench first",)
+
+
+def _tagged_ports(node: Node, seen: Observation, network: Package | None) -> tuple[str, ...]:
+    """Ports that lead to a switch which takes tagged frames alone: the inventory names eth0, the board eth0.1."""
+    if network is None or seen.board is None or not any(network.of_type("switch_vlan")):
+        return ()
+    parents = {port.partition(".")[0]: port for port in seen.board.lan_ports if "." in port}
+    return tuple(
+        f"{port} leads to a switch, whose LAN is {parents[port]}: what is on its ports will not be heard (lan_ports)"
+        for port in node.lan_ports
+        if port in parents
+    )
 
 
 def _lacking_scripts(node: Node, seen: Observation, basis: NodePlan, firmware: FirmwareStep | None) -> tuple[str, ...]:

@@ -269,14 +269,10 @@ def extra_checked(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def vlan_without_switch(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
-        if "switch_vlan" in node.extra_uci.values():
-            continue
-        layout = dict(node.hardware.switch_vlans)
-        for index, port in enumerate(node.lan_ports):
-            _, dot, vlan = port.rpartition(".")
-            if not dot or vlan in layout:
-                continue
-            is_own = node.lan_ports != node.hardware.lan_ports
-            place = ("nodes", node.name) if is_own else ("hardware", node.hardware.name)
-            found = f"VLANs {listed(list(layout))}" if layout else "none"
-            yield Finding((*place, "lan_ports", str(index)), f"{port} needs it", f"VLAN {vlan} in switch_vlans", found)
+        vlans = [vlan for vlan, _ in node.hardware.switch_vlans]
+        is_own = node.lan_ports != node.hardware.lan_ports
+        place = ("nodes", node.name) if is_own else ("hardware", node.hardware.name)
+        for port in node.unswitched_ports:
+            path = (*place, "lan_ports", str(node.lan_ports.index(port)))
+            expected = f"VLAN {port.rpartition('.')[2]} in switch_vlans"
+            yield Finding(path, f"{port} needs it", expected, f"VLANs {listed(vlans)}" if vlans else "none")

@@ -118,6 +118,28 @@ def test_render_reports_in_json_without_the_key(run: Run, tmp_path: Path) -> Non
     assert build["calls"]["b01"] in (tmp_path / "ib/rocket-23.05/build.sh").read_text()
 
 
+def test_an_image_whose_ports_may_be_dead_is_told_of(run: Run, inventory: Path, tmp_path: Path) -> None:
+    text = INVENTORY.replace("[eth0]", "[eth0.1]")
+    (inventory / "fleet.yaml").write_text(text)
+    told = run("render", "b01", "--imagebuilder", tmp_path / "ib")
+    assert (told.code, told.err.count("\n")) == (0, 1)
+    assert told.err.startswith("b01: with this image eth0.1 may have no port behind it")
+    assert run("render", "b01", "--out", tmp_path / "out").err == ""
+    (inventory / "fleet.yaml").write_text(text.replace("[eth0.1]", "[eth0.1]\n    switch_vlans: {1: 3 0t}"))
+    assert run("render", "b01", "--imagebuilder", tmp_path / "ib").err == ""
+    written = (tmp_path / "ib/rocket-23.05/files/b01/etc/config/network").read_text()
+    assert "option ports '3 0t'" in written
+
+
+@pytest.mark.parametrize(("vlans", "told"), [("{0: 3 0t}", "1 to 4094"), ("{1: eth0}", "such as 3 0t")])
+def test_a_layout_that_no_switch_can_have_is_told(run: Run, inventory: Path, vlans: str, told: str) -> None:
+    (inventory / "fleet.yaml").write_text(INVENTORY.replace("[eth0]", f"[eth0]\n    switch_vlans: {vlans}"))
+    ran = run("render", "b01")
+    assert ran.code == 2
+    assert "switch_vlans" in ran.err
+    assert told in ran.err
+
+
 @pytest.mark.usefixtures("inventory")
 def test_a_node_that_is_not_there_is_told(run: Run) -> None:
     ran = run("render", "b9*")

@@ -11,6 +11,7 @@ from meshctl.device.observation import BoardInfo, ChangeStatus, ReleaseInfo
 from meshctl.model import Release
 from meshctl.plan import Cut, Verdict, node_plan
 from meshctl.plan.masking import Fingerprints
+from meshctl.uci import Section
 from tests.meshctl.plan.support import FINGERPRINTS, PASS_PHRASE, factory, fleet, planned, running, wanted
 
 
@@ -175,3 +176,20 @@ def test_a_node_that_is_in_its_mesh_has_what_it_needs() -> None:
     bare = {name: version for name, version in (seen.packages or {}).items() if name != "hostapd-common"}
     plan = planned(team, "b01", replace(seen, uci=other, packages=bare))
     assert (plan.verdict, plan.notes) == (Verdict.CHANGE, ())
+
+
+def test_a_port_that_leads_to_a_switch_of_tagged_frames_is_planned_with_a_word_of_caution() -> None:
+    team = fleet()
+    seen = factory(team, "b01")
+    behind = replace(seen, board=BoardInfo("compex,wpj344-16m", lan_ports=("eth0.1",)))
+    want = wanted(team, "b01")
+    kept = tuple(
+        replace(file, package=replace(file.package, sections=(*file.package.sections, Section("switch_vlan"))))
+        if file.package is not None and file.package.name == "network"
+        else file
+        for file in want.files
+    )
+    (note,) = node_plan(replace(want, files=kept), behind, FINGERPRINTS).notes
+    assert note.startswith("eth0 leads to a switch, whose LAN is eth0.1")
+    assert node_plan(want, behind, FINGERPRINTS).notes == ()
+    assert node_plan(replace(want, files=kept), seen, FINGERPRINTS).notes == ()
