@@ -104,7 +104,9 @@ def _wireless(package: Package, own: Package) -> Iterator[Section]:
     names, paths = {radio.name for radio in radios}, {radio.get("path") for radio in radios} - {""}
     off: set[str | None] = set()
     for section in own.sections:
-        if section.type == "wifi-device" and section.name not in names and section.get("path") not in paths:
+        # a device with several radios has one path for all; `wifi config` misses those that do not say which they are
+        is_other = section.get("path") not in paths or bool(section.get("radio"))
+        if section.type == "wifi-device" and section.name not in names and is_other:
             if section.get("disabled") == "1":
                 off.add(section.name)
             yield Section(section.type, section.name, {**section.options, "disabled": "1"})

@@ -200,6 +200,14 @@ def test_a_radio_of_the_inventory_is_never_kept_under_another_name() -> None:
     assert package(render(box(), wireless=other), "wireless").section("radio2") is None
 
 
+def test_a_radio_of_a_device_with_several_is_kept_although_it_shares_their_path() -> None:
+    other = ADDED.replace("pci0000:00/0000:00:01.0", fleets.RADIO_2G.path).replace(
+        "option disabled", "option radio '1'\n\toption disabled"
+    )
+    written = package(render(box(), wireless=other), "wireless")
+    assert written.sections[-2:] == parse(other, "wireless").sections
+
+
 @pytest.mark.parametrize("release", Release)
 def test_what_was_written_is_written_again_and_the_hash_does_not_know(release: Release) -> None:
     first = render(box(release), network=NETWORK, system=SYSTEM, wireless=ADDED)
