@@ -8,7 +8,12 @@
 4. A *drain* lets the queue run empty for one round trip, so that the least round trip is seen again: after
    `DRAIN_EVERY_S` without having seen it, and as soon as the round trip looks longer than our own queue explains. If
    it stays long while the queue is empty, the route has changed: the window moves at once to the new round trip times
-   the delivery rate.
+   the delivery rate, by no more than startup would; on a route so long that this rate is none of its own it starts up
+   again.
+5. The least round trip is *proved* where it was seen with next to nothing of ours on its way. Once it differs from
+   that (the path changed, or no drain has seen the empty path for long) the next drain goes down to
+   `LEAST_WINDOW` - 1 packets: a queue that stands for good would otherwise be taken for the path, and what it loses
+   for the loss of a radio.
 
 The idea of step 2 is that of FAST TCP (Jin, Wei, Low 2004), that of steps 3 and 4 of BBR's bandwidth model (Cardwell
 and others 2016).
@@ -76,6 +81,9 @@ DRAIN_EVERY_S = 2.0
 DRAIN_EVERY_ROUND_TRIPS = 15.0
 """Between two drains, at least: each costs about a quarter of a round trip of throughput."""
 
+PROVE_EVERY_ROUND_TRIPS = 4.0
+"""The same while the least round trip is not proved: what is built on it is wrong meanwhile."""
+
 DRAIN_TO = 0.95
 DRAIN_PACKETS = 3
 """Part of the pipe filled while draining, less these packets: on a short path a burst of them is the queue."""
@@ -133,12 +141,14 @@ class AdaptiveWindow:
         "_hold_from",
         "_latest_four",
         "_loss",
+        "_proved",
         "_rates",
         "_round_ends",
         "_saved",
         "_suspect_every",
         "_suspected",
         "_suspicion",
+        "_to_the_bottom",
         "_trip",
         "_updated_at",
         "_was_standing",
@@ -155,6 +165,8 @@ class AdaptiveWindow:
         self._latest_four: deque[float] = deque(maxlen=4)
         self._rates: deque[tuple[float, float]] = deque()
         self._alone = 0
+        self._proved = 0.0
+        self._to_the_bottom = False
         self._round_ends = 0
         self._updated_at = 0.0
         self._drained_at = 0.0
@@ -178,6 +190,9 @@ class AdaptiveWindow:
     def presumable(self) -> bool:
         # A queue that our window does not explain is work enough for the link; and a drain wants it empty.
         return bool(self._rates) and self.phase in (Phase.STARTUP, Phase.CRUISE) and not self._queue_is_suspect()
+
+    def draining(self, now: float) -> bool:
+        return self.phase in (Phase.DRAIN, Phase.HOLD) and now - self._updated_at > self._was_standing
 
     def packets_per_s(self) -> float | None:
         smoothed = self._trip.smoothed
@@ -222,12 +237,14 @@ class AdaptiveWindow:
             # None of the four found more of ours on its way than a drain leaves: the path itself is longer now. (An
             # application that pauses says nothing of that: a link that became slow still holds what it sent before.)
             trip.forget_least(min(self._latest_four), now)
+            self._proved = trip.least
         if self.phase is Phase.DRAIN:
-            if in_flight <= self.packets:
+            if in_flight <= self.packets or largest >= self._round_ends:
+                # Everything sent before the drain has arrived, or so much that the rest is no queue.
                 self.phase = Phase.HOLD
                 self._hold_from = next_number
                 self._held_least = float("inf")
-            elif now - self._updated_at > 1.0:
+            elif now - self._updated_at > max(1.0, 2 * self._was_standing):
                 self._end_drain(now)
             return
         if self.phase is Phase.HOLD:
@@ -244,7 +261,7 @@ class AdaptiveWindow:
             return
         self._round_ends = next_number
         self._updated_at = now
-        if trip.latest <= trip.least * 1.02 + 0.0005:
+        if trip.latest <= trip.least * 1.02 + 0.0005 and self._is_proved():
             # The empty path was seen just now: no drain is needed to see it.
             self._drained_at = now
         self._update(limited=limited, now=now)
@@ -256,11 +273,23 @@ class AdaptiveWindow:
         least, standing = self._trip.least, self._trip.standing
         return least is not None and standing is not None and standing - least > SUSPECT_QUEUE_S + 0.25 * least
 
+    def _is_proved(self) -> bool:
+        """Whether the least round trip is the one seen when next to nothing of ours was on its way; otherwise it may
+        hold a queue that never ran empty."""
+        least = self._trip.least
+        return least is not None and abs(least - self._proved) <= 0.15 * self._proved + self._scatter_s()
+
+    def _scatter_s(self) -> float:
+        """What the packets that a drain leaves on their way may take, and a radio's scatter."""
+        return START_QUEUE_S / 3 + (LEAST_WINDOW - 1) / (self.capacity() or float("inf"))
+
     def _update(self, *, limited: bool, now: float) -> None:
         least, standing = self._trip.least, self._trip.standing
         assert least is not None
         assert standing is not None
         if self.phase is Phase.STARTUP:
+            # It begins with little on its way.
+            self._proved = least
             if not limited:
                 self._start_faster(least, standing, now)
             return
@@ -269,11 +298,12 @@ class AdaptiveWindow:
         if self._suspected >= 2 and since_drain > max(self._suspect_every, 4 * standing):
             self._begin_drain(now, suspicion=True)
             return
-        if since_drain > max(DRAIN_EVERY_S, DRAIN_EVERY_ROUND_TRIPS * least):
-            if limited or standing - least < QUEUE_S / 4:
+        every_round_trips = DRAIN_EVERY_ROUND_TRIPS if self._is_proved() else PROVE_EVERY_ROUND_TRIPS
+        if since_drain > max(DRAIN_EVERY_S, every_round_trips * least):
+            if not self._suspected and self._is_proved() and (limited or standing - least < QUEUE_S / 4):
                 self._drained_at = now
             else:
-                self._begin_drain(now, suspicion=False)
+                self._begin_drain(now, suspicion=self._suspected > 0)
                 return
         empty = standing - least < QUEUE_S / 4 and not limited and now >= self._grow_from
         self._empty_rounds = self._empty_rounds + 1 if empty else 0
@@ -296,6 +326,13 @@ class AdaptiveWindow:
         if wanted < self.packets or not limited:
             self.packets = self._bounded(min(wanted, 2 * self.packets), least, standing)
 
+    def _start_again(self, packets: float) -> None:
+        """A route so much longer that what was measured on the one before does not tell how much it holds."""
+        self.phase = Phase.STARTUP
+        self.packets = min(MOST_WINDOW, max(START_WINDOW, packets))
+        self._rates.clear()
+        self._full_capacity, self._full_rounds = 0.0, 0
+
     def _start_faster(self, least: float, standing: float, now: float) -> None:
         """Double, unless the link has not become faster by it for some round trips (its queue is too short to see)."""
         capacity = self.capacity() or 0.0
@@ -310,7 +347,7 @@ class AdaptiveWindow:
             self._grow_from = now + GROW_AGAIN_S
             self.packets = self._bounded(self.packets, least, standing)
         else:
-            self.packets = self._bounded(2 * self.packets, least, standing)
+            self.packets = max(self.packets, self._bounded(2 * self.packets, least, standing))
 
     def _queue(self, standing: float) -> float:
         # Losses leave holes in the queue as well as in what arrives.
@@ -344,8 +381,11 @@ class AdaptiveWindow:
         self._suspicion = suspicion
         self._saved = self.packets
         self._was_standing = standing
+        self._held_least = float("inf")
         self._updated_at = now
-        self.packets = max(LEAST_WINDOW - 1, DRAIN_TO * self.packets * least / standing - DRAIN_PACKETS)
+        self._to_the_bottom = not self._is_proved()
+        drained = 0.0 if self._to_the_bottom else DRAIN_TO * self.packets * least / standing - DRAIN_PACKETS
+        self.packets = max(LEAST_WINDOW - 1, drained)
 
     def _end_drain(self, now: float) -> None:
         least = self._trip.least
@@ -357,12 +397,21 @@ class AdaptiveWindow:
         self._grow_from = now + 3 * self._was_standing
         self._suspected = 0
         throughput = self._saved / self._was_standing
-        if self._suspicion and held > 1.15 * least + START_QUEUE_S / 3 and held != float("inf"):
+        if self._to_the_bottom and held != float("inf"):
+            self._proved = held
+        if (
+            (self._suspicion or self._to_the_bottom)
+            and held > 1.15 * least + self._scatter_s()
+            and held != float("inf")
+        ):
             self._trip.forget_least(held, now)
+            self._suspect_every = SUSPECT_AGAIN_S
             if held > (least + self._was_standing) / 2:
                 # Still long although our queue is gone: the route, not the queue, is longer.
-                throughput = self.capacity() or throughput
-            self._suspect_every = SUSPECT_AGAIN_S
+                throughput = max(throughput, self.capacity() or 0.0)
+                if held > RATE_WINDOW_S / 3:
+                    self._start_again(2 * self._saved)
+                    return
         elif self._suspicion:
             self._suspect_every = min(2 * self._suspect_every, MOST_SUSPECT_AGAIN_S)
         else:
@@ -370,7 +419,9 @@ class AdaptiveWindow:
             return
         base = min(held, self._was_standing) if held != float("inf") else least
         queue = self._shared(QUEUE_S, throughput)
-        self.packets = min(MOST_WINDOW, max(LEAST_WINDOW, throughput * base + queue))
+        # The rate may have changed with the route: no further ahead of what was measured than when starting.
+        most = min(MOST_WINDOW, START_RATE_BOUND * max(START_WINDOW, self._saved))
+        self.packets = min(most, max(LEAST_WINDOW, throughput * base + queue))
 
     def _saw_rate(self, rate: float, *, limited: bool, now: float) -> None:
         """Windowed maximum; a rate the application limited says nothing unless it is larger."""

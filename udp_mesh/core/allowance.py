@@ -43,7 +43,11 @@ def window_room(outbound: Outbound, now: float) -> int:
         late_s = now - _late_at(outbound)
         if late_s > 0 and window.presumable():
             packets += (window.capacity() or 0.0) * min(late_s, PRESUMED_FOR_S)
-    return int(packets) - outbound.flight.outstanding
+    room = int(packets) - outbound.flight.outstanding
+    if room <= 0 and window.draining(now):
+        # A drain ends with the round trip of a piece that is not urgent: one may leave whatever else is on its way.
+        room = max(room, 1 - outbound.flight.others_outstanding())
+    return room
 
 
 def permitted(outbound: Outbound, room: int, now: float, packets_per_s: float | None, *, urgent: bool) -> int:

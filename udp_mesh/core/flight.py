@@ -84,6 +84,10 @@ class Flight:
     def next_number(self) -> int:
         return self.base + len(self._packets)
 
+    def others_outstanding(self) -> int:
+        """How many of `outstanding` are not urgent. Walks the queue."""
+        return sum(packet is not None and not packet.mark.urgent for packet in self._packets)
+
     def add(self, number: int, packet: Packet | None) -> None:
         """A packet left; None for one that asks for no acknowledgement. Every number of the channel comes, in order."""
         packets = self._packets

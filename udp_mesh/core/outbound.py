@@ -161,11 +161,15 @@ class Outbound(OpenMessages):
                 ahead = mark.ahead_of(ack.largest)
             self.delivered_at = now
             limited = newest is None or newest.mark.limited
+            in_flight = flight.outstanding
+            if self.window.draining(now) and not flight.others_outstanding():
+                # The few urgent ones that leave during a drain are no queue.
+                in_flight = 0
             self.window.acknowledged(
                 count,
                 largest,
                 flight.next_number,
-                flight.outstanding,
+                in_flight,
                 rate,
                 limited=limited,
                 ahead=ahead,

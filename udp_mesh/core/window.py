@@ -17,6 +17,10 @@ class Window(Protocol):
         """How many packets may be on their way."""
         ...
 
+    def draining(self, now: float) -> bool:
+        """Whether a drain takes longer than what was on its way before it."""
+        ...
+
     def packets_per_s(self) -> float | None:
         """Pacing (None: as fast as the window allows)."""
         ...
@@ -55,6 +59,9 @@ class FixedWindow:
     def __init__(self, packets: int) -> None:
         self.packets = float(packets)
         self.queue_share = 1.0
+
+    def draining(self, now: float) -> bool:
+        return False
 
     def packets_per_s(self) -> float | None:
         return None

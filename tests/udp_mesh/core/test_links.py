@@ -164,6 +164,32 @@ def test_a_longer_route_is_filled_soon() -> None:
     assert run.measure(8.0).goodput_bits_per_s >= 0.88 * 10e6
 
 
+def test_a_route_that_became_eighty_times_longer_is_filled_within_some_seconds() -> None:
+    run = Run()
+    run.link(rate_bits_per_s=20e6, delay_s=0.005)
+    run.start()
+    run.world.run(3.0)
+    run.link(delay_s=0.4)
+    run.world.run(9.0)
+    figures = run.measure(6.0)
+    assert figures.goodput_bits_per_s >= 0.4 * 20e6
+    assert figures.latency(0.5) <= 0.47
+
+
+def test_the_queue_that_a_long_route_left_is_not_taken_for_the_short_one() -> None:
+    # A window for the long route keeps the queue of the short one full for good, and half of what is sent is lost.
+    run = Run()
+    run.link(rate_bits_per_s=20e6, delay_s=0.4)
+    run.start()
+    run.world.run(24.0)
+    run.link(delay_s=0.005)
+    run.world.run(4.0)
+    figures = run.measure(3.0)
+    assert figures.latency(0.5) <= 0.015
+    assert figures.wire_ratio <= 1.05
+    assert figures.goodput_bits_per_s >= 0.93 * 20e6
+
+
 def test_a_slower_link_is_not_flooded() -> None:
     run = Run(seed=3)
     run.link(loss=0.02)
