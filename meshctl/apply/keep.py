@@ -13,7 +13,7 @@ import json
 import re
 import tarfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from ipaddress import IPv4Address
 from types import MappingProxyType
@@ -23,12 +23,16 @@ from meshctl.apply.change import new_change_id, new_nonce, reload_script
 from meshctl.apply.job import Job
 from meshctl.apply.node import follow
 from meshctl.device import openwrt
+from meshctl.device.connection import OwnKey
 from meshctl.device.deadman import Change, NewFile
 from meshctl.device.errors import NodeRefused
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import InputError, NodeError, Unreachable
 from meshctl.fleet import Outcome, Result
+from meshctl.model import Node
+from meshctl.plan.lockout import lockout
+from meshctl.plan.objections import Objection
 from meshctl.plan.seen import parsed
 from meshctl.render import MARKER_PATH
 
@@ -206,6 +210,11 @@ def _address(backup: Backup) -> IPv4Address | None:
     lan = None if tree is None else tree.section("lan")
     text = "" if lan is None else lan.get("ipaddr").partition("/")[0]
     return IPv4Address(text) if text else None
+
+
+def lockout_by(backup: Backup, node: Node, own: Sequence[OwnKey]) -> Objection | None:
+    """The objection against a backup after which none of our keys would be let in, or None."""
+    return lockout(node, {path.lstrip("/"): new.content for path, new in backup.files.items()}, own)
 
 
 def objection_to(backup: Backup, node: str, seen: Observation) -> str:

@@ -12,7 +12,7 @@ import typer
 from meshctl.apply.checks import Expectation
 from meshctl.apply.gather import facts_of, observe_cleared
 from meshctl.apply.job import Job, Work
-from meshctl.apply.keep import Backup, fetch, lacking_packages, objection_to, put_back, read_backup
+from meshctl.apply.keep import Backup, fetch, lacking_packages, lockout_by, objection_to, put_back, read_backup
 from meshctl.cli.asking import must_agree
 from meshctl.cli.carry import Refused
 from meshctl.cli.options import AsJson, InventoryPath
@@ -121,6 +121,9 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Out
                     problem = objection_to(saved, name, seen)
                     if problem:
                         raise Refused(problem)
+                    shut_out = lockout_by(saved, node, opened.access.own_keys(node))
+                    if shut_out is not None:
+                        raise Refused(shut_out.reason, hint=shut_out.hint)
                     for package in lacking_packages(saved, seen):
                         work.note(f"package {package} was installed then and is not now", name)
                     if saved.disabled:

@@ -8,23 +8,23 @@ from __future__ import annotations
 
 import binascii
 from base64 import b64decode
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 
 from meshctl.device.connection import OwnKey, fingerprint_of
 from meshctl.model import Node
 from meshctl.plan.objections import Objection
-from meshctl.render import RenderedFile
 
 AUTHORIZED_KEYS = "etc/dropbear/authorized_keys"
 
 
-def lockout(node: Node, files: Iterable[RenderedFile], own: Sequence[OwnKey]) -> Objection | None:
-    """The objection against a change after which none of `own` would be let in, or None."""
-    file = next((file for file in files if file.path == AUTHORIZED_KEYS), None)
+def lockout(node: Node, files: Mapping[str, bytes], own: Sequence[OwnKey]) -> Objection | None:
+    """The objection against a change to `files` (paths without a leading slash) after which none of `own` would be let
+    in, or None."""
+    content = files.get(AUTHORIZED_KEYS)
     # dropbear reads this file for root alone
-    if file is None or node.ssh.user != "root":
+    if content is None or node.ssh.user != "root":
         return None
-    lines = [line for line in file.content.decode("utf-8", "replace").splitlines() if line.strip()]
+    lines = [line for line in content.decode("utf-8", "replace").splitlines() if line.strip()]
     allowed = {word for line in lines for word in line.split()}
     # 19.07's dropbear knows RSA alone
     usable = [key for key in own if node.release.has_ed25519 or key.key_type == "ssh-rsa"]

@@ -85,7 +85,8 @@ def node_plan(
     if problem is not None:
         return replace(basis, verdict=Verdict.REFUSED, reason=problem.reason, hint=problem.hint)
     files = file_changes(wanted.files, seen)
-    shut_out = None if own_keys is None or not (files or firmware) else lockout(node, wanted.files, own_keys)
+    contents = {file.path: file.content for file in wanted.files} if files or firmware else {}
+    shut_out = None if own_keys is None else lockout(node, contents, own_keys)
     if shut_out is not None:
         return replace(basis, verdict=Verdict.REFUSED, reason=shut_out.reason, hint=shut_out.hint)
     told = effects((change.path for change in files), before, after)

@@ -6,13 +6,16 @@ import contextlib
 import gzip
 import io
 import tarfile
+from base64 import b64decode
 from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshctl.apply.keep import Backup, lacking_packages, objection_to, read_backup, with_info
+from meshctl.apply.keep import Backup, lacking_packages, lockout_by, objection_to, read_backup, with_info
+from meshctl.device.connection import OwnKey
+from meshctl.device.deadman import NewFile
 from meshctl.device.observation import BoardInfo
 from meshctl.errors import InputError
 from tests.meshctl.plan.support import fleet, running
@@ -90,3 +93,14 @@ def test_a_backup_goes_onto_its_own_node_and_board_only() -> None:
     assert "the backup is of b01, not of b02" in objection_to(saved(), "b02", seen)
     assert "is ubnt,rocket-m" in objection_to(saved(), "b01", replace(seen, board=BoardInfo("ubnt,rocket-m")))
     assert lacking_packages(saved(), replace(seen, packages={"iw": "1"})) == ("wpad",)
+
+
+def test_a_backup_that_lets_in_none_of_our_keys_is_refused_and_one_without_keys_is_not() -> None:
+    node = fleet().nodes["b01"]
+    keys = {"/etc/dropbear/authorized_keys": NewFile(f"{fleet().operators.ssh_keys[0]}\n".encode(), 0o600)}
+    ours = OwnKey("agent key", "ssh-ed25519", b64decode(fleet().operators.ssh_keys[0].split()[1]))
+    assert lockout_by(saved(), node, ()) is None
+    assert lockout_by(replace(saved(), files=keys), node, (ours,)) is None
+    refused = lockout_by(replace(saved(), files=keys), node, ())
+    assert refused is not None
+    assert f"it gets the keys {ours.fingerprint} (alice)" in refused.reason

@@ -7,14 +7,18 @@ from dataclasses import replace
 
 from meshctl.device.connection import OwnKey
 from meshctl.model import Release
-from meshctl.plan import Verdict
-from meshctl.plan.lockout import lockout
+from meshctl.plan import Verdict, Wanted
+from meshctl.plan.lockout import AUTHORIZED_KEYS, lockout
 from tests.meshctl.plan.support import factory, fleet, planned, running, wanted
 
 TEAM = fleet()
 AUTHORIZED = TEAM.operators.ssh_keys[0]
 OURS = OwnKey("agent key alice", "ssh-ed25519", base64.b64decode(AUTHORIZED.split()[1]))
 OTHER = OwnKey("key /home/bob/.ssh/id_ed25519", "ssh-ed25519", b"\0\0\0\x0bssh-ed25519\0\0\0 " + bytes(32))
+
+
+def contents(want: Wanted) -> dict[str, bytes]:
+    return {file.path: file.content for file in want.files}
 
 
 def test_a_change_is_planned_where_one_of_our_keys_is_let_in() -> None:
@@ -47,8 +51,8 @@ def test_where_the_keys_were_not_asked_for_nothing_is_said() -> None:
 def test_1907_lets_in_rsa_alone() -> None:
     want = wanted(TEAM, "b01")
     old = replace(want.node, release=Release.V19_07)
-    assert lockout(want.node, want.files, (OURS,)) is None
-    refused = lockout(old, want.files, (OURS,))
+    assert lockout(want.node, contents(want), (OURS,)) is None
+    refused = lockout(old, contents(want), (OURS,))
     assert refused is not None
     assert "the keys we have that OpenWrt 19.07 knows: none" in refused.reason
 
@@ -56,12 +60,11 @@ def test_1907_lets_in_rsa_alone() -> None:
 def test_another_user_than_root_has_keys_of_its_own() -> None:
     want = wanted(TEAM, "b01")
     node = replace(want.node, ssh=replace(want.node.ssh, user="admin"))
-    assert lockout(node, want.files, ()) is None
+    assert lockout(node, contents(want), ()) is None
 
 
 def test_a_line_that_is_no_key_is_told_as_one() -> None:
     want = wanted(TEAM, "b01")
-    files = tuple(replace(f, content=b"ssh-rsa AAAA! x\n") if "authorized" in f.path else f for f in want.files)
-    refused = lockout(want.node, files, ())
+    refused = lockout(want.node, {AUTHORIZED_KEYS: b"ssh-rsa AAAA! x\n"}, ())
     assert refused is not None
     assert "it gets the keys one that cannot be read" in refused.reason
