@@ -179,9 +179,11 @@ def test_a_route_that_became_eighty_times_longer_is_filled_within_some_seconds()
 def test_the_queue_that_a_long_route_left_is_not_taken_for_the_short_one() -> None:
     # A window for the long route keeps the queue of the short one full for good, and half of what is sent is lost.
     run = Run()
-    run.link(rate_bits_per_s=20e6, delay_s=0.4)
+    run.link(rate_bits_per_s=20e6, delay_s=0.005)
     run.start()
-    run.world.run(24.0)
+    run.world.run(3.0)
+    run.link(delay_s=0.4)
+    run.world.run(15.0)
     run.link(delay_s=0.005)
     run.world.run(4.0)
     figures = run.measure(3.0)
