@@ -189,14 +189,14 @@ class Flight:
         self.outstanding = 0
         return lost
 
-    def oldest_sent_at(self) -> float:
-        """When the first packet still on its way left; only meaningful while something is."""
+    def oldest(self) -> Mark | None:
+        """The mark of the first packet still on its way."""
         packets = self._packets
         while packets and packets[0] is None:
             packets.popleft()
             self.base += 1
         front = packets[0] if packets else None
-        return front.mark.sent_at if front is not None else float("inf")
+        return front.mark if front is not None else None
 
     def lose_before(self, sent_before: float) -> list[Packet]:
         """Packets sent before that time count as lost."""

@@ -87,6 +87,8 @@ class Outbound(OpenMessages):
         self._bursts = Bursts()
         self.path_size = PathSize()
         self.last_progress = 0.0
+        self.other_progress = 0.0
+        """When the last packet that was not urgent arrived."""
         self.limited = True
         """The application, not window or pacing, decides how much leaves."""
         self.since_ack_wanted = 0
@@ -137,6 +139,8 @@ class Outbound(OpenMessages):
             # What was acknowledged late, all at once, says nothing about the rate of the link.
             after_silence = self.struggling or self.silent_since is not None
             self.last_progress = now
+            if not all(packet.mark.urgent for packet in acknowledged):
+                self.other_progress = now
             self.struggling = False
             if self.silent_since is not None:
                 self._end_silence()
@@ -291,10 +295,14 @@ class Outbound(OpenMessages):
 
     def _expiry_at(self) -> float:
         """When to look for packets whose acknowledgement is overdue."""
-        oldest = self.flight.oldest_sent_at()
+        oldest = self.flight.oldest()
+        if oldest is None:
+            return float("inf")
         timeout = self.timeout()
-        quiet = self.last_progress + max(QUIET_S, timeout / 2)
-        return max(quiet, oldest + timeout, self.expired_at + EXPIRE_EVERY_S)
+        # Urgent packets overtake others in radios: that they arrive says nothing about one that all others follow.
+        progress = self.last_progress if oldest.urgent else self.other_progress
+        quiet = progress + max(QUIET_S, timeout / 2)
+        return max(quiet, oldest.sent_at + timeout, self.expired_at + EXPIRE_EVERY_S)
 
     def _expire(self, sent_before: float) -> None:
         """Packets sent until then are no longer counted as on their way, so that others may leave.
