@@ -1,4 +1,4 @@
-"""Urgent packets overtake others in a radio and tell nothing of their loss: time does, however many urgent ones arrive."""
+"""Urgent packets overtake others in a radio and do not tell of their loss: time does, however many arrive."""
 
 import random
 from dataclasses import dataclass
@@ -31,21 +31,19 @@ def test_bulk_that_was_lost_all_at_once_is_sent_again_while_urgent_messages_keep
     world = World(seed=1)
     for name in ("a", "b"):
         world.add(settings(name, *TOPICS))
-    for way in world.pipes:
-        world.pipes[way] = Wall(delay_s=0.05)
+    walls = [Wall(delay_s=0.05) for _ in world.pipes]
+    world.pipes.update(zip(world.pipes, walls, strict=True))
     assert world.run(20.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
 
     def report() -> None:
         world.send("a", "telemetry", bytes(100), "b")
 
     def fall() -> None:
-        for way in world.pipes.values():
-            assert isinstance(way, Wall)
-            way.stands = False
+        for wall in walls:
+            wall.stands = False
 
-    for way in world.pipes.values():
-        assert isinstance(way, Wall)
-        way.stands = True
+    for wall in walls:
+        wall.stands = True
     for number in range(20 * telemetry_hz):
         world.at(world.now + number / telemetry_hz, report)
     world.send("a", "map", bytes(50_000), "b")
@@ -56,4 +54,4 @@ def test_bulk_that_was_lost_all_at_once_is_sent_again_while_urgent_messages_keep
         return [event.topic for event in events if event.topic == "map"]
 
     assert world.run(5.0, until=lambda: bool(maps()))
-    assert any(way.dropped for way in world.pipes.values())
+    assert any(wall.dropped for wall in walls)
