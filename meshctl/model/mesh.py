@@ -30,11 +30,14 @@ class Backend(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Batman:
-    """batman-adv's options by their UCI names; `orig_interval_ms` None means: chosen from `Mesh.reconnect_s`."""
+    """batman-adv's options by their UCI names; `orig_interval_ms` None means: chosen from `Mesh.reconnect_s`.
+
+    They are the kernel's defaults, but for the table of ARP answers (docs/decisions/0012-arp.md).
+    """
 
     routing_algo: str = "BATMAN_IV"
     bridge_loop_avoidance: bool = True
-    distributed_arp_table: bool = True
+    distributed_arp_table: bool = False
     aggregated_ogms: bool = True
     multicast_mode: bool = True
     fragmentation: bool = True

@@ -87,8 +87,8 @@ class BatmanDocument(Document):
     """BATMAN_IV or BATMAN_V; the same on all nodes."""
     bridge_loop_avoidance: Flag = True
     """Needed where two radios share a switch."""
-    distributed_arp_table: Flag = True
-    """Answer ARP from a table spread over the mesh."""
+    distributed_arp_table: Flag = False
+    """Answer ARP from a table spread over the mesh: less airtime among many, but it hides who moved or was replaced."""
     aggregated_ogms: Flag = True
     """Send several originator messages in one frame."""
     multicast_mode: Flag = True
