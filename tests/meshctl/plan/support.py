@@ -59,17 +59,14 @@ nodes:
 def fleet(*, channel: int = 6, max_down: int = 1, canary: bool = False, firmware: str = "") -> Fleet:
     """A base and five beacons in one encrypted mesh."""
     text = INVENTORY.format(channel=channel, max_down=max_down, canary=str(canary).lower(), firmware=firmware)
-    with TemporaryDirectory() as directory:
-        path = Path(directory) / "fleet.yaml"
-        path.write_text(text, encoding="utf-8")
-        return load_fleet(path)
+    return _loaded(text)
 
 
 @cache
 def two_meshes(*, channel: int = 6, far_channel: int = 36) -> Fleet:
     """A base and b01 in mesh `main`, b03 and b04 in mesh `far`, b02 in both."""
     text = INVENTORY.format(channel=channel, max_down=1, canary="false", firmware="")
-    head, nodes = text.split("defaults:")
+    head, _, _ = text.partition("defaults:")
     radio = "radio1: {path: platform/ahb/18100000.pcie, band: 5g, rated_power_dbm: 30, max_drive_dbm: 27}"
     head = head.replace("max_drive_dbm: 27}\n", f"max_drive_dbm: 27}}\n      {radio}\n", 1)
     head += f"""  far:
@@ -90,9 +87,13 @@ nodes:
   b03: {{role: beacon, address: 10.42.0.103, radios: {far}}}
   b04: {{role: beacon, address: 10.42.0.104, radios: {far}}}
 """
+    return _loaded(head + nodes)
+
+
+def _loaded(text: str) -> Fleet:
     with TemporaryDirectory() as directory:
         path = Path(directory) / "fleet.yaml"
-        path.write_text(head + nodes, encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
         return load_fleet(path)
 
 
