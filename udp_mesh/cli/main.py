@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from udp_mesh.daemon.configuration import CONDITIONS_TOPIC, DEFAULT_PATH
 Command = Callable[[argparse.Namespace], int]
 
 EPILOG = """\
-exit codes: 0 done, 1 refused or no answer, 2 wrong usage, 3 no daemon at the socket,
+exit codes: 0 done, 1 refused or no answer, 2 wrong usage, 3 no daemon answers at the socket,
 4 problems in the configuration, 5 a message was not delivered, 130 interrupted
 
 examples:
@@ -41,6 +42,15 @@ ENDLESS: tuple[Command, ...] = (
 FORWARDED = {"report": "udp_mesh.report", "sim": "udp_mesh.sim"}
 """Commands with arguments of their own: the package's `main(argv)` gets them."""
 
+MOST_TIMES = 1_000_000_000
+
+
+class Help(argparse.RawDescriptionHelpFormatter):
+    """Keeps paths and examples whole: argparse breaks lines at hyphens."""
+
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False, break_long_words=False)
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the process's exit code."""
@@ -53,7 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return command(parsed)
     except MeshError as error:
-        complain(str(error))
+        hint = _hint(error)
+        complain(f"{error} ({hint})" if hint else str(error))
         return Exit.UNREACHABLE if error.code == "unreachable" else Exit.FAILED
     except BrokenPipeError:
         # The reader of our output has gone: nobody is left to be told.
@@ -63,13 +74,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         return Exit.OK if command in ENDLESS else Exit.INTERRUPTED
 
 
+def _hint(error: MeshError) -> str:
+    """What to do about a refusal, where the command line knows."""
+    match error.code, error.__cause__:
+        case "unreachable", PermissionError():
+            return "its socket is for root and for the group that `socket_group` in [daemon] names"
+        case "unreachable", FileNotFoundError() | ConnectionRefusedError():
+            return "`udp-mesh run` starts one, --socket names another socket"
+        case "unknown-peer", _:
+            return "`udp-mesh peers` lists those that were heard"
+        case "unknown-topic", _:
+            return "`udp-mesh topics` lists what is configured"
+        case _:
+            return ""
+
+
 def build_parser() -> argparse.ArgumentParser:
     """Every command with its help."""
     parser = argparse.ArgumentParser(
         prog="udp-mesh",
         description="Prioritized messages between robots over lossy, breaking links.",
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=Help,
     )
     parser.add_argument("--version", action="version", version=f"udp-mesh {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
@@ -91,7 +117,7 @@ def _command(
     command: Command,
     help_text: str,
     *,
-    example: str = "",
+    example: str,
     daemon: bool = True,
     json: bool = True,
 ) -> argparse.ArgumentParser:
@@ -99,7 +125,8 @@ def _command(
         name,
         help=help_text,
         description=f"{help_text[:1].upper()}{help_text[1:]}.",
-        epilog=f"example: {example}" if example else None,
+        epilog=f"example: {example}",
+        formatter_class=Help,
     )
     parser.set_defaults(command=command)
     if daemon:
@@ -107,6 +134,20 @@ def _command(
     if json:
         parser.add_argument("--json", action="store_true", help="JSON for scripts")
     return parser
+
+
+def _commands_of(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, help_text: str, example: str
+) -> argparse._SubParsersAction[argparse.ArgumentParser]:
+    """A command that has commands of its own."""
+    parser = commands.add_parser(
+        name,
+        help=help_text,
+        description=f"{help_text[:1].upper()}{help_text[1:]}.",
+        epilog=f"example: {example}",
+        formatter_class=Help,
+    )
+    return parser.add_subparsers(title="what", metavar="WHAT", required=True)
 
 
 def _add_serve(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -146,16 +187,22 @@ def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
             metavar="SECONDS",
             help="again and again (default: every 1 s)",
         )
-    _command(commands, "events", inspect.events, "print events of peers and topics as they happen")
-    _command(commands, "metrics", inspect.metrics, "print the page for Prometheus", json=False)
+    _command(
+        commands,
+        "events",
+        inspect.events,
+        "print events of peers and topics as they happen",
+        example="udp-mesh events --json",
+    )
+    _command(
+        commands, "metrics", inspect.metrics, "print the page for Prometheus", example="udp-mesh metrics", json=False
+    )
 
 
 def _add_change(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    setters = commands.add_parser(
-        "set",
-        help="change the running daemon until its next reload or restart",
-        epilog="example: udp-mesh set window 3",
-    ).add_subparsers(title="what", metavar="WHAT", required=True)
+    setters = _commands_of(
+        commands, "set", "change the running daemon until its next reload or restart", "udp-mesh set window 3"
+    )
     topic = _command(
         setters,
         "topic",
@@ -163,27 +210,57 @@ def _add_change(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         "add or change a topic",
         example="udp-mesh set topic map priority=7 outbox=all",
     )
-    topic.add_argument("topic")
-    topic.add_argument("values", nargs="*", metavar="key=value")
-    window = _command(setters, "window", change.set_window, "set the packets in flight per peer")
+    topic.add_argument("topic", help="its name; one that is not configured yet is added")
+    topic.add_argument(
+        "values", nargs="*", metavar="key=value", help="as in [topics], such as priority=9; the others stay as they are"
+    )
+    window = _command(
+        setters, "window", change.set_window, "set the packets in flight per peer", example="udp-mesh set window 3"
+    )
     window.add_argument("window", help='"adaptive", or a number such as 3')
-    rates = _command(setters, "rates", change.set_rates, "set times and thresholds of the protocol")
+    rates = _command(
+        setters,
+        "rates",
+        change.set_rates,
+        "set times and thresholds of the protocol",
+        example="udp-mesh set rates offline_s=5 heartbeat_s=0.5",
+    )
     rates.add_argument("values", nargs="+", metavar="key=value", help="as in [rates], such as offline_s=5")
-    neighbour = _command(setters, "neighbour", change.set_neighbour, "add or change a fixed neighbour")
+    neighbour = _command(
+        setters,
+        "neighbour",
+        change.set_neighbour,
+        "add or change a fixed neighbour",
+        example="udp-mesh set neighbour 10.42.0.11 --name husky1 --legacy",
+    )
     neighbour.add_argument("address", help="10.0.0.2, 10.0.0.2:8700 or [fd00::2]:8700")
     neighbour.add_argument("--name", help="its node name (needed for --legacy)")
     neighbour.add_argument("--link", help="the link it is reached over")
     neighbour.add_argument("--legacy", action="store_true", help="it speaks the fielded format")
-    keys = _command(setters, "keys", change.set_keys, "take the keys of a file, the first one seals")
-    keys.add_argument("file", type=Path)
-    droppers = commands.add_parser(
-        "drop",
-        help="remove a topic or neighbour from the running daemon",
-        epilog="example: udp-mesh drop topic video",
-    ).add_subparsers(title="what", metavar="WHAT", required=True)
-    _command(droppers, "topic", change.drop_topic, "forget a topic").add_argument("topic")
-    _command(droppers, "neighbour", change.drop_neighbour, "forget a fixed neighbour").add_argument("address")
-    _command(commands, "reload", change.reload, "read the daemon's configuration again")
+    keys = _command(
+        setters,
+        "keys",
+        change.set_keys,
+        "take the keys of a file, the first one seals",
+        example="udp-mesh set keys /etc/udp-mesh/new.key",
+    )
+    keys.add_argument("file", type=Path, help="one or two keys, one per line; the daemon reads it")
+    droppers = _commands_of(
+        commands, "drop", "remove a topic or neighbour from the running daemon", "udp-mesh drop topic video"
+    )
+    _command(droppers, "topic", change.drop_topic, "forget a topic", example="udp-mesh drop topic video").add_argument(
+        "topic", help="its name"
+    )
+    _command(
+        droppers,
+        "neighbour",
+        change.drop_neighbour,
+        "forget a fixed neighbour",
+        example="udp-mesh drop neighbour 10.42.0.11",
+    ).add_argument("address", help="as it was set")
+    _command(
+        commands, "reload", change.reload, "read the daemon's configuration again", example="udp-mesh reload --json"
+    )
 
 
 def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -194,12 +271,12 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "send a message",
         example="udp-mesh pub map/diff --file map.bin --to base --wait",
     )
-    publish.add_argument("topic")
+    publish.add_argument("topic", help="its name, as in `udp-mesh topics`")
     publish.add_argument("text", nargs="?", help="the message (- or nothing: --file, or standard input)")
     publish.add_argument("--file", type=Path, help="send this file's bytes (- for standard input)")
     publish.add_argument("--to", metavar="PEER", help="one peer (default: the topic's destinations, or all)")
     publish.add_argument("--type", default="", help="the message's type name, carried along")
-    publish.add_argument("--count", type=int, default=1, help="send it so many times")
+    publish.add_argument("--count", type=_times, default=1, help="send it so many times")
     publish.add_argument("--rate", type=_positive, default=1.0, metavar="HZ", help="with --count, so many a second")
     publish.add_argument(
         "--wait", type=_positive, nargs="?", const=60.0, metavar="SECONDS", help="wait for the outcome (default: 60 s)"
@@ -208,43 +285,61 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         commands, "echo", traffic.echo, "print messages that arrive", example="udp-mesh echo 'map/*' status"
     )
     echo.add_argument("topics", nargs="+", metavar="TOPIC", help=f"names or patterns; {CONDITIONS_TOPIC} too")
-    echo.add_argument("--count", type=int, help="stop after so many")
+    echo.add_argument("--count", type=_times, help="stop after so many")
     echo.add_argument("--timeout", type=_positive, metavar="SECONDS", help="stop when nothing comes for so long")
     echo.add_argument("--raw", action="store_true", help="write the payloads' bytes and nothing else")
     ping = _command(
         commands, "ping", traffic.ping, "measure round trips to a peer", example="udp-mesh ping base --count 5"
     )
-    ping.add_argument("peer")
-    ping.add_argument("-c", "--count", type=int, default=4)
-    ping.add_argument("--interval", type=_positive, default=1.0, metavar="SECONDS")
-    ping.add_argument("--timeout", type=_positive, default=2.0, metavar="SECONDS")
+    ping.add_argument("peer", help="its name, as in `udp-mesh peers`")
+    ping.add_argument("-c", "--count", type=_times, default=4, help="so many (default: %(default)s)")
+    ping.add_argument(
+        "--interval", type=_positive, default=1.0, metavar="SECONDS", help="between two (default: %(default)g)"
+    )
+    ping.add_argument(
+        "--timeout", type=_positive, default=2.0, metavar="SECONDS", help="for each answer (default: %(default)g)"
+    )
     bench = _command(
         commands, "bench", traffic.bench, "fill the link to a peer and measure", example="udp-mesh bench base"
     )
-    bench.add_argument("peer")
+    bench.add_argument("peer", help="its name, as in `udp-mesh peers`")
     bench.add_argument(
-        "--size", type=int, default=1_000_000, metavar="BYTES", help="per message (default: %(default)s)"
+        "--size", type=_times, default=1_000_000, metavar="BYTES", help="per message (default: %(default)s)"
     )
-    bench.add_argument("--seconds", type=_positive, default=5.0)
+    bench.add_argument("--seconds", type=_positive, default=5.0, help="how long (default: %(default)g)")
     bench.add_argument(
-        "--timeout", type=_positive, default=60.0, metavar="SECONDS", help="give up when none is delivered"
+        "--timeout",
+        type=_positive,
+        default=60.0,
+        metavar="SECONDS",
+        help="give up when none is delivered for so long (default: %(default)g)",
     )
-    recorders = commands.add_parser(
-        "record",
-        help="record messages and conditions for `udp-mesh report`",
-        epilog="example: udp-mesh record start run1.jsonl",
-    ).add_subparsers(title="what", metavar="WHAT", required=True)
-    start = _command(recorders, "start", traffic.record_start, "begin a recording")
+    recorders = _commands_of(
+        commands, "record", "record messages and conditions for `udp-mesh report`", "udp-mesh record start run1.jsonl"
+    )
+    start = _command(
+        recorders, "start", traffic.record_start, "begin a recording", example="udp-mesh record start run1.jsonl"
+    )
     start.add_argument("file", type=Path, help="a file that does not exist yet, written by the daemon")
     start.add_argument("--payloads", action="store_true", help="with the bytes of received messages")
-    _command(recorders, "stop", traffic.record_stop, "end the recording")
+    _command(recorders, "stop", traffic.record_stop, "end the recording", example="udp-mesh record stop")
 
 
 def _positive(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
     if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected a positive number, found {text}")
+        raise argparse.ArgumentTypeError(f"expected a positive number, found {text!r}")
     return value
+
+
+def _times(text: str) -> int:
+    """A count that does something: at least one."""
+    if not text.isdecimal() or not 1 <= int(text) <= MOST_TIMES:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, found {text!r}")
+    return int(text)
 
 
 if __name__ == "__main__":

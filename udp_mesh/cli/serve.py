@@ -27,9 +27,18 @@ def run_daemon(arguments: argparse.Namespace) -> int:
     try:
         asyncio.run(run(configuration))
     except OSError as error:
-        complain(f"cannot start: {error}")
+        complain(f"cannot start: {_reason(error)}")
         return Exit.FAILED
     return Exit.OK
+
+
+def _reason(error: OSError) -> str:
+    """Without the number, and with the way out where files are for somebody else."""
+    if error.strerror is None:
+        return str(error)
+    place = f"{error.filename}: " if error.filename is not None else ""
+    hint = " (`socket` and `state_directory` in [daemon] name other places)"
+    return f"{place}{error.strerror}{hint if isinstance(error, PermissionError) else ''}"
 
 
 def check(arguments: argparse.Namespace) -> int:

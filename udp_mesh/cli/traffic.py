@@ -18,6 +18,9 @@ BENCH_BACKLOG_BYTES = 16 << 20
 
 def publish(arguments: argparse.Namespace) -> int:
     """Sends one message, or the same one `--count` times at `--rate` a second."""
+    if arguments.file is not None and arguments.text not in (None, "-"):
+        complain(f"expected the message or --file, found both: {arguments.text!r} and --file {arguments.file}")
+        return Exit.USAGE
     payload = _payload(arguments)
     if payload is None:
         return Exit.FAILED
@@ -31,6 +34,8 @@ def publish(arguments: argparse.Namespace) -> int:
             )
             numbers.append(number)
         if arguments.wait is None:
+            if arguments.json:
+                say_json_line({"topic": arguments.topic, "accepted": len(numbers)})
             return Exit.OK
         return _await_outcomes(mesh, numbers, arguments)
 
@@ -39,6 +44,8 @@ def _payload(arguments: argparse.Namespace) -> bytes | None:
     if arguments.text not in (None, "-"):
         return bytes(arguments.text.encode())
     if arguments.text == "-" or arguments.file is None or str(arguments.file) == "-":
+        if sys.stdin.isatty():
+            complain("the message is what you type now; Ctrl-D ends it")
         return sys.stdin.buffer.read()
     path: Path = arguments.file
     try:
@@ -122,7 +129,12 @@ def ping(arguments: argparse.Namespace) -> int:
             except MeshError as error:
                 if error.code in ("unreachable", "timeout"):
                     raise
-                say_json_line({"peer": arguments.peer, "error": error.code}) if arguments.json else say(str(error))
+                if arguments.json:
+                    say_json_line({"peer": arguments.peer, "error": error.code})
+                if error.code == "unknown-peer":
+                    raise
+                if not arguments.json:
+                    say(str(error))
                 continue
             times.append(reply["round_trip_s"])
             if arguments.json:

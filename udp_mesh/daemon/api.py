@@ -185,9 +185,12 @@ class LocalServer:
             listener.setblocking(False)
             loop = asyncio.get_running_loop()
             self._server = await loop.create_unix_server(lambda: Client(self), sock=listener)
-        except OSError:
+        except OSError as error:
             listener.close()
-            raise
+            if error.strerror is None:
+                raise
+            # bind(2) does not say where.
+            raise OSError(error.errno, error.strerror, str(self._path)) from error
 
     async def close(self) -> None:
         """Stops listening, lets what is written be read, closes every connection, removes the socket's file."""

@@ -81,7 +81,7 @@ class Configuration:
 
 def load(path: Path) -> Configuration:
     """The configuration in this file, with the keys of the key file it names. Raises ConfigurationError."""
-    text = _read_text(path, str(path), 0)
+    text = _read_text(path)
     top = parse(text, str(path))
     key_file, unkeyed = top.text("key_file"), top.boolean("unkeyed", False)
     keys: tuple[Key, ...] = ()
@@ -94,7 +94,11 @@ def load(path: Path) -> Configuration:
         except ConfigurationError as error:
             line = top.source.line(("key_file",))
             top.source.problems += [
-                dataclasses.replace(problem, file=str(path), line=line) if problem.line == 0 else problem
+                dataclasses.replace(
+                    problem, file=str(path), line=line, key="key_file", found=f"{problem.file}: {problem.found}"
+                )
+                if problem.line == 0
+                else problem
                 for problem in error.problems
             ]
     elif not unkeyed:
@@ -108,7 +112,7 @@ def read_keys(path: Path) -> tuple[Key, ...]:
     """The one or two keys of a key file, one per line, the sealing one first. Raises ConfigurationError."""
     keys: list[Key] = []
     problems: list[Problem] = []
-    for number, line in enumerate(_read_text(path, str(path), 0).splitlines(), start=1):
+    for number, line in enumerate(_read_text(path).splitlines(), start=1):
         words = line.split("#")[0].strip()
         if not words:
             continue
@@ -124,14 +128,15 @@ def read_keys(path: Path) -> tuple[Key, ...]:
     return tuple(keys)
 
 
-def _read_text(path: Path, name: str, line: int) -> str:
+def _read_text(path: Path) -> str:
+    name = str(path)
     try:
         with path.open("rb") as file:
             raw = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
-        raise ConfigurationError([Problem(name, line, "", "a readable file", f"{path}: {error.strerror}")]) from error
+        raise ConfigurationError([Problem(name, 0, "", "a readable file", f"{error.strerror}")]) from error
     if len(raw) > MAX_FILE_BYTES:
-        raise ConfigurationError([Problem(name, line, "", f"a file of at most {MAX_FILE_BYTES} bytes", "a larger one")])
+        raise ConfigurationError([Problem(name, 0, "", f"a file of at most {MAX_FILE_BYTES} bytes", "a larger one")])
     try:
         return raw.decode()
     except UnicodeDecodeError as error:
@@ -326,12 +331,13 @@ def _read_limits(table: Table) -> Limits:
 
 def _read_daemon(table: Table) -> DaemonSettings:
     default = DaemonSettings()
-    mode_text = table.text("socket_mode", f"{default.socket_mode:04o}") or ""
+    octal = 'octal permissions in quotes such as "0660"'
+    mode_text = table.text("socket_mode", f"{default.socket_mode:04o}", octal) or ""
     mode = default.socket_mode
     if re.fullmatch(r"0?[0-7]{3}", mode_text):
         mode = int(mode_text, 8)
     else:
-        table.report("socket_mode", 'octal permissions such as "0660"', mode_text)
+        table.report("socket_mode", octal, mode_text)
     metrics_text = table.text("metrics_address")
     metrics = parse_address(metrics_text, 0) if metrics_text is not None and metrics_text.count(":") else None
     if metrics_text is not None and (metrics is None or not ipaddress.ip_address(metrics[0]).is_loopback):

@@ -50,12 +50,13 @@ def locate(text: str) -> dict[Path, int]:
     table: Path = ()
     counts: dict[Path, int] = {}
     open_brackets, open_string = 0, ""
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         if not open_brackets and not open_string:
             header = _HEADER.match(line)
             if header:
                 keys = tuple(_split_key(header["key"]))
                 if header["array"]:
+                    lines.setdefault(keys, number)
                     counts[keys] = counts.get(keys, -1) + 1
                     table = (*keys, counts[keys])
                 else:
@@ -140,11 +141,26 @@ def parse(text: str, file: str) -> Table:
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        at = re.search(r"at line (\d+)", str(error))
-        line = int(at[1]) if at else text.count("\n") + 1
-        reason = re.sub(r" \(at .*\)$", "", str(error))
-        raise ConfigurationError([Problem(file, line, "", "TOML", f"{reason[:1].lower()}{reason[1:]}")]) from error
+        raise ConfigurationError([_syntax_problem(text, file, str(error))]) from error
     return Table(values, Source(file, locate(text)), ())
+
+
+def _syntax_problem(text: str, file: str, error: str) -> Problem:
+    """What `tomllib` says, in the form of all other problems. The text itself is not shown: it may be a key."""
+    at = re.search(r"\(at line (?P<line>\d+), column (?P<column>\d+)\)$", error)
+    line = int(at["line"]) if at else text.count("\n") + 1
+    place = f"at column {at['column']}" if at else "at the end of the file"
+    reason = re.sub(r" \(at .*\)$", "", error)
+    match reason:
+        case "Invalid value":
+            expected = "a value (text in quotes, a number, true, false, [...] or {...})"
+            return Problem(file, line, "", expected, "something else", place)
+        case "Cannot overwrite a value":
+            return Problem(file, line, "", "each key once", "one that stands above as well", place)
+        case _ if reason.startswith("Expected "):
+            return Problem(file, line, "", reason.removeprefix("Expected "), "something else", place)
+        case _:
+            return Problem(file, line, "", "TOML", f"{reason[:1].lower()}{reason[1:]}", place)
 
 
 class Table:
@@ -166,11 +182,11 @@ class Table:
     def report(self, key: str, expected: str, found: object, hint: str = "") -> None:
         self.source.report((*self.path, key), expected, show(found), hint)
 
-    def text(self, key: str, default: str | None = None) -> str | None:
+    def text(self, key: str, default: str | None = None, expected: str = "a string") -> str | None:
         value = self._take(key)
         if value is None or isinstance(value, str):
             return default if value is None else value
-        self.report(key, "a string", value)
+        self.report(key, expected, value)
         return default
 
     def boolean(self, key: str, default: bool) -> bool:
@@ -269,6 +285,8 @@ def show(value: object) -> str:
         return "true" if value else "false"
     if isinstance(value, dict):
         return "a table"
+    if isinstance(value, list) and any(isinstance(item, dict) for item in value):
+        return "a list of tables"
     if isinstance(value, str):
         return f'"{value}"' if len(value) <= 60 else f'"{value[:57]}..."'
     text = str(value)

@@ -1,7 +1,10 @@
 """The command line against real daemons: what scripts rely on is exit codes and JSON."""
 
+import argparse
+import errno
 import io
 import json
+import shlex
 import signal
 import socket
 import subprocess
@@ -15,7 +18,8 @@ import pytest
 
 from tests.udp_mesh.daemon.processes import RunningDaemon, collect, two_daemons
 from tests.udp_mesh.links.sockets import WAIT_S
-from udp_mesh.cli.main import build_parser, main
+from udp_mesh.cli import serve
+from udp_mesh.cli.main import FORWARDED, build_parser, main
 from udp_mesh.cli.output import Exit
 from udp_mesh.client.mesh_client import FrameReader, encode_frame
 from udp_mesh.crypto import Key
@@ -105,6 +109,11 @@ def test_a_file_is_sent_several_times(run: Run, pair: Pair, tmp_path: Path) -> N
     assert "missing: No such file" in complaint
 
 
+def test_a_script_is_told_that_its_message_was_accepted(run: Run) -> None:
+    code, text, _ = run("pub", "map", "x", "--to", "bob", "--count", "2", "--rate", "100", "--json")
+    assert (code, json.loads(text)) == (Exit.OK, {"topic": "map", "accepted": 2})
+
+
 def test_an_undeliverable_message_has_an_exit_code_of_its_own(run: Run) -> None:
     assert run("set", "topic", "brief", "deadline_s=0.05", "rate_limit_bytes_per_s=1000")[0] == Exit.OK
     code, text, _ = run("pub", "brief", "x" * 900, "--to", "bob", "--count", "4", "--rate", "1000", "--wait")
@@ -160,9 +169,11 @@ def test_a_peer_answers_a_ping_and_a_stranger_does_not(run: Run) -> None:
     assert code == Exit.OK
     assert all(json.loads(line)["round_trip_s"] > 0 for line in text.splitlines())
     assert "2 of 2 answered" in run("ping", "bob", "--count", "2", "--interval", "0.01", "--timeout", "50")[1]
-    code, text, _ = run("ping", "nobody", "-c", "1")
-    assert code == Exit.FAILED
-    assert "nobody" in text
+    code, text, complaint = run("ping", "nobody", "-c", "1000")
+    assert (code, text) == (Exit.FAILED, "")
+    assert "nobody was never heard of (`udp-mesh peers` lists" in complaint
+    code, text, _ = run("ping", "nobody", "--json")
+    assert (code, json.loads(text)) == (Exit.FAILED, {"peer": "nobody", "error": "unknown-peer"})
 
 
 def test_a_benchmark_says_what_arrived(run: Run) -> None:
@@ -195,7 +206,9 @@ def test_what_is_set_shows_and_what_is_dropped_is_gone(run: Run) -> None:
         (["set", "topic", "map", "priority"], Exit.USAGE, "expected key=value, found 'priority'"),
         (["set", "topic", "map", "prioriti=3"], Exit.FAILED, "did you mean 'priority'?"),
         (["set", "window", "many"], Exit.FAILED, 'expected "adaptive" or 1 to 4096'),
-        (["pub", "unknown", "x"], Exit.FAILED, "unknown topic"),
+        (["pub", "unknown", "x"], Exit.FAILED, "unknown topic: topic unknown is not declared (`udp-mesh topics` lists"),
+        (["pub", "map", "x", "--to", "nobody"], Exit.FAILED, "nobody was never heard of (`udp-mesh peers` lists"),
+        (["pub", "map", "x", "--file", "map.bin"], Exit.USAGE, "expected the message or --file, found both"),
     ],
 )
 def test_a_mistake_is_explained_in_one_line(run: Run, words: list[str], code: int, complaint: str) -> None:
@@ -218,9 +231,42 @@ def test_metrics_are_printed(run: Run) -> None:
     assert "udp_mesh_peer_online" in run("metrics")[1]
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["pub", "map", "x", "--count", "0"],
+        ["echo", "map", "--count", "-1"],
+        ["ping", "bob", "--count", "many"],
+        ["bench", "bob", "--size", "0"],
+        ["bench", "bob", "--size", "-5"],
+        ["ping", "bob", "--interval", "soon"],
+    ],
+)
+def test_a_number_that_would_do_nothing_is_wrong_usage(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == Exit.USAGE
+    assert f"{words[-2]}: expected a" in capsys.readouterr().err
+
+
 def test_no_daemon_has_an_exit_code_of_its_own(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["status", "--socket", str(tmp_path / "none.sock")]) == Exit.UNREACHABLE
-    assert "no udp-mesh daemon at" in capsys.readouterr().err
+    complaint = capsys.readouterr().err
+    assert "no udp-mesh daemon at" in complaint
+    assert "`udp-mesh run` starts one" in complaint
+
+
+def test_a_socket_for_others_is_not_called_a_missing_daemon(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Root may use every socket, so the refusal is the kernel's word in a stand-in's mouth."""
+
+    def refused(_: socket.socket, _path: str) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(socket.socket, "connect", refused)
+    assert main(["status", "--socket", "s"]) == Exit.UNREACHABLE
+    assert "Permission denied (its socket is for root and for the group" in capsys.readouterr().err
 
 
 def test_a_key_is_made_once_for_its_owner_only(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -259,11 +305,62 @@ def test_every_command_has_help(capsys: pytest.CaptureFixture[str]) -> None:
     for command in [*commands, "pub", "echo", "ping", "bench", "record", "report", "sim"]:
         assert f"\n    {command} " in text
     with pytest.raises(SystemExit) as caught:
-        main(["pub", "--help"])
-    assert caught.value.code == 0
-    with pytest.raises(SystemExit) as caught:
         main(["dance"])
     assert caught.value.code == Exit.USAGE
+
+
+def _commands(parser: argparse.ArgumentParser, *words: str) -> Iterator[tuple[str, ...]]:
+    """Every command below a parser, as the words that call it."""
+    groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    if not groups:
+        yield words
+    for group in groups:
+        yield from (found for name, below in group.choices.items() for found in _commands(below, *words, name))
+
+
+@pytest.mark.parametrize("words", sorted(_commands(build_parser())))
+def test_every_command_shows_an_example_that_it_would_take(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([*words, "--help"])
+    assert caught.value.code == 0
+    *_, example = capsys.readouterr().out.rstrip().splitlines()
+    assert example.startswith(f"example: udp-mesh {' '.join(words)}")
+    if words[0] not in FORWARDED:
+        build_parser().parse_args(shlex.split(example.removeprefix("example: udp-mesh ")))
+
+
+@pytest.mark.parametrize(
+    ("daemon", "complaint"),
+    [
+        ('user = "nobody-here"', "daemon.user: expected a user of this machine, found 'nobody-here'"),
+        ('socket_group = "no-such-group"', "daemon.socket_group: expected a group of this machine"),
+    ],
+)
+def test_a_daemon_that_cannot_start_says_why(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, daemon: str, complaint: str
+) -> None:
+    path = tmp_path / "mesh.toml"
+    path.write_text(
+        f'unkeyed = true\n[[links]]\ninterface = "none0"\n[daemon]\nsocket = "{tmp_path}/s"\n'
+        f'state_directory = "{tmp_path}/state"\n{daemon}\n'
+    )
+    assert main(["run", str(path)]) == Exit.FAILED
+    assert f"udp-mesh: cannot start: {complaint}" in capsys.readouterr().err
+
+
+def test_a_directory_that_is_not_ours_is_named_with_the_way_out(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "mesh.toml"
+    (tmp_path / "file").touch()
+    path.write_text(f'unkeyed = true\n[daemon]\nsocket = "{tmp_path}/file/s"\nstate_directory = "{tmp_path}"\n')
+    assert main(["run", str(path)]) == Exit.FAILED
+    assert f"cannot start: {tmp_path}/file" in capsys.readouterr().err
+    assert serve._reason(PermissionError(errno.EACCES, "Permission denied", "/run/udp-mesh")) == (
+        "/run/udp-mesh: Permission denied (`socket` and `state_directory` in [daemon] name other places)"
+    )
 
 
 def test_events_are_printed_until_the_daemon_ends(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

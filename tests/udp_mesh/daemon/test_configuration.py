@@ -180,14 +180,35 @@ def test_a_key_file_is_all_that_is_needed(tmp_path: Path) -> None:
         ("[rates]\noffline_s = -1", "udp-mesh.toml:3: rates.offline_s: expected a number from 0 to 86400, found -1"),
         (
             '[daemon]\nsocket_mode = "rw"',
-            'udp-mesh.toml:3: daemon.socket_mode: expected octal permissions such as "0660", found "rw"',
+            'udp-mesh.toml:3: daemon.socket_mode: expected octal permissions in quotes such as "0660", found "rw"',
         ),
         (
             '[daemon]\nmetrics_address = "10.0.0.1:9"',
             "udp-mesh.toml:3: daemon.metrics_address: expected a loopback address with a port (127.0.0.1:9871), "
             'found "10.0.0.1:9"',
         ),
-        ("name = ", "udp-mesh.toml:2: expected TOML, found invalid value"),
+        (
+            "name = ",
+            "udp-mesh.toml:2: expected a value (text in quotes, a number, true, false, [...] or {...}), "
+            "found something else (at column 8)",
+        ),
+        (
+            "[topics\nx",
+            "udp-mesh.toml:2: expected ']' at the end of a table declaration, found something else (at column 8)",
+        ),
+        (
+            'name = "a"\nname = "b"',
+            "udp-mesh.toml:3: expected each key once, found one that stands above as well (at column 11)",
+        ),
+        ('name = """a', "udp-mesh.toml:3: expected TOML, found unterminated string (at the end of the file)"),
+        (
+            '\n[[link]]\ninterface = "eth0"',
+            "udp-mesh.toml:3: link: expected a known key, found link = a list of tables (did you mean 'links'?)",
+        ),
+        (
+            "[daemon]\nsocket_mode = 660",
+            'udp-mesh.toml:3: daemon.socket_mode: expected octal permissions in quotes such as "0660", found 660',
+        ),
         ("unkeyed = true", "udp-mesh.toml:2: unkeyed: expected either key_file or unkeyed, found both"),
     ],
 )
@@ -209,7 +230,7 @@ def test_a_missing_key_is_named_with_the_way_out(tmp_path: Path) -> None:
 
 def test_a_missing_key_file_is_named_at_the_line_that_names_it(tmp_path: Path) -> None:
     (problem,) = problems(tmp_path, 'name = "a"\nkey_file = "other.key"\n')
-    assert problem.startswith("udp-mesh.toml:2: expected a readable file, found ")
+    assert problem.startswith("udp-mesh.toml:2: key_file: expected a readable file, found ")
     assert problem.endswith("other.key: No such file or directory")
 
 
@@ -233,6 +254,8 @@ def test_a_key_file_holds_one_or_two_keys(tmp_path: Path, count: int) -> None:
 def test_a_configuration_that_cannot_be_read_is_one_problem(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"missing\.toml: expected a readable file"):
         load(tmp_path / "missing.toml")
+    with pytest.raises(ConfigurationError, match=r"^[^:]*: expected a readable file, found Is a directory$"):
+        load(tmp_path)
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b'name = "a"\n\xff')
     with pytest.raises(ConfigurationError, match=r"binary.toml:2: expected UTF-8"):
@@ -277,6 +300,7 @@ def test_lines_are_found_behind_strings_comments_and_brackets_that_look_like_key
         ("c",): 4,
         ("x",): 7,
         ("x", "y.z"): 8,
+        ("t",): 9,
         ("t", 0): 9,
         ("t", 0, "k"): 10,
         ("t", 1): 11,
