@@ -86,6 +86,7 @@ def _leave_owed(state: State, session: Session, now: float, out: list[Datagram])
         peer.outbound.flight.add(number, None)
         out.append(Datagram(way.link, way.address, data, True))
         del frames[:count]
+    state.arm(peer)
 
 
 def _introduction(state: State, session: Session) -> Heartbeat:
@@ -127,6 +128,7 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
                 outbound.flight.add(number, None)
                 out.append(Datagram(session.way.link, session.way.address, data, True))
             peers.append(peer)
+            outbound.wake_at = _INFINITY
             mask |= outbound.scheduler.waiting
         else:
             del state.ready[peer]
@@ -166,12 +168,12 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
         if room > 0:
             state.ready.pop(peer, None)
             outbound.limited = not outbound.scheduler.waiting
-        state.arm(peer)
         if held & outbound.scheduler.waiting:
             until = state.yielding.holds_until(now)
             if until is not None:
                 peer.book_held(held & outbound.scheduler.waiting, now, until)
-                state.set_timer(peer, until)
+                outbound.wake_at = min(outbound.wake_at, until)
+        state.arm(peer)
 
 
 def _leave_casts(state: State, priority: int, now: float, out: list[Datagram]) -> None:
@@ -205,22 +207,14 @@ def has_datagrams(state: State) -> bool:
     return bool(state.owing or state.ready or state.outgoing or state.casts.waiting)
 
 
-def is_quiet(state: State, until: float) -> bool:
+def is_quiet(state: State) -> bool:
     """See `Node.is_quiet`."""
-    if has_datagrams(state) or state.ledger.waits:
-        return False
-    at = next_timer(state)
-    return at is None or at >= until
+    return not (has_datagrams(state) or state.ledger.waits)
 
 
 def next_timer(state: State) -> float | None:
     """See `Node.next_timer`."""
-    timers = state.timers
-    while timers and timers[0][2].timer_at != timers[0][0]:
-        heappop(timers)
-    at = min(state.housekeeping_at, state.discovery.next_at, state.casts.next_at())
-    if timers and timers[0][0] < at:
-        at = timers[0][0]
+    at = min(state.housekeeping_at, state.discovery.next_at, state.casts.next_at(), state.next_peer_at())
     for gate in state.gates.values():
         if gate.parked:
             at = min(at, gate.opens_at())
@@ -234,13 +228,11 @@ def handle_timer(state: State, now: float) -> None:
     """See `Node.handle_timer`."""
     if state.closed:
         return
-    timers = state.timers
     due_peers: list[Peer] = []
-    while timers and timers[0][0] <= now:
-        at, _, peer = heappop(timers)
-        if peer.timer_at == at:
-            peer.timer_at = _INFINITY
-            due_peers.append(peer)
+    while state.next_peer_at() <= now:
+        _, _, peer = heappop(state.timers)
+        peer.timer_at = peer.wants_at = _INFINITY
+        due_peers.append(peer)
     for peer in due_peers:
         outbound = peer.outbound
         outbound.handle_timer(now)

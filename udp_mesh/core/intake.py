@@ -128,7 +128,7 @@ def _take_data(
             state.owing[session] = None
             if inbound.overdue():
                 _cut_ack(state, session, now)
-        elif acks.due_at is not None and acks.due_at < peer.timer_at:
+        elif acks.due_at is not None and acks.due_at < peer.wants_at:
             state.set_timer(peer, acks.due_at)
         return
     try:

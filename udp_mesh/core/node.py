@@ -75,12 +75,13 @@ class Node:
         """Whether `datagrams_to_send` may return something; False right after it returned all there was."""
         return bool(self._legacy) or dispatch.has_datagrams(self._state)
 
-    def is_quiet(self, until: float) -> bool:
-        """Whether nothing is to be sent, told or done before `until`: the driver may leave the node alone.
+    @property
+    def is_quiet(self) -> bool:
+        """Whether nothing is to be sent or told until `next_timer`: the driver may leave the node alone.
 
         True after most datagrams of a bulk, of which only every few ask for an answer.
         """
-        return not self._legacy and dispatch.is_quiet(self._state, until)
+        return not self._legacy and dispatch.is_quiet(self._state)
 
     def next_event(self) -> Event | None:
         """The oldest event not yet fetched."""

@@ -53,6 +53,7 @@ class Peer:
         "retired",
         "session",
         "timer_at",
+        "wants_at",
     )
 
     outbound: Outbound
@@ -74,7 +75,9 @@ class Peer:
         self.retired: dict[bytes, None] = {}
         """Earlier boot ids: never believed again."""
         self.timer_at = float("inf")
-        """When this peer stands in the node's timer queue."""
+        """Where this peer stands in the node's timer queue: at `wants_at`, or earlier until it comes to the front."""
+        self.wants_at = float("inf")
+        """When this peer wants attention."""
         self.held_until: dict[int, float] = {}
         """Priority -> until when the time it is held back for other robots is booked."""
 

@@ -148,7 +148,7 @@ class Rates:
     """Packets per acknowledgement under bulk: at 8 to 16 acknowledgements cost under 5 % of a half-duplex channel."""
     ack_delay_s: float = 0.008
     """Longest an acknowledgement waits; the sender lowers it to a part of its smallest round trip."""
-    pace_quantum_s: float = 0.002
+    pace_quantum_s: float = 0.003
     """Packets of this much time leave together; less costs CPU per wake-up, more costs latency."""
     broadcast_packets_per_s: float = 400.0
     """Less urgent broadcasts leave no faster: nothing acknowledges them, so no window can hold them back."""

@@ -6,7 +6,7 @@ state and of `now`.
 """
 
 from collections.abc import Iterator
-from heapq import heappush
+from heapq import heappop, heappush
 
 from udp_mesh.core.casts import CastQueue, Repairs
 from udp_mesh.core.compression import PackingQueue
@@ -24,6 +24,8 @@ from udp_mesh.core.session import Peer, Session
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
 from udp_mesh.core.yielding import Yielding
 from udp_mesh.crypto import Key, Keyring, SendChannel
+
+_NEVER = float("inf")
 
 HOUSEKEEPING_S = 0.5
 """Between two rounds through all peers: offline, purges, starvation."""
@@ -80,22 +82,43 @@ class State:
         self.closed = False
 
     def set_timer(self, peer: Peer, at: float) -> None:
-        """The peer wants attention at `at`; an earlier wish stands."""
-        if at < peer.timer_at:
-            peer.timer_at = at
-            self.timer_serial += 1
-            heappush(self.timers, (at, self.timer_serial, peer))
+        """The peer wants attention at `at` too; an earlier wish stands."""
+        if at < peer.wants_at:
+            peer.wants_at = at
+            self._queue(peer)
 
     def arm(self, peer: Peer) -> None:
-        """Bring the peer's timer up to what its halves want now."""
+        """Bring the peer's timer up to what its halves want now, be it later than before."""
         at = peer.outbound.timer() if peer.engaged else None
-        if at is not None and at < peer.timer_at:
-            self.set_timer(peer, at)
         session = peer.session
         if session is not None:
             due = session.inbound.acks.due_at
-            if due is not None and due < peer.timer_at:
-                self.set_timer(peer, due)
+            if due is not None and (at is None or due < at):
+                at = due
+        peer.wants_at = _NEVER if at is None else at
+        self._queue(peer)
+
+    def _queue(self, peer: Peer) -> None:
+        if peer.wants_at < peer.timer_at:
+            peer.timer_at = peer.wants_at
+            self.timer_serial += 1
+            heappush(self.timers, (peer.timer_at, self.timer_serial, peer))
+
+    def next_peer_at(self) -> float:
+        """When the first peer wants attention. Who stands in front but wants it later goes to its place now: it may
+        have changed its mind a hundred times since."""
+        timers = self.timers
+        while timers:
+            at, _, peer = timers[0]
+            if peer.timer_at != at:
+                heappop(timers)
+            elif peer.wants_at > at:
+                peer.timer_at = _NEVER
+                heappop(timers)
+                self._queue(peer)
+            else:
+                return at
+        return _NEVER
 
     def ask_by(self, boot_id: bytes, repairs: Repairs) -> None:
         """Ask this sender for what is missing, when it is time."""
