@@ -21,6 +21,9 @@ Address: TypeAlias = tuple[str, int]
 MAX_MTU = 65_535
 """The loopback's 65,536 is one byte more than an IP packet can have."""
 
+LEAST_MTU = 200
+"""Bytes of IP packet that leave room for headers and a useful piece of payload: narrower interfaces are not used."""
+
 
 ALL_NODES = "ff02::1"
 """Every IPv6 node on the link (RFC 4291, 2.7.1): what a broadcast is for IPv4. It needs no joining, and switches and
@@ -48,6 +51,9 @@ class Attachment:
     address: Address
     broadcast: Address | None
     mtu: int
+    index: int
+    """The kernel's number of the device: one made anew under the same name and addresses is another, and a socket bound
+    to the one before hears nothing."""
 
 
 EVERY_INTERFACE = (LinkWish(interface="*"),)
@@ -79,7 +85,9 @@ def _of_interface(running: list[Interface], wish: LinkWish, port: int) -> Iterab
             address = min(usable, key=_preference)
             to_all = _to_all(interface, address) if wish.broadcast else None
             broadcast = None if to_all is None else (to_all, port)
-            yield Attachment(interface.name, interface.name, (address.host, port), broadcast, _mtu(interface, wish))
+            own = (address.host, port)
+            mtu = _mtu(interface, wish)
+            yield Attachment(interface.name, interface.name, own, broadcast, mtu, interface.index)
 
 
 def _of_address(running: list[Interface], wish: LinkWish, port: int) -> Iterable[Attachment]:
@@ -91,7 +99,8 @@ def _of_address(running: list[Interface], wish: LinkWish, port: int) -> Iterable
             if own:
                 to_all = _to_all(interface, address) if wish.broadcast else None
                 broadcast = None if to_all is None else (to_all, port)
-                yield Attachment(str(wanted), interface.name, (str(wanted), port), broadcast, _mtu(interface, wish))
+                mtu = _mtu(interface, wish)
+                yield Attachment(str(wanted), interface.name, (str(wanted), port), broadcast, mtu, interface.index)
                 return
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from udp_mesh.links.attachments import Attachment, LinkWish, choose
+from udp_mesh.links.attachments import LEAST_MTU, Attachment, LinkWish, choose
 from udp_mesh.links.netlink import interfaces
 from udp_mesh.links.udp import UdpLink
 
@@ -54,6 +54,8 @@ class LinkHub:
         return Changes(tuple(opened), tuple(gone), failed)
 
     def _open(self, attachment: Attachment) -> UdpLink | str:
+        if attachment.mtu < LEAST_MTU:
+            return f"expected an MTU of at least {LEAST_MTU} bytes, found {attachment.mtu} on {attachment.device}"
         try:
             return UdpLink(attachment, urgent_dscp=self._urgent_dscp)
         except OSError as error:

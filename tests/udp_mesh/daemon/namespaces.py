@@ -190,6 +190,48 @@ def interface_goes_in_the_middle() -> None:
             assert link_of(both.alice, "bob") == "mesh1"
 
 
+def interface_made_anew() -> None:
+    """Deleted and there again at once, with the same name and address, as a driver's reload or a script does it."""
+    with pair() as both:
+        both.join("mesh0")
+        for number, daemon in enumerate((both.alice, both.bob), 1):
+            both.ip(daemon, f"addr add 10.7.20.{number}/20 broadcast + dev mesh0")
+        met(both)
+        pids = [daemon.process.pid for daemon in (both.alice, both.bob) if daemon.process is not None]
+        alice, bob = (f"nsenter -t {pid} -n ip" for pid in pids)
+        steps = [
+            f"{alice} link del mesh0",
+            f"ip link add mesh0 netns {pids[0]} type veth peer name mesh0 netns {pids[1]}",
+            *(
+                f"{ip} {words}"
+                for number, ip in enumerate((alice, bob), 1)
+                for words in (f"addr add 10.7.20.{number}/20 broadcast + dev mesh0", "link set mesh0 up")
+            ),
+        ]
+        subprocess.run(["sh", "-ec", "\n".join(steps)], check=True)
+        both.exchange()
+
+
+def interface_too_narrow() -> None:
+    """An interface that no datagram fits is told of; the others go on."""
+    with pair() as both:
+        both.join("mesh0")
+        both.join("narrow0")
+        for number, daemon in enumerate((both.alice, both.bob), 1):
+            both.ip(daemon, f"addr add 10.7.20.{number}/20 broadcast + dev mesh0")
+            both.ip(daemon, "link set narrow0 mtu 150")
+            both.ip(daemon, f"addr add 10.8.0.{number}/24 broadcast + dev narrow0")
+        for daemon in (both.alice, both.bob):
+            logged(daemon, "link-failed link=narrow0 reason=expected an MTU of at least 200 bytes, found 150")
+        met(both)
+        both.exchange()
+
+
+def logged(daemon: RunningDaemon, text: str) -> None:
+    """Waits until the daemon's log says so."""
+    poll(lambda: text in daemon.log.read_text(), f"{daemon.name} logs {text!r}")
+
+
 def link_of(daemon: RunningDaemon, peer: str) -> str | None:
     with daemon.client() as client:
         return next((found["link"] for found in client.request("peers")["peers"] if found["name"] == peer), None)
@@ -214,6 +256,8 @@ SCENARIOS: dict[str, Callable[[], None]] = {
         ipv4_beside_ipv6,
         address_changes_in_the_middle,
         interface_goes_in_the_middle,
+        interface_made_anew,
+        interface_too_narrow,
     )
 }
 

@@ -29,7 +29,7 @@ def free_port() -> int:
 
 
 def open_link(host: str, port: int, *, urgent_dscp: int = 0) -> UdpLink:
-    return UdpLink(Attachment(host, "lo", (host, port), None, 65_535), urgent_dscp=urgent_dscp)
+    return UdpLink(Attachment(host, "lo", (host, port), None, 65_535, 1), urgent_dscp=urgent_dscp)
 
 
 def receive(link: UdpLink, count: int) -> list[tuple[bytes, Address]]:

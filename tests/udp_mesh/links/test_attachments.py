@@ -32,9 +32,15 @@ def names(*wishes: LinkWish) -> list[str]:
 
 def test_by_default_every_running_interface_that_can_broadcast_is_used() -> None:
     assert choose(ALL, EVERY_INTERFACE, 8700) == (
-        Attachment("bat0", "bat0", ("10.7.20.5", 8700), ("10.7.31.255", 8700), 1500),
-        Attachment("wlan0", "wlan0", ("192.168.1.20", 8700), ("192.168.1.31", 8700), 1500),
+        Attachment("bat0", "bat0", ("10.7.20.5", 8700), ("10.7.31.255", 8700), 1500, 2),
+        Attachment("wlan0", "wlan0", ("192.168.1.20", 8700), ("192.168.1.31", 8700), 1500, 3),
     )
+
+
+def test_an_interface_made_anew_under_the_same_name_and_address_is_another() -> None:
+    (before,) = choose((WLAN0,), EVERY_INTERFACE, 8700)
+    (after,) = choose((replace(WLAN0, index=9),), EVERY_INTERFACE, 8700)
+    assert before != after
 
 
 def test_defect_6_broadcast_addresses_are_right_for_netmasks_within_an_octet() -> None:
@@ -104,7 +110,7 @@ WLAN6 = Interface(
 
 
 def test_where_ipv4_has_no_broadcast_address_all_ipv6_nodes_of_the_link_are_addressed() -> None:
-    expected = Attachment("wlan6", "wlan6", ("fe80::6", 8700), (ALL_NODES, 8700), 1500)
+    expected = Attachment("wlan6", "wlan6", ("fe80::6", 8700), (ALL_NODES, 8700), 1500, 6)
     assert choose((LO, WLAN6), EVERY_INTERFACE, 8700) == (expected,)
     # an interface with both is used with IPv4, as ever
     both = replace(WLAN6, addresses=(*WLAN6.addresses, *WLAN0.addresses))

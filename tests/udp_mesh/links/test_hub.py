@@ -71,6 +71,23 @@ assert "Address already in use (UDP port 8700" in failed["mesh0"], failed
 taken.close()
 assert hub.refresh().opened
 
+# Too narrow for a datagram of ours: told, not opened, and nothing else suffers.
+ip("link set mesh0 mtu 150")
+failed = hub.refresh().failed
+assert "expected an MTU of at least 200 bytes, found 150 on mesh0" in failed["mesh0"], failed
+ip("link set mesh0 mtu 1500")
+settle(("mesh0", "10.7.20.6"))
+
+# Deleted and made anew between two looks, with the same name and address: the old socket would hear nothing.
+first = hub.links["mesh0"]
+ip("link del mesh0")
+ip("link add mesh0 type veth peer name far0")
+ip("link set far0 up")
+ip("link set mesh0 up")
+ip("addr add 10.7.20.6/20 broadcast + dev mesh0")
+settle(("mesh0", "10.7.20.6"))
+assert hub.links["mesh0"] is not first
+
 # Broadcasts reach the other side of the veth, and not ourselves.
 class Out:
     destination, data, urgent = None, b"to all", False

@@ -145,7 +145,7 @@ def test_a_port_in_use_is_an_error_and_leaks_nothing() -> None:
 
 def test_ipv6_neighbours_are_reached() -> None:
     port = free_port()
-    attachment = Attachment("::1", "lo", ("::1", port), None, 65_535)
+    attachment = Attachment("::1", "lo", ("::1", port), None, 65_535, 1)
     with closing(UdpLink(attachment, urgent_dscp=46)) as link, socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as far:
         far.bind(("::1", 0))
         far.settimeout(60)
