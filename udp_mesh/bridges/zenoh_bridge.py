@@ -19,7 +19,10 @@ import sys
 import threading
 from typing import Any, NamedTuple, Sequence
 
-import zenoh
+try:
+    import zenoh
+except ModuleNotFoundError as error:
+    raise SystemExit("udp_mesh.bridges.zenoh_bridge: {} (pip install 'meshctl[zenoh]')".format(error)) from error
 
 from udp_mesh.bridges.envelope import TYPE, Envelope, EnvelopeError, open_envelope, seal
 from udp_mesh.bridges.port import MeshPort

@@ -83,6 +83,8 @@ async def _serve(service: Service, notifier: Notifier) -> None:
     gc.set_threshold(*GC_THRESHOLDS)
     notifier.ready(_status(service))
     log.info("ready name=%s port=%d boot=%s", service.settings.name, service.settings.port, service.boot_id.hex())
+    if not service.driver.hub.links:
+        log.warning("no-link no configured interface is up with an address; links are taken as they come")
     period_s = notifier.watchdog_s
     while not stop.is_set():
         try:

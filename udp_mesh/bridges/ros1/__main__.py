@@ -2,7 +2,10 @@
 
 import sys
 
-from udp_mesh.bridges.ros1.bridge import main
+try:
+    from udp_mesh.bridges.ros1.bridge import main
+except ModuleNotFoundError as error:
+    raise SystemExit("udp_mesh.bridges.ros1: {} (source /opt/ros/RELEASE/setup.bash first)".format(error)) from error
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -17,12 +17,6 @@ import time
 from collections import deque
 from typing import Any, Deque, Sequence
 
-import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rosidl_runtime_py.utilities import get_message
-
 from udp_mesh.bridges.joint import Joint
 from udp_mesh.bridges.names import Route, ros_word, routes
 from udp_mesh.bridges.port import MeshPort
@@ -30,6 +24,15 @@ from udp_mesh.bridges.relay import Relay, ToRos
 from udp_mesh.bridges.ros2.quality import Quality, parse_quality, quality_text, ros2_name, shared
 from udp_mesh.bridges.types import TypeKey
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
+
+try:
+    import rclpy
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.node import Node
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+    from rosidl_runtime_py.utilities import get_message
+except ModuleNotFoundError as error:
+    raise SystemExit("udp_mesh.bridges.ros2: {} (source /opt/ros/RELEASE/setup.bash first)".format(error)) from error
 
 log = logging.getLogger(__name__)
 
