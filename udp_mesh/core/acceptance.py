@@ -7,6 +7,7 @@ ends into events.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import zip_longest
 
 from udp_mesh.core.compression import STEP_BYTES, Unpacked, compress
 from udp_mesh.core.departure import header_bytes
@@ -34,6 +35,12 @@ from udp_mesh.wire.limits import MAX_TYPE_BYTES
 
 ANNOUNCE_BYTES = 5
 """Of a topic's announcement besides its two names."""
+
+RELEASED_AT_ONCE = 400
+"""Messages of an outbox queued in one go: some milliseconds, in which no urgent one can leave."""
+
+RELEASE_AGAIN_S = 0.02
+"""Until the next: 20,000 messages a second, more than a robot's link carries."""
 
 MOST_CHANNELS = 65_536
 """Topic numbers are 16 bits."""
@@ -69,7 +76,9 @@ def send(
     state.next_message_id += 1
     state.ledger.counters.messages_sent += 1
     if topic.compression and (len(payload) > STEP_BYTES or state.packing.holds(topic.name)):
-        state.packing.add(Unpacked(message_id, channel, payload, tuple(names), now))
+        plain = _accept(message_id, channel, payload, None, now)
+        keys = tuple(state.outboxes.keep(name, plain, now) for name in names) if topic.reliable else ()
+        state.packing.add(Unpacked(message_id, channel, payload, tuple(names), now, keys))
     else:
         packed = compress(payload) if topic.compression else None
         _enqueue_all(state, _accept(message_id, channel, payload, packed, now), names, now)
@@ -82,20 +91,22 @@ def pack(state: State, now: float) -> None:
     if done is not None:
         message, packed = done
         accepted = _accept(message.message_id, message.channel, message.payload, packed, message.accepted_at)
-        _enqueue_all(state, accepted, message.names, now)
+        _enqueue_all(state, accepted, message.names, now, message.store_keys)
 
 
 def stop_packing(state: State, now: float) -> None:
     """Everything goes on its way as it is."""
     for message in state.packing.take_all():
         accepted = _accept(message.message_id, message.channel, message.payload, None, message.accepted_at)
-        _enqueue_all(state, accepted, message.names, now)
+        _enqueue_all(state, accepted, message.names, now, message.store_keys)
 
 
-def _enqueue_all(state: State, accepted: Accepted, names: Sequence[str], now: float) -> None:
+def _enqueue_all(
+    state: State, accepted: Accepted, names: Sequence[str], now: float, store_keys: Sequence[int | None] = ()
+) -> None:
     if names:
-        for name in names:
-            enqueue(state, name, accepted, now)
+        for name, store_key in zip_longest(names, store_keys):
+            enqueue(state, name, accepted, now, store_key)
     else:
         _to_all(state, accepted, now)
 
@@ -157,6 +168,18 @@ def enqueue(state: State, name: str, accepted: Accepted, now: float, store_key: 
         return
     if peer.session is not None and not inflates(peer.session):
         accepted = unpacked(accepted)
+    if state.outboxes.holds(name, topic.name) and topic.priority > state.settings.rates.urgent_priority:
+        # Older ones of the topic are still to come; only what is urgent goes ahead of what is stale.
+        _hold(state, name, Held(accepted, store_key), now)
+        return
+    if store_key is None and topic.reliable:
+        store_key = state.outboxes.keep(name, accepted, now)
+    _queue(state, peer, accepted, now, store_key)
+
+
+def _queue(state: State, peer: Peer, accepted: Accepted, now: float, store_key: int | None) -> None:
+    """On its way to a peer, in reach or not."""
+    topic = accepted.channel.topic
     message = Outgoing(accepted, topic.priority, reliable=topic.reliable)
     message.store_key = store_key
     outbound = peer.outbound
@@ -209,7 +232,10 @@ def _broadcast_bytes(accepted: Accepted) -> int:
 
 def shelve(state: State, peer: Peer, now: float) -> None:
     """The peer went out of reach: move what its outboxes keep out of the queue."""
-    for message in list(peer.outbound.open) if peer.engaged else ():
+    everything = list(peer.outbound.open) if peer.engaged else []
+    # The newest first: each then stands in front of those already there.
+    everything.sort(key=lambda message: message.accepted.message_id, reverse=True)
+    for message in everything:
         if message.accepted.channel.topic.outbox is Outbox.NONE or message.accepted.broadcast_number is not None:
             continue
         # best effort is not remembered for long over there, and fielded programs know no numbers of ours
@@ -233,8 +259,8 @@ def _give_up_held(state: State, name: str, held: Held, reason: ExpiryReason) -> 
 
 
 def release_outbox(state: State, peer: Peer, now: float) -> None:
-    """The peer is in reach: what waited for it is queued, oldest first."""
-    for held in state.outboxes.release(peer.name):
+    """The peer is in reach: some of what waited for it is queued, the most urgent and oldest first; more of it soon."""
+    for held in state.outboxes.release(peer.name, RELEASED_AT_ONCE):
         begun, session = held.begun, peer.session
         if begun is not None and held.epoch == peer.outbound.epoch:
             if session is not None and begun.fragment_bytes <= session.way.fragment_bytes:
@@ -244,7 +270,10 @@ def release_outbox(state: State, peer: Peer, now: float) -> None:
                 state.arm(peer)
                 continue
             peer.outbound.cancel(begun)
-        enqueue(state, peer.name, held.accepted, now, held.store_key)
+        accepted = held.accepted if session is None or inflates(session) else unpacked(held.accepted)
+        _queue(state, peer, accepted, now, held.store_key)
+    if state.outboxes.holds(peer.name):
+        state.housekeeping_at = min(state.housekeeping_at, now + RELEASE_AGAIN_S)
 
 
 def report_ended(state: State, peer: Peer, now: float) -> None:

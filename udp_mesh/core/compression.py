@@ -120,13 +120,15 @@ def decompress(body: bytes, limit_bytes: int) -> bytes | None:
 
 @dataclass(frozen=True, slots=True)
 class Unpacked:
-    """A message accepted but not yet compressed; `names` are its destinations, none for all."""
+    """A message accepted but not yet compressed; `names` are its destinations, none for all, `store_keys` where each of
+    their copies is on disk."""
 
     message_id: MessageId
     channel: Channel
     payload: bytes
     names: tuple[str, ...]
     accepted_at: float
+    store_keys: tuple[int | None, ...] = ()
 
 
 class PackingQueue:

@@ -3,10 +3,9 @@
 What becomes of their pieces on the way is `outbound`'s part.
 """
 
-from collections import deque
 from collections.abc import Iterable
 from enum import Enum
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
 from udp_mesh.core.events import ExpiryReason
@@ -40,7 +39,7 @@ class OpenMessages:
         """Wire ids given up after they had begun: the peer may forget them."""
         self._deadlines: list[tuple[float, int, Outgoing]] = []
         self._deadline_serial = 0
-        self._kept: dict[str, deque[Outgoing]] = {}
+        self._kept: dict[str, list[Outgoing]] = {}
         """Open messages of topics that keep only the last few."""
 
     def take_on(self, message: Outgoing) -> None:
@@ -56,13 +55,16 @@ class OpenMessages:
         if message.accepted.deadline is not None:
             self._deadline_serial += 1
             heappush(self._deadlines, (message.accepted.deadline, self._deadline_serial, message))
+            if len(self._deadlines) > 64 + 2 * len(self.open):
+                # What ended long before its deadline must not stay in memory until then.
+                self._deadlines = [entry for entry in self._deadlines if not entry[2].ended]
+                heapify(self._deadlines)
 
     def _replace_older(self, message: Outgoing, keep_last: int) -> None:
-        kept = self._kept.setdefault(message.accepted.channel.topic.name, deque())
-        while kept and kept[0].ended:
-            kept.popleft()
-        kept.append(message)
+        kept = self._kept.get(message.accepted.channel.topic.name, [])
         alive = [older for older in kept if not older.ended and not older.superseded]
+        alive.append(message)
+        self._kept[message.accepted.channel.topic.name] = alive
         for older in alive[: max(0, len(alive) - keep_last)]:
             if not older.begun:
                 self.finish(older, ExpiryReason.SUPERSEDED)

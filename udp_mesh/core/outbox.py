@@ -1,10 +1,18 @@
 """Messages held for peers that are offline, as their topic's outbox says: none, the last, or all within a bound.
 
-A message on disk stays there until its outcome is known, not only until it is sent: a crash in between sends it again.
-One that had begun to leave keeps its number, so that a peer which had all of it before the cut does not take it twice.
+1. `keep` puts a message on disk as soon as it is accepted, where its topic says so: it stays there until its outcome is
+   known, not only until it is sent. A crash in between sends it again.
+2. `hold` keeps it while its peer is away, in the order accepted, and says which older ones had to go for it.
+3. `release` gives back the most urgent and oldest ones, some at a time: a long absence leaves a hundred thousand.
+4. `settle` forgets it on disk: its outcome is known.
+
+A message that had begun to leave keeps its number, so that a peer which had all of it before the cut does not take it
+twice.
 """
 
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
+from heapq import heapify, heappop, heappush
 
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.message import Accepted, Outgoing
@@ -12,7 +20,7 @@ from udp_mesh.core.seams import Store, StoredMessage
 from udp_mesh.core.settings import Outbox
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Held:
     """One message held for one peer; `store_key` where it is on disk."""
 
@@ -22,15 +30,59 @@ class Held:
     """What has left of it, where the peer may have it."""
     epoch: int = 0
     """`Outbound.epoch` in which it began."""
+    gone: bool = False
+    """Expired or replaced: it stands in its shelf until somebody looks."""
+
+    @property
+    def size(self) -> int:
+        return len(self.accepted.payload)
+
+
+@dataclass(slots=True)
+class _Shelf:
+    """What is held of one topic for one peer, in the order accepted."""
+
+    held: deque[Held] = field(default_factory=deque)
+    messages: int = 0
+    bytes: int = 0
+
+    def front(self) -> Held:
+        """The oldest. Only of a shelf that holds something."""
+        while self.held[0].gone:
+            self.held.popleft()
+        return self.held[0]
+
+    def put(self, new: Held) -> None:
+        """In its place: the newest, or one taken back, which then is older than all that came meanwhile."""
+        later: list[Held] = []
+        if self.messages and new.accepted.message_id < self.front().accepted.message_id:
+            self.held.appendleft(new)
+        else:
+            while self.held and self.held[-1].accepted.message_id > new.accepted.message_id:
+                later.append(self.held.pop())
+            self.held.append(new)
+            self.held.extend(reversed(later))
+        self.messages += 1
+        self.bytes += new.size
+
+    def drop(self, held: Held) -> None:
+        held.gone = True
+        self.messages -= 1
+        self.bytes -= held.size
+        if len(self.held) > 64 + 2 * self.messages:
+            self.held = deque(waiting for waiting in self.held if not waiting.gone)
 
 
 class Outboxes:
-    """By peer name, oldest first."""
+    """By peer name and topic."""
 
-    __slots__ = ("_held", "_next_key", "_store", "bytes")
+    __slots__ = ("_deadlines", "_held", "_messages", "_next_key", "_serial", "_store", "bytes")
 
     def __init__(self, store: Store | None) -> None:
-        self._held: dict[str, list[Held]] = {}
+        self._held: dict[str, dict[str, _Shelf]] = {}
+        self._deadlines: list[tuple[float, int, str, Held]] = []
+        self._messages = 0
+        self._serial = 0
         self._store = store
         self._next_key = 0
         self.bytes = 0
@@ -43,40 +95,74 @@ class Outboxes:
         self._next_key = max((message.key for message in stored), default=-1) + 1
         return stored
 
+    def keep(self, peer: str, accepted: Accepted, now: float) -> int | None:
+        """Put a message on disk, where its topic wants that; its key there, None where it is held in memory alone."""
+        topic = accepted.channel.topic
+        if self._store is None or not topic.outbox_on_disk or topic.outbox is Outbox.NONE:
+            return None
+        key = self._next_key
+        self._next_key += 1
+        remaining = None if accepted.deadline is None else max(0.0, accepted.deadline - now)
+        type_name = accepted.channel.type_name
+        stored = StoredMessage(key, peer, topic.name, type_name, accepted.payload, remaining)
+        return key if self._store.put(stored) else None
+
     def hold(self, peer: str, new: Held, now: float) -> list[tuple[Held, ExpiryReason]]:
         """Keep a message; returns those that had to go for it (perhaps this one)."""
         accepted = new.accepted
         topic = accepted.channel.topic
-        kept = self._held.setdefault(peer, [])
-        same = [held for held in kept if held.accepted.channel.topic.name == topic.name]
-        gone: list[tuple[Held, ExpiryReason]] = []
-        if topic.outbox is Outbox.LAST:
-            gone = [(held, ExpiryReason.SUPERSEDED) for held in same]
-        else:
-            room = topic.outbox_bytes - len(accepted.payload)
-            used = sum(len(held.accepted.payload) for held in same)
-            for held in same:
-                if used <= room:
-                    break
-                used -= len(held.accepted.payload)
-                gone.append((held, ExpiryReason.OUTBOX_FULL))
-        for held, _ in gone:
-            self._remove(kept, held)
-        if len(accepted.payload) > topic.outbox_bytes:
-            gone.append((new, ExpiryReason.OUTBOX_FULL))
+        if new.size > topic.outbox_bytes:
             self.settle(new.store_key)
-            return gone
-        if new.store_key is None and topic.outbox_on_disk and self._store is not None:
-            new.store_key = self._put(peer, accepted, now)
-        kept.append(new)
-        self.bytes += len(accepted.payload)
+            return [(new, ExpiryReason.OUTBOX_FULL)]
+        shelf = self._held.setdefault(peer, {}).setdefault(topic.name, _Shelf())
+        shelf.put(new)
+        self.bytes += new.size
+        self._messages += 1
+        gone: list[tuple[Held, ExpiryReason]] = []
+        last = topic.outbox is Outbox.LAST
+        while shelf.messages > 1 if last else shelf.bytes > topic.outbox_bytes:
+            oldest = shelf.front()
+            self._drop(shelf, oldest)
+            gone.append((oldest, ExpiryReason.SUPERSEDED if last else ExpiryReason.OUTBOX_FULL))
+        if not new.gone:
+            if new.store_key is None:
+                new.store_key = self.keep(peer, accepted, now)
+            self._note_deadline(peer, new)
         return gone
 
-    def release(self, peer: str) -> list[Held]:
-        """The peer is online: everything held for it, oldest first, leaves the outbox (but not yet the disk)."""
-        kept = self._held.pop(peer, [])
-        self.bytes -= sum(len(held.accepted.payload) for held in kept)
-        return kept
+    def release(self, peer: str, most: int) -> list[Held]:
+        """The peer is online: up to `most` of what is held for it leaves the outbox (but not yet the disk), the most
+        urgent first, of those the oldest."""
+        shelves = self._held.get(peer, {})
+        released: list[Held] = []
+        by_urgency: dict[int, list[_Shelf]] = {}
+        for shelf in shelves.values():
+            if shelf.messages:
+                by_urgency.setdefault(shelf.front().accepted.channel.topic.priority, []).append(shelf)
+        for _, level in sorted(by_urgency.items()):
+            heads = [(shelf.front().accepted.message_id, place) for place, shelf in enumerate(level)]
+            heads.sort()
+            while heads and len(released) < most:
+                _, place = heappop(heads)
+                shelf = level[place]
+                held = shelf.front()
+                shelf.held.popleft()
+                self._take(shelf, held)
+                released.append(held)
+                if shelf.messages:
+                    heappush(heads, (shelf.front().accepted.message_id, place))
+        if not self.holds(peer):
+            self._held.pop(peer, None)
+        return released
+
+    def holds(self, peer: str, topic: str | None = None) -> bool:
+        """Whether something (of this topic) is held for a peer."""
+        shelves = self._held.get(peer)
+        if not shelves:
+            return False
+        if topic is None:
+            return any(shelf.messages for shelf in shelves.values())
+        return topic in shelves and shelves[topic].messages > 0
 
     def settle(self, store_key: int | None) -> None:
         """The outcome is known: the disk may forget it."""
@@ -85,41 +171,52 @@ class Outboxes:
 
     def expire(self, now: float) -> list[tuple[str, Held]]:
         """(peer, message) of everything past its deadline, removed."""
-        late = [
-            (peer, held)
-            for peer, kept in self._held.items()
-            for held in kept
-            if held.accepted.deadline is not None and held.accepted.deadline <= now
-        ]
-        for peer, held in late:
-            self._remove(self._held[peer], held)
+        late: list[tuple[str, Held]] = []
+        while self._deadlines and (self._deadlines[0][0] <= now or self._deadlines[0][3].gone):
+            _, _, peer, held = heappop(self._deadlines)
+            if not held.gone:
+                self._drop(self._held[peer][held.accepted.channel.topic.name], held)
+                late.append((peer, held))
         return late
 
     def drop_all(self) -> list[tuple[str, Held]]:
         """At the end of the node: what is only in memory is lost with it; what is on disk stays there."""
-        gone = [(peer, held) for peer, kept in self._held.items() for held in kept if held.store_key is None]
+        everything = [
+            (peer, held)
+            for peer, shelves in self._held.items()
+            for shelf in shelves.values()
+            for held in shelf.held
+            if not held.gone and held.store_key is None
+        ]
         self._held.clear()
-        self.bytes = 0
-        return gone
+        self._deadlines.clear()
+        self.bytes = self._messages = 0
+        return everything
 
     def peers(self) -> list[str]:
-        return [peer for peer, kept in self._held.items() if kept]
+        return [peer for peer in self._held if self.holds(peer)]
 
     def count(self, peer: str) -> tuple[int, int]:
         """(messages, bytes) held for a peer."""
-        kept = self._held.get(peer, [])
-        return len(kept), sum(len(held.accepted.payload) for held in kept)
+        shelves = self._held.get(peer, {}).values()
+        return sum(shelf.messages for shelf in shelves), sum(shelf.bytes for shelf in shelves)
 
-    def _remove(self, kept: list[Held], held: Held) -> None:
-        kept.remove(held)
-        self.bytes -= len(held.accepted.payload)
+    def _drop(self, shelf: _Shelf, held: Held) -> None:
+        self._take(shelf, held)
         self.settle(held.store_key)
 
-    def _put(self, peer: str, accepted: Accepted, now: float) -> int:
-        assert self._store is not None
-        key = self._next_key
-        self._next_key += 1
-        remaining = None if accepted.deadline is None else max(0.0, accepted.deadline - now)
-        channel = accepted.channel
-        self._store.put(StoredMessage(key, peer, channel.topic.name, channel.type_name, accepted.payload, remaining))
-        return key
+    def _take(self, shelf: _Shelf, held: Held) -> None:
+        shelf.drop(held)
+        self.bytes -= held.size
+        self._messages -= 1
+
+    def _note_deadline(self, peer: str, held: Held) -> None:
+        deadline = held.accepted.deadline
+        if deadline is None:
+            return
+        self._serial += 1
+        heappush(self._deadlines, (deadline, self._serial, peer, held))
+        if len(self._deadlines) > 64 + 2 * self._messages:
+            # What was replaced or sent long before its deadline must not stay in memory until then.
+            self._deadlines = [entry for entry in self._deadlines if not entry[3].gone]
+            heapify(self._deadlines)

@@ -234,6 +234,10 @@ def housekeep(state: State, now: float) -> None:
     for peer in peers[start : state.look_from]:
         if not peer.engaged:
             _look_at(state, peer, now)
+    for name in state.outboxes.peers():
+        holding = state.roster.peers.get(name)
+        if holding is not None and holding.online:
+            release_outbox(state, holding, now)
     for session in state.roster.not_current():
         if now - session.last_heard > state.settings.rates.offline_s:
             state.roster.forget(session)

@@ -51,8 +51,8 @@ class StoredMessage:
 class Store(Protocol):
     """Where outboxes on disk live; the daemon's is a directory. Calls are few and synchronous."""
 
-    def put(self, message: StoredMessage) -> None:
-        """Keep the message until `remove`; it survives a crash once this returns."""
+    def put(self, message: StoredMessage) -> bool:
+        """Keep the message until `remove`; it survives a crash once this returns True (False: there is no room)."""
         ...
 
     def remove(self, key: int) -> None:

@@ -10,10 +10,12 @@ A file is a line with the message's fields as JSON and the CRC-32 of these and t
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import logging
 import os
+import time
 import zlib
 from pathlib import Path
 
@@ -22,6 +24,8 @@ from udp_mesh.core.seams import StoredMessage
 log = logging.getLogger(__name__)
 
 SUFFIX = ".message"
+TELL_AGAIN_S = 60.0
+"""Between two lines of the log that say the disk is full."""
 
 
 class DirectoryStore:
@@ -32,12 +36,14 @@ class DirectoryStore:
         self._limit_bytes = limit_bytes
         self._sizes: dict[int, int] = {}
         self._unflushed: set[Path] = set()
+        self._told_at = float("-inf")
         self.bytes = 0
         """Bytes of all files kept."""
         self.refused = 0
         """Messages not kept because the directory is full or the disk failed: they are held in memory only."""
 
-    def put(self, message: StoredMessage) -> None:
+    def put(self, message: StoredMessage) -> bool:
+        """Keep it; False where the bound or the disk refuses, which is counted and logged."""
         head = json.dumps(
             {
                 "key": message.key,
@@ -50,10 +56,10 @@ class DirectoryStore:
         ).encode()
         head += f" {_checksum(head, message.payload):08x}".encode()
         size = len(head) + 1 + len(message.payload)
-        if self.bytes + size > self._limit_bytes:
-            self.refused += 1
-            log.warning("outbox-full directory=%s bytes=%d limit=%d", self._directory, self.bytes, self._limit_bytes)
-            return
+        more = size - self._sizes.get(message.key, 0)
+        if self.bytes + more > self._limit_bytes:
+            self._refuse("outbox-full", f"directory={self._directory} bytes={self.bytes} limit={self._limit_bytes}")
+            return False
         path = self._path(message.key)
         temporary = path.with_suffix(".new")
         try:
@@ -63,15 +69,23 @@ class DirectoryStore:
                 file.write(message.payload)
             temporary.rename(path)
         except OSError as error:
-            self.refused += 1
-            log.error("outbox-write-failed path=%s error=%s", path, error)
+            self._refuse("outbox-write-failed", f"path={path} error={error}")
             # A full disk: what is half written must not keep it full.
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
-            return
-        self.bytes += size - self._sizes.get(message.key, 0)
+            return False
+        self.bytes += more
         self._sizes[message.key] = size
         self._unflushed.add(path)
+        return True
+
+    def _refuse(self, event: str, why: str) -> None:
+        """Counted each time, logged now and then: a disk stays full for long."""
+        self.refused += 1
+        now = time.monotonic()
+        if now - self._told_at >= TELL_AGAIN_S:
+            self._told_at = now
+            log.error("%s held-in-memory=%d %s", event, self.refused, why)
 
     def remove(self, key: int) -> None:
         size = self._sizes.pop(key, None)
@@ -131,6 +145,21 @@ class DirectoryStore:
 
     def _path(self, key: int) -> Path:
         return self._directory / f"{key:020d}{SUFFIX}"
+
+
+class Flusher:
+    """Flushes away from the loop, one round at a time: whoever comes meanwhile shares the next."""
+
+    def __init__(self, store: DirectoryStore) -> None:
+        self._store = store
+        self._turn = asyncio.Lock()
+
+    async def flush(self) -> None:
+        """Returns when the disk has all that was put before: that may be in the hands of the round under way."""
+        async with self._turn:
+            paths = self._store.take_unflushed()
+            if paths:
+                await asyncio.get_running_loop().run_in_executor(None, self._store.flush, paths)
 
 
 def _sync(path: Path, flags: int) -> None:

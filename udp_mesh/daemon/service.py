@@ -12,7 +12,7 @@ import fnmatch
 import logging
 import os
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,7 +39,7 @@ from udp_mesh.daemon.configuration import (
     load,
 )
 from udp_mesh.daemon.driver import Driver
-from udp_mesh.daemon.outbox import DirectoryStore
+from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 from udp_mesh.daemon.recording import Recorder
 from udp_mesh.daemon.status import TopicCount, conditions_json, event_json, event_name
 
@@ -64,6 +64,7 @@ class Service:
         self.store = DirectoryStore(
             configuration.daemon.state_directory / "outbox", configuration.daemon.outbox_disk_bytes
         )
+        self._flusher = Flusher(self.store)
         self.driver = Driver(
             configuration.settings,
             configuration.links,
@@ -117,7 +118,10 @@ class Service:
         if isinstance(answer, dict):
             client.reply(header.get("id"), **answer)
             return
-        task = asyncio.get_running_loop().create_task(self._answer_later(client, header, answer))
+        self._spawn(self._answer_later(client, header, answer))
+
+    def _spawn(self, work: Coroutine[None, None, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -176,7 +180,7 @@ class Service:
         return self._flushed(outcome) if self.store.needs_flush else outcome
 
     async def _flushed(self, message: int) -> int:
-        await asyncio.get_running_loop().run_in_executor(None, self.store.flush, self.store.take_unflushed())
+        await self._flusher.flush()
         return message
 
     def topic(self, name: str) -> Topic | None:
@@ -339,6 +343,9 @@ class Service:
         """Once per period: the conditions as a topic for local programs, and into the recording."""
         period_s = self.configuration.daemon.conditions_period_s
         self._conditions_timer = asyncio.get_running_loop().call_later(period_s, self._conditions_due)
+        if self.store.needs_flush:
+            # What a peer left behind when it went out of reach: nobody waits for it.
+            self._spawn(self._flusher.flush())
         wanted = any(CONDITIONS_TOPIC in patterns for patterns in self._subscriptions.values())
         if not wanted and self.recorder is None:
             return

@@ -164,8 +164,9 @@ class Disk:
     def __init__(self) -> None:
         self.kept: dict[int, StoredMessage] = {}
 
-    def put(self, message: StoredMessage) -> None:
+    def put(self, message: StoredMessage) -> bool:
         self.kept[message.key] = message
+        return True
 
     def remove(self, key: int) -> None:
         self.kept.pop(key, None)

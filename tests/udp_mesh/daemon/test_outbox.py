@@ -1,16 +1,20 @@
 """Messages on disk: what was put is loaded, whatever ended the process."""
 
+import asyncio
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.udp_mesh.links.sockets import WAIT_S
 from udp_mesh.core.seams import StoredMessage
-from udp_mesh.daemon.outbox import DirectoryStore
+from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 
 
 def message(key: int, payload: bytes = b"payload", remaining_s: float | None = None) -> StoredMessage:
@@ -72,6 +76,44 @@ def test_flushing_skips_what_was_delivered_meanwhile(tmp_path: Path) -> None:
     store.remove(1)
     store.flush(paths)
     assert not store.needs_flush
+
+
+class SlowDisk(DirectoryStore):
+    """Flushes when `go` is set."""
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(directory, 1 << 20)
+        self.go = threading.Event()
+
+    def flush(self, paths: list[Path]) -> None:
+        assert self.go.wait(WAIT_S)
+        super().flush(paths)
+
+
+def test_nobody_is_told_of_a_flush_that_others_still_wait_for(tmp_path: Path) -> None:
+    async def run() -> None:
+        store = SlowDisk(tmp_path)
+        flusher = Flusher(store)
+        store.put(message(1))
+        store.put(message(2))
+        first, second = (asyncio.create_task(flusher.flush()) for _ in range(2))
+        for _ in range(100):
+            await asyncio.sleep(0)
+        assert not store.needs_flush
+        assert not first.done()
+        assert not second.done()
+        store.go.set()
+        await asyncio.gather(first, second)
+
+    asyncio.run(run())
+
+
+def test_a_disk_that_stays_full_fills_no_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store = DirectoryStore(tmp_path, 3000)
+    for key in range(1000):
+        store.put(message(key, bytes(1000)))
+    assert store.refused == 998
+    assert [record.getMessage().split()[0] for record in caplog.records] == ["outbox-full"]
 
 
 def test_a_message_put_before_sigkill_is_loaded_after(tmp_path: Path) -> None:

@@ -1,0 +1,199 @@
+"""Long absences: an outbox costs the same per message however much it holds, is emptied in steps, and stays on disk."""
+
+import sys
+from types import FrameType
+
+import pytest
+
+from tests.udp_mesh.core.pair import World, settings
+from tests.udp_mesh.core.test_casts import Disk
+from udp_mesh.core.acceptance import RELEASED_AT_ONCE
+from udp_mesh.core.events import (
+    ExpiryReason,
+    MessageDelivered,
+    MessageExpired,
+    MessageReceived,
+    PeerOffline,
+    PeerOnline,
+)
+from udp_mesh.core.seams import Store, StoredMessage
+from udp_mesh.core.settings import Outbox, Topic
+
+LOG = Topic("log", priority=8, outbox=Outbox.ALL)
+STATUS = Topic("status", priority=0, outbox=Outbox.ALL)
+
+
+def met(*topics: Topic, store: Store | None = None) -> World:
+    world = World(seed=1)
+    world.add(settings("a", *topics), store=store)
+    world.add(settings("b", *topics))
+    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    return world
+
+
+def reach(world: World, up: bool) -> None:
+    for pipe in world.pipes.values():
+        pipe.up = up
+
+
+def away(*topics: Topic) -> World:
+    """A world in which a holds b for offline."""
+    world = met(*topics)
+    reach(world, up=False)
+    assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))
+    return world
+
+
+def send(world: World, topic: str, numbers: range) -> None:
+    """Without letting virtual time, or the pumping of all nodes, come between."""
+    for number in numbers:
+        world.nodes["a"].send(topic, b"%d" % number, destination="b", now=world.now)
+
+
+def arrived(world: World, topic: str) -> list[int]:
+    events = [event for event in world.told("b", MessageReceived) if isinstance(event, MessageReceived)]
+    return [int(event.payload) for event in events if event.topic == topic]
+
+
+def held(world: World) -> int:
+    return world.nodes["a"].conditions(world.now).peers[0].outbox_messages
+
+
+class Calls:
+    """Counts function calls, which do not depend on the machine's speed."""
+
+    def __enter__(self) -> "Calls":
+        self.count = 0
+        sys.setprofile(self._called)
+        return self
+
+    def _called(self, _frame: FrameType, what: str, _argument: object) -> None:
+        self.count += what in ("call", "c_call")
+
+    def __exit__(self, *_: object) -> None:
+        sys.setprofile(None)
+
+
+@pytest.mark.parametrize(
+    "topic", [LOG, Topic("log", outbox=Outbox.LAST), Topic("log", outbox=Outbox.ALL, deadline_s=900.0)]
+)
+def test_a_message_costs_the_same_however_many_are_held(topic: Topic) -> None:
+    world = away(topic)
+    send(world, "log", range(300))
+    with Calls() as few:
+        send(world, "log", range(300, 400))
+    send(world, "log", range(400, 3000))
+    with Calls() as many:
+        send(world, "log", range(3000, 3100))
+    assert many.count < 1.2 * few.count
+
+
+def test_to_take_back_what_was_under_way_costs_the_same_per_message() -> None:
+    counts = []
+    for messages in (500, 2000):
+        world = met(LOG)
+        reach(world, up=False)
+        send(world, "log", range(messages))
+        with Calls() as calls:
+            assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))  # noqa: B023
+        assert held(world) == messages
+        counts.append(calls.count)
+    assert counts[1] < 8 * counts[0]
+
+
+def test_a_full_outbox_is_emptied_in_steps_in_order_and_once() -> None:
+    world = away(LOG)
+    send(world, "log", range(3 * RELEASED_AT_ONCE))
+    reach(world, up=True)
+    assert world.run(20.0, until=lambda: held(world) < 3 * RELEASED_AT_ONCE)
+    assert held(world) == 2 * RELEASED_AT_ONCE
+    # what is published meanwhile comes behind
+    send(world, "log", range(3 * RELEASED_AT_ONCE, 3 * RELEASED_AT_ONCE + 50))
+    world.run(10.0)
+    assert arrived(world, "log") == list(range(3 * RELEASED_AT_ONCE + 50))
+    assert len(world.told("a", MessageDelivered)) == 3 * RELEASED_AT_ONCE + 50
+    assert held(world) == 0
+
+
+def test_urgent_messages_do_not_wait_for_the_outbox() -> None:
+    world = away(LOG, STATUS)
+    send(world, "log", range(3 * RELEASED_AT_ONCE))
+    send(world, "status", range(2))
+    reach(world, up=True)
+    assert world.run(20.0, until=lambda: held(world) < 3 * RELEASED_AT_ONCE + 2)
+    send(world, "status", range(2, 3))
+    assert world.run(20.0, until=lambda: len(arrived(world, "status")) == 3)
+    assert len(arrived(world, "log")) < RELEASED_AT_ONCE
+
+
+def test_what_a_second_absence_takes_back_stands_in_front_of_what_was_still_held() -> None:
+    world = away(LOG)
+    send(world, "log", range(3 * RELEASED_AT_ONCE))
+    reach(world, up=True)
+    assert world.run(20.0, until=lambda: held(world) < 3 * RELEASED_AT_ONCE)
+    reach(world, up=False)
+    world.run(20.0)
+    assert held(world) + len(world.told("a", MessageDelivered)) == 3 * RELEASED_AT_ONCE
+    reach(world, up=True)
+    world.run(20.0)
+    assert sorted(arrived(world, "log")) == list(range(3 * RELEASED_AT_ONCE))
+    assert arrived(world, "log")[-RELEASED_AT_ONCE:] == list(range(2 * RELEASED_AT_ONCE, 3 * RELEASED_AT_ONCE))
+
+
+@pytest.mark.parametrize("deadline_s", [None, 3600.0])
+@pytest.mark.parametrize("keep_last", [None, 1])
+def test_what_has_ended_is_not_kept_in_memory_until_its_deadline(
+    deadline_s: float | None, keep_last: int | None
+) -> None:
+    world = met(Topic("t", deadline_s=deadline_s, keep_last=keep_last), LOG)
+    payloads = [b"%d" % number * 10 for number in range(600)]
+    for payload in payloads:
+        world.send("a", "t", payload, "b")
+        world.run(0.03)
+    # the list, the loop, the argument
+    assert sum(sys.getrefcount(payload) > 3 for payload in payloads) < 150
+
+
+def test_what_an_outbox_no_longer_holds_is_not_kept_in_memory_until_its_deadline() -> None:
+    world = away(Topic("t", outbox=Outbox.LAST, deadline_s=3600.0))
+    payloads = [b"%d" % number * 10 for number in range(600)]
+    for payload in payloads:
+        world.send("a", "t", payload, "b")
+    assert sum(sys.getrefcount(payload) > 3 for payload in payloads) < 150
+
+
+@pytest.mark.parametrize("size_bytes", [100, 300_000])
+@pytest.mark.parametrize("compression", [False, True])
+def test_a_message_is_on_disk_from_its_acceptance_to_its_outcome(size_bytes: int, compression: bool) -> None:
+    topic = Topic("t", outbox=Outbox.ALL, outbox_on_disk=True, compression=compression)
+    disk = Disk()
+    world = met(topic, store=disk)
+    payload = world.rng.randbytes(size_bytes // 2) + bytes(size_bytes - size_bytes // 2)
+    world.nodes["a"].send("t", payload, destination="b", now=world.now)
+    assert [kept.payload for kept in disk.kept.values()] == [payload]
+    # the robot's battery is pulled while the message is under way
+    world.run(0.005)
+    world.add(settings("a", topic), store=disk)
+    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert payload in [
+        event.payload for event in world.told("b", MessageReceived) if isinstance(event, MessageReceived)
+    ]
+    assert disk.kept == {}
+
+
+class FullDisk(Disk):
+    def put(self, message: StoredMessage) -> bool:
+        return False
+
+
+@pytest.mark.parametrize("online", [True, False])
+def test_a_message_the_disk_had_no_room_for_ends_with_the_node(online: bool) -> None:
+    topic = Topic("t", outbox=Outbox.ALL, outbox_on_disk=True)
+    world = met(topic, store=FullDisk())
+    reach(world, up=False)
+    if not online:
+        assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))
+    world.send("a", "t", b"only in memory", "b")
+    world.nodes["a"].close(world.now)
+    ends = [event for event in world.told("a", MessageExpired) if isinstance(event, MessageExpired)]
+    assert [end.reason for end in ends] == [ExpiryReason.CLOSED]
