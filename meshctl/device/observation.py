@@ -111,6 +111,8 @@ class Station:
     tx_mbit_s: float | None = None
     rx_mbit_s: float | None = None
     expected_mbit_s: float | None = None
+    # for how long the radio has known it
+    connected_s: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

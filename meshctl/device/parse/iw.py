@@ -77,6 +77,7 @@ def _station(heading: str, lines: list[str]) -> Station:
         tx_mbit_s=_number(fields.get("tx bitrate")),
         rx_mbit_s=_number(fields.get("rx bitrate")),
         expected_mbit_s=_number(fields.get("expected throughput")),
+        connected_s=_integer(fields.get("connected time")),
     )
 
 

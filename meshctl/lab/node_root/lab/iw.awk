@@ -1,4 +1,5 @@
-# iw's stand-in, the printing part. A station that is deleted is known again from its next beacon, which is at once.
+# iw's stand-in, the printing part. A station that is deleted is known again from its next beacon, which is at once; all
+# of them are known since the node started.
 BEGIN { FS = "\t" }
 function describe(indent, face,    width, type) {
 	type = face[2] == "adhoc" ? "IBSS" : face[2] == "mesh" ? "mesh point" : face[2] == "sta" ? "managed" : "AP"
@@ -35,7 +36,7 @@ FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" && (act ==
 	known = 1
 	printf "Station %s (on %s)\n\tinactive time:\t%d ms\n\trx bytes:\t96000\n\trx packets:\t1200\n\ttx bytes:\t88000\n\ttx packets:\t1100\n\ttx retries:\t12\n\ttx failed:\t0\n\trx drop misc:\t0\n", $3, device, $5
 	printf "\tsignal:  \t%d [%d, %d] dBm\n\tsignal avg:\t%d [%d, %d] dBm\n", $4, $4 - 2, $4 - 4, $4, $4 - 2, $4 - 4
-	printf "\ttx bitrate:\t%.1f MBit/s MCS 15 short GI\n\trx bitrate:\t%.1f MBit/s MCS 15 short GI\n\texpected throughput:\t%.2fMbps\n\tauthorized:\tyes\n\tauthenticated:\tyes\n\tassociated:\tyes\n\tconnected time:\t60 seconds\n", $6, $6, $6 * 0.4
+	printf "\ttx bitrate:\t%.1f MBit/s MCS 15 short GI\n\trx bitrate:\t%.1f MBit/s MCS 15 short GI\n\texpected throughput:\t%.2fMbps\n\tauthorized:\tyes\n\tauthenticated:\tyes\n\tassociated:\tyes\n\tconnected time:\t%d seconds\n", $6, $6, $6 * 0.4, uptime
 }
 function fail(text, number) { printf "command failed: %s (-%d)\n", text, number > "/dev/stderr"; exit 256 - number }
 END {
