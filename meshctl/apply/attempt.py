@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from meshctl.apply.change import change_of, new_change_id, new_nonce, services_of
 from meshctl.apply.checks import missing
-from meshctl.apply.forget import Forgetting
+from meshctl.apply.forgetting import Forgetting
 from meshctl.apply.job import Job
 from meshctl.apply.settle import Move, applied_age_s, next_move
 from meshctl.apply.waiting import Pace
@@ -28,6 +28,8 @@ from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.model import Secret
 from meshctl.plan import Cut
+from meshctl.plan.radios import NO_RADIOS, Radios, restarted
+from meshctl.plan.seen import WIRELESS, packages_seen
 
 # A lock outlives its change by this much, for the moves after it.
 LOCK_SLACK_S = 60
@@ -62,14 +64,14 @@ class Attempt:
     is_given_up: bool = False
     # what it does besides files may take so long before its window begins
     extra_s: float = 0.0
-    # its radio starts anew with it
-    takes_radios_down: bool = False
+    # those that start anew with it
+    radios: Radios = NO_RADIOS
     # the one of `places` where it was met
     met: Endpoint | None = None
     forgetting: Forgetting = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self.forgetting = Forgetting(self.job)
+        self.forgetting = Forgetting(self.job, self.radios)
 
     @property
     def new(self) -> Endpoint:
@@ -100,8 +102,16 @@ def attempt_of(job: Job, old: Endpoint, *, window_s: int | None = None) -> Attem
         window_s or job.node.confirm_window_s,
         old,
         job.work.access.places(job.node),
-        takes_radios_down=job.plan.cut >= Cut.MESH,
+        radios=_radios_of(job),
     )
+
+
+def _radios_of(job: Job) -> Radios:
+    """Which of the node's radios start anew with its plan's files."""
+    if not any(change.path == WIRELESS for change in job.plan.files):
+        return NO_RADIOS
+    before = packages_seen([WIRELESS], job.before)["wireless"]
+    return restarted(before, next((file.package for file in job.wanted.files if file.path == WIRELESS), None))
 
 
 def prepare(attempt: Attempt, connection: SshConnection) -> None:

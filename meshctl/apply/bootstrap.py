@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 from meshctl.apply.access import Access
 from meshctl.apply.gather import Seen, observe_cleared
+from meshctl.apply.neighbourhood import look_around as look_at_neighbours
 from meshctl.apply.planning import Choices, Prepared, assemble, other_paths
 from meshctl.apply.wanted import Renderer
 from meshctl.device.connection import Endpoint
@@ -209,8 +210,13 @@ def plan_arrivals(
     salt: bytes,
     owner: str,
     choices: Choices | None = None,
+    interrupt: Interrupt | None = None,
 ) -> Prepared:
-    """The plan that provisions the devices that were found."""
+    """The plan that provisions the devices that were found. Whoever may know their radios is looked at, too: a spare
+    may have been in the mesh, and a device that was reset was in it before."""
     first = {name: renderer.wanted(item.node) for name, item in arrivals.found.items()}
-    seen = Seen({name: item.seen for name, item in arrivals.found.items()}, {})
-    return assemble(renderer, access, first, seen, known, salt=salt, owner=owner, choices=choices or Choices())
+    found = {name: item.seen for name, item in arrivals.found.items()}
+    made = assemble(
+        renderer, access, first, Seen(found, {}), known, salt=salt, owner=owner, choices=choices or Choices()
+    )
+    return replace(made, around=look_at_neighbours(access, renderer.fleet, found, known, interrupt=interrupt))

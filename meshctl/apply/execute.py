@@ -14,14 +14,15 @@ from pathlib import Path
 from meshctl.apply.access import Access
 from meshctl.apply.checks import expectation
 from meshctl.apply.flash import checked_image, flash
-from meshctl.apply.gather import facts_of
+from meshctl.apply.forgetting import NOT_ASKED, ask_the_rest, make_up_for
+from meshctl.apply.gather import facts_of, known_macs
 from meshctl.apply.job import Job, Work
+from meshctl.apply.neighbourhood import look_around
 from meshctl.apply.node import configure
 from meshctl.apply.packages import install
 from meshctl.apply.planning import Prepared, base_macs
 from meshctl.apply.switch import switch
 from meshctl.apply.whereabouts import ask_around
-from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.fleet import (
@@ -63,6 +64,17 @@ def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
         node.hardware.name: checked_image(node.hardware)
         for node in (fleet.nodes[name] for name, planned in plan.nodes.items() if planned.firmware is not None)
     }
+    known = setting.journal.last_known(fleet.name)
+    seen = prepared.seen.observations
+    lost = {
+        name: at_s
+        for name, at_s in setting.journal.lost_sight_of(fleet.name).items()
+        if name in plan.nodes and name in seen
+    }
+    around = {**seen, **prepared.around}
+    if lost:
+        again = {name: seen[name] for name in lost}
+        around = look_around(setting.access, fleet, again, known, told=around, interrupt=setting.interrupt)
     work = Work(
         fleet,
         setting.access,
@@ -72,12 +84,16 @@ def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
         setting.owner,
         remember=lambda name, seen: setting.run.remember(fleet.name, name, facts_of(seen), seen.answered_at_s),
         rate_bytes_per_s=setting.rate_bytes_per_s,
-        around=prepared.seen.observations,
+        around=around,
+        names=known_macs(fleet, known),
+        bases=base_macs(fleet, seen, known),
     )
     outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _without_work(fleet, made))}
     for outcome in outcomes.values():
         _tell(setting, outcome)
-    jobs = _jobs(prepared, work, setting.journal)
+    jobs = _jobs(prepared, work)
+    for name, since_s in lost.items():
+        make_up_for(_job(prepared, work, name), max(0.0, time.time() - since_s))
     budget = FailureBudget(fleet.apply.stop_after_failures)
     stopped = ""
     for stage in plan.stages:
@@ -95,6 +111,7 @@ def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
         elif budget.spent:
             stopped = budget.reason
     outcomes.update(_searched(prepared, setting, jobs, outcomes))
+    outcomes.update(_with_those_not_asked(work, outcomes))
     return {name: outcomes[name] for name in plan.nodes}
 
 
@@ -122,6 +139,15 @@ def _searched(
     return told
 
 
+def _with_those_not_asked(work: Work, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
+    """The outcomes of nodes that some neighbour may not hear for a while, with who that is."""
+    told = {}
+    for name, silent in ask_the_rest(work).items():
+        told[name] = replace(outcomes[name], facts={**outcomes[name].facts, NOT_ASKED: " ".join(silent)})
+        work.run.finish_node(told[name])
+    return told
+
+
 def _tell(setting: Setting, outcome: Outcome) -> None:
     setting.run.finish_node(outcome)
     setting.observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
@@ -141,21 +167,15 @@ def _without_work(fleet: Fleet, plan: NodePlan) -> Outcome | None:
             return None
 
 
-def _jobs(prepared: Prepared, work: Work, journal: Journal) -> dict[str, Job]:
-    seen: Mapping[str, Observation] = prepared.seen.observations
-    bases = base_macs(work.fleet, seen, journal.last_known(work.fleet.name))
-    return {
-        name: Job(
-            work,
-            work.fleet.nodes[name],
-            plan,
-            prepared.wanted[name],
-            seen[name],
-            expectation(prepared.wanted[name], seen[name], bases),
-        )
-        for name, plan in prepared.plan.nodes.items()
-        if plan.verdict is Verdict.CHANGE
-    }
+def _jobs(prepared: Prepared, work: Work) -> dict[str, Job]:
+    changing = (name for name, plan in prepared.plan.nodes.items() if plan.verdict is Verdict.CHANGE)
+    return {name: _job(prepared, work, name) for name in changing}
+
+
+def _job(prepared: Prepared, work: Work, name: str) -> Job:
+    seen, wanted = prepared.seen.observations[name], prepared.wanted[name]
+    expected = expectation(wanted, seen, work.bases)
+    return Job(work, work.fleet.nodes[name], prepared.plan.nodes[name], wanted, seen, expected)
 
 
 def _stage(

@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from meshctl.apply.attempt import LOCK_SLACK_S, install_switch
-from meshctl.apply.forget import Forgetting
+from meshctl.apply.forgetting import Forgetting
 from meshctl.apply.job import Job
 from meshctl.apply.waiting import Pace
 from meshctl.device import deadman, openwrt
@@ -155,7 +155,7 @@ def _await_return(job: Job, marker: str, forgetting: Forgetting) -> Outcome:
         else:
             job.work.remember(job.name, seen)
             if seen.boot_id != job.before.boot_id:
-                forgetting.when_back(went_back=False)
+                forgetting.when_back(seen, rebooted=True)
                 return _verdict(job, seen, marker)
             if pace.elapsed_s > START_S:
                 return Outcome(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from meshctl.apply.access import Access
 from meshctl.apply.checks import Expectation
@@ -16,11 +17,15 @@ from meshctl.fleet.journal import Run
 from meshctl.model import Fleet, Node
 from meshctl.plan import NodePlan, Wanted
 
+if TYPE_CHECKING:
+    from meshctl.apply.forgetting import Forgetting
+
 
 @dataclass(frozen=True, slots=True)
 class Work:
     """What all nodes of a run share. `owner` names this process to the locks on the nodes; `remember` keeps what a
-    node told, for later; `around` is what the nodes of their meshes told before anything was changed."""
+    node told, for later; `around` is what the nodes of their meshes told before anything was changed, `names` tells
+    whose the MACs of mesh radios are, `bases` which are the base's; `later` collects what is to be asked in the end."""
 
     fleet: Fleet
     access: Access
@@ -31,6 +36,9 @@ class Work:
     remember: Callable[[str, Observation], None] = lambda name, seen: None
     rate_bytes_per_s: float | None = None
     around: Mapping[str, Observation] = field(default_factory=dict)
+    names: Mapping[str, str] = field(default_factory=dict)
+    bases: Sequence[str] = ()
+    later: list[Forgetting] = field(default_factory=list)
 
     def note(self, text: str, node: str = "") -> None:
         self.observer(Event(EventKind.NOTE, node, time.time(), text))

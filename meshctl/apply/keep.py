@@ -18,22 +18,22 @@ from dataclasses import dataclass, field
 from ipaddress import IPv4Address
 from types import MappingProxyType
 
-from meshctl.apply.attempt import Attempt, begin, prepare
+from meshctl.apply.attempt import Attempt
 from meshctl.apply.change import new_change_id, new_nonce, reload_script
 from meshctl.apply.job import Job
-from meshctl.apply.node import follow
+from meshctl.apply.node import carry
 from meshctl.device import openwrt
 from meshctl.device.connection import OwnKey
 from meshctl.device.deadman import Change, NewFile
-from meshctl.device.errors import NodeRefused
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
-from meshctl.errors import InputError, NodeError, Unreachable
+from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.model import Node
 from meshctl.plan.lockout import lockout
 from meshctl.plan.objections import Objection
-from meshctl.plan.seen import parsed
+from meshctl.plan.radios import NO_RADIOS, Radios, restarted
+from meshctl.plan.seen import WIRELESS, packages_seen, parsed
 from meshctl.render import MARKER_PATH
 
 INFO_NAME = "meshctl-backup.json"
@@ -167,6 +167,8 @@ def _members(data: bytes, file: str) -> list[tuple[tarfile.TarInfo, bytes]]:
 def put_back(job: Job, connection: SshConnection, backup: Backup) -> Outcome:
     """Make the node what the backup has, under its dead-man's switch. Owns `connection`.
 
+    Raises NodeError only when nothing was changed on the node.
+
     Files that the node has now and the backup has not stay: `sysupgrade -b` does not name what it left out.
     """
     live = job.before.uci or {}
@@ -183,19 +185,18 @@ def put_back(job: Job, connection: SshConnection, backup: Backup) -> Outcome:
         job.node.confirm_window_s,
         connection.endpoint,
         job.work.access.places(job.node, address),
-        takes_radios_down=True,
+        radios=_radios(files, job.before),
     )
-    try:
-        prepare(attempt, connection)
-        begin(attempt, connection)
-    except Unreachable as error:
-        attempt.trouble = str(error)
-    except NodeRefused as refusal:
-        return Outcome(job.name, Result.REFUSED, str(refusal), hint=refusal.hint)
-    finally:
-        connection.close()
-    with job.step("prove"):
-        return follow(attempt)
+    return carry(attempt, connection)
+
+
+def _radios(files: Mapping[str, NewFile], before: Observation) -> Radios:
+    """Which radios start anew with these files."""
+    wireless = files.get(f"/{WIRELESS}")
+    if wireless is None:
+        return NO_RADIOS
+    after = parsed(wireless.content.decode("utf-8", "replace"), "wireless")
+    return restarted(packages_seen([WIRELESS], before)["wireless"], after)
 
 
 def _differs(path: str, new: NewFile, live: Mapping[str, str]) -> bool:

@@ -3,7 +3,7 @@
 `configure` sends the change over the connection at hand and begins it, then follows the node's own dead-man's switch
 over new connections (`follow`) until the change is confirmed or undone. A cut at any point ends in the same loop: it
 asks the node what is, and does what is next. While the node is silent, and once it is back, its neighbours are asked to
-forget the radio it had (`forget`).
+forget the radio it had (`forgetting`).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def carry(attempt: Attempt, connection: SshConnection) -> Outcome:
     job = attempt.job
     try:
         prepare(attempt, connection)
-        if attempt.takes_radios_down:
+        if attempt.radios:
             attempt.forgetting.beforehand(for_s=_limit_s(attempt))
         begin(attempt, connection)
     except Unreachable as error:
@@ -79,8 +79,7 @@ def follow(attempt: Attempt) -> Outcome:
             if attempt.last is not None:
                 work.remember(attempt.job.name, attempt.last)
             if outcome is not None:
-                if _has_started_its_radio_anew(attempt, outcome):
-                    attempt.forgetting.when_back(went_back=outcome.result is Result.ROLLED_BACK)
+                _have_its_radio_forgotten(attempt, outcome)
                 return outcome
         else:
             attempt.forgetting.while_silent()
@@ -140,11 +139,13 @@ def _limit_s(attempt: Attempt) -> float:
     return attempt.settle_s + attempt.extra_s + attempt.window_s + GRACE_AFTER_WINDOW_S
 
 
-def _has_started_its_radio_anew(attempt: Attempt, outcome: Outcome) -> bool:
-    if outcome.result not in (Result.DONE, Result.ROLLED_BACK):
-        return False
-    has_rebooted = attempt.last is not None and attempt.last.boot_id != attempt.job.before.boot_id
-    return attempt.takes_radios_down or has_rebooted
+def _have_its_radio_forgotten(attempt: Attempt, outcome: Outcome) -> None:
+    if outcome.result in (Result.DONE, Result.ROLLED_BACK):
+        attempt.forgetting.when_back(
+            attempt.last,
+            went_back=outcome.result is Result.ROLLED_BACK,
+            rebooted=attempt.last is not None and attempt.last.boot_id != attempt.job.before.boot_id,
+        )
 
 
 def _out_of_sight(attempt: Attempt) -> Outcome:

@@ -24,6 +24,7 @@ from meshctl.device.upload import upload
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome
 from meshctl.plan import PackageStep
+from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS
 
 DIRECTORY = "/tmp/meshctl/packages"
 # Unpacking packages into jffs2 takes a minute on the slowest boards, and as much again to keep what is removed.
@@ -49,7 +50,7 @@ def install(job: Job, connection: SshConnection, step: PackageStep) -> Outcome:
     except BaseException:
         connection.close()
         raise
-    return carry(_attempt(job, connection, script, takes_radios_down=bool(step.remove)), connection)
+    return carry(_attempt(job, connection, script, has_other_supplicant=bool(step.remove)), connection)
 
 
 def _bring(job: Job, connection: SshConnection, files: Sequence[Path]) -> list[str]:
@@ -66,11 +67,11 @@ def _bring(job: Job, connection: SshConnection, files: Sequence[Path]) -> list[s
     return there
 
 
-def _attempt(job: Job, connection: SshConnection, script: str, *, takes_radios_down: bool) -> Attempt:
+def _attempt(job: Job, connection: SshConnection, script: str, *, has_other_supplicant: bool) -> Attempt:
     """A change of packages alone: the node stays where it is, and has to hear whom it heard."""
     here = replace(connection.endpoint, identity=job.name)
     expected = Expectation(neighbours=job.expected.neighbours, bases=job.expected.bases, needs=job.wanted.needs)
-    reload = _WITH_THE_OTHER_SUPPLICANT if takes_radios_down else "exit 0\n"
+    reload = _WITH_THE_OTHER_SUPPLICANT if has_other_supplicant else "exit 0\n"
     return Attempt(
         replace(job, expected=expected),
         Change(new_change_id(), {}, reload, extra=script),
@@ -79,7 +80,7 @@ def _attempt(job: Job, connection: SshConnection, script: str, *, takes_radios_d
         here,
         (here,),
         extra_s=INSTALL_S,
-        takes_radios_down=takes_radios_down,
+        radios=EVERY_RADIO if has_other_supplicant else NO_RADIOS,
     )
 
 

@@ -39,12 +39,13 @@ class Choices:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A plan, and what was rendered and seen for it."""
+    """A plan, and what was rendered and seen for it; `around` is what others told who may know these nodes' radios."""
 
     plan: Plan
     wanted: Mapping[str, Wanted] = field(repr=False)
     seen: Seen = field(repr=False)
     salt: bytes = b""
+    around: Mapping[str, Observation] = field(default_factory=dict, repr=False)
 
 
 def prepare(

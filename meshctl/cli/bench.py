@@ -98,6 +98,7 @@ def bootstrap(
             salt=secrets.token_bytes(SALT_BYTES),
             owner=opened.owner,
             choices=choices,
+            interrupt=opened.interrupt,
         )
         try:
             ask_and_carry_out(opened, prepared, "bootstrap", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
@@ -210,6 +211,7 @@ def replace(
                 salt=secrets.token_bytes(SALT_BYTES),
                 owner=opened.owner,
                 choices=choices,
+                interrupt=opened.interrupt,
             )
             ask_and_carry_out(opened, prepared, "replace", choices, yes=yes, as_json=as_json, brief=True, rate=rate)
         except typer.Exit as ended:

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from meshctl.apply.checks import Expectation
-from meshctl.apply.gather import facts_of, observe_cleared
+from meshctl.apply.forgetting import NOT_ASKED, ask_the_rest
+from meshctl.apply.gather import facts_of, known_macs, observe_cleared
 from meshctl.apply.job import Job, Work
 from meshctl.apply.keep import Backup, fetch, lacking_packages, lockout_by, objection_to, put_back, read_backup
+from meshctl.apply.neighbourhood import look_around
+from meshctl.apply.planning import base_macs
 from meshctl.cli.asking import must_agree
 from meshctl.cli.carry import Refused
 from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.plan import Yes
 from meshctl.cli.session import KeyFiles, Lab, Nodes, Session, chosen, exit_for, progress_for, session
+from meshctl.device.observation import Observation
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result, run
 from meshctl.plan import Cut, Effect, NodePlan, Verdict
@@ -112,7 +117,19 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Out
             progress_for(1, as_json=as_json) as progress,
             opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)),
         ):
-            work = Work(opened.fleet, opened.access, journal_run, progress, opened.interrupt, opened.owner)
+            known = opened.journal.last_known(opened.fleet.name)
+            around: dict[str, Observation] = {}
+            work = Work(
+                opened.fleet,
+                opened.access,
+                journal_run,
+                progress,
+                opened.interrupt,
+                opened.owner,
+                around=around,
+                names=known_macs(opened.fleet, known),
+                bases=base_macs(opened.fleet, around, known),
+            )
 
             def one(only: str) -> Outcome:
                 connection = opened.access.open(node)
@@ -124,6 +141,9 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Out
                     shut_out = lockout_by(saved, node, opened.access.own_keys(node))
                     if shut_out is not None:
                         raise Refused(shut_out.reason, hint=shut_out.hint)
+                    around.update(
+                        look_around(opened.access, opened.fleet, {name: seen}, known, interrupt=opened.interrupt)
+                    )
                     for package in lacking_packages(saved, seen):
                         work.note(f"package {package} was installed then and is not now", name)
                     if saved.disabled:
@@ -136,6 +156,8 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Out
                 return put_back(job, connection, saved)
 
             ended = run([name], one, parallel=1, interrupt=opened.interrupt, observer=progress)
+            for silent in ask_the_rest(work).values():
+                ended[name] = replace(ended[name], facts={NOT_ASKED: " ".join(silent)})
             journal_run.finish_node(ended[name])
     finally:
         journal_run.end(ended[name].result.value if ended else "could not run")

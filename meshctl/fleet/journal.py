@@ -27,6 +27,8 @@ BUSY_TIMEOUT_S = 20.0
 # In the middle of a run nodes wait to be confirmed: a journal that somebody holds is written to later.
 STEP_TIMEOUT_S = 1.0
 _RUN_COLUMNS = "id, command, fleet, inventory, owner, process, plan, began_s, ended_s, result"
+# Outcomes of a node that leave open what became of a change begun before.
+_END_NOT_SEEN = (Result.UNCERTAIN, Result.PENDING, Result.UNREACHABLE)
 _SCHEMA = """
 CREATE TABLE runs (
     id INTEGER PRIMARY KEY, command TEXT NOT NULL, fleet TEXT NOT NULL, inventory TEXT NOT NULL, owner TEXT NOT NULL,
@@ -249,6 +251,19 @@ class Journal:
             if not Result(result).is_settled:
                 left[run_id] = (*left.get(run_id, ()), node)
         return left
+
+    def lost_sight_of(self, fleet: str) -> dict[str, float]:
+        """The nodes on which a change was begun that no run saw the end of, and when the first such was (Unix time)."""
+        ended = ", ".join(f"'{result.value}'" for result in Result if result not in _END_NOT_SEEN)
+        rows = self._read(
+            "SELECT node, MIN(steps.began_s) FROM steps JOIN runs ON runs.id = run WHERE fleet = ?1"
+            " AND command NOT LIKE 'robots %' AND step IN ('apply', 'flash') AND NOT EXISTS"
+            " (SELECT 1 FROM outcomes AS later JOIN runs AS after ON after.id = later.run WHERE after.fleet = ?1"
+            " AND later.node = steps.node AND later.run >= steps.run AND after.command NOT LIKE 'robots %'"
+            f" AND later.result IN ({ended})) GROUP BY node ORDER BY node",
+            (fleet,),
+        )
+        return dict(rows)
 
     def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
         """Keep what a node told; an older sighting never replaces a newer one."""

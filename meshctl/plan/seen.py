@@ -14,6 +14,7 @@ from meshctl.topology import NEIGHBOUR_FRESH_MS
 from meshctl.uci import Package, parse
 
 CONFIG = "etc/config/"
+WIRELESS = f"{CONFIG}wireless"
 
 
 def package_of(path: str) -> str | None:

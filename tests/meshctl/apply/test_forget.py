@@ -1,14 +1,10 @@
-"""Laws of who is asked to forget a radio, and when; and that they do, over real SSH, on a virtual fleet."""
+"""Laws of who is asked to forget a radio, with which words, and when."""
 
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
 import pytest
 from hypothesis import given
@@ -20,18 +16,18 @@ from meshctl.apply.forget import (
     LONGEST_PAUSE_S,
     MOST_ASKED,
     Entry,
-    Forgetting,
     behind,
     by_holder,
     entries_of,
     forget_script,
+    neighbours_now,
     next_ask_s,
+    silent_holders,
     watch_script,
 )
-from meshctl.apply.job import Job
 from meshctl.device.observation import Observation, Originator, Station, WirelessLink
+from meshctl.plan.radios import NO_RADIOS, Radios
 from tests.meshctl.plan.support import fleet, running
-from tests.meshctl.proof.rig import Rig
 
 MAC = "02:00:00:00:01:02"
 OTHER = "02:00:00:00:01:03"
@@ -87,38 +83,35 @@ def test_a_silent_node_has_its_neighbours_asked_at_once_and_then_ever_more_seldo
     assert all(FIRST_PAUSE_S - 1e-6 <= pause <= LONGEST_PAUSE_S + 1e-6 for pause in pauses)
 
 
-def test_a_node_that_is_silent_for_long_is_told_of_once_however_often_its_neighbours_are_asked(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    steps: list[str] = []
-    notes: list[str] = []
-    scripts: list[str] = []
+def test_of_two_radios_only_those_who_know_the_one_that_starts_anew_are_asked() -> None:
+    around = {"b01": knows("b01", ("mesh0", MAC), ("mesh1", OTHER)), "b02": itself(MAC, OTHER)}
+    assert entries_of("b02", around, Radios(frozenset({"mesh1"}))) == (Entry("b01", "mesh1", OTHER),)
+    assert entries_of("b02", around, NO_RADIOS) == ()
 
-    @contextmanager
-    def step(name: str) -> Iterator[None]:
-        steps.append(name)
-        yield
 
-    def answer(script: str, *, timeout_s: float) -> SimpleNamespace:
-        scripts.append(script)
-        return SimpleNamespace(stdout=f"{MAC}\n")
+def hears(*macs: str) -> Observation:
+    return replace(itself(MAC), neighbours=(), stations=tuple(Station("mesh0", mac) for mac in macs))
 
-    connection = SimpleNamespace(run=answer, close=lambda: None)
-    work = SimpleNamespace(
-        around={"b02": itself(MAC), "b01": knows("b01", ("mesh0", MAC))},
-        interrupt=SimpleNamespace(leaving=False),
-        access=SimpleNamespace(take=lambda name: connection, keep=lambda name, kept: None),
-        note=lambda text, node: notes.append(text),
-    )
-    forgetting = Forgetting(cast("Job", SimpleNamespace(name="b02", work=work, step=step)))
-    monkeypatch.setattr("meshctl.apply.forget.next_ask_s", lambda asked_s: float("-inf"))
-    forgetting.begins()
-    for _ in range(5):
-        forgetting.while_silent()
-    forgetting.when_back(went_back=False)
-    assert len(scripts) == 6
-    assert steps == ["neighbours forget it"]
-    assert notes == ["b01 forgot its radio, to hear it anew"]
+
+def test_whom_the_node_hears_and_who_told_nothing_may_know_it() -> None:
+    around = {
+        "b01": replace(knows("b01"), macs={}, links=(WirelessLink("mesh0", "IBSS", BASE),)),
+        "b02": hears(BASE, OTHER),
+    }
+    names = {OTHER: "b03", MAC: "b02"}
+    assert silent_holders("b02", around, names, ("b01", "b02", "b03", "b04")) == ("b03",)
+    assert neighbours_now(around["b02"], {**names, BASE: "b01"}) == ("b01", "b03")
+
+
+def test_who_answered_without_telling_of_its_stations_may_know_the_node() -> None:
+    around = {"b01": replace(knows("b01"), stations=None), "b02": hears(OTHER)}
+    assert silent_holders("b02", around, {OTHER: "b01"}, ()) == ("b01",)
+
+
+def test_a_stranger_may_be_any_fellow_whose_radios_nobody_has_seen() -> None:
+    around = {"b01": knows("b01"), "b02": hears("02:99:00:00:00:01")}
+    assert silent_holders("b02", around, {OTHER: "b03"}, ("b01", "b02", "b03", "b04")) == ("b04",)
+    assert silent_holders("b02", around, {"02:99:00:00:00:01": "b02"}, ("b04",)) == ()
 
 
 def hop(name: str, mac: str, next_hop: str, *, best: bool = True) -> Observation:
@@ -140,7 +133,9 @@ def test_those_whose_best_way_to_the_base_begins_with_the_node_are_behind_it() -
 # iw of a holder: `get` tells the age that stands in line N of `ages` at second N, `del` writes down when it was called;
 # the clock is what sleeps
 FAKES = {
-    "iw": """now=$(cat "$HERE/now"); case $4 in
+    "iw": """now=$(cat "$HERE/now")
+[ $# != 1 ] || printf 'phy#0\\n\\tInterface mesh0\\nphy#1\\n\\tInterface mesh1\\n'
+case $4 in
 get) sed -n "${now}s/.*/Station $5\\n\\tinactive time:\\t& ms\\n\\tconnected time:\\t& seconds/p" "$HERE/ages" ;;
 del) echo "$now $2 $5" >>"$HERE/deleted"; [ "$5" != unknown ] ;;
 esac""",
@@ -193,8 +188,15 @@ def test_only_an_entry_from_before_is_forgotten_when_asked_and_printed(
 ) -> None:
     text = forget_script([Entry("b01", "mesh0", MAC), Entry("b01", "mesh0", "unknown")], older_than_s=11.2)
     printed, deleted = deletions(tmp_path, [age_s], text)
-    assert printed == (f"{MAC}\n" if is_deleted else "")
+    # one that is not there cannot be removed
+    assert printed == (f"gone {MAC}\nkept unknown\n" if is_deleted else "")
     assert deleted == ([f"1 mesh0 {MAC}", "1 mesh0 unknown"] if is_deleted else [])
+
+
+def test_who_did_not_tell_looks_on_all_of_its_interfaces(tmp_path: Path) -> None:
+    printed, deleted = deletions(tmp_path, [50], forget_script([Entry("b01", "", MAC)], older_than_s=11.2))
+    assert printed == f"gone {MAC}\n" * 2
+    assert deleted == [f"1 mesh0 {MAC}", f"1 mesh1 {MAC}"]
 
 
 def test_no_word_of_a_node_is_run(tmp_path: Path) -> None:
@@ -202,24 +204,3 @@ def test_no_word_of_a_node_is_run(tmp_path: Path) -> None:
     deletions(tmp_path, [5000] * 4, forget_script(evil, older_than_s=1) + watch_script("b02", evil, for_s=2))
     assert len((tmp_path / "deleted").read_text().splitlines()) >= 4
     assert not (tmp_path / "x").exists()
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    with Rig(tmp_path, count=2, window_s=60) as made:
-        made.take_in(made.current)
-        yield made
-
-
-@pytest.mark.lab
-@pytest.mark.xdist_group("lab")
-@pytest.mark.timeout(600)
-def test_after_a_change_of_a_radio_its_neighbour_has_forgotten_it(
-    rig: Rig,
-) -> None:
-    _, new = rig.flip()
-    ended = rig.meshctl("provision", new, "n001", "--yes", "--json")
-    assert ended.results == {"n001": "done"}, ended.out + ended.err
-    # told only by those that had an entry and removed it
-    notes = [event["text"] for event in ended.events if event["event"] == "note" and event["node"] == "n001"]
-    assert notes == ["base forgot its radio, to hear it anew"]

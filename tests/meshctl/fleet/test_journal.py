@@ -52,6 +52,27 @@ def test_what_a_run_left_stands_until_a_later_run_takes_it_up(path: Path) -> Non
         assert [run.id for run in journal.runs(fleet="f", node="b")] == [2, 1]
 
 
+def test_a_change_is_lost_sight_of_from_its_beginning_until_a_run_has_seen_how_its_node_is(path: Path) -> None:
+    with Journal(path) as journal:
+        first = journal.begin("provision", fleet="f", inventory="inv", nodes=("a", "b", "c"))
+        for name in ("a", "b", "c"):
+            with first.step(name, "stage" if name == "c" else "apply"):
+                pass
+        first.finish_node(Outcome("b", Result.ROLLED_BACK))
+        lost = journal.lost_sight_of("f")
+        assert lost == {"a": next(step.began_s for step in journal.steps(first.id, "a"))}
+        first.finish_node(Outcome("a", Result.UNCERTAIN))
+        second = journal.begin("resume", fleet="f", inventory="inv", nodes=("a",))
+        second.finish_node(Outcome("a", Result.UNREACHABLE))
+        robots = journal.begin("robots deploy", fleet="f", inventory="inv", nodes=("a",))
+        robots.finish_node(Outcome("a", Result.DONE))
+        assert journal.lost_sight_of("f") == lost
+        assert journal.lost_sight_of("other") == {}
+        third = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
+        third.finish_node(Outcome("a", Result.UNCHANGED))
+        assert journal.lost_sight_of("f") == {}
+
+
 def test_steps_tell_what_failed_and_what_was_cut_short(path: Path) -> None:
     with Journal(path) as journal:
         run = journal.begin("apply", fleet="f", inventory="inv", nodes=("a",))

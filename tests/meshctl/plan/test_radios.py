@@ -1,0 +1,82 @@
+"""Laws of which radios start anew: those whose own settings differ, and those that know nobody for longer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from meshctl.device.observation import Station
+from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, Radios, restarted, started_within
+from meshctl.uci import Package, parse
+from tests.meshctl.plan.support import fleet, running
+
+WIRELESS = """\
+config wifi-device 'radio0'
+	option channel '6'
+
+config wifi-iface 'mesh0'
+	option device 'radio0'
+	option ifname 'mesh0'
+	option key 'one'
+
+config wifi-device 'radio1'
+	option channel '36'
+
+config wifi-iface 'mesh1'
+	option device 'radio1'
+	option ifname 'mesh1'
+	option key 'two'
+"""
+
+
+def wireless(old: str = "", new: str = "") -> Package:
+    assert old in WIRELESS
+    return parse(WIRELESS.replace(old, new, 1), "wireless")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "ifname"),
+    [
+        ("option channel '36'", "option channel '40'", "mesh1"),
+        ("option key 'two'", "option key 'three'", "mesh1"),
+        ("option key 'one'", "option key 'four'", "mesh0"),
+        ("option channel '6'", "option channel '6'\n\toption disabled '1'", "mesh0"),
+    ],
+)
+def test_only_the_radio_whose_own_settings_or_interface_differ_starts_anew(old: str, new: str, ifname: str) -> None:
+    assert restarted(wireless(), wireless(old, new)) == Radios(frozenset({ifname}))
+
+
+def test_a_radio_that_is_taken_out_of_the_settings_stops() -> None:
+    _, _, without = WIRELESS.partition("config wifi-device 'radio1'")
+    assert restarted(wireless(), parse(WIRELESS.removesuffix("config wifi-device 'radio1'" + without), "wireless")) == (
+        Radios(frozenset({"mesh1"}))
+    )
+
+
+def test_other_quoting_and_order_of_options_start_no_radio() -> None:
+    same = wireless("option ifname 'mesh0'\n\toption key 'one'", 'option key one\n\toption ifname "mesh0"')
+    assert restarted(wireless(), same) == NO_RADIOS
+    assert not NO_RADIOS
+
+
+def test_where_names_or_files_are_not_known_every_radio_may_have_started() -> None:
+    nameless = wireless("\toption ifname 'mesh1'\n", "")
+    assert restarted(nameless, wireless()) == EVERY_RADIO
+    assert restarted(None, wireless()) == EVERY_RADIO
+    assert restarted(wireless(), None) == EVERY_RADIO
+    assert "anything" in EVERY_RADIO
+
+
+def test_a_radio_that_knows_nobody_for_longer_has_started_since_and_one_that_knows_nobody_is_not_taken_for_it() -> None:
+    stations = (
+        Station("mesh0", "02:00:00:00:00:01", connected_s=90),
+        Station("mesh0", "02:00:00:00:00:02", connected_s=20),
+        Station("mesh1", "02:00:00:00:00:03", connected_s=None),
+    )
+    seen = replace(running(fleet(), "b02"), stations=stations, uptime_s=5000.0)
+    assert started_within(seen, 100.0) == Radios(frozenset({"mesh0"}))
+    assert started_within(seen, 90.0) == NO_RADIOS
+    assert started_within(replace(seen, stations=None), 100.0) == NO_RADIOS
+    assert started_within(replace(seen, uptime_s=99.0), 100.0) == EVERY_RADIO
