@@ -231,6 +231,7 @@ def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: l
         computer=_computer(document.computer) if document.computer is not None else None,
         is_base=document.is_base,
         carries=_names(("robots", name, "carries"), document.carries, root, diagnostics),
+        fielded=document.fielded,
     )
 
 

@@ -138,13 +138,17 @@ class Computer:
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A robot, or the operator's base station (`is_base`): the peer that udp_mesh knows by `name`."""
+    """A robot, or the operator's base station (`is_base`): the peer that udp_mesh knows by `name`.
+
+    `fielded` is the address of one that still runs the fielded program, of which nothing is ours.
+    """
 
     name: str
     nodes: tuple[str, ...]
     computer: Computer | None = None
     is_base: bool = False
     carries: tuple[str, ...] = ()
+    fielded: IPv4Address | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,6 +55,7 @@ def daemon_config(fleet: Fleet, robot: str, *, key_name: str = KEY_NAME) -> byte
         f"fragment_bytes = {transport.fragment_bytes}",
         *_rates(transport),
         *_links(fleet, robot, computer),
+        *_fielded(fleet, robot),
         *(line for topic in fleet.topics for line in _topic(topic, robot)),
     ]
     if transport.metrics_port is not None:
@@ -161,6 +162,20 @@ def _links(fleet: Fleet, robot: str, computer: Computer) -> Iterator[str]:
                     f"name = {_text(peer.name)}",
                     f'address = "{peer.computer.address.ip}"',
                 )
+
+
+def _fielded(fleet: Fleet, robot: str) -> Iterator[str]:
+    """Robots that still run the fielded program: spoken with in its format. A single one on the network obliges every
+    daemon there to know it, or that daemon's broadcasts would end the program."""
+    for peer in _others(fleet, robot):
+        if peer.fielded is not None:
+            yield from (
+                "",
+                "[[neighbours]]",
+                f"name = {_text(peer.name)}",
+                f'address = "{peer.fielded}"',
+                "legacy = true",
+            )
 
 
 def _others(fleet: Fleet, robot: str) -> Iterator[Robot]:

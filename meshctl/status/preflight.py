@@ -173,7 +173,11 @@ def _daemons(fleet: Fleet, status: FleetStatus) -> Check:
     """A daemon up on every robot that takes part."""
     codes = ("not-installed", "daemon", "unproven")
     bad = [_silence(r) if r.silent_because else _told(r.name, r.alarms, codes) for r in _crew(status)]
-    without = [f"{name} has no computer" for name, robot in fleet.robots.items() if robot.computer is None]
+    without = [
+        f"{name} {'has no computer' if robot.fielded is None else 'still runs the fielded program'}"
+        for name, robot in fleet.robots.items()
+        if robot.computer is None
+    ]
     shelved = [robot.name for robot in status.robots if not takes_part(robot.state)]
     good = f"{_plural(len(_crew(status)), 'daemon')} up"
     good += f"; not taking part: {some(tuple(shelved))}" if shelved else ""

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument
 from meshctl.inventory.documents.node import SshLayer
-from meshctl.inventory.fields import Flag, Interface, Real, Text, Whole, Window
+from meshctl.inventory.fields import Address, Flag, Interface, Real, Text, Whole, Window
 from meshctl.model import Outbox, TopicClass
 
 
@@ -36,6 +36,8 @@ class RobotDocument(Document):
     """True for the operator's base station."""
     carries: tuple[Text, ...] = ()
     """Beacons in its racks; ranges allowed."""
+    fielded: Address = NOT_WRITTEN
+    """Address of its computer while that still runs the fielded udp_mesh; `computer` takes its place later."""
 
 
 class OperatorsDocument(Document):

@@ -47,6 +47,8 @@ def _stations(fleet: Fleet) -> Iterator[tuple[IPv4Address, tuple[tuple[str, ...]
         if robot.computer is not None:
             path = ("robots", robot.name, "computer", "address")
             yield robot.computer.address.ip, (path, f"the computer of {robot.name}")
+        elif robot.fielded is not None:
+            yield robot.fielded, (("robots", robot.name, "fielded"), f"the computer of {robot.name}")
 
 
 @fleet_rule(

@@ -365,7 +365,7 @@ def stops_late(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "A robot that sends or gets messages has no computer",
     why="""udp_mesh runs on the robot's computer: a topic that names a robot without one is never sent, or never
     arrives.""",
-    mend="Give the robot a `computer`, or take it out of the topic.",
+    mend="Give the robot a `computer`, or `fielded` while it runs the fielded program, or take it out of the topic.",
     failing="robots: {husky1: {computer: <removed>}}",
     passing="robots: {husky1: {computer: {python: python3}}}",
 )
@@ -374,6 +374,6 @@ def peer_without_computer(fleet: Fleet, _context: LintContext) -> Iterator[Findi
         for key, names in (("sources", topic.sources), ("destinations", topic.destinations)):
             for index, name in enumerate(names):
                 robot = fleet.robots.get(name)
-                if robot is not None and robot.computer is None:
+                if robot is not None and robot.computer is None and robot.fielded is None:
                     path = ("topics", topic.name, key, str(index))
                     yield Finding(path, f"{name} runs no udp_mesh", "a robot with a computer", name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from dataclasses import replace
-from ipaddress import IPv4Interface
+from ipaddress import IPv4Address, IPv4Interface
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +89,15 @@ def test_without_broadcast_every_other_robot_is_a_neighbour(tmp_path: Path) -> N
         ("spot", ("10.42.0.101", 8700)),
         ("uav", ("10.42.0.102", 8700)),
     ]
+
+
+@pytest.mark.parametrize("robot", ["base", "spot"])
+def test_every_daemon_of_a_mixed_fleet_knows_the_fielded_robots(robot: str, tmp_path: Path) -> None:
+    source = fleet(robots=("base", "spot"))
+    robots = {**source.robots, "husky2": Robot("husky2", (), fielded=IPv4Address("10.42.0.120"))}
+    found = loaded(replace(source, robots=robots), robot, tmp_path)
+    assert found.settings.neighbours == (core.Neighbour(("10.42.0.120", 8700), "husky2", legacy=True),)
+    assert found.links == (LinkWish(None, f"10.42.0.{100 if robot == 'base' else 101}", broadcast=True),)
 
 
 def test_a_robot_does_not_send_to_itself_but_never_broadcasts_instead(tmp_path: Path) -> None:
