@@ -24,11 +24,11 @@ from enum import Enum
 
 from udp_mesh.core.rtt import STANDING_WINDOW_S, RoundTrip
 
-QUEUE_S = 0.0035
+QUEUE_S = 0.003
 """Queue the sender keeps at the bottleneck: covers batched acknowledgements and pacing; adds this much to urgent
 latency."""
 
-LOSS_QUEUE = 10.0
+LOSS_QUEUE = 13.0
 LOSS_QUEUE_UP_TO = 0.05
 """Losses leave holes in the queue: some more of it keeps the link busy, up to what urgent messages can bear."""
 
