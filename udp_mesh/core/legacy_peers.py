@@ -2,6 +2,10 @@
 
 A datagram of that format is taken only from a configured address, and only under the configured name: what it claims
 about itself is not authenticated. Heartbeats, offline after silence, queues and outcomes are as for other peers.
+
+A robot that moves over is noticed: once a node of our own format has proved itself under the configured name, it is
+that peer, whatever the configuration still says, and the fielded format is not spoken with it any more. What waits for
+it begins anew (`presence`). Broadcasts stay covered for as long as the configuration names any fielded peer.
 """
 
 from udp_mesh.core.acceptance import release_outbox, report_ended, shelve
@@ -32,7 +36,7 @@ LEGACY_HEARTBEAT_S = 1.0
 class LegacyPeer:
     """One fielded peer."""
 
-    __slots__ = ("address", "broadcasts", "last_heard", "link", "neighbour", "peer", "sender", "unicasts")
+    __slots__ = ("_moved", "address", "broadcasts", "last_heard", "link", "neighbour", "peer", "sender", "unicasts")
 
     def __init__(self, neighbour: Neighbour, peer: Peer, settings: Settings, rng: RandomSource) -> None:
         self.neighbour = neighbour
@@ -43,6 +47,14 @@ class LegacyPeer:
         self.unicasts = LegacyReassembly(settings.limits)
         self.broadcasts = LegacyReassembly(settings.limits)
         self.last_heard = float("-inf")
+        self._moved = False
+
+    def moved_over(self) -> bool:
+        """Whether a node of our own format speaks for it by now."""
+        if not self._moved and self.peer.session is not None:
+            self._moved = True
+            self.peer.legacy = False
+        return self._moved
 
 
 class LegacyPeers:
@@ -78,7 +90,7 @@ class LegacyPeers:
         """One datagram without our mark: the fielded format from a configured address, or nothing of ours."""
         counters = self._state.ledger.counters
         legacy = self._by_host.get(source[0])
-        if legacy is None:
+        if legacy is None or legacy.moved_over():
             counters.dropped_unauthenticated += 1
             return
         try:
@@ -145,7 +157,7 @@ class LegacyPeers:
 
     def leave(self, now: float, out: list[Datagram]) -> None:
         """Fragments that may leave now."""
-        for legacy in self._by_host.values():
+        for legacy in self._fielded():
             if legacy.link and (legacy.peer.outbound.open or legacy.sender.timer() is not None):
                 legacy.sender.leave(legacy.link, legacy.address, now, out)
                 report_ended(self._state, legacy.peer, now)
@@ -155,7 +167,7 @@ class LegacyPeers:
         if not self._by_host:
             return float("inf")
         at = self._heartbeat_at
-        for legacy in self._by_host.values():
+        for legacy in self._fielded():
             due = legacy.sender.timer()
             if due is not None and legacy.link:
                 at = min(at, due)
@@ -168,7 +180,7 @@ class LegacyPeers:
         self._heartbeat_at = now + LEGACY_HEARTBEAT_S
         state = self._state
         rates = state.settings.rates
-        for legacy in self._by_host.values():
+        for legacy in self._fielded():
             peer = legacy.peer
             quiet_s = now - legacy.last_heard
             if peer.online and quiet_s > rates.offline_s:
@@ -185,6 +197,9 @@ class LegacyPeers:
             for link in self._links(legacy):
                 host = encode_legacy(Host(state.settings.name, link.address[0]))
                 state.outgoing.append(Datagram(link.name, legacy.neighbour.address, host, True))
+
+    def _fielded(self) -> list[LegacyPeer]:
+        return [legacy for legacy in self._by_host.values() if not legacy.moved_over()]
 
     def _links(self, legacy: LegacyPeer) -> list[LinkInfo]:
         # The fielded format has room for an IPv4 address only.
