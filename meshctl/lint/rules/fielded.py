@@ -66,11 +66,11 @@ def fielded_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 
 @fleet_rule(
     "MC753",
-    Severity.ERROR,
+    Severity.WARNING,
     "A robot is fielded and has moved over",
-    why="""With `computer` it gets a daemon, and with `fielded` all others speak to it in the old format, which that
-    daemon does not take from them.""",
-    mend="Take `fielded` out as soon as the robot has a `computer`, and deploy to all robots.",
+    why="""With `computer` it gets a daemon of ours, which the others find. What is left of `fielded` has every robot go
+    on covering its broadcasts for a program that is not there, and nobody can tell whether the fleet has moved.""",
+    mend="Take `fielded` out when the robot gets a `computer`, and deploy to all robots.",
     failing="robots: {husky1: {fielded: 10.42.0.110}}",
     passing="robots: {husky1: {computer: <removed>, fielded: 10.42.0.110}}",
 )
