@@ -62,6 +62,7 @@ def up(
     typer.echo(f"inventory: {copy.inventory}")
     typer.echo(f"reach it:  export MESHCTL_LAB={place} MESHCTL_INVENTORY={copy.inventory}")
     typer.echo(f"by hand:   meshctl lab shell {fleet.spec.names[0]}")
+    typer.echo("then:      meshctl bootstrap --yes; meshctl lab unplug; meshctl topology")
 
 
 @app.command("down")

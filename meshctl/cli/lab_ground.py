@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -61,7 +61,21 @@ def link(
         raise InputError(
             f"nothing to change between {a} and {b}", hint="--loss, --up, --down, --tq, --delay, --rate say what"
         )
-    VirtualFleet.attach(lab_directory(directory)).link(a, b, **changes)
+    fleet = VirtualFleet.attach(lab_directory(directory))
+    fleet.link(a, b, **changes)
+    for now in fleet.status()["links"]:
+        if set(now["between"]) == {a, b}:
+            typer.echo(_set(now))
+
+
+def _set(now: dict[str, Any]) -> str:
+    """`b01 - b02: loses 30% there, 5% back, 20 ms later, at most 256 kbit/s`"""
+    a, b = now["between"]
+    if not now["up"]:
+        return f"{a} - {b}: down"
+    delay = f", {now['delay_ms']:g} ms later" if now["delay_ms"] else ""
+    rate = f", at most {now['rate_kbps']} kbit/s" if now["rate_kbps"] else ""
+    return f"{a} - {b}: loses {_lost(now['loss'], now['loss_back'])}{delay}{rate}"
 
 
 def move(
@@ -147,8 +161,12 @@ def _described(one: LinkSpec) -> str:
     if not one.up:
         return f"{one.a} - {one.b}: down"
     there, back = one.loss_to(one.b), one.loss_to(one.a)
-    lost = f"{there:.0%}" if there == back else f"{there:.0%} there, {back:.0%} back"
-    return f"{one.a} - {one.b}: loses {lost}; quality {one.tq_to(one.b)} there, {one.tq_to(one.a)} back, of 255"
+    lost, qualities = _lost(there, back), f"{one.tq_to(one.b)} there, {one.tq_to(one.a)} back"
+    return f"{one.a} - {one.b}: loses {lost}; quality {qualities}, of 255"
+
+
+def _lost(there: float, back: float) -> str:
+    return f"{there:.0%}" if there == back else f"{there:.0%} there, {back:.0%} back"
 
 
 _SAID = {

@@ -69,5 +69,11 @@ def topology(
     if drawn:
         typer.echo(drawn)
     if not look.observations:
-        typer.echo("nobody answered: meshctl status says why", err=True)
+        is_new = bool(nodes) and all(node.age_s is None for node in found.nodes)
+        why = (
+            "no node was ever seen: meshctl bootstrap takes factory devices in" if is_new else "meshctl status says why"
+        )
+        typer.echo(f"nobody answered: {why}", err=True)
+    elif apart := [node.name for node in nodes if node.name not in look.graph]:
+        typer.echo(f"nobody tells of {', '.join(apart)}: meshctl status says why", err=True)
     raise typer.Exit(ExitCode.OK if look.observations or not nodes else ExitCode.UNREACHABLE)

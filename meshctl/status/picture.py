@@ -35,6 +35,10 @@ class Picture:
     addresses: Mapping[str, str]
     routing: str = "batman-adv"
 
+    def age_s(self, name: str) -> float | None:
+        """For programs: to the millisecond."""
+        return round(self.ages_s[name], 3) if name in self.ages_s else None
+
     def direction(self, a: str, b: str) -> Direction:
         return self.directions.get((a, b), Direction())
 
@@ -107,7 +111,7 @@ def as_json(picture: Picture) -> str:
     cuts = picture.graph.cut_off_by(picture.entry)
     nodes: list[dict[str, Any]] = [
         {
-            "name": name, "address": picture.addresses.get(name), "age_s": picture.ages_s.get(name),
+            "name": name, "address": picture.addresses.get(name), "age_s": picture.age_s(name),
             "hops": paths[name].hops if name in paths else None,
             "quality": round(paths[name].quality, 4) if name in paths else None,
             "via": paths[name].via if name in paths and name != picture.entry else None,
@@ -127,7 +131,8 @@ def as_json(picture: Picture) -> str:
 
 
 def _direction_json(direction: Direction) -> dict[str, Any]:
-    return {"quality": direction.quality, "signal_dbm": direction.signal_dbm, "age_ms": direction.age_ms}
+    quality = None if direction.quality is None else round(direction.quality, 4)
+    return {"quality": quality, "signal_dbm": direction.signal_dbm, "age_ms": direction.age_ms}
 
 
 def netjson(picture: Picture) -> str:
@@ -143,7 +148,7 @@ def netjson(picture: Picture) -> str:
                 {
                     "id": picture.addresses.get(name, name),
                     "label": name,
-                    "properties": {"age_s": picture.ages_s.get(name)},
+                    "properties": {"age_s": picture.age_s(name)},
                 }
                 for name in picture.graph.nodes
             ],
