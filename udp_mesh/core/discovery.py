@@ -88,7 +88,7 @@ class Discovery:
         self._interval_s = self.interval_s(settings, sessions, now)
         self._last_at = now
         self.next_at = now + self._interval_s * (1 - JITTER * self._rng.random())
-        heard = self._heard(sessions, now)
+        heard = self._heard(sessions, settings.name, now)
         if self._to_answer:
             # More new nodes than one heartbeat can list: the others are not kept waiting for the next regular one.
             self.hurry(len(sessions), now)
@@ -106,12 +106,14 @@ class Discovery:
             waiting,
         )
 
-    def _heard(self, sessions: list[Session], now: float) -> tuple[bytes, ...]:
+    def _heard(self, sessions: list[Session], own_name: str, now: float) -> tuple[bytes, ...]:
         """Tags of those to be answered first, then of the others in turn."""
         tags = list(self._to_answer)[:MAX_HEARD]
         for tag in tags:
             del self._to_answer[tag]
-        alive = [session for session in sessions if now - session.last_heard < MISSED_HEARTBEATS * session.interval_s]
+        # Who lost its name to another run is not listed: nothing it sends is taken, and it must know that.
+        taken = [one for one in sessions if one.current or not one.proven or one.name == own_name]
+        alive = [session for session in taken if now - session.last_heard < MISSED_HEARTBEATS * session.interval_s]
         if alive:
             start = self._listed_from % len(alive)
             for session in alive[start:] + alive[:start]:

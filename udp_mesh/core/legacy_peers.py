@@ -16,7 +16,7 @@ from udp_mesh.core.open_messages import Outcome
 from udp_mesh.core.seams import Datagram, RandomSource
 from udp_mesh.core.session import Peer
 from udp_mesh.core.settings import Address, LinkInfo, Neighbour, Settings
-from udp_mesh.core.state import State
+from udp_mesh.core.state import ASLEEP_S, State
 from udp_mesh.wire.errors import DecodeError
 from udp_mesh.wire.legacy import (
     Host,
@@ -177,11 +177,15 @@ class LegacyPeers:
         """Heartbeats, silences and purges, once a second."""
         if not self._by_host or now < self._heartbeat_at:
             return
+        # This process did not run for so long: silence meanwhile was ours.
+        asleep_s = now - self._heartbeat_at if self._heartbeat_at != float("-inf") else 0.0
         self._heartbeat_at = now + LEGACY_HEARTBEAT_S
         state = self._state
         rates = state.settings.rates
         for legacy in self._fielded():
             peer = legacy.peer
+            if asleep_s > ASLEEP_S:
+                legacy.last_heard = min(now, legacy.last_heard + asleep_s)
             quiet_s = now - legacy.last_heard
             if peer.online and quiet_s > rates.offline_s:
                 peer.online = False

@@ -26,7 +26,7 @@ from udp_mesh.core.path_size import NARROWER_MTUS, WIDEN_AFTER_S
 from udp_mesh.core.roster import Arrival
 from udp_mesh.core.session import STALE_PATH_S, Peer, Session
 from udp_mesh.core.settings import Address
-from udp_mesh.core.state import State
+from udp_mesh.core.state import ASLEEP_S, HOUSEKEEPING_S, State
 from udp_mesh.wire.frames import Heartbeat
 from udp_mesh.wire.header import VERSION
 from udp_mesh.wire.limits import HEARD_TAG_BYTES
@@ -93,20 +93,30 @@ def prove(state: State, session: Session, now: float) -> None:
         return
     if arrival is Arrival.RETIRED:
         return
-    old = peer.session
-    state.roster.replace(peer, session)
-    if old is not None:
-        state.repairs.pop(old.boot_id, None)
-        state.owing.pop(old, None)
-    if peer.engaged:
-        peer.outbound.restart(now)
-        state.ready[peer] = None
-    state.discovery.answer(session, len(state.roster.sessions), now)
+    _replace(state, peer, session, now)
     if arrival is Arrival.RESTARTED and peer.online:
         state.ledger.tell(PeerRestarted(peer.name))
         peer.online_since = now
     come_online(state, peer, session, now)
     state.arm(peer)
+
+
+def _replace(state: State, peer: Peer, session: Session, now: float) -> None:
+    """The session is what the name means from now on; what waits for the name begins anew with it."""
+    old = peer.session
+    state.roster.replace(peer, session)
+    if old is not None:
+        state.repairs.pop(old.boot_id, None)
+        state.owing.pop(old, None)
+        if peer.engaged:
+            old.next_wire_id = peer.outbound.next_wire_id
+    if peer.engaged:
+        peer.outbound.restart(now)
+        # Of a run that is taken back the numbers go on: it remembers what it had.
+        peer.outbound.flight.restart(session.way.channel.next_number)
+        peer.outbound.next_wire_id = session.next_wire_id
+        state.ready[peer] = None
+    state.discovery.answer(session, len(state.roster.sessions), now)
 
 
 def come_online(state: State, peer: Peer, session: Session, now: float) -> None:
@@ -131,8 +141,12 @@ def heard(state: State, session: Session, link: str, source: Address, now: float
         follow(state, session, link, source, now)
     peer = session.peer
     if peer is None or peer.session is not session:
-        conflict(state, session, source, now)
-        return
+        if peer is None or peer.online:
+            conflict(state, session, source, now)
+            return
+        # Of two nodes with one name the later one went: its name means this one again, which was heard all the time
+        # (so that nothing recorded of it can be taken for its voice).
+        _replace(state, peer, session, now)
     if session.unheard_since is not None:
         return
     if not peer.online:
@@ -145,10 +159,13 @@ def heard(state: State, session: Session, link: str, source: Address, now: float
 def conflict(state: State, session: Session, source: Address, now: float) -> None:
     """A run that was replaced by a later one still speaks: two nodes use one name."""
     peer = session.peer or state.roster.peers.get(session.name)
-    if peer is None or peer.session is None or now - peer.conflict_reported_at < REPORT_AGAIN_S:
+    if peer is None or peer.session is None:
         return
     if peer.online_since is not None and now - peer.online_since < STALE_PATH_S:
         # The last packets of a run that ended may come behind the first ones of the next.
+        return
+    session.contested = True
+    if now - peer.conflict_reported_at < REPORT_AGAIN_S:
         return
     peer.conflict_reported_at = now
     state.ledger.tell(NameConflict(session.name, source, peer.session.way.address, own=False))
@@ -222,6 +239,10 @@ def go_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
 
 def housekeep(state: State, now: float) -> None:
     """A round: all peers with traffic, and of the others as many as one round bears."""
+    asleep_s = now - state.housekept_at - HOUSEKEEPING_S
+    state.housekept_at = now
+    if asleep_s > ASLEEP_S:
+        _excuse(state, asleep_s, now)
     state.sent.feed(state.ledger.counters.bytes_sent, now)
     queue_share = state.crowd.queue_share(state.sent.per_s(now), now)
     peers = list(state.roster.peers.values())
@@ -239,10 +260,22 @@ def housekeep(state: State, now: float) -> None:
         if holding is not None and holding.online:
             release_outbox(state, holding, now)
     for session in state.roster.not_current():
-        if now - session.last_heard > state.settings.rates.offline_s:
+        if session.contested and session.peer is not None:
+            # It may be taken back for as long as its name is remembered.
+            session.inbound.unicasts.purge(now)
+            session.inbound.broadcasts.purge(now)
+        elif now - session.last_heard > state.settings.rates.offline_s:
             state.roster.forget(session)
             state.repairs.pop(session.boot_id, None)
             state.incompatible_reported.pop(session.boot_id, None)
+
+
+def _excuse(state: State, asleep_s: float, now: float) -> None:
+    """This process did not run for so long (it was stopped, its machine stood still): silence meanwhile was ours."""
+    for session in state.roster.sessions.values():
+        session.last_heard = min(now, session.last_heard + asleep_s)
+        if session.unheard_since is not None:
+            session.unheard_since = min(now, session.unheard_since + asleep_s)
 
 
 def _look_at(state: State, peer: Peer, now: float) -> None:

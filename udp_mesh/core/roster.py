@@ -99,6 +99,7 @@ class Roster:
                     self.forget(self.sessions[oldest])
             if old.boot_id in self.sessions:
                 self._aside[old.boot_id] = old
+        peer.retired.pop(session.boot_id, None)
         peer.session = session
         session.peer = peer
         self._aside.pop(session.boot_id, None)

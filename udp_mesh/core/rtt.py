@@ -22,6 +22,10 @@ SLOW_ROUND_TRIPS = 2.0
 """Round trips that an answer is always waited for: to send all again before it can be acknowledged would keep a slow
 path as slow as it is."""
 
+MOST_SURPRISE_S = 2.0
+"""A round trip longer than this, and than twice what is usual, counts as that: a process or machine that stood still in
+the middle would otherwise be taken for a path on which a packet in some seconds is enough."""
+
 TIMER_GRAIN_S = 0.005
 """Added to timeouts: drivers and radios are late by this much without anything being lost."""
 
@@ -42,6 +46,7 @@ class RoundTrip:
 
     def sample(self, round_trip_s: float, now: float) -> None:
         """One measured round trip, without the time the peer held its acknowledgement back."""
+        round_trip_s = min(round_trip_s, max(MOST_SURPRISE_S, 2 * (self.smoothed or 0.0)))
         self.latest = round_trip_s
         if self.smoothed is None:
             self.smoothed = round_trip_s

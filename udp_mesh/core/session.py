@@ -109,6 +109,7 @@ class Session:
     __slots__ = (
         "boot_id",
         "broadcast_channels",
+        "contested",
         "data_channels",
         "features",
         "inbound",
@@ -120,6 +121,7 @@ class Session:
         "met_at",
         "meters",
         "name",
+        "next_wire_id",
         "owed",
         "peer",
         "peer_receives",
@@ -144,6 +146,10 @@ class Session:
         """Its heartbeats to all have listed us: from one that no longer does something follows."""
         self.unheard_since: float | None = None
         """Since when they list us no more and it acknowledges nothing: only its way to us works."""
+        self.contested = False
+        """It went on speaking after another run took its name: two nodes share that."""
+        self.next_wire_id = 0
+        """Of the messages to it, when another run took its name."""
         self.introduced_at = float("-inf")
         self.last_heard = float("-inf")
         self.meters = Meters(0.0)
@@ -176,6 +182,11 @@ class Session:
         if channel.key != keys[0]:
             self.way.channel = SendChannel(keys[0], own_boot, self.boot_id)
             self.way.channel.next_number = channel.next_number
+
+    @property
+    def current(self) -> bool:
+        """Whether it is the one that its name means."""
+        return self.peer is not None and self.peer.session is self
 
     def hears_us(self) -> None:
         """It lists us, or acknowledged what left lately."""

@@ -30,6 +30,9 @@ _NEVER = float("inf")
 HOUSEKEEPING_S = 0.5
 """Between two rounds through all peers: offline, purges, starvation."""
 
+ASLEEP_S = 1.0
+"""A round so much later than it should be: this process did not run. A busy machine is late by less."""
+
 
 def live_keys(settings: Settings) -> tuple[Key, ...]:
     """The keys of the settings, or the key everyone knows."""
@@ -77,6 +80,7 @@ class State:
         self.timers: list[tuple[float, int, Peer]] = []
         self.timer_serial = 0
         self.housekeeping_at = now
+        self.housekept_at = now
         self.mismatch_reported: dict[tuple[str, int], float] = {}
         self.incompatible_reported: dict[bytes, float] = {}
         self.closed = False

@@ -1,0 +1,91 @@
+"""Two nodes with one name: reported, one of them served, and the other again as soon as that one is gone."""
+
+import pytest
+
+from tests.udp_mesh.core.pair import BROADCAST, Pipe, World, settings
+from udp_mesh.core.events import (
+    MessageDelivered,
+    MessagePeerLost,
+    MessageReceived,
+    NameConflict,
+    PeerOffline,
+    PeerOnline,
+)
+from udp_mesh.core.node import Node
+from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
+
+MAP = Topic("map", priority=7)
+
+
+def conflict() -> World:
+    """The nodes are called "a" and "a2" here; both have the name a."""
+    world = World(seed=1)
+    for name in ("a", "c"):
+        world.add(settings(name, MAP))
+    assert world.run(5.0, until=lambda: bool(world.told("c", PeerOnline)))
+    exchange(world, "a")
+    second = Node(settings("a", MAP), boot_id=world.rng.randbytes(16), rng=world.rng, now=world.now)
+    world.nodes["a2"], world.addresses["a2"], world.events["a2"] = second, ("10.0.0.9", 8700), []
+    second.link_up(LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a2"], BROADCAST), world.now)
+    for other in ("a", "c"):
+        world.pipes["a2", other] = Pipe()
+        world.pipes[other, "a2"] = Pipe()
+    for name in ("a", "a2", "c"):
+        assert world.run(10.0, until=lambda: bool(world.told(name, NameConflict)))  # noqa: B023
+    exchange(world, "a2")
+    return world
+
+
+def exchange(world: World, name: str) -> None:
+    """One message each way between c and the node that its name a means."""
+    before = {who: len(world.told(who, MessageReceived)) for who in ("c", name)}
+    ended = {who: len(world.told(who, MessageDelivered)) for who in ("c", name)}
+    world.send(name, "map", bytes(20_000), "c")
+    world.send("c", "map", bytes(20_000), "a")
+    world.run(2.0)
+    for who in ("c", name):
+        assert len(world.told(who, MessageReceived)) == before[who] + 1
+        assert len(world.told(who, MessageDelivered)) == ended[who] + 1
+
+
+@pytest.mark.parametrize("how", ["says good-bye", "is killed"])
+@pytest.mark.parametrize("meanwhile_s", [1.0, 100.0])
+def test_when_one_of_them_goes_the_other_is_served_again(how: str, meanwhile_s: float) -> None:
+    world = conflict()
+    world.run(meanwhile_s)
+    if how == "says good-bye":
+        world.nodes["a2"].close(world.now)
+        world._pump("a2")
+    del world.nodes["a2"]
+    online = len(world.told("c", PeerOnline))
+    assert world.run(20.0, until=lambda: len(world.told("c", PeerOnline)) > online)
+    world.run(3.0)
+    exchange(world, "a")
+    assert world.run(10.0, until=lambda: all(peer.online for peer in world.nodes["a"].conditions(world.now).peers))
+
+
+def test_the_first_one_is_served_again_although_it_was_silent_for_long() -> None:
+    world = conflict()
+    world.run(5.0)
+    first = world.nodes.pop("a")
+    world.run(30.0)
+    del world.nodes["a2"]
+    world.run(15.0)
+    world.nodes["a"] = first
+    world.run(5.0)
+    exchange(world, "a")
+
+
+def test_what_the_one_not_served_sends_ends_too() -> None:
+    world = conflict()
+    world.send("a", "map", bytes(20_000), "c")
+    assert world.run(15.0, until=lambda: bool(world.told("a", PeerOffline)))
+    assert world.run(60.0, until=lambda: bool(world.told("a", MessagePeerLost)))
+
+
+def test_what_waited_for_the_name_goes_to_who_is_there() -> None:
+    world = conflict()
+    del world.nodes["a2"]
+    world.send("c", "map", bytes(20_000), "a")
+    assert world.run(20.0, until=lambda: len(world.told("c", MessageDelivered)) == 3)
+    assert len(world.told("a", MessageReceived)) == 2

@@ -1,0 +1,79 @@
+"""A process or machine that stands still (stopped, swapped out, a virtual machine put aside) loses nothing by it."""
+
+import pytest
+
+from tests.udp_mesh.core.pair import World, settings
+from udp_mesh.core.events import MessageDelivered, MessagePeerLost, MessageReceived, PeerOffline, PeerOnline
+from udp_mesh.core.settings import Topic
+
+TOPICS = (Topic("map", priority=7), Topic("status", priority=0))
+MAP_BYTES = 1_000_000
+
+
+def met(seed: int) -> World:
+    world = World(seed=seed)
+    for name in ("a", "b"):
+        world.add(settings(name, *TOPICS))
+    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    return world
+
+
+def delivered_once(world: World, within_s: float) -> None:
+    assert world.run(within_s, until=lambda: bool(world.told("a", MessageDelivered)))
+    world.run(5.0)
+    assert len(world.told("a", MessageDelivered)) == 1
+    assert len(world.told("b", MessageReceived)) == 1
+    assert not world.told("a", MessagePeerLost)
+
+
+@pytest.mark.parametrize("stopped_s", [2.0, 20.0, 120.0, 1000.0])
+@pytest.mark.parametrize("lost", [False, True])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_team_that_stood_still_goes_on_where_it_was(stopped_s: float, lost: bool, seed: int) -> None:
+    world = met(seed)
+    world.send("a", "map", bytes(MAP_BYTES), "b")
+    world.run(0.3)
+    world.now += stopped_s
+    if lost:
+        world._queue.clear()
+    delivered_once(world, within_s=3.0)
+    assert not world.told("a", PeerOffline)
+    assert not world.told("b", PeerOffline)
+
+
+@pytest.mark.parametrize("stopped_s", [5.0, 45.0, 200.0])
+def test_a_stopped_sender_takes_nobody_for_lost(stopped_s: float) -> None:
+    """What the others said meanwhile did not fit the socket's buffer: to the sender they were silent."""
+    world = met(3)
+    world.send("a", "map", bytes(MAP_BYTES), "b")
+    world.run(0.3)
+    sender = world.nodes.pop("a")
+    world.run(stopped_s)
+    world.nodes["a"] = sender
+    delivered_once(world, within_s=6.0)
+    assert not world.told("a", PeerOffline)
+    assert bool(world.told("b", PeerOffline)) == (stopped_s > 10)
+
+
+@pytest.mark.parametrize("stopped_s", [5.0, 45.0])
+def test_a_stopped_receiver_gets_the_message_when_it_goes_on(stopped_s: float) -> None:
+    world = met(4)
+    world.send("a", "map", bytes(MAP_BYTES), "b")
+    world.run(0.3)
+    receiver = world.nodes.pop("b")
+    world.run(stopped_s)
+    world.nodes["b"] = receiver
+    delivered_once(world, within_s=6.0)
+    assert not world.told("b", PeerOffline)
+    assert bool(world.told("a", PeerOffline)) == (stopped_s > 10)
+
+
+def test_a_peer_that_is_silent_afterwards_is_lost_all_the_same() -> None:
+    world = met(5)
+    world.send("a", "map", bytes(MAP_BYTES), "b")
+    del world.nodes["b"]
+    world.now += 500.0
+    world.run(9.0)
+    assert not world.told("a", PeerOffline)
+    assert world.run(3.0, until=lambda: bool(world.told("a", PeerOffline)))
+    assert world.run(60.0, until=lambda: bool(world.told("a", MessagePeerLost)))
