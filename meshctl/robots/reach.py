@@ -156,6 +156,9 @@ def chosen_robots(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[str, ..
     for pattern in wanted:
         if not any(fnmatchcase(name, pattern) for name in able):
             if pattern in fleet.robots:
-                raise InputError(f"robot {pattern} has no computer in the inventory")
+                fielded = fleet.robots[pattern].fielded is not None
+                instead = " in place of `fielded`, and stop the fielded program there" if fielded else ""
+                hint = f"write robots.{pattern}.computer{instead}"
+                raise InputError(f"robot {pattern} has no computer in the inventory", hint=hint)
             raise InputError(f"no robot of {fleet.name} is called {pattern!r}", hint=did_you_mean(pattern, able))
     return tuple(name for name in able if not wanted or any(fnmatchcase(name, pattern) for pattern in wanted))

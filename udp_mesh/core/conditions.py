@@ -15,7 +15,7 @@ class QueueConditions:
     oldest_s: float
     """Age of the message at the head."""
     starved_s: float
-    """Time in which this level waited while only more urgent ones were sent, since the peer came online."""
+    """Time in which this level waited while only more urgent ones were sent, since this run of ours began."""
     held_s: float
     """Time in which this level was held back for other robots' more urgent messages."""
 
@@ -47,7 +47,7 @@ class PeerConditions:
     loss: float
     """Share of packets lost on the way to the peer, 0 to 1, smoothed."""
     sent_bits_per_s: float
-    """Wire bits sent to the peer, with IP and UDP headers."""
+    """Wire bits of messages sent to the peer, with IP and UDP headers; acknowledgements and the like are left out."""
     delivered_bits_per_s: float
     """Payload bits the peer acknowledged."""
     received_bits_per_s: float
