@@ -28,6 +28,9 @@ LEAST_GAP_S = 0.2
 MEETING_HASTE = 5.0
 """While a team meets, so many times more heartbeats are heard than later: 150 a second are 1 Mbit/s when full."""
 
+MOST_TO_ANSWER = 2048
+"""New nodes that wait to be listed: a team of a thousand meets twice over; a key holder invents more than that."""
+
 JITTER = 0.1
 """Part of the interval by which heartbeats vary, so that two nodes never stay in step."""
 
@@ -52,6 +55,8 @@ class Discovery:
     def answer(self, session: Session, team: int, now: float) -> None:
         """A session heard for the first time (or still unproven): list it soon."""
         self._to_answer[session.heard_tag] = None
+        if len(self._to_answer) > MOST_TO_ANSWER:
+            del self._to_answer[next(iter(self._to_answer))]
         self.hurry(team, now)
 
     def hurry(self, team: int, now: float) -> None:

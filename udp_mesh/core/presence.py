@@ -49,6 +49,8 @@ def greet(
     if not beat.min_version <= VERSION <= beat.max_version:
         if now - state.incompatible_reported.get(session.boot_id, float("-inf")) > REPORT_AGAIN_S:
             state.incompatible_reported[session.boot_id] = now
+            if len(state.incompatible_reported) > state.settings.limits.strangers:
+                del state.incompatible_reported[next(iter(state.incompatible_reported))]
             state.ledger.tell(Incompatible(session.name, source, session.versions))
         return
     lists_us = state.boot_id[:HEARD_TAG_BYTES] in beat.heard

@@ -76,9 +76,10 @@ class Roster:
         """The session is alive. NEW and RESTARTED make it its peer's session; `Peer.session` still holds the old
         one."""
         session.proven = True
-        self._strangers.pop(session.boot_id, None)
         if session.name == self.own_name:
+            # It stays among the strangers, who are few: a key holder could invent such boots without end.
             return Arrival.OWN_NAME, None
+        self._strangers.pop(session.boot_id, None)
         peer = self.peer(session.name, settings)
         if peer is None:
             self.forget(session)

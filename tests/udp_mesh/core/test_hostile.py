@@ -10,7 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.udp_mesh.core.pair import KEY, Pair, World, pair, settings
+from udp_mesh.core.discovery import MOST_TO_ANSWER
 from udp_mesh.core.events import MessageDelivered, MessageReceived
+from udp_mesh.core.roster import RETIRED_REMEMBERED
 from udp_mesh.core.session import OWED_FRAMES
 from udp_mesh.core.settings import Limits, Neighbour, Topic
 from udp_mesh.crypto import TO_ALL, SendChannel
@@ -29,6 +31,7 @@ from udp_mesh.wire.frames import (
     TopicAnnounce,
     Waiting,
 )
+from udp_mesh.wire.limits import HEARD_TAG_BYTES
 
 A = ("10.0.0.1", 8700)
 FORGER = ("10.0.0.66", 8700)
@@ -79,6 +82,27 @@ def test_a_flood_of_invented_senders_holds_bounded_state() -> None:
         both.b.receive(data, "mesh", FORGER, both.now)
     assert len(both.b._state.roster.sessions) <= 1 + 8
     assert [peer.name for peer in both.b.conditions(both.now).peers] == ["a"]
+    assert still_works(both)
+
+
+@pytest.mark.parametrize("name", ["b", "ghost", "ghost{}"])
+@pytest.mark.parametrize("versions", [(1, 1), (2, 3)])
+def test_a_flood_of_boots_that_a_key_holder_invents_holds_bounded_state(name: str, versions: tuple[int, int]) -> None:
+    """They know whom they talk to, so each is proven at once: under one name, under the victim's own, under many."""
+    both = pair(limits=Limits(strangers=8, peers=16))
+    state = both.b._state
+    rng = random.Random(1)
+    for number in range(5000):
+        boot_id = rng.randbytes(16)
+        beat = Heartbeat(name.format(number), *versions, 0, 1000, 0, 0, 0, 0, (state.boot_id[:HEARD_TAG_BYTES],))
+        _, data = SendChannel(KEY, boot_id, TO_ALL).seal_long(encode([beat]))
+        both.b.receive(data, "mesh", FORGER, both.now)
+    assert len(state.roster.sessions) <= 1 + 8 + 16 + RETIRED_REMEMBERED
+    assert len(state.repairs) <= 1 + 8 + 16 + RETIRED_REMEMBERED
+    assert len(state.incompatible_reported) <= 8
+    assert len(state.discovery._to_answer) <= MOST_TO_ANSWER
+    both.events(both.b)
+    both.now += 60.0
     assert still_works(both)
 
 
