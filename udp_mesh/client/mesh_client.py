@@ -147,7 +147,11 @@ class MeshClient:
         """As `request`, with the reply's payload."""
         number = self._next_id
         self._next_id += 1
-        self._write(dict(fields, op=op, id=number), payload)
+        try:
+            self._write(dict(fields, op=op, id=number), payload)
+        except MeshError as error:
+            self._drain()
+            raise self._gone(str(error)) from error
         deadline = time.monotonic() + self.timeout_s
         while number not in self._replies:
             if not self._read(deadline - time.monotonic()):
@@ -217,16 +221,37 @@ class MeshClient:
         except OSError as error:
             raise MeshError("unreachable", "the daemon closed the connection: {}".format(error.strerror)) from error
 
+    def _drain(self) -> None:
+        """Takes in what the daemon said before it closed the connection."""
+        try:
+            while self._poll.poll(0) and self._read_once():
+                pass
+        except (OSError, MeshError):
+            return
+
+    def _gone(self, reason: str) -> MeshError:
+        """The daemon closed the connection; perhaps it said why."""
+        for header, _ in self._events:
+            if header.get("event") == "rejected" and header.get("code") == "too-many-clients":
+                return MeshError("too-many-clients", "the daemon refused: {}".format(header.get("error")))
+        return MeshError("unreachable", reason)
+
     def _read(self, timeout_s: Optional[float]) -> bool:
         """Reads once; False where nothing came in time."""
         if not self._poll.poll(None if timeout_s is None else max(0.0, timeout_s) * 1000):
             return False
         try:
-            data = self._socket.recv(_READ_BYTES)
+            if not self._read_once():
+                raise self._gone("the daemon closed the connection")
         except OSError as error:
-            raise MeshError("unreachable", "the daemon closed the connection: {}".format(error.strerror)) from error
+            raise self._gone("the daemon closed the connection: {}".format(error.strerror)) from error
+        return True
+
+    def _read_once(self) -> bool:
+        """Takes in what is there; False where the connection has ended."""
+        data = self._socket.recv(_READ_BYTES)
         if not data:
-            raise MeshError("unreachable", "the daemon closed the connection")
+            return False
         for frame in self._reader.feed(data):
             number = frame[0].get("id")
             if isinstance(number, int) and "event" not in frame[0]:

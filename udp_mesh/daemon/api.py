@@ -2,7 +2,8 @@
 
 A connection hands each request to the service and writes what the service gives back. What a slow reader does not
 fetch is bounded: past `CLIENT_BACKLOG_BYTES` messages for it are dropped, and it is told how many once it reads
-again; past `REPLIES_BACKLOG_BYTES` more its own requests wait. Other readers and the mesh never wait for it.
+again; past `REPLIES_BACKLOG_BYTES` more its own requests wait. Other readers and the mesh never wait for it. A message
+for a program that has read everything is never dropped, however large.
 """
 
 from __future__ import annotations
@@ -24,9 +25,11 @@ log = logging.getLogger(__name__)
 
 CLIENT_BACKLOG_BYTES = 32 << 20
 """Bytes written to one client and not yet read by it: a stopped subscriber. A few of the largest usual messages."""
+BACKLOGS_BYTES = 256 << 20
+"""The same for all clients together: past it, who holds more than an equal part of that gets no more."""
 REPLIES_BACKLOG_BYTES = 4 << 20
 """Bytes of replies beyond that: a program that asks without end and never reads the answers."""
-MAX_CLIENTS = 128
+MAX_CLIENTS = 256
 """Connections at a time: a program that leaks them must not take the daemon's descriptors."""
 
 
@@ -73,29 +76,26 @@ class Client(asyncio.Protocol):
 
     def tell(self, header: Header, payload: bytes = b"") -> None:
         """An event; dropped and counted where the program does not read."""
-        transport = self._transport
-        if transport is None:
-            return
-        if transport.get_write_buffer_size() + len(payload) > CLIENT_BACKLOG_BYTES:
-            self._dropped += 1
-            self._server.dropped_for_slow_clients += 1
-            return
-        if self._dropped:
-            self._report_dropped()
-        self._write(header, payload)
+        if self._transport is not None:
+            self.tell_encoded(encode_frame(header, payload))
 
     def tell_encoded(self, frame: bytes) -> None:
         """As `tell`, for a frame that several clients get."""
         transport = self._transport
         if transport is None:
             return
-        if transport.get_write_buffer_size() + len(frame) > CLIENT_BACKLOG_BYTES:
+        waiting = self.backlog()
+        if waiting and (waiting + len(frame) > CLIENT_BACKLOG_BYTES or self._server.too_much_for(waiting)):
             self._dropped += 1
             self._server.dropped_for_slow_clients += 1
             return
         if self._dropped:
             self._report_dropped()
         transport.write(frame)
+
+    def backlog(self) -> int:
+        """Bytes written and not yet read."""
+        return 0 if self._transport is None else self._transport.get_write_buffer_size()
 
     def close(self) -> None:
         if self._transport is not None:
@@ -184,13 +184,18 @@ class LocalServer:
             self._path.chmod(self._mode)
             listener.setblocking(False)
             loop = asyncio.get_running_loop()
-            self._server = await loop.create_unix_server(lambda: Client(self), sock=listener)
+            self._server = await loop.create_unix_server(lambda: Client(self), sock=listener, backlog=MAX_CLIENTS)
         except OSError as error:
             listener.close()
             if error.strerror is None:
                 raise
             # bind(2) does not say where.
             raise OSError(error.errno, error.strerror, str(self._path)) from error
+
+    def too_much_for(self, waiting: int) -> bool:
+        """Whether a client for which so many bytes wait must not get more for all others' sake."""
+        share = BACKLOGS_BYTES // max(1, len(self.clients))
+        return waiting > share and sum(client.backlog() for client in self.clients) > BACKLOGS_BYTES
 
     async def close(self) -> None:
         """Stops listening, lets what is written be read, closes every connection, removes the socket's file."""

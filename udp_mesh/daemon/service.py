@@ -137,7 +137,9 @@ class Service:
         self._routes.clear()
 
     def subscribe(self, client: Client, patterns: list[str]) -> None:
-        self._subscriptions.setdefault(client, []).extend(patterns)
+        wanted = self._subscriptions.setdefault(client, [])
+        # A program that subscribes again and again wants each pattern once.
+        wanted.extend(pattern for pattern in dict.fromkeys(patterns) if pattern not in wanted)
         self._routes.clear()
 
     def unsubscribe(self, client: Client, patterns: list[str]) -> None:

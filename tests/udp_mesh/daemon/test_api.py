@@ -1,0 +1,138 @@
+"""The local socket under a crowd: programs that do not read, that are too many, that want the largest messages."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import tempfile
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import pytest
+
+from tests.udp_mesh.links.sockets import WAIT_S
+from udp_mesh.client import MeshClient, MeshError
+from udp_mesh.client.mesh_client import FrameReader, Header, encode_frame
+from udp_mesh.core.settings import Limits
+from udp_mesh.daemon import api
+from udp_mesh.daemon.api import Client, LocalServer
+
+
+class Answers:
+    """Answers every request at once."""
+
+    def request(self, client: Client, header: Header, payload: bytes) -> None:
+        client.reply(header.get("id"), payload)
+
+    def client_gone(self, client: Client) -> None:
+        pass
+
+
+def serve(work: Callable[[LocalServer, Path], Awaitable[None]]) -> None:
+    """Does `work` beside a listening server."""
+
+    async def run() -> None:
+        with tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder:
+            path = Path(folder) / "api.sock"
+            server = LocalServer(Answers(), path, mode=0o600, group=None, max_payload_bytes=lambda: 1 << 20)
+            await server.start()
+            try:
+                await work(server, path)
+            finally:
+                await server.close()
+
+    asyncio.run(run())
+
+
+async def connected(server: LocalServer, path: Path, count: int) -> list[socket.socket]:
+    """Programs that are connected and read nothing."""
+    loop = asyncio.get_running_loop()
+    before = len(server.clients)
+    programs = []
+    for _ in range(count):
+        program = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        program.setblocking(False)
+        await loop.sock_connect(program, str(path))
+        programs.append(program)
+    await until(lambda: len(server.clients) == before + count)
+    return programs
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(WAIT_S):
+        while True:
+            if condition():
+                return
+            await asyncio.sleep(0)
+
+
+async def read(program: socket.socket, wanted: Callable[[list[Header]], bool]) -> list[Header]:
+    """Headers of what arrives, until `wanted`."""
+    reader, found = FrameReader(), list[Header]()
+    async with asyncio.timeout(WAIT_S):
+        while not wanted(found):
+            data = await asyncio.get_running_loop().sock_recv(program, 1 << 20)
+            assert data
+            found += [header for header, _ in reader.feed(data)]
+    return found
+
+
+def test_the_largest_message_reaches_a_program_that_has_read_everything() -> None:
+    async def work(server: LocalServer, path: Path) -> None:
+        (program,) = await connected(server, path, 1)
+        (client,) = server.clients
+        client.tell({"event": "message"}, bytes(Limits().message_bytes))
+        found = await read(program, bool)
+        assert found == [{"event": "message"}]
+        assert server.dropped_for_slow_clients == 0
+        program.close()
+
+    serve(work)
+
+
+def test_programs_that_do_not_read_hold_little_together_and_take_nothing_from_one_that_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(api, "BACKLOGS_BYTES", 10_000_000)
+    frame = encode_frame({"event": "message"}, bytes(500_000))
+    rounds = 60
+
+    async def work(server: LocalServer, path: Path) -> None:
+        lazy = await connected(server, path, 9)
+        idle = list(server.clients)
+        (program,) = await connected(server, path, 1)
+        reading = asyncio.create_task(read(program, lambda found: len(found) == rounds))
+        (reader,) = [client for client in server.clients if client not in idle]
+        for _ in range(rounds):
+            for client in server.clients:
+                client.tell_encoded(frame)
+            await until(lambda: not reader.backlog())
+        assert len(await reading) == rounds
+        # all that waits, and at most one frame each beyond its part
+        assert sum(client.backlog() for client in idle) < 10_000_000 + 9 * 1_000_000
+        told = await read(lazy[0], lambda found: "dropped" in [header["event"] for header in found])
+        assert len(told) + told[-1]["messages"] - 1 == rounds
+        for one in (*lazy, program):
+            one.close()
+
+    serve(work)
+
+
+def test_one_program_too_many_is_told_why() -> None:
+    async def work(server: LocalServer, path: Path) -> None:
+        programs = await connected(server, path, api.MAX_CLIENTS)
+
+        def ask() -> None:
+            with MeshClient(str(path), timeout_s=WAIT_S) as client:
+                client.request("peers")
+
+        with pytest.raises(MeshError, match="at most 256 programs connect at a time") as refused:
+            await asyncio.to_thread(ask)
+        assert refused.value.code == "too-many-clients"
+        programs.pop().close()
+        await until(lambda: len(server.clients) < api.MAX_CLIENTS)
+        await asyncio.to_thread(ask)
+        for program in programs:
+            program.close()
+
+    serve(work)
