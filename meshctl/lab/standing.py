@@ -1,7 +1,8 @@
 """The ground under a running fleet: told to the fleet, kept in its directory, changed by one at a time.
 
-`ground_of` reads it, `stand_on` replaces it, `move` changes one node's place, `switch` is a node's power switch: what a
-mission needs of a fleet. Works for every fleet that `VirtualFleet.attach` finds.
+`ground_of` reads it, `stand_on` replaces it, `move` changes one node's place, `switch` is a node's power switch and
+`forget` has the others forget its radio: what a mission needs of a fleet. Works for every fleet that
+`VirtualFleet.attach` finds.
 """
 
 from __future__ import annotations
@@ -9,10 +10,12 @@ from __future__ import annotations
 import contextlib
 import fcntl
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 
 from meshctl.lab import ground_file
-from meshctl.lab.fleet import VirtualFleet
+from meshctl.lab.errors import LabError
+from meshctl.lab.fleet import VirtualFleet, VirtualNode
 from meshctl.lab.ground import Ground, Point, links_of
 from meshctl.lab.state import Power
 
@@ -20,6 +23,7 @@ _FILE_NAME = "ground.json"
 _LOCK_NAME = "ground.lock"
 # of some 250 bytes each, so that a request stays below the 128 KiB of one (`warden.MESSAGE_BYTES`)
 _LINKS_AT_ONCE = 300
+_TOLD_AT_ONCE = 8
 
 
 def ground_of(fleet: VirtualFleet) -> Ground:
@@ -50,6 +54,23 @@ def switch(fleet: VirtualFleet, name: str, on: bool) -> None:
         fleet.ask("power_on", node=name)
     elif fleet.node(name).power is not Power.OFF:
         fleet.ask("power_cut", node=name, unsynced="kept", back=False)
+
+
+def forget(fleet: VirtualFleet, name: str) -> None:
+    """Have every other node that is up forget the radios of `name`, as the kernel does by itself within a minute."""
+    stations = "; ".join(
+        f'iw dev "$dev" station del {radio.mac} 2>/dev/null' for radio in fleet.spec.node(name).radios if radio.mac
+    )
+    script = f"for dev in $(iw dev | sed -n 's/^[[:space:]]*Interface //p'); do {stations or ':'}; done; true"
+
+    def tell(node: VirtualNode) -> None:
+        # one that goes off or is not up yet knows nobody
+        with contextlib.suppress(LabError):
+            if node.name != name and node.is_up():
+                node.exec(script)
+
+    with ThreadPoolExecutor(_TOLD_AT_ONCE) as pool:
+        list(pool.map(tell, fleet.nodes))
 
 
 def _tell(fleet: VirtualFleet, ground: Ground) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from meshctl.lab.ground import Ground, links_of
 from meshctl.lab.mission import Event, Happening, Incident, agenda, scene
-from meshctl.lab.mission_run import play
+from meshctl.lab.mission_run import FORGOTTEN_S, play
 from tests.meshctl.lab.test_mission import AWAY
 
 
@@ -25,6 +25,7 @@ class Recorded:
     grounds: list[Ground] = field(default_factory=list)
     powered: dict[str, bool] = field(default_factory=dict)
     switched: list[tuple[str, bool]] = field(default_factory=list)
+    forgotten: list[str] = field(default_factory=list)
     told: list[Event] = field(default_factory=list)
 
     def stand_on(self, ground: Ground) -> None:
@@ -34,6 +35,10 @@ class Recorded:
         assert name in self.names
         self.powered[name] = on
         self.switched.append((name, on))
+
+    def forget(self, name: str) -> None:
+        assert not self.powered[name]
+        self.forgotten.append(name)
 
     def clock(self) -> float:
         return self.now_s
@@ -81,6 +86,18 @@ def test_what_was_stopped_and_taken_up_again_is_the_same_mission(stop_at_s: int)
     assert played(second, start_s=stopped_s) is None
     assert first.told + second.told == list(agenda(AWAY))
     assert (second.switched[0][0], dict(second.switched[:4])["beacon"]) == ("base", stopped_s >= 50)
+
+
+@pytest.mark.parametrize(("on_s", "is_forgotten"), [(80.0 + FORGOTTEN_S - 1, False), (80.0 + FORGOTTEN_S, True)])
+@pytest.mark.parametrize("start_s", [0.0, 85.0])
+def test_whoever_was_away_for_long_is_known_to_nobody_when_it_comes_on(
+    on_s: float, start_s: float, is_forgotten: bool
+) -> None:
+    stage = Recorded()
+    mission = replace(AWAY, incidents=(Incident(80.0, "spare", False), Incident(on_s, "spare", True)))
+    play(mission, stage, tell=stage.told.append, clock=stage.clock, wait=stage.wait, start_s=start_s)
+    assert ("spare" in stage.forgotten) == is_forgotten
+    assert ("beacon" in stage.forgotten) == (start_s < 50)
 
 
 def test_nodes_that_the_fleet_has_not_are_told_of_and_not_switched() -> None:
