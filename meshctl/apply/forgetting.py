@@ -15,10 +15,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
+from typing import TypeAlias
 
 from meshctl.apply.forget import (
     GONE,
@@ -51,6 +53,11 @@ SILENT_S = 5.0
 NOT_ASKED = "not_asked"
 # What becomes of that, for an operator (docs/provisioning.md).
 MAY_LOSE = ": what it sends them may be lost for minutes"
+
+
+# What a neighbour is to run, written only once it can be sent: ages count up to then, and a login takes seconds, in
+# which an entry that was made anew would grow older than the change seems to be.
+Script: TypeAlias = Callable[[], str]
 
 
 @dataclass(slots=True)
@@ -86,7 +93,8 @@ class Forgetting:
         hidden = behind(self.node, work.around, work.bases)
         names = [name for name in self._holders if name in hidden]
         answers = self._ask(
-            "neighbours watch it", {name: watch_script(self.node, self._holders[name], for_s=for_s) for name in names}
+            "neighbours watch it",
+            {name: partial(watch_script, self.node, self._holders[name], for_s=for_s) for name in names},
         )
         self._watching = frozenset(name for name, answer in answers.items() if answer)
         unwatched = [name for name in names if name not in self._watching]
@@ -161,8 +169,7 @@ class Forgetting:
 
     def _forget(self, asked: Mapping[str, Sequence[Entry]], since_s: float) -> dict[str, str]:
         """Have them; what each said that answered."""
-        age_s = time.monotonic() - since_s
-        scripts = {name: forget_script(entries, older_than_s=age_s) for name, entries in asked.items()}
+        scripts = {name: partial(_forget_since, entries, since_s) for name, entries in asked.items()}
         answers = self._ask("neighbours forget it", scripts)
         self.tell(answers)
         return answers
@@ -180,12 +187,11 @@ class Forgetting:
         macs = {entry.mac for entries in self._left.values() for entry in entries}
         return "\n".join(line for line in answer.splitlines() if line.partition(" ")[2] in macs)
 
-    def left(self) -> dict[str, str]:
+    def left(self) -> dict[str, Script]:
         """Whom to ask once more, and with what."""
-        age_s = time.monotonic() - self._since_s
-        return {name: forget_script(entries, older_than_s=age_s) for name, entries in self._left.items()}
+        return {name: partial(_forget_since, entries, self._since_s) for name, entries in self._left.items()}
 
-    def _ask(self, step: str, scripts: Mapping[str, str]) -> dict[str, str]:
+    def _ask(self, step: str, scripts: Mapping[str, Script]) -> dict[str, str]:
         """Run each node's script, all at once; what each printed that answered. The step is told once."""
         if not scripts or self.job.work.interrupt.leaving:
             return {}
@@ -204,7 +210,8 @@ def ask_the_rest(work: Work) -> dict[str, tuple[str, ...]]:
     if not waiting or work.interrupt.leaving:
         return {}
     names = dict.fromkeys(name for _, scripts in waiting for name in scripts)
-    answers = _ask_all(work, {name: "".join(scripts.get(name, "") for _, scripts in waiting) for name in names})
+    of_each = {name: [scripts[name] for _, scripts in waiting if name in scripts] for name in names}
+    answers = _ask_all(work, {name: partial(_together, scripts) for name, scripts in of_each.items()})
     rest: dict[str, tuple[str, ...]] = {}
     for forgetting, scripts in waiting:
         forgetting.tell({name: forgetting.said_of_it(answers[name]) for name in scripts if name in answers})
@@ -223,14 +230,22 @@ def make_up_for(job: Job, ago_s: float) -> None:
     forgetting.when_back(job.before)
 
 
-def _ask_all(work: Work, scripts: Mapping[str, str]) -> dict[str, str]:
+def _forget_since(entries: Sequence[Entry], since_s: float) -> str:
+    return forget_script(entries, older_than_s=time.monotonic() - since_s)
+
+
+def _together(scripts: Iterable[Script]) -> str:
+    return "".join(script() for script in scripts)
+
+
+def _ask_all(work: Work, scripts: Mapping[str, Script]) -> dict[str, str]:
     """What each printed that answered in time."""
     with ThreadPoolExecutor(max_workers=min(len(scripts), MOST_ASKED), thread_name_prefix="forget") as pool:
         answers = pool.map(lambda name: _ask_one(work, name, scripts[name]), scripts)
         return {name: said for name, said in zip(scripts, answers, strict=True) if said is not None}
 
 
-def _ask_one(work: Work, name: str, script: str) -> str | None:
+def _ask_one(work: Work, name: str, script: Script) -> str | None:
     access = work.access
     try:
         connection = access.take(name) or access.open(work.fleet.nodes[name], deadlines=_DEADLINES)
@@ -241,7 +256,7 @@ def _ask_one(work: Work, name: str, script: str) -> str | None:
     patience.daemon = True
     patience.start()
     try:
-        done = connection.run(script, timeout_s=ASK_S)
+        done = connection.run(script(), timeout_s=ASK_S)
     except NodeError:
         connection.close()
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
@@ -38,6 +38,7 @@ class Neighbours:
 
     def __init__(self, around: dict[str, Observation], *, silent: tuple[str, ...] = (), answer: str = f"gone {MAC}\n"):
         self.silent = set(silent)
+        self.log_in: Callable[[], None] = lambda: None
         self.answer = answer
         self.asked: list[tuple[str, str]] = []
         self.notes: list[str] = []
@@ -62,6 +63,7 @@ class Neighbours:
     def _open(self, there: SimpleNamespace, **_: object) -> SimpleNamespace:
         if there.name in self.silent:
             raise NodeError("it does not answer")
+        self.log_in()
 
         def run(script: str, *, timeout_s: float) -> SimpleNamespace:
             self.asked.append((there.name, script))
@@ -135,6 +137,18 @@ def test_who_does_not_answer_then_either_is_asked_once_more_in_the_end_and_the_o
         "b02: b01 forgot its radio, to hear it anew",
         "b02: b03 and b04 could not be asked to forget its radio: what it sends them may be lost for minutes",
     ]
+
+
+def test_an_entry_is_no_older_for_the_time_that_a_login_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
+    now_s = [1000.0]
+    monkeypatch.setattr("meshctl.apply.forgetting.time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    forgetting = Forgetting(near.job)
+    forgetting.begins()
+    now_s[0] += 10.0
+    near.log_in = lambda: now_s.__setitem__(0, now_s[0] + 7.0)
+    forgetting.when_back(node("b02"))
+    assert "-ge 17 ]" in near.asked[0][1]
 
 
 def test_who_cannot_forget_is_told_to_the_operator() -> None:
