@@ -304,9 +304,14 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     bench.add_argument("peer", help="its name, as in `udp-mesh peers`")
     bench.add_argument(
-        "--size", type=_times, default=1_000_000, metavar="BYTES", help="per message (default: %(default)s)"
+        "--size", type=_times, default=200_000, metavar="BYTES", help="per message (default: %(default)s)"
     )
-    bench.add_argument("--seconds", type=_positive, default=5.0, help="how long (default: %(default)g)")
+    bench.add_argument(
+        "--seconds",
+        type=_positive,
+        default=5.0,
+        help="how long to send (default: %(default)g); it ends when all of it has arrived",
+    )
     bench.add_argument(
         "--timeout",
         type=_positive,

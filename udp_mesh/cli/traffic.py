@@ -13,7 +13,10 @@ from udp_mesh.client.mesh_client import MeshClient, MeshError, as_message
 from udp_mesh.daemon.configuration import BENCH_TOPIC, CONDITIONS_TOPIC
 
 BENCH_BACKLOG_BYTES = 16 << 20
-"""What the benchmark keeps accepted and undelivered: enough for any link, little enough to end soon."""
+BENCH_BACKLOG_S = 2.0
+BENCH_LEAST_BACKLOG = 4
+"""What the benchmark keeps accepted and undelivered: so much time of what arrives, never fewer messages and never more
+bytes. That keeps any link busy, and a slow one is done soon after the time asked for."""
 
 
 def publish(arguments: argparse.Namespace) -> int:
@@ -149,6 +152,11 @@ def ping(arguments: argparse.Namespace) -> int:
     return Exit.OK if len(times) == arguments.count else Exit.FAILED
 
 
+def _backlog(size_bytes: int, delivered_per_s: float) -> int:
+    """Messages of the benchmark that may be under way."""
+    return max(BENCH_LEAST_BACKLOG, min(BENCH_BACKLOG_BYTES // size_bytes, int(BENCH_BACKLOG_S * delivered_per_s)))
+
+
 def bench(arguments: argparse.Namespace) -> int:
     """Fills the link to a peer at the lowest priority for some seconds, and says what arrived."""
     payload = bytes(arguments.size)
@@ -160,7 +168,7 @@ def bench(arguments: argparse.Namespace) -> int:
         while True:
             now = time.monotonic()
             if now - begun < arguments.seconds:
-                while len(outstanding) * arguments.size < BENCH_BACKLOG_BYTES:
+                while len(outstanding) < _backlog(arguments.size, delivered / max(ended - begun, 1e-3)):
                     number = mesh.publish(BENCH_TOPIC, payload, to=arguments.peer, notify=True)
                     assert number is not None
                     outstanding.add(number)

@@ -18,7 +18,7 @@ import pytest
 
 from tests.udp_mesh.daemon.processes import RunningDaemon, collect, two_daemons
 from tests.udp_mesh.links.sockets import WAIT_S
-from udp_mesh.cli import serve
+from udp_mesh.cli import serve, traffic
 from udp_mesh.cli.main import FORWARDED, build_parser, main
 from udp_mesh.cli.output import Exit
 from udp_mesh.client.mesh_client import FrameReader, encode_frame
@@ -382,3 +382,13 @@ def test_events_are_printed_until_the_daemon_ends(capsys: pytest.CaptureFixture[
         assert main(["events", "--socket", str(path)]) == Exit.UNREACHABLE
         server.join()
     assert capsys.readouterr().out == "peer-online peer=bob\n"
+
+
+@pytest.mark.parametrize(
+    ("size_bytes", "delivered_per_s", "messages"),
+    [(200_000, 0.0, 4), (200_000, 0.6, 4), (200_000, 5.0, 10), (200_000, 600.0, 83), (100_000_000, 1.0, 4)],
+)
+def test_a_benchmark_keeps_little_more_under_way_than_soon_arrives(
+    size_bytes: int, delivered_per_s: float, messages: int
+) -> None:
+    assert traffic._backlog(size_bytes, delivered_per_s) == messages
