@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from ipaddress import IPv4Address
 from typing import Any
 
 from meshctl.fleet.journal import LastKnown
-from meshctl.model import Fleet
+from meshctl.model import Fleet, Robot
 from meshctl.robots.facts import RobotFacts, ServiceFacts
 from meshctl.status import Check, preflight
 from meshctl.status.document import preflight_json
@@ -43,6 +44,13 @@ def test_who_stays_on_the_shelf_is_named_and_stops_nobody(fleet: Fleet) -> None:
     found = checks(fleet)
     assert "not taking part: shelf (carried)" in found["robot radios"].reason
     assert "not taking part: shelf" in found["daemons"].reason
+
+
+def test_a_robot_that_has_not_moved_over_is_named_and_stops_nobody(fleet: Fleet) -> None:
+    husky = Robot("husky", (), fielded=IPv4Address("10.42.0.20"))
+    found = checks(replace(fleet, robots={**fleet.robots, "husky": husky, "cart": Robot("cart", ())}))
+    assert stopped(found) == []
+    assert "husky still runs the fielded program, cart has no computer" in found["daemons"].reason
 
 
 def test_a_beacon_that_was_never_seen_is_a_no_go_before_it_is_packed(fleet: Fleet) -> None:
