@@ -48,7 +48,10 @@ def test_who_stays_on_the_shelf_is_named_and_stops_nobody(fleet: Fleet) -> None:
 
 def test_a_robot_that_has_not_moved_over_is_named_and_stops_nobody(fleet: Fleet) -> None:
     husky = Robot("husky", (), fielded=IPv4Address("10.42.0.20"))
-    found = checks(replace(fleet, robots={**fleet.robots, "husky": husky, "cart": Robot("cart", ())}))
+    robots = {**fleet.robots, "husky": husky, "cart": Robot("cart", ())}
+    # only robots with a computer are asked
+    asked = status_of(fleet, known=KNOWN)
+    found = {check.name: check for check in preflight(replace(fleet, robots=robots), asked, DELIVERED)}
     assert stopped(found) == []
     assert "husky still runs the fielded program, cart has no computer" in found["daemons"].reason
 
