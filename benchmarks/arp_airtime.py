@@ -144,22 +144,32 @@ class Bench:
         self._everywhere("ip neigh flush all", but=GONE if scene == "one gone" else "")
         for robot in self._inventory.robots:
             self._machine(f"ip netns exec pc.{robot} ip neigh flush all")
-        if scene != "quiet":
-            for address in self._addresses:
-                ping = f"ping -q -i {PING_EVERY_S} -w {SCENE_S} {address}"
-                self._machine(f"ip netns exec pc.{self._operator} {ping} >/dev/null 2>&1 </dev/null &")
         try:
-            text = self._machine(f"python3 /run/overhear_arp.py {SCENE_S}", timeout_s=SCENE_S + 120.0)
+            # whoever listens is there before anybody speaks
+            self._machine(f"python3 /run/overhear_arp.py {SCENE_S} >/run/arp.out 2>&1 </dev/null &")
+            self._until(lambda: self._overheard().startswith("listening"), "somebody to listen")
+            if scene != "quiet":
+                self._machine("; ".join(self._ping(address) for address in self._addresses))
+            self._until(lambda: "requests" in self._overheard(), "the scene to end")
+            text = self._overheard()
         finally:
             if scene == "one gone":
                 self._fleet.mend(GONE)
                 self._settle()
-        *lines, last = text.splitlines()
+        _, *lines, last = text.splitlines()
         overheard = [
             {"kind": kind, "rate": int(rate), "bytes": int(length), "count": int(count)}
             for kind, rate, length, count in map(str.split, lines)
         ]
         return {"requests": int(last.split()[1]), "overheard": overheard}
+
+    def _ping(self, address: str) -> str:
+        # with a deadline of its own ping would end at the first address that nobody has
+        words = f"timeout {SCENE_S} ping -q -i {PING_EVERY_S} {address}"
+        return f"(ip netns exec pc.{self._operator} {words} >/dev/null 2>&1 </dev/null &)"
+
+    def _overheard(self) -> str:
+        return self._machine("cat /run/arp.out")
 
     def _settle(self) -> None:
         def answers(address: str) -> bool:

@@ -1,9 +1,9 @@
 """ARP on the air: `overhear_arp.py SECONDS` listens on hwsim's monitor, where every transmission shows once.
 
-Prints a line `KIND RATE BYTES COUNT` for each kind of packet that carries ARP through batman-adv (broadcast; unicast:
-to one node; table: a question to the distributed ARP table, or an answer into it) and, to compare, for batman-adv's own
-(ogm); then `requests N`, how many different broadcasts those transmissions were. Rate as radiotap has it, in units of
-500 kbit/s (0: not told, an 802.11n rate); bytes are the frame's length without checksum.
+Prints `listening` once it does, then a line `KIND RATE BYTES COUNT` for each kind of packet that carries ARP through
+batman-adv (broadcast; unicast: to one node; table: a question to the distributed ARP table, or an answer into it) and,
+to compare, for batman-adv's own (ogm); then `requests N`, how many different broadcasts those transmissions were.
+Rate as radiotap has it, in units of 500 kbit/s (0: not told, an 802.11n rate); bytes: a frame's length without checksum.
 """
 
 from __future__ import annotations
@@ -46,6 +46,8 @@ def main(seconds: float) -> None:
     requests: set[bytes] = set()
     with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(_ETH_P_ALL)) as air:
         air.bind(("hwsim0", 0))
+        sys.stdout.write("listening\n")
+        sys.stdout.flush()
         until_s = time.monotonic() + seconds
         while (left_s := until_s - time.monotonic()) > 0:
             air.settimeout(left_s)
