@@ -3,7 +3,7 @@
 Prints `listening` once it does, then a line `KIND RATE BYTES COUNT` for each kind of packet that carries ARP through
 batman-adv (broadcast; unicast: to one node; table: a question to the distributed ARP table, or an answer into it) and,
 to compare, for batman-adv's own (ogm); then `requests N`, how many different broadcasts those transmissions were.
-Rate as radiotap has it, in units of 500 kbit/s (0: not told, an 802.11n rate); bytes: a frame's length without checksum.
+Rate as radiotap has it, in units of 500 kbit/s (0: not told, an 802.11n rate); bytes: the frame without checksum.
 """
 
 from __future__ import annotations
