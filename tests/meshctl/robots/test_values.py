@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import zipfile
 from io import BytesIO
+from ipaddress import IPv4Address, IPv4Interface
 
 import pytest
 
 from meshctl.errors import InputError
 from meshctl.fleet import Result
-from meshctl.model import SecretKind, SecretRef
+from meshctl.model import Computer, Robot, SecretKind, SecretRef
 from meshctl.robots.bundle import UNIT_NAME, Bundle, File, service_unit
 from meshctl.robots.deploy import switched
+from meshctl.robots.reach import chosen_robots
 from meshctl.robots.rotation import parse_ref, stages, written
 from meshctl.robots.tags import Target, parse_wheel, pip_options, takes
 from meshctl.robots.target import Facts, changed_files, clock_remark, objections, parse_facts, room_objection
 from meshctl.robots.wheels import own_wheel, stock_units
+from tests.meshctl.render import fleets
 
 BOOKWORM = Target((3, 11), "x86_64", "glibc", (2, 36))
 PI = Target((3, 12), "aarch64", "glibc", (2, 39))
@@ -174,3 +177,21 @@ def test_a_reference_reads_back_as_it_is_printed(text: str) -> None:
 def test_what_is_no_reference_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="expected env:NAME"):
         parse_ref(text)
+
+
+def test_a_robot_that_has_not_moved_over_is_passed_by_and_named_with_the_way_to_take_it_in() -> None:
+    moved = Robot("husky1", (), Computer(IPv4Interface("10.42.0.10/24")))
+    fleet = fleets.fleet(
+        robots={
+            "husky1": moved,
+            "husky2": Robot("husky2", (), fielded=IPv4Address("10.42.0.20")),
+            "cart": Robot("cart", ()),
+        }
+    )
+    assert chosen_robots(fleet, None) == ("husky1",)
+    with pytest.raises(InputError) as caught:
+        chosen_robots(fleet, ["husky2"])
+    assert caught.value.hint == "write robots.husky2.computer in place of `fielded`, and stop the fielded program there"
+    with pytest.raises(InputError) as caught:
+        chosen_robots(fleet, ["cart"])
+    assert caught.value.hint == "write robots.cart.computer"
