@@ -5,6 +5,7 @@ deadline depends on the clock. `deep` draws new cases and many more of them: `HY
 """
 
 import os
+from importlib.metadata import version
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -16,6 +17,21 @@ settings.register_profile(
 )
 settings.register_profile("deep", deadline=None, max_examples=2000, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fast"))
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Tests that share a fleet or a machine share a worker; a pytest that loses that without a word is refused.
+
+    pytest-xdist writes a test's group behind `_nodeid`, which is not there from pytest 9.2 on: then every worker would
+    start a machine of its own.
+    """
+    if config.getoption("dist", "no") != "loadgroup":
+        return
+    if not any("_nodeid" in vars(kind).get("__slots__", ()) for kind in pytest.Item.__mro__):
+        raise pytest.UsageError(
+            f"pytest {pytest.__version__} and pytest-xdist {version('pytest-xdist')} lose the groups of tests:"
+            " expected pytest below 9.2, which `make setup` installs"
+        )
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
