@@ -27,6 +27,8 @@ PACKAGES = (
     "iputils-ping",
     "iw",
     "libpython3-stdlib",
+    # what cryptography's own wheel needs of the machine's Python: with it udp_mesh runs on robots' computers
+    "python3-cffi-backend",
     "python3-minimal",
     "python3-yaml",
     "tcpdump",
