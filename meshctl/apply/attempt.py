@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from meshctl.apply.change import change_of, new_change_id, new_nonce, services_of
-from meshctl.apply.checks import missing
+from meshctl.apply.checks import RELOADING, missing
 from meshctl.apply.forgetting import Forgetting
 from meshctl.apply.job import Job
 from meshctl.apply.settle import Move, applied_age_s, next_move
@@ -20,7 +20,7 @@ from meshctl.apply.waiting import Pace
 from meshctl.device import deadman
 from meshctl.device.connection import Endpoint
 from meshctl.device.deadman import Change
-from meshctl.device.errors import AuthenticationRefused, NodeRefused
+from meshctl.device.errors import AuthenticationRefused, CommandFailed, NodeRefused
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.observe import observe
 from meshctl.device.openwrt import root_in_ram
@@ -192,6 +192,9 @@ def reach(attempt: Attempt) -> SshConnection | None:
 def look(attempt: Attempt, connection: SshConnection) -> Move:
     """Observe the node once and say what is next. Raises Unreachable."""
     job = attempt.job
+    busy = _while_it_reloads(attempt, connection)
+    if busy is not None:
+        return busy
     attempt.last = observe(connection)
     age_s = applied_age_s(attempt.status)
     if age_s is not None:
@@ -206,6 +209,33 @@ def look(attempt: Attempt, connection: SshConnection) -> Move:
         attempt.gaps,
         is_at_new_address=connection.endpoint == attempt.new,
         leaving=job.work.interrupt.leaving,
+        is_given_up=attempt.is_given_up,
+    )
+
+
+def _while_it_reloads(attempt: Attempt, connection: SshConnection) -> Move | None:
+    """What is next as long as the node's services take up the change; None when it is time to look at everything.
+
+    That would hold them up on a small processor, and be cut short when they take the radio down. Raises Unreachable.
+    """
+    try:
+        status = deadman.status(connection)
+    except CommandFailed:
+        # what is wrong there the observation tells
+        return None
+    if status.change_id != attempt.id or status.state not in ("waiting", "applied") or status.reload_status is not None:
+        return None
+    if status.state == "applied":
+        attempt.shut_out = ""
+        attempt.forgetting.stands()
+    attempt.gaps = (RELOADING,)
+    leaving = attempt.job.work.interrupt.leaving
+    return next_move(
+        attempt.id,
+        status,
+        attempt.gaps,
+        is_at_new_address=False,
+        leaving=leaving,
         is_given_up=attempt.is_given_up,
     )
 

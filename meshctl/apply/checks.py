@@ -18,6 +18,7 @@ from meshctl.uci import Package, Section
 
 # Robots move: of the neighbours a node had, so many have to be heard again.
 NEIGHBOURS_BACK = 0.5
+RELOADING = "its services are still reloading"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +71,7 @@ def _reload(after: Observation) -> tuple[str, ...]:
         return ()
     status = after.change.reload_status
     if status is None:
-        return ("its services are still reloading",)
+        return (RELOADING,)
     return (f"reloading its services failed with status {status}",) if status != 0 else ()
 
 
