@@ -22,7 +22,8 @@ check: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# The long proofs: every kill point, hundreds of virtual nodes, hours of virtual time, real roscores, real sudo.
+# The long proofs: every kill point, hundreds of virtual nodes, hours of virtual time, real roscores, real sudo, missions of
+# real radios.
 proof: setup
 	scripts/setup-ros
 	$(BIN)/pytest -m proof

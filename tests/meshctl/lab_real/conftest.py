@@ -1,4 +1,5 @@
-"""One machine of real radios for all tests of this folder, taken from factory state to a working mesh once.
+"""One machine of real radios for the tests of this folder, taken from factory state to a working mesh once; those of
+`crew` have one of their own, which is gone before this one starts.
 
 Tests that change the fleet leave it as the inventory says, whatever that is by then. QEMU is installed by
 scripts/setup-lab when it is missing: nothing here is skipped.
@@ -8,13 +9,14 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
+import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -22,7 +24,6 @@ from meshctl.lab.copybook import prepare
 from meshctl.lab.fleet import VirtualNode
 from meshctl.lab.real import control
 from meshctl.lab.real.fleet import RealFleet
-from meshctl.lab.real.machine import QEMU
 from meshctl.lab.twin import spec_of
 from tests import waiting
 
@@ -55,14 +56,21 @@ class Done:
 
 @dataclass(frozen=True, slots=True)
 class Lab:
-    """The running fleet, and the copy of the inventory that belongs to it."""
+    """The running fleet, and the copy of the inventory that belongs to it. `NODES`: those of its mesh, base first."""
+
+    NODES: ClassVar[tuple[str, ...]] = NODES
 
     fleet: RealFleet
     inventory: Path
     state: Path
 
-    def meshctl(self, *words: str, expect: int | None = 0) -> Done:
-        """Run meshctl as an operator does, in a process of its own; `expect` None: any exit code."""
+    def meshctl(
+        self, *words: str, expect: int | None = 0, when_told: tuple[str, Callable[[], None]] | None = None
+    ) -> Done:
+        """Run meshctl as an operator does, in a process of its own; `expect` None: any exit code.
+
+        `when_told`: a text, and what is done as soon as meshctl has said it.
+        """
         environment = {
             **os.environ,
             "MESHCTL_LAB": str(self.fleet.directory),
@@ -70,12 +78,31 @@ class Lab:
             "XDG_STATE_HOME": str(self.state),
             "COLUMNS": "200",
         }
-        done = subprocess.run(
-            (sys.executable, "-m", "meshctl", *words),
-            env=environment, capture_output=True, text=True, timeout=COMMAND_S, check=False,
-        )  # fmt: skip
-        assert expect is None or done.returncode == expect, f"meshctl {' '.join(words)}: {done.stdout}{done.stderr}"
-        return Done(done.returncode, done.stdout, done.stderr)
+        lines: list[str] = []
+        with (
+            tempfile.TemporaryFile("w+") as complaints,
+            subprocess.Popen(
+                (sys.executable, "-m", "meshctl", *words),
+                env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=complaints, text=True,
+            ) as process,
+        ):  # fmt: skip
+            patience = threading.Timer(COMMAND_S, process.kill)
+            patience.start()
+            try:
+                assert process.stdout is not None
+                for line in process.stdout:
+                    lines.append(line)
+                    if when_told is not None and when_told[0] in line:
+                        when_told[1]()
+                        when_told = None
+                status = process.wait()
+            finally:
+                patience.cancel()
+                process.kill()
+            complaints.seek(0)
+            done = Done(status, "".join(lines), complaints.read())
+        assert expect is None or status == expect, f"meshctl {' '.join(words)}: {done.text}{done.errors}"
+        return done
 
     def provision(self, *nodes: str) -> list[list[dict[str, Any]]]:
         """Provision until all is as the inventory says; the events of each run.
@@ -129,11 +156,12 @@ class Lab:
 
     def hops(self) -> dict[str, int]:
         """How many hops each node is from the base, along the next hops that the kernels would take now."""
-        towards = {name: self.originators(name).get("base", "") for name in NODES[1:]}
+        others = self.NODES[1:]
+        towards = {name: self.originators(name).get("base", "") for name in others}
         found = {"base": 0}
-        for name in NODES[1:]:
+        for name in others:
             at, count = name, 0
-            while at != "base" and count <= len(NODES):
+            while at != "base" and count <= len(others):
                 at, count = towards.get(at, "base"), count + 1
             found[name] = count
         return found
@@ -144,8 +172,8 @@ class Lab:
 
     def settle(self) -> None:
         """Wait until every node is up and the base's batman-adv has a route to every other one."""
-        others = set(NODES[1:])
-        until(lambda: all(node.is_up() for node in self.fleet.nodes), "every node to boot")
+        others = set(self.NODES[1:])
+        until(lambda: all(self.node(name).is_up() for name in self.NODES), "every node to boot")
         until(lambda: self.originators("base").keys() >= others, "routes from the base to every node")
         until(lambda: self.answers("base-station", "10.42.0.10"), "the Husky's computer to answer")
 
@@ -155,11 +183,10 @@ def until(condition: Callable[[], bool], what: str) -> None:
     waiting.until(condition, what, wait_s=180.0, look_s=0.2)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def factory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     """Five nodes fresh from their boxes, each on its bench."""
-    if shutil.which(QEMU) is None or not _apt_knows_kernels():
-        subprocess.run((SETUP,), check=True, timeout=START_S)
+    set_up_host()
     place = tmp_path_factory.mktemp("real")
     copy = prepare(INVENTORY, place / "lab")
     fleet = RealFleet(spec_of(copy.fleet, links=copy.links), place / "lab")
@@ -170,7 +197,7 @@ def factory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         fleet.down()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def lab(factory: Lab) -> Lab:
     """The same, taken into the fleet on the bench and carried into the field: only the mesh leads there."""
     factory.meshctl("bootstrap", "--yes", *NODES)
@@ -180,6 +207,6 @@ def lab(factory: Lab) -> Lab:
     return factory
 
 
-def _apt_knows_kernels() -> bool:
-    done = subprocess.run(("apt-cache", "show", "linux-image-amd64"), capture_output=True, check=False)
-    return done.returncode == 0 and bool(done.stdout)
+def set_up_host() -> None:
+    """QEMU and what apt needs; there already, as a rule."""
+    subprocess.run((SETUP,), check=True, timeout=START_S)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import pytest
 from meshctl.lab.copybook import prepare
 from meshctl.lab.real.fleet import RealFleet
 from meshctl.lab.twin import spec_of
-from tests.meshctl.lab_real.conftest import SETUP, START_S, Lab, until
+from tests.meshctl.lab_real.conftest import START_S, Lab, set_up_host
 
 INVENTORY = Path(__file__).with_name("inventory")
 FIELDED = ("base", "b01", "b02", "husky")
@@ -23,17 +22,12 @@ KEYS = {"main": "a word that all of them know", "fast": "and another one for fiv
 class Crew(Lab):
     """The running fleet; `spare` stays on its bench, fresh from the box."""
 
+    NODES = FIELDED
+
     def write_keys(self, **keys: str) -> None:
         """What the meshes' keys are from now on; a node has them once it is provisioned."""
         lines = "".join(f"{mesh}: {key}\n" for mesh, key in {**KEYS, **keys}.items())
         (self.inventory.parent / "keys.yaml").write_text(lines, encoding="utf-8")
-
-    def settle(self) -> None:
-        """Wait until every fielded node is up and the base's batman-adv has a route to every other one."""
-        others = set(FIELDED[1:])
-        until(lambda: all(self.node(name).is_up() for name in FIELDED), "every node to boot")
-        until(lambda: self.originators("base").keys() >= others, "routes from the base to every node")
-        until(lambda: self.answers("base-station", "10.42.0.10"), "the Husky's computer to answer")
 
     def stations(self, name: str, interface: str) -> dict[str, bool]:
         """Whom a radio of the node knows, and whether each has proven that it knows the key."""
@@ -49,10 +43,10 @@ class Crew(Lab):
         return told
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def crew(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Crew]:
     """The fielded nodes taken in on the bench and carried out: only the mesh leads to them."""
-    subprocess.run((SETUP,), check=True, timeout=START_S)
+    set_up_host()
     place = tmp_path_factory.mktemp("crew")
     copy = prepare(INVENTORY, place / "lab")
     fleet = RealFleet(spec_of(copy.fleet, links=copy.links), place / "lab").up(wait_s=START_S)

@@ -10,7 +10,7 @@ from meshctl.lab.real import control
 from tests.meshctl.lab_real.conftest import until
 from tests.meshctl.lab_real.crew.conftest import FIELDED, KEYS, Crew
 
-pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
 TWINS = ("b02", "husky")
 # data frames on the air in ten seconds: how many are encrypted, how many carry anything but a handshake in the clear

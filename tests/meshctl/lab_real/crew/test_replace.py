@@ -8,7 +8,7 @@ from meshctl.inventory import load_fleet
 from tests.meshctl.lab_real.conftest import until
 from tests.meshctl.lab_real.crew.conftest import Crew
 
-pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
 
 def test_a_factory_fresh_device_takes_over_a_dead_beacons_name_and_place(crew: Crew) -> None:
