@@ -156,7 +156,7 @@ def _place(text: str) -> BenchPlace:
     host, colon, port = text.rpartition(":")
     if not colon or (text.count(":") > 1 and not text.startswith("[")):
         return BenchPlace(text)
-    if not port.isdigit() or not 0 < int(port) < 65536:
+    if not port.isdecimal() or not 0 < int(port) < 65536:
         raise InputError(f"--at {text}: expected HOST or HOST:PORT")
     return BenchPlace(host.strip("[]"), int(port))
 

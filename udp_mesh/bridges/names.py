@@ -88,7 +88,7 @@ def parse_topic_list(entries: Iterable[object]) -> tuple[list[ListedTopic], list
     problems: list[str] = []
     for place, entry in enumerate(entries):
         parts = [part.strip() for part in str(entry).split("|")]
-        if len(parts) != 3 or not parts[0].isdigit() or not parts[2].strip("/") or " " in parts[2]:
+        if len(parts) != 3 or not parts[0].isdecimal() or not parts[2].strip("/") or " " in parts[2]:
             problems.append("topic_list[{}]: expected 'priority|pkg/Type|topic', found {!r}".format(place, entry))
             continue
         found.append(ListedTopic(parts[2].strip("/"), min(int(parts[0]), 15)))

@@ -16,7 +16,7 @@ def set_topic(arguments: argparse.Namespace) -> int:
 
 
 def set_window(arguments: argparse.Namespace) -> int:
-    window: str | int = int(arguments.window) if arguments.window.isdigit() else arguments.window
+    window: str | int = int(arguments.window) if arguments.window.isdecimal() else arguments.window
     return _change(arguments, "set-window", window=window)
 
 

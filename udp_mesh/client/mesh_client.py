@@ -118,7 +118,8 @@ class MeshClient:
             self._socket.connect(path)
         except OSError as error:
             self._socket.close()
-            raise MeshError("unreachable", "no udp-mesh daemon at {}: {}".format(path, error.strerror)) from error
+            reason = error.strerror or error
+            raise MeshError("unreachable", "no udp-mesh daemon at {}: {}".format(path, reason)) from error
         # A process-wide default timeout (rospy sets one) must not apply here.
         self._socket.settimeout(None)
         self._poll = select.poll()

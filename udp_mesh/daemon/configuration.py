@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import ipaddress
+import os
 import re
 import socket
 from dataclasses import dataclass, field
@@ -33,6 +34,8 @@ from udp_mesh.wire.limits import MAX_MESSAGE_BYTES, MAX_NAME_BYTES, MAX_TOPIC_BY
 DEFAULT_PATH = Path("/etc/udp-mesh/udp-mesh.toml")
 DEFAULT_SOCKET = Path("/run/udp-mesh/udp-mesh.sock")
 DEFAULT_STATE = Path("/var/lib/udp-mesh")
+MAX_SOCKET_BYTES = 107
+"""Of a Unix socket's path, without the NUL behind it."""
 MAX_FILE_BYTES = 1 << 20
 """A configuration of a megabyte is a mistake (a wrong path), not a configuration."""
 
@@ -293,7 +296,7 @@ def parse_address(text: str, port: int) -> Address | None:
     if "%" in host:
         # The interface of a link-local address is the neighbour's `link`.
         return None
-    if not number.isdigit() or not 1 <= int(number) <= 65_535:
+    if not re.fullmatch("[0-9]{1,5}", number) or not 1 <= int(number) <= 65_535:
         return None
     return host, int(number)
 
@@ -344,8 +347,11 @@ def _read_daemon(table: Table) -> DaemonSettings:
     metrics = parse_address(metrics_text, 0) if metrics_text is not None and metrics_text.count(":") else None
     if metrics_text is not None and (metrics is None or not ipaddress.ip_address(metrics[0]).is_loopback):
         table.report("metrics_address", "a loopback address with a port (127.0.0.1:9871)", metrics_text)
+    socket_path = table.text("socket") or str(default.socket)
+    if len(os.fsencode(socket_path)) > MAX_SOCKET_BYTES:
+        table.report("socket", f"a path of at most {MAX_SOCKET_BYTES} bytes (unix(7))", socket_path)
     settings = DaemonSettings(
-        socket=Path(table.text("socket") or default.socket),
+        socket=Path(socket_path),
         socket_mode=mode,
         socket_group=table.text("socket_group"),
         user=table.text("user"),

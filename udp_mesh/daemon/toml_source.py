@@ -184,6 +184,9 @@ class Table:
 
     def text(self, key: str, default: str | None = None, expected: str = "a string") -> str | None:
         value = self._take(key)
+        if isinstance(value, str) and "\0" in value:
+            self.report(key, "a string without the character NUL", value.replace("\0", "\\u0000"))
+            return default
         if value is None or isinstance(value, str):
             return default if value is None else value
         self.report(key, expected, value)

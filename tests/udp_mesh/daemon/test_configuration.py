@@ -1,14 +1,18 @@
 """The configuration: what it means, and that every mistake is named by its line."""
 
+import dataclasses
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from udp_mesh.core.settings import Neighbour, Outbox, Topic
+from udp_mesh.core.settings import Limits, Neighbour, Outbox, Rates, Topic
 from udp_mesh.crypto import Key
 from udp_mesh.daemon.configuration import (
     RESERVED_TOPICS,
     Configuration,
+    DaemonSettings,
     load,
     parse_address,
     read_keys,
@@ -209,6 +213,19 @@ def test_a_key_file_is_all_that_is_needed(tmp_path: Path) -> None:
             "[daemon]\nsocket_mode = 660",
             'udp-mesh.toml:3: daemon.socket_mode: expected octal permissions in quotes such as "0660", found 660',
         ),
+        (
+            '[daemon]\nmetrics_address = "127.0.0.1:²"',
+            "udp-mesh.toml:3: daemon.metrics_address: expected a loopback address with a port (127.0.0.1:9871), "
+            'found "127.0.0.1:²"',
+        ),
+        (
+            '[daemon]\nuser = "a\\u0000"',
+            'udp-mesh.toml:3: daemon.user: expected a string without the character NUL, found "a\\u0000"',
+        ),
+        (
+            f'[daemon]\nsocket = "/{"s" * 200}"',
+            f'udp-mesh.toml:3: daemon.socket: expected a path of at most 107 bytes (unix(7)), found "/{"s" * 56}..."',
+        ),
         ("unkeyed = true", "udp-mesh.toml:2: unkeyed: expected either key_file or unkeyed, found both"),
     ],
 )
@@ -325,3 +342,52 @@ def test_lines_are_found_behind_strings_comments_and_brackets_that_look_like_key
 )
 def test_addresses_are_numeric_with_an_optional_port(text: str, address: tuple[str, int] | None) -> None:
     assert parse_address(text, 8700) == address
+
+
+NUMBERS = ["0", "-1", "3", "1.5", "1e400", "nan", "inf", "99999999999999999999999", "07:32:00", "1979-05-27", "true"]
+TABLES = ["[]", "[1]", "[{}]", "{}", "{ a = 1 }"]
+TEXTS = [
+    "",
+    "x",
+    "a b",
+    "\\u0000",
+    "²",
+    "10.0.0.1:²",
+    "127.0.0.1:0",
+    "fe80::1%a",
+    "all",
+    "0777",
+    "adaptive",
+    "fleet.key",
+    ".",
+]
+WORDS = [*NUMBERS, *TABLES, *(f'"{text}"' for text in TEXTS)]
+KEYS = {
+    "": ["name", "port", "window", "fragment_bytes", "topics", "links", "neighbours", "rates", "limits", "daemon", "x"],
+    "[topics.x]": [item.name for item in dataclasses.fields(Topic)],
+    "[undeclared]": [item.name for item in dataclasses.fields(Topic)],
+    "[rates]": [item.name for item in dataclasses.fields(Rates)],
+    "[limits]": [item.name for item in dataclasses.fields(Limits)],
+    "[daemon]": [item.name for item in dataclasses.fields(DaemonSettings)],
+    "[[links]]": ["interface", "address", "kind", "mtu"],
+    "[[neighbours]]": ["address", "name", "link", "legacy"],
+}
+
+
+@settings(max_examples=60)
+@given(data=st.data())
+def test_whatever_stands_in_the_file_is_taken_or_told(
+    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    lines = ['key_file = "fleet.key"']
+    for table in ["", *data.draw(st.lists(st.sampled_from([*KEYS][1:]), max_size=3, unique=True))]:
+        lines.append(table)
+        keys = data.draw(st.lists(st.sampled_from(KEYS[table]), max_size=3, unique=True))
+        lines += [f"{key} = {data.draw(st.sampled_from(WORDS))}" for key in keys]
+    path = tmp_path_factory.getbasetemp() / "any.toml"
+    path.write_text("\n".join(lines))
+    (path.parent / "fleet.key").write_text(KEY.secret.hex())
+    try:
+        load(path)
+    except ConfigurationError as error:
+        assert all(str(problem).startswith(f"{path}:") for problem in error.problems)
