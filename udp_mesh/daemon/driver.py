@@ -183,18 +183,26 @@ class Driver:
     def _interfaces_changed(self) -> None:
         assert self._monitor is not None
         if self._monitor.drain():
+            at = self._clock() + INTERFACE_SETTLE_S
             if self._refresh is not None:
+                if self._refresh.when() <= at:
+                    # Some drivers send notices without end: they must not put off the look for ever.
+                    return
                 self._refresh.cancel()
-            self._refresh = self._loop.call_later(INTERFACE_SETTLE_S, self._refresh_and_pump)
+            self._refresh = self._loop.call_at(at, self._refresh_and_pump)
 
     def _refresh_and_pump(self) -> None:
+        completed = False
         try:
             self.refresh_links()
+            completed = True
         except OSError as error:
-            # The kernel would not list its interfaces (out of memory): what is open stays open until it does.
             log.error("interfaces-unknown error=%s", error)
-            self._watch_all()
-            self._refresh = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
+        finally:
+            if not completed:
+                # The kernel would not list its interfaces (out of memory), or a bug: what is open stays open and heard.
+                self._watch_all()
+                self._refresh = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
         self._pump()
 
     def _unwatch(self, link: UdpLink) -> None:

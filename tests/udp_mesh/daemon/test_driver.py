@@ -135,6 +135,39 @@ def test_a_kernel_that_will_not_list_its_interfaces_is_asked_again(monkeypatch: 
     run(body)
 
 
+def test_a_bug_in_the_look_at_interfaces_leaves_the_open_links_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        def fail() -> None:
+            raise ZeroDivisionError("a bug")
+
+        monkeypatch.setattr(alice.driver.hub, "refresh", fail)
+        with pytest.raises(ZeroDivisionError):
+            alice.driver._refresh_and_pump()
+        assert isinstance(await alice.deliver("map", PAYLOAD, to="bob"), MessageDelivered)
+
+    run(body)
+
+
+def test_notices_without_end_do_not_put_off_the_look_at_interfaces(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body(alice: Node, _: Node) -> None:
+        driver = alice.driver
+        assert driver._monitor is not None
+        monkeypatch.setattr(driver._monitor, "drain", lambda: True)
+        driver._interfaces_changed()
+        first = driver._refresh
+        assert first is not None
+        await asyncio.sleep(0.001)
+        driver._interfaces_changed()
+        assert driver._refresh is first
+        # but one that waits for another attempt later comes at once
+        first.cancel()
+        later = driver._refresh = asyncio.get_running_loop().call_later(3600.0, driver._refresh_and_pump)
+        driver._interfaces_changed()
+        assert later.cancelled()
+
+    run(body)
+
+
 def test_nothing_is_left_on_the_loop_after_the_end() -> None:
     async def main() -> None:
         async with make("alice", 1, 2, free_port()) as node:
