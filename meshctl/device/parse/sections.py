@@ -37,4 +37,4 @@ def split_sections(output: bytes, nonce: str) -> dict[str, Section]:
 
 
 def _status(text: bytes) -> int:
-    return int(text) if text.isdecimal() and len(text) < 5 else -1
+    return int(text) if text.isdigit() and len(text) < 5 else -1
