@@ -263,7 +263,9 @@ def release_outbox(state: State, peer: Peer, now: float) -> None:
     for held in state.outboxes.release(peer.name, RELEASED_AT_ONCE):
         begun, session = held.begun, peer.session
         if begun is not None and held.epoch == peer.outbound.epoch:
-            if session is not None and begun.fragment_bytes <= session.way.fragment_bytes:
+            # One that has left whole may have arrived whole: under a new number it would arrive twice.
+            whole = begun.next_position >= begun.fragments
+            if session is not None and (whole or begun.fragment_bytes <= session.way.fragment_bytes):
                 begun.store_key = held.store_key
                 peer.outbound.resume(begun, now)
                 state.ready[peer] = None

@@ -10,6 +10,7 @@ from udp_mesh.core.discovery import leads
 from udp_mesh.core.events import ExpiryReason, MessageId
 from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Accepted
+from udp_mesh.core.presence import refit
 from udp_mesh.core.seams import Datagram
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
 from udp_mesh.core.state import State, live_keys
@@ -40,9 +41,8 @@ def link_up(state: State, link: LinkInfo, now: float) -> None:
     """A new or changed link; heartbeats introduce it soon."""
     state.links[link.name] = link
     for session in state.roster.sessions.values():
-        way = session.way
-        if way.link == link.name:
-            way.lead(link.name, way.address, link.mtu, state.settings.fragment_bytes)
+        if session.way.link == link.name:
+            refit(state, session, link.mtu)
     state.discovery.hurry(len(state.roster.sessions), now)
 
 
@@ -78,10 +78,9 @@ def apply(state: State, settings: Settings, now: float) -> list[str]:
             state.ready[peer] = None
         state.arm(peer)
     for session in state.roster.sessions.values():
-        way = session.way
-        info = state.links.get(way.link)
+        info = state.links.get(session.way.link)
         if info is not None:
-            way.lead(way.link, way.address, info.mtu, settings.fragment_bytes)
+            refit(state, session, info.mtu)
     state.discovery.hurry(len(state.roster.sessions), now)
     return changes
 

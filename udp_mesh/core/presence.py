@@ -191,12 +191,31 @@ def follow(state: State, session: Session, link: str, source: Address, now: floa
     if not first and session.proven and session.peer is not None:
         state.ledger.tell(PeerAddressChanged(session.name, old, source, link))
     if outbound is not None and way.fragment_bytes < before:
-        _fit(outbound, way)
+        _fit(outbound, way, all_of_it=False)
 
 
-def _fit(outbound: Outbound, way: Way) -> None:
-    """What was cut into larger fragments than the way carries now begins anew."""
+def refit(state: State, session: Session, mtu: int) -> None:
+    """The link, or the settings, changed under a session's way: what leaves from now on fits both, and what the path
+    was found to carry."""
+    way = session.way
+    outbound = session.peer.outbound if session.peer is not None and session.peer.engaged else None
+    if outbound is not None and outbound.path_size.narrowed_at is not None:
+        mtu = min(mtu, way.mtu)
+    before = way.mtu
+    way.lead(way.link, way.address, mtu, state.settings.fragment_bytes)
+    if outbound is not None and mtu < before:
+        _fit(outbound, way, all_of_it=False)
+
+
+def _fit(outbound: Outbound, way: Way, *, all_of_it: bool) -> None:
+    """What was cut into larger fragments than the way carries now begins anew.
+
+    One that has left whole may have arrived whole, and under a new number it would arrive twice: it only does so with
+    `all_of_it`, where none of its large pieces get through anyhow. Our own kernel cuts what is too large for our link.
+    """
     for message in list(outbound.open):
+        if not all_of_it and message.begun and message.next_position >= message.fragments:
+            continue
         if message.begun and min(len(message.body), message.fragment_bytes) > way.fragment_bytes:
             outbound.cancel(message)
             outbound.send_anew(message)
@@ -212,7 +231,7 @@ def _measure_path(state: State, peer: Peer, session: Session, now: float) -> Non
         size.reset()
         size.narrowed_at = now
         state.ledger.tell(PathNarrowed(peer.name, way.mtu, way.fragment_bytes))
-        _fit(outbound, way)
+        _fit(outbound, way, all_of_it=True)
         state.ready[peer] = None
     elif size.narrowed_at is not None and now - size.narrowed_at > WIDEN_AFTER_S and info is not None:
         size.narrowed_at = None

@@ -1,14 +1,14 @@
 """A path that swallows large datagrams in silence is found out; loss of any other kind is not taken for one."""
 
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 
-from tests.udp_mesh.core.pair import IP_UDP_BYTES, Pipe, World, settings
+from tests.udp_mesh.core.pair import BROADCAST, IP_UDP_BYTES, Pipe, World, settings
 from udp_mesh.core.events import MessageDelivered, MessageReceived, PathNarrowed, PeerOnline
 from udp_mesh.core.path_size import WIDEN_AFTER_S
-from udp_mesh.core.settings import Topic
+from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
 
 TOPICS = (Topic("status", priority=0), Topic("map"))
 
@@ -101,3 +101,55 @@ def test_loss_and_cuts_of_any_size_are_not_taken_for_a_narrow_path(loss: float) 
     world.at(world.now, publish)
     world.run(12.0)
     assert narrow(world) == []
+
+
+def under_way(world: World) -> list[int]:
+    """Sizes of the datagrams that leave a from now on, as IP packets."""
+    sizes: list[int] = []
+    world.tap = lambda name, datagram, _: sizes.append(len(datagram.data) + IP_UDP_BYTES) if name == "a" else None
+    world.send("a", "map", bytes(500_000), "b")
+    world.run(0.1)
+    assert max(sizes) > 1300
+    sizes.clear()
+    return sizes
+
+
+def test_what_had_begun_fits_a_link_that_became_narrower() -> None:
+    world = met(1500)
+    sizes = under_way(world)
+    link = LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a"], BROADCAST, mtu=700)
+    world.nodes["a"].link_up(link, world.now)
+    assert world.run(20.0, until=lambda: bool(topics(world, "a", MessageDelivered)))
+    assert max(sizes) <= 700
+    assert topics(world, "b", MessageReceived) == ["map"]
+
+
+def test_what_had_left_whole_when_the_link_became_narrower_arrives_once() -> None:
+    world = met(1500)
+    for _ in range(20):
+        world.send("a", "map", bytes(3_000), "b")
+        # all of it is on its way, and nothing is acknowledged
+        world.run(0.012)
+        link = LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a"], BROADCAST, mtu=700)
+        world.nodes["a"].link_up(link, world.now)
+        world.run(0.5)
+        world.nodes["a"].link_up(replace(link, mtu=1500), world.now)
+    assert topics(world, "a", MessageDelivered) == ["map"] * 20
+    assert topics(world, "b", MessageReceived) == ["map"] * 20
+
+
+@pytest.mark.parametrize("change", ["link", "settings"])
+def test_what_the_path_was_found_to_carry_outlives_a_reload(change: str) -> None:
+    world = met(1280)
+    world.send("a", "map", bytes(100_000), "b")
+    assert world.run(30.0, until=lambda: bool(topics(world, "a", MessageDelivered)))
+    node = world.nodes["a"]
+    if change == "link":
+        node.link_up(LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a"], BROADCAST), world.now)
+    else:
+        node.apply(settings("a", *TOPICS, window=32), world.now)
+    world.pipes["a", "b"].dropped = 0
+    world.send("a", "map", bytes(100_000), "b")
+    assert world.run(5.0, until=lambda: len(topics(world, "a", MessageDelivered)) == 2)
+    assert world.pipes["a", "b"].dropped == 0
+    assert narrow(world) == [1280]

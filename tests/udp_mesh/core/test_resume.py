@@ -4,9 +4,9 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from tests.udp_mesh.core.pair import World, settings
+from tests.udp_mesh.core.pair import BROADCAST, World, settings
 from udp_mesh.core.events import MessageDelivered, MessageExpired, MessageReceived, PeerOffline, PeerOnline
-from udp_mesh.core.settings import Limits, Outbox, Topic
+from udp_mesh.core.settings import Limits, LinkInfo, LinkKind, Outbox, Topic
 
 ART = Topic("art", outbox=Outbox.ALL)
 
@@ -59,6 +59,20 @@ def test_what_had_arrived_of_a_large_message_is_not_sent_again() -> None:
     assert (
         world.pipes[("a", "b")].carried_bytes < 2_700_000
     )  # with the probes of ten seconds; all of it again would be 3.2 MB
+
+
+def test_one_that_had_left_whole_arrives_once_although_the_link_became_narrower() -> None:
+    world = met(ART)
+    cut(world, ("b", "a"))
+    world.send("a", "art", bytes(4_000), "b")
+    assert world.run(1.0, until=lambda: bool(world.told("b", MessageReceived)))
+    cut(world, *world.pipes)
+    assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))
+    link = LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a"], BROADCAST, mtu=700)
+    world.nodes["a"].link_up(link, world.now)
+    heal(world)
+    assert world.run(10.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert len(world.told("b", MessageReceived)) == 1
 
 
 def test_a_peer_that_restarted_gets_the_message_anew() -> None:
