@@ -27,6 +27,7 @@ from typing import Any
 
 from benchmarks.page import fill
 from benchmarks.reconvergence_udp_mesh import airtime_us
+from meshctl.errors import MeshctlError
 from meshctl.lab.copybook import prepare
 from meshctl.lab.real import control
 from meshctl.lab.real.fleet import RealFleet
@@ -45,6 +46,8 @@ GONE = "b02"
 # under emulation, on a machine with other things to do; loop avoidance alone holds a new bat0 for half a minute
 _START_S, _COMMAND_S, _SETTLE_S = 600.0, 900.0, 240.0
 _POLL_S = 0.5
+# a connection into a starved machine may break; what is said to a node may be said again
+_TRIES = 3
 
 
 def main() -> None:
@@ -193,7 +196,14 @@ class Bench:
             list(pool.map(lambda name: self._on(name, command), names))
 
     def _on(self, name: str, command: str) -> str:
-        return self._fleet.node(name).exec(command, timeout_s=120.0).check(f"{name}: {command}").stdout
+        for left in reversed(range(_TRIES)):
+            try:
+                return self._fleet.node(name).exec(command, timeout_s=120.0).check(f"{name}: {command}").stdout
+            except MeshctlError as error:
+                if not left:
+                    raise
+                _say(f"{name}: {error}; again")
+        raise AssertionError("no try was made")
 
     def _machine(self, command: str, *, timeout_s: float = 60.0) -> str:
         return control.run(self._fleet.directory, command, timeout_s=timeout_s).check(command[:80]).stdout
