@@ -43,6 +43,8 @@ def _text(header: Header, key: str) -> str:
     except UnicodeEncodeError as error:
         # JSON can name half of a surrogate pair, which is no text
         raise RequestError("bad-request", f"{key}: expected Unicode text, found {value!r}") from error
+    if "\0" in value:
+        raise RequestError("bad-request", f"{key}: expected text without the character NUL, found {value!r}")
     return value
 
 

@@ -95,6 +95,8 @@ with MeshClient({str(bob.socket)!r}) as mesh:
         ("record-start", {"path": "/nowhere/run.jsonl"}, "cannot-record"),
         ("ping", {"peer": "nobody"}, "unknown-peer"),
         ("ping", {"peer": "bob", "timeout_s": -1}, "bad-request"),
+        ("set-keys", {"file": "fleet\0.key"}, "bad-request"),
+        ("record-start", {"path": "run\0.jsonl"}, "bad-request"),
     ],
 )
 def test_a_request_that_cannot_be_met_is_refused_with_a_word_and_a_reason(
