@@ -67,11 +67,31 @@ class RealDoors(Doors):
         made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
             async with asyncio.timeout(_DIAL_S):
-                await asyncio.get_running_loop().sock_connect(made, (door.address, _SSH_PORT))
+                await self._connected(made, host, door)
         except BaseException:
             made.close()
             raise
         return made
+
+    async def _connected(self, made: socket.socket, host: str, door: Door) -> None:
+        """Returns when the socket is connected. Raises LabError as soon as the door leads elsewhere: a node that has
+        given up an address does not refuse what still comes for it."""
+        connecting = asyncio.ensure_future(asyncio.get_running_loop().sock_connect(made, (door.address, _SSH_PORT)))
+        moving = asyncio.ensure_future(self._moved(host, door))
+        try:
+            await asyncio.wait((connecting, moving), return_when=asyncio.FIRST_COMPLETED)
+            if not connecting.done():
+                raise LabError(f"{door.node} is no longer at {door.address}")
+            await connecting
+        finally:
+            connecting.cancel()
+            moving.cancel()
+            # the socket must not be closed before its waiting has ended
+            await asyncio.gather(connecting, moving, return_exceptions=True)
+
+    async def _moved(self, host: str, door: Door) -> None:
+        while self._standing.get(host) == door:
+            await self.changed.wait()
 
     def is_hung(self, host: str) -> bool:
         door = self._standing.get(host)
