@@ -91,6 +91,7 @@ def test_both_radios_of_one_node_are_in_its_mesh(crew: Crew) -> None:
     until(lambda: heard_over(crew, "b02")["mesh1"] == {"husky"}, "the Husky over five gigahertz")
 
 
+@pytest.mark.proof
 def test_who_does_not_know_the_key_stays_outside(crew: Crew) -> None:
     crew.on(
         "husky", "for n in 0 1; do uci set wireless.mesh$n.key='a word of its own'; done; uci commit; reload_config"
@@ -105,6 +106,8 @@ def test_who_does_not_know_the_key_stays_outside(crew: Crew) -> None:
     crew.settle()
 
 
+# test_mesh_changes.py changes it with the channel and the BSSID, in every run
+@pytest.mark.proof
 def test_the_whole_mesh_takes_a_new_key_over_itself(crew: Crew) -> None:
     crew.write_keys(main="the new word of all")
     last = crew.provision(*FIELDED)[-1]
