@@ -26,6 +26,10 @@ LOSS_WEIGHT = 5.0
 LATE_AFTER_S = 0.006
 """Acknowledgements are late when they stay away for longer than their spacing takes, and at least this long."""
 
+URGENT_WAIT_S = 0.1
+"""Longest an urgent piece waits for what is on its way: that may stand in a queue of seconds, or be lost unnoticed. One
+datagram, with all that is small and waits, delays bulk by a hundredth."""
+
 PRESUMED_FOR_S = 0.03
 """So long the link is presumed to go on delivering; what its packets then wait is bounded by it."""
 
@@ -57,9 +61,16 @@ def permitted(outbound: Outbound, room: int, now: float, packets_per_s: float | 
     packets = room
     if urgent:
         packets += outbound.rates.urgent_excess_packets
+        if packets <= 0 and now >= urgent_may_wait_until(outbound):
+            packets = 1
     else:
         packets = min(packets, outbound.pacer.allowance(now, packets_per_s))
     return max(packets, outbound.probe_credit)
+
+
+def urgent_may_wait_until(outbound: Outbound) -> float:
+    """When an urgent piece leaves whatever is on its way (to a silent peer it is a probe)."""
+    return outbound.urgent_left_at + URGENT_WAIT_S
 
 
 def look_again(outbound: Outbound, room: int, now: float, packets_per_s: float | None) -> float | None:

@@ -7,7 +7,7 @@ last fragments, small messages, pieces sent again) is built frame by frame, smal
 
 import struct
 
-from udp_mesh.core.allowance import ack_spacing, look_again, permitted, window_room
+from udp_mesh.core.allowance import ack_spacing, look_again, permitted, urgent_may_wait_until, window_room
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.flight import Mark, Packet
 from udp_mesh.core.limiter import Gate
@@ -108,8 +108,11 @@ def leave_level(
         most = permitted(outbound, room, now, pace, urgent=urgent)
         if most <= 0:
             outbound.limited = False
-            if not urgent and (again := look_again(outbound, room, now, pace)) is not None:
-                outbound.wake_at = again
+            if urgent:
+                if outbound.silent_since is None:
+                    outbound.wake_at = min(outbound.wake_at, urgent_may_wait_until(outbound))
+            elif (again := look_again(outbound, room, now, pace)) is not None:
+                outbound.wake_at = min(outbound.wake_at, again)
             break
         message = run.message
         if message.superseded and run.again:
@@ -135,7 +138,9 @@ def leave_level(
             gate.spend(used - before)
         if outbound.probe_credit:
             outbound.probe_credit = max(0, outbound.probe_credit - count)
-        if not urgent:
+        if urgent:
+            outbound.urgent_left_at = now
+        else:
             outbound.pacer.spend(count, now, pace)
     return used
 

@@ -82,6 +82,7 @@ class Outbound(OpenMessages):
         self.overdue: list[Packet] = []
         """Packets that timed out and are neither known to have arrived nor sent again."""
         self.expired_at = float("-inf")
+        self.urgent_left_at = float("-inf")
         self.probe_credit = 0
         self.probed_at = float("-inf")
         self._bursts = Bursts()

@@ -3,6 +3,7 @@
 import pytest
 
 from tests.udp_mesh.core.pair import World, settings
+from udp_mesh.core.allowance import URGENT_WAIT_S
 from udp_mesh.core.events import MessageReceived
 from udp_mesh.core.settings import Topic
 
@@ -57,3 +58,26 @@ def test_urgent_messages_stay_urgent_on_a_path_that_became_slow(
     assert len(settled) > 50
     late = [payload for payload in settled if took.get(payload, 99.0) > urgent_within_s]
     assert len(late) <= len(settled) // 50, sorted(took.get(payload, 99.0) for payload in late)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("loss", [0.0, 0.1])
+def test_what_is_on_its_way_on_a_path_that_became_slow_holds_no_urgent_message_back(seed: int, loss: float) -> None:
+    """Hundreds of packets may stand in the path's queue, or be lost without anybody knowing: urgent ones join them."""
+    world = World(seed=seed)
+    for name in "ab":
+        world.add(settings(name, *TOPICS))
+    world.run(3.0)
+    for way in world.pipes.values():
+        way.rate_bits_per_s, way.loss = 20e6, loss
+    world.send("a", "map", bytes(20_000_000), "b")
+    world.run(2.0)
+    for way in world.pipes.values():
+        way.rate_bits_per_s = 200e3
+    outbound = world.nodes["a"]._state.roster.peers["b"].outbound
+    for number in range(200):
+        world.send("a", "status", b"%d" % number, "b")
+        world.run(URGENT_WAIT_S + 0.001)
+        waiting = [message for message in outbound.open if message.priority == 0 and not message.begun]
+        # a silent peer gets probes instead
+        assert not waiting or outbound.silent_since is not None
