@@ -20,6 +20,10 @@ LOST_PER_ROUND = 2
 """At least eight full pieces in more than a second: with half of all datagrams lost that happens once in some hundred
 times, and costs a tenth of the rate until `WIDEN_AFTER_S`."""
 
+DOUBT_S = 2.5
+"""And no full piece acknowledged for so long since the first round: on a path whose round trip has just become a second
+or two their acknowledgements are still to come, and what is cut anew although it arrived arrives twice."""
+
 PROBES_PER_SMALL = LOST_PER_ROUND + 1
 """Of the probes of a silent peer one in so many is small: a round takes the others."""
 
@@ -36,13 +40,14 @@ LEAST_FULL_BYTES = 450
 class PathSize:
     """What is known about one peer's path. `narrowed_at` is when it was last taken for narrower."""
 
-    __slots__ = ("_asked", "_lost", "_round_at", "_rounds", "narrowed_at")
+    __slots__ = ("_asked", "_doubted_at", "_lost", "_round_at", "_rounds", "narrowed_at")
 
     def __init__(self) -> None:
         self._lost = 0
         """Full pieces lost in this round."""
         self._rounds = 0
         self._round_at = 0.0
+        self._doubted_at = 0.0
         self._asked = 0
         self.narrowed_at: float | None = None
 
@@ -51,10 +56,9 @@ class PathSize:
         """Full pieces were lost and none arrived since."""
         return self._lost > 0 or self._rounds > 0
 
-    @property
-    def too_narrow(self) -> bool:
+    def too_narrow(self, now: float) -> bool:
         """Full pieces do not get through."""
-        return self._rounds >= ROUNDS
+        return self._rounds >= ROUNDS and now - self._doubted_at >= DOUBT_S
 
     def ask(self) -> bool:
         """Whether the next probe shall be small."""
@@ -78,6 +82,8 @@ class PathSize:
     def small_arrived(self, now: float) -> None:
         """A small datagram got there."""
         if self._lost >= LOST_PER_ROUND and now - self._round_at >= ROUND_S:
+            if not self._rounds:
+                self._doubted_at = now
             self._rounds += 1
             self._lost = 0
             self._round_at = now

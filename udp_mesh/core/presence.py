@@ -20,6 +20,7 @@ from udp_mesh.core.events import (
     PeerRestarted,
     TopicStarved,
 )
+from udp_mesh.core.message import Outgoing
 from udp_mesh.core.open_messages import Outcome
 from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.path_size import NARROWER_MTUS, WIDEN_AFTER_S
@@ -216,9 +217,17 @@ def _fit(outbound: Outbound, way: Way, *, all_of_it: bool) -> None:
     for message in list(outbound.open):
         if not all_of_it and message.begun and message.next_position >= message.fragments:
             continue
-        if message.begun and min(len(message.body), message.fragment_bytes) > way.fragment_bytes:
+        if message.begun and any(
+            not there and _size(message, position) > way.fragment_bytes
+            for position, there in enumerate(message.arrived)
+        ):
             outbound.cancel(message)
             outbound.send_anew(message)
+
+
+def _size(message: Outgoing, position: int) -> int:
+    start, end = message.span(position)
+    return end - start
 
 
 def _measure_path(state: State, peer: Peer, session: Session, now: float) -> None:
@@ -226,7 +235,7 @@ def _measure_path(state: State, peer: Peer, session: Session, now: float) -> Non
     outbound, way = peer.outbound, session.way
     size, info = outbound.path_size, state.links.get(way.link)
     narrower = [mtu for mtu in NARROWER_MTUS if mtu < way.mtu]
-    if size.too_narrow and narrower:
+    if size.too_narrow(now) and narrower:
         way.lead(way.link, way.address, narrower[0], state.settings.fragment_bytes)
         size.reset()
         size.narrowed_at = now

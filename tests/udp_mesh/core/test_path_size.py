@@ -153,3 +153,34 @@ def test_what_the_path_was_found_to_carry_outlives_a_reload(change: str) -> None
     assert world.run(5.0, until=lambda: len(topics(world, "a", MessageDelivered)) == 2)
     assert world.pipes["a", "b"].dropped == 0
     assert narrow(world) == [1280]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("loss", [0.05, 0.4])
+def test_a_path_that_becomes_long_and_lossy_is_not_taken_for_narrow_nor_does_anything_arrive_twice(
+    seed: int, loss: float
+) -> None:
+    world = World(seed=seed)
+    for name in ("a", "b"):
+        world.add(settings(name, *TOPICS))
+    assert world.run(20.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    sent = 0
+
+    def publish() -> None:
+        nonlocal sent
+        sent += 1
+        world.send("a", "status", bytes(100), "b")
+        world.send("b", "status", bytes(100), "a")
+        if not sent % 10:
+            world.send("a", "map", bytes(world.rng.randrange(2_000, 20_000)), "b")
+        if sent < 100:
+            world.at(world.now + 0.1, publish)
+
+    publish()
+    world.run(3.0)
+    for way in world.pipes.values():
+        way.delay_s, way.loss = 1.0, loss
+    assert world.run(60.0, until=lambda: len(topics(world, "a", MessageDelivered)) == 110)
+    world.run(5.0)
+    assert narrow(world) == []
+    assert sorted(topics(world, "b", MessageReceived)) == ["map"] * 10 + ["status"] * 100
