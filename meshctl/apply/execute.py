@@ -7,13 +7,14 @@ failed canary, a spent failure budget or Ctrl-C stops what has not begun; what i
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from meshctl.apply.access import Access
 from meshctl.apply.checks import expectation
 from meshctl.apply.flash import checked_image, flash
+from meshctl.apply.forget import booted_unforgotten_s
 from meshctl.apply.forgetting import NOT_ASKED, ask_the_rest, make_up_for
 from meshctl.apply.gather import facts_of, known_macs
 from meshctl.apply.job import Job, Work
@@ -64,35 +65,13 @@ def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
         node.hardware.name: checked_image(node.hardware)
         for node in (fleet.nodes[name] for name, planned in plan.nodes.items() if planned.firmware is not None)
     }
-    known = setting.journal.last_known(fleet.name)
-    seen = prepared.seen.observations
-    lost = {
-        name: at_s
-        for name, at_s in setting.journal.lost_sight_of(fleet.name).items()
-        if name in plan.nodes and name in seen
-    }
-    around = {**seen, **prepared.around}
-    if lost:
-        again = {name: seen[name] for name in lost}
-        around = look_around(setting.access, fleet, again, known, told=around, interrupt=setting.interrupt)
-    work = Work(
-        fleet,
-        setting.access,
-        setting.run,
-        setting.observer,
-        setting.interrupt,
-        setting.owner,
-        remember=lambda name, seen: setting.run.remember(fleet.name, name, facts_of(seen), seen.answered_at_s),
-        rate_bytes_per_s=setting.rate_bytes_per_s,
-        around=around,
-        names=known_macs(fleet, known),
-        bases=base_macs(fleet, seen, known),
-    )
+    unforgotten = _unforgotten(prepared, setting)
+    work = _work(prepared, setting, unforgotten)
     outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _without_work(fleet, made))}
     for outcome in outcomes.values():
         _tell(setting, outcome)
     jobs = _jobs(prepared, work)
-    for name, since_s in lost.items():
+    for name, since_s in unforgotten.items():
         make_up_for(_job(prepared, work, name), max(0.0, time.time() - since_s))
     budget = FailureBudget(fleet.apply.stop_after_failures)
     stopped = ""
@@ -113,6 +92,37 @@ def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
     outcomes.update(_searched(prepared, setting, jobs, outcomes))
     outcomes.update(_with_those_not_asked(work, outcomes))
     return {name: outcomes[name] for name in plan.nodes}
+
+
+def _unforgotten(prepared: Prepared, setting: Setting) -> dict[str, float]:
+    """The nodes that answered whose radios may have started anew without their neighbours having been told, and since
+    when (Unix time): of a change's beginning the end was not seen, or they have booted since they were last known."""
+    seen = prepared.seen.observations
+    lost = setting.journal.lost_sight_of(setting.fleet.name)
+    booted = {name: booted_unforgotten_s(name, seen) for name in prepared.plan.nodes}
+    since = {name: at_s for name, at_s in booted.items() if at_s is not None} | lost
+    return {name: at_s for name, at_s in since.items() if name in prepared.plan.nodes and name in seen}
+
+
+def _work(prepared: Prepared, setting: Setting, unforgotten: Iterable[str]) -> Work:
+    fleet, seen = setting.fleet, prepared.seen.observations
+    known = setting.journal.last_known(fleet.name)
+    around = {**seen, **prepared.around}
+    if again := {name: seen[name] for name in unforgotten}:
+        around = look_around(setting.access, fleet, again, known, told=around, interrupt=setting.interrupt)
+    return Work(
+        fleet,
+        setting.access,
+        setting.run,
+        setting.observer,
+        setting.interrupt,
+        setting.owner,
+        remember=lambda name, told: setting.run.remember(fleet.name, name, facts_of(told), told.answered_at_s),
+        rate_bytes_per_s=setting.rate_bytes_per_s,
+        around=around,
+        names=known_macs(fleet, known),
+        bases=base_macs(fleet, seen, known),
+    )
 
 
 # Results of a node that was in work and is out of sight.

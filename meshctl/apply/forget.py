@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 from meshctl.device.framing import quoted
 from meshctl.device.observation import Observation
-from meshctl.plan.radios import EVERY_RADIO, Radios
+from meshctl.plan.radios import EVERY_RADIO, SLACK_S, Radios
 from meshctl.topology import NEIGHBOUR_FRESH_MS, mesh_macs
 
 # Asked too early, while the old radio still sends, an entry comes back as it was; asked too late, when the node is
@@ -89,6 +89,25 @@ def silent_holders(
     known = frozenset(names.values())
     nameless = [name for name in fellows if name not in known] if strangers - names.keys() else []
     return tuple(name for name in dict.fromkeys((*named, *nameless)) if name != node and name not in told)
+
+
+def booted_unforgotten_s(node: str, around: Mapping[str, Observation]) -> float | None:
+    """When `node` booted (Unix time), if somebody has known a radio of it from before that; None otherwise."""
+    own = around.get(node)
+    if own is None or own.uptime_s is None:
+        return None
+    macs = frozenset(mesh_macs(own))
+    # whatever was read when, within the time that each answer took
+    booted_s = own.asked_at_s - own.uptime_s
+    is_known_from_before = any(
+        station.connected_s is not None
+        and station.mac.lower() in macs
+        and seen.answered_at_s - station.connected_s < booted_s - SLACK_S
+        for holder, seen in around.items()
+        for station in seen.stations or ()
+        if holder != node
+    )
+    return booted_s if is_known_from_before else None
 
 
 def neighbours_now(seen: Observation, names: Mapping[str, str]) -> tuple[str, ...]:

@@ -5,7 +5,7 @@
     while it is silent: the others, ever more seldom (`while_silent`); when it answers again: all that do not watch,
     those that did not tell before, and those that it hears now (`when_back`)
     when all nodes have ended: once more those that did not answer; the operator is told of the rest (`ask_the_rest`)
-    a change that an earlier run lost sight of: the same, as soon as its node is seen again (`make_up_for`)
+    a change that an earlier run lost sight of, or a reboot: the same, as soon as the node is seen again (`make_up_for`)
 
 All are asked at once, each within `ASK_S`. Nothing here is a reason for failure: a neighbour that does not answer, or
 cannot (19.07), changes no outcome; it is told.
@@ -223,9 +223,11 @@ def ask_the_rest(work: Work) -> dict[str, tuple[str, ...]]:
 
 
 def make_up_for(job: Job, ago_s: float) -> None:
-    """A change was begun on the node that long ago and its end not seen: whichever of its radios have started since,
-    their neighbours are asked to forget those that were there before."""
+    """A change was begun on the node that long ago and its end not seen, or it booted then: whichever of its radios
+    have started since, their neighbours are asked to forget those that were there before."""
     forgetting = Forgetting(job, started_within(job.before, ago_s))
+    if job.before.uptime_s is not None:
+        ago_s = min(ago_s, job.before.uptime_s + time.time() - job.before.asked_at_s)
     forgetting.began(ago_s)
     forgetting.when_back(job.before)
 

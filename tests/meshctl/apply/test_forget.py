@@ -17,6 +17,7 @@ from meshctl.apply.forget import (
     MOST_ASKED,
     Entry,
     behind,
+    booted_unforgotten_s,
     by_holder,
     entries_of,
     forget_script,
@@ -116,6 +117,29 @@ def test_a_stranger_may_be_any_fellow_whose_radios_nobody_has_seen() -> None:
 
 def hop(name: str, mac: str, next_hop: str, *, best: bool = True) -> Observation:
     return replace(running(fleet(), name), originators=(Originator(mac, next_hop, "mesh0", 100, best, 200),))
+
+
+def at(seen: Observation, asked_at_s: float, *, uptime_s: float | None) -> Observation:
+    return replace(seen, asked_at_s=asked_at_s, answered_at_s=asked_at_s + 1.0, uptime_s=uptime_s)
+
+
+@pytest.mark.parametrize(
+    ("connected_s", "is_old"), [(150, True), (104, True), (102, False), (40, False), (None, False)]
+)
+def test_who_has_known_a_radio_from_before_its_node_booted_must_forget_it(
+    connected_s: int | None, is_old: bool
+) -> None:
+    # it is up since 900, give or take what an answer takes; the neighbour knows it since 1001 - connected_s
+    around = {
+        "b01": at(
+            replace(knows("b01"), stations=(Station("mesh0", MAC, connected_s=connected_s),)), 1000, uptime_s=9e9
+        ),
+        "b02": at(itself(MAC), 1000.0, uptime_s=100.0),
+    }
+    assert booted_unforgotten_s("b02", around) == (900.0 if is_old else None)
+    assert booted_unforgotten_s("b01", around) is None
+    assert booted_unforgotten_s("b02", {**around, "b02": at(itself(MAC), 1000.0, uptime_s=None)}) is None
+    assert booted_unforgotten_s("b03", around) is None
 
 
 def test_those_whose_best_way_to_the_base_begins_with_the_node_are_behind_it() -> None:

@@ -169,6 +169,16 @@ def test_a_change_whose_end_nobody_saw_is_made_up_for_if_the_radio_has_started_s
     assert "-ge 100 ]" in anew.asked[0][1] or "-ge 101 ]" in anew.asked[0][1]
 
 
+def test_of_a_node_that_booted_since_what_was_known_before_its_boot_is_forgotten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("meshctl.apply.forgetting.time", SimpleNamespace(monotonic=lambda: 0.0, time=lambda: 1003.0))
+    seen = replace(node("b02", "b01"), asked_at_s=1000.0, uptime_s=40.0)
+    booted = Neighbours({"b02": seen})
+    make_up_for(booted.job, ago_s=500.0)
+    assert "-ge 43 ]" in booted.asked[0][1]
+
+
 def test_beside_whom_a_node_hears_those_are_looked_at_that_it_heard_lately() -> None:
     seen = {"b02": node("b02", "b01")}
     known = {
@@ -255,6 +265,16 @@ class TestOnAVirtualFleet:
         ended = Ended(process.returncode, "".join(said) + rest, err)
         assert ended.results == {"n001": "done"}, ended.out + ended.err
         assert notes(ended) == FORGOT
+
+    def test_after_a_reboot_the_next_run_has_the_neighbour_forget_the_radio_once(self, rig: Rig) -> None:
+        boot = rig.fleet.node("n001").boot_id
+        rig.meshctl("run", rig.current, "n001", command=["reboot"])
+        waiting.until(lambda: rig.fleet.node("n001").boot_id != boot, "the node to boot")
+        rig.fleet.node("n001").wait_up(wait_s=120.0)
+        for told in (FORGOT, []):
+            ended = rig.meshctl("provision", rig.current, "--yes", "--json")
+            assert ended.results["n001"] == "unchanged", ended.out + ended.err
+            assert notes(ended) == told
 
     def test_a_radio_that_started_anew_while_nobody_looked_is_made_up_for(self, rig: Rig) -> None:
         old, new = rig.current, {"a": "b", "b": "a"}[rig.current]

@@ -1,6 +1,11 @@
-# iw's stand-in, the printing part. A station that is deleted is known again from its next beacon, which is at once; all
-# of them are known since the node started.
-BEGIN { FS = "\t" }
+# iw's stand-in, the printing part. A station that is deleted is known again from its next beacon, which is at once; of the
+# others the node has known since it started.
+BEGIN {
+	FS = "\t"
+	while ((getline line < "/tmp/run/netifd/forgotten") > 0) { split(line, told, " "); since[told[1] " " told[2]] = told[3] }
+	# what is open for reading is not written
+	close("/tmp/run/netifd/forgotten")
+}
 function describe(indent, face,    width, type) {
 	type = face[2] == "adhoc" ? "IBSS" : face[2] == "mesh" ? "mesh point" : face[2] == "sta" ? "managed" : "AP"
 	printf "%sifindex %d\n%swdev 0x%x\n%saddr %s\n", indent, face[4] + 7, indent, face[4] * 4294967296 + 2, indent, face[3]
@@ -36,7 +41,7 @@ FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" && (act ==
 	known = 1
 	printf "Station %s (on %s)\n\tinactive time:\t%d ms\n\trx bytes:\t96000\n\trx packets:\t1200\n\ttx bytes:\t88000\n\ttx packets:\t1100\n\ttx retries:\t12\n\ttx failed:\t0\n\trx drop misc:\t0\n", $3, device, $5
 	printf "\tsignal:  \t%d [%d, %d] dBm\n\tsignal avg:\t%d [%d, %d] dBm\n", $4, $4 - 2, $4 - 4, $4, $4 - 2, $4 - 4
-	printf "\ttx bitrate:\t%.1f MBit/s MCS 15 short GI\n\trx bitrate:\t%.1f MBit/s MCS 15 short GI\n\texpected throughput:\t%.2fMbps\n\tauthorized:\tyes\n\tauthenticated:\tyes\n\tassociated:\tyes\n\tconnected time:\t%d seconds\n", $6, $6, $6 * 0.4, uptime
+	printf "\ttx bitrate:\t%.1f MBit/s MCS 15 short GI\n\trx bitrate:\t%.1f MBit/s MCS 15 short GI\n\texpected throughput:\t%.2fMbps\n\tauthorized:\tyes\n\tauthenticated:\tyes\n\tassociated:\tyes\n\tconnected time:\t%d seconds\n", $6, $6, $6 * 0.4, uptime - since[device " " $3]
 }
 function fail(text, number) { printf "command failed: %s (-%d)\n", text, number > "/dev/stderr"; exit 256 - number }
 END {
@@ -44,4 +49,5 @@ END {
 	# ad-hoc cells: Linux 5.7 and later; 19.07 has the wireless stack of 4.19
 	if (verb == "station" && act == "del" && type == "adhoc" && series == "19.07") fail("Operation not supported", 95)
 	if (verb == "station" && act != "dump" && !known) fail("No such file or directory", 2)
+	if (verb == "station" && act == "del") print device, mac, uptime >>"/tmp/run/netifd/forgotten"
 }
