@@ -4,6 +4,11 @@ A quantum of packets leaves together, then a timer waits for the next: fewer wak
 segments that offload can batch.
 """
 
+MOST_DEBT_S = 0.25
+"""What left beyond the pace (bursts to a peer that was silent), or at the pace of a path that was slow then, holds up
+what follows for no longer than this, or than a packet takes now: the window limits what is on its way, pacing only
+spreads it."""
+
 
 class Pacer:
     """`free_at` is when the next packet may leave; up to a quantum of unused time may be caught up."""
@@ -18,7 +23,7 @@ class Pacer:
         """How many packets may leave now."""
         if packets_per_s is None:
             return 1 << 30
-        start = self.free_at
+        start = self.free_at = min(self.free_at, now + max(MOST_DEBT_S, 1.0 / packets_per_s))
         if start > now:
             return 0
         start = max(start, now - self._quantum_s)

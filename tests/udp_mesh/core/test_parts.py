@@ -11,7 +11,7 @@ from udp_mesh.core.acks import AckState
 from udp_mesh.core.compression import compress, decompress
 from udp_mesh.core.flight import Flight, Mark, Packet
 from udp_mesh.core.limiter import Gate
-from udp_mesh.core.pacing import Pacer
+from udp_mesh.core.pacing import MOST_DEBT_S, Pacer
 from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.reassembly import PIECE_OVERHEAD_BYTES, Reassembly, Verdict, Whole
 from udp_mesh.core.settings import Limits
@@ -206,6 +206,18 @@ def test_a_compressed_bomb_is_refused_without_being_inflated() -> None:
 def test_anything_that_is_not_zlib_is_refused(body: bytes) -> None:
     result = decompress(body, 1000)
     assert result is None or zlib.compress(result)
+
+
+def test_what_left_at_the_pace_of_a_slow_path_holds_nothing_up_on_a_fast_one() -> None:
+    pacer, now = Pacer(0.003), 10.0
+    # ten bursts to a peer that was silent, when a packet took ten seconds
+    for _ in range(10):
+        pacer.spend(10, now, 0.1)
+    assert pacer.allowance(now, 0.1) == 0
+    assert pacer.wake_at(0.1) <= now + 10.0
+    assert pacer.allowance(now, 100.0) == 0
+    assert pacer.wake_at(100.0) <= now + MOST_DEBT_S
+    assert pacer.allowance(now + MOST_DEBT_S, 100.0) == 1
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 0.5), st.integers(1, 3000)), max_size=50))

@@ -4,7 +4,7 @@ import pytest
 
 from tests.udp_mesh.core.pair import World, settings
 from udp_mesh.core.allowance import URGENT_WAIT_S
-from udp_mesh.core.events import MessageReceived
+from udp_mesh.core.events import MessageDelivered, MessageReceived
 from udp_mesh.core.settings import Topic
 
 TOPICS = (Topic("status", priority=0), Topic("map", priority=7), Topic("video", priority=9, reliable=False))
@@ -81,3 +81,16 @@ def test_what_is_on_its_way_on_a_path_that_became_slow_holds_no_urgent_message_b
         waiting = [message for message in outbound.open if message.priority == 0 and not message.begun]
         # a silent peer gets probes instead
         assert not waiting or outbound.silent_since is not None
+
+
+def test_what_a_silent_and_then_slow_peer_was_sent_holds_nothing_up_when_its_path_is_well_again() -> None:
+    """Probes and bursts leave ahead of the pace, and were once owed for a minute at that of a path of seconds."""
+    world = World(seed=1)
+    for name in "ab":
+        world.add(settings(name, *TOPICS))
+    world.run(3.0)
+    world.send("a", "map", bytes(50_000), "b")
+    world.run(3.0)
+    world.nodes["a"]._state.roster.peers["b"].outbound.pacer.spend(100, world.now, 1.0)
+    world.send("a", "map", bytes(50_000), "b")
+    assert world.run(2.0, until=lambda: len(world.told("a", MessageDelivered)) == 2)
