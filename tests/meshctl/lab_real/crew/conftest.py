@@ -53,10 +53,7 @@ def crew(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Crew]:
     try:
         made = Crew(fleet, copy.inventory, place / "state")
         made.write_keys()
-        made.meshctl("bootstrap", "--yes", *FIELDED)
-        for name in FIELDED[1:]:
-            fleet.node(name).plug(False)
-        made.settle()
+        made.take_in()
         yield made
     finally:
         fleet.down()
