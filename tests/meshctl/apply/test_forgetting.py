@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ from meshctl.apply.neighbourhood import REMEMBERED_S, neighbours_of
 from meshctl.device.observation import Observation, Station, WirelessLink
 from meshctl.errors import NodeError
 from meshctl.fleet.journal import LastKnown
-from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, Radios
+from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, SLACK_S, Radios
 from tests import waiting
 from tests.meshctl.plan.support import fleet, running
 from tests.meshctl.proof.rig import Ended, Rig
@@ -208,6 +209,12 @@ def notes(ended: Ended) -> list[str]:
     return [event["text"] for event in told if "its radio" in event["text"]]
 
 
+def known_for_s(rig: Rig) -> list[int]:
+    """For how many seconds base has known each radio that it hears."""
+    told = rig.fleet.node("base").exec("iw dev mesh0 station dump").check("base: stations").stdout
+    return [int(age) for age in re.findall(r"connected time:\s*(\d+)", told)]
+
+
 FORGOT = ["base forgot its radio, to hear it anew"]
 
 
@@ -268,9 +275,11 @@ class TestOnAVirtualFleet:
 
     def test_after_a_reboot_the_next_run_has_the_neighbour_forget_the_radio_once(self, rig: Rig) -> None:
         boot = rig.fleet.node("n001").boot_id
+        waiting.until(lambda: max(known_for_s(rig), default=0) > SLACK_S + 2, "base to know the radio for a while")
         rig.meshctl("run", rig.current, "n001", command=["reboot"])
         waiting.until(lambda: rig.fleet.node("n001").boot_id != boot, "the node to boot")
         rig.fleet.node("n001").wait_up(wait_s=120.0)
+        waiting.until(lambda: bool(known_for_s(rig)), "its radio to be heard again")
         for told in (FORGOT, []):
             ended = rig.meshctl("provision", rig.current, "--yes", "--json")
             assert ended.results["n001"] == "unchanged", ended.out + ended.err
@@ -288,6 +297,7 @@ class TestOnAVirtualFleet:
         rig.fleet.break_("n001", "power-cut")
         waiting.until(lambda: rig.fleet.node("n001").boot_id != boot, "the node to boot")
         rig.fleet.node("n001").wait_up(wait_s=120.0)
+        waiting.until(lambda: bool(known_for_s(rig)), "its radio to be heard again")
         ended = rig.meshctl("provision", old, "n001", "--yes", "--json")
         assert ended.results == {"n001": "unchanged"}, ended.out + ended.err
         assert notes(ended) == FORGOT
