@@ -318,8 +318,10 @@ class _Feeder(threading.Thread):
                 break
             try:
                 self._channel.sendall(piece)
-            except OSError:
-                return  # the command ended without reading all of it; its exit status says what that means
+            except (paramiko.SSHException, OSError, EOFError):
+                # The command ended without reading all of it, as its exit status says, or the link was cut, as the
+                # reader finds out.
+                return
         with _quiet():
             self._channel.shutdown_write()
 

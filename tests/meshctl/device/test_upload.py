@@ -6,12 +6,14 @@ import hashlib
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import cast
 
+import paramiko
 import pytest
 
 from meshctl.device.connection import Completed, Connection, Endpoint
 from meshctl.device.errors import ChannelClosed, ConnectionLost, UploadFailed
-from meshctl.device.ssh import SshConnection
+from meshctl.device.ssh import SshConnection, _Feeder
 from meshctl.device.upload import CHUNK_BYTES, Progress, upload
 from meshctl.errors import InputError
 from tests.meshctl.device.sandbox import Sandbox
@@ -179,3 +181,18 @@ def test_a_path_that_names_no_file_is_a_mistake_of_ours(connection: SshConnectio
     for path in ("relative", "/", "/tmp/.."):
         with pytest.raises(ValueError, match="absolute path"):
             upload(connection, b"x", path)
+
+
+def test_a_link_that_is_cut_under_what_is_being_sent_ends_the_sending_and_nothing_else() -> None:
+    """paramiko says so with an EOFError of its own, at whatever moment of a write the link goes."""
+
+    class Gone:
+        def sendall(self, piece: bytes) -> None:
+            raise EOFError
+
+        def shutdown_write(self) -> None:
+            raise EOFError
+
+    feeder = _Feeder(cast(paramiko.Channel, Gone()), iter((b"first", b"second")))
+    feeder.run()
+    assert feeder.failure is None
