@@ -111,6 +111,18 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _parser(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, help_text: str, example: str
+) -> argparse.ArgumentParser:
+    return commands.add_parser(
+        name,
+        help=help_text,
+        description=f"{help_text[:1].upper()}{help_text[1:]}.",
+        epilog=f"example: {example}",
+        formatter_class=Help,
+    )
+
+
 def _command(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
     name: str,
@@ -121,13 +133,7 @@ def _command(
     daemon: bool = True,
     json: bool = True,
 ) -> argparse.ArgumentParser:
-    parser = commands.add_parser(
-        name,
-        help=help_text,
-        description=f"{help_text[:1].upper()}{help_text[1:]}.",
-        epilog=f"example: {example}",
-        formatter_class=Help,
-    )
+    parser = _parser(commands, name, help_text, example)
     parser.set_defaults(command=command)
     if daemon:
         parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket (default: %(default)s)")
@@ -140,13 +146,7 @@ def _commands_of(
     commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, help_text: str, example: str
 ) -> argparse._SubParsersAction[argparse.ArgumentParser]:
     """A command that has commands of its own."""
-    parser = commands.add_parser(
-        name,
-        help=help_text,
-        description=f"{help_text[:1].upper()}{help_text[1:]}.",
-        epilog=f"example: {example}",
-        formatter_class=Help,
-    )
+    parser = _parser(commands, name, help_text, example)
     return parser.add_subparsers(title="what", metavar="WHAT", required=True)
 
 
