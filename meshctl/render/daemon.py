@@ -156,12 +156,11 @@ def _links(fleet: Fleet, robot: str, computer: Computer) -> Iterator[str]:
     if not fleet.udp_mesh.broadcast:
         for peer in _others(fleet, robot):
             if peer.computer is not None:
-                yield from (
-                    "",
-                    "[[neighbours]]",
-                    f"name = {_text(peer.name)}",
-                    f'address = "{peer.computer.address.ip}"',
-                )
+                yield from _neighbour(peer.name, str(peer.computer.address.ip))
+
+
+def _neighbour(name: str, address: str) -> tuple[str, ...]:
+    return ("", "[[neighbours]]", f"name = {_text(name)}", f'address = "{address}"')
 
 
 def _fielded(fleet: Fleet, robot: str) -> Iterator[str]:
@@ -169,13 +168,7 @@ def _fielded(fleet: Fleet, robot: str) -> Iterator[str]:
     daemon there to know it, or that daemon's broadcasts would end the program."""
     for peer in _others(fleet, robot):
         if peer.fielded is not None:
-            yield from (
-                "",
-                "[[neighbours]]",
-                f"name = {_text(peer.name)}",
-                f'address = "{peer.fielded}"',
-                "legacy = true",
-            )
+            yield from (*_neighbour(peer.name, str(peer.fielded)), "legacy = true")
 
 
 def _others(fleet: Fleet, robot: str) -> Iterator[Robot]:
