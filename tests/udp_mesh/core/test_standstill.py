@@ -41,15 +41,20 @@ def test_a_team_that_stood_still_goes_on_where_it_was(stopped_s: float, lost: bo
     assert not world.told("b", PeerOffline)
 
 
+def stop(world: World, name: str, stopped_s: float) -> None:
+    """One node stands still, and what is sent to it meanwhile is lost; then it goes on."""
+    stopped = world.nodes.pop(name)
+    world.run(stopped_s)
+    world.nodes[name] = stopped
+
+
 @pytest.mark.parametrize("stopped_s", [5.0, 45.0, 200.0])
 def test_a_stopped_sender_takes_nobody_for_lost(stopped_s: float) -> None:
     """What the others said meanwhile did not fit the socket's buffer: to the sender they were silent."""
     world = met(3)
     world.send("a", "map", bytes(MAP_BYTES), "b")
     world.run(0.3)
-    sender = world.nodes.pop("a")
-    world.run(stopped_s)
-    world.nodes["a"] = sender
+    stop(world, "a", stopped_s)
     delivered_once(world, within_s=6.0)
     assert not world.told("a", PeerOffline)
     assert bool(world.told("b", PeerOffline)) == (stopped_s > 10)
@@ -60,9 +65,7 @@ def test_a_stopped_receiver_gets_the_message_when_it_goes_on(stopped_s: float) -
     world = met(4)
     world.send("a", "map", bytes(MAP_BYTES), "b")
     world.run(0.3)
-    receiver = world.nodes.pop("b")
-    world.run(stopped_s)
-    world.nodes["b"] = receiver
+    stop(world, "b", stopped_s)
     delivered_once(world, within_s=6.0)
     assert not world.told("b", PeerOffline)
     assert bool(world.told("a", PeerOffline)) == (stopped_s > 10)
