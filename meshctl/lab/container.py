@@ -106,9 +106,12 @@ def _own_uptime() -> None:
     if not os.path.exists("/proc/self/timens_offsets"):
         return
     ns.unshare(ns.CLONE_NEWTIME)
-    monotonic, boottime = int(time.clock_gettime(time.CLOCK_MONOTONIC)), int(time.clock_gettime(time.CLOCK_BOOTTIME))
+    # to the nanosecond: a node must never seem to have booted before it was switched on
+    monotonic, boottime = (
+        divmod(-time.clock_gettime_ns(clock), 10**9) for clock in (time.CLOCK_MONOTONIC, time.CLOCK_BOOTTIME)
+    )
     with open("/proc/self/timens_offsets", "w", encoding="ascii") as offsets:
-        offsets.write(f"monotonic -{monotonic} 0\nboottime -{boottime} 0\n")
+        offsets.write(f"monotonic {monotonic[0]} {monotonic[1]}\nboottime {boottime[0]} {boottime[1]}\n")
 
 
 def _mounts(container: Container) -> None:

@@ -59,7 +59,8 @@ def started_within(seen: Observation, seconds: float) -> Radios:
     """The radios that must have started within these last seconds: they know somebody, and nobody for longer; or the
     whole node has. One that knows nobody, or does not tell for how long, is not taken for one that did.
     """
-    if seen.uptime_s is not None and seen.uptime_s < seconds:
+    # two clocks: one that booted just before has started its radios anew just as well
+    if seen.uptime_s is not None and seen.uptime_s < seconds + SLACK_S:
         return EVERY_RADIO
     known: dict[str, list[int | None]] = {}
     for station in seen.stations or ():

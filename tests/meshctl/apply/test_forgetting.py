@@ -288,6 +288,7 @@ class TestOnAVirtualFleet:
     def test_a_radio_that_started_anew_while_nobody_looked_is_made_up_for(self, rig: Rig) -> None:
         old, new = rig.current, {"a": "b", "b": "a"}[rig.current]
         boot = rig.fleet.node("n001").boot_id
+        waiting.until(lambda: max(known_for_s(rig), default=0) > SLACK_S + 2, "base to know the radio for a while")
         with rig.start("provision", new, "n001", "--yes", "--json") as process:
             assert process.stdout is not None
             for line in process.stdout:

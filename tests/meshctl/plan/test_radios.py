@@ -80,3 +80,5 @@ def test_a_radio_that_knows_nobody_for_longer_has_started_since_and_one_that_kno
     assert started_within(seen, 90.0) == NO_RADIOS
     assert started_within(replace(seen, stations=None), 100.0) == NO_RADIOS
     assert started_within(replace(seen, uptime_s=99.0), 100.0) == EVERY_RADIO
+    # that long by the operator's clock, a little longer by its own
+    assert started_within(replace(seen, uptime_s=101.0), 100.0) == EVERY_RADIO
