@@ -138,9 +138,11 @@ def _steady(cell: Cell, seen: Measured, since_s: float, until_s: float) -> dict[
         "wire_ratio": (sender.in_bytes + receiver.in_bytes) / delivered if delivered else None,
         "datagrams_per_mb": (sender.in_frames + receiver.in_frames) / delivered * 1e6 if delivered else None,
         "airtime_s_per_mb": seen.count.airtime_s / delivered * 1e6 if delivered else None,
-        "sender_cpu": seen.sender_cpu_s / cell.load.seconds,
+        "sender_cpu": None if seen.sender_cpu_s is None else seen.sender_cpu_s / cell.load.seconds,
         "receiver_cpu": seen.receiver_cpu_s / cell.load.seconds,
-        "cpu_s_per_mb": (seen.sender_cpu_s + seen.receiver_cpu_s) / delivered * 1e6 if delivered else None,
+        "cpu_s_per_mb": (seen.sender_cpu_s + seen.receiver_cpu_s) / delivered * 1e6
+        if delivered and seen.sender_cpu_s is not None
+        else None,
     }
 
 
