@@ -1,6 +1,7 @@
 """What the transport is held to (docs/facts/transport-facts.md, "Goals"), as data the tables are checked against.
 
-A goal names a set, a cell, a figure and a bound; a missed goal is printed as missed, never hidden.
+A goal names a set, a cell, a figure and a bound; a missed goal is printed as missed, never hidden. Beside them ours is
+compared with the best of the others in every cell they crossed.
 """
 
 from __future__ import annotations
@@ -54,6 +55,37 @@ GOALS: tuple[Goal, ...] = (
 )
 
 
+COMPARED: tuple[tuple[str, bool], ...] = (
+    # figure, and whether more is better
+    ("share", True),
+    ("urgent_p99_s", False),
+    ("recovery_fresh_s", False),
+    ("share_after", True),
+    ("settled_p99_s", False),
+)
+# whose urgent messages do not arrive has no latency to compare
+_LEAST_ARRIVED = 0.99
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Our figure in a cell and that of the best other transport; None where nothing comparable came of it."""
+
+    set: str
+    cell: str
+    figure: str
+    ours: float | None
+    best: float | None
+    best_peer: str
+    more_is_better: bool
+
+    @property
+    def ahead(self) -> bool:
+        if self.ours is None or self.best is None:
+            return self.ours is not None
+        return self.ours >= self.best if self.more_is_better else self.ours <= self.best
+
+
 def medians(results: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """One result per cell: the median of each figure over the runs that have it, and how many `runs` there were.
 
@@ -71,6 +103,35 @@ def medians(results: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 whole[figure] = median(values) if 2 * len(values) > len(runs) else None
         summary.append(whole)
     return summary
+
+
+def compared(results: Iterable[Mapping[str, Any]]) -> list[Comparison]:
+    """Ours against the best of the others: each figure of every cell that at least one of them crossed."""
+    cells: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
+    for result in medians(results):
+        cells.setdefault((result["set"], result["name"]), {})[result["peer"]] = result
+    made = []
+    for (set_name, name), peers in cells.items():
+        others = {peer: result for peer, result in peers.items() if not peer.startswith(OURS)}
+        if OURS not in peers or not others:
+            continue
+        for figure, more_is_better in COMPARED:
+            if all(peer.get(figure) is None for peer in peers.values()):
+                # not asked in this cell: a load without urgent messages, or without a cut
+                continue
+            known = {peer: value for peer, r in others.items() if (value := _comparable(r, figure)) is not None}
+            best_peer = (max if more_is_better else min)(known, key=known.__getitem__) if known else ""
+            ours = _comparable(peers[OURS], figure)
+            made.append(Comparison(set_name, name, figure, ours, known.get(best_peer), best_peer, more_is_better))
+    return made
+
+
+def _comparable(result: Mapping[str, Any], figure: str) -> float | None:
+    arrived = result.get("urgent_arrived")
+    if figure == "urgent_p99_s" and arrived is not None and arrived < _LEAST_ARRIVED:
+        return None
+    value = result.get(figure)
+    return None if value is None else float(value)
 
 
 def judged(results: Iterable[Mapping[str, Any]]) -> list[tuple[Goal, float | None, bool]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from benchmarks.goals import judged, medians
+from benchmarks.goals import compared, judged, medians
 
 _COLUMNS: dict[str, tuple[str, float, str]] = {
     # figure: heading, factor, format
@@ -77,4 +77,24 @@ def report(results: Sequence[Mapping[str, Any]]) -> str:
             row([goal.set, goal.cell, heading, f"{sign} {bound * factor:g}", shown(goal.figure, value),
                  verdict(met)])
         )  # fmt: skip
-    return "\n\n".join([*parts, "### goals\n\n" + "\n".join(goals)]) + "\n"
+    parts += ["### goals\n\n" + "\n".join(goals), "### beside the best of the others\n\n" + _comparisons(results)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _comparisons(results: Sequence[Mapping[str, Any]]) -> str:
+    lines = [row(["set", "link", "figure", "ours", "best other", "which", ""]), row(["---"] * 7)]
+    lines += [
+        row(
+            [
+                one.set,
+                one.cell,
+                _COLUMNS[one.figure][0],
+                shown(one.figure, one.ours),
+                shown(one.figure, one.best),
+                one.best_peer or "none",
+                "ahead" if one.ahead else "**behind**",
+            ]
+        )
+        for one in compared(results)
+    ]
+    return "\n".join(lines)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.cells import OURS, SETS, cells
-from benchmarks.goals import GOALS, judged, medians
+from benchmarks.goals import GOALS, compared, judged, medians
 from benchmarks.page import fill
 from benchmarks.tables import report
 from benchmarks.trial import percentile
@@ -53,6 +53,24 @@ def test_a_cell_run_several_times_is_judged_by_its_median() -> None:
     runs = [{"set": "loss", "name": "0%", "peer": OURS, "share": share} for share in (0.2, 0.96, 0.97)]
     assert [(result["share"], result["runs"]) for result in medians(runs)] == [(0.96, 3)]
     assert [met for goal, _, met in judged(runs) if goal.figure == "share"] == [True]
+
+
+def test_ours_is_compared_with_the_best_other_that_delivers_and_told_as_behind_where_it_is() -> None:
+    cell = {"set": "loss", "name": "0%"}
+    results = [
+        {**cell, "peer": OURS, "share": 0.95, "urgent_p99_s": 0.02, "urgent_arrived": 1.0},
+        {**cell, "peer": f"{OURS}, window 3", "share": 0.99, "urgent_p99_s": 0.001, "urgent_arrived": 1.0},
+        {**cell, "peer": "fast", "share": 0.96, "urgent_p99_s": 0.2, "urgent_arrived": 1.0},
+        {**cell, "peer": "lossy", "share": 0.1, "urgent_p99_s": 0.01, "urgent_arrived": 0.5},
+    ]
+    found = {one.figure: (one.best, one.best_peer, one.ahead) for one in compared(results)}
+    assert found == {"share": (0.96, "fast", False), "urgent_p99_s": (0.2, "fast", True)}
+    assert report(results).count("**behind**") == 1
+    nothing = [results[0], {**cell, "peer": "dead", "share": 0.0, "urgent_p99_s": None, "urgent_arrived": 0.0}]
+    assert [(one.figure, one.best, one.ahead) for one in compared(nothing)] == [
+        ("share", 0.0, True),
+        ("urgent_p99_s", None, True),
+    ]
 
 
 def test_what_mostly_never_arrived_has_no_median() -> None:
