@@ -147,10 +147,10 @@ def close(state: State, now: float) -> None:
         if not peer.engaged:
             continue
         for message in list(peer.outbound.open):
-            if message.store_key is None:
-                peer.outbound.finish(message, ExpiryReason.CLOSED)
-            else:
+            if state.outboxes.on_disk(message.store_key):
                 peer.outbound.withdraw(message)
+            else:
+                peer.outbound.finish(message, ExpiryReason.CLOSED)
         report_ended(state, peer, now)
     for name, held in state.outboxes.drop_all():
         tell_expired(state, name, held.accepted, ExpiryReason.CLOSED)

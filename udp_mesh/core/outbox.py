@@ -107,6 +107,10 @@ class Outboxes:
         stored = StoredMessage(key, peer, topic.name, type_name, accepted.payload, remaining)
         return key if self._store.put(stored) else None
 
+    def on_disk(self, store_key: int | None) -> bool:
+        """Whether a message will be there in the next run."""
+        return store_key is not None and self._store is not None and self._store.holds(store_key)
+
     def hold(self, peer: str, new: Held, now: float) -> list[tuple[Held, ExpiryReason]]:
         """Keep a message; returns those that had to go for it (perhaps this one)."""
         accepted = new.accepted
@@ -125,7 +129,7 @@ class Outboxes:
             self._drop(shelf, oldest)
             gone.append((oldest, ExpiryReason.SUPERSEDED if last else ExpiryReason.OUTBOX_FULL))
         if not new.gone:
-            if new.store_key is None:
+            if not self.on_disk(new.store_key):
                 new.store_key = self.keep(peer, accepted, now)
             self._note_deadline(peer, new)
         return gone
@@ -186,7 +190,7 @@ class Outboxes:
             for peer, shelves in self._held.items()
             for shelf in shelves.values()
             for held in shelf.held
-            if not held.gone and held.store_key is None
+            if not held.gone and not self.on_disk(held.store_key)
         ]
         self._held.clear()
         self._deadlines.clear()

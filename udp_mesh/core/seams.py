@@ -49,10 +49,14 @@ class StoredMessage:
 
 
 class Store(Protocol):
-    """Where outboxes on disk live; the daemon's is a directory. Calls are few and synchronous."""
+    """Where outboxes on disk live; the daemon's is a directory. Calls are few and wait for no disk."""
 
     def put(self, message: StoredMessage) -> bool:
-        """Keep the message until `remove`; it survives a crash once this returns True (False: there is no room)."""
+        """Keep the message until `remove`; False: there is no room. When it survives a crash is the store's to tell."""
+        ...
+
+    def holds(self, key: int) -> bool:
+        """Whether the message is kept, or about to be; False once the disk has refused it."""
         ...
 
     def remove(self, key: int) -> None:

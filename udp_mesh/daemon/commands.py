@@ -272,8 +272,8 @@ def record_start(service: Service, _client: Client, header: Header, _: bytes) ->
     return {}
 
 
-def record_stop(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
-    recorder = service.stop_recording()
+async def record_stop(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
+    recorder = await service.stop_recording()
     if recorder is None:
         raise RequestError("not-recording", "nothing is being recorded")
     return {"path": str(recorder.path), "bytes": recorder.bytes, "lines": recorder.lines}

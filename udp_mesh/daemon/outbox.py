@@ -1,9 +1,10 @@
 """Messages held on disk for peers that are away: one file per message in one directory.
 
-`put` writes a file under a temporary name and renames it: from then on it survives the end of this process (SIGKILL
-too). `flush` makes everything put so far survive a power cut (fsync of files and directory), away from the event
-loop; the daemon answers a publisher of such a topic after it. `load` reads what is kept, and sets aside what is
-damaged. The directory is bounded: past `limit_bytes` a message is refused and counted rather than filling the disk.
+`put` takes a message and hands it to a thread that writes it, in the order put, under a temporary name that it then
+renames: once `flush` returns, everything put before is on the disk (fsync of files and directory) and survives a power
+cut; the daemon answers a publisher of such a topic after it. However slow the disk, nobody else waits for it. `load`
+reads what is kept, and sets aside what is damaged. The directory is bounded: past `limit_bytes` a message is refused
+and counted rather than filling the disk.
 
 A file is a line with the message's fields as JSON and the CRC-32 of these and the payload, then the payload.
 """
@@ -15,8 +16,10 @@ import contextlib
 import json
 import logging
 import os
+import threading
 import time
 import zlib
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from udp_mesh.core.seams import StoredMessage
@@ -26,24 +29,38 @@ log = logging.getLogger(__name__)
 SUFFIX = ".message"
 TELL_AGAIN_S = 60.0
 """Between two lines of the log that say the disk is full."""
+_CHECKSUM_BYTES = 8
 
 
 class DirectoryStore:
-    """The core's `Store` over a directory (made with the first message, readable by its owner only)."""
+    """The core's `Store` over a directory (made with the first message, readable by its owner only).
+
+    What waits to be written is bounded as the directory is, since both count from `put` on.
+    """
 
     def __init__(self, directory: Path, limit_bytes: int) -> None:
         self._directory = directory
         self._limit_bytes = limit_bytes
+        # what both the caller's thread and the writing one change
+        self._lock = threading.Lock()
         self._sizes: dict[int, int] = {}
-        self._unflushed: set[Path] = set()
         self._told_at = float("-inf")
         self.bytes = 0
-        """Bytes of all files kept."""
+        """Bytes of all files kept, those still to be written included."""
         self.refused = 0
         """Messages not kept because the directory is full or the disk failed: they are held in memory only."""
+        self.puts = 0
+        """How many were taken since the start: who sees it grow has something to flush."""
+        self._flushed_puts = 0
+        # the caller's alone: what is not written yet needs not be when it is delivered first
+        self._writes: dict[int, Future[None]] = {}
+        # the writing thread's alone
+        self._unsynced: set[Path] = set()
+        self._disk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="outbox")
 
     def put(self, message: StoredMessage) -> bool:
-        """Keep it; False where the bound or the disk refuses, which is counted and logged."""
+        """Have it written; False where the bound refuses, which is counted and logged. What the disk refuses later is
+        counted and logged likewise, and not held (`holds`)."""
         head = json.dumps(
             {
                 "key": message.key,
@@ -54,30 +71,37 @@ class DirectoryStore:
                 "bytes": len(message.payload),
             }
         ).encode()
-        head += f" {_checksum(head, message.payload):08x}".encode()
-        size = len(head) + 1 + len(message.payload)
-        more = size - self._sizes.get(message.key, 0)
-        if self.bytes + more > self._limit_bytes:
-            self._refuse("outbox-full", f"directory={self._directory} bytes={self.bytes} limit={self._limit_bytes}")
-            return False
-        path = self._path(message.key)
+        size = len(head) + 1 + _CHECKSUM_BYTES + 1 + len(message.payload)
+        with self._lock:
+            more = size - self._sizes.get(message.key, 0)
+            if self.bytes + more > self._limit_bytes:
+                why = f"directory={self._directory} bytes={self.bytes} limit={self._limit_bytes}"
+                self._refuse("outbox-full", why)
+                return False
+            self.bytes += more
+            self._sizes[message.key] = size
+        self.puts += 1
+        self._writes[message.key] = self._disk.submit(self._write, message.key, head, message.payload)
+        return True
+
+    def _write(self, key: int, head: bytes, payload: bytes) -> None:
+        path = self._path(key)
         temporary = path.with_suffix(".new")
         try:
             self._directory.mkdir(parents=True, exist_ok=True, mode=0o700)
             with temporary.open("wb") as file:
-                file.write(head + b"\n")
-                file.write(message.payload)
+                file.write(b"%b %08x\n" % (head, _checksum(head, payload)))
+                file.write(payload)
             temporary.rename(path)
         except OSError as error:
-            self._refuse("outbox-write-failed", f"path={path} error={error}")
             # A full disk: what is half written must not keep it full.
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
-            return False
-        self.bytes += more
-        self._sizes[message.key] = size
-        self._unflushed.add(path)
-        return True
+            with self._lock:
+                self.bytes -= self._sizes.pop(key, 0)
+                self._refuse("outbox-write-failed", f"path={path} error={error}")
+            return
+        self._unsynced.add(path)
 
     def _refuse(self, event: str, why: str) -> None:
         """Counted each time, logged now and then: a disk stays full for long."""
@@ -88,16 +112,27 @@ class DirectoryStore:
             log.error("%s held-in-memory=%d %s", event, self.refused, why)
 
     def remove(self, key: int) -> None:
-        size = self._sizes.pop(key, None)
-        if size is None:
-            return
-        path = self._path(key)
-        self.bytes -= size
-        self._unflushed.discard(path)
+        with self._lock:
+            size = self._sizes.pop(key, None)
+            if size is None:
+                return
+            self.bytes -= size
+        write = self._writes.pop(key, None)
+        if write is not None:
+            write.cancel()
+        self._disk.submit(self._unlink, self._path(key))
+
+    def _unlink(self, path: Path) -> None:
+        self._unsynced.discard(path)
         try:
             path.unlink(missing_ok=True)
         except OSError as error:
             log.error("outbox-remove-failed path=%s error=%s", path, error)
+
+    def holds(self, key: int) -> bool:
+        """Whether it is on disk, or about to be."""
+        with self._lock:
+            return key in self._sizes
 
     def load(self) -> list[StoredMessage]:
         messages: list[StoredMessage] = []
@@ -120,21 +155,20 @@ class DirectoryStore:
 
     @property
     def needs_flush(self) -> bool:
-        return bool(self._unflushed)
+        return self._flushed_puts < self.puts
 
-    def take_unflushed(self) -> list[Path]:
-        """The files put since the last call, to be handed to `flush`."""
-        paths = sorted(self._unflushed)
-        self._unflushed.clear()
-        return paths
+    def flush(self) -> Future[None]:
+        """Done when the disk holds everything put so far and not removed."""
+        self._flushed_puts = self.puts
+        self._writes = {key: write for key, write in self._writes.items() if not write.done()}
+        return self._disk.submit(self._sync_all)
 
-    def flush(self, paths: list[Path]) -> None:
-        """Waits until the disk holds these files; runs in a thread of its own. A file already removed is no error."""
+    def _sync_all(self) -> None:
+        paths = sorted(self._unsynced)
+        self._unsynced.clear()
         for path in paths:
             try:
                 _sync(path, os.O_RDONLY)
-            except FileNotFoundError:
-                continue
             except OSError as error:
                 log.error("outbox-flush-failed path=%s error=%s", path, error)
         try:
@@ -143,12 +177,16 @@ class DirectoryStore:
         except OSError as error:
             log.error("outbox-flush-failed path=%s error=%s", self._directory, error)
 
+    def close(self) -> None:
+        """Waits until everything put is written."""
+        self._disk.shutdown()
+
     def _path(self, key: int) -> Path:
         return self._directory / f"{key:020d}{SUFFIX}"
 
 
 class Flusher:
-    """Flushes away from the loop, one round at a time: whoever comes meanwhile shares the next."""
+    """Flushes one round at a time: whoever comes meanwhile shares the next."""
 
     def __init__(self, store: DirectoryStore) -> None:
         self._store = store
@@ -157,9 +195,8 @@ class Flusher:
     async def flush(self) -> None:
         """Returns when the disk has all that was put before: that may be in the hands of the round under way."""
         async with self._turn:
-            paths = self._store.take_unflushed()
-            if paths:
-                await asyncio.get_running_loop().run_in_executor(None, self._store.flush, paths)
+            if self._store.needs_flush:
+                await asyncio.wrap_future(self._store.flush())
 
 
 def _sync(path: Path, flags: int) -> None:

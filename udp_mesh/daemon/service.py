@@ -103,7 +103,8 @@ class Service:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self.driver.close()
-        self.stop_recording()
+        await self.stop_recording()
+        await asyncio.get_running_loop().run_in_executor(None, self.store.close)
 
     # Requests (the local API calls these)
 
@@ -157,6 +158,7 @@ class Service:
         """Accepts a message; later, where it must first be on disk. Raises RequestError."""
         if topic.startswith(RESERVED_PREFIX) and topic != BENCH_TOPIC:
             raise RequestError("reserved-topic", f"{topic} belongs to the daemon")
+        stored = self.store.puts
         outcome = self.driver.send(topic, payload, destination=destination, type_name=type_name)
         if isinstance(outcome, Rejected):
             raise RequestError(outcome.reason.value.replace(" ", "-"), f"{outcome.reason.value}: {outcome.detail}")
@@ -179,7 +181,8 @@ class Service:
             self._outcomes[outcome] = client
             if len(self._outcomes) > MAX_OUTCOMES:
                 self._outcomes.popitem(last=False)
-        return self._flushed(outcome) if self.store.needs_flush else outcome
+        # one that is not stored never waits for those that are
+        return self._flushed(outcome) if self.store.puts > stored else outcome
 
     async def _flushed(self, message: int) -> int:
         await self._flusher.flush()
@@ -266,13 +269,12 @@ class Service:
             raise RequestError("cannot-record", f"{path}: {error.strerror}") from error
         self.recorder.conditions(self.driver.conditions())
 
-    def stop_recording(self) -> Recorder | None:
-        """Ends the recording; returns it (None: there was none)."""
+    async def stop_recording(self) -> Recorder | None:
+        """Ends the recording; returns it when it is written whole (None: there was none)."""
         recorder, self.recorder = self.recorder, None
         if recorder is not None:
-            if recorder.open:
-                recorder.conditions(self.driver.conditions())
-            recorder.close()
+            recorder.conditions(self.driver.conditions())
+            await asyncio.wrap_future(recorder.close())
         return recorder
 
     # Events

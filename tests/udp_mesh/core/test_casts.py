@@ -168,6 +168,9 @@ class Disk:
         self.kept[message.key] = message
         return True
 
+    def holds(self, key: int) -> bool:
+        return key in self.kept
+
     def remove(self, key: int) -> None:
         self.kept.pop(key, None)
 

@@ -186,10 +186,18 @@ class FullDisk(Disk):
         return False
 
 
+class FailingDisk(Disk):
+    """Takes everything, and finds out later that it cannot write."""
+
+    def put(self, message: StoredMessage) -> bool:
+        return True
+
+
 @pytest.mark.parametrize("online", [True, False])
-def test_a_message_the_disk_had_no_room_for_ends_with_the_node(online: bool) -> None:
+@pytest.mark.parametrize("disk", [FullDisk, FailingDisk])
+def test_a_message_the_disk_had_no_room_for_ends_with_the_node(online: bool, disk: type[Disk]) -> None:
     topic = Topic("t", outbox=Outbox.ALL, outbox_on_disk=True)
-    world = met(topic, store=FullDisk())
+    world = met(topic, store=disk())
     reach(world, up=False)
     if not online:
         assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))

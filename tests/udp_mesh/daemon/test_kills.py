@@ -5,10 +5,12 @@ import socket
 import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+from tests.udp_mesh.daemon.disks import standing_disk
 from tests.udp_mesh.daemon.processes import (
     KEY,
     OTHER_KEY,
@@ -56,6 +58,26 @@ def test_what_waited_on_disk_when_the_sender_was_killed_is_delivered_after_its_r
             alice.start()
             entries = {message.payload for message in collect(receiver, 10)}
     assert entries == {b"entry %d" % number for number in range(10)}
+
+
+def test_a_disk_that_stands_still_holds_up_nobody_but_the_publisher_who_waits_for_it() -> None:
+    topics = 'log = { priority = 8, outbox = "all", outbox_on_disk = true }'
+    with (
+        two_daemons(topics) as (alice, bob),
+        standing_disk(alice.folder / "alice" / "outbox", 0) as go_on,
+        alice.client() as patient,
+        alice.client() as sender,
+        bob.client() as receiver,
+    ):
+        receiver.subscribe("log", "status")
+        with ThreadPoolExecutor(1) as waiting:
+            answer = waiting.submit(patient.publish, "log", b"entry", to="bob", notify=True)
+            assert collect(receiver, 1)[0].payload == b"entry"
+            sender.publish("status", b"now", to="bob")
+            assert collect(receiver, 1)[0].payload == b"now"
+            assert not answer.done()
+            go_on()
+            assert outcomes(patient, 1) == {answer.result(WAIT_S): "delivered"}
 
 
 def test_a_reload_under_load_drops_nothing() -> None:

@@ -5,13 +5,13 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.udp_mesh.daemon.disks import standing_disk
 from tests.udp_mesh.links.sockets import WAIT_S
 from udp_mesh.core.seams import StoredMessage
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
@@ -27,6 +27,7 @@ def test_what_was_put_and_not_removed_is_loaded_oldest_first(tmp_path: Path) -> 
         store.put(message(key, bytes([key]) * 1000, remaining_s=key / 3))
     store.remove(2)
     store.remove(99)
+    store.close()
     later = DirectoryStore(tmp_path / "outbox", 1 << 20)
     assert later.load() == [message(1, b"\x01" * 1000, 1 / 3), message(3, b"\x03" * 1000, 1.0)]
     assert later.bytes == store.bytes
@@ -43,6 +44,7 @@ def test_the_directory_equals_a_dictionary(steps: list[tuple[int, bool, bytes]])
             else:
                 store.remove(key)
                 expected.pop(key, None)
+        store.close()
         again = DirectoryStore(Path(folder), 1 << 20)
         assert again.load() == [expected[key] for key in sorted(expected)]
         assert again.bytes == store.bytes
@@ -52,6 +54,7 @@ def test_a_full_directory_refuses_and_counts(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path, 3000)
     for key in range(5):
         store.put(message(key, bytes(1000)))
+    store.close()
     assert store.refused == 3
     assert len(store.load()) == 2
 
@@ -60,6 +63,7 @@ def test_a_damaged_file_is_set_aside_and_the_others_load(tmp_path: Path) -> None
     store = DirectoryStore(tmp_path, 1 << 20)
     for key in (1, 2, 3):
         store.put(message(key))
+    store.close()
     torn = tmp_path / f"{2:020d}.message"
     torn.write_bytes(torn.read_bytes()[:-1])
     (tmp_path / "half.new").write_bytes(b"half")
@@ -72,38 +76,48 @@ def test_flushing_skips_what_was_delivered_meanwhile(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path, 1 << 20)
     store.put(message(1))
     store.put(message(2))
-    paths = store.take_unflushed()
     store.remove(1)
-    store.flush(paths)
+    store.flush().result(WAIT_S)
     assert not store.needs_flush
+    assert store.holds(2)
+    assert not store.holds(1)
+    store.close()
+    assert [path.name for path in tmp_path.iterdir()] == [f"{2:020d}.message"]
 
 
-class SlowDisk(DirectoryStore):
-    """Flushes when `go` is set."""
-
-    def __init__(self, directory: Path) -> None:
-        super().__init__(directory, 1 << 20)
-        self.go = threading.Event()
-
-    def flush(self, paths: list[Path]) -> None:
-        assert self.go.wait(WAIT_S)
-        super().flush(paths)
+def test_nobody_but_who_asks_waits_for_a_disk_that_stands_still(tmp_path: Path) -> None:
+    store = DirectoryStore(tmp_path, 1 << 20)
+    with standing_disk(tmp_path, 1) as go_on:
+        for key in (1, 2, 3):
+            assert store.put(message(key))
+        store.remove(2)
+        asked = store.flush()
+        assert not asked.done()
+        assert store.bytes > 0
+        assert not (tmp_path / f"{3:020d}.message").exists()
+        go_on()
+        asked.result(WAIT_S)
+    assert not (tmp_path / f"{2:020d}.message").exists()
+    assert (tmp_path / f"{3:020d}.message").exists()
+    store.close()
 
 
 def test_nobody_is_told_of_a_flush_that_others_still_wait_for(tmp_path: Path) -> None:
     async def run() -> None:
-        store = SlowDisk(tmp_path)
+        store = DirectoryStore(tmp_path, 1 << 20)
         flusher = Flusher(store)
-        store.put(message(1))
-        store.put(message(2))
-        first, second = (asyncio.create_task(flusher.flush()) for _ in range(2))
-        for _ in range(100):
-            await asyncio.sleep(0)
-        assert not store.needs_flush
-        assert not first.done()
-        assert not second.done()
-        store.go.set()
-        await asyncio.gather(first, second)
+        with standing_disk(tmp_path, 1) as go_on:
+            store.put(message(1))
+            store.put(message(2))
+            first, second = (asyncio.create_task(flusher.flush()) for _ in range(2))
+            for _ in range(100):
+                await asyncio.sleep(0)
+            assert not store.needs_flush
+            assert not first.done()
+            assert not second.done()
+            go_on()
+            await asyncio.gather(first, second)
+        store.close()
 
     asyncio.run(run())
 
@@ -112,11 +126,12 @@ def test_a_disk_that_stays_full_fills_no_log(tmp_path: Path, caplog: pytest.LogC
     store = DirectoryStore(tmp_path, 3000)
     for key in range(1000):
         store.put(message(key, bytes(1000)))
+    store.close()
     assert store.refused == 998
     assert [record.getMessage().split()[0] for record in caplog.records] == ["outbox-full"]
 
 
-def test_a_message_put_before_sigkill_is_loaded_after(tmp_path: Path) -> None:
+def test_a_message_flushed_before_sigkill_is_loaded_after(tmp_path: Path) -> None:
     script = f"""
 import os, signal
 from pathlib import Path
@@ -125,6 +140,7 @@ from udp_mesh.daemon.outbox import DirectoryStore
 store = DirectoryStore(Path({str(tmp_path)!r}), 1 << 20)
 for key in range(20):
     store.put(StoredMessage(key, "base", "map", "", bytes(5000), None))
+store.flush().result()
 os.kill(os.getpid(), signal.SIGKILL)
 """
     ended = subprocess.run([sys.executable, "-c", script], check=False)
@@ -140,6 +156,7 @@ def test_whatever_a_torn_write_or_a_bad_disk_leaves_of_a_file_it_is_set_aside_an
         store = DirectoryStore(Path(folder), 1 << 20)
         for key in (1, 2, 3):
             store.put(message(key, b"payload of some length", 12.5))
+        store.close()
         victim = Path(folder) / f"{2:020d}.message"
         whole = victim.read_bytes()
         how = data.draw(st.sampled_from(["cut", "changed", "replaced", "zeros behind"]))
@@ -162,6 +179,7 @@ def test_whatever_a_torn_write_or_a_bad_disk_leaves_of_a_file_it_is_set_aside_an
 def test_a_file_under_anothers_name_is_set_aside(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path, 1 << 20)
     store.put(message(1))
+    store.close()
     copy = tmp_path / f"{7:020d}.message"
     copy.write_bytes((tmp_path / f"{1:020d}.message").read_bytes())
     assert [kept.key for kept in DirectoryStore(tmp_path, 1 << 20).load()] == [1]
@@ -179,8 +197,9 @@ store = DirectoryStore(Path({str(tmp_path)!r}), 1 << 30)
 resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
 for key, size in enumerate((5_000, 500_000, 6_000)):
     store.put(StoredMessage(key, "base", "map", "", bytes(size), None))
+store.flush().result()
 assert store.refused == 1, store.refused
-store.flush(store.take_unflushed())
+assert [store.holds(key) for key in range(3)] == [True, False, True]
 """
     ended = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
@@ -193,9 +212,10 @@ store.flush(store.take_unflushed())
 def test_a_directory_that_vanished_is_told_and_made_again(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path / "outbox", 1 << 20)
     store.put(message(1))
-    paths = store.take_unflushed()
-    paths[0].unlink()
+    store.flush().result(WAIT_S)
+    store.remove(1)
+    store.flush().result(WAIT_S)
     (tmp_path / "outbox").rmdir()
-    store.flush(paths)
     store.put(message(2))
+    store.close()
     assert [kept.key for kept in DirectoryStore(tmp_path / "outbox", 1 << 20).load()] == [2]

@@ -1,0 +1,72 @@
+"""A recording is written by a thread: whole when it is closed, with its gaps told, and nobody waits for it."""
+
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.udp_mesh.links.sockets import WAIT_S
+from udp_mesh.core.events import PeerOffline
+from udp_mesh.daemon import recording
+from udp_mesh.daemon.recording import Recorder
+
+
+def recorder(path: Path, limit_bytes: int = 1 << 20) -> Recorder:
+    return Recorder(path, node="scout", boot_id=bytes(8), wall_s=1e9, now=0.0, limit_bytes=limit_bytes, payloads=False)
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_bytes().splitlines()]
+
+
+def test_everything_recorded_is_in_the_file_once_it_is_closed(tmp_path: Path) -> None:
+    made = recorder(tmp_path / "run.jsonl")
+    for number in range(3000):
+        made.event(number / 100, PeerOffline("base", left=False))
+    made.close().result(WAIT_S)
+    found = lines(made.path)
+    assert len(found) == made.lines == 3001
+    assert [line["t"] for line in found[1:]] == [number / 100 for number in range(3000)]
+    assert made.path.stat().st_size == made.bytes
+    assert not made.open
+    made.event(31.0, PeerOffline("base", left=False))
+    made.close().result(WAIT_S)
+    assert made.lines == 3001
+
+
+def test_a_recording_ends_at_its_limit(tmp_path: Path) -> None:
+    made = recorder(tmp_path / "run.jsonl", limit_bytes=2000)
+    for number in range(100):
+        made.event(float(number), PeerOffline("base", left=False))
+    assert not made.open
+    made.close().result(WAIT_S)
+    assert 1900 < made.path.stat().st_size <= 2000
+
+
+def test_what_a_disk_that_stands_still_does_not_take_is_left_out_and_the_gap_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "BACKLOG_BYTES", 3 * recording.BATCH_BYTES)
+    made = recorder(tmp_path / "run.jsonl", limit_bytes=1 << 24)
+    go_on = threading.Event()
+    made._disk.submit(go_on.wait, WAIT_S)
+    for number in range(10_000):
+        made.event(float(number), PeerOffline("base", left=False))
+    go_on.set()
+    made._disk.submit(lambda: None).result(WAIT_S)
+    made.event(10_000.0, PeerOffline("base", left=False))
+    made.close().result(WAIT_S)
+    found = lines(made.path)
+    (gap,) = [line for line in found[1:] if line["kind"] == "gap"]
+    assert found[-2] == gap
+    assert gap["lines"] + len(found) - 3 == 10_000
+    assert made.path.stat().st_size == made.bytes
+
+
+def test_a_file_that_is_there_is_never_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "run.jsonl").write_text("of yesterday")
+    with pytest.raises(FileExistsError):
+        recorder(tmp_path / "run.jsonl")
+    assert (tmp_path / "run.jsonl").read_text() == "of yesterday"
