@@ -27,6 +27,9 @@ CLIENT_BACKLOG_BYTES = 32 << 20
 """Bytes written to one client and not yet read by it: a stopped subscriber. A few of the largest usual messages."""
 BACKLOGS_BYTES = 256 << 20
 """The same for all clients together: past it, who holds more than an equal part of that gets no more."""
+HALF_SENT_BYTES = 256 << 20
+"""Bytes of requests that are not there whole, of all clients together: past it, who holds more than an equal part of
+that has its request refused. Several of the largest messages at a time."""
 REPLIES_BACKLOG_BYTES = 4 << 20
 """Bytes of replies beyond that: a program that asks without end and never reads the answers."""
 MAX_CLIENTS = 256
@@ -93,6 +96,11 @@ class Client(asyncio.Protocol):
             self._report_dropped()
         transport.write(frame)
 
+    @property
+    def half_sent(self) -> int:
+        """Bytes of a request that is not here whole."""
+        return self._reader.held
+
     def backlog(self) -> int:
         """Bytes written and not yet read."""
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
@@ -125,6 +133,9 @@ class Client(asyncio.Protocol):
                 self.refuse(*frame)
             else:
                 self._handle(frame)
+        if self._server.too_much_half_sent(self._reader.held):
+            text = f"local programs have begun to send more than {HALF_SENT_BYTES >> 20} MiB at a time: try again"
+            self.refuse(*self._reader.give_up("busy", text))
         transport = self._transport
         if transport is not None and transport.get_write_buffer_size() > CLIENT_BACKLOG_BYTES + REPLIES_BACKLOG_BYTES:
             transport.pause_reading()
@@ -196,6 +207,11 @@ class LocalServer:
         """Whether a client for which so many bytes wait must not get more for all others' sake."""
         share = BACKLOGS_BYTES // max(1, len(self.clients))
         return waiting > share and sum(client.backlog() for client in self.clients) > BACKLOGS_BYTES
+
+    def too_much_half_sent(self, held: int) -> bool:
+        """Whether a client that has sent so much of a request must not send the rest of it for all others' sake."""
+        share = HALF_SENT_BYTES // max(1, len(self.clients))
+        return held > share and sum(client.half_sent for client in self.clients) > HALF_SENT_BYTES
 
     async def close(self) -> None:
         """Stops listening, lets what is written be read, closes every connection, removes the socket's file."""

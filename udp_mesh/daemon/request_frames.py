@@ -59,7 +59,7 @@ class RequestReader:
                     self._needed = payload - start
                     break
                 text = f"expected a payload of at most {most} bytes, found {payload_bytes}"
-                found.append(_refused(bytes(buffer[body:payload]), text))
+                found.append(_refused(bytes(buffer[body:payload]), "too-large", text))
             elif len(buffer) < end:
                 self._needed = end - start
                 break
@@ -71,6 +71,26 @@ class RequestReader:
         del buffer[:start]
         return found
 
+    @property
+    def held(self) -> int:
+        """Bytes of the frame that is not here whole."""
+        return len(self._buffer)
+
+    def give_up(self, code: str, text: str) -> BadFrame:
+        """Let go of the frame that is not here whole; the rest of it is read past. Only after its first eight bytes."""
+        buffer = self._buffer
+        head_bytes, payload_bytes = _LENGTHS.unpack_from(buffer)
+        payload = _LENGTHS.size + head_bytes
+        refused = (
+            _refused(bytes(buffer[_LENGTHS.size : payload]), code, text)
+            if len(buffer) >= payload
+            else BadFrame(None, code, text)
+        )
+        self._passed_over = payload + payload_bytes - len(buffer)
+        self._needed = _LENGTHS.size
+        buffer.clear()
+        return refused
+
 
 def _taken(head: bytes, payload: bytes) -> Frame | BadFrame:
     try:
@@ -79,10 +99,10 @@ def _taken(head: bytes, payload: bytes) -> Frame | BadFrame:
         return BadFrame(None, error.code, str(error))
 
 
-def _refused(head: bytes, text: str) -> BadFrame:
+def _refused(head: bytes, code: str, text: str) -> BadFrame:
     """A frame whose payload is not taken; its header tells whom to answer."""
     try:
-        return BadFrame(_header(head).get("id"), "too-large", text)
+        return BadFrame(_header(head).get("id"), code, text)
     except MeshError as error:
         return BadFrame(None, error.code, str(error))
 

@@ -118,6 +118,43 @@ def test_programs_that_do_not_read_hold_little_together_and_take_nothing_from_on
     serve(work)
 
 
+def test_programs_that_send_half_of_their_requests_hold_little_together_and_take_nothing_from_one_that_sends_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(api, "HALF_SENT_BYTES", 4_000_000)
+    request = encode_frame({"op": "publish", "id": 1}, bytes(1 << 20))
+
+    async def work(server: LocalServer, path: Path) -> None:
+        loop = asyncio.get_running_loop()
+        programs = await connected(server, path, 9)
+        most = 0
+
+        async def look() -> None:
+            nonlocal most
+            while True:
+                most = max(most, sum(client.half_sent for client in server.clients))
+                await asyncio.sleep(0)
+
+        looking = asyncio.create_task(look())
+        for program in programs[:8]:
+            await loop.sock_sendall(program, request[:-1])
+        await loop.sock_sendall(programs[8], encode_frame({"op": "publish", "id": 2}, b"whole"))
+        assert [answer["ok"] for answer in await read(programs[8], bool)] == [True]
+        told = []
+        for program in programs[:8]:
+            await loop.sock_sendall(program, request[-1:])
+            told += await read(program, bool)
+        assert {answer["id"] for answer in told} == {1}
+        assert {answer.get("code") for answer in told} == {None, "busy"}
+        # and what asyncio reads at a time
+        assert most <= 4_000_000 + 256 * 1024
+        looking.cancel()
+        for program in programs:
+            program.close()
+
+    serve(work)
+
+
 def test_one_program_too_many_is_told_why() -> None:
     async def work(server: LocalServer, path: Path) -> None:
         programs = await connected(server, path, api.MAX_CLIENTS)
