@@ -68,6 +68,8 @@ def greet(
             prove(state, session, now)
     else:
         heard(state, session, link, source, now)
+        if session.name == state.settings.name:
+            _own_name(state, session, now)
     if not (session.proven and session.knows_us):
         # It does not hear us, or we cannot know yet that it does.
         state.discovery.answer(session, len(state.roster.sessions), now)
@@ -86,10 +88,8 @@ def greet(
 def prove(state: State, session: Session, now: float) -> None:
     """The session has shown that it hears this run of ours."""
     arrival, peer = state.roster.prove(session, state.settings)
-    path = session.way
     if arrival is Arrival.OWN_NAME:
-        own = next(iter(state.links.values())).address if state.links else ("", state.settings.port)
-        state.ledger.tell(NameConflict(session.name, own, path.address, own=True))
+        _own_name(state, session, now)
         return
     if peer is None:
         state.ledger.counters.dropped_over_limit += 1
@@ -102,6 +102,15 @@ def prove(state: State, session: Session, now: float) -> None:
         peer.online_since = now
     come_online(state, peer, session, now)
     state.arm(peer)
+
+
+def _own_name(state: State, session: Session, now: float) -> None:
+    """Another node uses our name: told as long as it does, and no more often for all the boots one may invent."""
+    if now - state.own_name_reported_at < REPORT_AGAIN_S:
+        return
+    state.own_name_reported_at = now
+    own = next(iter(state.links.values())).address if state.links else ("", state.settings.port)
+    state.ledger.tell(NameConflict(session.name, own, session.way.address, own=True))
 
 
 def _replace(state: State, peer: Peer, session: Session, now: float) -> None:

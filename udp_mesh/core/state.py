@@ -83,6 +83,7 @@ class State:
         self.housekept_at = now
         self.mismatch_reported: dict[tuple[str, int], float] = {}
         self.incompatible_reported: dict[bytes, float] = {}
+        self.own_name_reported_at = float("-inf")
         self.closed = False
 
     def set_timer(self, peer: Peer, at: float) -> None:

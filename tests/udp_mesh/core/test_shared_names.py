@@ -12,6 +12,7 @@ from udp_mesh.core.events import (
     PeerOnline,
 )
 from udp_mesh.core.node import Node
+from udp_mesh.core.presence import REPORT_AGAIN_S
 from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
 
 MAP = Topic("map", priority=7)
@@ -46,6 +47,18 @@ def exchange(world: World, name: str) -> None:
     for who in ("c", name):
         assert len(world.told(who, MessageReceived)) == before[who] + 1
         assert len(world.told(who, MessageDelivered)) == ended[who] + 1
+
+
+def test_each_of_them_is_told_as_long_as_it_lasts_and_once_a_minute_whatever_boots_are_invented() -> None:
+    world = conflict()
+    for number in range(20):
+        again = Node(settings("a", MAP), boot_id=world.rng.randbytes(16), rng=world.rng, now=world.now)
+        again.link_up(LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a2"], BROADCAST), world.now)
+        world.nodes["a2"] = again
+        world.run(9.0)
+        told = [event for event in world.told("a", NameConflict) if isinstance(event, NameConflict) and event.own]
+        assert len(told) <= 1 + (number + 2) * 9.0 / REPORT_AGAIN_S
+    assert len(told) >= 3
 
 
 @pytest.mark.parametrize("how", ["says good-bye", "is killed"])
