@@ -24,7 +24,7 @@ MOST_SHARE = 0.9
 """Among others, whatever the correction."""
 
 HOLDS_S = 10.5
-"""What a heartbeat says holds until some of the most sparse ones have been missed."""
+"""What a heartbeat says holds at least so long: until some of the most sparse ones of a small team have been missed."""
 
 
 class Crowd:
@@ -34,11 +34,12 @@ class Crowd:
 
     def __init__(self) -> None:
         self._others: dict[bytes, tuple[float, float]] = {}
+        """Bytes per second, and until when that holds."""
 
-    def told(self, boot_id: bytes, bytes_per_s: float, now: float) -> None:
-        """A heartbeat says how much its sender sends to everybody."""
+    def told(self, boot_id: bytes, bytes_per_s: float, now: float, *, holds_s: float = HOLDS_S) -> None:
+        """A heartbeat says how much its sender sends to everybody; the next one is missed after `holds_s`."""
         if bytes_per_s >= LEAST_BYTES_PER_S:
-            self._others[boot_id] = (bytes_per_s, now)
+            self._others[boot_id] = (bytes_per_s, now + max(HOLDS_S, holds_s))
         elif self._others:
             self._others.pop(boot_id, None)
 
@@ -47,7 +48,7 @@ class Crowd:
         others = self._others
         if not others:
             return 1.0
-        for boot_id in [boot_id for boot_id, (_, at) in others.items() if now - at > HOLDS_S]:
+        for boot_id in [boot_id for boot_id, (_, until) in others.items() if now > until]:
             del others[boot_id]
         rates = [max(own_bytes_per_s, LEAST_BYTES_PER_S), *(rate for rate, _ in others.values())]
         total = sum(rates)

@@ -45,7 +45,7 @@ def greet(
     """An authentic heartbeat of a session (to all, or to us alone), perhaps a recording until the session is
     proven."""
     session.learn(beat, now)
-    state.crowd.told(session.boot_id, beat.send_rate, now)
+    state.crowd.told(session.boot_id, beat.send_rate, now, holds_s=MISSED_HEARTBEATS * session.interval_s)
     session.last_heard = now
     if not beat.min_version <= VERSION <= beat.max_version:
         if now - state.incompatible_reported.get(session.boot_id, float("-inf")) > REPORT_AGAIN_S:

@@ -38,6 +38,13 @@ def test_who_sends_next_to_nothing_or_was_not_heard_for_long_does_not_count() ->
     assert crowd(1e5).queue_share(1e5, HOLDS_S + 1.0) == 1.0
 
 
+def test_in_a_large_team_what_was_said_holds_until_the_next_heartbeat_is_overdue() -> None:
+    made = Crowd()
+    made.told(b"0", 1e5, 0.0, holds_s=4 * HOLDS_S)
+    assert made.queue_share(1e5, 3 * HOLDS_S) < 1.0
+    assert made.queue_share(1e5, 4 * HOLDS_S + 1.0) == 1.0
+
+
 def settled_queue(share: float, loss: float) -> float:
     """Packets above the path's own that the window settles at: 150 packets/s over 20 ms."""
     trip = RoundTrip()
