@@ -73,8 +73,7 @@ class LegacyPeers:
         wanted = {neighbour.address[0]: neighbour for neighbour in self._state.settings.neighbours if neighbour.legacy}
         for host in list(self._by_host):
             if host not in wanted or self._by_host[host].neighbour != wanted[host]:
-                gone = self._by_host.pop(host)
-                gone.peer.legacy = False
+                self._drop(self._by_host.pop(host))
         for host, neighbour in wanted.items():
             if host not in self._by_host and neighbour.name is not None:
                 peer = self._state.roster.peer(neighbour.name, self._state.settings)
@@ -82,6 +81,15 @@ class LegacyPeers:
                     peer.legacy = True
                     peer.lost = False
                     self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings, self._state.rng)
+
+    def _drop(self, gone: LegacyPeer) -> None:
+        """It is not named any more; one that was never heard, and for which nothing waits, was never there."""
+        peer, state = gone.peer, self._state
+        peer.legacy = False
+        heard = peer.session is not None or peer.fielded_way is not None
+        if not heard and not peer.outbound.open and not state.outboxes.holds(peer.name):
+            state.ready.pop(peer, None)
+            del state.roster.peers[peer.name]
 
     def __len__(self) -> int:
         return len(self._by_host)

@@ -117,6 +117,22 @@ def test_where_a_fielded_peer_was_heard_is_told() -> None:
     assert (peer.name, peer.online, peer.address, peer.link, peer.last_heard) == ("old", True, OLD, "mesh", old.now)
 
 
+def test_a_neighbour_no_longer_named_is_forgotten_unless_it_was_heard_or_something_waits_for_it() -> (
+    None
+):
+    old = OldRobot()
+    named = old.node._state.settings
+    others = tuple(
+        Neighbour((f"10.0.0.{host}", OLD[1]), name=name, legacy=True) for host, name in ((21, "typo"), (22, "away"))
+    )
+    old.node.apply(replace(named, neighbours=(*named.neighbours, *others)), old.now)
+    old.node.send("map", b"for later", destination="away", now=old.now)
+    assert {peer.name for peer in old.node.conditions(old.now).peers} == {"old", "typo", "away"}
+    old.node.apply(replace(named, neighbours=()), old.now)
+    assert {peer.name for peer in old.node.conditions(old.now).peers} == {"old", "away"}
+    old.hear()
+
+
 def test_a_broadcast_of_a_fielded_peer_arrives_without_an_acknowledgement() -> None:
     old = OldRobot()
     old.say(pieces(0x8001, b"all", wants_ack=False)[0])
