@@ -19,7 +19,7 @@ from udp_mesh.core.state import HOUSEKEEPING_S, State
 from udp_mesh.wire.codec import encode
 from udp_mesh.wire.frames import Cancel, Frame, Heartbeat, Ping
 from udp_mesh.wire.header import VERSION
-from udp_mesh.wire.limits import MAX_IDS
+from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
 
 BATCH_BYTES = 65_536
 """What one call returns at most, about: one system call with segmentation offload."""
@@ -76,13 +76,12 @@ def _leave_owed(state: State, session: Session, now: float, out: list[Datagram])
     if not way.confirmed and frames and not session.knows_us:
         frames.insert(0, _introduction(state, session))
     while frames:
-        count, size = 0, 0
-        while count < len(frames) and count < 32:
-            size += len(encode([frames[count]])) + 2
-            if count and size > way.room_bytes:
-                break
-            count += 1
-        number, data = way.seal(encode(frames[:count]))
+        count = min(len(frames), MAX_FRAMES_PER_DATAGRAM)
+        encoded = encode(frames[:count])
+        while count > 1 and len(encoded) > way.room_bytes:
+            count = max(1, count * way.room_bytes // len(encoded) - 1)
+            encoded = encode(frames[:count])
+        number, data = way.seal(encoded)
         peer.outbound.flight.add(number, None)
         out.append(Datagram(way.link, way.address, data, True))
         del frames[:count]
