@@ -155,7 +155,8 @@ class Rates:
     starved_s: float = 5.0
     """How long a level waits while others are sent before its topic is reported as starved."""
     yield_after_s: float = 0.03
-    """How long an urgent message waits here before others are asked to hold back their less urgent traffic."""
+    """How much longer than three round trips an urgent message waits here before others are asked to hold back their
+    less urgent traffic."""
     yield_hold_s: float = 0.1
     """How long less urgent traffic is held back for others after one such report."""
     yield_share: float = 0.8
