@@ -66,7 +66,10 @@ def test_ours_is_compared_with_the_best_other_that_delivers_and_told_as_behind_w
     found = {one.figure: (one.best, one.best_peer, one.ahead) for one in compared(results)}
     assert found == {"share": (0.96, "fast", False), "urgent_p99_s": (0.2, "fast", True)}
     assert report(results).count("**behind**") == 1
-    nothing = [results[0], {**cell, "peer": "dead", "share": 0.0, "urgent_p99_s": None, "urgent_arrived": 0.0}]
+    nothing: list[dict[str, object]] = [
+        results[0],
+        {**cell, "peer": "dead", "share": 0.0, "urgent_p99_s": None, "urgent_arrived": 0.0},
+    ]
     assert [(one.figure, one.best, one.ahead) for one in compared(nothing)] == [
         ("share", 0.0, True),
         ("urgent_p99_s", None, True),

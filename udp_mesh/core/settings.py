@@ -141,8 +141,8 @@ class Rates:
     urgent_excess_packets: int = 4
     """How far urgent packets may exceed the window."""
     twice_loss: float = 0.005
-    """Measured loss from which small urgent messages are sent twice: where one in a hundred is lost, the slowest one in a
-    hundred is a lost one. A single loss of many packets is less."""
+    """Measured loss from which small urgent messages are sent twice: where one in a hundred is lost, the slowest one in
+    a hundred is a lost one. A single loss of many packets is less."""
     twice_gap_s: float = 0.003
     """Between the two sendings: longer than most bursts at a radio, short against a deadline."""
     ack_every_packets: int = 10
