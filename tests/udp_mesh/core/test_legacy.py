@@ -117,9 +117,7 @@ def test_where_a_fielded_peer_was_heard_is_told() -> None:
     assert (peer.name, peer.online, peer.address, peer.link, peer.last_heard) == ("old", True, OLD, "mesh", old.now)
 
 
-def test_a_neighbour_no_longer_named_is_forgotten_unless_it_was_heard_or_something_waits_for_it() -> (
-    None
-):
+def test_a_neighbour_no_longer_named_is_forgotten_unless_it_was_heard_or_something_waits_for_it() -> None:
     old = OldRobot()
     named = old.node._state.settings
     others = tuple(
