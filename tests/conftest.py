@@ -19,6 +19,10 @@ settings.register_profile("deep", deadline=None, max_examples=2000, suppress_hea
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fast"))
 
 
+TRIED_AGAIN = "tried again"
+"""The property of a test in whose setup a machine was made once more: why."""
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Tests that share a fleet or a machine share a worker; a pytest that loses that without a word is refused.
 
@@ -35,7 +39,14 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Nothing is left out without a word."""
+    """Nothing is left out or tried again without a word."""
+    reports = [report for reports in terminalreporter.stats.values() for report in reports]
+    told = [each for report in reports for each in getattr(report, "user_properties", ())]
+    reasons = dict.fromkeys(str(reason) for name, reason in told if name == TRIED_AGAIN)
+    if reasons:
+        terminalreporter.section("tried again")
+        for reason in reasons:
+            terminalreporter.line(reason)
     if not expects_ros():
         terminalreporter.section("not tested here")
         terminalreporter.line(

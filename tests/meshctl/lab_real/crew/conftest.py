@@ -8,10 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from meshctl.lab.copybook import prepare
-from meshctl.lab.real.fleet import RealFleet
-from meshctl.lab.twin import spec_of
-from tests.meshctl.lab_real.conftest import START_S, Lab, set_up_host
+from tests.meshctl.lab_real.conftest import Lab, fielded
 
 INVENTORY = Path(__file__).with_name("inventory")
 FIELDED = ("base", "b01", "b02", "husky")
@@ -46,14 +43,5 @@ class Crew(Lab):
 @pytest.fixture(scope="package")
 def crew(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Crew]:
     """The fielded nodes taken in on the bench and carried out: only the mesh leads to them."""
-    set_up_host()
-    place = tmp_path_factory.mktemp("crew")
-    copy = prepare(INVENTORY, place / "lab")
-    fleet = RealFleet(spec_of(copy.fleet, links=copy.links), place / "lab").up(wait_s=START_S)
-    try:
-        made = Crew(fleet, copy.inventory, place / "state")
-        made.write_keys()
-        made.take_in()
+    with fielded(Crew, INVENTORY, tmp_path_factory.mktemp("crew"), before=Crew.write_keys) as made:
         yield made
-    finally:
-        fleet.down()
