@@ -18,6 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 SOURCE = Path(__file__).with_name("emulator.c")
 INTERFACE = "mesh0"
@@ -216,29 +217,33 @@ class Wire(Laboratory):
         """There is no count."""
 
 
+L = TypeVar("L", bound=Laboratory)
+
+
 @contextmanager
-def wire() -> Iterator[Wire]:
-    """A started wire; everything is gone afterwards, also after a failure."""
+def _started(kind: type[L], hosts: int, seed: int) -> Iterator[L]:
     with tempfile.TemporaryDirectory(prefix="link-") as directory:
-        made = Wire(2, 1, Path(directory), f"link{os.getpid()}-")
+        made = kind(hosts, seed, Path(directory), f"link{os.getpid()}-")
         try:
             made.start()
             yield made
         finally:
             made.stop()
+
+
+@contextmanager
+def wire() -> Iterator[Wire]:
+    """A started wire; everything is gone afterwards, also after a failure."""
+    with _started(Wire, 2, 1) as made:
+        yield made
 
 
 @contextmanager
 def laboratory(hosts: int = 2, *, seed: int = 1, link: Link | None = None) -> Iterator[Laboratory]:
     """A started laboratory; everything is gone afterwards, also after a failure."""
-    with tempfile.TemporaryDirectory(prefix="link-") as directory:
-        made = Laboratory(hosts, seed, Path(directory), f"link{os.getpid()}-")
-        try:
-            made.start()
-            made.become(link or Link())
-            yield made
-        finally:
-            made.stop()
+    with _started(Laboratory, hosts, seed) as made:
+        made.become(link or Link())
+        yield made
 
 
 def _ip(*arguments: str) -> str:

@@ -96,7 +96,6 @@ class Client(asyncio.Protocol):
             self._report_dropped()
         transport.write(frame)
 
-    @property
     def half_sent(self) -> int:
         """Bytes of a request that is not here whole."""
         return self._reader.held
@@ -133,7 +132,7 @@ class Client(asyncio.Protocol):
                 self.refuse(*frame)
             else:
                 self._handle(frame)
-        if self._server.too_much_half_sent(self._reader.held):
+        if self._server.too_much_half_sent(self.half_sent()):
             text = f"local programs have begun to send more than {HALF_SENT_BYTES >> 20} MiB at a time: try again"
             self.refuse(*self._reader.give_up("busy", text))
         transport = self._transport
@@ -205,13 +204,15 @@ class LocalServer:
 
     def too_much_for(self, waiting: int) -> bool:
         """Whether a client for which so many bytes wait must not get more for all others' sake."""
-        share = BACKLOGS_BYTES // max(1, len(self.clients))
-        return waiting > share and sum(client.backlog() for client in self.clients) > BACKLOGS_BYTES
+        return self._too_much(waiting, BACKLOGS_BYTES, Client.backlog)
 
     def too_much_half_sent(self, held: int) -> bool:
         """Whether a client that has sent so much of a request must not send the rest of it for all others' sake."""
-        share = HALF_SENT_BYTES // max(1, len(self.clients))
-        return held > share and sum(client.half_sent for client in self.clients) > HALF_SENT_BYTES
+        return self._too_much(held, HALF_SENT_BYTES, Client.half_sent)
+
+    def _too_much(self, own: int, limit: int, of_each: Callable[[Client], int]) -> bool:
+        """Whether this is more than an equal part of a limit that all together exceed."""
+        return own > limit // max(1, len(self.clients)) and sum(map(of_each, self.clients)) > limit
 
     async def close(self) -> None:
         """Stops listening, lets what is written be read, closes every connection, removes the socket's file."""

@@ -132,7 +132,7 @@ def test_programs_that_send_half_of_their_requests_hold_little_together_and_take
         async def look() -> None:
             nonlocal most
             while True:
-                most = max(most, sum(client.half_sent for client in server.clients))
+                most = max(most, sum(client.half_sent() for client in server.clients))
                 await asyncio.sleep(0)
 
         looking = asyncio.create_task(look())

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from tests.udp_mesh.daemon.disks import standing_disk
 from tests.udp_mesh.links.sockets import WAIT_S
+from tests.waiting import until
 from udp_mesh.core.seams import StoredMessage
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 
@@ -212,10 +213,11 @@ assert [store.holds(key) for key in range(3)] == [True, False, True]
 def test_a_directory_that_vanished_is_told_and_made_again(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path / "outbox", 1 << 20)
     store.put(message(1))
-    store.flush().result(WAIT_S)
-    store.remove(1)
-    store.flush().result(WAIT_S)
+    path = tmp_path / "outbox" / f"{1:020d}.message"
+    until(path.exists, "the message to be written", wait_s=WAIT_S)
+    path.unlink()
     (tmp_path / "outbox").rmdir()
+    store.flush().result(WAIT_S)
     store.put(message(2))
     store.close()
     assert [kept.key for kept in DirectoryStore(tmp_path / "outbox", 1 << 20).load()] == [2]
