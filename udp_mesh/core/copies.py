@@ -3,8 +3,8 @@
 1. `later` is told of each small urgent piece that left for the first time, and notes when its copies are due.
 2. `due` hands out what is due; what is still unanswered by then is noted once more, a few times.
 
-On a way that loses little nothing is copied; from `twice_loss` on one copy leaves soon, from `LOSSY` on two: of three
-sendings 20 % loss takes all in one case of 125.
+On a way that loses little nothing is copied; from `twice_loss` on one copy leaves soon, and `EARLY` adds to it as more
+is lost: 20 % loss takes all of three sendings in one case of 125, all of four in one of 625.
 """
 
 from heapq import heappop, heappush
@@ -17,9 +17,9 @@ OVERDUE_ROUND_TRIPS = 1.1
 OVERDUE_TIMES = 6
 """So often an overdue answer brings another copy; then the peer is nearly silent, and probes do."""
 
-LOSSY = 0.1
-LOSSY_GAPS = 3
-"""From this loss on a third sending leaves after so many gaps: two are often lost together."""
+EARLY = ((0.1, 3), (0.15, 6))
+"""From each loss on one more sending leaves, so many gaps after the first: what is lost is often lost together, so they
+lie ever further apart."""
 
 
 class Copies:
@@ -46,8 +46,9 @@ class Copies:
         if not twice:
             return
         self._note(now + gap_s, message, position, 0)
-        if loss >= LOSSY:
-            self._note(now + LOSSY_GAPS * gap_s, message, position, 0)
+        for least_loss, gaps in EARLY:
+            if loss >= least_loss:
+                self._note(now + gaps * gap_s, message, position, 0)
         if message.reliable:
             self._note(now + overdue_s, message, position, OVERDUE_TIMES - 1)
 
