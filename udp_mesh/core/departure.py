@@ -79,6 +79,12 @@ class Way:
     def seal(self, frames: bytes) -> tuple[int, bytes]:
         return self.channel.seal(frames) if self.confirmed else self.channel.seal_long(frames)
 
+    def seal_run(self, run: list[bytes]) -> list[bytes]:
+        """Datagrams with the channel's next numbers."""
+        if self.confirmed:
+            return self.channel.seal_run(run)
+        return [self.channel.seal_long(frames)[1] for frames in run]
+
     @property
     def overhead_bytes(self) -> int:
         return SHORT_OVERHEAD_BYTES if self.confirmed else LONG_OVERHEAD_BYTES
@@ -184,10 +190,7 @@ def _leave_run(outbound: Outbound, way: Way, run: Run, count: int, mark: Mark, o
     size = message.fragment_bytes
     offset = message.first_bytes + (position - 1) * size
     body = memoryview(message.body)
-    seal = way.seal
-    add = outbound.flight.add
-    append = out.append
-    link, address = way.link, way.address
+    frames = []
     spacing = ack_spacing(outbound)
     since = outbound.since_ack_wanted
     wide = position + count > _NARROW_POSITIONS
@@ -202,10 +205,10 @@ def _leave_run(outbound: Outbound, way: Way, run: Run, count: int, mark: Mark, o
         if since >= spacing:
             since = 0
             first |= FRAGMENT_ACK_NOW
-        number, data = seal(pack(first, wire_id, place) + body[offset : offset + size])
+        frames.append(pack(first, wire_id, place) + body[offset : offset + size])
         offset += size
-        add(number, Packet(mark, message, place))
-        append(Datagram(link, address, data, False))
+    out.extend(Datagram.run(way.link, way.address, way.seal_run(frames)))
+    outbound.flight.add_run(mark, message, range(position, position + count))
     outbound.since_ack_wanted = since
     sent_bytes = count * (size + FRAGMENT_BYTES + way.overhead_bytes)
     outbound.sent_packets += count

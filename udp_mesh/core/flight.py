@@ -7,6 +7,8 @@ in a radio's queues (wifi's access categories), so their arrival says nothing ab
 """
 
 from collections import OrderedDict, deque
+from functools import partial
+from itertools import repeat
 from typing import NamedTuple
 
 from udp_mesh.core.message import Outgoing
@@ -97,6 +99,13 @@ class Flight:
             self.base = number + 1
             return
         packets.append(packet)
+
+    def add_run(self, mark: Mark, message: Outgoing, positions: range) -> None:
+        """As `add` for a packet of each piece, which have the next numbers; without a call in Python for each."""
+        self.outstanding += len(positions)
+        self._packets.extend(
+            map(partial(tuple.__new__, Packet), zip(repeat(mark), repeat(message), positions, repeat(())))
+        )
 
     def acknowledge(self, largest: int, received: int) -> tuple[list[Packet], list[Packet], Packet | None]:
         """Packets newly acknowledged, packets now lost, and packet `largest` if this is the first word of it.

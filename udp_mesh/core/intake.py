@@ -5,8 +5,6 @@
 3. A long header introduces a boot: its check is verified before anything is derived or remembered for it.
 """
 
-import struct
-
 from udp_mesh.core.acceptance import report_ended
 from udp_mesh.core.casts import UNREPAIRED_FROM
 from udp_mesh.core.events import ExpiryReason, KeyMismatch, MessageReceived
@@ -33,11 +31,17 @@ from udp_mesh.wire.frames import (
     RefuseReason,
     TopicAnnounce,
 )
-from udp_mesh.wire.header import SEAL_TAG_BYTES, SHORT_HEADER_BYTES, Kind, LongHeader, encode_short, parse_header
+from udp_mesh.wire.header import (
+    BROADCAST_BYTE,
+    DATA_BYTE,
+    SEAL_TAG_BYTES,
+    SHORT_HEADER,
+    SHORT_HEADER_BYTES,
+    Kind,
+    LongHeader,
+    parse_header,
+)
 
-_SHORT = struct.Struct(">BHI")
-_DATA_BYTE = encode_short(Kind.DATA, 0, 0)[0]
-_BROADCAST_BYTE = encode_short(Kind.BROADCAST, 0, 0)[0]
 _LEAST_BYTES = SHORT_HEADER_BYTES + SEAL_TAG_BYTES
 
 MISMATCHES_REMEMBERED = 256
@@ -54,8 +58,8 @@ def take_datagram(state: State, data: bytes | memoryview, link: str, source: Add
         counters.dropped_malformed += 1
         return
     first = data[0]
-    if first == _DATA_BYTE:
-        _, tag, low = _SHORT.unpack_from(data)
+    if first == DATA_BYTE:
+        _, tag, low = SHORT_HEADER.unpack_from(data)
         for channel, session in state.roster.data_tags.get(tag, ()):
             try:
                 number, frames = channel.open(data, low)
@@ -67,17 +71,17 @@ def take_datagram(state: State, data: bytes | memoryview, link: str, source: Add
             _take_data(state, session, number, frames, link, source, now)
             return
         counters.dropped_unauthenticated += 1
-    elif first == _BROADCAST_BYTE:
-        _, tag, low = _SHORT.unpack_from(data)
+    elif first == BROADCAST_BYTE:
+        _, tag, low = SHORT_HEADER.unpack_from(data)
         for channel, session in state.roster.broadcast_tags.get(tag, ()):
             try:
-                opened = channel.open(data, low)
+                _, frames = channel.open(data, low)
             except ReplayError:
                 counters.dropped_replayed += 1
                 return
             except OpenError:
                 continue
-            _take_broadcast(state, session, opened.frames, link, source, now)
+            _take_broadcast(state, session, frames, link, source, now)
             return
         counters.dropped_unauthenticated += 1
     else:

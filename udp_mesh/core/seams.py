@@ -1,6 +1,9 @@
 """What the driver hands to a node besides bytes and the time, and what the node hands back to be sent."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from itertools import repeat
 from typing import NamedTuple, Protocol
 
 from udp_mesh.core.settings import Address
@@ -18,6 +21,11 @@ class Datagram(NamedTuple):
     destination: Address | None
     data: bytes
     urgent: bool
+
+    @classmethod
+    def run(cls, link: str, destination: Address, run: Iterable[bytes]) -> Iterator["Datagram"]:
+        """Bulk datagrams to one destination, made without a call in Python for each."""
+        return map(partial(tuple.__new__, cls), zip(repeat(link), repeat(destination), run, repeat(False)))
 
 
 class RandomSource(Protocol):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import hmac
 import struct
-from typing import NamedTuple
+from collections.abc import Sequence
 
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
@@ -24,14 +24,17 @@ from udp_mesh.crypto.keys import Key
 from udp_mesh.crypto.replay import ReplayWindow
 from udp_mesh.wire.errors import DecodeError
 from udp_mesh.wire.header import (
+    BROADCAST_BYTE,
     CHECK_BYTES,
+    DATA_BYTE,
     LONG_HEADER_BYTES,
+    NUMBER_LOW_MASK,
     SEAL_TAG_BYTES,
+    SHORT_HEADER,
     SHORT_HEADER_BYTES,
     Kind,
     LongHeader,
     encode_long,
-    encode_short,
 )
 from udp_mesh.wire.limits import BOOT_ID_BYTES
 
@@ -55,13 +58,6 @@ class OpenError(DecodeError):
 
 class ReplayError(OpenError):
     """The datagram's packet number was already seen, or is too old to know."""
-
-
-class Opened(NamedTuple):
-    number: int
-    """Full packet number."""
-    frames: bytes
-    """The encoded frames, for `codec.decode`."""
 
 
 class _Channel:
@@ -95,7 +91,7 @@ class _Channel:
 class SendChannel(_Channel):
     """Seals; owns the packet numbers. `receiver_boot=TO_ALL` for the channel to all."""
 
-    __slots__ = ("_long", "_short", "boot_id", "next_number")
+    __slots__ = ("_first_byte", "_long", "boot_id", "next_number")
 
     def __init__(self, key: Key, sender_boot: bytes, receiver_boot: bytes = TO_ALL) -> None:
         super().__init__(key, sender_boot, receiver_boot)
@@ -103,27 +99,40 @@ class SendChannel(_Channel):
         self.next_number = 0
         """The packet number of the next datagram sealed."""
         to_all = receiver_boot == TO_ALL
-        self._short = Kind.BROADCAST if to_all else Kind.DATA
+        self._first_byte = BROADCAST_BYTE if to_all else DATA_BYTE
         self._long = Kind.HELLO if to_all else Kind.INTRODUCTION
 
     def seal(self, frames: bytes | bytearray | memoryview) -> tuple[int, bytes]:
         """Packet number and datagram with the short header (23 B more than the frames)."""
-        number = self._take_number()
-        header = encode_short(self._short, self.tag, number)
+        number = self._take_numbers(1)
+        header = SHORT_HEADER.pack(self._first_byte, self.tag, number & NUMBER_LOW_MASK)
         return number, header + self._cipher.encrypt(_NONCE.pack(self._salt, number), frames, header)
+
+    def seal_run(self, run: Sequence[bytes]) -> list[bytes]:
+        """As `seal`, for datagrams that get the next numbers in order: of a fast link's processor time much is the cost
+        of calls."""
+        first = self._take_numbers(len(run))
+        first_byte, tag, salt = self._first_byte, self.tag, self._salt
+        pack_header, pack_nonce, encrypt = SHORT_HEADER.pack, _NONCE.pack, self._cipher.encrypt
+        sealed = []
+        for number, frames in enumerate(run, first):
+            header = pack_header(first_byte, tag, number & NUMBER_LOW_MASK)
+            sealed.append(header + encrypt(pack_nonce(salt, number), frames, header))
+        return sealed
 
     def seal_long(self, frames: bytes | bytearray | memoryview) -> tuple[int, bytes]:
         """Packet number and datagram with the long header (49 B more): for who may not know this boot yet."""
-        number = self._take_number()
+        number = self._take_numbers(1)
         clear = encode_long(self._long, self.key.key_id, self.boot_id, number)
         header = clear + self.key.check(clear)
         return number, header + self._cipher.encrypt(_NONCE.pack(self._salt, number), frames, header)
 
-    def _take_number(self) -> int:
+    def _take_numbers(self, count: int) -> int:
+        """The first of so many numbers in a row."""
         number = self.next_number
-        if number > MAX_PACKET_NUMBER:
+        if number + count - 1 > MAX_PACKET_NUMBER:
             raise OverflowError("packet numbers of this channel are used up; the node needs a new boot id")
-        self.next_number = number + 1
+        self.next_number = number + count
         return number
 
 
@@ -136,18 +145,19 @@ class ReceiveChannel(_Channel):
         super().__init__(key, sender_boot, receiver_boot)
         self.window = ReplayWindow()
 
-    def open(self, data: bytes | bytearray | memoryview, number_low: int) -> Opened:
-        """Opens a datagram with a short header; `number_low` is that header's. Raises `ReplayError` or `OpenError`."""
+    def open(self, data: bytes | bytearray | memoryview, number_low: int) -> tuple[int, bytes]:
+        """Packet number and encoded frames (for `codec.decode`) of a datagram with a short header; `number_low` is that
+        header's. Raises `ReplayError` or `OpenError`."""
         number = expand_number(number_low, self.window.largest)
         return self._open(memoryview(data), number, SHORT_HEADER_BYTES)
 
-    def open_long(self, data: bytes | bytearray | memoryview, header: LongHeader) -> Opened:
-        """Opens a datagram with a long header whose check has passed (`check_long`)."""
+    def open_long(self, data: bytes | bytearray | memoryview, header: LongHeader) -> tuple[int, bytes]:
+        """The same of a datagram with a long header whose check has passed (`check_long`)."""
         if header.number > MAX_PACKET_NUMBER:
             raise OpenError(f"packet number: expected at most 48 bits, found {header.number}")
         return self._open(memoryview(data), header.number, LONG_HEADER_BYTES)
 
-    def _open(self, view: memoryview, number: int, header_bytes: int) -> Opened:
+    def _open(self, view: memoryview, number: int, header_bytes: int) -> tuple[int, bytes]:
         window = self.window
         if not window.would_accept(number):
             raise ReplayError(f"packet {number} was already seen or is too old")
@@ -156,7 +166,7 @@ class ReceiveChannel(_Channel):
         except InvalidTag as error:
             raise OpenError(f"packet {number} does not open") from error
         window.accept(number)
-        return Opened(number, frames)
+        return number, frames
 
 
 def check_long(key: Key, data: bytes | bytearray | memoryview, header: LongHeader) -> None:

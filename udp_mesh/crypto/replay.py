@@ -17,20 +17,16 @@ class ReplayWindow:
     """Equals a plain set of numbers, except that everything older than the window (or below its floor) counts as
     seen."""
 
-    __slots__ = ("_blocks", "_floor", "_top")
+    __slots__ = ("_blocks", "_floor", "largest")
 
     def __init__(self) -> None:
         self._blocks = [0] * WINDOW_BLOCKS
-        self._top = -1
+        self.largest = -1
+        """Largest number accepted, -1 before the first."""
         self._floor = 0
 
-    @property
-    def largest(self) -> int:
-        """Largest number accepted, -1 before the first."""
-        return self._top
-
     def would_accept(self, number: int) -> bool:
-        top = self._top
+        top = self.largest
         if number < self._floor:
             return False
         if number > top:
@@ -42,7 +38,7 @@ class ReplayWindow:
     def accept(self, number: int) -> bool:
         """Marks `number` as seen; False if it already was, or is too old to know."""
         block = number >> 6
-        top = self._top
+        top = self.largest
         if number > top:
             if number < self._floor:
                 return False
@@ -50,7 +46,7 @@ class ReplayWindow:
             if block != top_block:
                 for fresh in range(max(top_block + 1, block - WINDOW_BLOCKS + 1), block + 1):
                     self._blocks[fresh % WINDOW_BLOCKS] = 0
-            self._top = number
+            self.largest = number
         elif not self.would_accept(number):
             return False
         self._blocks[block % WINDOW_BLOCKS] |= 1 << (number & 63)

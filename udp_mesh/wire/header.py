@@ -52,18 +52,20 @@ class ShortHeader(NamedTuple):
     number_low: int
 
 
-_SHORT = struct.Struct(">BHI")
+SHORT_HEADER = struct.Struct(">BHI")
+"""First byte, channel tag, low 32 bits of the packet number."""
 _LONG = struct.Struct(">B4s16sQ4s")
-SHORT_HEADER_BYTES = _SHORT.size
+SHORT_HEADER_BYTES = SHORT_HEADER.size
 LONG_HEADER_BYTES = _LONG.size
 CHECK_BYTES = 4
 SEAL_TAG_BYTES = 16
 """What AES-128-GCM adds behind the sealed frames."""
 
 _HELLO_BYTE = MARK | VERSION << 4 | Kind.HELLO
-_BROADCAST_BYTE = MARK | VERSION << 4 | Kind.BROADCAST
+BROADCAST_BYTE = MARK | VERSION << 4 | Kind.BROADCAST
 _INTRODUCTION_BYTE = MARK | VERSION << 4 | Kind.INTRODUCTION
-_DATA_BYTE = MARK | VERSION << 4 | Kind.DATA
+DATA_BYTE = MARK | VERSION << 4 | Kind.DATA
+NUMBER_LOW_MASK = 0xFFFFFFFF
 
 
 def is_ours(data: bytes | bytearray | memoryview) -> bool:
@@ -72,7 +74,7 @@ def is_ours(data: bytes | bytearray | memoryview) -> bool:
 
 
 def encode_short(kind: Kind, tag: int, number: int) -> bytes:
-    return _SHORT.pack(MARK | VERSION << 4 | kind, tag, number & 0xFFFFFFFF)
+    return SHORT_HEADER.pack(MARK | VERSION << 4 | kind, tag, number & NUMBER_LOW_MASK)
 
 
 def encode_long(kind: Kind, key_id: bytes, boot_id: bytes, number: int) -> bytes:
@@ -90,9 +92,9 @@ def parse_header(data: bytes | bytearray | memoryview) -> LongHeader | ShortHead
     if size < SHORT_HEADER_BYTES + SEAL_TAG_BYTES:
         raise DecodeError(f"datagram: expected at least {SHORT_HEADER_BYTES + SEAL_TAG_BYTES} bytes, found {size}")
     first = data[0]
-    if first in (_DATA_BYTE, _BROADCAST_BYTE):
-        _, tag, low = _SHORT.unpack_from(data)
-        return ShortHeader(Kind.DATA if first == _DATA_BYTE else Kind.BROADCAST, tag, low)
+    if first in (DATA_BYTE, BROADCAST_BYTE):
+        _, tag, low = SHORT_HEADER.unpack_from(data)
+        return ShortHeader(Kind.DATA if first == DATA_BYTE else Kind.BROADCAST, tag, low)
     if first < MARK:
         raise DecodeError(f"datagram: expected the mark bit, found first byte {first:#04x}")
     if (first >> 4) & 7 != VERSION:
