@@ -62,7 +62,10 @@ def send(
         return Rejected(RejectReason.TOO_LARGE, f"expected at most {limits.message_bytes} bytes, found {len(payload)}")
     channel = channel_of(state, topic, type_name)
     if channel is None:
-        return Rejected(RejectReason.UNKNOWN_TOPIC, "every topic number is taken, or the type's name is too long")
+        return Rejected(
+            RejectReason.UNKNOWN_TOPIC,
+            f"every topic number is taken, or the type's name is not printable text of at most {MAX_TYPE_BYTES} bytes",
+        )
     if destination is not None:
         names = [destination]
     elif topic.destinations:
@@ -137,10 +140,12 @@ def _room_for(state: State, topic: Topic, names: list[str], size_bytes: int) -> 
 
 
 def channel_of(state: State, topic: Topic, type_name: str) -> Channel | None:
-    """The topic's number on the air with this type; None when there are too many."""
+    """The topic's number on the air with this type; None when there are too many, or where no receiver takes the type's
+    name: it would refuse every datagram that announces it, with all that is packed beside it."""
     channel = state.channels.get((topic.name, type_name))
     if channel is None:
-        if len(state.channels) >= MOST_CHANNELS or len(type_name.encode()) > MAX_TYPE_BYTES:
+        travels = type_name.isprintable() and len(type_name.encode()) <= MAX_TYPE_BYTES
+        if len(state.channels) >= MOST_CHANNELS or not travels:
             return None
         channel = Channel(len(state.channels), topic, topic.name, type_name)
         state.channels[(topic.name, type_name)] = channel

@@ -12,14 +12,19 @@ from pathlib import Path
 
 from udp_mesh import __version__
 from udp_mesh.client.mesh_client import Header
-from udp_mesh.core.settings import Neighbour, Settings
+from udp_mesh.core.settings import Settings
 from udp_mesh.daemon import metrics
 from udp_mesh.daemon.api import Client, RequestError
 from udp_mesh.daemon.configuration import (
     CONDITIONS_TOPIC,
+    NODE_NAME,
     RESERVED_PREFIX,
+    TOPIC_NAME,
+    is_node_name,
+    is_topic_name,
     parse_address,
     read_keys,
+    read_neighbour,
     read_rates,
     topic_from_values,
 )
@@ -27,6 +32,7 @@ from udp_mesh.daemon.service import Service
 from udp_mesh.daemon.status import conditions_json, plain, show_address, topic_json, topics_json
 from udp_mesh.daemon.toml_source import ConfigurationError, Source, Table
 from udp_mesh.wire.header import VERSION as WIRE_VERSION
+from udp_mesh.wire.limits import MAX_TYPE_BYTES
 
 MAX_PING_S = 60.0
 
@@ -78,6 +84,15 @@ def publish(service: Service, client: Client, header: Header, payload: bytes) ->
     topic, destination = _text(header, "topic"), _optional_text(header, "to")
     notify = client if header.get("notify") else None
     type_name = _text(header, "type") if header.get("type") else ""
+    # What no receiver takes is refused here, by name.
+    if not is_topic_name(topic):
+        raise RequestError("bad-request", f"topic: expected {TOPIC_NAME}, found {topic!r}")
+    if destination is not None and not is_node_name(destination):
+        raise RequestError("bad-request", f"to: expected {NODE_NAME}, found {destination!r}")
+    if not type_name.isprintable() or len(type_name.encode()) > MAX_TYPE_BYTES:
+        raise RequestError(
+            "bad-request", f"type: expected printable text of at most {MAX_TYPE_BYTES} bytes, found {type_name[:60]!r}"
+        )
     message = service.publish(topic, payload, destination, type_name, notify)
     if isinstance(message, int):
         return {"message": message}
@@ -140,6 +155,17 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
                 "lost_on_send": link.datagrams_lost_on_send,
             }
             for link in driver.hub.links.values()
+        ],
+        "refusals": [
+            {
+                "link": refusal.link,
+                "to": refusal.to,
+                "reason": refusal.reason,
+                "datagrams": refusal.datagrams,
+                "for_s": round(refusal.last - refusal.since, 3),
+                "last_ago_s": round(driver.now() - refusal.last, 3),
+            }
+            for refusal in driver.refusals.standing()
         ],
         "link_failures": driver.link_failures,
         "recording": None if recorder is None else {"path": str(recorder.path), "bytes": recorder.bytes},
@@ -219,17 +245,15 @@ def set_rates(service: Service, _client: Client, header: Header, _: bytes) -> He
 
 
 def set_neighbour(service: Service, _client: Client, header: Header, _: bytes) -> Header:
-    text, settings = _text(header, "address"), service.settings
-    address = parse_address(text, settings.port)
-    if address is None:
-        raise RequestError("bad-request", f"address: expected an IP address with or without a port, found {text!r}")
-    try:
-        neighbour = Neighbour(
-            address, _optional_text(header, "name"), _optional_text(header, "link"), bool(header.get("legacy"))
-        )
-    except ValueError as error:
-        raise RequestError("bad-request", str(error)) from error
-    others = tuple(other for other in settings.neighbours if other.address != address)
+    settings, source = service.settings, Source("command", {})
+    text, name, link = _text(header, "address"), _optional_text(header, "name"), _optional_text(header, "link")
+    values = {"address": text, "name": name, "link": link, "legacy": bool(header.get("legacy"))}
+    neighbour = read_neighbour(
+        Table({key: value for key, value in values.items() if value is not None}, source, ("neighbour",)), settings.port
+    )
+    if neighbour is None:
+        raise _refusal(ConfigurationError(source.problems))
+    others = tuple(other for other in settings.neighbours if other.address != neighbour.address)
     return _changed(service, replace(settings, neighbours=(*others, neighbour)))
 
 

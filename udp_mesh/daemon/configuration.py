@@ -155,14 +155,15 @@ def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
     top.text("key_file")
     unkeyed = top.boolean("unkeyed", False)
     name = top.text("name", socket.gethostname().split(".")[0]) or ""
-    _check_name(top, "name", name, MAX_NAME_BYTES)
+    if not is_node_name(name):
+        top.report("name", NODE_NAME, name)
     port = top.integer("port", DEFAULT_PORT, 1, 65_535) or DEFAULT_PORT
     window = top.integer_or_word("window", "adaptive", 1, 4096)
     fragment_bytes = top.integer("fragment_bytes", 1400, 64, 8192) or 1400
     topics = tuple(read_topic(topic, entry) for topic, entry in top.table("topics").named_tables())
     undeclared = read_topic("*", top.table("undeclared")) if top.has("undeclared") else None
     links = tuple(_read_link(entry) for entry in top.tables("links")) or EVERY_INTERFACE
-    neighbours = tuple(_read_neighbour(entry, port) for entry in top.tables("neighbours"))
+    neighbours = _read_neighbours(top, port)
     rates, limits = read_rates(top.table("rates")), _read_limits(top.table("limits"))
     daemon = _read_daemon(top.table("daemon"))
     top.finish()
@@ -176,7 +177,7 @@ def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
             unkeyed=unkeyed,
             topics=(*topics, *RESERVED_TOPICS),
             undeclared=undeclared,
-            neighbours=tuple(neighbour for neighbour in neighbours if neighbour is not None),
+            neighbours=neighbours,
             window=_window(window),
             fragment_bytes=fragment_bytes,
             rates=rates,
@@ -201,19 +202,32 @@ def problem_of(source: Source, error: ValueError) -> Problem:
     return Problem(source.file, source.line(path), parts["key"], parts["expected"], parts["found"] or "otherwise")
 
 
-def _check_name(table: Table, key: str, name: str, limit_bytes: int) -> None:
-    size = len(name.encode())
-    if not 1 <= size <= limit_bytes or not name.isprintable() or any(c.isspace() or c == "/" for c in name):
-        table.report(key, f"a name of 1 to {limit_bytes} bytes without space or slash", name)
+NODE_NAME = f"a name of 1 to {MAX_NAME_BYTES} bytes without space or slash"
+TOPIC_NAME = f"a topic of 1 to {MAX_TOPIC_BYTES} bytes without space"
+
+
+def is_node_name(name: str) -> bool:
+    """Whether a node can have this name."""
+    return _is_name(name, MAX_NAME_BYTES) and "/" not in name
+
+
+def is_topic_name(name: str) -> bool:
+    """Whether a topic can have this name."""
+    return _is_name(name, MAX_TOPIC_BYTES)
+
+
+def _is_name(name: str, limit_bytes: int) -> bool:
+    # half a surrogate pair is not printable, so that what is encoded here can be
+    return name.isprintable() and not any(map(str.isspace, name)) and 1 <= len(name.encode()) <= limit_bytes
 
 
 def read_topic(name: str, table: Table) -> Topic:
     """How one topic travels: an entry of `[topics]`, or what a command sets. Problems go to the table's source."""
-    size, good_name = len(name.encode()), False
+    good_name = False
     if name.startswith(RESERVED_PREFIX):
         table.source.report(table.path, f"a topic outside {RESERVED_PREFIX}", name)
-    elif not 1 <= size <= MAX_TOPIC_BYTES or not name.isprintable() or any(c.isspace() for c in name):
-        table.source.report(table.path, f"a topic of 1 to {MAX_TOPIC_BYTES} bytes without space", name)
+    elif not is_topic_name(name):
+        table.source.report(table.path, TOPIC_NAME, name)
     else:
         good_name = True
     default = Topic("default")
@@ -232,6 +246,9 @@ def read_topic(name: str, table: Table) -> Topic:
         repair=table.boolean("repair", default.repair),
     )
     table.finish()
+    for destination in topic.destinations:
+        if not is_node_name(destination):
+            table.report("destinations", f"names of nodes, each {NODE_NAME}", destination)
     if topic.outbox_on_disk and topic.outbox is Outbox.NONE:
         table.report("outbox_on_disk", 'outbox = "last" or "all" beside it', topic.outbox_on_disk)
     return dataclasses.replace(topic, name=name) if good_name else topic
@@ -257,12 +274,29 @@ def _read_link(table: Table) -> LinkWish:
     return LinkWish(interface, address, kind == "broadcast", mtu)
 
 
-def _read_neighbour(table: Table, port: int) -> Neighbour | None:
+def _read_neighbours(top: Table, port: int) -> tuple[Neighbour, ...]:
+    found: dict[Address, Neighbour] = {}
+    for entry in top.tables("neighbours"):
+        neighbour = read_neighbour(entry, port)
+        if neighbour is None:
+            continue
+        if neighbour.address in found:
+            entry.report("address", "each neighbour once", neighbour.address[0])
+        found[neighbour.address] = neighbour
+    return tuple(found.values())
+
+
+def read_neighbour(table: Table, port: int) -> Neighbour | None:
+    """A fixed neighbour: an entry of `[[neighbours]]`, or what a command sets. Problems go to the table's source, and
+    None comes back."""
     text, name = table.text("address"), table.text("name")
     link, legacy = table.text("link"), table.boolean("legacy", False)
     table.finish()
     if text is None:
         table.source.report(table.path, "an address", "none")
+        return None
+    if name is not None and not is_node_name(name):
+        table.report("name", NODE_NAME, name)
         return None
     if legacy and name is None:
         table.source.report(table.path, "a name, since a legacy neighbour's own claim is not authenticated", "none")
@@ -347,15 +381,15 @@ def _read_daemon(table: Table) -> DaemonSettings:
     metrics = parse_address(metrics_text, 0) if metrics_text is not None and metrics_text.count(":") else None
     if metrics_text is not None and (metrics is None or not ipaddress.ip_address(metrics[0]).is_loopback):
         table.report("metrics_address", "a loopback address with a port (127.0.0.1:9871)", metrics_text)
-    socket_path = table.text("socket") or str(default.socket)
+    socket_path = _read_path(table, "socket", default.socket)
     if len(os.fsencode(socket_path)) > MAX_SOCKET_BYTES:
-        table.report("socket", f"a path of at most {MAX_SOCKET_BYTES} bytes (unix(7))", socket_path)
+        table.report("socket", f"a path of at most {MAX_SOCKET_BYTES} bytes (unix(7))", str(socket_path))
     settings = DaemonSettings(
-        socket=Path(socket_path),
+        socket=socket_path,
         socket_mode=mode,
         socket_group=table.text("socket_group"),
         user=table.text("user"),
-        state_directory=Path(table.text("state_directory") or default.state_directory),
+        state_directory=_read_path(table, "state_directory", default.state_directory),
         metrics_address=metrics,
         conditions_period_s=table.number("conditions_period_s", default.conditions_period_s, 0.05, 3600) or 1.0,
         outbox_disk_bytes=_or(table.integer("outbox_disk_bytes", None, 0, 1 << 40), default.outbox_disk_bytes),
@@ -364,6 +398,13 @@ def _read_daemon(table: Table) -> DaemonSettings:
     )
     table.finish()
     return settings
+
+
+def _read_path(table: Table, key: str, default: Path) -> Path:
+    text = table.text(key)
+    if text == "":
+        table.report(key, "a path", text)
+    return Path(text) if text else default
 
 
 def topic_from_values(name: str, values: dict[str, object], current: Topic | None) -> Topic:

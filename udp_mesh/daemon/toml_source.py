@@ -157,6 +157,9 @@ def _syntax_problem(text: str, file: str, error: str) -> Problem:
             return Problem(file, line, "", expected, "something else", place)
         case "Cannot overwrite a value":
             return Problem(file, line, "", "each key once", "one that stands above as well", place)
+        case _ if declared := re.fullmatch(r"Cannot declare \((?P<keys>.*)\) twice", reason):
+            table = ".".join(re.findall(r"'((?:[^'\\]|\\.)*)'", declared["keys"]))
+            return Problem(file, line, "", "each table once", f"[{table}], which stands above as well", place)
         case _ if reason.startswith("Expected "):
             return Problem(file, line, "", reason.removeprefix("Expected "), "something else", place)
         case _:

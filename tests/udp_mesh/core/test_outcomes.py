@@ -16,6 +16,7 @@ from udp_mesh.core.events import (
     MessagePeerLost,
     MessageReceived,
     PeerRestarted,
+    Rejected,
 )
 from udp_mesh.core.settings import Rates, Topic
 
@@ -154,3 +155,12 @@ def test_a_receiver_that_restarts_in_the_middle_gets_the_whole_message_in_its_ne
     assert world.told("a", PeerRestarted)
     received = [event for event in world.told("b", MessageReceived) if isinstance(event, MessageReceived)]
     assert [event.payload for event in received] == [payload]
+
+
+@pytest.mark.parametrize("type_name", ["a\nb", "\x1b[2J", "\ud800", "x" * 256])
+def test_a_type_that_no_receiver_takes_is_refused_and_holds_up_nothing(type_name: str) -> None:
+    two = pair(Topic("status", priority=0))
+    assert isinstance(two.a.send("status", b"x", destination="b", type_name=type_name, now=two.now), Rejected)
+    assert not isinstance(two.a.send("status", b"after", destination="b", now=two.now), Rejected)
+    two.roundtrip(3)
+    assert [event.payload for event in two.events(two.b) if isinstance(event, MessageReceived)] == [b"after"]

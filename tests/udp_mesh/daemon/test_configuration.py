@@ -226,6 +226,25 @@ def test_a_key_file_is_all_that_is_needed(tmp_path: Path) -> None:
             f'[daemon]\nsocket = "/{"s" * 200}"',
             f'udp-mesh.toml:3: daemon.socket: expected a path of at most 107 bytes (unix(7)), found "/{"s" * 56}..."',
         ),
+        (
+            '[topics]\nmap = { destinations = ["base", "a b"] }',
+            "udp-mesh.toml:3: topics.map.destinations: expected names of nodes, each a name of 1 to 63 bytes without "
+            'space or slash, found "a b"',
+        ),
+        (
+            '[[neighbours]]\naddress = "10.0.0.1"\nname = "a/b"',
+            'udp-mesh.toml:4: neighbours.0.name: expected a name of 1 to 63 bytes without space or slash, found "a/b"',
+        ),
+        (
+            '[[neighbours]]\naddress = "10.0.0.1"\n[[neighbours]]\naddress = "10.0.0.1:8700"',
+            'udp-mesh.toml:5: neighbours.1.address: expected each neighbour once, found "10.0.0.1"',
+        ),
+        ('[daemon]\nsocket = ""', 'udp-mesh.toml:3: daemon.socket: expected a path, found ""'),
+        ('[daemon]\nstate_directory = ""', 'udp-mesh.toml:3: daemon.state_directory: expected a path, found ""'),
+        (
+            "[topics.map]\npriority = 1\n[topics.map]\npriority = 2",
+            "udp-mesh.toml:4: expected each table once, found [topics.map], which stands above as well (at column 12)",
+        ),
         ("unkeyed = true", "udp-mesh.toml:2: unkeyed: expected either key_file or unkeyed, found both"),
     ],
 )
