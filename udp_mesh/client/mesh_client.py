@@ -24,6 +24,9 @@ from typing import Any, Deque, Dict, Iterator, List, NamedTuple, Optional, Tuple
 
 DEFAULT_SOCKET = "/run/udp-mesh/udp-mesh.sock"
 MAX_HEADER_BYTES = 1 << 16
+"""Of a request: the daemon takes no longer one."""
+MAX_REPLY_HEADER_BYTES = 1 << 26
+"""Of what the daemon sends: the status of a thousand peers takes some megabytes."""
 MAX_PAYLOAD_BYTES = 1 << 30
 _LENGTHS = struct.Struct(">II")
 _READ_BYTES = 1 << 18
@@ -73,7 +76,7 @@ class FrameReader:
         start = 0
         while len(buffer) - start >= self._needed:
             head_bytes, payload_bytes = _LENGTHS.unpack_from(buffer, start)
-            if head_bytes > MAX_HEADER_BYTES or payload_bytes > self._max_payload_bytes:
+            if head_bytes > MAX_REPLY_HEADER_BYTES or payload_bytes > self._max_payload_bytes:
                 raise MeshError("bad-frame", "a frame of {} and {} bytes is too long".format(head_bytes, payload_bytes))
             body = start + _LENGTHS.size
             end = body + head_bytes + payload_bytes
@@ -151,6 +154,8 @@ class MeshClient:
         try:
             self._write(dict(fields, op=op, id=number), payload)
         except MeshError as error:
+            if error.code == "bad-request":
+                raise
             self._drain()
             raise self._gone(str(error)) from error
         deadline = time.monotonic() + self.timeout_s
@@ -216,9 +221,14 @@ class MeshClient:
     # The socket
 
     def _write(self, header: Header, payload: bytes) -> None:
+        frame = encode_frame(header, payload)
+        head_bytes = _LENGTHS.unpack_from(frame)[0]
+        if head_bytes > MAX_HEADER_BYTES:
+            text = "a request's header of {} bytes: the daemon takes {} at most".format(head_bytes, MAX_HEADER_BYTES)
+            raise MeshError("bad-request", text)
         try:
             with self._write_lock:
-                self._socket.sendall(encode_frame(header, payload))
+                self._socket.sendall(frame)
         except OSError as error:
             raise MeshError("unreachable", "the daemon closed the connection: {}".format(error.strerror)) from error
 
