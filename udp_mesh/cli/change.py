@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import tomllib
 from typing import Any
 
@@ -16,7 +17,7 @@ def set_topic(arguments: argparse.Namespace) -> int:
 
 
 def set_window(arguments: argparse.Namespace) -> int:
-    window: str | int = int(arguments.window) if arguments.window.isdecimal() else arguments.window
+    window: str | int = int(arguments.window) if re.fullmatch("[0-9]{1,9}", arguments.window) else arguments.window
     return _change(arguments, "set-window", window=window)
 
 

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 
-from udp_mesh.cli.output import Exit, fields_text, say, say_json, say_json_line
+from udp_mesh.cli.output import Exit, fields_text, say, say_json, say_json_line, say_part
 from udp_mesh.cli.views import Json, peers_view, status_view, topics_view
 from udp_mesh.client.mesh_client import MeshClient
 
@@ -60,5 +60,5 @@ def metrics(arguments: argparse.Namespace) -> int:
     """The page for Prometheus."""
     with MeshClient(arguments.socket) as mesh:
         _, page = mesh.request_frame("metrics")
-        sys.stdout.write(page.decode())
+        say_part(page.decode())
     return Exit.OK

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 import textwrap
 from collections.abc import Callable, Sequence
@@ -11,15 +12,18 @@ from pathlib import Path
 
 from udp_mesh import __version__
 from udp_mesh.cli import change, inspect, serve, traffic
-from udp_mesh.cli.output import Exit, complain
+from udp_mesh.cli.output import Exit, OutputFailed, complain, give_up, prepare
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, MeshError
+from udp_mesh.daemon.commands import MAX_PING_S
 from udp_mesh.daemon.configuration import CONDITIONS_TOPIC, DEFAULT_PATH
 
 Command = Callable[[argparse.Namespace], int]
 
 EPILOG = """\
-exit codes: 0 done, 1 refused or no answer, 2 wrong usage, 3 no daemon answers at the socket,
-4 problems in the configuration, 5 a message was not delivered, 130 interrupted
+exit codes: 0 done, 1 refused or no answer, 2 wrong usage or a file that `report` or `sim` cannot use,
+3 no daemon answers at the socket, 4 problems in the configuration, 5 a message was not delivered, 130 interrupted
+
+UDP_MESH_SOCKET in the environment names the daemon's socket where --socket does not.
 
 examples:
   udp-mesh check udp-mesh.toml && udp-mesh run udp-mesh.toml
@@ -54,13 +58,15 @@ class Help(argparse.RawDescriptionHelpFormatter):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the process's exit code."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    if arguments and arguments[0] in FORWARDED:
-        forwarded: Callable[[list[str]], int] = importlib.import_module(FORWARDED[arguments[0]]).main
-        return forwarded(arguments[1:])
-    parsed = build_parser().parse_args(arguments)
-    command: Command = parsed.command
+    prepare()
+    command: Command | None = None
     try:
+        arguments = list(sys.argv[1:] if argv is None else argv)
+        if arguments and arguments[0] in FORWARDED:
+            forwarded: Callable[[list[str]], int] = importlib.import_module(FORWARDED[arguments[0]]).main
+            return forwarded(arguments[1:])
+        parsed = build_parser().parse_args(arguments)
+        command = parsed.command
         return command(parsed)
     except MeshError as error:
         hint = _hint(error)
@@ -68,7 +74,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return Exit.UNREACHABLE if error.code == "unreachable" else Exit.FAILED
     except BrokenPipeError:
         # The reader of our output has gone: nobody is left to be told.
-        sys.stderr.close()
+        give_up()
+        return Exit.FAILED
+    except OutputFailed as error:
+        give_up()
+        complain(f"standard output: {error}")
         return Exit.FAILED
     except KeyboardInterrupt:
         return Exit.OK if command in ENDLESS else Exit.INTERRUPTED
@@ -80,7 +90,7 @@ def _hint(error: MeshError) -> str:
         case "unreachable", PermissionError():
             return "its socket is for root and for the group that `socket_group` in [daemon] names"
         case "unreachable", FileNotFoundError() | ConnectionRefusedError():
-            return "`udp-mesh run` starts one, --socket names another socket"
+            return "`udp-mesh run` starts one, --socket or UDP_MESH_SOCKET names another socket"
         case "unknown-peer", _:
             return "`udp-mesh peers` lists those that were heard"
         case "unknown-topic", _:
@@ -136,7 +146,11 @@ def _command(
     parser = _parser(commands, name, help_text, example)
     parser.set_defaults(command=command)
     if daemon:
-        parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket (default: %(default)s)")
+        parser.add_argument(
+            "--socket",
+            default=os.environ.get("UDP_MESH_SOCKET") or DEFAULT_SOCKET,
+            help="the daemon's socket (default: UDP_MESH_SOCKET, or %(default)s)",
+        )
     if json:
         parser.add_argument("--json", action="store_true", help="JSON for scripts")
     return parser
@@ -297,7 +311,7 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--interval", type=_positive, default=1.0, metavar="SECONDS", help="between two (default: %(default)g)"
     )
     ping.add_argument(
-        "--timeout", type=_positive, default=2.0, metavar="SECONDS", help="for each answer (default: %(default)g)"
+        "--timeout", type=_ping_s, default=2.0, metavar="SECONDS", help="for each answer (default: %(default)g)"
     )
     bench = _command(
         commands, "bench", traffic.bench, "fill the link to a peer and measure", example="udp-mesh bench base"
@@ -340,9 +354,16 @@ def _positive(text: str) -> float:
     return value
 
 
+def _ping_s(text: str) -> float:
+    value = _positive(text)
+    if value > MAX_PING_S:
+        raise argparse.ArgumentTypeError(f"expected at most {MAX_PING_S:g} seconds, found {text!r}")
+    return value
+
+
 def _times(text: str) -> int:
     """A count that does something: at least one."""
-    if not text.isdecimal() or not 1 <= int(text) <= MOST_TIMES:
+    if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= MOST_TIMES:
         raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, found {text!r}")
     return int(text)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from enum import IntEnum
 
 
@@ -25,17 +27,66 @@ class Exit(IntEnum):
     """Ctrl-C before it was done: 128 and the signal's number, as shells count."""
 
 
+class OutputFailed(Exception):
+    """Standard output takes no more (a full disk); its reader's going away is a BrokenPipeError."""
+
+
+def prepare() -> None:
+    """Makes standard output and standard error such that whatever is written to them is no error of ours: a closed one
+    swallows it, and characters that a terminal's encoding lacks are shown by their numbers."""
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
+    reconfigure = getattr(sys.stdout, "reconfigure", None)
+    if reconfigure is not None:
+        reconfigure(errors="backslashreplace")
+
+
+def give_up() -> None:
+    """Nothing more is written to standard output, not even what Python holds for it at its end."""
+    with suppress(OSError, ValueError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
+
+
 def say(text: str) -> None:
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+    say_part(text + "\n")
+
+
+def say_part(text: str) -> None:
+    """Without the end of a line."""
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputFailed(error.strerror) from error
+
+
+def say_bytes(raw: bytes) -> None:
+    try:
+        sys.stdout.buffer.write(raw)
+        sys.stdout.buffer.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputFailed(error.strerror) from error
 
 
 def say_json(value: object) -> None:
-    say(json.dumps(value, indent=2, ensure_ascii=False))
+    say(json.dumps(value, indent=2, ensure_ascii=_is_ascii_safer()))
 
 
 def say_json_line(value: object) -> None:
-    say(json.dumps(value, separators=(",", ":"), ensure_ascii=False))
+    say(json.dumps(value, separators=(",", ":"), ensure_ascii=_is_ascii_safer()))
+
+
+def _is_ascii_safer() -> bool:
+    """Where not every character can be written, JSON's own escapes stand for them."""
+    return (sys.stdout.encoding or "").lower().replace("-", "") != "utf8"
 
 
 def complain(text: str) -> None:

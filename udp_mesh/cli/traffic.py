@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 import base64
+import os
 import sys
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from udp_mesh.cli.output import Exit, complain, milliseconds, rate, say, say_json, say_json_line, size
+from udp_mesh.cli.output import Exit, complain, milliseconds, rate, say, say_bytes, say_json, say_json_line, size
+from udp_mesh.cli.views import Json
 from udp_mesh.client.mesh_client import MeshClient, MeshError, as_message
 from udp_mesh.daemon.configuration import BENCH_TOPIC, CONDITIONS_TOPIC
 
@@ -28,6 +31,13 @@ def publish(arguments: argparse.Namespace) -> int:
     if payload is None:
         return Exit.FAILED
     with MeshClient(arguments.socket) as mesh:
+        destinations: set[str] = set()
+        if arguments.wait is not None:
+            topic = _topic(mesh, arguments.topic)
+            if topic is not None and not topic["reliable"]:
+                complain(f"nobody is told what became of a message of {arguments.topic}, which is best effort (--wait)")
+                return Exit.USAGE
+            destinations = _destinations(mesh, arguments.to, topic)
         numbers = []
         for turn in range(arguments.count):
             if turn:
@@ -35,18 +45,23 @@ def publish(arguments: argparse.Namespace) -> int:
             number = mesh.publish(
                 arguments.topic, payload, to=arguments.to, type=arguments.type, notify=arguments.wait is not None
             )
+            assert number is not None
             numbers.append(number)
         if arguments.wait is None:
             if arguments.json:
                 say_json_line({"topic": arguments.topic, "accepted": len(numbers)})
             return Exit.OK
-        return _await_outcomes(mesh, numbers, arguments)
+        return _await_outcomes(mesh, {(number, peer) for number in numbers for peer in destinations}, arguments)
 
 
 def _payload(arguments: argparse.Namespace) -> bytes | None:
     if arguments.text not in (None, "-"):
-        return bytes(arguments.text.encode())
+        # The bytes of the command line, whatever they are.
+        return os.fsencode(arguments.text)
     if arguments.text == "-" or arguments.file is None or str(arguments.file) == "-":
+        if sys.stdin is None:
+            complain("expected a message or --file: standard input is closed")
+            return None
         if sys.stdin.isatty():
             complain("the message is what you type now; Ctrl-D ends it")
         return sys.stdin.buffer.read()
@@ -58,19 +73,38 @@ def _payload(arguments: argparse.Namespace) -> bytes | None:
         return None
 
 
-def _await_outcomes(mesh: MeshClient, numbers: list[int | None], arguments: argparse.Namespace) -> int:
-    """Waits for one outcome of each message; the first that is not `delivered` decides the exit code."""
-    waiting, code, deadline = set(numbers), Exit.OK, time.monotonic() + arguments.wait
+def _topic(mesh: MeshClient, name: str) -> Json | None:
+    """How messages of this topic travel; None where they are refused."""
+    reply = mesh.request("topics")
+    found = [topic for topic in reply["topics"] if topic["configured"] and topic["name"] == name]
+    topic: Json | None = found[0] if found else reply["undeclared"]
+    return topic
+
+
+def _destinations(mesh: MeshClient, to: str | None, topic: Json | None) -> set[str]:
+    """Whose outcomes are awaited: of a message to all, those of the peers that are online."""
+    if to is not None:
+        return {to}
+    conditions = mesh.request("status")["conditions"]
+    if topic is not None and topic["destinations"]:
+        return set(topic["destinations"]) - {conditions["name"]}
+    return {peer["name"] for peer in conditions["peers"] if peer["online"]}
+
+
+def _await_outcomes(mesh: MeshClient, waiting: set[tuple[int, str]], arguments: argparse.Namespace) -> int:
+    """Waits for the outcome of each message at each destination; one that is not `delivered` decides the exit code."""
+    code, deadline = Exit.OK, time.monotonic() + arguments.wait
     while waiting:
         frame = mesh.next_frame(max(0.0, deadline - time.monotonic()))
         if frame is None:
+            names = ", ".join(sorted({peer for _, peer in waiting}))
             hint = "" if arguments.to else " (one to all that fits a datagram has none: name a peer with --to)"
-            complain(f"{len(waiting)} message(s) have no outcome within {arguments.wait:g} s{hint}")
+            complain(f"{len(waiting)} outcome(s) are missing after {arguments.wait:g} s, of {names}{hint}")
             return Exit.NOT_DELIVERED
         fields = frame[0]
         if fields.get("event") != "outcome":
             continue
-        waiting.discard(fields["message_id"])
+        waiting.discard((fields["message_id"], fields["peer"]))
         if fields["outcome"] != "delivered":
             code = Exit.NOT_DELIVERED
         if arguments.json:
@@ -103,8 +137,7 @@ def echo(arguments: argparse.Namespace) -> int:
                 continue
             shown += 1
             if arguments.raw:
-                sys.stdout.buffer.write(payload)
-                sys.stdout.buffer.flush()
+                say_bytes(payload)
             elif arguments.json:
                 say_json_line({**header, "bytes": len(payload), "payload": base64.b64encode(payload).decode()})
             else:
@@ -121,35 +154,52 @@ def _preview(payload: bytes) -> str:
 
 
 def ping(arguments: argparse.Namespace) -> int:
-    """Round trips through both daemons, at the most urgent priority."""
+    """Round trips through both daemons, at the most urgent priority; Ctrl-C ends it with what was measured."""
     times: list[float] = []
-    with MeshClient(arguments.socket, timeout_s=arguments.timeout + 5) as mesh:
-        for turn in range(arguments.count):
-            if turn:
-                time.sleep(arguments.interval)
-            try:
-                reply = mesh.request("ping", peer=arguments.peer, timeout_s=arguments.timeout)
-            except MeshError as error:
-                if error.code in ("unreachable", "timeout"):
-                    raise
-                if arguments.json:
-                    say_json_line({"peer": arguments.peer, "error": error.code})
-                if error.code == "unknown-peer":
-                    raise
-                if not arguments.json:
-                    say(str(error))
-                continue
-            times.append(reply["round_trip_s"])
-            if arguments.json:
-                say_json_line({"peer": arguments.peer, "round_trip_s": times[-1]})
-            else:
-                say(f"{arguments.peer}: {milliseconds(times[-1])}")
-    if times and not arguments.json:
-        say(
-            f"{len(times)} of {arguments.count} answered, least {milliseconds(min(times))}, "
-            f"mean {milliseconds(sum(times) / len(times))}, most {milliseconds(max(times))}"
+    asked = 0
+    code = Exit.FAILED
+    try:
+        with MeshClient(arguments.socket, timeout_s=arguments.timeout + 5) as mesh:
+            for turn in range(arguments.count):
+                if turn:
+                    time.sleep(arguments.interval)
+                asked += 1
+                _ping_once(mesh, arguments, times)
+        code = Exit.OK if len(times) == arguments.count else Exit.FAILED
+    except KeyboardInterrupt:
+        # the one under way was not waited for to its end
+        asked = max(asked - 1, len(times))
+        code = Exit.INTERRUPTED
+    if not arguments.json:
+        spread = (
+            f", least {milliseconds(min(times))}, mean {milliseconds(sum(times) / len(times))}, "
+            f"most {milliseconds(max(times))}"
+            if times
+            else ""
         )
-    return Exit.OK if len(times) == arguments.count else Exit.FAILED
+        say(f"{len(times)} of {asked} answered{spread}")
+    return code
+
+
+def _ping_once(mesh: MeshClient, arguments: argparse.Namespace, times: list[float]) -> None:
+    """Adds what it took, where it was answered. Raises MeshError where no other will be answered either."""
+    try:
+        reply = mesh.request("ping", peer=arguments.peer, timeout_s=arguments.timeout)
+    except MeshError as error:
+        if error.code in ("unreachable", "timeout"):
+            raise
+        if arguments.json:
+            say_json_line({"peer": arguments.peer, "error": error.code})
+        if error.code != "no-answer":
+            raise
+        if not arguments.json:
+            say(str(error))
+        return
+    times.append(reply["round_trip_s"])
+    if arguments.json:
+        say_json_line({"peer": arguments.peer, "round_trip_s": round(times[-1], 6)})
+    else:
+        say(f"{arguments.peer}: {milliseconds(times[-1])}")
 
 
 def _backlog(size_bytes: int, delivered_per_s: float) -> int:
@@ -157,51 +207,74 @@ def _backlog(size_bytes: int, delivered_per_s: float) -> int:
     return max(BENCH_LEAST_BACKLOG, min(BENCH_BACKLOG_BYTES // size_bytes, int(BENCH_BACKLOG_S * delivered_per_s)))
 
 
+@dataclass(slots=True)
+class _Run:
+    """What a benchmark has sent, and what of it arrived until when."""
+
+    begun: float
+    ended: float
+    sent: int = 0
+    delivered: int = 0
+    outstanding: set[int] = field(default_factory=set)
+
+    @property
+    def seconds(self) -> float:
+        return max(self.ended - self.begun, 1e-3)
+
+
 def bench(arguments: argparse.Namespace) -> int:
-    """Fills the link to a peer at the lowest priority for some seconds, and says what arrived."""
-    payload = bytes(arguments.size)
-    sent = delivered = 0
-    outstanding: set[int] = set()
+    """Fills the link to a peer at the lowest priority for some seconds, says what arrived. Ctrl-C ends it sooner."""
+    code = Exit.OK
     with MeshClient(arguments.socket) as mesh:
         begun = time.monotonic()
-        ended = begun
-        while True:
-            now = time.monotonic()
-            if now - begun < arguments.seconds:
-                while len(outstanding) < _backlog(arguments.size, delivered / max(ended - begun, 1e-3)):
-                    number = mesh.publish(BENCH_TOPIC, payload, to=arguments.peer, notify=True)
-                    assert number is not None
-                    outstanding.add(number)
-                    sent += 1
-            elif not outstanding:
-                break
-            frame = mesh.next_frame(arguments.timeout)
-            if frame is None:
+        run = _Run(begun, begun)
+        try:
+            if not _fill(mesh, arguments, run):
                 complain(f"no message was delivered within {arguments.timeout:g} s")
-                return Exit.NOT_DELIVERED
-            fields = frame[0]
-            if fields.get("event") == "outcome" and fields["message_id"] in outstanding:
-                outstanding.discard(fields["message_id"])
-                if fields["outcome"] == "delivered":
-                    delivered += 1
-                    ended = time.monotonic()
-    seconds = max(ended - begun, 1e-9)
-    result = {
-        "peer": arguments.peer,
-        "messages": sent,
-        "delivered": delivered,
-        "bytes": delivered * arguments.size,
-        "seconds": round(seconds, 3),
-        "bits_per_s": round(delivered * arguments.size * 8 / seconds),
-    }
+                code = Exit.NOT_DELIVERED
+        except KeyboardInterrupt:
+            code = Exit.INTERRUPTED
+    arrived_bytes = run.delivered * arguments.size
+    bits_per_s = arrived_bytes * 8 / run.seconds
     if arguments.json:
+        result = {
+            "peer": arguments.peer,
+            "messages": run.sent,
+            "delivered": run.delivered,
+            "bytes": arrived_bytes,
+            "seconds": round(run.seconds, 3),
+            "bits_per_s": round(bits_per_s),
+        }
         say_json(result)
     else:
         say(
-            f"{delivered} of {sent} messages of {size(arguments.size)} delivered in {seconds:.2f} s: "
-            f"{rate(delivered * arguments.size * 8 / seconds)}"
+            f"{run.delivered} of {run.sent} messages of {size(arguments.size)} delivered in {run.seconds:.2f} s: "
+            f"{rate(bits_per_s)}"
         )
-    return Exit.OK if delivered == sent else Exit.NOT_DELIVERED
+    return Exit.NOT_DELIVERED if code == Exit.OK and run.delivered < run.sent else code
+
+
+def _fill(mesh: MeshClient, arguments: argparse.Namespace, run: _Run) -> bool:
+    """Sends for the time asked for and waits for the rest; False where nothing arrives any more."""
+    payload = bytes(arguments.size)
+    while True:
+        if time.monotonic() - run.begun < arguments.seconds:
+            while len(run.outstanding) < _backlog(arguments.size, run.delivered / run.seconds):
+                number = mesh.publish(BENCH_TOPIC, payload, to=arguments.peer, notify=True)
+                assert number is not None
+                run.outstanding.add(number)
+                run.sent += 1
+        elif not run.outstanding:
+            return True
+        frame = mesh.next_frame(arguments.timeout)
+        if frame is None:
+            return False
+        fields = frame[0]
+        if fields.get("event") == "outcome" and fields["message_id"] in run.outstanding:
+            run.outstanding.discard(fields["message_id"])
+            if fields["outcome"] == "delivered":
+                run.delivered += 1
+                run.ended = time.monotonic()
 
 
 def record_start(arguments: argparse.Namespace) -> int:

@@ -4,6 +4,8 @@ import argparse
 import errno
 import io
 import json
+import os
+import re
 import shlex
 import signal
 import socket
@@ -16,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from tests.udp_mesh.daemon.processes import RunningDaemon, collect, two_daemons
+from tests.udp_mesh.daemon.processes import RunningDaemon, collect, poll, two_daemons
 from tests.udp_mesh.links.sockets import WAIT_S
 from udp_mesh.cli import serve, traffic
 from udp_mesh.cli.main import FORWARDED, build_parser, main
@@ -70,6 +72,29 @@ def test_a_watch_repeats_until_it_is_interrupted(pair: Pair) -> None:
     assert uptimes[1] > uptimes[0]
 
 
+@pytest.mark.parametrize("words", [["ping", "bob", "-c", "1000"], ["bench", "bob", "--seconds", "1000", "--size", "1"]])
+def test_a_measurement_that_is_interrupted_says_what_it_has(pair: Pair, words: list[str]) -> None:
+    code = "import sys; from udp_mesh.cli import main, traffic; print('ready', flush=True); sys.exit(main.main())"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *words, "--socket", str(pair[0].socket)], stdout=subprocess.PIPE, text=True
+    ) as program:
+        assert program.stdout is not None
+        program.stdout.readline()
+        if words[0] == "ping":
+            assert "bob: " in program.stdout.readline()
+        else:
+            poll(lambda: bench_arrived(pair[1]), "the benchmark's messages arrive")
+        program.send_signal(signal.SIGINT)
+        last = program.stdout.read().splitlines()[-1]
+        assert program.wait(WAIT_S) == Exit.INTERRUPTED
+    assert re.match("[1-9][0-9]* of [1-9][0-9]* (answered, least|messages of 1 B delivered)", last)
+
+
+def bench_arrived(daemon: RunningDaemon) -> bool:
+    with daemon.client() as client:
+        return int(client.request("status")["conditions"]["counters"]["messages_received"]) > 20
+
+
 def test_a_wait_that_is_interrupted_is_no_success(pair: Pair) -> None:
     words = ["ping", "bob", "-c", "1000", "--json", "--socket", str(pair[0].socket)]
     program = subprocess.Popen([sys.executable, "-m", "udp_mesh.cli.main", *words], stdout=subprocess.PIPE)
@@ -95,6 +120,86 @@ def test_a_message_is_sent_and_its_outcome_decides_the_exit_code(run: Run, pair:
         assert code == Exit.OK
         assert json.loads(text)["outcome"] == "delivered"
         assert collect(receiver, 1)[0].payload == b"hello"
+
+
+def test_the_outcome_at_every_destination_is_waited_for(run: Run) -> None:
+    assert run("set", "topic", "orders", 'destinations=["bob", "carol"]', "deadline_s=0.2", "outbox=all")[0] == Exit.OK
+    code, text, _ = run("pub", "orders", "go", "--wait", str(WAIT_S), "--json")
+    told = {line["peer"]: line["outcome"] for line in map(json.loads, text.splitlines())}
+    assert (code, told) == (Exit.NOT_DELIVERED, {"bob": "delivered", "carol": "expired"})
+    code, text, _ = run("pub", "map", "x" * 20_000, "--wait", str(WAIT_S), "--json")
+    assert (code, json.loads(text)["peer"]) == (Exit.OK, "bob")
+
+
+def test_what_has_no_outcome_says_so(run: Run) -> None:
+    code, text, complaint = run("pub", "video", "x", "--to", "bob", "--wait")
+    assert (code, text) == (Exit.USAGE, "")
+    assert "video, which is best effort" in complaint
+    assert run("set", "topic", "later", 'destinations=["carol"]', "outbox=all")[0] == Exit.OK
+    code, text, complaint = run("pub", "later", "x", "--wait", "0.1")
+    assert (code, text) == (Exit.NOT_DELIVERED, "")
+    assert "1 outcome(s) are missing after 0.1 s, of carol (one to all that fits a datagram has none" in complaint
+
+
+def test_a_message_is_the_bytes_of_the_command_line(run: Run, pair: Pair) -> None:
+    with pair[1].client() as receiver:
+        receiver.subscribe("status")
+        assert run("pub", "status", os.fsdecode(b"\xff\xfe"), "--to", "bob", "--wait")[0] == Exit.OK
+        assert collect(receiver, 1)[0].payload == b"\xff\xfe"
+
+
+@pytest.mark.parametrize("words", [["status"], ["status", "--json"], ["metrics"], ["ping", "bob", "-c", "1"]])
+def test_an_output_that_takes_no_more_is_a_complaint(pair: Pair, words: list[str]) -> None:
+    with open("/dev/full", "w") as full:
+        program = subprocess.run(
+            [sys.executable, "-m", "udp_mesh.cli.main", *words, "--socket", str(pair[0].socket)],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=WAIT_S,
+        )
+    assert (program.returncode, program.stderr) == (
+        Exit.FAILED,
+        "udp-mesh: standard output: No space left on device\n",
+    )
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_closed_standard_stream_is_no_error_of_ours(pair: Pair, closed: str) -> None:
+    words = shlex.join([sys.executable, "-m", "udp_mesh.cli.main", "status", "--socket", str(pair[0].socket)])
+    program = subprocess.run(["sh", "-c", f"{words} {closed}"], capture_output=True, text=True, timeout=WAIT_S)
+    assert (program.returncode, program.stderr) == (Exit.OK, "")
+    words = words.replace(" status ", " pub status --to bob ")
+    program = subprocess.run(["sh", "-c", f"{words} <&-"], capture_output=True, text=True, timeout=WAIT_S)
+    assert program.returncode == Exit.FAILED
+    assert "standard input is closed" in program.stderr
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_characters_that_the_terminal_lacks_are_shown_by_their_numbers(
+    pair: Pair, form: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alice, _ = pair
+    with alice.client() as client:
+        client.request("set-topic", topic="gr\u00fc\u00df", values={"priority": 5})
+    raw = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="ascii"))
+    assert main(["topics", "--socket", str(alice.socket), *form]) == Exit.OK
+    text = raw.getvalue().decode("ascii")
+    if form:
+        assert "gr\u00fc\u00df" in {topic["name"] for topic in json.loads(text)["topics"]}
+    else:
+        assert "gr\\xfc\\xdf" in text
+    assert main(["drop", "topic", "gr\u00fc\u00df", "--socket", str(alice.socket)]) == Exit.OK
+
+
+def test_the_environment_names_the_socket(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("UDP_MESH_SOCKET", str(pair[0].socket))
+    assert main(["peers"]) == Exit.OK
+    assert "bob" in capsys.readouterr().out
+    assert main(["peers", "--socket", str(pair[0].socket) + "x"]) == Exit.UNREACHABLE
 
 
 def test_a_file_is_sent_several_times(run: Run, pair: Pair, tmp_path: Path) -> None:
@@ -240,6 +345,8 @@ def test_metrics_are_printed(run: Run) -> None:
         ["bench", "bob", "--size", "0"],
         ["bench", "bob", "--size", "-5"],
         ["ping", "bob", "--interval", "soon"],
+        ["ping", "bob", "--timeout", "61"],
+        ["echo", "map", "--count", "\uff13"],
     ],
 )
 def test_a_number_that_would_do_nothing_is_wrong_usage(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
