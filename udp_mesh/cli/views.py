@@ -75,6 +75,11 @@ def status_view(status: Json) -> str:
     else:
         lines.append("NO LINK: no configured interface is up with an address")
     lines += [f"link {name} FAILED: {reason}" for name, reason in status["link_failures"].items()]
+    lines += [
+        f"link {refusal['link']} CANNOT SEND to {refusal['to']}: {refusal['reason']} "
+        f"({refusal['datagrams']} datagrams, the last {duration(refusal['last_ago_s'])} ago)"
+        for refusal in status.get("refusals", ())
+    ]
     lines += ["", peers_view(conditions["peers"])]
     lines += [
         f"{stranger['name']} at {stranger['address']} on {stranger['link']} is heard and DOES NOT HEAR US, "

@@ -14,7 +14,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 
 from udp_mesh.core.conditions import Conditions
@@ -22,6 +21,7 @@ from udp_mesh.core.events import Event, MessageId, Rejected
 from udp_mesh.core.node import Node
 from udp_mesh.core.seams import Datagram, RandomSource, Store
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
+from udp_mesh.daemon.refusals import REVIEW_S, Refusals
 from udp_mesh.links.attachments import Address, LinkWish
 from udp_mesh.links.hub import LinkHub
 from udp_mesh.links.netlink import InterfaceMonitor
@@ -68,16 +68,18 @@ class Driver:
         self.node = Node(settings, boot_id=boot_id, rng=rng, now=self._clock(), store=store)
         self.hub = LinkHub(links, settings.port, urgent_dscp=urgent_dscp)
         self.link_failures: dict[str, str] = {}
+        self.refusals = Refusals()
         self.lost_on_full_socket = 0
         self.wakeups = 0
         self._on_event = on_event
         self._monitor: InterfaceMonitor | None = None
-        self._blocked: dict[str, deque[Datagram]] = {}
+        self._blocked: dict[str, list[Datagram]] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = 0.0
         self._due = float("-inf")
         """When the node wanted attention, as of the last look: the loop may have come here without its timer."""
         self._refresh: asyncio.TimerHandle | None = None
+        self._review: asyncio.TimerHandle | None = None
         self._pump_requested = False
         self.closed = False
         self._wall_offset: float | None = None
@@ -102,7 +104,7 @@ class Driver:
         self._transmit_all()
         self._report_events()
         self.closed = True
-        for handle in (self._timer, self._refresh):
+        for handle in (self._timer, self._refresh, self._review):
             if handle is not None:
                 handle.cancel()
         if self._monitor is not None:
@@ -160,6 +162,7 @@ class Driver:
         for link in changes.gone:
             name = link.attachment.name
             self._blocked.pop(name, None)
+            self.refusals.link_gone(name)
             if name not in reopened:
                 log.info("link-down link=%s", name)
                 self.node.link_down(name, now)
@@ -326,27 +329,43 @@ class Driver:
         link = self.hub.links.get(name)
         if link is None:
             return
-        waiting = self._blocked.get(name)
+        waiting = self._blocked.get(name, [])
         done = 0 if waiting else link.send(datagrams)
+        if link.refused:
+            self._note_refused(link)
         if done == len(datagrams):
             return
-        if waiting is None:
-            waiting = self._blocked[name] = deque()
         if not waiting:
             self._loop.add_writer(link.fileno(), self._writable, link)
-        room = max(0, BLOCKED_DATAGRAMS - len(waiting))
-        rest = datagrams[done:]
-        waiting.extend(rest[:room])
-        self.lost_on_full_socket += len(rest) - len(rest[:room])
+        # Urgent first, here too; what falls off the end is the latest of the rest.
+        waiting = sorted([*waiting, *datagrams[done:]], key=lambda datagram: not datagram.urgent)
+        self._blocked[name] = waiting[:BLOCKED_DATAGRAMS]
+        self.lost_on_full_socket += len(waiting[BLOCKED_DATAGRAMS:])
 
     def _writable(self, link: UdpLink) -> None:
-        waiting = self._blocked.get(link.attachment.name)
-        if waiting:
-            for _ in range(link.send(list(waiting))):
-                waiting.popleft()
+        waiting = self._blocked.get(link.attachment.name, [])
+        del waiting[: link.send(waiting)]
+        if link.refused:
+            self._note_refused(link)
         if not waiting:
             self._loop.remove_writer(link.fileno())
             self._pump()
+
+    def _note_refused(self, link: UdpLink) -> None:
+        self.refusals.add(link.attachment.name, link.refused, self._clock())
+        link.refused.clear()
+        if self._review is None and not self.closed:
+            self._review = self._loop.call_later(REVIEW_S, self._review_refusals)
+
+    def _review_refusals(self) -> None:
+        going_on, over = self.refusals.review(self._clock())
+        for one in going_on:
+            log.warning(
+                "send-refused link=%s to=%s datagrams=%d reason=%s", one.link, one.to, one.datagrams, one.reason
+            )
+        for one in over:
+            log.info("send-refused-no-more link=%s datagrams=%d reason=%s", one.link, one.datagrams, one.reason)
+        self._review = self._loop.call_later(REVIEW_S, self._review_refusals) if self.refusals else None
 
     def _report_events(self) -> None:
         while (event := self.node.next_event()) is not None:

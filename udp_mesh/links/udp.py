@@ -28,6 +28,8 @@ RECEIVE_BUFFER_BYTES = 4 << 20
 """Kernel receive buffer: 30 ms of a gigabit, so that a busy core loses nothing; capped by net.core.rmem_max."""
 SEND_BUFFER_BYTES = 1 << 20
 """Kernel send buffer: a few runs; what waits here is beyond the scheduler's reach, so no more."""
+MAX_REFUSED = 256
+"""Destinations and reasons told apart of what the kernel refuses: more than a team."""
 _DATAGRAM_BYTES = 1 << 16
 _INT = struct.Struct("=i")
 _TIMESPEC = struct.Struct("@ll")
@@ -57,7 +59,9 @@ class UdpLink:
         self.segmentation = True
         """Whether runs are still handed to the kernel whole."""
         self.datagrams_lost_on_send = 0
-        """Datagrams the kernel refused (unreachable, device gone, too long)."""
+        """Datagrams the kernel refused (unreachable, forbidden, device gone, too long)."""
+        self.refused: dict[tuple[Address, int], int] = {}
+        """The same by destination and errno, until whoever tells of it has cleared it."""
         self.system_calls = 0
         self._buffer = memoryview(bytearray(_DATAGRAM_BYTES))
         family = socket.AF_INET6 if ":" in attachment.address[0] else socket.AF_INET
@@ -189,19 +193,24 @@ class UdpLink:
         except BlockingIOError:
             return None
         except OSError as error:
-            if len(run) > 1 and error.errno in (errno.EIO, errno.EINVAL, errno.EMSGSIZE, errno.EOPNOTSUPP):
-                # No segmentation on this device or path (EMSGSIZE: a datagram above the path's MTU).
-                self.segmentation = error.errno == errno.EMSGSIZE
-                return self._send_singly(run, destination)
+            number = error.errno or errno.EIO
+            if len(run) > 1 and number in (errno.EIO, errno.EINVAL, errno.EMSGSIZE, errno.EOPNOTSUPP):
+                return self._send_singly(run, destination, number)
             # Unreachable, forbidden, too long, the device gone: as lost as on a radio, and answered by the same means.
             self.datagrams_lost_on_send += len(run)
+            if len(self.refused) < MAX_REFUSED or (destination, number) in self.refused:
+                self.refused[destination, number] = self.refused.get((destination, number), 0) + len(run)
         return len(run)
 
-    def _send_singly(self, run: Sequence[Outgoing], destination: Address) -> int | None:
-        for place, datagram in enumerate(run):
-            if self._send_run([datagram], destination) is None:
-                return place or None
-        return len(run)
+    def _send_singly(self, run: Sequence[Outgoing], destination: Address, number: int) -> int | None:
+        lost_before, done = self.datagrams_lost_on_send, 0
+        while done < len(run) and self._send_run([run[done]], destination) is not None:
+            done += 1
+        if number != errno.EMSGSIZE and self.datagrams_lost_on_send - lost_before < done:
+            # What goes singly and not in a run: no segmentation on this device or path. (EMSGSIZE: one above the
+            # path's MTU; and EINVAL is the answer of a route that swallows everything, too.)
+            self.segmentation = False
+        return done or None
 
     def close(self) -> None:
         self._socket.close()

@@ -227,6 +227,52 @@ def interface_too_narrow() -> None:
         both.exchange()
 
 
+def sending_is_forbidden() -> None:
+    """A rule forbids what goes to one peer, then everything: it is told, why and to whom; when it is gone, all goes on
+    and arrives once."""
+    with pair() as both:
+        both.join("mesh0")
+        for number, daemon in enumerate((both.alice, both.bob), 1):
+            both.ip(daemon, f"addr add 10.7.20.{number}/20 broadcast + dev mesh0")
+        met(both)
+        for forbidden in ("10.7.20.2/32", "0.0.0.0/0"):
+            with both.alice.client() as sender, both.bob.client() as receiver:
+                receiver.subscribe("*")
+                both.ip(both.alice, f"xfrm policy add dir out dst {forbidden} action block")
+                sender.publish("map", bytes(300_000), to="bob", notify=True)
+                sender.publish("status", b"urgent", to="bob", notify=True)
+                (refusal,) = poll(lambda: sender.request("status")["refusals"] or None, "alice tells what is refused")
+                assert (refusal["link"], refusal["reason"]) == ("mesh0", "Operation not permitted")
+                assert "10.7.20.2:8700" in refusal["to"]
+                assert receiver.next_frame(1.0) is None
+                both.ip(both.alice, "xfrm policy flush")
+                assert [message.topic for message in collect(receiver, 2)] == ["status", "map"]
+                assert set(outcomes(sender, 2).values()) == {"delivered"}
+                assert receiver.next_frame(0.5) is None
+        logged(both.alice, "send-refused link=mesh0 to=10.7.20.2:8700 ")
+
+
+def interface_queue_overflows() -> None:
+    """A queue of two datagrams in front of the interface drops most of what leaves (the kernel says nothing of it, or
+    ENOBUFS): everything arrives, once."""
+    with pair() as both:
+        both.join("mesh0")
+        for number, daemon in enumerate((both.alice, both.bob), 1):
+            both.ip(daemon, f"addr add 10.7.20.{number}/20 broadcast + dev mesh0")
+        met(both)
+        assert both.alice.process is not None
+        words = "qdisc add dev mesh0 root tbf rate 8mbit burst 3000 limit 3000"
+        subprocess.run(["nsenter", "-t", str(both.alice.process.pid), "-n", "tc", *words.split()], check=True)
+        with both.alice.client() as sender, both.bob.client() as receiver:
+            receiver.subscribe("*")
+            sender.publish("map", bytes(1_000_000), to="bob", notify=True)
+            for number in range(20):
+                sender.publish("status", b"%d" % number, to="bob", notify=True)
+            sent = {bytes(1_000_000), *(b"%d" % number for number in range(20))}
+            assert {message.payload for message in collect(receiver, 21)} == sent
+            assert set(outcomes(sender, 21).values()) == {"delivered"}
+
+
 def logged(daemon: RunningDaemon, text: str) -> None:
     """Waits until the daemon's log says so."""
     poll(lambda: text in daemon.log.read_text(), f"{daemon.name} logs {text!r}")
@@ -258,6 +304,8 @@ SCENARIOS: dict[str, Callable[[], None]] = {
         interface_goes_in_the_middle,
         interface_made_anew,
         interface_too_narrow,
+        sending_is_forbidden,
+        interface_queue_overflows,
     )
 }
 

@@ -55,6 +55,32 @@ def test_a_socket_that_stays_full_holds_a_bounded_queue_and_counts_what_it_loses
     run(body)
 
 
+def test_urgent_datagrams_go_first_where_the_socket_is_full_and_are_not_what_is_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        sent: list[bytes] = []
+        room = 0
+
+        def send(_: UdpLink, datagrams: Sequence[Outgoing]) -> int:
+            sent.extend(datagram.data for datagram in datagrams[:room])
+            return min(room, len(datagrams))
+
+        driver = alice.driver
+        (name,) = driver.hub.links
+        address = bob.driver.hub.links["127.0.4.2"].attachment.address
+        monkeypatch.setattr(UdpLink, "send", send)
+        driver._transmit(name, [Datagram(name, address, b"bulk", urgent=False)] * BLOCKED_DATAGRAMS)
+        driver._transmit(name, [Datagram(name, address, b"urgent %d" % n, urgent=True) for n in range(3)])
+        room = 4
+        driver._writable(driver.hub.links[name])
+        assert sent == [b"urgent 0", b"urgent 1", b"urgent 2", b"bulk"]
+        assert driver.lost_on_full_socket == 3
+        monkeypatch.undo()
+
+    run(body)
+
+
 @pytest.mark.parametrize("step_s", [-3600.0, -0.2, 0.2, 3600.0])
 def test_a_step_of_the_wall_clock_does_not_disturb_the_transport(
     monkeypatch: pytest.MonkeyPatch, step_s: float

@@ -80,6 +80,22 @@ def test_an_unreachable_destination_costs_its_datagram_only(pair: tuple[UdpLink,
     assert receive(bob, 1) == [(b"c", alice.attachment.address)]
 
 
+def test_what_the_kernel_refuses_is_counted_by_destination_and_reason(pair: tuple[UdpLink, UdpLink]) -> None:
+    alice, bob = pair
+    nowhere, to = ("255.255.255.255", 9), bob.attachment.address
+    alice.send([Out(b"a", nowhere), Out(b"b", nowhere), Out(bytes(70_000), to), Out(b"c", to)])
+    assert alice.refused == {(nowhere, errno.EACCES): 2, (to, errno.EMSGSIZE): 1}
+
+
+def test_a_destination_that_takes_nothing_at_all_does_not_end_segmentation(pair: tuple[UdpLink, UdpLink]) -> None:
+    alice, bob = pair
+    nobody = (BOB, 0)  # the kernel answers EINVAL, as where it cannot segment, but also to a single datagram
+    assert alice.send([Out(bytes(10), nobody)] * 5 + [Out(b"c", bob.attachment.address)]) == 6
+    assert alice.datagrams_lost_on_send == 5
+    assert alice.segmentation
+    assert receive(bob, 1)[0][0] == b"c"
+
+
 def test_a_datagram_too_long_to_send_costs_itself_only(pair: tuple[UdpLink, UdpLink]) -> None:
     alice, bob = pair
     assert alice.send([Out(bytes(70_000), bob.attachment.address), Out(b"c", bob.attachment.address)]) == 2
