@@ -63,8 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = list(sys.argv[1:] if argv is None else argv)
         if arguments and arguments[0] in FORWARDED:
-            forwarded: Callable[[list[str]], int] = importlib.import_module(FORWARDED[arguments[0]]).main
-            return forwarded(arguments[1:])
+            return _forward(FORWARDED[arguments[0]], arguments[1:])
         parsed = build_parser().parse_args(arguments)
         command = parsed.command
         return command(parsed)
@@ -82,6 +81,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         return Exit.FAILED
     except KeyboardInterrupt:
         return Exit.OK if command in ENDLESS else Exit.INTERRUPTED
+
+
+def _forward(package: str, arguments: list[str]) -> int:
+    """A package's own command; it speaks of its files itself, so what is left is standard output."""
+    command: Callable[[list[str]], int] = importlib.import_module(package).main
+    try:
+        code = command(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputFailed(error.strerror) from error
+    return code
 
 
 def _hint(error: MeshError) -> str:

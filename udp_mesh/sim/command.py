@@ -13,7 +13,7 @@ from typing import Any
 from udp_mesh.report.page import write_page
 from udp_mesh.report.recording import parse
 from udp_mesh.sim.run import Played, play
-from udp_mesh.sim.scenario import Scenario, ScenarioError, load
+from udp_mesh.sim.scenario import MAX_DURATION_S, Scenario, ScenarioError, load
 
 SHIPPED = Path(__file__).with_name("scenarios")
 
@@ -23,12 +23,16 @@ def run_command(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="udp-mesh sim",
         description="Play a whole team in virtual time, on the transport's own core and a simulated radio channel.",
-        epilog="example: udp-mesh sim final-run --out /tmp/final-run",
+        epilog="exit codes: 0 played, 2 the scenario cannot be used or the results not be written, 130 interrupted\n\n"
+        "example: udp-mesh sim final-run --out /tmp/final-run",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("scenario", nargs="?", help="a YAML file, or the name of a shipped scenario")
     parser.add_argument("--list", action="store_true", help="name the shipped scenarios and exit")
-    parser.add_argument("--seed", type=int, help="instead of the scenario's own")
-    parser.add_argument("--duration", type=float, metavar="S", help="virtual seconds, instead of the scenario's own")
+    parser.add_argument("--seed", type=_seed, help="instead of the scenario's own")
+    parser.add_argument(
+        "--duration", type=_duration_s, metavar="SECONDS", help="of virtual time, instead of the scenario's own"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="write recording.jsonl, summary.json and report.html")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     chosen = parser.parse_args(list(arguments))
@@ -41,11 +45,17 @@ def run_command(arguments: Sequence[str]) -> int:
             scenario = replace(scenario, seed=chosen.seed)
         if chosen.duration is not None:
             scenario = replace(scenario, duration_s=chosen.duration)
+        if chosen.out is not None:
+            # before the run, which may take long
+            _make_writable(chosen.out)
         played = play(scenario, _progress(scenario))
         if chosen.out is not None:
             write(played, chosen.out)
-    except (ScenarioError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+    except ScenarioError as error:
+        print("\n".join(f"udp-mesh: {problem}" for problem in str(error).splitlines()), file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"udp-mesh: {error.filename}: {error.strerror}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -53,6 +63,32 @@ def run_command(arguments: Sequence[str]) -> int:
     summary = played.summary()
     print(json.dumps(summary, indent=2) if chosen.json else text(summary))
     return 0
+
+
+def _seed(text: str) -> int:
+    if not (text.isascii() and text.isdecimal()):
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, found {text!r}")
+    return int(text)
+
+
+def _duration_s(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 1e-3 <= value <= MAX_DURATION_S:
+        raise argparse.ArgumentTypeError(f"expected 0.001 to {MAX_DURATION_S:g} seconds, found {text!r}")
+    return value
+
+
+def _make_writable(directory: Path) -> None:
+    """Raises OSError where nothing could be written there."""
+    directory.mkdir(parents=True, exist_ok=True)
+    probe = directory / "recording.jsonl"
+    with probe.open("ab"):
+        pass
+    if not probe.stat().st_size:
+        probe.unlink()
 
 
 def shipped() -> list[str]:
@@ -71,8 +107,8 @@ def find(name: str) -> Path:
 
 def write(played: Played, directory: Path) -> None:
     directory.mkdir(parents=True, exist_ok=True)
-    (directory / "recording.jsonl").write_text("\n".join(played.lines) + "\n")
-    (directory / "summary.json").write_text(json.dumps(played.summary(), indent=2) + "\n")
+    (directory / "recording.jsonl").write_text("\n".join(played.lines) + "\n", "utf-8")
+    (directory / "summary.json").write_text(json.dumps(played.summary(), indent=2) + "\n", "utf-8")
     recorded = parse((line.encode() for line in played.lines), "recording.jsonl")
     write_page([recorded], directory / "report.html", title=played.scenario.name)
 

@@ -26,12 +26,11 @@ from udp_mesh.core.settings import Settings
 from udp_mesh.report import recording
 from udp_mesh.sim.medium import Counts
 from udp_mesh.sim.place import Course
-from udp_mesh.sim.scenario import Flow, Incident, Scenario
+from udp_mesh.sim.scenario import MAX_MESSAGE_BYTES, Flow, Incident, Scenario
 from udp_mesh.sim.team import Ledger, Team
 
 # when a message was handed over, at the head of its payload
 _SENT = struct.Struct("<d")
-_FILLING_BYTES = 1 << 22
 SAMPLE_S = 1.0
 
 
@@ -98,7 +97,7 @@ class _Play:
             name: Settings(name, unkeyed=True, topics=scenario.topics, window=scenario.window)
             for name in scenario.robots
         }
-        self.filling = self.rng.randbytes(_FILLING_BYTES)
+        self.filling = self.rng.randbytes(MAX_MESSAGE_BYTES)
         self.lines = [recording.header(scenario.observer, 0.0)]
         self.topics = {topic.name: TopicTotal() for topic in scenario.topics}
         self.offered = {topic.name: 0 for topic in scenario.topics}
@@ -144,8 +143,8 @@ class _Play:
             if flow.spread:
                 # a lognormal with the wanted mean
                 size = int(size * self.rng.lognormvariate(-(flow.spread**2) / 2, flow.spread))
-            size = max(_SENT.size, min(size, _FILLING_BYTES))
-            start = self.rng.randrange(_FILLING_BYTES - size + 1)
+            size = max(_SENT.size, min(size, MAX_MESSAGE_BYTES))
+            start = self.rng.randrange(MAX_MESSAGE_BYTES - size + 1)
             payload = _SENT.pack(now) + self.filling[start : start + size - _SENT.size]
             self.offered[flow.topic] += 1
             self.team.send(source, flow.topic, payload, flow.destination or None)

@@ -6,6 +6,8 @@ and line, what was expected and what was found; unknown keys are problems.
 
 from __future__ import annotations
 
+import difflib
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -13,13 +15,31 @@ from typing import Any, Literal
 
 import yaml
 
-from udp_mesh.core.settings import Outbox, Topic
+from udp_mesh.core.settings import Outbox, Settings, Topic
 from udp_mesh.sim.medium import Channel
 from udp_mesh.sim.place import Air, Course, Wall, course, standing
 
 EVERYBODY = "*"
 _PROBLEMS_SHOWN = 20
 _MAX_BYTES = 1 << 20
+MAX_MESSAGE_BYTES = 1 << 22
+"""Of one simulated message."""
+MAX_DURATION_S = 1e7
+"""Four months: what is longer is a mistake."""
+
+# The least and the most of each number of `Channel` and `Air`, in its unit.
+_RANGES = {
+    "rate": (1e3, 1e11),
+    "overhead_s": (0.0, 1.0),
+    "queue_frames": (1, 1_000_000),
+    "attempts": (1, 255),
+    "broadcast_repeats": (1, 16),
+    "route_s": (0.001, 3600.0),
+    "hop_delay_s": (0.0, 10.0),
+    "good_m": (0.0, 1e6),
+    "range_m": (0.001, 1e6),
+    "least_loss": (0.0, 1.0),
+}
 
 
 class ScenarioError(ValueError):
@@ -82,7 +102,7 @@ class _At:
     def problem(self, expected: str, found: object = None) -> None:
         line = 1 if self.node is None else self.node.start_mark.line + 1
         seen = self._seen() if found is None else repr(found)
-        self.problems.append(f"{self.file}:{line}: {self.what}: expected {expected}, found {seen}")
+        self.problems.append(f"{self.file}:{line}: {self.what or 'scenario'}: expected {expected}, found {seen}")
 
     def _seen(self) -> str:
         match self.node:
@@ -106,7 +126,9 @@ class _At:
             name = str(key.value) if isinstance(key, yaml.ScalarNode) else ""
             entry = _At(value, self.file, f"{self.what}.{name}" if self.what else name, self.problems)
             if known is not None and name not in known:
-                _At(key, self.file, self.what or "scenario", self.problems).problem(f"one of {', '.join(known)}", name)
+                near = difflib.get_close_matches(name, known, n=1)
+                meant = f" (did you mean '{near[0]}'?)" if near else ""
+                _At(key, self.file, self.what, self.problems).problem(f"one of {', '.join(known)}{meant}", name)
             elif name in entries:
                 entry.problem("each key once", name)
             else:
@@ -130,17 +152,23 @@ class _At:
             return default
         return str(self.node.value)
 
-    def number(self, default: float, least: float = 0.0) -> float:
+    def number(self, default: float, least: float = 0.0, most: float = 1e9) -> float:
         if self.node is None:
             return default
         try:
-            value = float(self.node.value) if isinstance(self.node, yaml.ScalarNode) else float("nan")
+            value = float(self.node.value) if isinstance(self.node, yaml.ScalarNode) else math.nan
         except ValueError:
-            value = float("nan")
-        if not value >= least:
-            self.problem(f"a number of at least {least:g}")
+            value = math.nan
+        if not least <= value <= most:
+            self.problem(f"a number of at {f'most {most:g}' if value > most else f'least {least:g}'}")
             return default
         return value
+
+    def whole(self, default: int, least: int = 0, most: int = 1_000_000_000) -> int:
+        value = self.number(default, least, most)
+        if value != int(value):
+            self.problem("a whole number")
+        return int(value)
 
     def flag(self) -> bool:
         return self.text("false", ("true", "false")) == "true"
@@ -161,13 +189,19 @@ def parse(raw: bytes, file: str) -> Scenario:
         raise ScenarioError(f"{file}: expected at most {_MAX_BYTES} bytes, found {len(raw)}")
     try:
         text = raw.decode()
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
-            raise ScenarioError(f"{file}: expected no aliases (`*name`)")
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent):
+                line = event.start_mark.line + 1 if event.start_mark else 1
+                raise ScenarioError(f"{file}:{line}: expected no aliases, found *{event.anchor}")
         root = yaml.compose(text, Loader=yaml.SafeLoader)
-    except (UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise ScenarioError(f"{file}:{line}: expected UTF-8, found byte {raw[error.start]:#04x}") from error
+    except (yaml.YAMLError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         line = mark.line + 1 if mark else 1
-        raise ScenarioError(f"{file}:{line}: expected YAML in UTF-8, found {str(error).splitlines()[0]}") from error
+        found = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise ScenarioError(f"{file}:{line}: expected YAML, found otherwise: {found}") from error
     problems: list[str] = []
     scenario = _scenario(_At(root, file, "", problems), Path(file).stem)
     if problems:
@@ -191,25 +225,32 @@ def _scenario(at: _At, name: str) -> Scenario:
     def get(key: str) -> _At:
         return keys.get(key, nothing)
 
-    robots = {key: _course(value, ()) for key, value in get("robots").mapping(None).items()}
+    robot_entries = get("robots").mapping(None)
+    robots = {key: _course(value, ()) for key, value in robot_entries.items()}
+    for key, value in robot_entries.items():
+        try:
+            Settings(key, unkeyed=True)
+        except ValueError as error:
+            value.problem("the name of a node", str(error))
     relay_entries = get("relays").mapping(None)
     relays = {key: _course(value, ("appear_s",)) for key, value in relay_entries.items()}
     appear_s = {}
     for key, value in relay_entries.items():
+        if key in robots:
+            value.problem("a name that no robot has", key)
         if isinstance(value.node, yaml.MappingNode):
             entries = value.mapping(None)
             if "appear_s" in entries:
                 appear_s[key] = entries["appear_s"].number(0.0)
     if len(robots) < 2:
         get("robots").problem("at least two robots", len(robots))
-    topics = tuple(_topic(key, value) for key, value in get("topics").mapping(None).items())
+    topics = tuple(_topic(key, value, tuple(robots)) for key, value in get("topics").mapping(None).items())
     topic_names = tuple(topic.name for topic in topics)
-    everybody = (*robots, *relays)
     window = get("window").text("adaptive")
     return Scenario(
         name=get("name").text(name),
-        seed=int(get("seed").number(1)),
-        duration_s=get("duration_s").number(60.0),
+        seed=get("seed").whole(1),
+        duration_s=get("duration_s").number(60.0, least=1e-3, most=MAX_DURATION_S),
         robots=robots,
         relays=relays,
         appear_s=appear_s,
@@ -217,14 +258,14 @@ def _scenario(at: _At, name: str) -> Scenario:
         air=_air(get("air")),
         topics=topics,
         flows=tuple(_flow(item, topic_names, tuple(robots)) for item in get("flows").items()),
-        incidents=tuple(_incident(item, everybody) for item in get("incidents").items()),
+        incidents=tuple(_incident(item, tuple(robots), tuple(relays)) for item in get("incidents").items()),
         observer=get("observer").text(next(iter(robots), ""), tuple(robots)),
-        window="adaptive" if window == "adaptive" else int(get("window").number(3, least=1)),
+        window="adaptive" if window == "adaptive" else get("window").whole(3, least=1, most=4096),
     )
 
 
 def _pair(at: _At) -> tuple[float, float]:
-    values = [item.number(0.0, least=-1e6) for item in at.items()]
+    values = [item.number(0.0, least=-1e6, most=1e6) for item in at.items()]
     if len(values) != 2:
         at.problem("[x, y] in metres")
         return (0.0, 0.0)
@@ -240,34 +281,38 @@ def _course(at: _At, more: tuple[str, ...]) -> Course:
         return standing(_pair(entries["at"]))
     points = []
     for item in entries["path"].items() if "path" in entries else ():
-        values = [value.number(0.0, least=-1e6) for value in item.items()]
+        values = [value.number(0.0, least=-1e6, most=1e6) for value in item.items()]
         if len(values) == 3:
             points.append((values[0], (values[1], values[2])))
         else:
             item.problem("[seconds, x, y]")
     try:
         return course(points)
-    except ValueError as error:
-        at.problem("`at: [x, y]` or `path: [[seconds, x, y], ...]` with rising times", str(error))
+    except ValueError:
+        at.problem("`at: [x, y]` or `path: [[seconds, x, y], ...]` with rising times")
         return standing((0.0, 0.0))
 
 
-def _numbers(at: _At, made: Any, whole: tuple[str, ...] = ()) -> dict[str, Any]:
+def _numbers(at: _At, made: Any) -> dict[str, Any]:
     known = tuple(item.name for item in fields(made) if item.name != "walls")
     entries = at.mapping((*known, "walls") if isinstance(made, Air) else known)
     values: dict[str, Any] = {}
     for name in known:
         if name in entries:
-            if isinstance(getattr(made, name), bool):
+            default = getattr(made, name)
+            if isinstance(default, bool):
                 values[name] = entries[name].flag()
                 continue
-            value = entries[name].number(getattr(made, name))
-            values[name] = int(value) if name in whole else value
+            least, most = _RANGES[name]
+            if isinstance(default, int):
+                values[name] = entries[name].whole(default, int(least), int(most))
+            else:
+                values[name] = entries[name].number(default, least, most)
     return values
 
 
 def _channel(at: _At) -> Channel:
-    return Channel(**_numbers(at, Channel(), ("queue_frames", "attempts", "broadcast_repeats")))
+    return Channel(**_numbers(at, Channel()))
 
 
 def _air(at: _At) -> Air:
@@ -276,14 +321,17 @@ def _air(at: _At) -> Air:
     for item in entries["walls"].items() if "walls" in entries else ():
         parts = item.mapping(("a", "b", "loss"))
         if "a" in parts and "b" in parts:
-            loss = parts["loss"].number(1.0) if "loss" in parts else 1.0
+            loss = parts["loss"].number(1.0, most=1.0) if "loss" in parts else 1.0
             walls.append(Wall(_pair(parts["a"]), _pair(parts["b"]), loss))
         else:
             item.problem("a and b, each [x, y]")
-    return Air(**_numbers(at, Air()), walls=tuple(walls))
+    air = Air(**_numbers(at, Air()), walls=tuple(walls))
+    if air.range_m < air.good_m:
+        at.problem(f"range_m of at least good_m, {air.good_m:g}", air.range_m)
+    return air
 
 
-def _topic(name: str, at: _At) -> Topic:
+def _topic(name: str, at: _At, robots: tuple[str, ...]) -> Topic:
     keys = (
         "priority", "reliable", "keep_last", "deadline_s", "rate_limit_bytes_per_s", "compression", "destinations",
         "outbox", "repair",
@@ -295,13 +343,15 @@ def _topic(name: str, at: _At) -> Topic:
             case "reliable" | "compression" | "repair":
                 values[key] = entry.flag()
             case "deadline_s":
-                values[key] = entry.number(1.0)
+                values[key] = entry.number(1.0, least=1e-3)
             case "outbox":
                 values[key] = Outbox(entry.text("none", tuple(kind.value for kind in Outbox)))
             case "destinations":
-                values[key] = tuple(item.text() for item in entry.items())
+                values[key] = tuple(item.text(one_of=robots) for item in entry.items())
+            case "priority":
+                values[key] = entry.whole(8, most=15)
             case _:
-                values[key] = int(entry.number(0))
+                values[key] = entry.whole(1, least=1)
     try:
         return Topic(name, **values)
     except ValueError as error:
@@ -326,19 +376,20 @@ def _flow(at: _At, topics: tuple[str, ...], robots: tuple[str, ...]) -> Flow:
         sources=sources,
         destination=get("destination").text("", robots),
         period_s=get("period_s").number(1.0, least=1e-3),
-        size_bytes=int(get("size_bytes").number(1, least=1)),
-        spread=get("spread").number(0.0),
+        size_bytes=get("size_bytes").whole(1, least=1, most=MAX_MESSAGE_BYTES),
+        spread=get("spread").number(0.0, most=5.0),
         start_s=get("start_s").number(0.0),
-        stop_s=get("stop_s").number(float("inf")),
+        stop_s=get("stop_s").number(math.inf),
     )
 
 
-def _incident(at: _At, everybody: tuple[str, ...]) -> Incident:
+def _incident(at: _At, robots: tuple[str, ...], relays: tuple[str, ...]) -> Incident:
     entries = at.mapping(("at_s", "what", "who"))
     for key in ("at_s", "what", "who"):
         if key not in entries:
             at.problem(key, "no such key")
             return Incident(0.0, "off", "")
-    return Incident(
-        entries["at_s"].number(0.0), entries["what"].text("off", INCIDENTS), entries["who"].text("", everybody)
-    )
+    what = entries["what"].text("off", INCIDENTS)
+    # a relay has a radio and no process of ours
+    who = entries["who"].text("", robots if what in ("crash", "restart") else (*robots, *relays))
+    return Incident(entries["at_s"].number(0.0), what, who)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from udp_mesh.sim.command import SHIPPED, run_command, shipped
+from udp_mesh.sim.run import play
 from udp_mesh.sim.scenario import ScenarioError, load, parse
 
 GOOD = """\
@@ -31,13 +34,45 @@ def test_each_shipped_scenario_loads(name: str) -> None:
     ("old", "new", "message"),
     [
         ("a: [0, 0]", "a: [0]", "s.yaml:4: robots.a: expected [x, y] in metres, found a list"),
-        ("priority: 0", "priority: 99", "s.yaml:7: topics.estop: expected a topic that can be used"),
+        ("priority: 0", "priority: 99", "s.yaml:7: topics.estop.priority: expected a number of at most 15, found '99'"),
+        ("priority: 0", "priority: 1.5", "s.yaml:7: topics.estop.priority: expected a whole number, found '1.5'"),
+        ("priority: 0", "destinations: [c]", "s.yaml:7: topics.estop.destinations[0]: expected one of a, b, found 'c'"),
+        ("  estop: {", "  e stop: {", "s.yaml:7: topics.e stop: expected a topic that can be used"),
+        ("a: [0, 0]", "a: [0, .inf]", "s.yaml:4: robots.a[1]: expected a number of at least -1e+06, found '.inf'"),
+        ("a: [0, 0]", "a: [0, inf]", "s.yaml:4: robots.a[1]: expected a number of at most 1e+06, found 'inf'"),
+        ("a: [0, 0]", "a c: [0, 0]", "s.yaml:4: robots.a c: expected the name of a node, found"),
+        ("a: [0, 0]", "a: [0, 0]\n  a: [0, 0]", "s.yaml:5: robots.a: expected each key once, found 'a'"),
+        ("seed: 3", "relays: {a: [1, 1]}", "s.yaml:1: relays.a: expected a name that no robot has, found 'a'"),
+        ("seed: 3", "seed: 1e400", "s.yaml:1: seed: expected a number of at most 1e+09, found '1e400'"),
+        ("seed: 3", "window: 5000", "s.yaml:1: window: expected a number of at most 4096, found '5000'"),
+        ("seed: 3", "channel: {rate: 0}", "s.yaml:1: channel.rate: expected a number of at least 1000, found '0'"),
+        ("seed: 3", "channel: {queue_frames: 0}", "channel.queue_frames: expected a number of at least 1, found '0'"),
+        ("seed: 3", "channel: {overhead_s: inf}", "channel.overhead_s: expected a number of at most 1, found 'inf'"),
+        ("seed: 3", "air: {least_loss: 2}", "s.yaml:1: air.least_loss: expected a number of at most 1, found '2'"),
+        ("seed: 3", "air: {good_m: 9, range_m: 5}", "s.yaml:1: air: expected range_m of at least good_m, 9, found 5.0"),
+        ("seed: 3", "duration: 3", "incidents (did you mean 'duration_s'?), found 'duration'"),
+        ("seed: 3", "seed: [", "s.yaml:3: expected YAML, found otherwise: "),
+        (
+            "seed: 3",
+            "relays: {c: [1, 1]}\nincidents: [{at_s: 3, what: crash, who: c}]",
+            "s.yaml:2: incidents[0].who: expected one of a, b, found 'c'",
+        ),
+        (
+            "size_bytes: 20",
+            "size_bytes: inf",
+            "flows[0].size_bytes: expected a number of at most 4.1943e+06, found 'inf'",
+        ),
+        ("duration_s: 5", "duration_s: 0", "s.yaml:2: duration_s: expected a number of at least 0.001, found '0'"),
         ("priority: 0", "urgency: 0", "s.yaml:7: topics.estop: expected one of priority, reliable"),
         ("topic: estop,", "topic: stop,", "s.yaml:9: flows[0].topic: expected one of estop, found 'stop'"),
         ("destination: b", "destination: c", "s.yaml:9: flows[0].destination: expected one of a, b, found 'c'"),
         ("[5, 20, 0]", "[0, 20, 0]", "rising times"),
         ("seed: 3", "sed: 3", "s.yaml:1: scenario: expected one of name, seed"),
-        ("duration_s: 5", "duration_s: soon", "s.yaml:2: duration_s: expected a number of at least 0, found 'soon'"),
+        (
+            "duration_s: 5",
+            "duration_s: soon",
+            "s.yaml:2: duration_s: expected a number of at least 0.001, found 'soon'",
+        ),
     ],
 )
 def test_a_problem_is_told_with_its_line(old: str, new: str, message: str) -> None:
@@ -60,8 +95,44 @@ def test_any_bytes_give_a_scenario_or_a_scenario_error(raw: bytes) -> None:
         assert str(error).startswith("s.yaml")
 
 
+@pytest.mark.parametrize("words", [["--duration", "0"], ["--duration", "nan"], ["--duration", "inf"], ["--seed", "-1"]])
+def test_a_number_that_would_play_nothing_is_wrong_usage(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run_command(["final-run", *words])
+    assert ended.value.code == 2
+    assert f"argument {words[0]}: expected" in capsys.readouterr().err
+
+
+def test_where_nothing_can_be_written_is_told_before_anything_is_played(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "taken").write_text("")
+    assert run_command(["final-run", "--out", str(tmp_path / "taken")]) == 2
+    assert capsys.readouterr().err == f"udp-mesh: {tmp_path}/taken: File exists\n"
+
+
+KEYS = (
+    "seed", "window", "channel.rate", "channel.overhead_s", "channel.queue_frames", "channel.attempts",
+    "channel.broadcast_repeats", "channel.route_s", "channel.hop_delay_s", "air.good_m", "air.range_m",
+    "air.least_loss",
+)  # fmt: skip
+VALUES = ("0", "-1", "1", "1.5", "1e400", "nan", "inf", ".inf", "-0.0", "1e18", "abc", "''", "true", "[]", "{}", "255")
+
+
+@given(st.sampled_from(KEYS), st.sampled_from(VALUES))
+def test_any_number_is_played_or_told(key: str, value: str) -> None:
+    outer, _, inner = key.partition(".")
+    text = GOOD.replace("seed: 3", f"{outer}: {{{inner}: {value}}}" if inner else f"{outer}: {value}")
+    try:
+        scenario = parse(text.replace("duration_s: 5", "duration_s: 0.2").encode(), "s.yaml")
+    except ScenarioError as error:
+        assert str(error).startswith("s.yaml:1: ")
+    else:
+        assert 0 <= play(scenario).summary()["channel"]["airtime_share"] < 50
+
+
 def test_an_alias_is_refused() -> None:
-    with pytest.raises(ScenarioError, match="no aliases"):
+    with pytest.raises(ScenarioError, match=r"^s.yaml:2: expected no aliases, found \*r$"):
         parse(b"robots: &r {a: [0, 0]}\nrelays: *r\n", "s.yaml")
 
 
