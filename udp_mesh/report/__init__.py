@@ -6,32 +6,51 @@ recording lines -> `recording.Recording` -> `figures` (numbers) -> `charts` (SVG
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+SHOWN_PROBLEMS = 5
+"""Of one recording's lines; the page counts them all."""
+
 
 def main(arguments: Sequence[str]) -> int:
     """`udp-mesh report RECORDING... --out PAGE`; 0 written, 2 a recording cannot be read or the page not written."""
+    from udp_mesh.report.figures import summary
     from udp_mesh.report.page import write_page
     from udp_mesh.report.recording import RecordingError, read
 
     parser = argparse.ArgumentParser(
         prog="udp-mesh report",
         description="Turn recordings of a run into one HTML page with its pictures.",
-        epilog="example: udp-mesh report base.jsonl --out run.html",
+        epilog="exit codes: 0 written, 2 a recording cannot be read or the page not be written, 130 interrupted\n\n"
+        "example: udp-mesh report base.jsonl --out run.html",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("recording", type=Path, nargs="+", help="made by `udp-mesh record` or `udp-mesh sim --out`")
     parser.add_argument("--out", type=Path, default=Path("report.html"), help="the page (default: report.html)")
-    parser.add_argument("--title", default="udp_mesh run")
+    parser.add_argument("--title", default="udp_mesh run", help="its heading (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print the page's numbers as JSON, too")
     chosen = parser.parse_args(list(arguments))
     try:
         recordings = [read(path) for path in chosen.recording]
         write_page(recordings, chosen.out, chosen.title)
-    except (RecordingError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+    except RecordingError as error:
+        print(f"udp-mesh: {error}", file=sys.stderr)
         return 2
-    for problem in (problem for recording in recordings for problem in recording.problems[:5]):
-        print(f"warning: {problem}", file=sys.stderr)
-    print(chosen.out)
+    except OSError as error:
+        print(f"udp-mesh: {error.filename}: {error.strerror}", file=sys.stderr)
+        return 2
+    for recording in recordings:
+        for problem in recording.problems[:SHOWN_PROBLEMS]:
+            print(f"udp-mesh: warning: {problem}", file=sys.stderr)
+        more = len(recording.problems) - SHOWN_PROBLEMS
+        if more > 0:
+            print(f"udp-mesh: warning: ... and {more} more lines that cannot be read", file=sys.stderr)
+    if chosen.json:
+        value = {"page": str(chosen.out), "recordings": [summary(recording) for recording in recordings]}
+        print(json.dumps(value, indent=2))
+    else:
+        print(chosen.out)
     return 0

@@ -1,4 +1,6 @@
-"""Pictures as SVG text: densities, spans of time, stacked areas, paths on a plane. Every text is escaped."""
+"""Pictures as SVG text: densities, spans of time, stacked areas, lines over time, paths on a plane.
+
+Every text is escaped."""
 
 from __future__ import annotations
 
@@ -125,6 +127,24 @@ def stacked(layers: Mapping[str, Sequence[float]], end: float, x_label: str, y_l
         outline += [f"{x:.1f},{axes.at_y(v):.1f}" for x, v in reversed(list(zip(xs, below, strict=True)))]
         parts.append(f'<polygon points="{" ".join(outline)}" fill="{colour(index)}"/>')
         below = above
+    return _svg(parts)
+
+
+def over_time(series: Mapping[str, Sequence[tuple[float, float]]], end: float, x_label: str, y_label: str) -> str:
+    """One line per name through its (seconds, value) points; where points are missing the line has a gap."""
+    values = [value for points in series.values() for _, value in points]
+    axes = _Axes((0.0, end), (0.0, max([*values, 1e-9]) * 1.05))
+    parts = axes.lines(x_label, y_label)
+    for index, points in enumerate(series.values()):
+        steps = sorted(later - earlier for (earlier, _), (later, _) in itertools.pairwise(points))
+        longest = 2.5 * steps[len(steps) // 2] if steps else 0.0
+        drawn, before = "", -math.inf
+        for t, value in points:
+            drawn += f"{'M' if t - before > longest else 'L'}{axes.at_x(t):.1f} {axes.at_y(value):.1f}"
+            before = t
+        parts.append(
+            f'<path d="{drawn}" fill="none" stroke="{colour(index)}" stroke-width="1.5" stroke-linecap="round"/>'
+        )
     return _svg(parts)
 
 

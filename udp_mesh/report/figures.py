@@ -1,13 +1,16 @@
-"""A recording's numbers: intervals between messages, time online, throughput by topic."""
+"""A recording's numbers: intervals between messages, time online, throughput by topic, outcomes, links; `summary` has
+them for scripts."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
-from udp_mesh.report.recording import Recording
+from udp_mesh.report.recording import Recording, Sample
 
 # what counts as a periodic topic: enough messages, with a middle interval that most keep to
 _LEAST_MESSAGES = 20
@@ -56,8 +59,11 @@ def intervals(recording: Recording) -> list[Intervals]:
     for (source, topic), times in arrived.items():
         if len(times) < _LEAST_MESSAGES:
             continue
-        values = [later - earlier for earlier, later in itertools.pairwise(times)]
+        values = [later - earlier for earlier, later in itertools.pairwise(sorted(times))]
         median_s = sorted(values)[len(values) // 2]
+        if median_s <= 0.0:
+            # most came at once: nothing periodic
+            continue
         near = [value for value in values if 0.5 * median_s <= value <= 1.5 * median_s]
         mean_s = sum(near) / len(near) if near else 0.0
         deviation_s = math.sqrt(sum((value - mean_s) ** 2 for value in near) / len(near)) if near else 0.0
@@ -99,6 +105,113 @@ def throughput(recording: Recording, bins: int = 120) -> tuple[float, list[Throu
         for topic, (priority, size, count) in totals.items()
     ]
     return width_s, sorted(found, key=lambda each: (each.priority, each.topic))
+
+
+@dataclass(frozen=True, slots=True)
+class Sending:
+    """What this node sent of one topic and what became of it; outcomes count destinations, and a broadcast in one
+    datagram has none. `latencies_s` are those of what was delivered, in rising order."""
+
+    topic: str
+    messages: int
+    total_bytes: int
+    delivered: int
+    expired: int
+    peer_lost: int
+    latencies_s: tuple[float, ...]
+
+    def latency_s(self, share: float) -> float | None:
+        """So much of what was delivered took no longer; None where nothing was."""
+        if not self.latencies_s:
+            return None
+        return self.latencies_s[min(len(self.latencies_s) - 1, int(share * len(self.latencies_s)))]
+
+
+def sendings(recording: Recording) -> list[Sending]:
+    """Of every topic that was sent, or had outcomes, the most urgent first."""
+    counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
+    ends: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
+    latencies: dict[str, list[float]] = defaultdict(list)
+    priorities: dict[str, int] = {}
+    for item in recording.sent:
+        counts[item.topic][0] += 1
+        counts[item.topic][1] += item.size
+        priorities[item.topic] = item.priority
+    for outcome in recording.outcomes:
+        ends[outcome.topic][outcome.kind] += 1
+        if outcome.latency_s is not None:
+            latencies[outcome.topic].append(outcome.latency_s)
+    return [
+        Sending(
+            topic,
+            counts[topic][0],
+            counts[topic][1],
+            ends[topic]["delivered"],
+            ends[topic]["expired"],
+            ends[topic]["peer-lost"],
+            tuple(sorted(latencies[topic])),
+        )
+        for topic in sorted({*counts, *ends}, key=lambda topic: (priorities.get(topic, 99), topic))
+    ]
+
+
+def course(
+    recording: Recording, read: Callable[[Sample], float | None], bins: int = 240
+) -> dict[str, list[tuple[float, float]]]:
+    """Per peer what its samples say over time: the mean of each of the equal bins that has any, in the bin's middle."""
+    width_s = max(recording.end_s / bins, 1e-9)
+    gathered: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for sample in recording.samples:
+        value = read(sample)
+        if value is not None:
+            gathered[sample.peer][min(bins - 1, int(sample.t / width_s))].append(value)
+    return {
+        peer: [((place + 0.5) * width_s, sum(values) / len(values)) for place, values in sorted(found.items())]
+        for peer, found in sorted(gathered.items())
+    }
+
+
+def summary(recording: Recording) -> dict[str, Any]:
+    """Everything that the page says in numbers, as JSON values."""
+    _, received = throughput(recording)
+    return {
+        "node": recording.name,
+        "started": recording.started,
+        "seconds": recording.end_s,
+        "lines_unreadable": len(recording.problems),
+        "lines_left_out": recording.left_out,
+        "received": [
+            {"topic": each.topic, "priority": each.priority, "messages": each.messages, "bytes": each.total_bytes}
+            for each in received
+        ],
+        "sent": [
+            {
+                "topic": each.topic,
+                "messages": each.messages,
+                "bytes": each.total_bytes,
+                "delivered": each.delivered,
+                "expired": each.expired,
+                "peer_lost": each.peer_lost,
+                "latency_p50_s": each.latency_s(0.5),
+                "latency_p99_s": each.latency_s(0.99),
+            }
+            for each in sendings(recording)
+        ],
+        "online": [
+            {"peer": each.peer, "share": round(each.share, 6), "spans_s": [list(span) for span in each.spans_s]}
+            for each in connections(recording)
+        ],
+        "intervals": [
+            {
+                "source": each.source,
+                "topic": each.topic,
+                "median_s": each.median_s,
+                "deviation_s": each.deviation_s,
+                "gaps": each.gaps,
+            }
+            for each in intervals(recording)
+        ],
+    }
 
 
 def histogram(values: tuple[float, ...], low: float, high: float, bins: int = 60) -> list[float]:

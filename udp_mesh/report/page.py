@@ -1,14 +1,15 @@
-"""One self-contained HTML page from recordings: totals, throughput by topic, connectivity, intervals."""
+"""One self-contained HTML page from recordings: totals, throughput by topic, connectivity, links, intervals."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 
 from udp_mesh.report import charts, figures
-from udp_mesh.report.recording import Recording
+from udp_mesh.report.recording import Recording, Sample
 
 _STYLE = """
 body{font:15px/1.45 system-ui,sans-serif;max-width:800px;margin:2em auto;padding:0 1em;color:#222}
@@ -32,23 +33,46 @@ def page(recordings: Sequence[Recording], title: str) -> str:
 
 
 def write_page(recordings: Sequence[Recording], path: Path, title: str) -> None:
-    """Write the page whole or not at all."""
-    unfinished = path.with_name(f".{path.name}.part")
-    unfinished.write_text(page(recordings, title))
-    os.replace(unfinished, path)
+    """Write the page whole or not at all. Raises OSError."""
+    text = page(recordings, title)
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", encoding="utf-8", dir=path.parent, prefix=".report-", delete=False
+        ) as file:
+            unfinished = Path(file.name)
+            file.write(text)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    try:
+        # as any file that the user makes, not as a secret
+        mask = os.umask(0)
+        os.umask(mask)
+        unfinished.chmod(0o666 & ~mask)
+        unfinished.replace(path)
+    except OSError as error:
+        unfinished.unlink()
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def _section(recording: Recording, named: bool) -> str:
     parts = [f"<h2>As seen by {escape(recording.name)}</h2>"] if named else []
     if recording.problems:
         parts.append(f"<p>{len(recording.problems)} lines could not be read and were left out.</p>")
-    parts += [_totals(recording), _throughput(recording), _connectivity(recording), _map(recording)]
+    if recording.left_out:
+        parts.append(
+            f"<p>The disk did not keep up when this was recorded: {recording.left_out} lines are missing, and what "
+            "they told is not counted.</p>"
+        )
+    parts += [_totals(recording), _sendings(recording), _throughput(recording), _connectivity(recording)]
+    parts += [_links(recording), _map(recording)]
     parts += [_intervals(each) for each in figures.intervals(recording)[:_SHOWN_INTERVALS]]
     return "".join(parts)
 
 
 def _totals(recording: Recording) -> str:
     _, topics = figures.throughput(recording)
+    if not topics:
+        return f"<p>{recording.end_s:.0f} s, nothing received.</p>"
     rows = "".join(
         f"<tr><td>{escape(each.topic)}</td><td>{each.priority}</td><td>{each.messages}</td>"
         f"<td>{each.total_bytes / 1e6:.2f}</td></tr>"
@@ -59,6 +83,28 @@ def _totals(recording: Recording) -> str:
         f"<p>{recording.end_s:.0f} s, {len(recording.arrivals)} messages, {total / 1e6:.1f} MB received.</p>"
         f"<table><tr><th>topic</th><th>priority</th><th>messages</th><th>MB</th></tr>{rows}</table>"
     )
+
+
+def _sendings(recording: Recording) -> str:
+    sent = figures.sendings(recording)
+    if not sent:
+        return ""
+    rows = "".join(
+        f"<tr><td>{escape(each.topic)}</td><td>{each.messages}</td><td>{each.total_bytes / 1e6:.2f}</td>"
+        f"<td>{each.delivered}</td><td>{each.expired}</td><td>{each.peer_lost}</td>"
+        f"<td>{_milliseconds(each.latency_s(0.5))}</td><td>{_milliseconds(each.latency_s(0.99))}</td></tr>"
+        for each in sent
+    )
+    return (
+        "<h3>What became of what was sent here</h3><table><tr><th>topic</th><th>messages</th><th>MB</th>"
+        "<th>delivered</th><th>expired</th><th>peer lost</th><th>p50 ms</th><th>p99 ms</th></tr>"
+        f"{rows}</table><p>Outcomes count destinations; a broadcast in one datagram has none. Latency is from sending "
+        "to knowing that it was delivered.</p>"
+    )
+
+
+def _milliseconds(seconds: float | None) -> str:
+    return "-" if seconds is None else f"{seconds * 1e3:.1f}"
 
 
 def _throughput(recording: Recording) -> str:
@@ -79,6 +125,21 @@ def _connectivity(recording: Recording) -> str:
     return (
         f"<h3>Online</h3>{charts.spans(rows, recording.end_s, 'seconds')}<p>{shares} of the time since first seen.</p>"
     )
+
+
+def _links(recording: Recording) -> str:
+    """Round trip and loss of each peer over the run."""
+    readings: tuple[tuple[str, str, Callable[[Sample], float | None]], ...] = (
+        ("Round trip", "ms", lambda sample: None if sample.round_trip_s is None else sample.round_trip_s * 1e3),
+        ("Loss on the way there", "%", lambda sample: None if sample.loss is None else sample.loss * 100),
+    )
+    parts = []
+    for heading, unit, read in readings:
+        series = figures.course(recording, read)
+        if series:
+            chart = charts.over_time(series, recording.end_s, "seconds", unit)
+            parts.append(f"<h3>{heading}</h3>{charts.legend(list(series))}{chart}")
+    return "".join(parts)
 
 
 def _map(recording: Recording) -> str:

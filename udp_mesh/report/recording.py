@@ -3,12 +3,15 @@
 The first line is `{"recording": 1, "node": ..., "started": UNIX_TIME}`; every other line has `t` (seconds since the
 start), `kind`, and `at` (whose view it is) where that is not the node of the first line. Read here are the kinds
 
-- `received`: `source`, `topic`, `priority`, `bytes`,
+- `received`, `sent`: `topic`, `priority`, `bytes`, and `source` of what is received,
+- `message-delivered` (`latency_s`), `message-expired`, `message-peer-lost`: `peer`, `topic`,
 - `peer-online`, `peer-offline`: `peer`,
-- `conditions`: `peers`, a list of `name`, `round_trip_s`, `loss`, `received_bits_per_s`, `hops` (each may be absent),
-- `place`: `x`, `y` in metres (simulated runs);
+- `conditions`: `peers`, a list of `name`, `online`, `round_trip_s`, `loss`, `received_bits_per_s`, `hops` (each but the
+  name may be absent),
+- `place`: `x`, `y` in metres (simulated runs),
+- `gap`: `lines`, so many were left out here when the run was recorded;
 
-others (`sent`, further events) are passed over.
+others (further events) are passed over.
 """
 
 from __future__ import annotations
@@ -17,11 +20,16 @@ import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 VERSION = 1
-# longer lines are no line of ours
-MAX_LINE_BYTES = 1 << 20
+MAX_LINE_BYTES = 128 << 20
+"""A longer line is no line of ours: the largest usual message (64 MiB), recorded with its payload in base64, fits."""
+MAX_T_S = 1e9
+"""Thirty years: a later time is damage, and would make every picture a point."""
+MAX_PLACE_M = 1e7
+MAX_BYTES = 1 << 50
+MAX_SAMPLE = 1e15
 _SAMPLED = ("round_trip_s", "loss", "received_bits_per_s", "hops")
 
 
@@ -66,9 +74,29 @@ class Place:
     y: float
 
 
+@dataclass(frozen=True, slots=True)
+class Sent:
+    t: float
+    topic: str
+    priority: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a sent message at one destination; `latency_s` where `kind` is `delivered`."""
+
+    t: float
+    peer: str
+    topic: str
+    kind: str
+    latency_s: float | None = None
+
+
 @dataclass(slots=True)
 class Recording:
-    """Everything in one recording, in its order. `problems` are lines that were left out, and why."""
+    """Everything in one recording, in its order. `problems` are lines that cannot be read, and why; `left_out` counts
+    lines that the recording itself says were never written."""
 
     name: str = ""
     started: float = 0.0
@@ -76,14 +104,16 @@ class Recording:
     presences: list[Presence] = field(default_factory=list)
     samples: list[Sample] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
+    sent: list[Sent] = field(default_factory=list)
+    outcomes: list[Outcome] = field(default_factory=list)
+    left_out: int = 0
+    last_s: float = 0.0
     problems: list[str] = field(default_factory=list)
 
     @property
     def end_s(self) -> float:
-        """The time of the last line."""
-        return max(
-            (items[-1].t for items in (self.arrivals, self.presences, self.samples, self.places) if items), default=0.0
-        )
+        """The latest time of a line."""
+        return self.last_s
 
 
 def header(name: str, started: float) -> str:
@@ -113,56 +143,139 @@ def read(path: Path) -> Recording:
     """Read a recording. Raises RecordingError when it is none at all; a torn or foreign line becomes a problem."""
     try:
         with path.open("rb") as file:
-            return parse(file, str(path))
+            return parse(_lines(file), str(path))
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _lines(file: BinaryIO) -> Iterator[bytes]:
+    """The lines of a file; of one that is too long its beginning, which is too long as well."""
+    while line := file.readline(MAX_LINE_BYTES + 1):
+        yield line
+        while len(line) > MAX_LINE_BYTES and not line.endswith(b"\n"):
+            line = file.readline(MAX_LINE_BYTES + 1)
+            if not line:
+                return
 
 
 def parse(lines: Iterable[bytes], file: str) -> Recording:
     """As `read`, from the lines themselves."""
     numbered = _objects(lines)
-    _, first = next(numbered, (0, None))
+    _, first = next(numbered, (1, "nothing"))
     if not isinstance(first, dict) or "recording" not in first:
-        raise RecordingError(f'{file}:1: expected {{"recording": {VERSION}, ...}}, found something else')
+        found = first if isinstance(first, str) else "another JSON value"
+        raise RecordingError(f'{file}:1: expected {{"recording": {VERSION}, ...}}, found {found}')
     if first["recording"] != VERSION:
         raise RecordingError(f"{file}:1: expected version {VERSION}, found {first['recording']!r}")
     started = first.get("started")
     recording = Recording(str(first.get("node", "")), float(started) if isinstance(started, int | float) else 0.0)
+    online: dict[str, bool] = {}
     for number, entry in numbered:
         try:
-            _take(recording, entry)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            recording.problems.append(
-                f"{file}:{number}: expected a recording's line, found {type(error).__name__} in it: {error}"
-            )
+            if isinstance(entry, str):
+                raise _UnreadableError("one JSON object", entry)
+            _take(recording, entry, online)
+        except _UnreadableError as error:
+            recording.problems.append(f"{file}:{number}: {error}")
     return recording
 
 
+class _UnreadableError(ValueError):
+    def __init__(self, expected: str, found: object) -> None:
+        text = found if isinstance(found, str) else repr(found)
+        super().__init__(f"expected {expected}, found {text if len(text) <= 60 else text[:57] + '...'}")
+
+
 def _objects(lines: Iterable[bytes]) -> Iterator[tuple[int, Any]]:
+    """Each line that is not empty, with its number: an object, or what it is instead, as text."""
     for number, raw in enumerate(lines, 1):
         if not raw.strip():
             continue
+        if len(raw) > MAX_LINE_BYTES:
+            yield number, f"a line of more than {MAX_LINE_BYTES} bytes"
+            continue
         try:
-            yield number, json.loads(raw) if len(raw) <= MAX_LINE_BYTES else None
-        except ValueError:
-            yield number, None
+            entry = json.loads(raw)
+        except (ValueError, RecursionError):
+            yield number, "no JSON (a line that was cut off?)"
+            continue
+        yield number, entry if isinstance(entry, dict) else "another JSON value"
 
 
-def _take(recording: Recording, entry: Any) -> None:
-    t, kind, at = float(entry["t"]), entry["kind"], str(entry.get("at", recording.name))
+def _take(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) -> None:
+    """Adds what the line says. `online` is what is known of each peer so far: a recording may begin, or have a gap,
+    when peers are online that no event of its own announced."""
+    t, kind = _number(entry, "t", 0.0, MAX_T_S), entry.get("kind")
+    at = _text(entry, "at") if "at" in entry else recording.name
+    recording.last_s = max(recording.last_s, t)
     match kind:
         case "received":
             recording.arrivals.append(
-                Arrival(t, at, str(entry["source"]), str(entry["topic"]), int(entry["priority"]), int(entry["bytes"]))
+                Arrival(t, at, _text(entry, "source"), _text(entry, "topic"), _whole(entry, "priority"), _size(entry))
             )
+        case "sent":
+            recording.sent.append(Sent(t, _text(entry, "topic"), _whole(entry, "priority"), _size(entry)))
+        case "message-delivered" | "message-expired" | "message-peer-lost":
+            latency_s = _number(entry, "latency_s", 0.0, MAX_T_S) if kind == "message-delivered" else None
+            outcome = kind.removeprefix("message-")
+            recording.outcomes.append(Outcome(t, _text(entry, "peer"), _text(entry, "topic"), outcome, latency_s))
         case "peer-online" | "peer-offline":
-            recording.presences.append(Presence(t, at, str(entry["peer"]), kind == "peer-online"))
+            peer = _text(entry, "peer")
+            online[peer] = kind == "peer-online"
+            recording.presences.append(Presence(t, at, peer, online[peer]))
         case "conditions":
-            for peer in entry["peers"]:
-                known = {name: peer.get(name) for name in _SAMPLED}
-                recording.samples.append(Sample(t, at, str(peer["name"]), **known))
+            for peer_entry in _peers(entry):
+                _sample(recording, t, at, peer_entry, online)
         case "place":
-            recording.places.append(Place(t, at, float(entry["x"]), float(entry["y"])))
+            x, y = (_number(entry, key, -MAX_PLACE_M, MAX_PLACE_M) for key in ("x", "y"))
+            recording.places.append(Place(t, at, x, y))
+        case "gap":
+            recording.left_out += _whole(entry, "lines")
         case _:
             # another kind, which no picture shows
             return
+
+
+def _sample(recording: Recording, t: float, at: str, entry: dict[str, Any], online: dict[str, bool]) -> None:
+    name = _text(entry, "name")
+    known: dict[str, Any] = {
+        key: _number(entry, key, 0.0, MAX_SAMPLE) for key in _SAMPLED if entry.get(key) is not None
+    }
+    recording.samples.append(Sample(t, at, name, **known))
+    now_online = entry.get("online")
+    if isinstance(now_online, bool) and now_online != online.get(name, False):
+        online[name] = now_online
+        recording.presences.append(Presence(t, at, name, now_online))
+
+
+def _peers(entry: dict[str, Any]) -> list[dict[str, Any]]:
+    peers = entry.get("peers")
+    if not isinstance(peers, list) or not all(isinstance(peer, dict) for peer in peers):
+        raise _UnreadableError("a list of objects as peers", peers)
+    return peers
+
+
+def _text(entry: dict[str, Any], key: str) -> str:
+    value = entry.get(key)
+    if not isinstance(value, str):
+        raise _UnreadableError(f"text as {key}", value)
+    # half a surrogate pair, which JSON can name, is nothing that a page can show
+    return value.encode(errors="replace").decode()
+
+
+def _number(entry: dict[str, Any], key: str, least: float, most: float) -> float:
+    value = entry.get(key)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not least <= value <= most:
+        raise _UnreadableError(f"a number from {least:g} to {most:g} as {key}", value)
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise _UnreadableError(f"a number from {least:g} to {most:g} as {key}", "a larger one") from error
+
+
+def _whole(entry: dict[str, Any], key: str) -> int:
+    return int(_number(entry, key, 0, MAX_BYTES))
+
+
+def _size(entry: dict[str, Any]) -> int:
+    return _whole(entry, "bytes")

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from udp_mesh.report import main
-from udp_mesh.report.charts import density, paths, spans, stacked, ticks
-from udp_mesh.report.figures import connections, histogram, intervals, throughput
+from udp_mesh.report import recording as report_recording
+from udp_mesh.report.charts import density, over_time, paths, spans, stacked, ticks
+from udp_mesh.report.figures import connections, course, histogram, intervals, sendings, summary, throughput
 from udp_mesh.report.page import page
 from udp_mesh.report.recording import (
     Arrival,
@@ -53,6 +54,117 @@ def test_a_torn_line_is_left_out_and_told() -> None:
     recording = parse([*lines(*ITEMS), b'{"t": 4, "kind": "recei'], "r.jsonl")
     assert len(recording.arrivals) == 1
     assert recording.problems[0].startswith("r.jsonl:7:")
+
+
+@pytest.mark.parametrize(
+    ("raw", "problem"),
+    [
+        ('{"t": 4, "kind": "recei', "expected one JSON object, found no JSON (a line that was cut off?)"),
+        ("[1]", "expected one JSON object, found another JSON value"),
+        ('{"kind": "place"}', "expected a number from 0 to 1e+09 as t, found None"),
+        ('{"t": NaN, "kind": "place"}', "expected a number from 0 to 1e+09 as t, found nan"),
+        ('{"t": 1e308, "kind": "place"}', "expected a number from 0 to 1e+09 as t, found 1e+308"),
+        ('{"t": -3, "kind": "place"}', "expected a number from 0 to 1e+09 as t, found -3"),
+        ('{"t": 1, "kind": "place", "x": 1e308, "y": 1}', "expected a number from -1e+07 to 1e+07 as x, found 1e+308"),
+        ('{"t": 1, "kind": "peer-online", "peer": 5}', "expected text as peer, found 5"),
+        (
+            '{"t": 1, "kind": "received", "source": "a", "topic": "t", "priority": 1, "bytes": 1e400}',
+            "expected a number from 0 to 1.1259e+15 as bytes, found inf",
+        ),
+        (
+            '{"t": 1, "kind": "conditions", "peers": [{"name": "a", "loss": -1}]}',
+            "expected a number from 0 to 1e+15 as loss, found -1",
+        ),
+        ('{"t": 1, "kind": "conditions", "peers": 5}', "expected a list of objects as peers, found 5"),
+    ],
+)
+def test_a_damaged_line_is_left_out_and_told_by_what_is_wrong_with_it(raw: str, problem: str) -> None:
+    recording = parse([header("base", 0.0).encode(), raw.encode()], "r")
+    assert recording.problems == [f"r:2: {problem}"]
+    assert "1 lines could not be read" in page([recording], "any")
+
+
+def test_a_recording_that_begins_while_peers_are_online_shows_them() -> None:
+    def conditions(t: float, online: bool) -> bytes:
+        peer = {"name": "spot1", "online": online, "loss": 0.5}
+        return json.dumps({"t": t, "kind": "conditions", "peers": [peer]}).encode()
+
+    told = line(Presence(4.0, "base", "spot1", False)).encode()
+    recording = parse(
+        [header("base", 0.0).encode(), conditions(0.0, True), conditions(2.0, True), told, conditions(5.0, False)], "r"
+    )
+    (spot,) = connections(recording)
+    assert (spot.spans_s, spot.share) == (((0.0, 4.0),), 0.8)
+    # what is said of a peer that is away is of before
+    assert [t for t, _ in course(recording, lambda sample: sample.loss, bins=5)["spot1"]] == [0.5, 2.5]
+
+
+def test_what_became_of_what_was_sent_is_counted_per_topic() -> None:
+    entries = [
+        {"t": 1, "kind": "sent", "topic": "map", "priority": 7, "bytes": 500},
+        {"t": 1, "kind": "sent", "topic": "estop", "priority": 0, "bytes": 4},
+        {"t": 2, "kind": "message-delivered", "peer": "b", "topic": "estop", "latency_s": 0.02},
+        {"t": 2, "kind": "message-delivered", "peer": "c", "topic": "estop", "latency_s": 0.04},
+        {"t": 3, "kind": "message-expired", "peer": "b", "topic": "map", "reason": "deadline"},
+        {"t": 3, "kind": "message-peer-lost", "peer": "c", "topic": "map"},
+    ]
+    recording = parse([header("a", 0.0).encode(), *(json.dumps(entry).encode() for entry in entries)], "r")
+    estop, bulk = sendings(recording)
+    assert (estop.topic, estop.messages, estop.delivered, estop.latency_s(0.5)) == ("estop", 1, 2, 0.04)
+    assert (bulk.total_bytes, bulk.expired, bulk.peer_lost, bulk.latency_s(0.5)) == (500, 1, 1, None)
+    assert "<td>estop</td><td>1</td><td>0.00</td><td>2</td><td>0</td><td>0</td><td>40.0</td>" in page([recording], "")
+
+
+def test_lines_that_were_never_written_are_told() -> None:
+    recording = parse([header("a", 0.0).encode(), b'{"t": 1, "kind": "gap", "lines": 40}'], "r")
+    assert "40 lines are missing" in page([recording], "any")
+    assert summary(recording)["lines_left_out"] == 40
+
+
+def test_a_message_recorded_with_a_large_payload_is_counted(tmp_path: Path) -> None:
+    path = tmp_path / "r.jsonl"
+    entry = {"t": 1, "kind": "received", "source": "a", "topic": "map", "priority": 7, "bytes": 3 << 19}
+    path.write_text(header("a", 0.0) + "\n" + json.dumps({**entry, "payload": "A" * (2 << 20)}) + "\n")
+    assert [item.size for item in read(path).arrivals] == [3 << 19]
+
+
+def test_a_line_without_end_is_one_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report_recording, "MAX_LINE_BYTES", 100)
+    path = tmp_path / "r.jsonl"
+    path.write_text("\n".join([header("a", 0.0), "x" * 1000, line(ITEMS[0])]) + "\n")
+    recording = read(path)
+    assert (len(recording.problems), len(recording.presences)) == (1, 1)
+
+
+def test_the_pages_numbers_are_there_for_scripts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "base.jsonl"
+    path.write_bytes(b"\n".join(lines(*ITEMS)) + b"\n{\n" * 7)
+    assert main([str(path), "--out", str(tmp_path / "page.html"), "--json"]) == 0
+    captured = capsys.readouterr()
+    value = json.loads(captured.out)
+    assert value["page"] == str(tmp_path / "page.html")
+    assert value["recordings"][0]["received"] == [{"topic": "telemetry", "priority": 3, "messages": 1, "bytes": 1000}]
+    assert value["recordings"][0]["online"] == [{"peer": "spot1", "share": 1.0, "spans_s": [[1.0, 3.0]]}]
+    assert captured.err.splitlines()[-1] == "udp-mesh: warning: ... and 2 more lines that cannot be read"
+
+
+def test_a_page_that_cannot_be_written_is_named_and_nothing_is_left(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, taken = tmp_path / "base.jsonl", tmp_path / "taken"
+    path.write_bytes(b"\n".join(lines(*ITEMS)))
+    taken.mkdir()
+    assert main([str(path), "--out", str(taken)]) == 2
+    assert main([str(path), "--out", str(tmp_path / "none" / "page.html")]) == 2
+    assert capsys.readouterr().err == (
+        f"udp-mesh: {taken}: Is a directory\nudp-mesh: {tmp_path}/none/page.html: No such file or directory\n"
+    )
+    assert sorted(tmp_path.iterdir()) == [path, taken]
+
+
+def test_messages_that_all_come_at_once_are_not_periodic() -> None:
+    burst = [Arrival(5.0, "base", "spot1", "map", 7, 100) for _ in range(30)]
+    assert intervals(parse(lines(*burst), "r")) == []
 
 
 def test_what_is_no_recording_is_an_error_with_its_line(tmp_path: Path) -> None:
@@ -128,6 +240,7 @@ def test_pictures_are_well_formed_and_escape_names() -> None:
         density([0.1, 2.0], 0.0, 1.0, (0.5, 0.1), "s"),
         spans({"<a>&": [(0.0, 1.0)]}, 2.0, "s"),
         stacked({"<b>": [1.0, 2.0], "c": [0.0, 1.0]}, 2.0, "s", "Mbit/s"),
+        over_time({"<d>": [(0.0, 1.0), (1.0, 2.0), (9.0, 1.0)], "e": []}, 9.0, "s", "ms"),
         paths({"d": [(0, 0, True), (5, 5, False)]}, {"<e>": (1, 1)}),
     ):
         ElementTree.fromstring(picture)
@@ -139,5 +252,13 @@ def test_the_page_shows_every_topic_and_peer(tmp_path: Path) -> None:
     out = tmp_path / "page.html"
     assert main([str(path), "--out", str(out)]) == 0
     text = out.read_text()
-    for expected in ("telemetry", "spot1", "Throughput by topic", "Online", "Where the robots were online"):
+    for expected in (
+        "telemetry",
+        "spot1",
+        "Throughput by topic",
+        "Online",
+        "Round trip",
+        "Loss",
+        "Where the robots were online",
+    ):
         assert expected in text
