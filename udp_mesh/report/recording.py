@@ -238,11 +238,11 @@ def _take(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) 
 
 def _sample(recording: Recording, t: float, at: str, entry: dict[str, Any], online: dict[str, bool]) -> None:
     name = _text(entry, "name")
-    known: dict[str, Any] = {
-        key: _number(entry, key, 0.0, MAX_SAMPLE) for key in _SAMPLED if entry.get(key) is not None
-    }
-    recording.samples.append(Sample(t, at, name, **known))
     now_online = entry.get("online")
+    # of a peer that is away the values are those of before
+    keys = [key for key in _SAMPLED if entry.get(key) is not None and now_online is not False]
+    known: dict[str, Any] = {key: _number(entry, key, 0.0, MAX_SAMPLE) for key in keys}
+    recording.samples.append(Sample(t, at, name, **known))
     if isinstance(now_online, bool) and now_online != online.get(name, False):
         online[name] = now_online
         recording.presences.append(Presence(t, at, name, now_online))
