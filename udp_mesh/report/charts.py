@@ -160,10 +160,16 @@ def paths(tracks: Mapping[str, Sequence[tuple[float, float, bool]]], marks: Mapp
     axes = _Axes((min(xs), min(xs) + wide), (min(ys), min(ys) + high), height)
     parts = axes.lines("metres", "metres")
     for index, track in enumerate(tracks.values()):
-        for (x0, y0, _), (x1, y1, on) in itertools.pairwise(track):
+        # one path per stretch, not per step: an hour has thousands of steps
+        for on, steps in itertools.groupby(itertools.pairwise(track), key=lambda step: step[1][2]):
+            stretch = list(steps)
+            places = [stretch[0][0], *(end for _, end in stretch)]
+            points_text = [f"{axes.at_x(x):.1f} {axes.at_y(y):.1f}" for x, y, _ in places]
+            # one that stands is a dot
+            drawn = "L".join([points_text[0], *(text for text, _ in itertools.groupby(points_text))])
             parts.append(
-                f'<path d="M{axes.at_x(x0):.1f} {axes.at_y(y0):.1f}L{axes.at_x(x1):.1f} {axes.at_y(y1):.1f}" '
-                f'stroke="{colour(index) if on else "#bbb"}" stroke-width="{3 if on else 1.5}"/>'
+                f'<path d="M{drawn}" fill="none" stroke="{colour(index) if on else "#bbb"}" '
+                f'stroke-width="{3 if on else 1.5}" stroke-linejoin="round" stroke-linecap="round"/>'
             )
     for name, (x, y) in marks.items():
         parts.append(f'<circle cx="{axes.at_x(x):.1f}" cy="{axes.at_y(y):.1f}" r="4" fill="#222"/>')

@@ -162,6 +162,21 @@ def test_a_page_that_cannot_be_written_is_named_and_nothing_is_left(
     assert sorted(tmp_path.iterdir()) == [path, taken]
 
 
+def test_the_topic_with_the_most_messages_is_shown_first_and_its_punctuality_told() -> None:
+    often = [Arrival(i + (0.2 if i % 10 == 0 else 0.0), "base", "spot1", "telemetry", 3, 100) for i in range(100)]
+    seldom = [Arrival(i * 4.0, "base", "spot2", "artifact", 2, 100) for i in range(25)]
+    first, second = intervals(parse(lines(*often, *seldom), "r"))
+    assert (first.topic, second.topic) == ("telemetry", "artifact")
+    # each late one makes its own interval longer and the next one shorter
+    assert first.punctual == pytest.approx(80 / 99)
+    assert second.punctual == 1.0
+
+
+def test_a_track_is_one_path_for_each_stretch_online_or_not() -> None:
+    track = [(float(x), 0.0, x < 50 or x > 80) for x in range(100)]
+    assert paths({"spot1": track}, {}).count("stroke-linejoin") == 3
+
+
 def test_messages_that_all_come_at_once_are_not_periodic() -> None:
     burst = [Arrival(5.0, "base", "spot1", "map", 7, 100) for _ in range(30)]
     assert intervals(parse(lines(*burst), "r")) == []
