@@ -1,8 +1,9 @@
 """How many packets may be on their way to one peer: delay decides, loss does not (radio loss is not congestion).
 
 1. Startup doubles the window once per round trip until the round trip has grown by `START_QUEUE_S`.
-2. Then, once per round trip: w <- w/2 + (w * least / standing + a) / 2, where a is `QUEUE_S` worth of packets: the
-   window settles where the sender keeps that much queue at the bottleneck, and no more.
+2. Then, once per round trip: w <- w/2 + (w * least / standing + a) / 2, where a is `QUEUE_S` worth of packets (less on
+   a short path, more where packets are lost): the window settles where the sender keeps that much queue at the
+   bottleneck, and no more.
 3. w never exceeds by much what the measured delivery rate needs, plus a, and growth that delivers nothing more ends: a
    queue too short to be seen as delay is not overrun.
 4. A *drain* lets the queue run empty for one round trip, so that the least round trip is seen again: after
@@ -28,9 +29,13 @@ QUEUE_S = 0.003
 """Queue the sender keeps at the bottleneck: covers batched acknowledgements and pacing; adds this much to urgent
 latency."""
 
-LOSS_QUEUE = 13.0
+SHORT_QUEUE_S = 0.002
+QUEUE_PER_ROUND_TRIP = 0.3
+"""Acknowledgements come every few packets of a small window: on a short path less of a queue covers them."""
+
+LOSS_QUEUE_S = 0.002
 LOSS_QUEUE_UP_TO = 0.05
-"""Losses leave holes in the queue: some more of it keeps the link busy, up to what urgent messages can bear."""
+"""Losses leave holes in the queue: so much more of it keeps the link busy, up to what urgent messages can bear."""
 
 START_QUEUE_S = 0.006
 """Growth of the round trip that ends the startup: more than the scatter of a radio, less than an urgent message's
@@ -351,8 +356,13 @@ class AdaptiveWindow:
 
     def _queue(self, standing: float) -> float:
         # Losses leave holes in the queue as well as in what arrives.
-        queue_s = QUEUE_S * (1 + LOSS_QUEUE * min(self._loss, LOSS_QUEUE_UP_TO))
-        return self._shared(queue_s, self.packets / standing)
+        lost_s = LOSS_QUEUE_S * min(1.0, self._loss / LOSS_QUEUE_UP_TO)
+        return self._shared(self._queue_s() + lost_s, self.packets / standing)
+
+    def _queue_s(self) -> float:
+        least = self._trip.least
+        assert least is not None
+        return min(QUEUE_S, max(SHORT_QUEUE_S, QUEUE_PER_ROUND_TRIP * least))
 
     def _shared(self, queue_s: float, packets_per_s: float) -> float:
         """Packets of queue: `queue_s` at this rate and a least number, less of both where others send too."""
@@ -418,7 +428,7 @@ class AdaptiveWindow:
             self.packets = self._saved
             return
         base = min(held, self._was_standing) if held != float("inf") else least
-        queue = self._shared(QUEUE_S, throughput)
+        queue = self._shared(self._queue_s(), throughput)
         # The rate may have changed with the route: no further ahead of what was measured than when starting.
         most = min(MOST_WINDOW, START_RATE_BOUND * max(START_WINDOW, self._saved))
         self.packets = min(most, max(LEAST_WINDOW, throughput * base + queue))

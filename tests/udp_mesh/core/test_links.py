@@ -9,6 +9,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
+from statistics import fmean
 
 import pytest
 
@@ -95,6 +96,10 @@ def settled(seconds: float = 4.0, *, urgent: bool = True, seed: int = 1, **link:
     return run.measure(seconds)
 
 
+def test_on_a_short_path_an_urgent_message_waits_for_a_shorter_queue() -> None:
+    assert settled(15.0, delay_s=0.001).latency(0.99) <= 0.008
+
+
 @pytest.mark.parametrize(("loss", "share"), [(0.0, 0.95), (0.05, 0.94), (0.2, 0.935)])
 def test_bulk_fills_a_lossy_link(loss: float, share: float) -> None:
     figures = settled(urgent=False, loss=loss)
@@ -156,12 +161,15 @@ def test_nothing_is_sent_twice_without_loss() -> None:
 
 
 def test_a_longer_route_is_filled_soon() -> None:
-    run = Run(urgent=False, seed=3)
-    run.link(loss=0.02)
-    run.start()
-    run.world.run(3.0)
-    run.link(delay_s=0.03)
-    assert run.measure(8.0).goodput_bits_per_s >= 0.88 * 10e6
+    goodputs = []
+    for seed in (1, 2, 3):
+        run = Run(urgent=False, seed=seed)
+        run.link(loss=0.02)
+        run.start()
+        run.world.run(3.0)
+        run.link(delay_s=0.03)
+        goodputs.append(run.measure(8.0).goodput_bits_per_s)
+    assert fmean(goodputs) >= 0.88 * 10e6
 
 
 def test_a_route_that_became_eighty_times_longer_is_filled_within_some_seconds() -> None:
