@@ -11,6 +11,8 @@ from html import escape
 
 WIDTH, HEIGHT = 760, 260
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 16, 14, 36
+_ROW_NAME = 9
+"""Characters that fit left of a row; pointing at it shows the rest."""
 # readable on white, told apart by people who do not see red and green (after Okabe and Ito)
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442", "#555555")
 
@@ -103,7 +105,8 @@ def spans(rows: Mapping[str, Sequence[tuple[float, float]]], end: float, x_label
     ]
     for index, (name, bars) in enumerate(rows.items()):
         y = _TOP + 24 * index
-        parts.append(_text(_LEFT - 6, y + 16, name, "end"))
+        shown = name if len(name) <= _ROW_NAME else f"{name[: _ROW_NAME - 1]}…"
+        parts.append(f"<g><title>{escape(name)}</title>{_text(_LEFT - 6, y + 16, shown, 'end')}</g>")
         for start, stop in bars:
             x = axes.at_x(start)
             parts.append(

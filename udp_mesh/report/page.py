@@ -167,6 +167,6 @@ def _intervals(each: figures.Intervals) -> str:
     return (
         f"<h3>Time between messages: {escape(each.topic)} from {escape(each.source)}</h3>{chart}"
         f"<p>{len(each.values_s)} intervals, median {each.median_s:.3f} s, {each.punctual:.1%} of them within 5 % of "
-        f"it; standard deviation {each.deviation_s:.4f} s within half to one and a half of it, {each.gaps} gaps outside. "
-        f"The curve is normal, with a deviation of {PAPER_DEVIATION_S:.0%} of the median.</p>"
+        f"it; standard deviation {each.deviation_s:.4f} s within half to one and a half of it, {each.gaps} gaps "
+        f"outside. The curve is normal, with a deviation of {PAPER_DEVIATION_S:.0%} of the median.</p>"
     )

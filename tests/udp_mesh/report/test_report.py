@@ -177,6 +177,12 @@ def test_a_track_is_one_path_for_each_stretch_online_or_not() -> None:
     assert paths({"spot1": track}, {}).count("stroke-linejoin") == 3
 
 
+def test_a_long_name_fits_beside_its_row_and_is_told_in_full() -> None:
+    picture = spans({"operator-base-station": [(0.0, 1.0)]}, 2.0, "s")
+    assert ">operator…</text>" in picture
+    assert "<title>operator-base-station</title>" in picture
+
+
 def test_messages_that_all_come_at_once_are_not_periodic() -> None:
     burst = [Arrival(5.0, "base", "spot1", "map", 7, 100) for _ in range(30)]
     assert intervals(parse(lines(*burst), "r")) == []
