@@ -9,19 +9,16 @@ for a program that has read everything is never dropped, however large.
 from __future__ import annotations
 
 import asyncio
-import grp
-import logging
-import os
+import contextlib
+import resource
 import socket
-import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, cast
 
 from udp_mesh.client.mesh_client import Frame, Header, encode_frame
+from udp_mesh.daemon.listener import Listener
 from udp_mesh.daemon.request_frames import BadFrame, RequestReader
-
-log = logging.getLogger(__name__)
 
 CLIENT_BACKLOG_BYTES = 32 << 20
 """Bytes written to one client and not yet read by it: a stopped subscriber. A few of the largest usual messages."""
@@ -34,6 +31,9 @@ REPLIES_BACKLOG_BYTES = 4 << 20
 """Bytes of replies beyond that: a program that asks without end and never reads the answers."""
 MAX_CLIENTS = 256
 """Connections at a time: a program that leaks them must not take the daemon's descriptors."""
+DESCRIPTORS_KEPT = 40
+"""Files for the daemon's own needs, whatever its limit: links, kernel's notices, outbox, recording, configuration, a
+scraper."""
 
 
 class RequestError(Exception):
@@ -120,11 +120,7 @@ class Client(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
-        if len(self._server.clients) >= MAX_CLIENTS:
-            self.refuse(None, "too-many-clients", f"at most {MAX_CLIENTS} programs connect at a time")
-            self.close()
-            return
-        self._server.clients.add(self)
+        self._server.connected(self)
 
     def data_received(self, data: bytes) -> None:
         for frame in self._reader.feed(data):
@@ -169,38 +165,39 @@ class LocalServer:
         self.clients: set[Client] = set()
         self.max_payload_bytes = max_payload_bytes
         self.dropped_for_slow_clients = 0
-        self._path = path
-        self._mode = mode
-        self._group = group
-        self._server: asyncio.AbstractServer | None = None
+        self._listener = Listener(path, mode=mode, group=group, take=self._take)
+        self._most = MAX_CLIENTS
+        self._connecting: dict[Client, asyncio.Task[None]] = {}
+        """Accepted, their transports not yet made: they count already, since the loop may accept more meanwhile."""
 
     async def start(self) -> None:
         """Listens. Raises OSError: in use by another daemon, no such directory, no such group, not allowed."""
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        if _answers(self._path):
-            raise OSError(f"another daemon answers at {self._path}")
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+        self._most = max(1, descriptors_for(MAX_CLIENTS + DESCRIPTORS_KEPT) - DESCRIPTORS_KEPT)
+        self._listener.open()
+
+    def _take(self, connection: socket.socket) -> None:
+        """A program has connected."""
+        if len(self.clients) + len(self._connecting) >= self._most:
+            text = f"at most {self._most} programs connect at a time"
+            # What cannot be written at once to a fresh connection is not worth waiting for.
+            with connection, contextlib.suppress(OSError):
+                connection.send(encode_frame({"event": "rejected", "code": "too-many-clients", "error": text}, b""))
+            return
+        client = Client(self)
+        self._connecting[client] = asyncio.get_running_loop().create_task(self._connect(client, connection))
+
+    async def _connect(self, client: Client, connection: socket.socket) -> None:
         try:
-            if self._path.exists() and stat.S_ISSOCK(self._path.stat().st_mode):
-                self._path.unlink()
-            # Nobody may connect before mode and group are right.
-            mask = os.umask(0o177)
-            try:
-                listener.bind(str(self._path))
-            finally:
-                os.umask(mask)
-            if self._group is not None:
-                os.chown(self._path, -1, _group_id(self._group))
-            self._path.chmod(self._mode)
-            listener.setblocking(False)
-            loop = asyncio.get_running_loop()
-            self._server = await loop.create_unix_server(lambda: Client(self), sock=listener, backlog=MAX_CLIENTS)
-        except OSError as error:
-            listener.close()
-            if error.strerror is None:
-                raise
-            # bind(2) does not say where.
-            raise OSError(error.errno, error.strerror, str(self._path)) from error
+            await asyncio.get_running_loop().connect_accepted_socket(lambda: client, connection)
+        except OSError:
+            connection.close()
+        finally:
+            self._connecting.pop(client, None)
+
+    def connected(self, client: Client) -> None:
+        """A program's connection can be used."""
+        self._connecting.pop(client, None)
+        self.clients.add(client)
 
     def too_much_for(self, waiting: int) -> bool:
         """Whether a client for which so many bytes wait must not get more for all others' sake."""
@@ -216,28 +213,24 @@ class LocalServer:
 
     async def close(self) -> None:
         """Stops listening, lets what is written be read, closes every connection, removes the socket's file."""
-        if self._server is None:
-            return
-        self._server.close()
+        self._listener.close()
+        await asyncio.gather(*self._connecting.values())
         for client in list(self.clients):
             client.close()
         await asyncio.sleep(0)
-        self._server = None
-        self._path.unlink(missing_ok=True)
 
 
-def _answers(path: Path) -> bool:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.settimeout(1.0)
-        try:
-            probe.connect(str(path))
-        except OSError:
-            return False
-        return True
-
-
-def _group_id(name: str) -> int:
+def descriptors_for(wanted: int) -> int:
+    """How many files this process may open, after asking for as many as `wanted` where the limit is lower."""
     try:
-        return grp.getgrnam(name).gr_gid
-    except KeyError as error:
-        raise OSError(f"daemon.socket_group: expected a group of this machine, found {name!r}") from error
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    except OSError:
+        # a sandbox that does not tell
+        return wanted
+    if soft == resource.RLIM_INFINITY or soft >= wanted:
+        return wanted
+    most = wanted if hard == resource.RLIM_INFINITY else min(hard, wanted)
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+        return most
+    return soft

@@ -13,6 +13,8 @@ REQUEST_BYTES = 8192
 """A scraper's request is a few hundred bytes; more is refused."""
 REQUEST_S = 5.0
 """A connection that says nothing is closed."""
+CONNECTIONS = 8
+"""At a time; more scrapers wait, or are turned away: they must not take the daemon's descriptors."""
 
 
 class MetricsServer:
@@ -22,14 +24,19 @@ class MetricsServer:
         self._address = address
         self._render = render
         self._server: asyncio.Server | None = None
+        self._open = 0
 
     async def start(self) -> None:
         """Raises OSError where the port is taken."""
         host, port = self._address
-        self._server = await asyncio.start_server(self._answer, host, port, limit=REQUEST_BYTES)
+        # asyncio accepts as many at a time as may wait
+        self._server = await asyncio.start_server(self._answer, host, port, limit=REQUEST_BYTES, backlog=CONNECTIONS)
 
     async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._open += 1
         try:
+            if self._open > CONNECTIONS:
+                return
             async with asyncio.timeout(REQUEST_S):
                 request = await reader.readuntil(b"\r\n\r\n")
                 if request.startswith(b"GET /metrics "):
@@ -43,6 +50,7 @@ class MetricsServer:
             # A scraper that went away or never asked: nothing to answer.
             return
         finally:
+            self._open -= 1
             writer.close()
 
     async def close(self) -> None:

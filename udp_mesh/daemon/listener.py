@@ -1,0 +1,178 @@
+"""The local socket's file and the connections it accepts.
+
+1. `open` binds the path with its mode and group; nobody may connect before these are right.
+2. Each connection goes to `take`. Where the process has no descriptor left, accepting rests for a while, which costs
+   nothing and is said once: a loop that tried again at once would be all the daemon does.
+3. `LOOK_S` apart the file is looked at: one that was deleted (somebody tidied /run) is made again, since no program
+   could connect otherwise until the next start. One that became another daemon's is left alone, also at the end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import grp
+import logging
+import os
+import socket
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+BACKLOG = 256
+"""Connections that wait to be accepted: all robot's programs starting at once."""
+ACCEPTED_AT_ONCE = 16
+"""Connections taken per turn of the loop: their protocols, and refusals, get their turn before the next."""
+REST_S = 1.0
+"""Until the next attempt after the kernel refused a connection for want of descriptors or memory."""
+LOOK_S = 5.0
+"""Between two looks at the socket's file: a stat(2) each."""
+SAY_AGAIN_S = 60.0
+"""Trouble that stays must not fill the log."""
+
+
+class Listener:
+    """One listening Unix socket on the running loop."""
+
+    def __init__(self, path: Path, *, mode: int, group: str | None, take: Callable[[socket.socket], None]) -> None:
+        self._path = path
+        self._mode = mode
+        self._group = group
+        self._take = take
+        self._socket: socket.socket | None = None
+        self._file: tuple[int, int] | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._trouble: str | None = None
+        self._said_at = 0.0
+
+    def open(self) -> None:
+        """Listens. Raises OSError: in use by another daemon, no such directory, no such group, not allowed."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        if _answers(self._path):
+            raise OSError(f"another daemon answers at {self._path}")
+        self._socket = self._bound()
+        self._file = _identity(self._path)
+        self._listen()
+        self._look_later()
+
+    def close(self) -> None:
+        """Stops listening; removes the file where it is still ours."""
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._socket is None:
+            return
+        self._ignore()
+        self._socket.close()
+        self._socket = None
+        if _identity(self._path) == self._file:
+            self._path.unlink(missing_ok=True)
+
+    def _bound(self) -> socket.socket:
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
+        made = False
+        try:
+            if self._path.exists() and stat.S_ISSOCK(self._path.stat().st_mode):
+                self._path.unlink()
+            mask = os.umask(0o177)
+            try:
+                listener.bind(str(self._path))
+                made = True
+            finally:
+                os.umask(mask)
+            if self._group is not None:
+                os.chown(self._path, -1, _group_id(self._group))
+            self._path.chmod(self._mode)
+            listener.listen(BACKLOG)
+        except OSError as error:
+            listener.close()
+            if made:
+                self._path.unlink(missing_ok=True)
+            if error.strerror is None:
+                raise
+            # bind(2) does not say where.
+            raise OSError(error.errno, error.strerror, str(self._path)) from error
+        return listener
+
+    # Accepting
+
+    def _listen(self) -> None:
+        if self._socket is not None:
+            asyncio.get_running_loop().add_reader(self._socket.fileno(), self._accept)
+
+    def _ignore(self) -> None:
+        if self._socket is not None:
+            asyncio.get_running_loop().remove_reader(self._socket.fileno())
+
+    def _accept(self) -> None:
+        for _ in range(ACCEPTED_AT_ONCE):
+            assert self._socket is not None
+            try:
+                connection, _address = self._socket.accept()
+            except (BlockingIOError, InterruptedError, ConnectionAbortedError):
+                break
+            except OSError as error:
+                self._say(f"no connection can be accepted: {error.strerror}")
+                self._ignore()
+                asyncio.get_running_loop().call_later(REST_S, self._listen)
+                return
+            connection.setblocking(False)
+            self._take(connection)
+
+    # The file
+
+    def _look_later(self) -> None:
+        self._timer = asyncio.get_running_loop().call_later(LOOK_S, self._look)
+
+    def _look(self) -> None:
+        self._look_later()
+        found = _identity(self._path)
+        if found == self._file:
+            return
+        if found is not None:
+            self._say(f"{self._path} has become another program's: nobody reaches this daemon there")
+            return
+        try:
+            fresh = self._bound()
+        except OSError as error:
+            self._say(f"{self._path} is gone and cannot be made again: {error.strerror or error}")
+            return
+        self._ignore()
+        if self._socket is not None:
+            self._socket.close()
+        self._socket, self._file = fresh, _identity(self._path)
+        self._listen()
+        log.warning("local-socket-made-again path=%s", self._path)
+
+    def _say(self, trouble: str) -> None:
+        """What is wrong, at most once in `SAY_AGAIN_S`."""
+        now = asyncio.get_running_loop().time()
+        if trouble != self._trouble or now - self._said_at >= SAY_AGAIN_S:
+            log.error("local-socket-trouble reason=%s", trouble)
+            self._trouble, self._said_at = trouble, now
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Device and inode of what is there now."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
+def _answers(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(str(path))
+        except OSError:
+            return False
+        return True
+
+
+def _group_id(name: str) -> int:
+    try:
+        return grp.getgrnam(name).gr_gid
+    except KeyError as error:
+        raise OSError(f"daemon.socket_group: expected a group of this machine, found {name!r}") from error
