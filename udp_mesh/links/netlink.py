@@ -124,6 +124,8 @@ def parse(data: bytes) -> tuple[Interface, ...]:
             if local is None or len(local) != {socket.AF_INET: 4, socket.AF_INET6: 16}.get(family):
                 continue
             broadcast = attributes.get(IFA_BROADCAST)
+            if broadcast is None and family == socket.AF_INET and attributes.get(IFA_ADDRESS) == local:
+                broadcast = _last_of_network(local, prefix_length)
             addresses.setdefault(index, []).append(
                 InterfaceAddress(
                     socket.inet_ntop(family, local),
@@ -134,6 +136,15 @@ def parse(data: bytes) -> tuple[Interface, ...]:
     return tuple(
         replace(interface, addresses=tuple(addresses.get(index, ()))) for index, interface in sorted(found.items())
     )
+
+
+def _last_of_network(address: bytes, prefix_length: int) -> bytes | None:
+    """What reaches all of an IPv4 network. The kernel has a route for it also where nobody gave the address a broadcast
+    address (`ip addr add` without `brd`; linux net/ipv4/fib_frontend.c, fib_add_ifaddr); networks of one or two
+    addresses have none (RFC 3021)."""
+    if prefix_length >= 31:
+        return None
+    return (int.from_bytes(address, "big") | (0xFFFFFFFF >> prefix_length)).to_bytes(4, "big")
 
 
 _LITTLE = struct.pack("=H", 1) == b"\x01\x00"

@@ -193,7 +193,8 @@ class UdpLink:
         except BlockingIOError:
             return None
         except OSError as error:
-            number = error.errno or errno.EIO
+            # An IPv4 address on an IPv6 socket, or the other way round: a peer not yet heard at its new address.
+            number = errno.EAFNOSUPPORT if isinstance(error, socket.gaierror) else error.errno or errno.EIO
             if len(run) > 1 and number in (errno.EIO, errno.EINVAL, errno.EMSGSIZE, errno.EOPNOTSUPP):
                 return self._send_singly(run, destination, number)
             # Unreachable, forbidden, too long, the device gone: as lost as on a radio, and answered by the same means.

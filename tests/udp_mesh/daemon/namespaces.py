@@ -147,6 +147,19 @@ def ipv4_beside_ipv6() -> None:
         both.exchange()
 
 
+def addresses_without_broadcast() -> None:
+    """One was given its address with a broadcast address, the other (`ip addr add` alone) without: they meet over
+    IPv4."""
+    with pair() as both:
+        both.join("mesh0")
+        both.ip(both.alice, "addr add 10.7.20.1/20 broadcast + dev mesh0")
+        both.ip(both.bob, "addr add 10.7.20.2/20 dev mesh0")
+        wanted = {"alice": "10.7.20.1:8700", "bob": "10.7.20.2:8700"}
+        poll(lambda: both.addresses() == wanted, "both are reached over IPv4")
+        met(both)
+        both.exchange()
+
+
 def address_changes_in_the_middle() -> None:
     """A map under way follows bob to another address, and another subnet, and arrives once."""
     with pair() as both:
@@ -300,6 +313,7 @@ SCENARIOS: dict[str, Callable[[], None]] = {
         ipv6_neighbours,
         two_ipv6_links,
         ipv4_beside_ipv6,
+        addresses_without_broadcast,
         address_changes_in_the_middle,
         interface_goes_in_the_middle,
         interface_made_anew,

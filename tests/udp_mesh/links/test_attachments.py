@@ -103,6 +103,28 @@ def test_a_message_cut_short_is_an_error_not_a_guess(cut: int) -> None:
         list(split_messages(bytes.fromhex(ADDRESS)[:cut]))
 
 
+@pytest.mark.parametrize(
+    ("address", "prefix_length", "broadcast"),
+    [("10.7.20.5", 20, "10.7.31.255"), ("192.168.1.20", 28, "192.168.1.31"), ("10.0.0.1", 31, None)],
+)
+def test_an_address_that_was_given_no_broadcast_address_has_its_networks_last(
+    address: str, prefix_length: int, broadcast: str | None
+) -> None:
+    local = socket.inet_aton(address)
+
+    def answers(far_end: bytes) -> bytes:
+        link = struct.pack("=BxHiII", 0, 1, 7, 0x1 | 0x2 | 0x40, 0) + struct.pack("=HH8s", 10, 3, b"wlan0\0\0\0")
+        body = struct.pack("=BBBBI", socket.AF_INET, prefix_length, 0x80, 0, 7)
+        body += struct.pack("=HH4s", 8, 1, far_end) + struct.pack("=HH4s", 8, 2, local)
+        return b"".join(
+            struct.pack("=IHHII", 16 + len(body), kind, 0, 1, 0) + body for kind, body in ((16, link), (20, body))
+        )
+
+    assert parse(answers(local))[0].addresses == (InterfaceAddress(address, prefix_length, broadcast),)
+    # a point-to-point address has somebody at the far end, not a network
+    assert parse(answers(socket.inet_aton("10.9.9.9")))[0].addresses[0].broadcast is None
+
+
 WLAN6 = Interface(
     "wlan6", 6, 1500, True, False, True, True,
     (InterfaceAddress("2001:db8::6", 64, None), InterfaceAddress("fe80::6", 64, None)),

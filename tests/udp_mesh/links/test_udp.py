@@ -87,6 +87,12 @@ def test_what_the_kernel_refuses_is_counted_by_destination_and_reason(pair: tupl
     assert alice.refused == {(nowhere, errno.EACCES): 2, (to, errno.EMSGSIZE): 1}
 
 
+def test_an_address_of_the_other_family_is_refused_as_such(pair: tuple[UdpLink, UdpLink]) -> None:
+    alice, _ = pair
+    assert alice.send([Out(b"a", ("::1", 9))]) == 1
+    assert alice.refused == {(("::1", 9), errno.EAFNOSUPPORT): 1}
+
+
 def test_a_destination_that_takes_nothing_at_all_does_not_end_segmentation(pair: tuple[UdpLink, UdpLink]) -> None:
     alice, bob = pair
     nobody = (BOB, 0)  # the kernel answers EINVAL, as where it cannot segment, but also to a single datagram
