@@ -4,6 +4,7 @@ Nothing here drops an accepted message: a topic's new settings reach the message
 """
 
 from dataclasses import fields, replace
+from enum import Enum
 
 from udp_mesh.core.acceptance import channel_of, enqueue, report_ended, stop_packing, tell_expired
 from udp_mesh.core.discovery import leads
@@ -12,7 +13,7 @@ from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Accepted
 from udp_mesh.core.presence import refit
 from udp_mesh.core.seams import Datagram
-from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
+from udp_mesh.core.settings import LinkInfo, LinkKind, Neighbour, Settings, Topic
 from udp_mesh.core.state import State, live_keys
 from udp_mesh.crypto import SendChannel
 from udp_mesh.wire.codec import encode
@@ -98,10 +99,32 @@ def _changes(old: Settings, new: Settings) -> list[str]:
         lines.append("keys: changed")
     for what in ("rates", "limits"):
         lines += [f"{what}: {text}" for text in _differences(getattr(old, what), getattr(new, what))]
-    for what in ("undeclared", "neighbours", "window", "fragment_bytes"):
+    lines += _topic_without_name(old.undeclared, new.undeclared)
+    lines += _neighbours(old.neighbours, new.neighbours)
+    for what in ("window", "fragment_bytes"):
         if getattr(old, what) != getattr(new, what):
-            lines.append(f"{what}: changed")
+            lines.append(f"{what}: {getattr(old, what)} -> {getattr(new, what)}")
     return lines
+
+
+def _topic_without_name(old: Topic | None, new: Topic | None) -> list[str]:
+    if old is None or new is None:
+        return [] if old is new else ["undeclared: removed" if new is None else "undeclared: added"]
+    return [f"undeclared: {text}" for text in _differences(old, new)]
+
+
+def _neighbours(old: tuple[Neighbour, ...], new: tuple[Neighbour, ...]) -> list[str]:
+    before = {neighbour.address: neighbour for neighbour in old}
+    after = {neighbour.address: neighbour for neighbour in new}
+    return [
+        *(f"neighbour {address[0]}: added" for address in after if address not in before),
+        *(f"neighbour {address[0]}: removed" for address in before if address not in after),
+        *(
+            f"neighbour {address[0]}: {text}"
+            for address in before.keys() & after.keys()
+            for text in _differences(before[address], after[address])
+        ),
+    ]
 
 
 def _differences(old: object, new: object) -> list[str]:
@@ -109,8 +132,23 @@ def _differences(old: object, new: object) -> list[str]:
     for field in fields(old):  # type: ignore[arg-type]
         before, after = getattr(old, field.name), getattr(new, field.name)
         if before != after:
-            texts.append(f"{field.name} {before} -> {after}")
+            texts.append(f"{field.name} {_shown(before)} -> {_shown(after)}")
     return texts
+
+
+def _shown(value: object) -> str:
+    """As it stands in a configuration."""
+    match value:
+        case None:
+            return "none"
+        case bool():
+            return str(value).lower()
+        case Enum():
+            return str(value.value)
+        case tuple():
+            return f"[{', '.join(map(str, value))}]"
+        case _:
+            return str(value)
 
 
 def _retopic(state: State, now: float) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from tests.udp_mesh.core.pair import World, pair, settings
 from udp_mesh.core.events import MessageDelivered, MessageId, MessageReceived, Rejected
-from udp_mesh.core.settings import Limits, Rates, Settings, Topic
+from udp_mesh.core.settings import Limits, Neighbour, Outbox, Rates, Settings, Topic
 
 
 def test_every_kind_of_change_in_the_middle_of_transfers_loses_nothing() -> None:
@@ -66,9 +66,28 @@ def test_each_change_is_named() -> None:
         "topic video: added",
         "topic map: priority 5 -> 6",
         "rates: heartbeat_s 1.0 -> 2.0",
-        "window: changed",
+        "window: adaptive -> 3",
     ]
     assert both.a.apply(both.a.settings, both.now) == []
+
+
+def test_a_change_is_named_in_the_words_of_the_configuration() -> None:
+    old, new = Topic("map"), Topic("map", outbox=Outbox.ALL, keep_last=3, destinations=("b", "c"), compression=True)
+    both = pair(old, undeclared=None, neighbours=(Neighbour(("10.0.0.7", 8700)), Neighbour(("10.0.0.8", 8700))))
+    settings_now = settings("a", new, undeclared=old, neighbours=(Neighbour(("10.0.0.7", 8700), "c"),))
+    assert both.a.apply(settings_now, both.now) == [
+        "topic map: keep_last none -> 3",
+        "topic map: compression false -> true",
+        "topic map: destinations [] -> [b, c]",
+        "topic map: outbox none -> all",
+        "undeclared: added",
+        "neighbour 10.0.0.8: removed",
+        "neighbour 10.0.0.7: name none -> c",
+    ]
+    later = settings("a", new, undeclared=replace(old, priority=3), neighbours=settings_now.neighbours)
+    assert both.a.apply(later, both.now) == ["undeclared: priority 8 -> 3"]
+    last = settings("a", new, undeclared=None, neighbours=later.neighbours)
+    assert both.a.apply(last, both.now) == ["undeclared: removed"]
 
 
 def test_an_undeclared_topic_is_refused_unless_all_are_allowed() -> None:
