@@ -129,7 +129,10 @@ def scaled(value: float) -> str:
 
 
 def milliseconds(seconds: float | None) -> str:
-    return "-" if seconds is None else f"{seconds * 1000:.3g} ms"
+    """`1.82 ms`, `340 ms`, `18.2 s`."""
+    if seconds is None:
+        return "-"
+    return f"{seconds * 1000:.3g} ms" if seconds < 0.9995 else duration(seconds)
 
 
 def duration(seconds: float | None) -> str:

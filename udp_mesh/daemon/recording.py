@@ -17,7 +17,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from udp_mesh.core.conditions import Conditions
-from udp_mesh.core.events import Event, MessageReceived
+from udp_mesh.core.events import Event, MessageDelivered, MessageExpired, MessagePeerLost, MessageReceived
+from udp_mesh.daemon.configuration import RESERVED_PREFIX
 from udp_mesh.daemon.status import Json, conditions_json, event_json
 
 log = logging.getLogger(__name__)
@@ -84,6 +85,11 @@ class Recorder:
         )
 
     def event(self, now: float, event: Event) -> None:
+        """What the core told; what became of the daemon's own messages is left out, as they are."""
+        if isinstance(event, MessageDelivered | MessageExpired | MessagePeerLost) and event.topic.startswith(
+            RESERVED_PREFIX
+        ):
+            return
         fields = event_json(event)
         kind = fields.pop("event")
         if isinstance(event, MessageReceived):

@@ -22,7 +22,7 @@ from tests.udp_mesh.daemon.processes import RunningDaemon, collect, poll, two_da
 from tests.udp_mesh.links.sockets import WAIT_S
 from udp_mesh.cli import serve, traffic
 from udp_mesh.cli.main import FORWARDED, build_parser, main
-from udp_mesh.cli.output import Exit
+from udp_mesh.cli.output import Exit, milliseconds
 from udp_mesh.client.mesh_client import FrameReader, encode_frame
 from udp_mesh.crypto import Key
 from udp_mesh.daemon.configuration import read_keys
@@ -330,6 +330,14 @@ def test_a_recording_is_started_and_stopped(run: Run, tmp_path: Path) -> None:
     assert code == Exit.OK
     assert json.loads(text)["path"] == str(path)
     assert run("record", "start", str(path))[0] == Exit.FAILED
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(None, "-"), (0.000842, "0.842 ms"), (0.34, "340 ms"), (0.9994, "999 ms"), (0.9996, "1.0 s"), (18.19, "18.2 s")],
+)
+def test_a_time_is_shown_in_a_unit_that_suits_it(seconds: float | None, text: str) -> None:
+    assert milliseconds(seconds) == text
 
 
 def test_metrics_are_printed(run: Run) -> None:

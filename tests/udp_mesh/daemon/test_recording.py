@@ -8,7 +8,14 @@ from typing import Any
 import pytest
 
 from tests.udp_mesh.links.sockets import WAIT_S
-from udp_mesh.core.events import PeerOffline
+from udp_mesh.core.events import (
+    ExpiryReason,
+    MessageDelivered,
+    MessageExpired,
+    MessageId,
+    MessagePeerLost,
+    PeerOffline,
+)
 from udp_mesh.daemon import recording
 from udp_mesh.daemon.recording import Recorder
 
@@ -34,6 +41,16 @@ def test_everything_recorded_is_in_the_file_once_it_is_closed(tmp_path: Path) ->
     made.event(31.0, PeerOffline("base", left=False))
     made.close().result(WAIT_S)
     assert made.lines == 3001
+
+
+def test_what_became_of_the_daemons_own_messages_is_left_out(tmp_path: Path) -> None:
+    made = recorder(tmp_path / "run.jsonl")
+    for topic in ("~mesh/ping", "status"):
+        made.event(1.0, MessageDelivered(MessageId(1), "base", topic, 0.02))
+        made.event(1.0, MessageExpired(MessageId(1), "base", topic, ExpiryReason.DEADLINE))
+        made.event(1.0, MessagePeerLost(MessageId(1), "base", topic))
+    made.close().result(WAIT_S)
+    assert [line["topic"] for line in lines(made.path)[1:]] == ["status"] * 3
 
 
 def test_a_recording_ends_at_its_limit(tmp_path: Path) -> None:
