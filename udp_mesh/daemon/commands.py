@@ -252,7 +252,7 @@ def set_neighbour(service: Service, _client: Client, header: Header, _: bytes) -
         Table({key: value for key, value in values.items() if value is not None}, source, ("neighbour",)), settings.port
     )
     if neighbour is None:
-        raise _refusal(ConfigurationError(source.problems))
+        raise RequestError("bad-request", str(_refusal(ConfigurationError(source.problems))))
     others = tuple(other for other in settings.neighbours if other.address != neighbour.address)
     return _changed(service, replace(settings, neighbours=(*others, neighbour)))
 

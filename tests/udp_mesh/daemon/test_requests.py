@@ -62,7 +62,7 @@ def test_a_neighbour_that_the_file_would_not_take_is_not_set_either(
     with pair[0].client() as client:
         with pytest.raises(MeshError) as refused:
             client.request("set-neighbour", **fields)
-        assert refused.value.code == "bad-configuration"
+        assert refused.value.code == "bad-request"
         assert complaint in str(refused.value)
         assert len(client.request("neighbours")["neighbours"]) == 1
 
