@@ -124,7 +124,7 @@ def ping(service: Service, _client: Client, header: Header, _: bytes) -> Awaitab
         raise RequestError("bad-request", f"timeout_s: expected up to {MAX_PING_S:g}, found {timeout_s!r}")
 
     async def answer() -> Header:
-        return {"round_trip_s": await service.ping(peer, float(timeout_s))}
+        return {"round_trip_s": round(await service.ping(peer, float(timeout_s)), 6)}
 
     return answer()
 
@@ -199,7 +199,13 @@ def render_metrics(service: Service) -> str:
         "outbox_messages_refused_by_disk": service.store.refused,
     }
     visible = {name: count for name, count in service.counts.items() if not name.startswith(RESERVED_PREFIX)}
-    return metrics.render(driver.conditions(), visible, extra)
+    about = {
+        "name": service.settings.name,
+        "version": __version__,
+        "wire_version": str(WIRE_VERSION),
+        "boot": service.boot_id.hex(),
+    }
+    return metrics.render(driver.conditions(), visible, extra, about=about, uptime_s=driver.now() - service.started)
 
 
 # What shall be

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping
 
-from udp_mesh.core.conditions import Conditions, PeerConditions
+from udp_mesh.core.conditions import Conditions
 from udp_mesh.daemon.status import TopicCount
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -37,9 +37,18 @@ _QUEUE_GAUGES = (
 )
 
 
-def render(conditions: Conditions, topics: Mapping[str, TopicCount], extra: Mapping[str, float]) -> str:
-    """The page that Prometheus reads; `extra` are counters of the daemon's own."""
+def render(
+    conditions: Conditions,
+    topics: Mapping[str, TopicCount],
+    extra: Mapping[str, float],
+    *,
+    about: Mapping[str, str],
+    uptime_s: float,
+) -> str:
+    """The page that Prometheus reads; `extra` are counters of the daemon's own, `about` what never changes in a run."""
     lines: list[str] = []
+    _family(lines, "info", "gauge", "Always 1; its labels say what runs here.", [(about, 1)])
+    _family(lines, "uptime_seconds", "gauge", "Since the daemon started.", [({}, round(uptime_s, 3))])
     for item in dataclasses.fields(conditions.counters):
         value = getattr(conditions.counters, item.name)
         _family(lines, f"{item.name}_total", "counter", item.name.replace("_", " ").capitalize() + ".", [({}, value)])
@@ -70,10 +79,6 @@ def render(conditions: Conditions, topics: Mapping[str, TopicCount], extra: Mapp
     for name, number in extra.items():
         _family(lines, f"{name}_total", "counter", name.replace("_", " ").capitalize() + ".", [({}, number)])
     return "\n".join(lines) + "\n"
-
-
-def peers_online(peers: Iterable[PeerConditions]) -> int:
-    return sum(peer.online for peer in peers)
 
 
 def _family(lines: list[str], name: str, kind: str, help_text: str, samples: Iterable[Sample]) -> None:
