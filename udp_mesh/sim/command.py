@@ -128,9 +128,11 @@ def _progress(scenario: Scenario) -> Callable[[float], None]:
 def text(summary: dict[str, Any]) -> str:
     """The summary for people."""
     channel = summary["channel"]
+    reasons = ", ".join(f"{count} {reason}" for reason, count in summary["rejected_because"].items())
+    because = f" ({reasons})" if reasons else ""
     lines = [
         f"{summary['scenario']}, seed {summary['seed']}, {summary['duration_s']:.0f} virtual seconds",
-        f"messages: {summary['accepted']} accepted, {summary['rejected']} refused; per destination: "
+        f"messages: {summary['accepted']} accepted, {summary['rejected']} refused{because}; per destination: "
         f"{summary['delivered']} delivered, {summary['expired']} expired, {summary['peer_lost']} lost with their peer",
         f"channel: busy {channel['airtime_share']:.0%} of the time, {channel['transmissions']} transmissions",
         f"{'topic':<14}{'offered':>9}{'arrived':>9}{'MB':>9}{'p50 ms':>9}{'p99 ms':>10}",

@@ -8,6 +8,7 @@ be woken. What the nodes tell goes to `on_event`; reliable messages are accounte
 from __future__ import annotations
 
 import random
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -40,7 +41,8 @@ class Ledger:
     """What became of every accepted reliable message: (robot, message, destination) -> its outcomes."""
 
     accepted: int = 0
-    rejected: int = 0
+    rejected: Counter[str] = field(default_factory=Counter)
+    """Refusals by their reason."""
     outcomes: dict[tuple[str, int, MessageId, str], list[str]] = field(default_factory=dict)
 
     def note(self, robot: str, run: int, event: Event) -> None:
@@ -117,7 +119,7 @@ class Team:
             raise ValueError(f"{robot} is switched off")
         result = member.node.send(topic, payload, destination=destination, now=self.agenda.now)
         if isinstance(result, Rejected):
-            self.ledger.rejected += 1
+            self.ledger.rejected[result.reason.value] += 1
         else:
             self.ledger.accepted += 1
         self._settle(member)

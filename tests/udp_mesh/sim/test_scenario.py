@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udp_mesh.sim.command import SHIPPED, run_command, shipped
+from udp_mesh.sim.command import SHIPPED, run_command, shipped, text
 from udp_mesh.sim.run import play
 from udp_mesh.sim.scenario import ScenarioError, load, parse
 
@@ -122,13 +122,20 @@ VALUES = ("0", "-1", "1", "1.5", "1e400", "nan", "inf", ".inf", "-0.0", "1e18", 
 @given(st.sampled_from(KEYS), st.sampled_from(VALUES))
 def test_any_number_is_played_or_told(key: str, value: str) -> None:
     outer, _, inner = key.partition(".")
-    text = GOOD.replace("seed: 3", f"{outer}: {{{inner}: {value}}}" if inner else f"{outer}: {value}")
+    changed = GOOD.replace("seed: 3", f"{outer}: {{{inner}: {value}}}" if inner else f"{outer}: {value}")
     try:
-        scenario = parse(text.replace("duration_s: 5", "duration_s: 0.2").encode(), "s.yaml")
+        scenario = parse(changed.replace("duration_s: 5", "duration_s: 0.2").encode(), "s.yaml")
     except ScenarioError as error:
         assert str(error).startswith("s.yaml:1: ")
     else:
         assert 0 <= play(scenario).summary()["channel"]["airtime_share"] < 50
+
+
+def test_why_messages_were_refused_is_told() -> None:
+    summary = play(parse(GOOD.replace("a: [0, 0]", "a: [900, 0]").encode(), "s.yaml")).summary()
+    assert summary["rejected_because"] == {"unknown peer": summary["rejected"]}
+    assert summary["rejected"] > 0
+    assert f"{summary['rejected']} refused ({summary['rejected']} unknown peer)" in text(summary)
 
 
 def test_an_alias_is_refused() -> None:
