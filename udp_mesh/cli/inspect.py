@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 import time
 from collections.abc import Callable
@@ -11,7 +12,8 @@ from udp_mesh.cli.output import Exit, fields_text, say, say_json, say_json_line,
 from udp_mesh.cli.views import Json, peers_view, status_view, topics_view
 from udp_mesh.client.mesh_client import MeshClient
 
-CLEAR = "\x1b[H\x1b[2J"
+HOME, END_OF_LINE, BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
+"""Go to the upper left corner; clear to the end of the line; clear all below (ECMA-48)."""
 
 
 def status(arguments: argparse.Namespace) -> int:
@@ -40,9 +42,22 @@ def _show(arguments: argparse.Namespace, op: str, view: Callable[[Json], str]) -
                 return Exit.OK
             if arguments.json:
                 say_json_line(reply)
+            elif sys.stdout.isatty():
+                columns, lines = shutil.get_terminal_size()
+                say_part(screen(view(reply), columns, lines))
             else:
-                say((CLEAR if sys.stdout.isatty() else "") + view(reply))
+                say(view(reply))
             time.sleep(arguments.watch)
+
+
+def screen(text: str, columns: int, lines: int) -> str:
+    """The text in the place of what stood on a terminal before, without a flicker; what does not fit is cut off, and
+    the last line says so."""
+    rows = text.split("\n")
+    most = max(lines - 1, 1)
+    if len(rows) > most:
+        rows = [*rows[: most - 1], f"... {len(rows) - most + 1} more lines (`| less` without --watch has all)"]
+    return HOME + "".join(f"{row[:columns]}{END_OF_LINE}\n" for row in rows) + BELOW
 
 
 def events(arguments: argparse.Namespace) -> int:

@@ -21,6 +21,7 @@ import pytest
 from tests.udp_mesh.daemon.processes import RunningDaemon, collect, poll, two_daemons
 from tests.udp_mesh.links.sockets import WAIT_S
 from udp_mesh.cli import serve, traffic
+from udp_mesh.cli.inspect import screen
 from udp_mesh.cli.main import FORWARDED, build_parser, main
 from udp_mesh.cli.output import Exit, milliseconds
 from udp_mesh.client.mesh_client import FrameReader, encode_frame
@@ -70,6 +71,17 @@ def test_a_watch_repeats_until_it_is_interrupted(pair: Pair) -> None:
         program.send_signal(signal.SIGINT)
         assert program.wait(WAIT_S) == Exit.OK
     assert uptimes[1] > uptimes[0]
+
+
+def test_a_watched_page_keeps_to_its_terminal() -> None:
+    page = "\n".join(f"{number:03} " + "x" * 100 for number in range(60))
+    shown = screen(page, 40, 24).removeprefix("\x1b[H").removesuffix("\x1b[J").split("\x1b[K\n")
+    assert len(shown) == 24
+    assert shown[-1] == ""
+    assert max(map(len, shown)) == 40
+    assert shown[0].startswith("000 x")
+    assert shown[-2].startswith("... 38 more lines")
+    assert screen("one\ntwo", 40, 24) == "\x1b[Hone\x1b[K\ntwo\x1b[K\n\x1b[J"
 
 
 @pytest.mark.parametrize("words", [["ping", "bob", "-c", "1000"], ["bench", "bob", "--seconds", "1000", "--size", "1"]])
