@@ -22,7 +22,11 @@ LAST_SEQUENCE = 0x7FFF
 """Unicast sequence numbers run from 1 to this, then from 1 again."""
 
 TRIES_BEFORE_SILENT = 3
-"""Tries of one fragment after which only single probes leave."""
+"""Tries of one fragment, with nothing acknowledged meanwhile, after which only single probes leave."""
+
+DOUBLINGS, DOUBLINGS_WHILE_ANSWERED = 3, 1
+"""How often the patience with one fragment doubles. Of a peer that acknowledges others some are lost, and with patience
+for that an urgent one would take most of a second; once it doubles all the same: the path may have become slower."""
 
 LEAST_PATIENCE_S = 0.025
 """Before a fragment is sent again at the earliest: fielded programs answer when their interpreter gets to it."""
@@ -36,17 +40,32 @@ class _Leg:
     position: int
     sent_at: float
     tries: int
+    answers: int
+    """Acknowledgements of any fragment that had come when it was sent last."""
+    unanswered: int
+    """Its tries since the last of them."""
 
 
 class LegacySender:
     """The sending half for one fielded peer; queues and outcomes are those of its `Outbound`."""
 
-    __slots__ = ("_fragments", "_legs", "_own_name", "_sequence", "_sequences", "_stamp", "outbound", "silent")
+    __slots__ = (
+        "_answers",
+        "_fragments",
+        "_legs",
+        "_own_name",
+        "_sequence",
+        "_sequences",
+        "_stamp",
+        "outbound",
+        "silent",
+    )
 
     def __init__(self, outbound: Outbound, own_name: str, first_sequence: int) -> None:
         """`first_sequence` is drawn for each run: the peer may still hold pieces of our last one (its defect 8)."""
         self.outbound = outbound
         self.silent = False
+        self._answers = 0
         self._own_name = own_name
         self._sequence = first_sequence % LAST_SEQUENCE
         self._stamp = 0
@@ -82,6 +101,7 @@ class LegacySender:
         """The peer has this fragment; unknown ones are ignored."""
         leg = self._legs.pop((sequence, position), None)
         self.silent = False
+        self._answers += 1
         if leg is None:
             return
         if leg.tries == 1:
@@ -100,6 +120,7 @@ class LegacySender:
             for leg in self._legs.values():
                 leg.sent_at = float("-inf")
                 leg.tries = 1
+                leg.unanswered = 0
 
     def timer(self) -> float | None:
         """When the next fragment is overdue."""
@@ -109,19 +130,22 @@ class LegacySender:
 
     def _patience(self, leg: _Leg) -> float:
         timeout = max(LEAST_PATIENCE_S, self.outbound.trip.timeout(0.0))
-        return min(PROBE_S, timeout * (1 << min(leg.tries - 1, 3)))
+        doublings = min(leg.tries - 1, DOUBLINGS_WHILE_ANSWERED)
+        if leg.answers == self._answers:
+            doublings = max(doublings, min(leg.unanswered - 1, DOUBLINGS))
+        return min(PROBE_S, timeout * (1 << doublings))
 
     def _resend(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
         due = [entry for entry in self._legs.values() if now >= entry.sent_at + self._patience(entry)]
         due.sort(key=lambda leg: leg.message.priority)
         for leg in due:
-            if leg.tries >= TRIES_BEFORE_SILENT and not self.silent:
+            if leg.unanswered >= TRIES_BEFORE_SILENT and leg.answers == self._answers:
                 self.silent = True
             self._send(leg.message, leg.position, leg.tries + 1, link, address, now, out)
             self.outbound.retransmitted += 1
             if self.silent:
                 # One probe; the others wait until it is answered.
-                for other in due:
+                for other in self._legs.values():
                     if other is not leg:
                         other.sent_at = now
                 break
@@ -164,7 +188,9 @@ class LegacySender:
         self, message: Outgoing, position: int, tries: int, link: str, address: Address, now: float, out: list[Datagram]
     ) -> None:
         sequence, fragments = self._fragments[message]
-        self._legs[(sequence, position)] = _Leg(message, position, now, tries)
+        before = self._legs.get((sequence, position))
+        unanswered = before.unanswered + 1 if before is not None and before.answers == self._answers else 1
+        self._legs[(sequence, position)] = _Leg(message, position, now, tries, self._answers, unanswered)
         payload = LegacyPayload(sequence, position, len(fragments), fragments[position], wants_ack=True)
         data = encode_legacy(payload)
         urgent = message.priority <= self.outbound.rates.urgent_priority

@@ -1,0 +1,68 @@
+"""A fielded peer on a link that loses a fifth each way: urgent messages keep overtaking, bulk keeps moving."""
+
+import heapq
+import random
+
+from tests.udp_mesh.core.test_legacy import OldRobot
+from udp_mesh.wire.legacy import LegacyAck, LegacyPayload, decode_mesh_data
+
+DELAY_S, LOSS, TICK_S = 0.010, 0.2, 0.001
+
+
+def play(seed: int, duration_s: float) -> tuple[list[float], int]:
+    """What each urgent message (ten a second) took beside endless bulk, in seconds; fragments of that that arrived."""
+    rng, old = random.Random(seed), OldRobot()
+    begun = old.now
+    back: list[tuple[float, int, int]] = []
+    sent_at: dict[bytes, float] = {}
+    took: dict[bytes, float] = {}
+    bulk: set[tuple[int, int]] = set()
+    tick = 0
+    while old.now < begun + duration_s:
+        if tick % 100 == 0:
+            name = b"%d" % tick
+            sent_at[name] = old.now
+            old.node.send("stop", name, destination="old", now=old.now)
+        if tick % 1000 == 0:
+            old.node.send("map", bytes(200_000), destination="old", now=old.now)
+        while back and back[0][0] <= old.now:
+            _, sequence, position = heapq.heappop(back)
+            old.say(LegacyAck(sequence, position))
+        for piece in old.hear():
+            if not isinstance(piece, LegacyPayload) or rng.random() < LOSS:
+                continue
+            if piece.total == 1:
+                name = decode_mesh_data(piece.data).data
+                took.setdefault(name, old.now + DELAY_S - sent_at[name])
+            else:
+                bulk.add((piece.sequence, piece.position))
+            if rng.random() >= LOSS:
+                heapq.heappush(back, (old.now + 2 * DELAY_S, piece.sequence, piece.position))
+        old.events()
+        tick += 1
+        old.now += TICK_S
+    return sorted(took.values()), len(bulk)
+
+
+def test_urgent_messages_and_bulk_to_a_fielded_peer_stand_a_fifth_of_loss() -> None:
+    took, bulk = play(5, 40.0)
+    assert len(took) >= 395
+    assert took[len(took) * 99 // 100] <= 0.35
+    assert bulk >= 1500
+
+
+def test_a_fielded_peer_that_answered_and_fell_silent_is_probed_gently() -> None:
+    old = OldRobot()
+    old.node.send("map", bytes(50_000), destination="old", now=old.now)
+    for turn in range(12):
+        old.now += 0.010
+        for place, piece in enumerate(old.hear()):
+            # one of each three never arrives
+            if isinstance(piece, LegacyPayload) and (turn + place) % 3:
+                old.say(LegacyAck(piece.sequence, piece.position))
+    silent_from, left = old.now + 2.0, 0
+    while old.now < silent_from + 10.0:
+        old.now += 0.010
+        pieces = [piece for piece in old.hear() if isinstance(piece, LegacyPayload)]
+        left += len(pieces) if old.now > silent_from else 0
+    assert 30 <= left <= 60
