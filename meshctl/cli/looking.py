@@ -121,7 +121,7 @@ def _robots(opened: Session, with_robots: bool) -> tuple[tuple[str, ...], str]:
     named = tuple(name for name, computer in able.items() if computer.ssh.host)
     if named or not able:
         return named, ""
-    return (), "the robots' computers were not asked: a virtual fleet has none"
+    return (), "the robots' computers were not asked: with --lab only one of which the inventory gives ssh.host is"
 
 
 def glance(
