@@ -105,6 +105,8 @@ def _hint(error: MeshError) -> str:
             return "`udp-mesh run` starts one, --socket or UDP_MESH_SOCKET names another socket"
         case "unknown-peer", _:
             return "`udp-mesh peers` lists those that were heard"
+        case "cannot-record", _ if "File exists" not in str(error):
+            return "the daemon writes it, and as a service may do so below its state directory, /var/lib/udp-mesh"
         case "unknown-topic", _:
             return "`udp-mesh topics` lists what is configured"
         case _:
@@ -346,12 +348,19 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="give up when none is delivered for so long (default: %(default)g)",
     )
     recorders = _commands_of(
-        commands, "record", "record messages and conditions for `udp-mesh report`", "udp-mesh record start run1.jsonl"
+        commands,
+        "record",
+        "record messages and conditions for `udp-mesh report`",
+        "udp-mesh record start /var/lib/udp-mesh/run1.jsonl",
     )
     start = _command(
-        recorders, "start", traffic.record_start, "begin a recording", example="udp-mesh record start run1.jsonl"
+        recorders,
+        "start",
+        traffic.record_start,
+        "begin a recording",
+        example="udp-mesh record start /var/lib/udp-mesh/run1.jsonl",
     )
-    start.add_argument("file", type=Path, help="a file that does not exist yet, written by the daemon")
+    start.add_argument("file", type=Path, help="a file that does not exist yet; the daemon writes it, with its rights")
     start.add_argument("--payloads", action="store_true", help="with the bytes of received messages")
     _command(recorders, "stop", traffic.record_stop, "end the recording", example="udp-mesh record stop")
 

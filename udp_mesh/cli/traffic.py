@@ -278,10 +278,24 @@ def _fill(mesh: MeshClient, arguments: argparse.Namespace, run: _Run) -> bool:
 
 
 def record_start(arguments: argparse.Namespace) -> int:
+    path = arguments.file.absolute()
     with MeshClient(arguments.socket) as mesh:
-        mesh.request("record-start", path=str(arguments.file.absolute()), payloads=arguments.payloads)
-    say_json({"path": str(arguments.file.absolute())}) if arguments.json else say(f"recording to {arguments.file}")
+        mesh.request("record-start", path=str(path), payloads=arguments.payloads)
+    say_json({"path": str(path)}) if arguments.json else say(f"recording to {path}")
+    if _is_nowhere(path):
+        complain(f"{path} is not to be seen here: the daemon has a /tmp of its own (PrivateTmp= of its service)")
     return Exit.OK
+
+
+def _is_nowhere(path: Path) -> bool:
+    try:
+        path.stat()
+    except FileNotFoundError:
+        return True
+    except OSError:
+        # a directory of the daemon's that we may not look into
+        return False
+    return False
 
 
 def record_stop(arguments: argparse.Namespace) -> int:

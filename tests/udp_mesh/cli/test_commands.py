@@ -24,7 +24,7 @@ from udp_mesh.cli import serve, traffic
 from udp_mesh.cli.inspect import screen
 from udp_mesh.cli.main import FORWARDED, build_parser, main
 from udp_mesh.cli.output import Exit, milliseconds
-from udp_mesh.client.mesh_client import FrameReader, encode_frame
+from udp_mesh.client.mesh_client import FrameReader, MeshClient, encode_frame
 from udp_mesh.crypto import Key
 from udp_mesh.daemon.configuration import read_keys
 
@@ -341,7 +341,20 @@ def test_a_recording_is_started_and_stopped(run: Run, tmp_path: Path) -> None:
     code, text, _ = run("record", "stop", "--json")
     assert code == Exit.OK
     assert json.loads(text)["path"] == str(path)
-    assert run("record", "start", str(path))[0] == Exit.FAILED
+    assert run("record", "start", str(path))[::2] == (Exit.FAILED, f"udp-mesh: {path}: File exists\n")
+
+
+def test_a_recording_where_the_daemon_may_not_write_or_we_cannot_look_is_told(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, _, complaint = run("record", "start", str(tmp_path / "none" / "run.jsonl"))
+    assert code == Exit.FAILED
+    assert "No such file or directory (the daemon writes it, and as a service may do so below" in complaint
+    # a /tmp of the daemon's own: what it made there is not here
+    monkeypatch.setattr(MeshClient, "request", lambda *_, **__: {})
+    code, _, complaint = run("record", "start", str(tmp_path / "run.jsonl"))
+    assert code == Exit.OK
+    assert "run.jsonl is not to be seen here: the daemon has a /tmp of its own" in complaint
 
 
 @pytest.mark.parametrize(
