@@ -170,15 +170,24 @@ def ping(arguments: argparse.Namespace) -> int:
         # the one under way was not waited for to its end
         asked = max(asked - 1, len(times))
         code = Exit.INTERRUPTED
-    if not arguments.json:
-        spread = (
-            f", least {milliseconds(min(times))}, mean {milliseconds(sum(times) / len(times))}, "
-            f"most {milliseconds(max(times))}"
-            if times
-            else ""
-        )
-        say(f"{len(times)} of {asked} answered{spread}")
+    except MeshError:
+        if times:
+            _sum_up(arguments, times, asked)
+        raise
+    _sum_up(arguments, times, asked)
     return code
+
+
+def _sum_up(arguments: argparse.Namespace, times: list[float], asked: int) -> None:
+    if arguments.json:
+        return
+    spread = (
+        f", least {milliseconds(min(times))}, mean {milliseconds(sum(times) / len(times))}, "
+        f"most {milliseconds(max(times))}"
+        if times
+        else ""
+    )
+    say(f"{len(times)} of {asked} answered{spread}")
 
 
 def _ping_once(mesh: MeshClient, arguments: argparse.Namespace, times: list[float]) -> None:

@@ -17,6 +17,7 @@ from udp_mesh.daemon import metrics
 from udp_mesh.daemon.api import Client, RequestError
 from udp_mesh.daemon.configuration import (
     CONDITIONS_TOPIC,
+    MAX_PING_S,
     NODE_NAME,
     RESERVED_PREFIX,
     TOPIC_NAME,
@@ -33,9 +34,6 @@ from udp_mesh.daemon.status import conditions_json, plain, show_address, topic_j
 from udp_mesh.daemon.toml_source import ConfigurationError, Source, Table
 from udp_mesh.wire.header import VERSION as WIRE_VERSION
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
-
-MAX_PING_S = 60.0
-
 
 # Reading a request's fields
 

@@ -49,6 +49,8 @@ RESERVED_TOPICS = (
     Topic(PONG_TOPIC, priority=0, deadline_s=10.0),
     Topic(BENCH_TOPIC, priority=15, reliable=True),
 )
+MAX_PING_S = 60.0
+"""A ping's answer is waited for no longer."""
 CONDITIONS_TOPIC = "~mesh/conditions"
 """What local subscribers get of the network's conditions; it never leaves the machine."""
 

@@ -24,7 +24,7 @@ from udp_mesh.cli import serve, traffic
 from udp_mesh.cli.inspect import screen
 from udp_mesh.cli.main import FORWARDED, build_parser, main
 from udp_mesh.cli.output import Exit, milliseconds
-from udp_mesh.client.mesh_client import FrameReader, MeshClient, encode_frame
+from udp_mesh.client.mesh_client import FrameReader, MeshClient, MeshError, encode_frame
 from udp_mesh.crypto import Key
 from udp_mesh.daemon.configuration import read_keys
 
@@ -291,6 +291,27 @@ def test_a_peer_answers_a_ping_and_a_stranger_does_not(run: Run) -> None:
     assert "nobody was never heard of (`udp-mesh peers` lists" in complaint
     code, text, _ = run("ping", "nobody", "--json")
     assert (code, json.loads(text)) == (Exit.FAILED, {"peer": "nobody", "error": "unknown-peer"})
+
+
+def test_a_ping_whose_daemon_ends_says_what_it_has(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    replies = iter([{"round_trip_s": 0.002}, {"round_trip_s": 0.004}])
+
+    def request(*_: object, **__: object) -> dict[str, float]:
+        reply = next(replies, None)
+        if reply is None:
+            raise MeshError("unreachable", "the daemon closed the connection")
+        return reply
+
+    monkeypatch.setattr(MeshClient, "request", request)
+    code, text, complaint = run("ping", "bob", "-c", "9", "--interval", "0.001")
+    assert (code, complaint) == (Exit.UNREACHABLE, "udp-mesh: the daemon closed the connection\n")
+    assert text.splitlines()[-1] == "2 of 3 answered, least 2 ms, mean 3 ms, most 4 ms"
+
+
+def test_a_command_that_only_asks_loads_no_transport() -> None:
+    code = "import sys, udp_mesh.cli.main; print('udp_mesh.core.node' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=WAIT_S).stdout
+    assert found == "False\n"
 
 
 def test_a_benchmark_says_what_arrived(run: Run) -> None:
