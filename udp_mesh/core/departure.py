@@ -50,6 +50,11 @@ def header_bytes(address: Address) -> int:
     return IP_UDP_BYTES + (IP6_EXTRA_BYTES if ":" in address[0] else 0)
 
 
+def datagram_room(address: Address, mtu: int, fragment_bytes: int) -> int:
+    """Bytes of frames in a datagram that an IP packet of `mtu` bytes carries, and with it a full fragment."""
+    return min(mtu - header_bytes(address) - LONG_OVERHEAD_BYTES, fragment_bytes + FRAGMENT_WIDE_BYTES)
+
+
 class Way:
     """How datagrams reach the peer now: link, address, sealing, sizes."""
 
@@ -66,15 +71,15 @@ class Way:
         self.mtu = 0
         """Bytes of the largest IP packet."""
         self.room_bytes = 0
-        """Frames that fit one datagram."""
+        """Frames of one datagram at most: small pieces that share one make it no larger than a full fragment does."""
         self.fragment_bytes = 0
         """Payload of a full fragment."""
 
     def lead(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
         """Datagrams go this way from now on; messages already begun keep their fragments where these still fit."""
         self.link, self.address, self.mtu = link, address, mtu
-        self.room_bytes = mtu - header_bytes(address) - LONG_OVERHEAD_BYTES
-        self.fragment_bytes = min(fragment_bytes, self.room_bytes - FRAGMENT_WIDE_BYTES)
+        self.room_bytes = datagram_room(address, mtu, fragment_bytes)
+        self.fragment_bytes = self.room_bytes - FRAGMENT_WIDE_BYTES
 
     def seal(self, frames: bytes) -> tuple[int, bytes]:
         return self.channel.seal(frames) if self.confirmed else self.channel.seal_long(frames)
