@@ -28,8 +28,8 @@ from udp_mesh.wire.codec import (
     LENGTH_BYTES,
     encode,
 )
-from udp_mesh.wire.frames import Fragment, Frame, MessageHead, TopicAnnounce
-from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM
+from udp_mesh.wire.frames import Delivered, Fragment, Frame, MessageHead, Ping, TopicAnnounce
+from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
 
 IP_UDP_BYTES = 28
 """IPv4 and UDP headers."""
@@ -39,6 +39,14 @@ IP6_EXTRA_BYTES = 20
 
 LEAST_ROOM_BYTES = 64
 """Less room than this in a datagram is not worth looking for another small message."""
+
+PING_BYTES = 9
+IDS_BYTES = 4
+ID_BYTES = 4
+"""Of a PING; of a DELIVERED without its message ids, and of each of these."""
+
+NO_MESSAGE_ID = 0xFFFF_FFFF
+"""Messages are numbered from 0 on: none comes to this one in the life of a boot."""
 
 _NARROW = struct.Struct(">BIH")
 _WIDE = struct.Struct(">BII")
@@ -170,6 +178,22 @@ def leave_copies(outbound: Outbound, way: Way, now: float, out: list[Datagram]) 
             outbound.mark(now, urgent=True),
             out,
         )
+
+
+def leave_large_ping(outbound: Outbound, way: Way, token: int, frames_bytes: int) -> Datagram:
+    """A ping in a datagram that is no smaller than one with `frames_bytes` of frames, and larger by 7 B at most.
+
+    What fills it are words of a message that no peer ever sends: that we have it whole.
+    """
+    frames: list[Frame] = [Ping(token)]
+    missing = frames_bytes - PING_BYTES
+    while missing > 0:
+        ids = min(MAX_IDS, max(1, -(-(missing - IDS_BYTES) // ID_BYTES)))
+        frames.append(Delivered((NO_MESSAGE_ID,) * ids))
+        missing -= IDS_BYTES + ID_BYTES * ids
+    number, data = way.seal(encode(frames))
+    outbound.flight.add(number, None)
+    return Datagram(way.link, way.address, data, True)
 
 
 def _begin(outbound: Outbound, way: Way, message: Outgoing) -> None:

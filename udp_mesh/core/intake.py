@@ -187,8 +187,8 @@ def _take_frames(state: State, session: Session, frames: list[Frame], number: in
             case Ping(token):
                 session.owe(Pong(token, 0))
                 state.owe(session)
-            case Pong():
-                outbound.path_size.small_arrived(now)
+            case Pong(token):
+                outbound.path_size.answered(token, now)
             case Bye():
                 leave(state, session, now)
             case _:

@@ -135,6 +135,7 @@ class Outbound(OpenMessages):
         received = ack.received << 1 | 1
         # Sparse traffic has too few successors to lose packets otherwise.
         timed_out = flight.confirm_timed_out(ack.largest, received) if ack.largest < flight.next_number else 0
+        spurious = flight.spurious
         acknowledged, lost, newest = flight.acknowledge(ack.largest, received)
         if acknowledged:
             # What was acknowledged late, all at once, says nothing about the rate of the link.
@@ -146,7 +147,7 @@ class Outbound(OpenMessages):
             if self.silent_since is not None:
                 self._end_silence()
             if self.path_size.in_doubt:
-                self.path_size.arrived(acknowledged, now)
+                self.path_size.arrived(acknowledged, flight.spurious - spurious, now)
             self._book_arrivals(acknowledged)
             if self.overdue:
                 self._settle_overdue()
@@ -341,13 +342,13 @@ class Outbound(OpenMessages):
         (then one probe in a few, once the silence is no short cut)."""
         if self.silent_since is None or not self.probe_credit:
             return False
-        if not self.scheduler.waiting:
-            return True
-        long_since = now - self.silent_since > PROBE_SOON_FOR_S
-        if long_since and self.path_size.ask():
+        if self.scheduler.waiting:
+            long_since = now - self.silent_since > PROBE_SOON_FOR_S
+            if not (long_since and self.path_size.ask_small()):
+                return False
             self.probe_credit = 0
-            return True
-        return False
+        self.path_size.asked_small()
+        return True
 
     def _set_aside(self) -> None:
         """Everything on its way waits again, urgent messages behind those still to come."""

@@ -8,7 +8,7 @@
 
 from udp_mesh.core.acceptance import release_outbox, report_ended, shelve
 from udp_mesh.core.casts import Repairs
-from udp_mesh.core.departure import Way
+from udp_mesh.core.departure import Way, datagram_room, leave_large_ping
 from udp_mesh.core.discovery import MISSED_HEARTBEATS
 from udp_mesh.core.events import (
     Incompatible,
@@ -23,7 +23,7 @@ from udp_mesh.core.events import (
 from udp_mesh.core.message import Outgoing
 from udp_mesh.core.open_messages import Outcome
 from udp_mesh.core.outbound import Outbound
-from udp_mesh.core.path_size import NARROWER_MTUS, WIDEN_AFTER_S
+from udp_mesh.core.path_size import NARROWER_MTUS
 from udp_mesh.core.roster import Arrival
 from udp_mesh.core.session import STALE_PATH_S, Peer, Session
 from udp_mesh.core.settings import Address
@@ -240,20 +240,34 @@ def _size(message: Outgoing, position: int) -> int:
 
 
 def _measure_path(state: State, peer: Peer, session: Session, now: float) -> None:
-    """Smaller fragments where full ones do not get through; after a long time, full ones again."""
+    """Smaller fragments where full ones do not get through; larger ones again where a ping of that size does."""
     outbound, way = peer.outbound, session.way
     size, info = outbound.path_size, state.links.get(way.link)
-    narrower = [mtu for mtu in NARROWER_MTUS if mtu < way.mtu]
+    fragment_bytes = state.settings.fragment_bytes
+    rooms = {mtu: datagram_room(way.address, mtu, fragment_bytes) for mtu in NARROWER_MTUS}
+    narrower = [mtu for mtu, room in rooms.items() if room < way.room_bytes]
     if size.too_narrow(now) and narrower:
-        way.lead(way.link, way.address, narrower[0], state.settings.fragment_bytes)
-        size.reset()
-        size.narrowed_at = now
+        way.lead(way.link, way.address, narrower.pop(0), fragment_bytes)
+        size.narrowed(now)
         state.ledger.tell(PathNarrowed(peer.name, way.mtu, way.fragment_bytes))
         _fit(outbound, way, all_of_it=True)
         state.ready[peer] = None
-    elif size.narrowed_at is not None and now - size.narrowed_at > WIDEN_AFTER_S and info is not None:
+    size.large_bytes = rooms[narrower[0]] if narrower else float("inf")
+    if size.narrowed_at is None or info is None:
+        return
+    if size.asking.carries > way.mtu:
+        way.lead(way.link, way.address, min(size.asking.carries, info.mtu), fragment_bytes)
+        size.reset()
+    rooms = {mtu: room for mtu, room in rooms.items() if mtu < info.mtu}
+    rooms[info.mtu] = datagram_room(way.address, info.mtu, fragment_bytes)
+    larger = {room: mtu for mtu, room in rooms.items() if room > way.room_bytes}
+    if not larger:
         size.narrowed_at = None
-        way.lead(way.link, way.address, info.mtu, state.settings.fragment_bytes)
+    elif peer.online and way.confirmed and outbound.silent_since is None and size.asking.due(now):
+        for room, mtu in larger.items():
+            token = state.rng.getrandbits(64)
+            size.asking.asked(token, mtu)
+            state.outgoing.append(leave_large_ping(outbound, way, token, room))
 
 
 def leave(state: State, session: Session, now: float) -> None:
