@@ -79,6 +79,7 @@ class Driver:
         self._due = float("-inf")
         """When the node wanted attention, as of the last look: the loop may have come here without its timer."""
         self._refresh: asyncio.TimerHandle | None = None
+        self._interfaces_unknown = ""
         self._review: asyncio.TimerHandle | None = None
         self._pump_requested = False
         self.closed = False
@@ -198,9 +199,11 @@ class Driver:
         completed = False
         try:
             self.refresh_links()
-            completed = True
+            completed, self._interfaces_unknown = True, ""
         except OSError as error:
-            log.error("interfaces-unknown error=%s", error)
+            if str(error) != self._interfaces_unknown:
+                log.error("interfaces-unknown error=%s", error)
+            self._interfaces_unknown = str(error)
         finally:
             if not completed:
                 # The kernel would not list its interfaces (out of memory), or a bug: what is open stays open and heard.

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tests.udp_mesh.daemon.processes import KEY, RATES, RunningDaemon, collect, outcomes, poll, wait_online
+from udp_mesh.cli.views import status_view
 
 MAP_BYTES = 3_000_000
 """At the topic's rate limit it takes some seconds: time to change the network in the middle."""
@@ -257,6 +258,7 @@ def sending_is_forbidden() -> None:
                 (refusal,) = poll(lambda: sender.request("status")["refusals"] or None, "alice tells what is refused")
                 assert (refusal["link"], refusal["reason"]) == ("mesh0", "Operation not permitted")
                 assert "10.7.20.2:8700" in refusal["to"]
+                assert "link mesh0 CANNOT SEND to 10.7.20.2:8700" in status_view(sender.request("status"))
                 assert receiver.next_frame(1.0) is None
                 both.ip(both.alice, "xfrm policy flush")
                 assert [message.topic for message in collect(receiver, 2)] == ["status", "map"]

@@ -149,14 +149,18 @@ def test_an_exception_nobody_expected_is_reported_and_the_transport_goes_on(monk
     run(body)
 
 
-def test_a_kernel_that_will_not_list_its_interfaces_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kernel_that_will_not_list_its_interfaces_is_asked_again_and_that_is_said_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     async def body(alice: Node, bob: Node) -> None:
         def refuse() -> None:
             raise NetlinkError(12, "no memory")
 
         monkeypatch.setattr(alice.driver.hub, "refresh", refuse)
-        alice.driver._refresh_and_pump()
+        for _ in range(5):
+            alice.driver._refresh_and_pump()
         assert isinstance(await alice.deliver("map", PAYLOAD, to="bob"), MessageDelivered)
+        assert sum("interfaces-unknown" in record.getMessage() for record in caplog.records) == 1
 
     run(body)
 
