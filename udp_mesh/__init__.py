@@ -11,12 +11,22 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from udp_mesh.client.mesh_client import MeshClient as MeshClient
+    from udp_mesh.core.events import MessageDelivered as MessageDelivered
+    from udp_mesh.core.events import MessageExpired as MessageExpired
+    from udp_mesh.core.events import MessagePeerLost as MessagePeerLost
+    from udp_mesh.core.events import MessageReceived as MessageReceived
+    from udp_mesh.core.events import PeerOffline as PeerOffline
+    from udp_mesh.core.events import PeerOnline as PeerOnline
+    from udp_mesh.core.settings import Limits as Limits
     from udp_mesh.core.settings import Neighbour as Neighbour
+    from udp_mesh.core.settings import Outbox as Outbox
+    from udp_mesh.core.settings import Rates as Rates
     from udp_mesh.core.settings import Settings as Settings
     from udp_mesh.core.settings import Topic as Topic
     from udp_mesh.crypto.keys import Key as Key
     from udp_mesh.daemon.library import Node as Node
     from udp_mesh.daemon.library import SendRefusedError as SendRefusedError
+    from udp_mesh.daemon.outbox import DirectoryStore as DirectoryStore
     from udp_mesh.links.attachments import LinkWish as LinkWish
 
 __version__ = "0.1.0"
@@ -25,9 +35,19 @@ _EXPORTS = {
     "Node": "udp_mesh.daemon.library",
     "SendRefusedError": "udp_mesh.daemon.library",
     "LinkWish": "udp_mesh.links.attachments",
+    "DirectoryStore": "udp_mesh.daemon.outbox",
     "Settings": "udp_mesh.core.settings",
     "Topic": "udp_mesh.core.settings",
+    "Outbox": "udp_mesh.core.settings",
+    "Rates": "udp_mesh.core.settings",
+    "Limits": "udp_mesh.core.settings",
     "Neighbour": "udp_mesh.core.settings",
+    "MessageReceived": "udp_mesh.core.events",
+    "MessageDelivered": "udp_mesh.core.events",
+    "MessageExpired": "udp_mesh.core.events",
+    "MessagePeerLost": "udp_mesh.core.events",
+    "PeerOnline": "udp_mesh.core.events",
+    "PeerOffline": "udp_mesh.core.events",
     "Key": "udp_mesh.crypto.keys",
     "MeshClient": "udp_mesh.client.mesh_client",
 }
