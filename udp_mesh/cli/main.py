@@ -182,7 +182,12 @@ def _add_serve(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         commands, "run", serve.run_daemon, "run the daemon", example="udp-mesh run mesh.toml", daemon=False, json=False
     )
     run.add_argument("config", type=Path, nargs="?", default=DEFAULT_PATH, help="default: %(default)s")
-    run.add_argument("--log-level", choices=("debug", "info", "warning", "error"), default="info")
+    run.add_argument(
+        "--log-level",
+        choices=("debug", "info", "warning", "error"),
+        default="info",
+        help="what is logged, from this level on (default: %(default)s)",
+    )
     check = _command(
         commands, "check", serve.check, "check a configuration", example="udp-mesh check mesh.toml", daemon=False
     )

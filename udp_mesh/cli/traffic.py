@@ -9,10 +9,11 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 from udp_mesh.cli.output import Exit, complain, milliseconds, rate, say, say_bytes, say_json, say_json_line, size
 from udp_mesh.cli.views import Json
-from udp_mesh.client.mesh_client import MeshClient, MeshError, as_message
+from udp_mesh.client.mesh_client import MAX_PAYLOAD_BYTES, MeshClient, MeshError, as_message
 from udp_mesh.daemon.configuration import BENCH_TOPIC, CONDITIONS_TOPIC
 
 BENCH_BACKLOG_BYTES = 16 << 20
@@ -64,13 +65,23 @@ def _payload(arguments: argparse.Namespace) -> bytes | None:
             return None
         if sys.stdin.isatty():
             complain("the message is what you type now; Ctrl-D ends it")
-        return sys.stdin.buffer.read()
+        return _bounded(sys.stdin.buffer, "standard input")
     path: Path = arguments.file
     try:
-        return path.read_bytes()
+        with path.open("rb") as file:
+            return _bounded(file, str(path))
     except OSError as error:
         complain(f"{path}: {error.strerror}")
         return None
+
+
+def _bounded(file: BinaryIO, name: str) -> bytes | None:
+    """What is in it, where that can be a message."""
+    payload = file.read(MAX_PAYLOAD_BYTES + 1)
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        complain(f"{name}: expected at most {MAX_PAYLOAD_BYTES} bytes, found more")
+        return None
+    return payload
 
 
 def _topic(mesh: MeshClient, name: str) -> Json | None:

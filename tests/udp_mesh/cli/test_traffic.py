@@ -101,6 +101,15 @@ def test_a_file_is_sent_several_times(run: Run, pair: Pair, tmp_path: Path) -> N
     assert "missing: No such file" in complaint
 
 
+@pytest.mark.parametrize("words", [["--file", "/dev/zero"], ["-"]])
+def test_a_file_without_end_is_no_message(run: Run, monkeypatch: pytest.MonkeyPatch, words: list[str]) -> None:
+    monkeypatch.setattr(traffic, "MAX_PAYLOAD_BYTES", 1000)
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(bytes(2000))))
+    code, _, complaint = run("pub", "status", *words, "--to", "bob")
+    name = "standard input" if words == ["-"] else "/dev/zero"
+    assert (code, complaint) == (Exit.FAILED, f"udp-mesh: {name}: expected at most 1000 bytes, found more\n")
+
+
 def test_a_script_is_told_that_its_message_was_accepted(run: Run) -> None:
     code, text, _ = run("pub", "map", "x", "--to", "bob", "--count", "2", "--rate", "100", "--json")
     assert (code, json.loads(text)) == (Exit.OK, {"topic": "map", "accepted": 2})
