@@ -39,12 +39,14 @@ class MetricsServer:
                 return
             async with asyncio.timeout(REQUEST_S):
                 request = await reader.readuntil(b"\r\n\r\n")
-                if request.startswith(b"GET /metrics "):
+                method, _, rest = request.partition(b"\r\n")[0].partition(b" ")
+                path = rest.partition(b" ")[0].partition(b"?")[0]
+                if method in (b"GET", b"HEAD") and path == b"/metrics":
                     status, body = "200 OK", self._render().encode()
                 else:
                     status, body = "404 Not Found", b"GET /metrics\n"
                 head = f"HTTP/1.1 {status}\r\nContent-Type: {CONTENT_TYPE}\r\nContent-Length: {len(body)}\r\n"
-                writer.write(head.encode() + b"Connection: close\r\n\r\n" + body)
+                writer.write(head.encode() + b"Connection: close\r\n\r\n" + (b"" if method == b"HEAD" else body))
                 await writer.drain()
         except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             # A scraper that went away or never asked: nothing to answer.

@@ -5,11 +5,16 @@ family's samples stand together, each set of labels once; label values escape ba
 end in `_total` and are never negative.
 """
 
+import asyncio
 import re
 
+import pytest
+
 from tests.udp_mesh.core.pair import pair
+from tests.udp_mesh.links.sockets import WAIT_S, free_port
 from udp_mesh.core.settings import Topic
 from udp_mesh.daemon.metrics import render
+from udp_mesh.daemon.metrics_server import MetricsServer
 from udp_mesh.daemon.status import TopicCount
 
 NAME = "[a-zA-Z_:][a-zA-Z0-9_:]*"
@@ -64,3 +69,36 @@ def test_the_page_keeps_to_the_formats_rules() -> None:
         'topic="line\\nfeed"',
         'topic="map"',
     ]
+
+
+@pytest.mark.parametrize(
+    ("request_line", "status", "body"),
+    [
+        ("GET /metrics HTTP/1.1", "200 OK", "up 1\n"),
+        ("GET /metrics?collect=all HTTP/1.1", "200 OK", "up 1\n"),
+        ("HEAD /metrics HTTP/1.1", "200 OK", ""),
+        ("GET /metricsx HTTP/1.1", "404 Not Found", "GET /metrics\n"),
+        ("POST /metrics HTTP/1.1", "404 Not Found", "GET /metrics\n"),
+        ("GET", "404 Not Found", "GET /metrics\n"),
+        ("", "404 Not Found", "GET /metrics\n"),
+    ],
+)
+def test_a_scraper_is_answered_as_http_wants(request_line: str, status: str, body: str) -> None:
+    async def ask() -> bytes:
+        port = free_port()
+        server = MetricsServer(("127.0.0.1", port), lambda: "up 1\n")
+        await server.start()
+        try:
+            async with asyncio.timeout(WAIT_S):
+                reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                writer.write(f"{request_line}\r\nHost: here\r\n\r\n".encode())
+                answer = await reader.read()
+                writer.close()
+                await writer.wait_closed()
+                return answer
+        finally:
+            await server.close()
+
+    head, _, found = asyncio.run(ask()).decode().partition("\r\n\r\n")
+    assert (head.split("\r\n")[0], found) == (f"HTTP/1.1 {status}", body)
+    assert f"Content-Length: {len(body) or len('up 1') + 1}" in head
