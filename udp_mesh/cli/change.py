@@ -13,7 +13,11 @@ from udp_mesh.client.mesh_client import MeshClient
 
 def set_topic(arguments: argparse.Namespace) -> int:
     values = _values(arguments.values)
-    return Exit.USAGE if values is None else _change(arguments, "set-topic", topic=arguments.topic, values=values)
+    if values is None:
+        return Exit.USAGE
+    # TOML has no word for what is not there; an outbox can be "none" itself
+    cleared = {key: None for key, value in values.items() if value == "none" and key != "outbox"}
+    return _change(arguments, "set-topic", topic=arguments.topic, values=values | cleared)
 
 
 def set_window(arguments: argparse.Namespace) -> int:

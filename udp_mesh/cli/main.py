@@ -244,7 +244,10 @@ def _add_change(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     )
     topic.add_argument("topic", help="its name; one that is not configured yet is added")
     topic.add_argument(
-        "values", nargs="*", metavar="key=value", help="as in [topics], such as priority=9; the others stay as they are"
+        "values",
+        nargs="*",
+        metavar="key=value",
+        help="as in [topics], such as priority=9, or deadline_s=none for none; the others stay as they are",
     )
     window = _command(
         setters, "window", change.set_window, "set the packets in flight per peer", example="udp-mesh set window 3"

@@ -145,6 +145,14 @@ def test_what_is_set_shows_and_what_is_dropped_is_gone(run: Run) -> None:
     assert run("reload")[1] == "nothing to change\n"
 
 
+def test_a_bound_that_was_set_can_be_taken_away(run: Run) -> None:
+    assert run("set", "topic", "bound", "deadline_s=2", "keep_last=3", "outbox=last")[0] == Exit.OK
+    code, text, _ = run("set", "topic", "bound", "deadline_s=none", "outbox=none")
+    assert (code, text) == (Exit.OK, "topic bound: deadline_s 2.0 -> none\ntopic bound: outbox last -> none\n")
+    (bound,) = (topic for topic in json.loads(run("topics", "--json")[1])["topics"] if topic["name"] == "bound")
+    assert (bound["deadline_s"], bound["keep_last"], bound["outbox"]) == (None, 3, "none")
+
+
 @pytest.mark.parametrize(
     ("words", "code", "complaint"),
     [
