@@ -14,8 +14,10 @@ Threads: `publish(..., wait=False)` may be called from any thread; everything el
 """
 
 import json
+import os
 import select
 import socket
+import stat
 import struct
 import threading
 import time
@@ -104,6 +106,13 @@ def parse_header(raw: bytes) -> Header:
     return header
 
 
+def _is_socket(path: str) -> bool:
+    try:
+        return stat.S_ISSOCK(os.stat(path).st_mode)
+    except OSError:
+        return False
+
+
 class MeshClient:
     """One connection to the daemon."""
 
@@ -121,7 +130,8 @@ class MeshClient:
             self._socket.connect(path)
         except OSError as error:
             self._socket.close()
-            reason = error.strerror or error
+            # connect(2) says "refused" of a file that is no socket, too
+            reason = "it is no socket" if os.path.exists(path) and not _is_socket(path) else error.strerror or error
             raise MeshError("unreachable", "no udp-mesh daemon at {}: {}".format(path, reason)) from error
         # A process-wide default timeout (rospy sets one) must not apply here.
         self._socket.settimeout(None)

@@ -1,6 +1,7 @@
 """The local API's frames: any pieces give the frames that were written, any bytes give frames or an error."""
 
 import ast
+import socket
 import sys
 from pathlib import Path
 
@@ -52,6 +53,19 @@ def test_no_daemon_is_an_error_that_names_the_socket(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match=r"no udp-mesh daemon at .*mesh.sock: No such file") as caught:
         MeshClient(str(tmp_path / "mesh.sock"))
     assert caught.value.code == "unreachable"
+
+
+def test_what_is_no_socket_is_called_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # a socket's path has at most 107 bytes
+    monkeypatch.chdir(tmp_path)
+    for path in (tmp_path, tmp_path / "file"):
+        (tmp_path / "file").touch()
+        with pytest.raises(MeshError, match=r"no udp-mesh daemon at .*: it is no socket$"):
+            MeshClient(str(path))
+    with socket.socket(socket.AF_UNIX) as left_over:
+        left_over.bind("s")
+    with pytest.raises(MeshError, match=r"Connection refused$"):
+        MeshClient("s")
 
 
 @pytest.mark.parametrize("path", [Path(mesh_client.__file__), Path(mesh_client.__file__).parents[1] / "__init__.py"])
