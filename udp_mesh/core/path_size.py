@@ -48,11 +48,15 @@ PROBES_PER_SMALL = LOST_PER_ROUND + 1
 ASK_AFTER_S = 10.0
 ASK_AT_MOST_EVERY_S = 600.0
 """The larger size is asked for after the first, then after twice as long each time, at last with RFC 8899's
-PMTU_RAISE_TIMER. A mistake costs a tenth of the rate for some seconds then; a path that is narrow, three pings each
+PMTU_RAISE_TIMER. A mistake costs a tenth of the rate until then; a path that is narrow, three pings each
 time."""
 
 ASKED_TIMES = 3
-"""Pings of a size per time (RFC 8899's MAX_PROBES): on a lossy path one alone proves little."""
+"""Pings of a size per time that would be answered (RFC 8899's MAX_PROBES) if as many got through as the loss says: one
+alone proves little."""
+
+LEAST_ARRIVING = 0.3
+"""Of pings and answers each, whatever the loss: 33 per time at most."""
 
 LARGE_AT_FIRST_BYTES = 1200
 """Until the first look at the way, some half second: about what frames take on the narrowest of IPv6 links."""
@@ -230,14 +234,15 @@ class Asking:
         self._at = now + self._pause_s
         self._times = 0
 
-    def due(self, now: float) -> bool:
-        """Whether to ask now; to be called some times a second at most, and only while the peer answers."""
+    def due(self, now: float, loss: float) -> bool:
+        """Whether to ask now; to be called some times a second at most, and only while the peer answers. `loss` is that
+        of datagrams to the peer."""
         if now < self._at:
             return False
         if not self._times:
             self._tokens.clear()
         self._times += 1
-        if self._times == ASKED_TIMES:
+        if self._times >= ASKED_TIMES / max(LEAST_ARRIVING, 1 - loss) ** 2:
             self._pause_s = min(2 * self._pause_s, ASK_AT_MOST_EVERY_S)
             self._wait(now)
         return True

@@ -263,7 +263,7 @@ def _measure_path(state: State, peer: Peer, session: Session, now: float) -> Non
     larger = {room: mtu for mtu, room in rooms.items() if room > way.room_bytes}
     if not larger:
         size.narrowed_at = None
-    elif peer.online and way.confirmed and outbound.silent_since is None and size.asking.due(now):
+    elif peer.online and way.confirmed and outbound.silent_since is None and size.asking.due(now, outbound.loss):
         for room, mtu in larger.items():
             token = state.rng.getrandbits(64)
             size.asking.asked(token, mtu)

@@ -207,6 +207,25 @@ def test_a_path_that_stays_narrow_is_asked_ever_more_seldom_and_loses_nothing_bu
     assert narrow(world) == [1280]
 
 
+@pytest.mark.parametrize("loss", [0.0, 0.3, 0.6])
+def test_a_path_taken_for_narrow_by_mistake_is_wide_again_within_minutes_however_much_is_lost(loss: float) -> None:
+    for seed in range(4):
+        world = met(1280, seed=seed)
+        world.send("a", "map", bytes(20_000), "b")
+        assert world.run(20.0, until=partial(found_narrow, world))
+        for way in world.pipes.values():
+            assert isinstance(way, Narrow)
+            way.mtu, way.loss = 1500, loss
+        largest = largest_of(world)
+        for _ in range(200):
+            world.send("a", "status", bytes(100), "b")
+            world.run(0.5)
+        largest[0] = 0
+        world.send("a", "map", bytes(20_000), "b")
+        world.run(1.0)
+        assert largest[0] > 1280, seed
+
+
 def test_a_path_that_carries_large_pings_and_nothing_else_is_asked_ever_more_seldom_too() -> None:
     size = PathSize()
     now = 0.0
@@ -215,7 +234,7 @@ def test_a_path_that_carries_large_pings_and_nothing_else_is_asked_ever_more_sel
         if size.narrowed_at is None:
             size.narrowed(now)
         assert size.asking.carries == 0
-        while not size.asking.due(now):
+        while not size.asking.due(now, 0.0):
             now += 0.5
         asked.append(now)
         size.asking.asked(1, 1500)
