@@ -18,6 +18,8 @@ REVIEW_S = 1.0
 moment until that is known."""
 TELL_AGAIN_S = 60.0
 """A rule that stays must not fill the log."""
+TELL_MORE_S = 5.0
+"""It concerns more peers than were told: sooner than that, but not a line for each."""
 OVER_S = 15.0
 """So long without a refusal, and it is over: longer than from one sparse heartbeat to the next."""
 DESTINATIONS = 64
@@ -38,6 +40,8 @@ class Refusal:
     datagrams: int = 0
     destinations: dict[Address, None] = field(default_factory=dict)
     told_at: float | None = None
+    told_of: int = 0
+    """Destinations it had when it was told last."""
 
     @property
     def to(self) -> str:
@@ -80,8 +84,10 @@ class Refusals:
             if now - refusal.last >= OVER_S:
                 del self._standing[key]
                 over.append(refusal)
-            elif refusal.told_at is None or now - refusal.told_at >= TELL_AGAIN_S:
-                refusal.told_at = now
+            elif refusal.told_at is None or now - refusal.told_at >= (
+                TELL_MORE_S if len(refusal.destinations) > refusal.told_of else TELL_AGAIN_S
+            ):
+                refusal.told_at, refusal.told_of = now, len(refusal.destinations)
                 going_on.append(refusal)
         return going_on, over
 

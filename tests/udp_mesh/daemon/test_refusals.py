@@ -2,7 +2,7 @@
 
 import errno
 
-from udp_mesh.daemon.refusals import OVER_S, REVIEW_S, TELL_AGAIN_S, Refusals
+from udp_mesh.daemon.refusals import OVER_S, REVIEW_S, TELL_AGAIN_S, TELL_MORE_S, Refusals
 
 BOB, CAROL = ("10.7.20.2", 8700), ("fe80::3", 8700)
 
@@ -29,6 +29,18 @@ def test_one_that_goes_on_is_told_once_a_minute() -> None:
         assert over == []
         told_at += [second] * len(going_on)
     assert told_at == list(range(0, 300, int(TELL_AGAIN_S)))
+
+
+def test_one_that_comes_to_concern_more_peers_is_told_again_soon() -> None:
+    refusals = Refusals()
+    refusals.add("mesh0", {(BOB, errno.EPERM): 1}, 0.0)
+    refusals.review(REVIEW_S)
+    refusals.add("mesh0", {(BOB, errno.EPERM): 1, (CAROL, errno.EPERM): 1}, 2.0)
+    assert refusals.review(2.0) == ([], [])
+    ((told,), _) = refusals.review(REVIEW_S + TELL_MORE_S)
+    assert told.to == "10.7.20.2:8700,[fe80::3]:8700"
+    refusals.add("mesh0", {(BOB, errno.EPERM): 1, (CAROL, errno.EPERM): 1}, 10.0)
+    assert refusals.review(2 * (REVIEW_S + TELL_MORE_S)) == ([], [])
 
 
 def test_each_link_and_reason_is_told_apart_and_ends_for_itself() -> None:
