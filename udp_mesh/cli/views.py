@@ -8,6 +8,9 @@ from udp_mesh.cli.output import duration, milliseconds, rate, size, table
 
 Json = dict[str, Any]
 
+NO_ANSWER_AFTER_S = 3.0
+"""An outage shorter than this is nothing to tell."""
+
 
 def peers_view(peers: list[Json]) -> str:
     """One line per peer, then one per level that has something waiting."""
@@ -16,8 +19,7 @@ def peers_view(peers: list[Json]) -> str:
     rows = [
         [
             peer["name"] + (" (fielded)" if peer["legacy"] else ""),
-            "ONE WAY" if peer["one_way"] else "online" if peer["online"] else "OFFLINE",
-            duration(peer["online_for_s"] if peer["online"] else peer["heard_ago_s"]),
+            *_state(peer),
             peer["address"] or "-",
             peer["link"] or "-",
             milliseconds(peer["round_trip_s"]),
@@ -48,6 +50,15 @@ def peers_view(peers: list[Json]) -> str:
     if waiting:
         lines += ["", table(["waiting for", "priority", "messages", "bytes", "oldest", "starved", "held"], waiting)]
     return "\n".join(lines)
+
+
+def _state(peer: Json) -> tuple[str, str]:
+    """In a word, and for how long."""
+    unanswered_for_s = peer["unanswered_for_s"] or 0.0
+    if peer["online"] and not peer["one_way"] and unanswered_for_s >= NO_ANSWER_AFTER_S:
+        return "NO ANSWER", duration(unanswered_for_s)
+    word = "ONE WAY" if peer["one_way"] else "online" if peer["online"] else "OFFLINE"
+    return word, duration(peer["online_for_s"] if peer["online"] else peer["heard_ago_s"])
 
 
 def status_view(status: Json) -> str:

@@ -66,6 +66,8 @@ class PeerConditions:
     outbox_bytes: int
     one_way: bool
     """It is heard, and its heartbeats say that it does not hear us; if that lasts it is not online."""
+    unanswered_for_s: float | None
+    """So long nothing sent to it was answered, although it may be heard; None where nothing waits for an answer."""
 
 
 @dataclass(slots=True)

@@ -93,6 +93,7 @@ def _peer(state: State, peer: Peer, outbound: Outbound, now: float) -> PeerCondi
         held_messages,
         held_bytes,
         session is not None and session.unheard_since is not None and _alive(session, now),
+        now - outbound.last_progress if outbound.silent_since is not None and outbound.open else None,
     )
 
 

@@ -14,6 +14,11 @@ Sample = tuple[Mapping[str, str], float]
 
 _PEER_GAUGES = (
     ("peer_online", "1 where the peer is online.", lambda peer: float(peer.online)),
+    (
+        "peer_unanswered_seconds",
+        "So long nothing sent to the peer was answered.",
+        lambda peer: peer.unanswered_for_s,
+    ),
     ("peer_round_trip_seconds", "Smoothed round trip.", lambda peer: peer.round_trip_s),
     ("peer_least_round_trip_seconds", "Least round trip lately.", lambda peer: peer.least_round_trip_s),
     ("peer_loss_ratio", "Share of packets lost on the way to the peer.", lambda peer: peer.loss),

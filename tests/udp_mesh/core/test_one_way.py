@@ -1,6 +1,6 @@
 """A link of which one direction works: nobody is called online who cannot be reached, and every message ends."""
 
-from tests.udp_mesh.core.pair import World, settings
+from tests.udp_mesh.core.pair import BROADCAST, World, settings
 from udp_mesh.core.events import (
     MessageDelivered,
     MessagePeerLost,
@@ -8,6 +8,7 @@ from udp_mesh.core.events import (
     PeerOffline,
     PeerOnline,
 )
+from udp_mesh.core.seams import Datagram
 from udp_mesh.core.settings import Outbox, Topic
 
 TOPICS = (Topic("map"), Topic("art", outbox=Outbox.ALL))
@@ -46,6 +47,32 @@ def test_a_peer_that_is_heard_and_does_not_hear_us_goes_offline_and_returns() ->
     assert world.run(5.0, until=lambda: len(world.told("a", MessageDelivered)) == 2)
     assert peer(world, "a") == (True, False)
     assert len(world.told("b", MessageReceived)) == 2
+
+
+def carry_broadcasts_alone(world: World, source: str, target: str) -> None:
+    """As behind a firewall that lets no unicast through this way."""
+    to_one = False
+
+    def look(name: str, datagram: Datagram, now: float) -> None:
+        nonlocal to_one
+        to_one = datagram.destination not in (None, BROADCAST)
+
+    world.tap = look
+    world.pipes[(source, target)].lost = lambda rng, now: to_one
+
+
+def test_a_peer_that_hears_our_broadcasts_alone_is_told_as_one_that_does_not_answer() -> None:
+    world = met(5)
+    (before,) = world.nodes["a"].conditions(world.now).peers
+    assert before.unanswered_for_s is None
+    carry_broadcasts_alone(world, "a", "b")
+    begun = world.now
+    world.send("a", "map", bytes(5000), "b")
+    world.run(20.0)
+    (found,) = world.nodes["a"].conditions(world.now).peers
+    assert (found.online, found.one_way) == (True, False)
+    assert found.unanswered_for_s is not None
+    assert world.now - begun - 2.0 < found.unanswered_for_s <= world.now - begun + 2.0
 
 
 def test_what_no_outbox_keeps_for_a_peer_that_never_hears_us_again_is_told_as_lost() -> None:
