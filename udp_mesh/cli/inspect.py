@@ -7,10 +7,11 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
+from typing import NoReturn
 
 from udp_mesh.cli.output import Exit, fields_text, say, say_json, say_json_line, say_part
 from udp_mesh.cli.views import Json, peers_view, status_view, topics_view
-from udp_mesh.client.mesh_client import MeshClient
+from udp_mesh.client.mesh_client import MeshClient, MeshError
 
 HOME, END_OF_LINE, BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
 """Go to the upper left corner; clear to the end of the line; clear all below (ECMA-48)."""
@@ -30,24 +31,54 @@ def topics(arguments: argparse.Namespace) -> int:
 
 def _show(arguments: argparse.Namespace, op: str, view: Callable[[Json], str]) -> int:
     """Once, or again and again with `--watch`: one screen, or one JSON line, each time."""
+    if arguments.watch is not None:
+        _watch(arguments, op, view)
     with MeshClient(arguments.socket) as mesh:
-        while True:
-            reply = mesh.request(op)
-            del reply["id"], reply["ok"]
-            if arguments.watch is None:
-                if arguments.json:
-                    say_json(reply)
-                else:
-                    say(view(reply))
-                return Exit.OK
-            if arguments.json:
-                say_json_line(reply)
-            elif sys.stdout.isatty():
-                columns, lines = shutil.get_terminal_size()
-                say_part(screen(view(reply), columns, lines))
-            else:
-                say(view(reply))
-            time.sleep(arguments.watch)
+        reply = _asked(mesh, op)
+    if arguments.json:
+        say_json(reply)
+    else:
+        say(view(reply))
+    return Exit.OK
+
+
+def _watch(arguments: argparse.Namespace, op: str, view: Callable[[Json], str]) -> NoReturn:
+    """Until Ctrl-C. A daemon that ends once it was seen is waited for: it may be restarted, or updated."""
+    period_s: float = arguments.watch
+    seen = is_away = False
+    while True:
+        try:
+            with MeshClient(arguments.socket) as mesh:
+                while True:
+                    reply = _asked(mesh, op)
+                    seen, is_away = True, False
+                    if arguments.json:
+                        say_json_line(reply)
+                    else:
+                        _page(view(reply))
+                    time.sleep(period_s)
+        except MeshError as error:
+            if error.code != "unreachable" or not seen:
+                raise
+            if not is_away and not arguments.json:
+                _page(f"{error}; waiting for it")
+            is_away = True
+        time.sleep(period_s)
+
+
+def _asked(mesh: MeshClient, op: str) -> Json:
+    reply = mesh.request(op)
+    del reply["id"], reply["ok"]
+    return reply
+
+
+def _page(text: str) -> None:
+    """On a terminal in the place of the page before."""
+    if sys.stdout.isatty():
+        columns, lines = shutil.get_terminal_size()
+        say_part(screen(text, columns, lines))
+    else:
+        say(text)
 
 
 def screen(text: str, columns: int, lines: int) -> str:

@@ -14,7 +14,6 @@ import grp
 import logging
 import os
 import socket
-import stat
 from collections.abc import Callable
 from pathlib import Path
 
@@ -51,6 +50,9 @@ class Listener:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         if _answers(self._path):
             raise OSError(f"another daemon answers at {self._path}")
+        if self._path.exists() and not self._path.is_socket():
+            what = "a directory" if self._path.is_dir() else "a file"
+            raise OSError(f"{self._path}: expected nothing there, or a socket left behind, found {what}")
         self._socket = self._bound()
         self._file = _identity(self._path)
         self._listen()
@@ -72,7 +74,7 @@ class Listener:
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
         made = False
         try:
-            if self._path.exists() and stat.S_ISSOCK(self._path.stat().st_mode):
+            if self._path.is_socket():
                 self._path.unlink()
             mask = os.umask(0o177)
             try:

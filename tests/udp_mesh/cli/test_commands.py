@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +18,8 @@ from typing import Any
 import pytest
 
 from tests.udp_mesh.cli.conftest import Pair, Run
-from tests.udp_mesh.links.sockets import WAIT_S
+from tests.udp_mesh.daemon.processes import RunningDaemon, configuration
+from tests.udp_mesh.links.sockets import WAIT_S, free_port
 from udp_mesh.cli import serve
 from udp_mesh.cli.inspect import screen
 from udp_mesh.cli.main import FORWARDED, build_parser, main
@@ -48,6 +50,29 @@ def test_a_watch_repeats_until_it_is_interrupted(pair: Pair) -> None:
         program.send_signal(signal.SIGINT)
         assert program.wait(WAIT_S) == Exit.OK
     assert uptimes[1] > uptimes[0]
+
+
+def test_a_watch_waits_for_a_daemon_that_starts_anew() -> None:
+    with (
+        tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder,
+        RunningDaemon(Path(folder), "alone", configuration(Path(folder), "alone", 1, [2], free_port())) as daemon,
+    ):
+        words = ["status", "--watch", "0.05", "--socket", str(daemon.socket)]
+        program = subprocess.Popen(
+            [sys.executable, "-m", "udp_mesh.cli.main", *words], stdout=subprocess.PIPE, text=True
+        )
+        with program:
+            assert program.stdout is not None
+            lines = iter(program.stdout.readline, "")
+            assert next(lines).startswith("alone  udp-mesh")
+            daemon.stop()
+            assert any(line.endswith("; waiting for it\n") for line in lines)
+            daemon.start()
+            assert any(line.startswith("alone  udp-mesh") for line in lines)
+            program.send_signal(signal.SIGINT)
+            for _ in lines:
+                pass
+            assert program.wait(WAIT_S) == Exit.OK
 
 
 def test_a_watched_page_keeps_to_its_terminal() -> None:

@@ -39,6 +39,18 @@ def listening(work: Callable[[Listener, Path, list[socket.socket]], Awaitable[No
     asyncio.run(run())
 
 
+@pytest.mark.parametrize("what", ["file", "directory"])
+def test_what_is_no_socket_is_left_alone_and_named(tmp_path: Path, what: str) -> None:
+    path = tmp_path / "api.sock"
+    if what == "file":
+        path.write_text("kept")
+    else:
+        path.mkdir()
+    with pytest.raises(OSError, match=f"api.sock: expected nothing there, .* found a {what}"):
+        Listener(path, mode=0o600, group=None, take=socket.socket.close).open()
+    assert path.exists()
+
+
 def connect(path: Path) -> None:
     """A program comes and goes as soon as there is a socket."""
 
