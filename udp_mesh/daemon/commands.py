@@ -18,16 +18,18 @@ from udp_mesh.daemon.api import Client, RequestError
 from udp_mesh.daemon.configuration import (
     CONDITIONS_TOPIC,
     MAX_PING_S,
-    NODE_NAME,
     RESERVED_PREFIX,
+    read_keys,
+    read_rates,
+    topic_from_values,
+)
+from udp_mesh.daemon.neighbours import (
+    NODE_NAME,
     TOPIC_NAME,
     is_node_name,
     is_topic_name,
     parse_address,
-    read_keys,
     read_neighbour,
-    read_rates,
-    topic_from_values,
 )
 from udp_mesh.daemon.service import Service
 from udp_mesh.daemon.status import conditions_json, plain, show_address, topic_json, topics_json

@@ -1,0 +1,108 @@
+"""Who and where, in a configuration: names of nodes and topics, `[[links]]`, `[[neighbours]]`, addresses."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+
+from udp_mesh.core.settings import Address, Neighbour
+from udp_mesh.daemon.toml_source import Table
+from udp_mesh.links.attachments import LinkWish
+from udp_mesh.wire.limits import MAX_NAME_BYTES, MAX_TOPIC_BYTES
+
+NODE_NAME = f"a name of 1 to {MAX_NAME_BYTES} bytes without space or slash"
+TOPIC_NAME = f"a topic of 1 to {MAX_TOPIC_BYTES} bytes without space"
+
+
+def is_node_name(name: str) -> bool:
+    """Whether a node can have this name."""
+    return _is_name(name, MAX_NAME_BYTES) and "/" not in name
+
+
+def is_topic_name(name: str) -> bool:
+    """Whether a topic can have this name."""
+    return _is_name(name, MAX_TOPIC_BYTES)
+
+
+def _is_name(name: str, limit_bytes: int) -> bool:
+    # half a surrogate pair is not printable, so that what is encoded here can be
+    return name.isprintable() and not any(map(str.isspace, name)) and 1 <= len(name.encode()) <= limit_bytes
+
+
+def read_link(table: Table) -> LinkWish:
+    """An entry of `[[links]]`; problems go to the table's source."""
+    interface, address = table.text("interface"), table.text("address")
+    kind = table.choice("kind", "broadcast", ("broadcast", "neighbours"))
+    mtu = table.integer("mtu", None, 200, 65_535)
+    table.finish()
+    if (interface is None) == (address is None):
+        table.source.report(table.path, "either interface or address", "both" if interface else "neither")
+    if address is not None:
+        try:
+            if ipaddress.ip_address(address).is_link_local and ":" in address:
+                table.report("address", "an address of one interface (name a link-local one's `interface`)", address)
+        except ValueError:
+            table.report("address", "an IPv4 or IPv6 address", address)
+    return LinkWish(interface, address, kind == "broadcast", mtu)
+
+
+def read_neighbours(top: Table, port: int) -> tuple[Neighbour, ...]:
+    """All of `[[neighbours]]`; problems go to the table's source."""
+    found: dict[Address, Neighbour] = {}
+    for entry in top.tables("neighbours"):
+        neighbour = read_neighbour(entry, port)
+        if neighbour is None:
+            continue
+        if neighbour.address in found:
+            entry.report("address", "each neighbour once", neighbour.address[0])
+        found[neighbour.address] = neighbour
+    return tuple(found.values())
+
+
+def read_neighbour(table: Table, port: int) -> Neighbour | None:
+    """A fixed neighbour: an entry of `[[neighbours]]`, or what a command sets. Problems go to the table's source, and
+    None comes back."""
+    text, name = table.text("address"), table.text("name")
+    link, legacy = table.text("link"), table.boolean("legacy", False)
+    table.finish()
+    if text is None:
+        table.source.report(table.path, "an address", "none")
+        return None
+    if name is not None and not is_node_name(name):
+        table.report("name", NODE_NAME, name)
+        return None
+    if legacy and name is None:
+        table.source.report(table.path, "a name, since a legacy neighbour's own claim is not authenticated", "none")
+        return None
+    address = parse_address(text, port)
+    if address is None:
+        table.report("address", "an IP address, optionally with a port (10.0.0.2, 10.0.0.2:8700, [fd00::2]:8700)", text)
+        return None
+    if ":" in address[0]:
+        if legacy:
+            table.report("address", "an IPv4 address, the only ones the fielded format knows", text)
+            return None
+        if link is None and ipaddress.ip_address(address[0]).is_link_local:
+            table.report("address", 'link = "INTERFACE" beside a link-local address', text)
+            return None
+    return Neighbour(address, name, link, legacy)
+
+
+def parse_address(text: str, port: int) -> Address | None:
+    """Host and port of `10.0.0.2`, `10.0.0.2:8700`, `fd00::2` or `[fd00::2]:8700`; None for anything else."""
+    host, number = text, str(port)
+    bracketed = re.fullmatch(r"\[(?P<host>[^]]+)\](?::(?P<port>\d+))?", text)
+    if bracketed:
+        host, number = bracketed["host"], bracketed["port"] or number
+    elif text.count(":") == 1:
+        host, _, number = text.partition(":")
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return None
+    if "%" in host:
+        # The interface of a link-local address is the neighbour's `link`.
+        return None
+    if not re.fullmatch("[0-9]{1,5}", number) or not 1 <= int(number) <= 65_535:
+        return None
+    return host, int(number)
