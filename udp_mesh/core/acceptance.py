@@ -5,12 +5,12 @@ and `release_outbox` move messages between a peer's queue and its outbox as it g
 ends into events.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 
 from udp_mesh.core.compression import STEP_BYTES, Unpacked, compress
-from udp_mesh.core.departure import header_bytes
+from udp_mesh.core.departure import IP_UDP_BYTES, header_bytes
 from udp_mesh.core.events import (
     ExpiryReason,
     MessageDelivered,
@@ -32,6 +32,9 @@ from udp_mesh.wire.codec import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
 from udp_mesh.wire.frames import Feature, MessageFlag
 from udp_mesh.wire.legacy import LEGACY_OVERHEAD_BYTES
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
+
+ETHERNET_MTU = 1500
+"""RFC 894."""
 
 ANNOUNCE_BYTES = 5
 """Of a topic's announcement besides its two names."""
@@ -216,15 +219,23 @@ def _to_all(state: State, accepted: Accepted, now: float) -> None:
     sessions = [peer.session for peer in state.roster.online() if peer.session is not None]
     if not all(map(inflates, sessions)):
         accepted = unpacked(accepted)
-    room = min((link.mtu - header_bytes(link.address) for link in state.links.values()), default=0)
-    if any(neighbour.legacy for neighbour in state.settings.neighbours):
-        room -= LEGACY_OVERHEAD_BYTES
-    fits = state.broadcasts() and _broadcast_bytes(accepted) <= room
+    fits = state.broadcasts() and _broadcast_bytes(accepted) <= _broadcast_room(state, sessions)
     if fits:
         state.casts.push(accepted)
     for peer in list(state.roster.peers.values()):
         if (peer.online and (not fits or peer.legacy)) or (not peer.online and topic.outbox is not Outbox.NONE):
             enqueue(state, peer.name, accepted, now)
+
+
+def _broadcast_room(state: State, sessions: Iterable[Session]) -> int:
+    """Bytes of a datagram that everybody's path carries, as far as that is known. On links that take larger packets
+    than Ethernet's it is Ethernet's all the same: nobody would notice that a mesh behind them does not."""
+    links = [link.mtu - header_bytes(link.address) for link in state.links.values()]
+    paths = [way.mtu - header_bytes(way.address) for way in (session.way for session in sessions) if way.link]
+    room = min([*links, *paths, max(ETHERNET_MTU, state.settings.fragment_bytes) - IP_UDP_BYTES], default=0)
+    if any(neighbour.legacy for neighbour in state.settings.neighbours):
+        room -= LEGACY_OVERHEAD_BYTES
+    return room
 
 
 def _broadcast_bytes(accepted: Accepted) -> int:

@@ -16,7 +16,7 @@ from udp_mesh.core.seams import Datagram
 from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
 from udp_mesh.wire.frames import MessageFlag
 
-TOPICS = (Topic("status", priority=0), Topic("map"))
+TOPICS = (Topic("status", priority=0), Topic("map"), Topic("seen", reliable=False))
 
 
 @dataclass
@@ -149,6 +149,20 @@ def test_a_path_is_narrowed_step_by_step_and_only_to_what_makes_fragments_smalle
     world.send("a", "map", bytes(100_000), "b")
     assert world.run(15.0, until=lambda: bool(topics(world, "a", MessageDelivered)))
     assert narrow(world) == found
+
+
+def test_a_message_to_all_is_cut_for_a_path_known_to_be_narrow() -> None:
+    world = met(1300)
+    world.send("a", "map", bytes(50_000), "b")
+    assert world.run(60.0, until=lambda: found_narrow(world))
+    world.send("a", "seen", bytes(1380))
+    assert world.run(10.0, until=lambda: "seen" in topics(world, "b", MessageReceived))
+
+
+def test_a_message_to_all_is_no_larger_than_ethernet_s_packets_whatever_the_link_carries() -> None:
+    world = met(1500, link_mtu=65_535)
+    world.send("a", "seen", bytes(20_000))
+    assert world.run(1.0, until=lambda: "seen" in topics(world, "b", MessageReceived))
 
 
 def test_a_path_that_is_wide_again_carries_full_fragments_after_some_time() -> None:
