@@ -16,6 +16,7 @@ import contextlib
 import json
 import logging
 import os
+import tempfile
 import threading
 import time
 import zlib
@@ -57,6 +58,18 @@ class DirectoryStore:
         # the writing thread's alone
         self._unsynced: set[Path] = set()
         self._disk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="outbox")
+
+    def prove(self) -> None:
+        """Say now, not with the first message, that the directory cannot be used."""
+        self._disk.submit(self._prove)
+
+    def _prove(self) -> None:
+        try:
+            self._directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+            with tempfile.TemporaryFile(dir=self._directory):
+                pass
+        except OSError as error:
+            log.error("outbox-unusable directory=%s error=%s", self._directory, error)
 
     def put(self, message: StoredMessage) -> bool:
         """Have it written; False where the bound refuses, which is counted and logged. What the disk refuses later is

@@ -93,6 +93,8 @@ class Service:
     def start(self) -> None:
         """Begins to send and receive."""
         self.driver.start()
+        if any(topic.outbox_on_disk for topic in self.settings.topics):
+            self.store.prove()
         self._conditions_due()
 
     async def close(self) -> None:

@@ -210,6 +210,19 @@ assert [store.holds(key) for key in range(3)] == [True, False, True]
     assert [kept.key for kept in DirectoryStore(tmp_path, 1 << 30).load()] == [0, 2]
 
 
+def test_a_directory_that_cannot_be_used_is_told_before_anything_is_to_be_kept(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "state").write_text("a file")
+    for directory in (tmp_path / "state" / "outbox", tmp_path / "usable"):
+        store = DirectoryStore(directory, 1 << 20)
+        store.prove()
+        store.close()
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert line.startswith(f"outbox-unusable directory={tmp_path}/state/outbox error=")
+    assert not list((tmp_path / "usable").iterdir())
+
+
 def test_a_directory_that_vanished_is_told_and_made_again(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path / "outbox", 1 << 20)
     store.put(message(1))
