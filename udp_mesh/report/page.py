@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Callable, Sequence
 from html import escape
@@ -38,21 +37,12 @@ def write_page(recordings: Sequence[Recording], path: Path, title: str) -> None:
     """Write the page whole or not at all. Raises OSError."""
     text = page(recordings, title)
     try:
-        with tempfile.NamedTemporaryFile(
-            "w", encoding="utf-8", dir=path.parent, prefix=".report-", delete=False
-        ) as file:
-            unfinished = Path(file.name)
-            file.write(text)
+        # a directory, which is gone afterwards with whatever a full disk left in it
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".report-") as directory:
+            unfinished = Path(directory) / "page"
+            unfinished.write_text(text, "utf-8")
+            unfinished.replace(path)
     except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from error
-    try:
-        # as any file that the user makes, not as a secret
-        mask = os.umask(0)
-        os.umask(mask)
-        unfinished.chmod(0o666 & ~mask)
-        unfinished.replace(path)
-    except OSError as error:
-        unfinished.unlink()
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 

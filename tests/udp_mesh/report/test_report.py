@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -283,3 +285,21 @@ def test_the_page_shows_every_topic_and_peer(tmp_path: Path) -> None:
         "Where the robots were online",
     ):
         assert expected in text
+
+
+def test_a_disk_that_takes_no_more_leaves_the_page_before_and_nothing_half_written(tmp_path: Path) -> None:
+    path = tmp_path / "run.html"
+    path.write_text("the page before")
+    # a limit on files' sizes fails a write in its middle, as a full disk does
+    script = f"""
+import resource
+from pathlib import Path
+from udp_mesh.report.page import write_page
+from udp_mesh.report.recording import Recording
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+write_page([Recording("base")], Path({str(path)!r}), "x" * 1000)
+"""
+    ended = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
+    assert f"File too large: '{path}'" in ended.stderr
+    assert [kept.name for kept in tmp_path.iterdir()] == ["run.html"]
+    assert path.read_text() == "the page before"
