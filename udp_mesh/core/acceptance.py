@@ -24,17 +24,15 @@ from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Accepted, Channel, Outgoing
 from udp_mesh.core.open_messages import Outcome
 from udp_mesh.core.outbox import Held
+from udp_mesh.core.path_size import ETHERNET_MTU
 from udp_mesh.core.session import Peer, Session
-from udp_mesh.core.settings import Outbox, Topic
+from udp_mesh.core.settings import Outbox, Topic, is_type_name
 from udp_mesh.core.state import State
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
 from udp_mesh.wire.codec import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
 from udp_mesh.wire.frames import Feature, MessageFlag
 from udp_mesh.wire.legacy import LEGACY_OVERHEAD_BYTES
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
-
-ETHERNET_MTU = 1500
-"""RFC 894."""
 
 ANNOUNCE_BYTES = 5
 """Of a topic's announcement besides its two names."""
@@ -147,8 +145,7 @@ def channel_of(state: State, topic: Topic, type_name: str) -> Channel | None:
     name: it would refuse every datagram that announces it, with all that is packed beside it."""
     channel = state.channels.get((topic.name, type_name))
     if channel is None:
-        travels = type_name.isprintable() and len(type_name.encode()) <= MAX_TYPE_BYTES
-        if len(state.channels) >= MOST_CHANNELS or not travels:
+        if len(state.channels) >= MOST_CHANNELS or not is_type_name(type_name):
             return None
         channel = Channel(len(state.channels), topic, topic.name, type_name)
         state.channels[(topic.name, type_name)] = channel

@@ -14,8 +14,11 @@ from collections.abc import Iterable, Sequence
 from udp_mesh.core.flight import Packet
 from udp_mesh.wire.codec import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
 
-NARROWER_MTUS = (1500, 1280, 576)
-"""What to try next, in bytes of IP packet: Ethernet's behind larger ones (RFC 894), the least that IPv6 links carry
+ETHERNET_MTU = 1500
+"""RFC 894."""
+
+NARROWER_MTUS = (ETHERNET_MTU, 1280, 576)
+"""What to try next, in bytes of IP packet: Ethernet's behind larger ones, the least that IPv6 links carry
 (RFC 8200, 5), and the least that every IPv4 host takes (RFC 1122, 3.3.2)."""
 
 ROUNDS = 4

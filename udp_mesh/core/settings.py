@@ -9,7 +9,7 @@ from enum import Enum
 from typing import Literal
 
 from udp_mesh.crypto import Key
-from udp_mesh.wire.limits import MAX_NAME_BYTES, MAX_TOPIC_BYTES, PRIORITY_LEVELS
+from udp_mesh.wire.limits import MAX_NAME_BYTES, MAX_TOPIC_BYTES, MAX_TYPE_BYTES, PRIORITY_LEVELS
 
 Address = tuple[str, int]
 """IPv4 or IPv6 host and UDP port."""
@@ -18,11 +18,22 @@ DEFAULT_PORT = 8700
 """UDP port of the fielded system, kept so that one firewall rule serves both."""
 
 
+def is_name(name: str, limit_bytes: int) -> bool:
+    """Whether the wire accepts this as the name of a node or a topic."""
+    # half a surrogate pair is not printable, so that what is encoded here can be
+    return name.isprintable() and not any(map(str.isspace, name)) and 1 <= len(name.encode()) <= limit_bytes
+
+
+def is_type_name(name: str) -> bool:
+    """Whether the wire accepts this as the name of a topic's type, which may be empty."""
+    return name.isprintable() and len(name.encode()) <= MAX_TYPE_BYTES
+
+
 def _check_name(name: str, what: str, limit_bytes: int) -> None:
-    """What the wire accepts as a name; raises ValueError."""
+    """Raises ValueError unless this `is_name`."""
     if not 0 < len(name.encode()) <= limit_bytes:
         raise ValueError(f"{what} {name!r}: expected 1 to {limit_bytes} bytes")
-    if not name.isprintable() or any(character.isspace() for character in name):
+    if not is_name(name, limit_bytes):
         raise ValueError(f"{what} {name!r}: expected no white space and no control characters")
 
 

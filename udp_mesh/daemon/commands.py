@@ -12,7 +12,7 @@ from pathlib import Path
 
 from udp_mesh import __version__
 from udp_mesh.client.mesh_client import Header
-from udp_mesh.core.settings import Settings
+from udp_mesh.core.settings import Settings, is_type_name
 from udp_mesh.daemon import metrics
 from udp_mesh.daemon.api import Client, RequestError
 from udp_mesh.daemon.configuration import (
@@ -89,7 +89,7 @@ def publish(service: Service, client: Client, header: Header, payload: bytes) ->
         raise RequestError("bad-request", f"topic: expected {TOPIC_NAME}, found {topic!r}")
     if destination is not None and not is_node_name(destination):
         raise RequestError("bad-request", f"to: expected {NODE_NAME}, found {destination!r}")
-    if not type_name.isprintable() or len(type_name.encode()) > MAX_TYPE_BYTES:
+    if not is_type_name(type_name):
         raise RequestError(
             "bad-request", f"type: expected printable text of at most {MAX_TYPE_BYTES} bytes, found {type_name[:60]!r}"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import re
 
-from udp_mesh.core.settings import Address, Neighbour
+from udp_mesh.core.settings import Address, Neighbour, is_name
 from udp_mesh.daemon.toml_source import Table
 from udp_mesh.links.attachments import LinkWish
 from udp_mesh.wire.limits import MAX_NAME_BYTES, MAX_TOPIC_BYTES
@@ -16,17 +16,12 @@ TOPIC_NAME = f"a topic of 1 to {MAX_TOPIC_BYTES} bytes without space"
 
 def is_node_name(name: str) -> bool:
     """Whether a node can have this name."""
-    return _is_name(name, MAX_NAME_BYTES) and "/" not in name
+    return is_name(name, MAX_NAME_BYTES) and "/" not in name
 
 
 def is_topic_name(name: str) -> bool:
     """Whether a topic can have this name."""
-    return _is_name(name, MAX_TOPIC_BYTES)
-
-
-def _is_name(name: str, limit_bytes: int) -> bool:
-    # half a surrogate pair is not printable, so that what is encoded here can be
-    return name.isprintable() and not any(map(str.isspace, name)) and 1 <= len(name.encode()) <= limit_bytes
+    return is_name(name, MAX_TOPIC_BYTES)
 
 
 def read_link(table: Table) -> LinkWish:
