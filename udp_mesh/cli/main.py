@@ -12,7 +12,7 @@ from pathlib import Path
 
 from udp_mesh import __version__
 from udp_mesh.cli import change, inspect, serve, traffic
-from udp_mesh.cli.output import Exit, OutputFailed, complain, give_up, prepare
+from udp_mesh.cli.output import Exit, OutputFailed, complain, give_up, prepare, written
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, MeshError
 from udp_mesh.daemon.configuration import CONDITIONS_TOPIC, DEFAULT_PATH, MAX_PING_S
 
@@ -85,13 +85,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _forward(package: str, arguments: list[str]) -> int:
     """A package's own command; it speaks of its files itself, so what is left is standard output."""
     command: Callable[[list[str]], int] = importlib.import_module(package).main
-    try:
+    with written():
         code = command(arguments)
         sys.stdout.flush()
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise OutputFailed(error.strerror) from error
     return code
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from enum import IntEnum
 
 
@@ -51,29 +51,32 @@ def give_up() -> None:
         os.close(null)
 
 
+@contextmanager
+def written() -> Iterator[None]:
+    """Where what fails is standard output: OutputFailed, or BrokenPipeError."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputFailed(error.strerror) from error
+
+
 def say(text: str) -> None:
     say_part(text + "\n")
 
 
 def say_part(text: str) -> None:
     """Without the end of a line."""
-    try:
+    with written():
         sys.stdout.write(text)
         sys.stdout.flush()
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise OutputFailed(error.strerror) from error
 
 
 def say_bytes(raw: bytes) -> None:
-    try:
+    with written():
         sys.stdout.buffer.write(raw)
         sys.stdout.buffer.flush()
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise OutputFailed(error.strerror) from error
 
 
 def say_json(value: object) -> None:

@@ -168,7 +168,6 @@ def ping(arguments: argparse.Namespace) -> int:
     """Round trips through both daemons, at the most urgent priority; Ctrl-C ends it with what was measured."""
     times: list[float] = []
     asked = 0
-    code = Exit.FAILED
     try:
         with MeshClient(arguments.socket, timeout_s=arguments.timeout + 5) as mesh:
             for turn in range(arguments.count):
@@ -217,7 +216,7 @@ def _ping_once(mesh: MeshClient, arguments: argparse.Namespace, times: list[floa
         return
     times.append(reply["round_trip_s"])
     if arguments.json:
-        say_json_line({"peer": arguments.peer, "round_trip_s": round(times[-1], 6)})
+        say_json_line({"peer": arguments.peer, "round_trip_s": times[-1]})
     else:
         say(f"{arguments.peer}: {milliseconds(times[-1])}")
 

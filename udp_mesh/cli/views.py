@@ -89,7 +89,7 @@ def status_view(status: Json) -> str:
     lines += [
         f"link {refusal['link']} CANNOT SEND to {refusal['to']}: {refusal['reason']} "
         f"({refusal['datagrams']} datagrams, the last {duration(refusal['last_ago_s'])} ago)"
-        for refusal in status.get("refusals", ())
+        for refusal in status["refusals"]
     ]
     lines += ["", peers_view(conditions["peers"])]
     lines += [
