@@ -65,11 +65,14 @@ class DirectoryStore:
 
     def _prove(self) -> None:
         try:
-            self._directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+            self._make_directory()
             with tempfile.TemporaryFile(dir=self._directory):
                 pass
         except OSError as error:
             log.error("outbox-unusable directory=%s error=%s", self._directory, error)
+
+    def _make_directory(self) -> None:
+        self._directory.mkdir(parents=True, exist_ok=True, mode=0o700)
 
     def put(self, message: StoredMessage) -> bool:
         """Have it written; False where the bound refuses, which is counted and logged. What the disk refuses later is
@@ -101,7 +104,7 @@ class DirectoryStore:
         path = self._path(key)
         temporary = path.with_suffix(".new")
         try:
-            self._directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+            self._make_directory()
             with temporary.open("wb") as file:
                 file.write(b"%b %08x\n" % (head, _checksum(head, payload)))
                 file.write(payload)

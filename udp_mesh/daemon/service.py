@@ -93,7 +93,8 @@ class Service:
     def start(self) -> None:
         """Begins to send and receive."""
         self.driver.start()
-        if any(topic.outbox_on_disk for topic in self.settings.topics):
+        topics = (*self.settings.topics, self.settings.undeclared)
+        if any(topic is not None and topic.outbox_on_disk for topic in topics):
             self.store.prove()
         self._conditions_due()
 
