@@ -104,11 +104,10 @@ class SendChannel(_Channel):
 
     def seal(self, frames: bytes | bytearray | memoryview) -> tuple[int, bytes]:
         """Packet number and datagram with the short header (23 B more than the frames)."""
-        number = self._take_numbers(1)
-        header = SHORT_HEADER.pack(self._first_byte, self.tag, number & NUMBER_LOW_MASK)
-        return number, header + self._cipher.encrypt(_NONCE.pack(self._salt, number), frames, header)
+        number = self.next_number
+        return number, self.seal_run((frames,))[0]
 
-    def seal_run(self, run: Sequence[bytes]) -> list[bytes]:
+    def seal_run(self, run: Sequence[bytes | bytearray | memoryview]) -> list[bytes]:
         """As `seal`, for datagrams that get the next numbers in order: of a fast link's processor time much is the cost
         of calls."""
         first = self._take_numbers(len(run))

@@ -333,9 +333,7 @@ class Driver:
         if link is None:
             return
         waiting = self._blocked.get(name, [])
-        done = 0 if waiting else link.send(datagrams)
-        if link.refused:
-            self._note_refused(link)
+        done = 0 if waiting else self._send(link, datagrams)
         if done == len(datagrams):
             return
         if not waiting:
@@ -347,18 +345,20 @@ class Driver:
 
     def _writable(self, link: UdpLink) -> None:
         waiting = self._blocked.get(link.attachment.name, [])
-        del waiting[: link.send(waiting)]
-        if link.refused:
-            self._note_refused(link)
+        del waiting[: self._send(link, waiting)]
         if not waiting:
             self._loop.remove_writer(link.fileno())
             self._pump()
 
-    def _note_refused(self, link: UdpLink) -> None:
-        self.refusals.add(link.attachment.name, link.refused, self._clock())
-        link.refused.clear()
-        if self._review is None and not self.closed:
-            self._review = self._loop.call_later(REVIEW_S, self._review_refusals)
+    def _send(self, link: UdpLink, datagrams: Sequence[Datagram]) -> int:
+        """How many are done with, those that the kernel refused included."""
+        done = link.send(datagrams)
+        if link.refused:
+            self.refusals.add(link.attachment.name, link.refused, self._clock())
+            link.refused.clear()
+            if self._review is None and not self.closed:
+                self._review = self._loop.call_later(REVIEW_S, self._review_refusals)
+        return done
 
     def _review_refusals(self) -> None:
         going_on, over = self.refusals.review(self._clock())

@@ -10,7 +10,9 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 
+from udp_mesh.daemon.status import show_address
 from udp_mesh.links.attachments import Address
 
 REVIEW_S = 1.0
@@ -46,9 +48,9 @@ class Refusal:
     @property
     def to(self) -> str:
         """To whom: the first few, and how many more."""
-        shown = [f"[{host}]:{port}" if ":" in host else f"{host}:{port}" for host, port in self.destinations]
-        more = len(shown) - SHOWN
-        return ",".join(shown[:SHOWN]) + (f",and-{more}-more" if more > 0 else "")
+        more = len(self.destinations) - SHOWN
+        shown = [str(show_address(destination)) for destination in islice(self.destinations, SHOWN)]
+        return ",".join(shown) + (f",and-{more}-more" if more > 0 else "")
 
 
 class Refusals:
