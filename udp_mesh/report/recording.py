@@ -107,13 +107,9 @@ class Recording:
     sent: list[Sent] = field(default_factory=list)
     outcomes: list[Outcome] = field(default_factory=list)
     left_out: int = 0
-    last_s: float = 0.0
+    end_s: float = 0.0
+    """The latest time of a line."""
     problems: list[str] = field(default_factory=list)
-
-    @property
-    def end_s(self) -> float:
-        """The latest time of a line."""
-        return self.last_s
 
 
 def header(name: str, started: float) -> str:
@@ -207,7 +203,7 @@ def _take(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) 
     when peers are online that no event of its own announced."""
     t, kind = _number(entry, "t", 0.0, MAX_T_S), entry.get("kind")
     at = _text(entry, "at") if "at" in entry else recording.name
-    recording.last_s = max(recording.last_s, t)
+    recording.end_s = max(recording.end_s, t)
     match kind:
         case "received":
             recording.arrivals.append(

@@ -51,6 +51,13 @@ def met(
     return world
 
 
+def become(world: World, mtu: int) -> None:
+    """Every path carries so much from now on."""
+    for way in world.pipes.values():
+        assert isinstance(way, Narrow)
+        way.mtu = mtu
+
+
 def narrow(world: World) -> list[int]:
     return [event.mtu for event in world.told("a", PathNarrowed) if isinstance(event, PathNarrowed)]
 
@@ -169,9 +176,7 @@ def test_a_path_that_is_wide_again_carries_full_fragments_after_some_time() -> N
     world = met(1280)
     world.send("a", "map", bytes(100_000), "b")
     assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
-    for way in world.pipes.values():
-        assert isinstance(way, Narrow)
-        way.mtu = 1500
+    become(world, 1500)
     world.run(12.0)
     before = world.pipes[("a", "b")].carried
     world.send("a", "map", bytes(100_000), "b")
@@ -184,9 +189,7 @@ def test_a_path_that_is_less_narrow_than_it_was_carries_what_it_can() -> None:
     world = met(900)
     world.send("a", "map", bytes(100_000), "b")
     assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
-    for way in world.pipes.values():
-        assert isinstance(way, Narrow)
-        way.mtu = 1400
+    become(world, 1400)
     world.run(60.0)
     world.pipes["a", "b"].dropped = 0
     largest = largest_of(world)
