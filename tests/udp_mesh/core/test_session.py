@@ -7,6 +7,8 @@ from dataclasses import replace
 
 from tests.udp_mesh.core.pair import BROADCAST, KEY, Pair, World, pair, settings
 from udp_mesh.core.events import (
+    Event,
+    Incompatible,
     KeyMismatch,
     MessageDelivered,
     MessageReceived,
@@ -18,7 +20,10 @@ from udp_mesh.core.events import (
 from udp_mesh.core.node import Node
 from udp_mesh.core.seams import Datagram
 from udp_mesh.core.settings import LinkInfo, LinkKind, Neighbour, Rates, Topic
-from udp_mesh.crypto import Key
+from udp_mesh.crypto import TO_ALL, Key, SendChannel
+from udp_mesh.wire.codec import encode
+from udp_mesh.wire.frames import Heartbeat
+from udp_mesh.wire.limits import HEARD_TAG_BYTES
 
 OTHER_KEY = Key(bytes(range(1, 33)))
 A, B = ("10.0.0.1", 8700), ("10.0.0.2", 8700)
@@ -34,6 +39,25 @@ def test_two_nodes_meet_within_three_exchanges() -> None:
         both.roundtrip()
     assert [type(event) for event in both.events(both.a)] == [PeerOnline]
     assert [type(event) for event in both.events(both.b)] == [PeerOnline]
+
+
+def told_of(versions: tuple[int, int], *, times: int, apart_s: float) -> list[Event]:
+    """What a node tells that hears a newcomer of these wire versions so many times."""
+    both = pair()
+    boot_id = random.Random(5).randbytes(16)
+    channel = SendChannel(KEY, boot_id, TO_ALL)
+    heard = (both.b._state.boot_id[:HEARD_TAG_BYTES],)
+    for number in range(times):
+        beat = Heartbeat("new", *versions, 0, 1000, number, 0, 0, 0, heard)
+        both.b.receive(channel.seal_long(encode([beat]))[1], "mesh", ("10.0.0.9", 8700), both.now)
+        both.now += apart_s
+    return both.events(both.b)
+
+
+def test_a_node_of_later_versions_too_is_met_and_one_of_later_ones_alone_is_told_of_once_a_minute() -> None:
+    assert PeerOnline in map(type, told_of((1, 2), times=3, apart_s=1.0))
+    assert told_of((2, 3), times=50, apart_s=1.0) == [Incompatible("new", ("10.0.0.9", 8700), (2, 3))]
+    assert len(told_of((2, 3), times=5, apart_s=61.0)) == 5
 
 
 def test_a_recorded_heartbeat_brings_nobody_online() -> None:
