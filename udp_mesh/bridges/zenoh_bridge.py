@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, Sequence
 try:
     import zenoh
 except ModuleNotFoundError as error:
-    raise SystemExit("udp_mesh.bridges.zenoh_bridge: {} (pip install 'meshctl[zenoh]')".format(error)) from error
+    raise SystemExit("udp_mesh.bridges.zenoh_bridge: {} (pip install eclipse-zenoh)".format(error)) from error
 
 from udp_mesh.bridges.envelope import TYPE, Envelope, EnvelopeError, open_envelope, seal
 from udp_mesh.bridges.port import MeshPort

@@ -9,9 +9,10 @@ import time
 from collections.abc import Callable
 from typing import NoReturn
 
-from udp_mesh.cli.output import Exit, fields_text, say, say_json, say_json_line, say_part
+from udp_mesh.cli.output import Exit, fields_text, say, say_json, say_json_line, say_part, say_screen
 from udp_mesh.cli.views import Json, peers_view, status_view, topics_view
 from udp_mesh.client.mesh_client import MeshClient, MeshError
+from udp_mesh.report.terminal import clean
 
 HOME, END_OF_LINE, BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
 """Go to the upper left corner; clear to the end of the line; clear all below (ECMA-48)."""
@@ -76,7 +77,7 @@ def _page(text: str) -> None:
     """On a terminal in the place of the page before."""
     if sys.stdout.isatty():
         columns, lines = shutil.get_terminal_size()
-        say_part(screen(text, columns, lines))
+        say_screen(screen(text, columns, lines))
     else:
         say(text)
 
@@ -84,7 +85,7 @@ def _page(text: str) -> None:
 def screen(text: str, columns: int, lines: int) -> str:
     """The text in the place of what stood on a terminal before, without a flicker; what does not fit is cut off, and
     the last line says so."""
-    rows = text.split("\n")
+    rows = clean(text).split("\n")
     most = max(lines - 1, 1)
     if len(rows) > most:
         rows = [*rows[: most - 1], f"... {len(rows) - most + 1} more lines (`| less` without --watch has all)"]

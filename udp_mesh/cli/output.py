@@ -9,6 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from enum import IntEnum
 
+from udp_mesh.report.terminal import clean, json_safe
+
 
 class Exit(IntEnum):
     """Exit codes of every command."""
@@ -68,6 +70,11 @@ def say(text: str) -> None:
 
 def say_part(text: str) -> None:
     """Without the end of a line."""
+    say_screen(clean(text))
+
+
+def say_screen(text: str) -> None:
+    """With control sequences of our own, around text that was cleaned before."""
     with written():
         sys.stdout.write(text)
         sys.stdout.flush()
@@ -80,11 +87,11 @@ def say_bytes(raw: bytes) -> None:
 
 
 def say_json(value: object) -> None:
-    say(json.dumps(value, indent=2, ensure_ascii=_is_ascii_safer()))
+    say(json_safe(json.dumps(value, indent=2, ensure_ascii=_is_ascii_safer())))
 
 
 def say_json_line(value: object) -> None:
-    say(json.dumps(value, separators=(",", ":"), ensure_ascii=_is_ascii_safer()))
+    say(json_safe(json.dumps(value, separators=(",", ":"), ensure_ascii=_is_ascii_safer())))
 
 
 def _is_ascii_safer() -> bool:
@@ -93,12 +100,13 @@ def _is_ascii_safer() -> bool:
 
 
 def complain(text: str) -> None:
-    sys.stderr.write(f"udp-mesh: {text}\n")
+    sys.stderr.write(f"udp-mesh: {clean(text)}\n")
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Columns as wide as they must be; numbers to the right."""
-    cells = [list(head), *[list(row) for row in rows]]
+    # a line end in a name must not begin a row of its own
+    cells = [[clean(cell, keep="") for cell in row] for row in (head, *rows)]
     widths = [max(len(row[column]) for row in cells) for column in range(len(head))]
     numeric = [all(_is_number(row[column]) for row in rows) for column in range(len(head))]
     return "\n".join(

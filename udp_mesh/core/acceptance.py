@@ -20,6 +20,7 @@ from udp_mesh.core.events import (
     Rejected,
     RejectReason,
 )
+from udp_mesh.core.legacy_send import carries
 from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Accepted, Channel, Outgoing
 from udp_mesh.core.open_messages import Outcome
@@ -173,7 +174,8 @@ def enqueue(state: State, name: str, accepted: Accepted, now: float, store_key: 
         return
     if peer.session is not None and not inflates(peer.session):
         accepted = unpacked(accepted)
-    if state.outboxes.holds(name, topic.name) and topic.priority > state.settings.rates.urgent_priority:
+    keeps = topic.outbox is not Outbox.NONE and peer.settling
+    if (keeps or state.outboxes.holds(name, topic.name)) and topic.priority > state.settings.rates.urgent_priority:
         # Older ones of the topic are still to come; only what is urgent goes ahead of what is stale.
         _hold(state, name, Held(accepted, store_key), now)
         return
@@ -216,15 +218,17 @@ def _to_all(state: State, accepted: Accepted, now: float) -> None:
     sessions = [peer.session for peer in state.roster.online() if peer.session is not None]
     if not all(map(inflates, sessions)):
         accepted = unpacked(accepted)
-    fits = state.broadcasts() and _broadcast_bytes(accepted) <= _broadcast_room(state, sessions)
+    fits = state.broadcasts() and _broadcast_bytes(accepted) <= broadcast_room(state, sessions)
     if fits:
         state.casts.push(accepted)
     for peer in list(state.roster.peers.values()):
+        if peer.legacy and not carries(accepted.channel.type_name):
+            continue
         if (peer.online and (not fits or peer.legacy)) or (not peer.online and topic.outbox is not Outbox.NONE):
             enqueue(state, peer.name, accepted, now)
 
 
-def _broadcast_room(state: State, sessions: Iterable[Session]) -> int:
+def broadcast_room(state: State, sessions: Iterable[Session]) -> int:
     """Bytes of a datagram that everybody's path carries, as far as that is known. On links that take larger packets
     than Ethernet's it is Ethernet's all the same: nobody would notice that a mesh behind them does not."""
     links = [link.mtu - header_bytes(link.address) for link in state.links.values()]

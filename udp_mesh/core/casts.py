@@ -9,14 +9,16 @@ random wait, again a few times, and answered per peer, or with a Cancel where it
 
 from collections import OrderedDict, deque
 from collections.abc import Iterable
+from dataclasses import replace
 
+from udp_mesh.core.freshness import clock_ms
 from udp_mesh.core.message import Accepted
 from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.seams import Datagram, RandomSource
 from udp_mesh.core.settings import Address
-from udp_mesh.crypto import SendChannel
+from udp_mesh.crypto import SHORT_OVERHEAD_BYTES, SendChannel
 from udp_mesh.wire.codec import encode
-from udp_mesh.wire.frames import Fragment, MessageFlag, MessageHead, Nack, TopicAnnounce
+from udp_mesh.wire.frames import Fragment, Frame, MessageFlag, MessageHead, Nack, Sent, TopicAnnounce
 from udp_mesh.wire.limits import PRIORITY_LEVELS
 
 UNREPAIRED_FROM = 1 << 31
@@ -93,9 +95,11 @@ class CastQueue:
         packets_per_s: float | None,
         copy_after_s: float | None,
         kept_limit_bytes: int,
+        dated_bytes: int,
     ) -> None:
         """Let the casts of a level leave on all `ways` (link, address); `copy_after_s` sends them a second time
-        then."""
+        then. Those of at
+        most `dated_bytes` say when they left."""
         level = self._levels[priority]
         ways = list(ways)
         while level:
@@ -106,7 +110,11 @@ class CastQueue:
             accepted = level.popleft()
             if accepted.deadline is not None and accepted.deadline <= now:
                 continue
-            _, data = channel.seal(encode(self._frames(accepted, now, kept_limit_bytes)))
+            frames = self._frames(accepted, now, kept_limit_bytes)
+            encoded = encode(_dated(frames, accepted, now))
+            if len(encoded) + SHORT_OVERHEAD_BYTES > dated_bytes:
+                encoded = encode(frames)
+            _, data = channel.seal(encoded)
             urgent = packets_per_s is None
             datagrams = [Datagram(link, address, data, urgent) for link, address in ways]
             out.extend(datagrams)
@@ -128,7 +136,7 @@ class CastQueue:
         """The cast of this number, if still kept."""
         return self._kept.get(number)
 
-    def _frames(self, accepted: Accepted, now: float, limit_bytes: int) -> list[TopicAnnounce | Fragment]:
+    def _frames(self, accepted: Accepted, now: float, limit_bytes: int) -> tuple[TopicAnnounce, Fragment]:
         channel = accepted.channel
         flags = accepted.flags | MessageFlag.TO_ALL
         if channel.topic.repair:
@@ -144,10 +152,18 @@ class CastQueue:
             self._unrepaired += 1
         age_ms = max(0, int((now - accepted.accepted_at) * 1000))
         head = MessageHead(len(accepted.body), 1, channel.number, channel.topic.priority, flags, age_ms)
-        return [
+        return (
             TopicAnnounce(channel.number, channel.name, channel.type_name),
             Fragment(number, 0, accepted.body, head),
-        ]
+        )
+
+
+def _dated(frames: tuple[TopicAnnounce, Fragment], accepted: Accepted, now: float) -> list[Frame]:
+    """The same, with the time and what remains of the message's life."""
+    announce, fragment = frames
+    assert fragment.head is not None
+    head = replace(fragment.head, life_ms=accepted.life_ms(now))
+    return [Sent(clock_ms(now)), announce, fragment._replace(head=head)]
 
 
 class Repairs:

@@ -93,6 +93,8 @@ class Counters:
     dropped_unauthenticated: int = 0
     dropped_replayed: int = 0
     dropped_unproven: int = 0
+    dropped_stale: int = 0
+    """Authentic, never seen before, and too old: a recording, or held back for longer than `ACCEPT_AGE_S`."""
     dropped_over_limit: int = 0
     events_dropped: int = 0
     repairs_asked: int = 0

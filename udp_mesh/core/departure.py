@@ -10,6 +10,7 @@ import struct
 from udp_mesh.core.allowance import ack_spacing, look_again, permitted, urgent_may_wait_until, window_room
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.flight import Mark, Packet
+from udp_mesh.core.freshness import clock_ms
 from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Outgoing
 from udp_mesh.core.open_messages import Outcome
@@ -26,9 +27,10 @@ from udp_mesh.wire.codec import (
     FRAGMENT_WIDE_BYTES,
     HEAD_BYTES,
     LENGTH_BYTES,
+    LIFE_BYTES,
     encode,
 )
-from udp_mesh.wire.frames import Delivered, Fragment, Frame, MessageHead, Ping, TopicAnnounce
+from udp_mesh.wire.frames import Delivered, Fragment, Frame, MessageHead, Ping, Sent, TopicAnnounce
 from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
 
 IP_UDP_BYTES = 28
@@ -66,7 +68,7 @@ def datagram_room(address: Address, mtu: int, fragment_bytes: int) -> int:
 class Way:
     """How datagrams reach the peer now: link, address, sealing, sizes."""
 
-    __slots__ = ("address", "channel", "confirmed", "fragment_bytes", "heard_at", "link", "mtu", "room_bytes")
+    __slots__ = ("address", "channel", "confirmed", "fragment_bytes", "heard_at", "link", "mtu", "room_bytes", "timed")
 
     def __init__(self, channel: SendChannel) -> None:
         self.channel = channel
@@ -82,12 +84,27 @@ class Way:
         """Frames of one datagram at most: small pieces that share one make it no larger than a full fragment does."""
         self.fragment_bytes = 0
         """Payload of a full fragment."""
+        self.timed = False
+        """The peer takes dated datagrams and heads that say how long their message may live."""
 
     def lead(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
         """Datagrams go this way from now on; messages already begun keep their fragments where these still fit."""
         self.link, self.address, self.mtu = link, address, mtu
         self.room_bytes = datagram_room(address, mtu, fragment_bytes)
         self.fragment_bytes = self.room_bytes - FRAGMENT_WIDE_BYTES
+
+    def dated(self, frames: list[Frame], now: float) -> list[Frame]:
+        """The frames, behind the time where the peer takes that.
+
+        It is no part of `room_bytes`: the long header, for which that leaves room, is larger than the short one by more
+        than the date and a remaining life. In a datagram with a long header both are left out where they do not fit.
+        """
+        return [Sent(clock_ms(now)), *frames] if self.timed else frames
+
+    def encode(self, frames: list[Frame], now: float) -> bytes:
+        """As `dated`, in bytes that fit the way."""
+        encoded = encode(self.dated(frames, now))
+        return encoded if self.confirmed or len(encoded) <= self.room_bytes else encode(frames)
 
     def seal(self, frames: bytes) -> tuple[int, bytes]:
         return self.channel.seal(frames) if self.confirmed else self.channel.seal_long(frames)
@@ -174,7 +191,7 @@ def leave_copies(outbound: Outbound, way: Way, now: float, out: list[Datagram]) 
             outbound,
             way,
             [(message, position)],
-            [*_frames(outbound, run, now, ack_now=True)],
+            [*_frames(outbound, way, run, now, ack_now=True)],
             outbound.mark(now, urgent=True),
             out,
         )
@@ -261,15 +278,20 @@ def _leave_one(outbound: Outbound, way: Way, run: Run, urgent: bool, mark: Mark,
     next_run: Run | None = run
     while next_run is not None:
         message = next_run.message
-        size = _piece_bytes(outbound, next_run)
-        if frames and (size > room or len(frames) >= MAX_FRAMES_PER_DATAGRAM - 2):
+        if next_run.again and (message, next_run.position) in pieces:
+            # Several copies of it were lost: one datagram needs no more than one.
+            scheduler.take(next_run, 1)
+            next_run = _next_small(outbound, way, priority, room)
+            continue
+        size = _piece_bytes(outbound, way, next_run)
+        if frames and (size > room or len(frames) >= MAX_FRAMES_PER_DATAGRAM - 3):
             break
         again += next_run.again
         pieces.append((message, next_run.position))
         scheduler.take(next_run, 1)
         last = next_run.position == message.fragments - 1
         ack_now = urgent or outbound.since_ack_wanted >= spacing or (last and scheduler.nothing_waits(priority))
-        frames.extend(_frames(outbound, next_run, now, ack_now=ack_now))
+        frames.extend(_frames(outbound, way, next_run, now, ack_now=ack_now))
         if ack_now:
             outbound.since_ack_wanted = 0
         room -= size
@@ -294,7 +316,7 @@ def _leave(
     *,
     urgent: bool = True,
 ) -> int:
-    number, data = way.seal(encode(frames))
+    number, data = way.seal(way.encode(frames, mark.sent_at))
     (message, position), *more = pieces
     outbound.flight.add(number, Packet(mark, message, position, tuple(more)))
     out.append(Datagram(way.link, way.address, data, urgent))
@@ -313,23 +335,27 @@ def _next_small(outbound: Outbound, way: Way, priority: int, room: int) -> Run |
             return None
         _begin(outbound, way, run.message)
         run = Run(run.message, 0, run.message.fragments, again=False)
-    return run if _piece_bytes(outbound, run) <= room else None
+    return run if _piece_bytes(outbound, way, run) <= room else None
 
 
-def _piece_bytes(outbound: Outbound, run: Run) -> int:
+def _piece_bytes(outbound: Outbound, way: Way, run: Run) -> int:
     """Bytes of the frames that carry one piece."""
     message = run.message
     start, end = message.span(run.position)
     size = end - start + FRAGMENT_WIDE_BYTES + LENGTH_BYTES
     if run.position == 0:
-        size += HEAD_BYTES
+        size += HEAD_BYTES + (LIFE_BYTES if _says_life(way, message) else 0)
         channel = message.accepted.channel
         if channel.number not in outbound.announced:
             size += 5 + len(channel.name.encode()) + len(channel.type_name.encode())
     return size
 
 
-def _frames(outbound: Outbound, run: Run, now: float, *, ack_now: bool) -> list[Frame]:
+def _says_life(way: Way, message: Outgoing) -> bool:
+    return way.timed and way.confirmed and message.accepted.deadline is not None
+
+
+def _frames(outbound: Outbound, way: Way, run: Run, now: float, *, ack_now: bool) -> list[Frame]:
     """The piece as a fragment, with head and, until the peer knows it, the topic's name in front of the first."""
     message, position = run.message, run.position
     accepted = message.accepted
@@ -347,6 +373,7 @@ def _frames(outbound: Outbound, run: Run, now: float, *, ack_now: bool) -> list[
         message.priority,
         accepted.flags,
         max(0, int((now - accepted.accepted_at) * 1000)),
+        accepted.life_ms(now) if _says_life(way, message) else None,
     )
     fragment = Fragment(wire_id, 0, payload, head, ack_now, is_cast)
     channel = accepted.channel

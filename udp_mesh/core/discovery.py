@@ -7,7 +7,9 @@ no recordings.
 """
 
 from collections.abc import Iterable
+from dataclasses import replace
 
+from udp_mesh.core.freshness import clock_ms
 from udp_mesh.core.seams import Datagram, RandomSource
 from udp_mesh.core.session import Session
 from udp_mesh.core.settings import LinkInfo, LinkKind, Neighbour, Rates, Settings
@@ -17,7 +19,7 @@ from udp_mesh.wire.frames import Feature, Heartbeat, Waiting
 from udp_mesh.wire.header import VERSION
 from udp_mesh.wire.limits import MAX_HEARD
 
-OWN_FEATURES = Feature.ZLIB | Feature.REPAIR
+OWN_FEATURES = Feature.ZLIB | Feature.REPAIR | Feature.TIMED
 
 ANSWER_WITHIN_S = 0.1
 """A new node is answered within this, after a random part of it, so that a team does not answer all at once."""
@@ -109,6 +111,7 @@ class Discovery:
             next_cast,
             heard,
             waiting,
+            clock_ms(now),
         )
 
     def _heard(self, sessions: list[Session], own_name: str, now: float) -> tuple[bytes, ...]:
@@ -132,23 +135,7 @@ class Discovery:
 
 def numbered(beat: Heartbeat, channel: SendChannel) -> bytes:
     """The encoded heartbeat with the number of the packet that will carry it."""
-    return encode(
-        [
-            Heartbeat(
-                beat.name,
-                beat.min_version,
-                beat.max_version,
-                beat.features,
-                beat.interval_ms,
-                beat.known_peers,
-                beat.send_rate,
-                channel.next_number,
-                beat.broadcast_messages,
-                beat.heard,
-                beat.waiting,
-            )
-        ]
-    )
+    return encode([replace(beat, broadcast_number=channel.next_number)])
 
 
 def announce(

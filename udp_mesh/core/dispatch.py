@@ -7,9 +7,10 @@ acknowledgement, a timer or a new message brings it back.
 
 from heapq import heappop
 
-from udp_mesh.core.acceptance import expire_held, pack, report_ended
+from udp_mesh.core.acceptance import broadcast_room, expire_held, pack, report_ended
 from udp_mesh.core.departure import IP_UDP_BYTES, leave_copies, leave_level
 from udp_mesh.core.discovery import OWN_FEATURES, announce
+from udp_mesh.core.freshness import clock_ms
 from udp_mesh.core.intake import unpack
 from udp_mesh.core.presence import housekeep
 from udp_mesh.core.seams import Datagram
@@ -47,11 +48,14 @@ def collect(state: State, now: float, max_bytes: int | None) -> list[Datagram]:
             _leave_owed(state, session, now, out)
     if state.ready or state.casts.waiting:
         _leave_levels(state, now, out, room)
-    if out:
-        counters = state.ledger.counters
-        counters.datagrams_sent += len(out)
-        counters.bytes_sent += sum([len(datagram[2]) for datagram in out]) + IP_UDP_BYTES * len(out)
     return out
+
+
+def count_sent(state: State, out: list[Datagram]) -> None:
+    """Datagrams leave, in whatever format."""
+    counters = state.ledger.counters
+    counters.datagrams_sent += len(out)
+    counters.bytes_sent += sum([len(datagram[2]) for datagram in out]) + IP_UDP_BYTES * len(out)
 
 
 def _leave_owed(state: State, session: Session, now: float, out: list[Datagram]) -> None:
@@ -74,13 +78,13 @@ def _leave_owed(state: State, session: Session, now: float, out: list[Datagram])
         frames.append(Cancel(tuple(cancelled[:MAX_IDS])))
         del cancelled[:MAX_IDS]
     if not way.confirmed and frames and not session.knows_us:
-        frames.insert(0, _introduction(state, session))
+        frames.insert(0, _introduction(state, session, now))
     while frames:
-        count = min(len(frames), MAX_FRAMES_PER_DATAGRAM)
-        encoded = encode(frames[:count])
+        count = min(len(frames), MAX_FRAMES_PER_DATAGRAM - 1)
+        encoded = way.encode(frames[:count], now)
         while count > 1 and len(encoded) > way.room_bytes:
             count = max(1, count * way.room_bytes // len(encoded) - 1)
-            encoded = encode(frames[:count])
+            encoded = way.encode(frames[:count], now)
         number, data = way.seal(encoded)
         peer.outbound.flight.add(number, None)
         out.append(Datagram(way.link, way.address, data, True))
@@ -88,7 +92,7 @@ def _leave_owed(state: State, session: Session, now: float, out: list[Datagram])
     state.arm(peer)
 
 
-def _introduction(state: State, session: Session) -> Heartbeat:
+def _introduction(state: State, session: Session, now: float) -> Heartbeat:
     """Who we are, for a peer that may not know this run of ours yet."""
     settings = state.settings
     return Heartbeat(
@@ -102,6 +106,8 @@ def _introduction(state: State, session: Session) -> Heartbeat:
         state.to_all.next_number,
         state.casts.next_number,
         (session.heard_tag,),
+        (),
+        clock_ms(now),
     )
 
 
@@ -123,7 +129,7 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
         if outbound.scheduler.waiting:
             if not session.way.confirmed and not session.knows_us and now >= session.introduced_at + INTRODUCE_AGAIN_S:
                 session.introduced_at = now
-                number, data = session.way.seal(encode([_introduction(state, session)]))
+                number, data = session.way.seal(encode([_introduction(state, session, now)]))
                 outbound.flight.add(number, None)
                 out.append(Datagram(session.way.link, session.way.address, data, True))
             peers.append(peer)
@@ -198,7 +204,14 @@ def _leave_casts(state: State, priority: int, now: float, out: list[Datagram]) -
         packets_per_s=None if urgent else rates.broadcast_packets_per_s,
         copy_after_s=rates.twice_gap_s if twice else None,
         kept_limit_bytes=state.settings.limits.repair_bytes,
+        dated_bytes=_dated_bytes(state),
     )
+
+
+def _dated_bytes(state: State) -> int:
+    """The largest broadcast that may say when it left: none, where some peer takes no dates."""
+    sessions = [peer.session for peer in state.roster.online() if peer.session is not None]
+    return broadcast_room(state, sessions) if all(session.timed for session in sessions) else 0
 
 
 def has_datagrams(state: State) -> bool:

@@ -88,10 +88,13 @@ class NameConflict:
 
 @dataclass(frozen=True, slots=True)
 class KeyMismatch:
-    """Datagrams come from here that none of our keys opens (reported at most once a minute per address)."""
+    """Datagrams come from here that none of our keys opens (once a minute per address, and not more than a few a minute
+    in all)."""
 
     address: Address
     link: str
+    more: int = 0
+    """Such datagrams, from other addresses, not reported by an event since the last one."""
 
 
 @dataclass(frozen=True, slots=True)

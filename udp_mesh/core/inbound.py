@@ -12,6 +12,7 @@ from typing import NamedTuple
 from udp_mesh.core.acks import MOST_PENDING, AckState
 from udp_mesh.core.compression import Unpacking
 from udp_mesh.core.flight import REORDER_PACKETS
+from udp_mesh.core.memory import TOPIC_BYTES, Account, Memory
 from udp_mesh.core.reassembly import Reassembly, Verdict, Whole
 from udp_mesh.core.settings import Limits, Rates
 from udp_mesh.wire.codec import FRAGMENT, FRAGMENT_ACK_NOW, FRAGMENT_BYTES, FRAGMENT_WIDE, FRAGMENT_WIDE_BYTES
@@ -37,10 +38,15 @@ class Arrived(NamedTuple):
     """Its broadcast number, where it is numbered so."""
 
 
+def _topic_bytes(names: tuple[str, str]) -> int:
+    return TOPIC_BYTES + sum(len(name) for name in names)
+
+
 class Inbound:
     """`arrived` and `refusals` are fetched and cleared by the session."""
 
     __slots__ = (
+        "_account",
         "_gap_ends",
         "_limits",
         "_rates",
@@ -49,6 +55,7 @@ class Inbound:
         "arrived",
         "broadcasts",
         "duplicates",
+        "expired",
         "fragments",
         "over_limit",
         "refusals",
@@ -57,18 +64,21 @@ class Inbound:
         "unpacking",
     )
 
-    def __init__(self, rates: Rates, limits: Limits) -> None:
+    def __init__(self, rates: Rates, limits: Limits, memory: Memory) -> None:
         self._rates = rates
         self._limits = limits
         self.acks = AckState()
-        self.unicasts = Reassembly(limits)
-        self.broadcasts = Reassembly(limits)
+        self._account = Account(memory)
+        self.unicasts = Reassembly(limits, self._account)
+        self.broadcasts = Reassembly(limits, self._account)
         self.topics: dict[int, tuple[str, str]] = {}
         self.arrived: list[Arrived] = []
         self.refusals: list[Refused] = []
         self.unpacking: deque[tuple[Unpacking, Arrived]] = deque()
         """Whole messages still being inflated, with what is told of them but for the payload."""
         self.duplicates = 0
+        self.expired = 0
+        """Pieces of messages whose senders have given them up by now."""
         self.fragments = 0
         self.over_limit = 0
         self._refused: dict[tuple[bool, int], RefuseReason] = {}
@@ -109,13 +119,24 @@ class Inbound:
 
     def announce(self, frame: TopicAnnounce) -> None:
         """Learn a topic's number; bounded, since only a faulty peer announces without end."""
-        if frame.topic_id in self.topics or len(self.topics) < self._limits.topics_per_peer:
-            self.topics[frame.topic_id] = (frame.name, frame.type_name)
-        else:
+        names = (frame.name, frame.type_name)
+        known = self.topics.get(frame.topic_id)
+        if known == names:
+            return
+        size = _topic_bytes(names)
+        if (known is None and len(self.topics) >= self._limits.topics_per_peer) or not self._account.has_room(size):
             self.over_limit += 1
+            return
+        self._account.take(size - (0 if known is None else _topic_bytes(known)))
+        self.topics[frame.topic_id] = names
 
-    def take(self, fragment: Fragment, now: float, *, broadcast: bool) -> bool:
-        """Take in one piece; False if it was refused, so that its datagram must not be acknowledged."""
+    def close(self) -> None:
+        """The peer is forgotten: what is kept for it no longer counts."""
+        self._account.close()
+
+    def take(self, fragment: Fragment, now: float, *, broadcast: bool, late_s: float = 0.0) -> bool:
+        """Take in one piece, `late_s` longer on its way than others; False if it was refused, so that its datagram must
+        not be acknowledged."""
         by_broadcast = broadcast or fragment.broadcast_id
         self.fragments += 1
         key = (by_broadcast, fragment.message_id)
@@ -123,7 +144,7 @@ class Inbound:
             self._refuse(key, self._refused[key])
             return False
         reassembly = self.broadcasts if by_broadcast else self.unicasts
-        result = reassembly.add(fragment, now)
+        result = reassembly.add(fragment, now, late_s)
         if isinstance(result, Whole):
             return self._hand_over(result, by_broadcast)
         match result:
@@ -134,6 +155,9 @@ class Inbound:
                 return True
             case Verdict.FULL:
                 self.over_limit += 1
+                return False
+            case Verdict.EXPIRED:
+                self.expired += 1
                 return False
             case Verdict.FORGOTTEN:
                 self._refuse(key, RefuseReason.FORGOTTEN)
@@ -183,10 +207,15 @@ class Inbound:
             return True
         unpacking = Unpacking(whole.body, self._limits.message_bytes)
         if not unpacking.step():
-            if self.unpacking_bytes + unpacking.held_bytes > self._limits.partial_bytes_per_peer:
+            size = len(whole.body)
+            if (
+                self.unpacking_bytes + unpacking.held_bytes > self._limits.partial_bytes_per_peer
+                or not self._account.has_room(size)
+            ):
                 self.over_limit += 1
                 self._refuse_for_good(key, RefuseReason.TOO_LARGE)
                 return False
+            self._account.take(size)
             self.unpacking.append((unpacking, arrived))
             return True
         if unpacking.payload is None:
@@ -204,6 +233,7 @@ class Inbound:
         if not unpacking.step():
             return True
         self.unpacking.popleft()
+        self._account.give_back(len(arrived.payload))
         if unpacking.payload is None:
             return False
         self.arrived.append(arrived._replace(payload=unpacking.payload))

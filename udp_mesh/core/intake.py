@@ -7,14 +7,17 @@
 
 from udp_mesh.core.acceptance import report_ended
 from udp_mesh.core.casts import UNREPAIRED_FROM
-from udp_mesh.core.events import ExpiryReason, KeyMismatch, MessageReceived
+from udp_mesh.core.conditions import Counters
+from udp_mesh.core.dating import broadcast_lateness_s, data_lateness_s, date_of, long_lateness_s
+from udp_mesh.core.events import ExpiryReason, MessageReceived
 from udp_mesh.core.message import Accepted, Outgoing
-from udp_mesh.core.presence import REPORT_AGAIN_S, follow, greet, heard, leave, prove
+from udp_mesh.core.paths import send_on_path
+from udp_mesh.core.presence import follow, greet, heard, leave, prove
 from udp_mesh.core.session import Session
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
 from udp_mesh.crypto import TO_ALL, Key, OpenError, ReceiveChannel, ReplayError, UnknownKeyError, check_long
-from udp_mesh.wire.codec import decode
+from udp_mesh.wire.codec import FRAGMENT, decode
 from udp_mesh.wire.errors import DecodeError, UnknownVersionError
 from udp_mesh.wire.frames import (
     Ack,
@@ -44,9 +47,6 @@ from udp_mesh.wire.header import (
 
 _LEAST_BYTES = SHORT_HEADER_BYTES + SEAL_TAG_BYTES
 
-MISMATCHES_REMEMBERED = 256
-"""Addresses whose unknown key was reported: a flood of them must not grow memory."""
-
 
 def take_datagram(state: State, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
     """See `Node.receive`."""
@@ -59,31 +59,34 @@ def take_datagram(state: State, data: bytes | memoryview, link: str, source: Add
         return
     first = data[0]
     if first == DATA_BYTE:
+        replayed = False
         _, tag, low = SHORT_HEADER.unpack_from(data)
         for channel, session in state.roster.data_tags.get(tag, ()):
             try:
                 number, frames = channel.open(data, low)
             except ReplayError:
-                counters.dropped_replayed += 1
-                return
+                # Perhaps a new one of another channel with this tag.
+                replayed = True
+                continue
             except OpenError:
                 continue
             _take_data(state, session, number, frames, link, source, now)
             return
-        counters.dropped_unauthenticated += 1
+        _count_unopened(counters, replayed=replayed)
     elif first == BROADCAST_BYTE:
+        replayed = False
         _, tag, low = SHORT_HEADER.unpack_from(data)
         for channel, session in state.roster.broadcast_tags.get(tag, ()):
             try:
                 _, frames = channel.open(data, low)
             except ReplayError:
-                counters.dropped_replayed += 1
-                return
+                replayed = True
+                continue
             except OpenError:
                 continue
             _take_broadcast(state, session, frames, link, source, now)
             return
-        counters.dropped_unauthenticated += 1
+        _count_unopened(counters, replayed=replayed)
     else:
         try:
             header = parse_header(data)
@@ -91,7 +94,9 @@ def take_datagram(state: State, data: bytes | memoryview, link: str, source: Add
                 _take_long(state, data, header, link, source, now)
         except UnknownKeyError:
             counters.dropped_unauthenticated += 1
-            _report_mismatch(state, link, source, now)
+            mismatch = state.mismatches.seen(source, link, now)
+            if mismatch is not None:
+                state.ledger.tell(mismatch)
         except ReplayError:
             counters.dropped_replayed += 1
         except OpenError:
@@ -102,13 +107,28 @@ def take_datagram(state: State, data: bytes | memoryview, link: str, source: Add
             counters.dropped_malformed += 1
 
 
+def _count_unopened(counters: Counters, *, replayed: bool) -> None:
+    if replayed:
+        counters.dropped_replayed += 1
+    else:
+        counters.dropped_unauthenticated += 1
+
+
 def _take_data(
     state: State, session: Session, number: int, frames: bytes, link: str, source: Address, now: float
 ) -> None:
-    """An opened datagram bound to this run of ours: its sender is alive."""
+    """An opened datagram bound to this run of ours: its sender is alive, or was when it was recorded."""
     way = session.way
     peer = session.peer
     session.received_bytes += len(frames) + 51
+    if not frames:
+        state.ledger.counters.dropped_malformed += 1
+        return
+    late_s: float | None = 0.0
+    if frames[0] < FRAGMENT or now > session.freshness.trusted_until:
+        late_s = data_lateness_s(state, session, frames, link, source, now)
+        if late_s is None:
+            return
     if (
         peer is not None
         and peer.online
@@ -140,10 +160,22 @@ def _take_data(
     except DecodeError:
         state.ledger.counters.dropped_malformed += 1
         return
-    _take_frames(state, session, decoded, number, now)
+    if session.timed and date_of(frames) is None:
+        # Its sender dates every message that begins: one without a date would have none when it is late.
+        decoded = [frame for frame in decoded if not (isinstance(frame, Fragment) and frame.head is not None)]
+    _take_frames(state, session, decoded, number, link, source, now, late_s or 0.0)
 
 
-def _take_frames(state: State, session: Session, frames: list[Frame], number: int, now: float) -> None:
+def _take_frames(
+    state: State,
+    session: Session,
+    frames: list[Frame],
+    number: int,
+    link: str,
+    source: Address,
+    now: float,
+    late_s: float = 0.0,
+) -> None:
     """The frames of a unicast datagram of a peer's session, in order."""
     inbound = session.inbound
     peer = session.peer
@@ -156,7 +188,7 @@ def _take_frames(state: State, session: Session, frames: list[Frame], number: in
             case Fragment():
                 wants_ack = True
                 ack_now = ack_now or frame.ack_now
-                kept = inbound.take(frame, now, broadcast=False) and kept
+                kept = inbound.take(frame, now, broadcast=False, late_s=late_s) and kept
             case Ack():
                 if frame.largest < session.way.channel.next_number:
                     session.way.confirmed = session.knows_us = True
@@ -185,8 +217,12 @@ def _take_frames(state: State, session: Session, frames: list[Frame], number: in
             case Nack(message_id):
                 _repair(state, session, message_id, now)
             case Ping(token):
-                session.owe(Pong(token, 0))
-                state.owe(session)
+                if (link, source) == (session.way.link, session.way.address):
+                    session.owe(Pong(token, 0))
+                    state.owe(session)
+                else:
+                    # It asks whether we are there, not whether we know another way.
+                    send_on_path(state, session, Pong(token, 0), link, source, now)
             case Pong(token):
                 outbound.path_size.answered(token, now)
             case Bye():
@@ -295,9 +331,12 @@ def _hand_over(state: State, session: Session, now: float) -> None:
 def unpack(state: State, now: float) -> None:
     """Inflate some more of a message that is whole, of each session in turn."""
     session = next(iter(state.unpacking))
-    del state.unpacking[session]
+    held = sum(one.inbound.unpacking_bytes for one in state.unpacking)
     if not session.inbound.unpack():
         state.ledger.counters.dropped_malformed += 1
+    if held <= 2 * state.settings.limits.message_bytes or not session.inbound.unpacking:
+        # In turn, but where much is held already: then what was begun ends before more grows.
+        del state.unpacking[session]
     _hand_over(state, session, now)
 
 
@@ -306,6 +345,12 @@ def _take_broadcast(state: State, session: Session, frames: bytes, link: str, so
     peer = session.peer
     if peer is None or peer.session is not session or session.boot_id not in state.repairs:
         state.ledger.counters.dropped_unproven += 1
+        return
+    if not frames:
+        state.ledger.counters.dropped_malformed += 1
+        return
+    late_s = broadcast_lateness_s(state, session, frames, link, source, now)
+    if late_s is None:
         return
     heard(state, session, link, source, now)
     try:
@@ -316,7 +361,7 @@ def _take_broadcast(state: State, session: Session, frames: bytes, link: str, so
     for frame in decoded:
         match frame:
             case Fragment():
-                session.inbound.take(frame, now, broadcast=True)
+                session.inbound.take(frame, now, broadcast=True, late_s=late_s)
             case TopicAnnounce():
                 session.inbound.announce(frame)
             case Bye():
@@ -352,9 +397,16 @@ def _take_long(
             state.ledger.counters.dropped_unproven += 1
             return
         session = state.roster.stranger(beat.name, header.boot_id, state.keys, state.settings)
-        _channel(session.data_channels if introduced else session.broadcast_channels, key).window.accept(number)
+        channel = _channel(session.data_channels if introduced else session.broadcast_channels, key)
+        if not channel.window.accept(number):
+            # Of a boot that was forgotten, and whose numbers were not.
+            state.roster.forget(session)
+            raise ReplayError(f"packet {number} was already seen or is too old")
     if beat is not None and beat.name != session.name:
         state.ledger.counters.dropped_malformed += 1
+        return
+    late_s = long_lateness_s(state, session, decoded, link, source, now)
+    if late_s is None:
         return
     if not introduced:
         if beat is not None:
@@ -374,7 +426,7 @@ def _take_long(
     heard(state, session, link, source, now)
     if session.peer.session is not session:
         return
-    _take_frames(state, session, decoded, number, now)
+    _take_frames(state, session, decoded, number, link, source, now, late_s)
     # The sender writes long headers until it is answered.
     session.inbound.acks.now_wanted = True
     state.owe(session)
@@ -400,14 +452,3 @@ def _beat(frames: list[Frame]) -> Heartbeat | None:
         if isinstance(frame, Heartbeat):
             return frame
     return None
-
-
-def _report_mismatch(state: State, link: str, source: Address, now: float) -> None:
-    reported = state.mismatch_reported
-    if now - reported.get(source, float("-inf")) < REPORT_AGAIN_S:
-        return
-    reported.pop(source, None)
-    while len(reported) >= MISMATCHES_REMEMBERED:
-        del reported[next(iter(reported))]
-    reported[source] = now
-    state.ledger.tell(KeyMismatch(source, link))

@@ -9,12 +9,14 @@ it begins anew (`presence`). Broadcasts stay covered for as long as the configur
 """
 
 from udp_mesh.core.acceptance import release_outbox, report_ended, shelve
+from udp_mesh.core.departure import IP_UDP_BYTES
 from udp_mesh.core.events import MessageReceived, PeerOffline, PeerOnline
+from udp_mesh.core.legacy_acks import LegacyAcks
 from udp_mesh.core.legacy_receive import LegacyReassembly
 from udp_mesh.core.legacy_send import LegacySender
 from udp_mesh.core.open_messages import Outcome
 from udp_mesh.core.seams import Datagram, RandomSource
-from udp_mesh.core.session import Peer
+from udp_mesh.core.session import Meters, Peer
 from udp_mesh.core.settings import Address, LinkInfo, Neighbour, Settings
 from udp_mesh.core.state import ASLEEP_S, State
 from udp_mesh.wire.errors import DecodeError
@@ -26,17 +28,44 @@ from udp_mesh.wire.legacy import (
     cover,
     decode_legacy,
     encode_legacy,
+    is_ros_name,
+    is_ros_type,
 )
 from udp_mesh.wire.limits import PRIORITY_LEVELS
 
 LEGACY_HEARTBEAT_S = 1.0
 """The fielded period; its receivers report a peer offline after ten."""
 
+MISSED_S = 3.5
+"""Without a sign of life for this long a fielded program may have been restarted: it says a heartbeat a second."""
+
+SETTLE_S = 10.0
+"""After its first heartbeat then, before what an outbox keeps leaves: the program acknowledges from the start, but what
+arrives before its reader has subscribed is lost there (on a slow computer that takes long)."""
+
+MOST_TOPICS = 256
+"""Topics of one fielded peer: nothing it says is authenticated, and each may become a ROS topic here."""
+
 
 class LegacyPeer:
     """One fielded peer."""
 
-    __slots__ = ("_moved", "address", "broadcasts", "last_heard", "link", "neighbour", "peer", "sender", "unicasts")
+    __slots__ = (
+        "_moved",
+        "acks",
+        "address",
+        "broadcasts",
+        "last_heard",
+        "link",
+        "meters",
+        "neighbour",
+        "peer",
+        "received_bytes",
+        "sender",
+        "settled_at",
+        "topics",
+        "unicasts",
+    )
 
     def __init__(self, neighbour: Neighbour, peer: Peer, settings: Settings, rng: RandomSource) -> None:
         self.neighbour = neighbour
@@ -47,13 +76,19 @@ class LegacyPeer:
         self.unicasts = LegacyReassembly(settings.limits)
         self.broadcasts = LegacyReassembly(settings.limits)
         self.last_heard = float("-inf")
+        self.acks = LegacyAcks()
+        self.settled_at: float | None = None
+        """When what waits in outboxes may leave; None: it has."""
+        self.topics: set[str] = set()
+        self.received_bytes = 0
+        self.meters = peer.fielded_meters = Meters(0.0)
         self._moved = False
 
     def moved_over(self) -> bool:
         """Whether a node of our own format speaks for it by now."""
         if not self._moved and self.peer.session is not None:
             self._moved = True
-            self.peer.legacy = False
+            self.peer.legacy = self.peer.settling = False
         return self._moved
 
 
@@ -85,7 +120,8 @@ class LegacyPeers:
     def _drop(self, gone: LegacyPeer) -> None:
         """It is not named any more; one that was never heard, and for which nothing waits, was never there."""
         peer, state = gone.peer, self._state
-        peer.legacy = False
+        peer.legacy = peer.settling = False
+        peer.fielded_meters = None
         heard = peer.session is not None or peer.fielded_way is not None
         if not heard and not peer.outbound.open and not state.outboxes.holds(peer.name):
             state.ready.pop(peer, None)
@@ -98,15 +134,17 @@ class LegacyPeers:
         """One datagram without our mark: the fielded format from a configured address, or nothing of ours."""
         counters = self._state.ledger.counters
         legacy = self._by_host.get(source[0])
-        if legacy is None or legacy.moved_over():
+        if legacy is None or legacy.moved_over() or source != legacy.neighbour.address:
+            # Fielded programs send from the port they listen on; another one on that computer is not believed.
             counters.dropped_unauthenticated += 1
             return
         try:
             datagram = decode_legacy(data)
             self._heard(legacy, link, source, now)
+            legacy.received_bytes += len(data) + IP_UDP_BYTES
             match datagram:
                 case Host():
-                    pass
+                    self._acknowledge(legacy, legacy.acks.heartbeat())
                 case LegacyAck(sequence, position):
                     legacy.sender.acknowledge(sequence, position, now)
                     report_ended(self._state, legacy.peer, now)
@@ -116,6 +154,9 @@ class LegacyPeers:
             counters.dropped_malformed += 1
 
     def _heard(self, legacy: LegacyPeer, link: str, source: Address, now: float) -> None:
+        if now - legacy.last_heard > MISSED_S:
+            legacy.settled_at = now + SETTLE_S
+            legacy.peer.settling = True
         legacy.last_heard = now
         legacy.link = link
         legacy.address = source
@@ -127,7 +168,6 @@ class LegacyPeers:
             peer.online = True
             peer.online_since = now
             self._state.ledger.tell(PeerOnline(peer.name, source, link))
-            release_outbox(self._state, peer, now)
 
     def _take(self, legacy: LegacyPeer, piece: LegacyPayload, link: str, source: Address, now: float) -> None:
         reassembly = legacy.unicasts if piece.wants_ack else legacy.broadcasts
@@ -139,9 +179,12 @@ class LegacyPeers:
         finally:
             self._state.ledger.counters.dropped_over_limit += reassembly.over_limit - too_large
             if keep and piece.wants_ack:
-                data = encode_legacy(LegacyAck(piece.sequence, piece.position))
-                self._state.outgoing.append(Datagram(link, source, data, True))
+                more = legacy.acks.came(piece, now)
+                self._acknowledge(legacy, [LegacyAck(piece.sequence, piece.position), *more])
         if message is not None:
+            if not self._may_name(legacy, message):
+                self._state.ledger.counters.dropped_over_limit += 1
+                return
             self._state.ledger.counters.messages_received += 1
             priority = min(message.priority, PRIORITY_LEVELS - 1)
             self._state.ledger.tell(
@@ -154,6 +197,20 @@ class LegacyPeers:
                     not piece.wants_ack,
                 )
             )
+
+    def _may_name(self, legacy: LegacyPeer, message: PriorityMeshData) -> bool:
+        """Whether a message's topic and type are names of ROS, and its topics not too many."""
+        if not is_ros_name(message.topic) or not is_ros_type(message.type_name):
+            return False
+        if message.topic not in legacy.topics:
+            if len(legacy.topics) >= MOST_TOPICS:
+                return False
+            legacy.topics.add(message.topic)
+        return True
+
+    def _acknowledge(self, legacy: LegacyPeer, acks: list[LegacyAck]) -> None:
+        for ack in acks:
+            self._state.outgoing.append(Datagram(legacy.link, legacy.address, encode_legacy(ack), True))
 
     def covered(self, out: list[Datagram]) -> list[Datagram]:
         """The datagrams, those to all in a cover that fielded programs take for one of theirs."""
@@ -177,12 +234,15 @@ class LegacyPeers:
         at = self._heartbeat_at
         for legacy in self._fielded():
             due = legacy.sender.timer()
-            if due is not None and legacy.link:
-                at = min(at, due)
+            if legacy.link:
+                at = min(at, legacy.acks.next_at(), at if due is None else due)
         return at
 
     def handle_timer(self, now: float) -> None:
-        """Heartbeats, silences and purges, once a second."""
+        """Acknowledgements that are due; heartbeats, silences and purges, once a second."""
+        for legacy in self._fielded():
+            if legacy.link:
+                self._acknowledge(legacy, legacy.acks.due(now))
         if not self._by_host or now < self._heartbeat_at:
             return
         # This process did not run for so long: silence meanwhile was ours.
@@ -206,6 +266,14 @@ class LegacyPeers:
                 report_ended(state, peer, now)
             legacy.unicasts.purge(now)
             legacy.broadcasts.purge(now)
+            if peer.online and legacy.settled_at is not None and now >= legacy.settled_at:
+                legacy.settled_at = None
+                peer.settling = False
+            if peer.online and legacy.settled_at is None and state.outboxes.holds(peer.name):
+                release_outbox(state, peer, now)
+            legacy.meters.sent.feed(peer.outbound.sent_bytes, now)
+            legacy.meters.delivered.feed(peer.outbound.delivered_bytes, now)
+            legacy.meters.received.feed(legacy.received_bytes, now)
             for link in self._links(legacy):
                 host = encode_legacy(Host(state.settings.name, link.address[0]))
                 state.outgoing.append(Datagram(link.name, legacy.neighbour.address, host, True))

@@ -5,21 +5,30 @@ again when its acknowledgement is overdue by the measured round trip, and a sile
 fragments.
 """
 
+from collections import OrderedDict
 from dataclasses import dataclass
 
+from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.message import Outgoing
 from udp_mesh.core.open_messages import Outcome
 from udp_mesh.core.outbound import PROBE_S, Outbound
 from udp_mesh.core.seams import Datagram
 from udp_mesh.core.settings import Address
-from udp_mesh.wire.legacy import LegacyPayload, PriorityMeshData, encode_legacy, encode_mesh_data, fragment_legacy
+from udp_mesh.wire.legacy import (
+    LAST_SEQUENCE as LAST_SEQUENCE,
+)
+from udp_mesh.wire.legacy import (
+    LegacyPayload,
+    PriorityMeshData,
+    encode_legacy,
+    encode_mesh_data,
+    fragment_legacy,
+    is_ros_type,
+)
 from udp_mesh.wire.limits import MAX_LEGACY_FRAGMENT_BYTES, PRIORITY_LEVELS
 
 LEGACY_WINDOW = 3
 """Fragments in flight to a fielded peer: its own choice, above which its radios were seen to interfere."""
-
-LAST_SEQUENCE = 0x7FFF
-"""Unicast sequence numbers run from 1 to this, then from 1 again."""
 
 TRIES_BEFORE_SILENT = 3
 """Tries of one fragment, with nothing acknowledged meanwhile, after which only single probes leave."""
@@ -30,6 +39,16 @@ for that an urgent one would take most of a second; once it doubles all the same
 
 LEAST_PATIENCE_S = 0.025
 """Before a fragment is sent again at the earliest: fielded programs answer when their interpreter gets to it."""
+
+MOST_PATIENCE_S = 0.2
+"""What that grows to where both tries of a fragment are answered: then the second was needless, and a message of one
+fragment arrived twice over there, where no finished message is remembered."""
+
+RESENT_REMEMBERED = 64
+"""Fragments answered after a resend of which another answer may come."""
+
+PATIENCE_WANES = 0.995
+"""Per answer at the first try, back towards `LEAST_PATIENCE_S`: some hundred answers after it was needed."""
 
 
 @dataclass(slots=True)
@@ -46,6 +65,13 @@ class _Leg:
     """Its tries since the last of them."""
 
 
+def carries(type_name: str) -> bool:
+    """Whether a fielded robot can publish a message of this type: `pkg/Type`, or one not said. Anything else (a
+    bridge's own messages, ROS 2, Zenoh) ends the callback of its reader with a traceback."""
+    name = type_name.partition(" ")[0]
+    return not name or is_ros_type(name)
+
+
 class LegacySender:
     """The sending half for one fielded peer; queues and outcomes are those of its `Outbound`."""
 
@@ -54,6 +80,8 @@ class LegacySender:
         "_fragments",
         "_legs",
         "_own_name",
+        "_patience_s",
+        "_resent",
         "_sequence",
         "_sequences",
         "_stamp",
@@ -66,6 +94,8 @@ class LegacySender:
         self.outbound = outbound
         self.silent = False
         self._answers = 0
+        self._patience_s = LEAST_PATIENCE_S
+        self._resent: OrderedDict[tuple[int, int], None] = OrderedDict()
         self._own_name = own_name
         self._sequence = first_sequence % LAST_SEQUENCE
         self._stamp = 0
@@ -88,7 +118,7 @@ class LegacySender:
                     break
                 message = run.message
                 if not message.begun and not self._begin(message, now):
-                    scheduler.drop_head(run)
+                    outbound.finish(message, ExpiryReason.REFUSED)
                     continue
                 run = scheduler.peek(priority)
                 assert run is not None
@@ -103,13 +133,23 @@ class LegacySender:
         self.silent = False
         self._answers += 1
         if leg is None:
+            if (sequence, position) in self._resent:
+                del self._resent[sequence, position]
+                self._patience_s = min(MOST_PATIENCE_S, 2 * self._patience_s)
             return
-        if leg.tries == 1:
+        if leg.tries > 1:
+            self._resent[sequence, position] = None
+            if len(self._resent) > RESENT_REMEMBERED:
+                self._resent.popitem(last=False)
+        else:
+            self._patience_s = max(LEAST_PATIENCE_S, PATIENCE_WANES * self._patience_s)
             # Karn: which try a later acknowledgement answers is unknown.
             self.outbound.trip.sample(max(1e-5, now - leg.sent_at), now)
         message = leg.message
-        if not message.ended and message.arrive(position) and not message.missing:
-            self.outbound.finish(message, Outcome.DELIVERED)
+        if not message.ended and message.arrive(position):
+            self.outbound.delivered_bytes += len(self._fragments[message][1][position])
+            if not message.missing:
+                self.outbound.finish(message, Outcome.DELIVERED)
         self.outbound.delivered_packets += 1
         self.outbound.delivered_at = now
 
@@ -129,7 +169,7 @@ class LegacySender:
         return min(leg.sent_at + self._patience(leg) for leg in self._legs.values())
 
     def _patience(self, leg: _Leg) -> float:
-        timeout = max(LEAST_PATIENCE_S, self.outbound.trip.timeout(0.0))
+        timeout = max(self._patience_s, self.outbound.trip.timeout(0.0))
         doublings = min(leg.tries - 1, DOUBLINGS_WHILE_ANSWERED)
         if leg.answers == self._answers:
             doublings = max(doublings, min(leg.unanswered - 1, DOUBLINGS))
@@ -153,6 +193,8 @@ class LegacySender:
     def _begin(self, message: Outgoing, now: float) -> bool:
         """Serialize, cut and number; False if the format cannot carry it (it then ends as refused)."""
         accepted = message.accepted
+        if not carries(accepted.channel.type_name):
+            return False
         self._stamp = (self._stamp + 1) & 0xFFFFFFFF
         channel = accepted.channel
         seconds = int(now)

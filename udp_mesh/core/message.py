@@ -42,6 +42,10 @@ class Accepted:
     broadcast_number: int | None = None
     """The broadcast message id this is a repair of."""
 
+    def life_ms(self, now: float) -> int | None:
+        """What remains of its life, for its head; None: it has no deadline."""
+        return None if self.deadline is None else max(1, int((self.deadline - now) * 1000))
+
 
 class Outgoing:
     """The copy for one peer. `wire_id` is None until its first fragment leaves."""

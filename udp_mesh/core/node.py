@@ -55,6 +55,8 @@ class Node:
         if self._legacy:
             out = self._legacy.covered(out)
             self._legacy.leave(now, out)
+        if out:
+            dispatch.count_sent(self._state, out)
         return out
 
     def next_timer(self) -> float | None:

@@ -24,8 +24,9 @@ from udp_mesh.core.message import Outgoing
 from udp_mesh.core.open_messages import Outcome
 from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.path_size import NARROWER_MTUS
+from udp_mesh.core.paths import challenge
 from udp_mesh.core.roster import Arrival
-from udp_mesh.core.session import STALE_PATH_S, Peer, Session
+from udp_mesh.core.session import STALE_PATH_S, Challenge, Peer, Session
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import ASLEEP_S, HOUSEKEEPING_S, State
 from udp_mesh.wire.frames import Heartbeat
@@ -95,7 +96,9 @@ def prove(state: State, session: Session, now: float) -> None:
         state.ledger.counters.dropped_over_limit += 1
         return
     if arrival is Arrival.RETIRED:
+        # Served again when it is heard and the later run is gone (`heard`).
         return
+    session.freshness.prove(now)
     _replace(state, peer, session, now)
     if arrival is Arrival.RESTARTED and peer.online:
         state.ledger.tell(PeerRestarted(peer.name))
@@ -156,12 +159,18 @@ def heard(state: State, session: Session, link: str, source: Address, now: float
         if peer is None or peer.online:
             conflict(state, session, source, now)
             return
-        # Of two nodes with one name the later one went: its name means this one again, which was heard all the time
-        # (so that nothing recorded of it can be taken for its voice).
+        # Of two nodes with one name the later one went: its name means this one again, if this is its voice.
+        if not session.is_fresh(now):
+            challenge(state, session, link, source, now)
+            return
         _replace(state, peer, session, now)
     if session.unheard_since is not None:
         return
     if not peer.online:
+        if not session.is_fresh(now):
+            # It may be a recording that never arrived: an answer to a question cannot be one.
+            challenge(state, session, link, source, now)
+            return
         come_online(state, peer, session, now)
     if peer.engaged and peer.outbound.silent_since is not None:
         peer.outbound.heard(now)
@@ -184,16 +193,48 @@ def conflict(state: State, session: Session, source: Address, now: float) -> Non
 
 
 def follow(state: State, session: Session, link: str, source: Address, now: float) -> None:
-    """The session was heard at an address: use it if it is the only one, or the one in use has gone quiet."""
-    info = state.links.get(link)
-    if info is None:
+    """The session was heard at an address: use it if it is the only one, or the one in use has gone quiet, and the peer
+    answers there.
+
+    A peer of an earlier version answers to where it was heard before, perhaps over a link that is gone: where nothing
+    at all comes from there it is followed without a question.
+    """
+    if link not in state.links:
         return
     way = session.way
     outbound = session.peer.outbound if session.peer is not None and session.peer.engaged else None
     struggling = outbound is not None and (outbound.struggling or outbound.silent_since is not None)
     first = not way.link
-    if not first and now - way.heard_at < STALE_PATH_S and not struggling and way.link in state.links:
+    quiet = now - way.heard_at >= STALE_PATH_S or way.link not in state.links
+    if not first and not quiet and not struggling:
         return
+    peer = session.peer
+    if not first and session.proven and peer is not None and (session.timed or not quiet or not peer.online):
+        challenge(state, session, link, source, now)
+        return
+    _move(state, session, link, source, now)
+
+
+def path_proven(state: State, session: Session, question: Challenge, now: float) -> None:
+    """The peer answered a ping of ours from where that went: it is alive, and there."""
+    session.freshness.prove(now)
+    way = session.way
+    if question.in_use:
+        # The way in use works: whatever came from elsewhere was no move. If it has been left since, it is gone back to.
+        session.challenges.clear()
+    if (way.link, way.address) != (question.link, question.address):
+        _move(state, session, question.link, question.address, now)
+    heard(state, session, question.link, question.address, now)
+
+
+def _move(state: State, session: Session, link: str, source: Address, now: float) -> None:
+    """Datagrams go there from now on."""
+    info = state.links.get(link)
+    if info is None:
+        return
+    way = session.way
+    outbound = session.peer.outbound if session.peer is not None and session.peer.engaged else None
+    first = not way.link
     old = way.address
     before = way.fragment_bytes
     way.lead(link, source, info.mtu, state.settings.fragment_bytes)
@@ -296,6 +337,9 @@ def housekeep(state: State, now: float) -> None:
     state.housekept_at = now
     if asleep_s > ASLEEP_S:
         _excuse(state, asleep_s, now)
+    mismatch = state.mismatches.rest(now)
+    if mismatch is not None:
+        state.ledger.tell(mismatch)
     state.sent.feed(state.ledger.counters.bytes_sent, now)
     queue_share = state.crowd.queue_share(state.sent.per_s(now), now)
     peers = list(state.roster.peers.values())
@@ -310,9 +354,10 @@ def housekeep(state: State, now: float) -> None:
             _look_at(state, peer, now)
     for name in state.outboxes.peers():
         holding = state.roster.peers.get(name)
-        if holding is not None and holding.online:
+        if holding is not None and holding.online and not holding.settling:
             release_outbox(state, holding, now)
     for session in state.roster.not_current():
+        session.age_windows(now)
         if session.contested and session.peer is not None:
             # It may be taken back for as long as its name is remembered.
             session.inbound.unicasts.purge(now)
@@ -336,6 +381,7 @@ def _look_at(state: State, peer: Peer, now: float) -> None:
     if session is None:
         return
     rates = state.settings.rates
+    session.age_windows(now)
     quiet_s = now - session.last_heard
     deaf_s = now - session.unheard_since if session.unheard_since is not None else 0.0
     patience_s = max(rates.offline_s, MISSED_HEARTBEATS * session.interval_s)

@@ -8,6 +8,7 @@ again.
 from enum import Enum
 from typing import NamedTuple
 
+from udp_mesh.core.memory import PARTIAL_BYTES, Account, Memory
 from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.settings import Limits
 from udp_mesh.wire.frames import Fragment, MessageFlag, MessageHead
@@ -46,27 +47,39 @@ class Verdict(Enum):
     """It contradicts its head: refuse it."""
     FORGOTTEN = 6
     """Its earlier pieces were given up: it must be sent anew."""
+    EXPIRED = 7
+    """Its life is over: its sender has reported so, and expects no acknowledgement."""
 
 
 class _Partial:
-    __slots__ = ("bytes", "head", "pieces", "seen", "touched_at")
+    __slots__ = ("bytes", "expires_at", "head", "pieces", "seen", "touched_at")
 
     def __init__(self, now: float) -> None:
         self.pieces: dict[int, bytes] = {}
         self.head: MessageHead | None = None
         self.bytes = 0
+        self.expires_at = float("inf")
+        """When its sender gives it up, by our clock: not before the sender does."""
         self.touched_at = now
         self.seen = 0
         """Pieces at the last `purge`."""
 
 
+CHARGED_BYTES = 1 << 16
+"""Taken from the memory of all peers at a time: a piece alone costs no more than a comparison."""
+
+
 class Reassembly:
     """`bytes` is what all unfinished messages hold, at most `Limits.partial_bytes_per_peer`."""
 
-    __slots__ = ("_limits", "_partials", "bytes", "finished", "forgotten")
+    __slots__ = ("_account", "_charged", "_limits", "_partials", "bytes", "finished", "forgotten")
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: Limits, account: Account | None = None) -> None:
+        """`account` is what this peer holds of the memory of all (None: there is no such bound)."""
         self._limits = limits
+        self._account = account or Account(Memory(1 << 62))
+        self._charged = 0
+        """What `bytes` may reach before more is taken from the account."""
         self._partials: dict[int, _Partial] = {}
         self.bytes = 0
         self.finished = RangeSet()
@@ -78,9 +91,15 @@ class Reassembly:
     def set_limits(self, limits: Limits) -> None:
         self._limits = limits
 
-    def add(self, fragment: Fragment, now: float) -> Whole | Verdict:
-        """Take in one piece."""
+    def add(self, fragment: Fragment, now: float, late_s: float = 0.0) -> Whole | Verdict:
+        """Take in one piece, `late_s` longer on its way than others."""
         message_id, position, payload, head = fragment[:4]
+        expires_at = float("inf")
+        if head is not None and head.life_ms is not None:
+            expires_at = now + head.life_ms / 1000 - late_s
+            if expires_at <= now and message_id not in self.finished:
+                self.end(message_id)
+                return Verdict.EXPIRED
         partial = self._partials.get(message_id)
         if partial is None:
             if message_id in self.finished:
@@ -93,16 +112,17 @@ class Reassembly:
                 if head.fragments == 1:
                     self._finish(message_id)
                     return Whole(message_id, head, bytes(payload))
-            if len(self._partials) >= self._limits.partials_per_peer:
+            if len(self._partials) >= self._limits.partials_per_peer or not self._account.has_room(PARTIAL_BYTES):
                 return Verdict.FULL
             partial = self._partials[message_id] = _Partial(now)
+            self._account.take(PARTIAL_BYTES)
         pieces = partial.pieces
         if position in pieces:
             return Verdict.DUPLICATE
         size = len(payload)
-        if self.bytes + size + PIECE_OVERHEAD_BYTES > self._limits.partial_bytes_per_peer:
+        if self.bytes + size + PIECE_OVERHEAD_BYTES > self._charged and not self._charge(size + PIECE_OVERHEAD_BYTES):
             if not pieces:
-                del self._partials[message_id]
+                self.forget(message_id)
             return Verdict.FULL
         known = partial.head
         if head is not None:
@@ -110,6 +130,7 @@ class Reassembly:
                 self.forget(message_id)
                 return Verdict.TOO_LARGE
             known = partial.head = head
+            partial.expires_at = min(partial.expires_at, expires_at)
             if max(pieces, default=0) >= head.fragments:
                 self.forget(message_id)
                 return Verdict.CORRUPT
@@ -126,6 +147,9 @@ class Reassembly:
         if partial.bytes != known.size_bytes:
             self.forget(message_id)
             return Verdict.CORRUPT
+        if partial.expires_at <= now:
+            self.end(message_id)
+            return Verdict.EXPIRED
         body = b"".join([pieces[place] for place in range(known.fragments)])
         self.forget(message_id)
         self._finish(message_id)
@@ -142,7 +166,7 @@ class Reassembly:
             position in pieces
             or position >= partial.head.fragments
             or len(pieces) + 1 >= partial.head.fragments
-            or self.bytes + size + PIECE_OVERHEAD_BYTES > self._limits.partial_bytes_per_peer
+            or self.bytes + size + PIECE_OVERHEAD_BYTES > self._charged
             or partial.bytes + size > partial.head.size_bytes
         ):
             return False
@@ -157,7 +181,25 @@ class Reassembly:
         if partial is None:
             return False
         self.bytes -= partial.bytes + PIECE_OVERHEAD_BYTES * len(partial.pieces)
+        self._account.give_back(PARTIAL_BYTES)
+        spare = self._charged - self.bytes
+        if spare >= 2 * CHARGED_BYTES or not self.bytes:
+            self._charged = self.bytes
+            self._account.give_back(spare)
         return True
+
+    def _charge(self, more: int) -> bool:
+        """Whether so many bytes more may be held."""
+        if self.bytes + more > self._limits.partial_bytes_per_peer:
+            return False
+        needed = self.bytes + more - self._charged
+        allowed = self._limits.partial_bytes_per_peer - self._charged
+        for size in (min(max(needed, CHARGED_BYTES), allowed), needed):
+            if self._account.has_room(size):
+                self._account.take(size)
+                self._charged += size
+                return True
+        return False
 
     def end(self, message_id: int) -> None:
         """The message is over without being delivered (cancelled, refused): later pieces of it are duplicates."""
@@ -171,7 +213,9 @@ class Reassembly:
                 partial.seen = len(partial.pieces)
                 partial.touched_at = now
             idle_s = now - partial.touched_at
-            if idle_s > RELIABLE_PATIENCE_S:
+            if partial.expires_at <= now:
+                self.end(message_id)
+            elif idle_s > RELIABLE_PATIENCE_S:
                 self.forget(message_id)
                 self._remember(self.forgotten, message_id)
             elif (
@@ -200,7 +244,10 @@ class Reassembly:
         self._remember(self.finished, message_id)
 
     def _remember(self, numbers: RangeSet, message_id: int) -> None:
+        before = len(numbers)
         numbers.add(message_id)
-        if len(numbers) > self._limits.finished_ranges_per_peer:
+        if len(numbers) > self._limits.finished_ranges_per_peer or self._account.too_many_ranges(len(numbers)):
             # The oldest gap is given up: what would still fill it is older than thousands of finished messages.
             numbers.fill_lowest_gap()
+        if len(numbers) != before:
+            self._account.count_ranges(len(numbers) - before)

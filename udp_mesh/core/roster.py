@@ -6,12 +6,14 @@ session becomes its name's session: the first one, a restart, or a conflict.
 
 from enum import Enum
 
+from udp_mesh.core.boots import BootMemory
+from udp_mesh.core.memory import Memory
 from udp_mesh.core.session import Peer, Session
 from udp_mesh.core.settings import Settings
 from udp_mesh.crypto import Key, ReceiveChannel
 
 RETIRED_REMEMBERED = 16
-"""Earlier boots of a name that are never believed again; older recordings would need a key since rotated."""
+"""Earlier boots of a name that are still heard, to notice conflicts; of those before only what they counted is kept."""
 
 
 class Arrival(Enum):
@@ -21,7 +23,7 @@ class Arrival(Enum):
     RESTARTED = 2
     OWN_NAME = 3
     RETIRED = 4
-    """An earlier run of the name speaks again: a conflict, if it is alive."""
+    """An earlier run of the name speaks again: a conflict while the later one is there, else it is served again."""
     FULL = 5
 
 
@@ -30,10 +32,12 @@ class Roster:
 
     __slots__ = (
         "_aside",
+        "_boots",
         "_limits",
         "_strangers",
         "broadcast_tags",
         "data_tags",
+        "memory",
         "own_boot",
         "own_name",
         "peers",
@@ -49,11 +53,14 @@ class Roster:
         self._strangers: dict[bytes, None] = {}
         self._aside: dict[bytes, Session] = {}
         """Sessions that are no peer's, by boot id."""
+        self._boots = BootMemory()
+        self.memory = Memory(settings.limits.partial_bytes)
         self.data_tags: dict[int, list[tuple[ReceiveChannel, Session]]] = {}
         self.broadcast_tags: dict[int, list[tuple[ReceiveChannel, Session]]] = {}
 
     def apply(self, settings: Settings) -> None:
         self._limits = settings.limits
+        self.memory.set_limit(settings.limits.partial_bytes)
 
     def peer(self, name: str, settings: Settings) -> Peer | None:
         """The peer of a name, made when first asked for; None when there are too many."""
@@ -66,7 +73,8 @@ class Roster:
         """A session for a boot heard for the first time."""
         while len(self._strangers) >= self._limits.strangers:
             self.forget(self.sessions[next(iter(self._strangers))])
-        session = Session(name, boot_id, self.own_boot, keys, settings)
+        session = Session(name, boot_id, self.own_boot, keys, settings, self.memory)
+        self._boots.restore(session)
         self.sessions[boot_id] = self._aside[boot_id] = session
         self._strangers[boot_id] = None
         self._enter_tags(session)
@@ -84,7 +92,8 @@ class Roster:
         if peer is None:
             self.forget(session)
             return Arrival.FULL, None
-        if session.boot_id in peer.retired:
+        if session.replaced and peer.session is not None:
+            session.peer = peer
             return Arrival.RETIRED, peer
         return (Arrival.NEW if peer.session is None else Arrival.RESTARTED), peer
 
@@ -93,6 +102,7 @@ class Roster:
         old = peer.session
         if old is not None:
             peer.retired[old.boot_id] = None
+            old.replaced = True
             if len(peer.retired) > RETIRED_REMEMBERED:
                 oldest = next(iter(peer.retired))
                 del peer.retired[oldest]
@@ -106,7 +116,9 @@ class Roster:
         self._aside.pop(session.boot_id, None)
 
     def forget(self, session: Session) -> None:
-        """Drop a session and its channels."""
+        """Drop a session and its channels; what these counted is kept."""
+        self._boots.keep(session)
+        session.inbound.close()
         self.sessions.pop(session.boot_id, None)
         self._strangers.pop(session.boot_id, None)
         self._aside.pop(session.boot_id, None)

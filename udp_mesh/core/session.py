@@ -4,17 +4,38 @@ heard (a heartbeat, perhaps replayed) -> *proven* (it showed that it hears this 
 next run, or gone. Nothing but its heartbeat is believed before it is proven.
 """
 
+from typing import NamedTuple
+
 from udp_mesh.core.departure import Way
+from udp_mesh.core.freshness import ACCEPT_AGE_S, Freshness
 from udp_mesh.core.inbound import Inbound
+from udp_mesh.core.memory import Memory
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.settings import Address, Settings
 from udp_mesh.crypto import TO_ALL, Key, ReceiveChannel, SendChannel
-from udp_mesh.wire.frames import Ack, Frame, Heartbeat, Waiting
+from udp_mesh.wire.frames import Ack, Feature, Frame, Heartbeat, Waiting
 from udp_mesh.wire.limits import HEARD_TAG_BYTES, MAX_HEARD
+
+
+class Challenge(NamedTuple):
+    """A ping that proves a path once its pong comes from where it went."""
+
+    link: str
+    address: Address
+    asked_at: float
+    in_use: bool
+    """It went to the address in use."""
+
+
+ANSWER_WITHIN_S = 60.0
+"""Pongs are waited for this long: a path may be as slow as that."""
 
 STALE_PATH_S = 2.0
 """A path not heard for this long is left for one that is: two heartbeats."""
+
+FLOORS_REMEMBERED = 64
+"""Keys taken away of which a session remembers how far their numbers had come: years of rotations."""
 
 OWED_FRAMES = 64
 """Small frames (pongs, repairs asked for, refusals) waiting to leave to one peer; more is a flood of questions."""
@@ -41,6 +62,7 @@ class Peer:
         "_settings",
         "conflict_reported_at",
         "engaged",
+        "fielded_meters",
         "fielded_way",
         "held_until",
         "left",
@@ -52,6 +74,7 @@ class Peer:
         "outbound",
         "retired",
         "session",
+        "settling",
         "timer_at",
         "wants_at",
     )
@@ -68,6 +91,10 @@ class Peer:
         self.legacy = False
         self.fielded_way: tuple[Address, str, float] | None = None
         """Address and link from which a fielded program was heard last, and when."""
+        self.fielded_meters: Meters | None = None
+        """Where it speaks the fielded format: no session of it has any."""
+        self.settling = False
+        """A fielded program that has just started: what outboxes keep for it does not leave yet."""
         self.lost = True
         """Silent for `peer_lost_s`, or never heard: nothing waits for it but in an outbox."""
         self.online_since: float | None = None
@@ -107,11 +134,16 @@ class Session:
     """A boot id heard under a name."""
 
     __slots__ = (
+        "_forgotten_floor",
+        "_key_floors",
         "boot_id",
         "broadcast_channels",
+        "challenged_at",
+        "challenges",
         "contested",
         "data_channels",
         "features",
+        "freshness",
         "inbound",
         "interval_s",
         "introduced_at",
@@ -128,12 +160,24 @@ class Session:
         "peer_sends",
         "proven",
         "received_bytes",
+        "replaced",
+        "restored",
+        "timed",
         "unheard_since",
         "versions",
         "way",
     )
 
-    def __init__(self, name: str, boot_id: bytes, own_boot: bytes, keys: tuple[Key, ...], settings: Settings) -> None:
+    def __init__(
+        self,
+        name: str,
+        boot_id: bytes,
+        own_boot: bytes,
+        keys: tuple[Key, ...],
+        settings: Settings,
+        memory: Memory | None = None,
+    ) -> None:
+        """`memory` is that of all peers (None: only this session's own limits hold)."""
         self.name = name
         self.boot_id = boot_id
         self.peer: Peer | None = None
@@ -161,9 +205,22 @@ class Session:
         self.interval_s = settings.rates.heartbeat_s
         self.versions = (1, 1)
         self.features = 0
-        self.inbound = Inbound(settings.rates, settings.limits)
+        self.inbound = Inbound(settings.rates, settings.limits, memory or Memory(1 << 62))
         self.way = Way(SendChannel(keys[0], own_boot, boot_id))
         self.owed: list[Frame] = []
+        self.freshness = Freshness()
+        self.timed = False
+        """It dates what it sends."""
+        self.challenges: dict[int, Challenge] = {}
+        """Pings whose pongs prove a path, by token (`paths`)."""
+        self.challenged_at = float("-inf")
+        self.replaced = False
+        """Another run has had its name since."""
+        self.restored = False
+        """An earlier session for the same boot was forgotten meanwhile."""
+        self._key_floors: dict[tuple[bytes, bytes], int] = {}
+        """(key id, receiver) of keys taken away -> the number from which on datagrams are new."""
+        self._forgotten_floor = 0
         self.data_channels: list[ReceiveChannel] = []
         self.broadcast_channels: list[ReceiveChannel] = []
         self.set_keys(own_boot, keys)
@@ -174,14 +231,61 @@ class Session:
 
     def set_keys(self, own_boot: bytes, keys: tuple[Key, ...]) -> None:
         """The live keys: channels of keys that stay keep their replay windows; packet numbers go on across keys."""
-        data = {channel.key: channel for channel in self.data_channels}
-        broadcast = {channel.key: channel for channel in self.broadcast_channels}
-        self.data_channels = [data.get(key) or ReceiveChannel(key, self.boot_id, own_boot) for key in keys]
-        self.broadcast_channels = [broadcast.get(key) or ReceiveChannel(key, self.boot_id, TO_ALL) for key in keys]
+        self.data_channels = self._receive_channels(self.data_channels, own_boot, keys)
+        self.broadcast_channels = self._receive_channels(self.broadcast_channels, TO_ALL, keys)
         channel = self.way.channel
         if channel.key != keys[0]:
             self.way.channel = SendChannel(keys[0], own_boot, self.boot_id)
             self.way.channel.next_number = channel.next_number
+
+    def _receive_channels(
+        self, before: list[ReceiveChannel], receiver: bytes, keys: tuple[Key, ...]
+    ) -> list[ReceiveChannel]:
+        """A key that comes back finds its numbers where they were: what was sealed with it before is a recording."""
+        known = {channel.key: channel for channel in before}
+        floors = self._key_floors
+        for channel in before:
+            if channel.key not in keys:
+                floors[channel.key.key_id, channel.receiver_boot] = channel.window.next_new
+        while len(floors) > FLOORS_REMEMBERED:
+            self._forgotten_floor = max(self._forgotten_floor, floors.pop(next(iter(floors))))
+        channels = []
+        for key in keys:
+            kept = known.get(key)
+            if kept is None:
+                kept = ReceiveChannel(key, self.boot_id, receiver)
+                kept.window.raise_floor(floors.get((key.key_id, receiver), self._forgotten_floor))
+            channels.append(kept)
+        return channels
+
+    def floors(self) -> dict[tuple[bytes, bytes], int]:
+        """(key id, receiver) -> the number from which on datagrams are new, of every key there ever was."""
+        found = dict(self._key_floors)
+        for channels in (self.data_channels, self.broadcast_channels):
+            for channel in channels:
+                found[channel.key.key_id, channel.receiver_boot] = channel.window.next_new
+        return found
+
+    def restore_floors(self, floors: dict[tuple[bytes, bytes], int]) -> None:
+        """What `floors` said of this boot's earlier session."""
+        self._key_floors = dict(floors)
+        for channels in (self.data_channels, self.broadcast_channels):
+            for channel in channels:
+                channel.window.raise_floor(floors.get((channel.key.key_id, channel.receiver_boot), 0))
+
+    def is_fresh(self, now: float) -> bool:
+        """Whether something came lately that was no recording."""
+        return now - self.freshness.fresh_at <= ACCEPT_AGE_S
+
+    def age_windows(self, now: float) -> None:
+        """What was not received for long counts as seen; questions not answered for long are forgotten."""
+        for token, question in list(self.challenges.items()):
+            if now - question.asked_at > ANSWER_WITHIN_S:
+                del self.challenges[token]
+        for channel in self.data_channels:
+            channel.window.age(now)
+        for channel in self.broadcast_channels:
+            channel.window.age(now)
 
     @property
     def current(self) -> bool:
@@ -224,3 +328,4 @@ class Session:
         self.interval_s = beat.interval_ms / 1000
         self.versions = (beat.min_version, beat.max_version)
         self.features = beat.features
+        self.timed = self.way.timed = bool(beat.features & Feature.TIMED)

@@ -194,6 +194,8 @@ class Limits:
     """Senders seen but not yet proven fresh, or undecryptable: a flood of invented senders."""
     partial_bytes_per_peer: int = 128 << 20
     """Bytes of unfinished messages of one peer: messages begun and never finished."""
+    partial_bytes: int = 256 << 20
+    """The same of all peers, and their topics' names: a key holder inventing names."""
     partials_per_peer: int = 4096
     """Unfinished messages of one peer: as above, with tiny fragments."""
     finished_ranges_per_peer: int = 4096

@@ -16,6 +16,7 @@ from udp_mesh.core.ledger import Ledger
 from udp_mesh.core.limiter import Gate
 from udp_mesh.core.message import Channel
 from udp_mesh.core.meter import Meter
+from udp_mesh.core.mismatches import Mismatches
 from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.outbox import Outboxes
 from udp_mesh.core.roster import Roster
@@ -81,7 +82,7 @@ class State:
         self.timer_serial = 0
         self.housekeeping_at = now
         self.housekept_at = now
-        self.mismatch_reported: dict[tuple[str, int], float] = {}
+        self.mismatches = Mismatches()
         self.incompatible_reported: dict[bytes, float] = {}
         self.own_name_reported_at = float("-inf")
         self.closed = False

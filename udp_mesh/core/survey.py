@@ -39,6 +39,7 @@ def conditions(state: State, now: float) -> Conditions:
             duplicates_received=sum(inbound.duplicates for inbound in inbounds),
             fragments_retransmitted=sum(outbound.retransmitted for outbound in outbounds),
             fragments_sent=sum(outbound.sent_packets for outbound in outbounds),
+            dropped_stale=counters.dropped_stale + sum(inbound.expired for inbound in inbounds),
             dropped_over_limit=counters.dropped_over_limit + sum(inbound.over_limit for inbound in inbounds),
         ),
         sent_bits_per_s,
@@ -67,7 +68,7 @@ def _peer(state: State, peer: Peer, outbound: Outbound, now: float) -> PeerCondi
     held_messages, held_bytes = state.outboxes.count(peer.name)
     capacity = outbound.window.capacity()
     fragment_bytes = session.way.fragment_bytes if session is not None else state.settings.fragment_bytes
-    meters = session.meters if session is not None else None
+    meters = session.meters if session is not None else peer.fielded_meters
     address, link, last_heard = _way(peer)
     return PeerConditions(
         peer.name,

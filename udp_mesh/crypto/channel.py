@@ -138,10 +138,11 @@ class SendChannel(_Channel):
 class ReceiveChannel(_Channel):
     """Opens the datagrams of one sender boot to us (or to all), each packet number once."""
 
-    __slots__ = ("window",)
+    __slots__ = ("receiver_boot", "window")
 
     def __init__(self, key: Key, sender_boot: bytes, receiver_boot: bytes = TO_ALL) -> None:
         super().__init__(key, sender_boot, receiver_boot)
+        self.receiver_boot = receiver_boot
         self.window = ReplayWindow()
 
     def open(self, data: bytes | bytearray | memoryview, number_low: int) -> tuple[int, bytes]:

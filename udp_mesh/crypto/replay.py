@@ -12,18 +12,42 @@ WINDOW_PACKETS = (WINDOW_BLOCKS - 1) * BLOCK_BITS
 """4,032 packets: at a gigabit of full datagrams 45 ms of reordering, at 10 Mbit/s over 4 s; 512 B of memory per
 channel."""
 
+AGE_STEP_S = 5.0
+"""Half of what a slow route, a queue or a cut may hold a datagram back (`freshness.ACCEPT_AGE_S`)."""
+
 
 class ReplayWindow:
     """Equals a plain set of numbers, except that everything older than the window (or below its floor) counts as
     seen."""
 
-    __slots__ = ("_blocks", "_floor", "largest")
+    __slots__ = ("_aged_at", "_blocks", "_floor", "_newer", "_older", "largest")
 
     def __init__(self) -> None:
         self._blocks = [0] * WINDOW_BLOCKS
         self.largest = -1
         """Largest number accepted, -1 before the first."""
         self._floor = 0
+        self._aged_at: float | None = None
+        self._older = self._newer = -1
+        """The largest number one and two steps of `age` ago."""
+
+    @property
+    def next_new(self) -> int:
+        """From this number on nothing was accepted or ruled out."""
+        return max(self.largest + 1, self._floor)
+
+    def age(self, now: float) -> None:
+        """To be called now and then: what is below the largest number of two steps (10 s) ago counts as seen.
+
+        A lost datagram that somebody else overheard is worth nothing after that: its pieces were sent again under new
+        numbers long before.
+        """
+        if self._aged_at is None:
+            self._aged_at = now
+        elif now - self._aged_at >= AGE_STEP_S:
+            self._aged_at = now
+            self._floor = max(self._floor, self._older + 1)
+            self._older, self._newer = self._newer, self.largest
 
     def would_accept(self, number: int) -> bool:
         top = self.largest

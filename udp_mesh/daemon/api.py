@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import resource
 import socket
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, cast
@@ -31,9 +32,19 @@ REPLIES_BACKLOG_BYTES = 4 << 20
 """Bytes of replies beyond that: a program that asks without end and never reads the answers."""
 MAX_CLIENTS = 256
 """Connections at a time: a program that leaks them must not take the daemon's descriptors."""
+SPARE_CLIENTS = 8
+"""Connections beyond that, for one look at what is wrong: they may ask `LOOKS`, once and soon. For one more of them the
+oldest gives way."""
+LOOKS = ("status", "metrics")
+SPARE_S = 2.0
+HALF_SENT_S = 30.0
+"""A request that stops coming for this long is given up, and its connection closed."""
 DESCRIPTORS_KEPT = 40
 """Files for the daemon's own needs, whatever its limit: links, kernel's notices, outbox, recording, configuration, a
 scraper."""
+
+
+_CREDENTIALS = struct.Struct("iII")
 
 
 class RequestError(Exception):
@@ -57,8 +68,14 @@ class Requests(Protocol):
 class Client(asyncio.Protocol):
     """One connected program."""
 
-    def __init__(self, server: LocalServer) -> None:
+    def __init__(self, server: LocalServer, *, spare: bool = False) -> None:
         self._server = server
+        self.spare = spare
+        """Beyond the connections there may be: it gets one look."""
+        self.user: int | None = None
+        """Whose program it is; None where the kernel does not say."""
+        self._deadline: asyncio.TimerHandle | None = None
+        self._held_before = 0
         self._reader = RequestReader(server.max_payload_bytes)
         self._transport: asyncio.Transport | None = None
         self._dropped = 0
@@ -120,7 +137,16 @@ class Client(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
+        self.user = _user_of(transport.get_extra_info("socket"))
         self._server.connected(self)
+        if self.spare:
+            self._deadline = asyncio.get_running_loop().call_later(SPARE_S, self.turn_away)
+
+    def turn_away(self) -> None:
+        """There is no room for it."""
+        self._server.spares.pop(self, None)
+        self.refuse(None, "too-many-clients", self._server.too_many())
+        self.close()
 
     def data_received(self, data: bytes) -> None:
         for frame in self._reader.feed(data):
@@ -131,16 +157,43 @@ class Client(asyncio.Protocol):
         if self._server.too_much_half_sent(self.half_sent()):
             text = f"local programs have begun to send more than {HALF_SENT_BYTES >> 20} MiB at a time: try again"
             self.refuse(*self._reader.give_up("busy", text))
+        self._watch_half_sent()
         transport = self._transport
         if transport is not None and transport.get_write_buffer_size() > CLIENT_BACKLOG_BYTES + REPLIES_BACKLOG_BYTES:
             transport.pause_reading()
 
+    def _watch_half_sent(self) -> None:
+        """While a request is not here whole, some of the rest must come now and then."""
+        if self.spare:
+            return
+        held = self.half_sent()
+        if held and self._deadline is None:
+            self._held_before = held
+            self._deadline = asyncio.get_running_loop().call_later(HALF_SENT_S, self._look_at_half_sent)
+        elif not held and self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
+
+    def _look_at_half_sent(self) -> None:
+        self._deadline = None
+        if self.half_sent() == self._held_before:
+            self.refuse(None, "too-slow", f"a request stopped coming for {HALF_SENT_S:g} s")
+            self.close()
+        else:
+            self._watch_half_sent()
+
     def _handle(self, frame: Frame) -> None:
         header, payload = frame
+        if self.spare and header.get("op") not in LOOKS:
+            self.refuse(header.get("id"), "too-many-clients", self._server.too_many())
+            self.close()
+            return
         try:
             self._server.requests.request(self, header, payload)
         except RequestError as error:
             self.refuse(header.get("id"), error.code, str(error))
+        if self.spare:
+            self.close()
 
     def resume_writing(self) -> None:
         # What was written is read, all but a few kilobytes.
@@ -151,7 +204,10 @@ class Client(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None
+        if self._deadline is not None:
+            self._deadline.cancel()
         self._server.clients.discard(self)
+        self._server.spares.pop(self, None)
         self._server.requests.client_gone(self)
 
 
@@ -163,6 +219,8 @@ class LocalServer:
     ) -> None:
         self.requests = requests
         self.clients: set[Client] = set()
+        self.spares: dict[Client, None] = {}
+        """Connections beyond the most, the oldest first."""
         self.max_payload_bytes = max_payload_bytes
         self.dropped_for_slow_clients = 0
         self._listener = Listener(path, mode=mode, group=group, take=self._take)
@@ -177,13 +235,15 @@ class LocalServer:
 
     def _take(self, connection: socket.socket) -> None:
         """A program has connected."""
-        if len(self.clients) + len(self._connecting) >= self._most:
-            text = f"at most {self._most} programs connect at a time"
+        making = sum(not client.spare for client in self._connecting)
+        spare = len(self.clients) + making >= self._most
+        if spare and len(self._connecting) - making >= 2 * SPARE_CLIENTS:
             # What cannot be written at once to a fresh connection is not worth waiting for.
             with connection, contextlib.suppress(OSError):
-                connection.send(encode_frame({"event": "rejected", "code": "too-many-clients", "error": text}, b""))
+                rejected = {"event": "rejected", "code": "too-many-clients", "error": self.too_many()}
+                connection.send(encode_frame(rejected, b""))
             return
-        client = Client(self)
+        client = Client(self, spare=spare)
         self._connecting[client] = asyncio.get_running_loop().create_task(self._connect(client, connection))
 
     async def _connect(self, client: Client, connection: socket.socket) -> None:
@@ -197,7 +257,16 @@ class LocalServer:
     def connected(self, client: Client) -> None:
         """A program's connection can be used."""
         self._connecting.pop(client, None)
-        self.clients.add(client)
+        if client.spare:
+            self.spares[client] = None
+            if len(self.spares) > SPARE_CLIENTS:
+                next(iter(self.spares)).turn_away()
+        else:
+            self.clients.add(client)
+
+    def too_many(self) -> str:
+        """Why a program is turned away."""
+        return f"at most {self._most} programs connect at a time"
 
     def too_much_for(self, waiting: int) -> bool:
         """Whether a client for which so many bytes wait must not get more for all others' sake."""
@@ -215,9 +284,22 @@ class LocalServer:
         """Stops listening, lets what is written be read, closes every connection, removes the socket's file."""
         self._listener.close()
         await asyncio.gather(*self._connecting.values())
-        for client in list(self.clients):
+        for client in [*self.clients, *self.spares]:
             client.close()
         await asyncio.sleep(0)
+
+
+def _user_of(connection: socket.socket | None) -> int | None:
+    """The user id of the program at the other end (unix(7), SO_PEERCRED)."""
+    if connection is None:
+        return None
+    try:
+        _, user, _ = _CREDENTIALS.unpack(
+            connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+        )
+    except OSError:
+        return None
+    return int(user)
 
 
 def descriptors_for(wanted: int) -> int:

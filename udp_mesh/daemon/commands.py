@@ -6,9 +6,11 @@ docs/local-api.md shows every request with its reply.
 
 from __future__ import annotations
 
-from collections.abc import Awaitable
+import os
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from udp_mesh import __version__
 from udp_mesh.client.mesh_client import Header
@@ -19,10 +21,12 @@ from udp_mesh.daemon.configuration import (
     CONDITIONS_TOPIC,
     MAX_PING_S,
     RESERVED_PREFIX,
+    load,
     read_keys,
     read_rates,
     topic_from_values,
 )
+from udp_mesh.daemon.files import FILE_S, is_below, off_loop
 from udp_mesh.daemon.neighbours import (
     NODE_NAME,
     TOPIC_NAME,
@@ -36,6 +40,13 @@ from udp_mesh.daemon.status import conditions_json, plain, show_address, topic_j
 from udp_mesh.daemon.toml_source import ConfigurationError, Source, Table
 from udp_mesh.wire.header import VERSION as WIRE_VERSION
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
+
+MAX_NEIGHBOURS = 1024
+"""Fixed neighbours: each gets every heartbeat. As many as there may be peers."""
+MAX_TOPICS = 4096
+"""Topics declared by commands: a program that invents names."""
+
+Result = TypeVar("Result")
 
 # Reading a request's fields
 
@@ -224,6 +235,8 @@ def set_topic(service: Service, _client: Client, header: Header, _: bytes) -> He
     except ConfigurationError as error:
         raise _refusal(error) from error
     others = tuple(other for other in settings.topics if other.name != name)
+    if len(others) >= MAX_TOPICS:
+        raise RequestError("too-many", f"expected at most {MAX_TOPICS} topics")
     return _changed(service, replace(settings, topics=(*others, topic)))
 
 
@@ -260,6 +273,8 @@ def set_neighbour(service: Service, _client: Client, header: Header, _: bytes) -
     if neighbour is None:
         raise RequestError("bad-request", str(_refusal(ConfigurationError(source.problems))))
     others = tuple(other for other in settings.neighbours if other.address != neighbour.address)
+    if len(others) >= MAX_NEIGHBOURS:
+        raise RequestError("too-many", f"expected at most {MAX_NEIGHBOURS} neighbours")
     return _changed(service, replace(settings, neighbours=(*others, neighbour)))
 
 
@@ -276,29 +291,40 @@ def neighbours(service: Service, _client: Client, _header: Header, _: bytes) -> 
     return {"neighbours": [plain(neighbour) for neighbour in service.settings.neighbours]}
 
 
-def set_keys(service: Service, _client: Client, header: Header, _: bytes) -> Header:
-    """Takes the keys of a key file, so that no key crosses the socket."""
-    path = Path(_text(header, "file"))
+async def _from_files(work: Callable[[], Result]) -> Result:
+    """What is read from files; a disk that does not answer costs the request alone. Raises RequestError."""
     try:
-        keys = read_keys(path)
+        return await off_loop(work)
     except ConfigurationError as error:
         raise _refusal(error) from error
+    except TimeoutError as error:
+        raise RequestError("too-slow", f"the file was not read within {FILE_S:g} s") from error
+
+
+async def set_keys(service: Service, _client: Client, header: Header, _: bytes) -> Header:
+    """Takes the keys of a key file, so that no key crosses the socket."""
+    path = Path(_text(header, "file"))
+    keys = await _from_files(lambda: read_keys(path))
     changes = service.apply(replace(service.settings, keys=keys, unkeyed=False))
     return {"changes": changes, "keys": [key.key_id.hex() for key in keys]}
 
 
-def reload(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
-    try:
-        return {"changes": service.reload()}
-    except ConfigurationError as error:
-        raise _refusal(error) from error
+async def reload(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
+    file = service.configured_file()
+    return {"changes": service.apply_file(await _from_files(lambda: load(file)))}
 
 
 # Recording
 
 
-def record_start(service: Service, _client: Client, header: Header, _: bytes) -> Header:
-    service.start_recording(Path(_text(header, "path")), bool(header.get("payloads")))
+async def record_start(service: Service, client: Client, header: Header, _: bytes) -> Header:
+    path, payloads = Path(_text(header, "path")), bool(header.get("payloads"))
+    service.may_record()
+    directory = service.configuration.daemon.state_directory
+    if client.user not in (0, os.geteuid()) and not await _from_files(lambda: is_below(path, directory)):
+        # The daemon may write where that program may not.
+        raise RequestError("cannot-record", f"{path}: other users' programs record below {directory} only")
+    service.start_recording(path, payloads)
     return {}
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import ipaddress
+import logging
 import os
 import re
 import socket
@@ -26,6 +27,7 @@ from udp_mesh.core.settings import (
     Topic,
 )
 from udp_mesh.crypto import Key
+from udp_mesh.daemon.files import is_exposed, read_regular
 from udp_mesh.daemon.neighbours import (
     NODE_NAME,
     TOPIC_NAME,
@@ -38,6 +40,8 @@ from udp_mesh.daemon.neighbours import (
 from udp_mesh.daemon.toml_source import ConfigurationError, Problem, Source, Table, parse
 from udp_mesh.links.attachments import EVERY_INTERFACE, LinkWish
 from udp_mesh.wire.limits import MAX_MESSAGE_BYTES
+
+log = logging.getLogger(__name__)
 
 DEFAULT_PATH = Path("/etc/udp-mesh/udp-mesh.toml")
 DEFAULT_SOCKET = Path("/run/udp-mesh/udp-mesh.sock")
@@ -132,22 +136,29 @@ def read_keys(path: Path) -> tuple[Key, ...]:
         if not words:
             continue
         try:
-            keys.append(Key.parse(words))
+            key = Key.parse(words)
         except ValueError as error:
             expected, _, found = str(error).removeprefix("expected ").partition(", found ")
             problems.append(Problem(str(path), number, "", expected, found))
+            continue
+        if not any(key.secret):
+            problems.append(Problem(str(path), number, "", "a random key (udp-mesh keygen)", "nothing but zeros"))
+        keys.append(key)
     if not problems and not 1 <= len(keys) <= 2:
         problems.append(Problem(str(path), 1, "", "one or two keys, one per line", f"{len(keys)}"))
+    elif len(set(keys)) < len(keys):
+        problems.append(Problem(str(path), 0, "", "two different keys", "the same key twice"))
     if problems:
         raise ConfigurationError(problems)
+    if is_exposed(path):
+        log.warning("key-file-exposed path=%s every user of this computer can read it: chmod 600", path)
     return tuple(keys)
 
 
 def _read_text(path: Path) -> str:
     name = str(path)
     try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_FILE_BYTES + 1)
+        raw = read_regular(path, MAX_FILE_BYTES)
     except OSError as error:
         raise ConfigurationError([Problem(name, 0, "", "a readable file", f"{error.strerror}")]) from error
     if len(raw) > MAX_FILE_BYTES:

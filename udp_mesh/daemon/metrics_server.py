@@ -14,7 +14,8 @@ REQUEST_BYTES = 8192
 REQUEST_S = 5.0
 """A connection that says nothing is closed."""
 CONNECTIONS = 8
-"""At a time; more scrapers wait, or are turned away: they must not take the daemon's descriptors."""
+"""At a time, for the daemon's descriptors' sake. For one more the oldest gives way: a scraper asks at once, and
+who holds connections without asking must not keep it out."""
 
 
 class MetricsServer:
@@ -24,7 +25,7 @@ class MetricsServer:
         self._address = address
         self._render = render
         self._server: asyncio.Server | None = None
-        self._open = 0
+        self._open: dict[asyncio.StreamWriter, None] = {}
 
     async def start(self) -> None:
         """Raises OSError where the port is taken."""
@@ -33,10 +34,12 @@ class MetricsServer:
         self._server = await asyncio.start_server(self._answer, host, port, limit=REQUEST_BYTES, backlog=CONNECTIONS)
 
     async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._open += 1
+        self._open[writer] = None
+        if len(self._open) > CONNECTIONS:
+            oldest = next(iter(self._open))
+            del self._open[oldest]
+            oldest.transport.abort()
         try:
-            if self._open > CONNECTIONS:
-                return
             async with asyncio.timeout(REQUEST_S):
                 request = await reader.readuntil(b"\r\n\r\n")
                 method, _, rest = request.partition(b"\r\n")[0].partition(b" ")
@@ -52,7 +55,7 @@ class MetricsServer:
             # A scraper that went away or never asked: nothing to answer.
             return
         finally:
-            self._open -= 1
+            self._open.pop(writer, None)
             writer.close()
 
     async def close(self) -> None:

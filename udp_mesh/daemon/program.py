@@ -19,7 +19,8 @@ from typing import Any
 
 from udp_mesh.daemon.api import LocalServer, RequestError
 from udp_mesh.daemon.commands import COMMANDS, render_metrics
-from udp_mesh.daemon.configuration import Configuration
+from udp_mesh.daemon.configuration import Configuration, load
+from udp_mesh.daemon.files import FILE_S, off_loop
 from udp_mesh.daemon.metrics_server import MetricsServer
 from udp_mesh.daemon.notify import Notifier
 from udp_mesh.daemon.privileges import drop_privileges
@@ -74,7 +75,14 @@ async def _serve(service: Service, notifier: Notifier) -> None:
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    loop.add_signal_handler(signal.SIGHUP, _reload, service, notifier)
+    reloads: set[asyncio.Task[None]] = set()
+
+    def reload() -> None:
+        task = loop.create_task(_reload(service, notifier))
+        reloads.add(task)
+        task.add_done_callback(reloads.discard)
+
+    loop.add_signal_handler(signal.SIGHUP, reload)
     loop.set_exception_handler(_report_bug)
     # A daemon that hangs on a robot far away: SIGUSR1 writes where to its log.
     faulthandler.register(signal.SIGUSR1)
@@ -99,16 +107,19 @@ def _report_bug(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     log.error("bug message=%s", context.get("message"), exc_info=context.get("exception"))
 
 
-def _reload(service: Service, notifier: Notifier) -> None:
+async def _reload(service: Service, notifier: Notifier) -> None:
     """On SIGHUP: a file with problems changes nothing, and each problem is logged."""
     notifier.reloading()
     try:
-        changes = service.reload()
+        file = service.configured_file()
+        changes = service.apply_file(await off_loop(lambda: load(file)))
     except ConfigurationError as error:
         for problem in error.problems:
             log.error("reload-refused %s", problem)
     except RequestError as error:
         log.error("reload-refused %s", error)
+    except TimeoutError:
+        log.error("reload-refused the files were not read within %g s", FILE_S)
     else:
         log.info("reloaded changes=%d %s", len(changes), "; ".join(changes))
     notifier.ready(_status(service))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from math import isfinite
 from typing import NamedTuple
 
 from udp_mesh.client.mesh_client import MAX_HEADER_BYTES, Frame, Header, MeshError, parse_header
@@ -111,6 +112,8 @@ def _header(raw: bytes) -> Header:
     """As `parse_header`, with an id that can be sent back."""
     header = parse_header(raw)
     request_id = header.get("id")
-    if isinstance(request_id, bool) or not isinstance(request_id, int | float | str | None):
+    # What JSON cannot write (NaN, Infinity) cannot be sent back either.
+    is_odd = isinstance(request_id, bool) or (isinstance(request_id, float) and not isfinite(request_id))
+    if is_odd or not isinstance(request_id, int | float | str | None):
         raise MeshError("bad-frame", "id: expected a number or text, found something else")
     return header

@@ -49,6 +49,8 @@ MAX_OUTCOMES = 65_536
 """Messages whose outcome somebody waits for: publishers that ask and never read."""
 MAX_COUNTED_TOPICS = 4096
 """Topics with counts of their own: a key holder inventing names."""
+MAX_PATTERNS = 1024
+"""Patterns one program subscribes to: each is held against each new topic."""
 TOKEN_BYTES = 8
 
 
@@ -143,7 +145,10 @@ class Service:
     def subscribe(self, client: Client, patterns: list[str]) -> None:
         wanted = self._subscriptions.setdefault(client, [])
         # A program that subscribes again and again wants each pattern once.
-        wanted.extend(pattern for pattern in dict.fromkeys(patterns) if pattern not in wanted)
+        new = [pattern for pattern in dict.fromkeys(patterns) if pattern not in wanted]
+        if len(wanted) + len(new) > MAX_PATTERNS:
+            raise RequestError("too-many", f"expected at most {MAX_PATTERNS} patterns of one program")
+        wanted.extend(new)
         self._routes.clear()
 
     def unsubscribe(self, client: Client, patterns: list[str]) -> None:
@@ -229,14 +234,21 @@ class Service:
         return changes
 
     def reload(self) -> list[str]:
-        """Reads the configuration's file again and applies it, all or nothing; raises ConfigurationError, RequestError.
+        """Reads the configuration's file again and applies it; raises ConfigurationError, RequestError."""
+        return self.apply_file(load(self.configured_file()))
+
+    def configured_file(self) -> Path:
+        """The configuration's file. Raises RequestError where there is none."""
+        if self.configuration.file is None:
+            raise RequestError("no-file", "this daemon was started without a configuration file")
+        return self.configuration.file
+
+    def apply_file(self, fresh: Configuration) -> list[str]:
+        """Applies what was read again, all or nothing; raises RequestError.
 
         Changes made by commands since the last reload give way to the file. What only a restart can change is said.
         """
-        file = self.configuration.file
-        if file is None:
-            raise RequestError("no-file", "this daemon was started without a configuration file")
-        fresh, running = load(file), self.configuration
+        running = self.configuration
         notes: list[str] = []
         settings = fresh.settings
         for name in ("name", "port"):
@@ -254,10 +266,14 @@ class Service:
 
     # Recording
 
-    def start_recording(self, path: Path, payloads: bool) -> None:
-        """Raises RequestError where one is running or the file cannot be made."""
+    def may_record(self) -> None:
+        """Raises RequestError where a recording is running."""
         if self.recorder is not None and self.recorder.open:
             raise RequestError("already-recording", f"already recording to {self.recorder.path}")
+
+    def start_recording(self, path: Path, payloads: bool) -> None:
+        """Raises RequestError where one is running or the file cannot be made."""
+        self.may_record()
         try:
             self.recorder = Recorder(
                 path,

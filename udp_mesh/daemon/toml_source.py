@@ -142,6 +142,8 @@ def parse(text: str, file: str) -> Table:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigurationError([_syntax_problem(text, file, str(error))]) from error
+    except RecursionError as error:
+        raise ConfigurationError([Problem(file, 0, "", "values within a few brackets", "hundreds of them")]) from error
     return Table(values, Source(file, locate(text)), ())
 
 

@@ -20,6 +20,7 @@ def main(arguments: Sequence[str]) -> int:
     from udp_mesh.report.figures import summary
     from udp_mesh.report.page import write_page
     from udp_mesh.report.recording import RecordingError, read
+    from udp_mesh.report.terminal import clean
 
     parser = argparse.ArgumentParser(
         prog="udp-mesh report",
@@ -37,14 +38,14 @@ def main(arguments: Sequence[str]) -> int:
         recordings = [read(path) for path in chosen.recording]
         write_page(recordings, chosen.out, chosen.title)
     except RecordingError as error:
-        print(f"udp-mesh: {error}", file=sys.stderr)
+        print(f"udp-mesh: {clean(str(error))}", file=sys.stderr)
         return 2
     except OSError as error:
         print(f"udp-mesh: {error.filename}: {error.strerror}", file=sys.stderr)
         return 2
     for recording in recordings:
         for problem in recording.problems[:SHOWN_PROBLEMS]:
-            print(f"udp-mesh: warning: {problem}", file=sys.stderr)
+            print(f"udp-mesh: warning: {clean(str(problem))}", file=sys.stderr)
         more = len(recording.problems) - SHOWN_PROBLEMS
         if more > 0:
             print(f"udp-mesh: warning: ... and {more} more lines that cannot be read", file=sys.stderr)

@@ -31,6 +31,7 @@ from udp_mesh.wire.frames import (
     Pong,
     Refused,
     RefuseReason,
+    Sent,
     TopicAnnounce,
     Waiting,
 )
@@ -49,6 +50,8 @@ class Type(IntEnum):
     PING = 8
     PONG = 9
     BYE = 10
+    SENT = 12
+    """11 stays free: the first version's tests take it for a type nobody knows."""
 
 
 FRAGMENT = 0x80
@@ -58,7 +61,9 @@ FRAGMENT_ACK_NOW = 0x04
 FRAGMENT_WIDE = 0x08
 """The position takes 32 bits instead of 16."""
 FRAGMENT_BROADCAST_ID = 0x10
-_FRAGMENT_KNOWN = 0x80 | 0x1F
+FRAGMENT_HAS_LIFE = 0x20
+"""The head ends with the message's remaining life."""
+_FRAGMENT_KNOWN = 0x80 | 0x3F
 
 _NARROW = struct.Struct(">BIH")
 _WIDE = struct.Struct(">BII")
@@ -75,8 +80,15 @@ LENGTH_BYTES = _LENGTH.size
 HEAD_BYTES = _HEAD.size
 """16 B more in the fragment at position 0."""
 
+LIFE_BYTES = 4
+"""4 B more in a head that says how much longer its message may live."""
+SENT_BYTES = 5
+"""The frame `Sent`."""
+
 _NO_EXTENSION = b"\x00"
 """Length of what later versions may add to a heartbeat; a reader skips what it does not know."""
+_CLOCK = struct.Struct(">I")
+"""The first field of the extension: the speaker's clock."""
 
 _BITMAP_ONES = (1 << limits.ACK_BITMAP_BITS) - 1
 
@@ -115,7 +127,7 @@ def encode_fragment(fragment: Fragment, *, last: bool = True) -> bytes:
     if not last:
         first |= FRAGMENT_HAS_LENGTH
     if head is not None:
-        first |= FRAGMENT_HAS_HEAD
+        first |= FRAGMENT_HAS_HEAD if head.life_ms is None else FRAGMENT_HAS_HEAD | FRAGMENT_HAS_LIFE
     if position < 65_536:
         parts.append(_NARROW.pack(first, message_id, position))
     else:
@@ -134,7 +146,12 @@ def _encode_head(head: MessageHead) -> bytes:
     if head.fragments > limits.MAX_FRAGMENTS_PER_MESSAGE or not 0 <= head.priority < limits.PRIORITY_LEVELS:
         raise ValueError(f"no such message: {head.fragments} fragments, priority {head.priority}")
     age_ms = min(head.age_ms, 0xFFFFFFFF)
-    return _HEAD.pack(head.size_bytes, head.fragments, age_ms, head.topic_id, head.priority, head.flags)
+    packed = _HEAD.pack(head.size_bytes, head.fragments, age_ms, head.topic_id, head.priority, head.flags)
+    if head.life_ms is None:
+        return packed
+    if head.life_ms < 1:
+        raise ValueError(f"no such message: {head.life_ms} ms to live")
+    return packed + min(head.life_ms, 0xFFFFFFFF).to_bytes(LIFE_BYTES, "big")
 
 
 def _encode_frame(frame: Frame, *, last: bool) -> bytes:
@@ -168,6 +185,8 @@ def _encode_frame(frame: Frame, *, last: bool) -> bytes:
             return struct.pack(">BQI", Type.PONG, token, held_us)
         case Bye(reason):
             return bytes((Type.BYE,)) + encode_text(reason, limits.MAX_REASON_BYTES, "reason")
+        case Sent(clock_ms):
+            return struct.pack(">BI", Type.SENT, clock_ms)
         case _:
             assert_never(frame)
 
@@ -207,7 +226,7 @@ def _encode_heartbeat(beat: Heartbeat) -> bytes:
             bytes((len(beat.heard),)),
             *beat.heard,
             _encode_waiting(beat.waiting),
-            _NO_EXTENSION,
+            _NO_EXTENSION if beat.clock_ms is None else b"\x04" + _CLOCK.pack(beat.clock_ms),
         )
     )
 
@@ -266,7 +285,9 @@ def _decode_fragment(first: int, reader: Reader) -> Fragment:
     position = reader.integer(4 if first & FRAGMENT_WIDE else 2, "fragment position")
     if position >= limits.MAX_FRAGMENTS_PER_MESSAGE or (first & FRAGMENT_WIDE and position < 65_536):
         raise DecodeError(f"fragment position: {position} is out of range")
-    head = _decode_head(reader) if first & FRAGMENT_HAS_HEAD else None
+    if first & FRAGMENT_HAS_LIFE and not first & FRAGMENT_HAS_HEAD:
+        raise DecodeError("fragment: expected a remaining life only in a head")
+    head = _decode_head(reader, with_life=first & FRAGMENT_HAS_LIFE != 0) if first & FRAGMENT_HAS_HEAD else None
     if (head is None) != (position != 0):
         raise DecodeError(f"fragment: expected a head exactly at position 0, found position {position}")
     count = reader.integer(2, "fragment length") if first & FRAGMENT_HAS_LENGTH else reader.remaining()
@@ -286,7 +307,7 @@ def _decode_fragment(first: int, reader: Reader) -> Fragment:
     return Fragment(message_id, position, payload, head, ack_now, broadcast_id)
 
 
-def _decode_head(reader: Reader) -> MessageHead:
+def _decode_head(reader: Reader, *, with_life: bool) -> MessageHead:
     size_bytes = reader.at_most(4, limits.MAX_MESSAGE_BYTES, "message size")
     fragments = reader.at_most(4, limits.MAX_FRAGMENTS_PER_MESSAGE, "number of fragments")
     if not 1 <= fragments <= max(1, size_bytes):
@@ -294,7 +315,11 @@ def _decode_head(reader: Reader) -> MessageHead:
     age_ms = reader.integer(4, "message age")
     topic_id = reader.integer(2, "topic id")
     priority = reader.at_most(1, limits.PRIORITY_LEVELS - 1, "priority")
-    return MessageHead(size_bytes, fragments, topic_id, priority, reader.integer(1, "message flags"), age_ms)
+    flags = reader.integer(1, "message flags")
+    life_ms = reader.integer(LIFE_BYTES, "remaining life") if with_life else None
+    if life_ms == 0:
+        raise DecodeError("remaining life: expected at least 1 ms, found 0")
+    return MessageHead(size_bytes, fragments, topic_id, priority, flags, age_ms, life_ms)
 
 
 def _decode_heartbeat(reader: Reader) -> Heartbeat:
@@ -312,8 +337,9 @@ def _decode_heartbeat(reader: Reader) -> Heartbeat:
     tags = bytes(reader.take(count * limits.HEARD_TAG_BYTES, "heard boots"))
     heard = tuple([tags[at : at + limits.HEARD_TAG_BYTES] for at in range(0, len(tags), limits.HEARD_TAG_BYTES)])
     waiting = _decode_waiting(reader)
-    reader.take(reader.integer(1, "extension length"), "heartbeat extension")
-    return Heartbeat(name, low, high, features, interval_ms, known, rate, number, messages, heard, waiting)
+    extension = reader.take(reader.integer(1, "extension length"), "heartbeat extension")
+    clock_ms = _CLOCK.unpack_from(extension)[0] if len(extension) >= _CLOCK.size else None
+    return Heartbeat(name, low, high, features, interval_ms, known, rate, number, messages, heard, waiting, clock_ms)
 
 
 def _decode_waiting(reader: Reader) -> tuple[Waiting, ...]:
@@ -392,4 +418,5 @@ _DECODERS: dict[int, Callable[[Reader], Frame]] = {
     Type.PING: lambda reader: Ping(reader.integer(8, "ping token")),
     Type.PONG: lambda reader: Pong(reader.integer(8, "pong token"), reader.integer(4, "pong hold time")),
     Type.BYE: lambda reader: Bye(reader.text(limits.MAX_REASON_BYTES, "reason")),
+    Type.SENT: lambda reader: Sent(reader.integer(4, "clock")),
 }

@@ -3,8 +3,8 @@
 A datagram carries one or more frames. Discovery: `Heartbeat` (to all, or to one peer as an introduction), `Bye`.
 Messages: `TopicAnnounce` gives a number to a topic, `Fragment` carries a piece of a message (the first piece carries
 the `MessageHead`), `Delivered`, `Refused` and `Cancel` end it. Reliability: `Ack` answers packets, `Nack` asks for
-missing pieces of a broadcast. `Ping` and `Pong` measure. Fields that come from the wire have already passed the caps
-of `limits`; a constructor checks nothing.
+missing pieces of a broadcast. `Ping` and `Pong` prove a path, `Sent` dates a datagram. Fields that come from the wire
+have already passed the caps of `limits`; a constructor checks nothing.
 
 Numbers: a *packet number* counts the datagrams of one channel (sender's boot to one receiver's boot, or to all),
 starts at 0 and is never used twice; a *message id* counts the messages of one such channel and is the same in every
@@ -27,6 +27,8 @@ class Feature(IntFlag):
     """Takes messages compressed with zlib (RFC 1950)."""
     REPAIR = 2
     """Asks for lost broadcasts with `Nack`, and answers it."""
+    TIMED = 4
+    """Takes `Sent` and a head's remaining life, stamps what it sends, and answers a ping where it came from."""
 
 
 class Waiting(NamedTuple):
@@ -63,6 +65,8 @@ class Heartbeat:
     heard: tuple[bytes, ...] = ()
     """First 8 bytes of the boot ids heard lately: a node finds itself here and knows the link works both ways."""
     waiting: tuple[Waiting, ...] = ()
+    clock_ms: int | None = None
+    """The speaker's clock as in `Sent`; None where its version does not say."""
 
 
 class MessageFlag(IntFlag):
@@ -94,6 +98,8 @@ class MessageHead:
     """Bits of `MessageFlag`."""
     age_ms: int = 0
     """How long ago the message was accepted for sending, when this copy left; up to 2**32-1 ms (49 days)."""
+    life_ms: int | None = None
+    """How much longer it is worth delivering, when this copy left, at least 1; None: no deadline, or not said."""
 
 
 class Fragment(NamedTuple):
@@ -197,10 +203,20 @@ class Pong:
 
 
 @dataclass(frozen=True, slots=True)
+class Sent:
+    """When this datagram left, by the sender's own clock: only differences mean something."""
+
+    clock_ms: int
+    """Milliseconds, modulo 2**32."""
+
+
+@dataclass(frozen=True, slots=True)
 class Bye:
     """The speaker stops in order; peers report it offline at once."""
 
     reason: str = ""
 
 
-Frame: TypeAlias = Heartbeat | Fragment | Ack | Delivered | Refused | Cancel | Nack | TopicAnnounce | Ping | Pong | Bye
+Frame: TypeAlias = (
+    Heartbeat | Fragment | Ack | Delivered | Refused | Cancel | Nack | TopicAnnounce | Ping | Pong | Bye | Sent
+)

@@ -9,6 +9,7 @@ the rest of `wire`.
 
 from __future__ import annotations
 
+import re
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
@@ -29,9 +30,25 @@ LEGACY_OVERHEAD_BYTES = _HEADER.size + 1
 """Header and the trailing byte of a disabled checksum."""
 BROADCAST_SEQUENCE = 0x8000
 """High bit of a sequence number: counts messages to all; unicast numbers run 1 to 0x7fff per peer and wrap to 1."""
+LAST_SEQUENCE = 0x7FFF
+"""Unicast sequence numbers run from 1 to this, then from 1 again."""
 _HOST = struct.Struct("<64p16p")
 _NAME_CAPACITY_BYTES = 63
 _ADDRESS_CAPACITY_BYTES = 15
+
+
+_ROS_NAME = re.compile(r"[A-Za-z/][A-Za-z0-9_/]*")
+_ROS_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
+
+
+def is_ros_name(name: str) -> bool:
+    """Whether ROS 1 takes this as the name of a topic (wiki.ros.org/Names), relative or global."""
+    return _ROS_NAME.fullmatch(name) is not None and "//" not in name and name.strip("/") != ""
+
+
+def is_ros_type(name: str) -> bool:
+    """Whether this is the name of a ROS 1 message type, `pkg/Type`."""
+    return _ROS_TYPE.fullmatch(name) is not None
 
 
 class LegacyType(IntEnum):

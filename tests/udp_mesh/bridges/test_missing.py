@@ -15,7 +15,7 @@ import pytest
     [
         ("ros1", "rosgraph", "source /opt/ros/RELEASE/setup.bash first"),
         ("ros2", "rclpy", "source /opt/ros/RELEASE/setup.bash first"),
-        ("zenoh_bridge", "zenoh", "pip install 'meshctl[zenoh]'"),
+        ("zenoh_bridge", "zenoh", "pip install eclipse-zenoh"),
     ],
 )
 def test_a_missing_middleware_is_told_in_one_line(tmp_path: Path, module: str, needs: str, remedy: str) -> None:

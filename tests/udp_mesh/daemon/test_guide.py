@@ -33,7 +33,7 @@ def test_the_guides_examples_of_configuration_load(tmp_path: Path) -> None:
     examples = [re.sub(r"^    ", "", block, flags=re.MULTILINE) for block in blocks]
     topics = next(text for text in examples if "artifacts" in text)
     links = next(text for text in examples if 'interface = "bat0"' in text)
-    (tmp_path / "fleet.key").write_text("00" * 32)
+    (tmp_path / "fleet.key").write_text("5a" * 32)
     path = tmp_path / "udp-mesh.toml"
     path.write_text(f'key_file = "fleet.key"\n{topics}\n{links}')
     configuration = load(path)

@@ -164,12 +164,16 @@ class Parser:
                 return dict(zip(("token", "held"), self.take("8sI"), strict=True))
             case 10:
                 return {"reason": self.text()}
+            case 12:
+                return {"clock": self.take("I")[0]}
         raise ValueError(f"no frame of type {kind}")
 
     def fragment(self, kind: int) -> Fields:
         message_id, position = self.take("II" if kind & 8 else "IH")
         names = ("size", "fragments", "age", "topic", "priority", "flags")
         head = dict(zip(names, self.take("IIIHBB"), strict=True)) if kind & 1 else None
+        if kind & 32 and head is not None:
+            head["life"] = self.take("I")[0]
         count = self.take("H")[0] if kind & 2 else len(self.data) - self.at
         (payload,) = self.take(f"{count}s")
         return {"id": message_id, "position": position, "head": head, "payload": payload, "cast": bool(kind & 16)}

@@ -28,6 +28,7 @@ from udp_mesh.wire.frames import (
     Pong,
     Refused,
     RefuseReason,
+    Sent,
     TopicAnnounce,
     Waiting,
 )
@@ -68,6 +69,11 @@ FRAMES: dict[str, list[Frame]] = {
     "nack of pieces and of all": [Nack(11, ((0, 2), (9, 1))), Nack(12)],
     "ping and pong": [Ping(0x0102030405060708), Pong(0x0102030405060708, 1500)],
     "bye": [Bye("shutting down")],
+    "heartbeat with its sender's clock": [Heartbeat("ugv1", 1, 1, 7, 1000, 0, 0, 9, 0, clock_ms=0xFFFFFFF0)],
+    "dated message with a remaining life": [
+        Sent(0x01020304),
+        Fragment(1, 0, b"hello", MessageHead(5, 1, 2, 0, 1, 40, 1500), ack_now=True),
+    ],
 }
 
 LEGACY: dict[str, LegacyDatagram] = {
@@ -91,8 +97,10 @@ def describe(value: object) -> object:
         fields: Mapping[str, object] = value._asdict()
         return {"type": type(value).__name__, **{name: describe(field) for name, field in fields.items()}}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        named = {field.name: describe(getattr(value, field.name)) for field in dataclasses.fields(value)}
-        return {"type": type(value).__name__, **named}
+        named = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        # What a frame may leave out is left out here too: files of earlier versions stay as they are.
+        said = {name: describe(field) for name, field in named.items() if field is not None}
+        return {"type": type(value).__name__, **said}
     if isinstance(value, tuple | list):
         return [describe(item) for item in value]
     if isinstance(value, int) and not isinstance(value, bool):

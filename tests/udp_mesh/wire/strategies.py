@@ -17,6 +17,7 @@ from udp_mesh.wire.frames import (
     Pong,
     Refused,
     RefuseReason,
+    Sent,
     TopicAnnounce,
     Waiting,
 )
@@ -48,6 +49,7 @@ def heartbeats(draw: st.DrawFn) -> Heartbeat:
         draw(unsigned(32)),
         tuple(draw(st.lists(st.binary(min_size=8, max_size=8), max_size=5))),
         draw(waiting),
+        draw(st.one_of(st.none(), unsigned(32))),
     )
 
 
@@ -58,7 +60,13 @@ def first_fragments(draw: st.DrawFn) -> Fragment:
     size = len(payload) + (draw(st.integers(1, 5000)) if more else 0)
     fragments = draw(st.integers(2, size)) if more else 1
     head = MessageHead(
-        size, fragments, draw(unsigned(16)), draw(st.integers(0, 15)), draw(unsigned(8)), draw(unsigned(32))
+        size,
+        fragments,
+        draw(unsigned(16)),
+        draw(st.integers(0, 15)),
+        draw(unsigned(8)),
+        draw(unsigned(32)),
+        draw(st.one_of(st.none(), st.integers(1, (1 << 32) - 1))),
     )
     return Fragment(draw(unsigned(32)), 0, payload, head, draw(st.booleans()), draw(st.booleans()))
 
@@ -97,4 +105,5 @@ frames: st.SearchStrategy[Frame] = st.one_of(
     st.builds(Ping, unsigned(64)),
     st.builds(Pong, unsigned(64), unsigned(32)),
     st.builds(Bye, texts),
+    st.builds(Sent, unsigned(32)),
 )

@@ -1,0 +1,256 @@
+"""A fielded robot on a link that loses: its program resends nothing, so our acknowledgements must let it go on."""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections import deque
+from dataclasses import dataclass, field, replace
+
+import pytest
+
+from tests.udp_mesh.core.pair import World, settings
+from tests.udp_mesh.core.test_legacy import OLD, OldRobot, pieces
+from udp_mesh.core.events import MessageDelivered, MessageExpired, MessageReceived
+from udp_mesh.core.legacy_acks import LegacyAcks
+from udp_mesh.core.legacy_peers import MOST_TOPICS, SETTLE_S
+from udp_mesh.core.seams import Datagram
+from udp_mesh.core.settings import Neighbour, Outbox, Topic
+from udp_mesh.wire.legacy import (
+    Host,
+    LegacyAck,
+    LegacyPayload,
+    PriorityMeshData,
+    decode_legacy,
+    encode_legacy,
+    encode_mesh_data,
+    fragment_legacy,
+)
+
+DELAY_S, TICK_S = 0.010, 0.001
+
+
+@dataclass
+class FieldedProgram:
+    """Its sending half, as the facts of the fielded format tell: three on their way, never sent again, all dropped
+    where one is unanswered for 10 s."""
+
+    queue: list[tuple[int, int, int, LegacyPayload]] = field(default_factory=list)
+    on_way: dict[tuple[int, int], float] = field(default_factory=dict)
+    sequence: int = 0
+    flushed: int = 0
+
+    def push(self, priority: int, data: bytes) -> None:
+        self.sequence = self.sequence % 0x7FFF + 1
+        chunks = fragment_legacy(encode_mesh_data(PriorityMeshData("old", "std_msgs/String", priority, "t", data)))
+        for place, chunk in enumerate(chunks):
+            piece = LegacyPayload(self.sequence, place, len(chunks), chunk, wants_ack=True)
+            heapq.heappush(self.queue, (priority, self.sequence, place, piece))
+
+    def leave(self, now: float) -> list[LegacyPayload]:
+        if any(now - at > 10.0 for at in self.on_way.values()):
+            self.flushed += len(self.queue)
+            self.queue.clear()
+            self.on_way.clear()
+        out = []
+        while self.queue and len(self.on_way) < 3:
+            _, sequence, place, piece = heapq.heappop(self.queue)
+            self.on_way[sequence, place] = now
+            out.append(piece)
+        return out
+
+
+def play(
+    loss: float, seconds: float, *, seed: int = 1, restart_at: float | None = None
+) -> tuple[int, int, FieldedProgram]:
+    """Ten urgent messages and twenty bulky ones a second: how many of each arrived."""
+    rng, old, program = random.Random(seed), OldRobot(), FieldedProgram()
+    begun = old.now
+    wire: deque[tuple[float, LegacyPayload]] = deque()
+    back: deque[tuple[float, LegacyAck]] = deque()
+    urgent = bulk = tick = 0
+    while old.now < begun + seconds + 2.0:
+        if old.now < begun + seconds:
+            if tick % 100 == 0:
+                program.push(0, b"urgent%d" % tick)
+            if tick % 50 == 0:
+                program.push(5, b"bulk%d" % tick + bytes(2000))
+        if tick % 1000 == 0:
+            old.say(Host("old", "10.0.0.9"))
+        if restart_at is not None and tick == int(restart_at * 1000):
+            now = old.now
+            old = OldRobot()
+            old.now = now
+            old.say(Host("old", "10.0.0.9"))
+        wire.extend((old.now + DELAY_S, piece) for piece in program.leave(old.now) if rng.random() >= loss)
+        while wire and wire[0][0] <= old.now:
+            old.say(wire.popleft()[1])
+        while back and back[0][0] <= old.now:
+            ack = back.popleft()[1]
+            program.on_way.pop((ack.sequence, ack.position), None)
+        for answer in old.hear():
+            if isinstance(answer, LegacyAck) and rng.random() >= loss:
+                back.append((old.now + DELAY_S, answer))
+        for event in old.events():
+            if isinstance(event, MessageReceived):
+                urgent += event.payload.startswith(b"urgent")
+                bulk += event.payload.startswith(b"bulk")
+        tick += 1
+        old.now += TICK_S
+    return urgent, bulk, program
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_fielded_sender_loses_what_the_link_loses_and_no_more(seed: int) -> None:
+    urgent, bulk, program = play(0.01, 20.0, seed=seed)
+    assert urgent >= 192
+    assert bulk >= 370
+    assert program.flushed == 0
+
+
+def test_without_loss_nothing_is_lost_and_no_place_stays_taken() -> None:
+    urgent, bulk, program = play(0.0, 10.0)
+    assert urgent >= 100
+    assert bulk >= 200
+    assert program.flushed == 0
+    assert program.queue == []
+    assert program.on_way == {}
+
+
+def test_a_restart_of_ours_stalls_a_fielded_sender_for_no_ten_seconds() -> None:
+    urgent, _, program = play(0.02, 15.0, restart_at=7.0)
+    assert urgent >= 135
+    assert program.flushed == 0
+
+
+def test_acknowledgements_besides_stay_few_without_loss() -> None:
+    """One repeat each, and some guesses per second: no more airtime than that."""
+    acks, now, more = LegacyAcks(), 0.0, 0
+    for sequence in range(1, 1001):
+        piece = LegacyPayload(sequence, 0, 1, b"x", wants_ack=True)
+        more += len(acks.came(piece, now))
+        now += 0.005
+        more += len(acks.due(now))
+    assert more <= 1000 + 6 * 5.0 / 0.05 + 24
+
+
+def fielded(*topics: Topic) -> OldRobot:
+    return OldRobot(topics=(Topic("map", priority=9), *topics))
+
+
+def test_what_an_outbox_keeps_waits_until_a_fielded_robot_has_started() -> None:
+    """It acknowledges before its reader has subscribed: what comes then is lost there."""
+    old = fielded(Topic("kept", priority=8, outbox=Outbox.ALL))
+    old.now += 20.0
+    old.hear()
+    old.events()
+    for number in range(40):
+        old.node.send("kept", b"%d" % number, destination="old", now=old.now)
+    assert not old.hear_payloads()
+    old.say(Host("old", "10.0.0.9"))
+    heard_at, left_at, left = old.now, [], 0
+    while old.now < heard_at + SETTLE_S + 5.0:
+        if int(old.now * 100) % 100 == 0:
+            old.say(Host("old", "10.0.0.9"))
+        for piece in old.hear_payloads():
+            left_at.append(old.now)
+            old.say(LegacyAck(piece.sequence, piece.position))
+        left += sum(isinstance(event, MessageDelivered) for event in old.events())
+        old.now += 0.01
+    assert min(left_at) >= heard_at + SETTLE_S
+    assert left == 40
+
+
+def test_a_bridges_own_messages_are_not_sent_to_fielded_robots() -> None:
+    old = OldRobot()
+    for type_name in ("bridge", "zenoh", "std_msgs/msg/String RIHS01_ab"):
+        old.node.send("map", b"{}", destination="old", now=old.now, type_name=type_name)
+        old.node.send("map", b"{}", now=old.now, type_name=type_name)
+    old.node.send("map", b"fine", destination="old", now=old.now, type_name="std_msgs/String abc")
+    assert len(old.hear_payloads()) == 1
+    assert sum(isinstance(event, MessageExpired) for event in old.events()) == 3
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind"), [("~mesh/ping", "a/B"), ("a b", "a/B"), ("chat", "B"), ("1", "a/B"), ("a//b", "a/B")]
+)
+def test_only_names_of_ros_are_taken_from_fielded_robots(topic: str, kind: str) -> None:
+    old = OldRobot()
+    body = encode_mesh_data(PriorityMeshData("old", kind, 1, topic, b"x"))
+    old.say(LegacyPayload(1, 0, 1, body, wants_ack=True))
+    assert old.received() == []
+
+
+def test_a_fielded_robot_names_so_many_topics_and_no_more() -> None:
+    old = OldRobot()
+    for number in range(MOST_TOPICS + 50):
+        body = encode_mesh_data(PriorityMeshData("old", "a/B", 1, f"t{number}", b"x"))
+        old.say(LegacyPayload(number + 1, 0, 1, body, wants_ack=True))
+    assert len(old.received()) == MOST_TOPICS
+    old.say(pieces(2000, b"x")[0])
+    assert old.node.conditions(old.now).counters.dropped_over_limit == 51
+
+
+def test_another_port_of_a_fielded_robot_is_not_believed() -> None:
+    old = OldRobot()
+    old.node.receive(encode_legacy(pieces(1, b"forged")[0]), "mesh", (OLD[0], 4444), old.now)
+    assert old.received() == []
+    old.node.send("map", b"x", destination="old", now=old.now)
+    assert len(old.hear_payloads()) == 1
+
+
+def test_the_status_of_a_fielded_robot_and_our_own_rate_say_what_goes_to_it() -> None:
+    world = World(seed=1)
+    config = replace(settings("new"), neighbours=(Neighbour(OLD, name="old", legacy=True),))
+    world.add(config, address="10.0.0.1")
+
+    def answer(name: str, datagram: Datagram, now: float) -> None:
+        if datagram.destination == OLD:
+            piece = decode_legacy(datagram.data)
+            if isinstance(piece, LegacyPayload):
+                ack = encode_legacy(LegacyAck(piece.sequence, piece.position))
+                world.at(now + 0.005, lambda: world.nodes["new"].receive(ack, "mesh", OLD, world.now))
+
+    world.tap = answer
+
+    def send() -> None:
+        world.nodes["new"].receive(encode_legacy(Host("old", OLD[0])), "mesh", OLD, world.now)
+        world.nodes["new"].send("map", bytes(12_500), destination="old", now=world.now)
+        world.at(world.now + 0.1, send)
+
+    send()
+    world.run(5.0)
+    conditions = world.nodes["new"].conditions(world.now)
+    (peer,) = conditions.peers
+    assert 0.8e6 < peer.sent_bits_per_s < 1.5e6
+    assert 0.8e6 < peer.delivered_bits_per_s < 1.5e6
+    assert peer.received_bits_per_s > 10_000
+    assert 0.8e6 < conditions.sent_bits_per_s < 1.5e6
+
+
+def test_answers_that_come_too_soon_after_a_resend_teach_patience() -> None:
+    """The fielded program answers when its interpreter gets to it; a small message resent needlessly comes twice."""
+    old = OldRobot()
+    rng = random.Random(2)
+    answers: list[tuple[float, LegacyAck]] = []
+    sent = resent = 0
+    seen: set[int] = set()
+    for tick in range(60_000):
+        if tick % 100 == 0:
+            old.node.send("stop", b"%d" % tick, destination="old", now=old.now)
+        if tick % 1000 == 0:
+            old.say(Host("old", "10.0.0.9"))
+        for piece in old.hear_payloads():
+            sent += 1
+            resent += piece.sequence in seen
+            seen.add(piece.sequence)
+            delay_s = 0.004 if rng.random() < 0.9 else 0.07
+            answers.append((old.now + delay_s, LegacyAck(piece.sequence, piece.position)))
+        for at, ack in list(answers):
+            if at <= old.now:
+                answers.remove((at, ack))
+                old.say(ack)
+        old.events()
+        old.now += 0.001
+    assert len(seen) >= 590
+    assert resent <= 20

@@ -1,0 +1,210 @@
+"""No local request holds the daemon up: files that are none, connections that say nothing, requests half sent."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.udp_mesh.daemon.processes import KEY, RunningDaemon, two_daemons
+from tests.udp_mesh.links.sockets import free_port
+from udp_mesh.client import MeshClient, MeshError
+from udp_mesh.client.mesh_client import encode_frame
+from udp_mesh.daemon import api, commands, metrics_server
+from udp_mesh.daemon.configuration import read_keys
+from udp_mesh.daemon.files import is_below, is_exposed, read_regular
+from udp_mesh.daemon.request_frames import BadFrame, RequestReader
+from udp_mesh.daemon.toml_source import ConfigurationError, parse
+
+METRICS_PORT = free_port()
+
+pytestmark = pytest.mark.xdist_group("udp_mesh_bounded")
+
+
+@pytest.fixture(scope="module")
+def alice() -> Iterator[RunningDaemon]:
+    with two_daemons(alice_more=f'metrics_address = "127.0.0.1:{METRICS_PORT}"\n') as (one, _):
+        yield one
+
+
+@pytest.mark.parametrize("kind", ["pipe", "directory", "socket", "device", "link to a pipe"])
+def test_a_key_file_that_is_none_is_refused_at_once(alice: RunningDaemon, kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "fleet.key"
+    if kind == "directory":
+        path.mkdir()
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(str(path))
+    elif kind == "device":
+        path = Path("/dev/zero")
+    else:
+        os.mkfifo(tmp_path / "pipe")
+        path = tmp_path / "pipe"
+        if kind != "pipe":
+            path = tmp_path / "link"
+            path.symlink_to(tmp_path / "pipe")
+    with alice.client() as client:
+        with pytest.raises(MeshError, match=r"not a regular file|Is a directory"):
+            client.request("set-keys", file=str(path))
+        assert client.request("status")["ok"]
+
+
+def test_a_file_behind_a_link_is_read(tmp_path: Path) -> None:
+    (tmp_path / "real").write_bytes(b"x" * 10)
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    assert read_regular(tmp_path / "link", 5) == b"x" * 6
+
+
+@pytest.mark.parametrize(("text", "found"), [("00" * 32, "nothing but zeros"), (f"{KEY}\n{KEY}", "the same key twice")])
+def test_keys_that_protect_nothing_are_refused(tmp_path: Path, text: str, found: str) -> None:
+    path = tmp_path / "fleet.key"
+    path.write_text(text)
+    with pytest.raises(ConfigurationError, match=found):
+        read_keys(path)
+
+
+def test_a_key_file_that_everybody_can_read_is_told_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "fleet.key"
+    path.write_text(KEY)
+    path.chmod(0o644)
+    with caplog.at_level(logging.WARNING):
+        read_keys(path)
+    assert is_exposed(path)
+    assert "key-file-exposed" in caplog.text
+    assert KEY not in caplog.text
+    caplog.clear()
+    path.chmod(0o640)
+    read_keys(path)
+    assert not caplog.text
+
+
+def test_brackets_without_end_are_a_problem_and_no_traceback() -> None:
+    with pytest.raises(ConfigurationError, match="brackets"):
+        parse("a = " + "[" * 20_000 + "]" * 20_000, "udp-mesh.toml")
+
+
+@pytest.mark.parametrize("odd", ["NaN", "Infinity", "-Infinity", "1e999", "true", "[1]"])
+def test_an_id_that_json_cannot_send_back_is_refused(odd: str) -> None:
+    head = b'{"op": "status", "id": ' + odd.encode() + b"}"
+    (found,) = RequestReader(lambda: 100).feed(len(head).to_bytes(4, "big") + bytes(4) + head)
+    assert isinstance(found, BadFrame)
+    assert found.request_id is None
+
+
+def test_a_long_number_is_an_id_like_any_other() -> None:
+    frame = encode_frame({"op": "status", "id": 10**400}, b"")
+    (found,) = RequestReader(lambda: 100).feed(frame)
+    assert not isinstance(found, BadFrame)
+
+
+def test_status_is_answered_whoever_holds_all_connections(alice: RunningDaemon) -> None:
+    idle = []
+    try:
+        for _ in range(api.MAX_CLIENTS + 3 * api.SPARE_CLIENTS):
+            one = socket.socket(socket.AF_UNIX)
+            one.connect(str(alice.socket))
+            idle.append(one)
+        # The newest of those there is no room for may ask, unless too many come at the very same moment.
+        asked = time.monotonic()
+        while True:
+            try:
+                with MeshClient(str(alice.socket), timeout_s=10.0) as client:
+                    assert client.request("status")["ok"]
+                break
+            except MeshError:
+                assert time.monotonic() < asked + 5.0
+        with MeshClient(str(alice.socket), timeout_s=10.0) as client:
+            with pytest.raises(MeshError) as refused:
+                client.request("peers")
+            assert refused.value.code == "too-many-clients"
+    finally:
+        for one in idle:
+            one.close()
+    deadline = time.monotonic() + 10.0
+    while True:
+        try:
+            with alice.client() as client:
+                client.request("peers")
+            return
+        except MeshError:
+            assert time.monotonic() < deadline
+
+
+def test_the_metrics_are_served_whoever_holds_connections_without_asking(alice: RunningDaemon) -> None:
+    idle = [socket.create_connection(("127.0.0.1", METRICS_PORT)) for _ in range(3 * metrics_server.CONNECTIONS)]
+    try:
+        for one in idle:
+            one.send(b"GET /met")
+        begun = time.monotonic()
+        with socket.create_connection(("127.0.0.1", METRICS_PORT), timeout=10.0) as scraper:
+            scraper.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
+            assert scraper.recv(64).startswith(b"HTTP/1.1 200 OK")
+        assert time.monotonic() - begun < metrics_server.REQUEST_S
+    finally:
+        for one in idle:
+            one.close()
+
+
+def test_neighbours_topics_and_patterns_are_so_many_and_no_more(
+    alice: RunningDaemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with alice.client() as client:
+        with pytest.raises(MeshError, match="at most 1024 patterns"):
+            client.request("subscribe", topics=[f"p{number}" for number in range(2000)])
+        for number in range(commands.MAX_NEIGHBOURS + 5):
+            try:
+                client.request("set-neighbour", address=f"10.77.{number >> 8}.{number & 255}")
+            except MeshError as error:
+                assert error.code == "too-many"
+                break
+        else:
+            pytest.fail("no bound was met")
+        client.request("reload")
+
+
+def test_other_users_record_below_the_state_directory_only(tmp_path: Path) -> None:
+    state, outside = tmp_path / "state", tmp_path / "outside"
+    (state / "runs").mkdir(parents=True)
+    outside.mkdir()
+    (state / "link").symlink_to(outside)
+    assert is_below(state / "run.jsonl", state)
+    assert is_below(state / "runs" / "run.jsonl", state)
+    for path in (outside / "run.jsonl", state / ".." / "run.jsonl", state / "link" / "x", tmp_path / "none" / "x"):
+        assert not is_below(path, state)
+
+
+def test_a_request_that_stops_coming_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(api, "HALF_SENT_S", 0.05)
+
+    class Requests:
+        def request(self, client: api.Client, header: dict[str, object], payload: bytes) -> None:
+            client.reply(header.get("id"))
+
+        def client_gone(self, client: api.Client) -> None: ...
+
+    async def work(path: Path) -> None:
+        server = api.LocalServer(Requests(), path, mode=0o600, group=None, max_payload_bytes=lambda: 1000)
+        await server.start()
+        reader, writer = await asyncio.open_unix_connection(str(path))
+        whole = encode_frame({"op": "x", "id": 1}, b"")
+        writer.write(whole)
+        assert b'"ok"' in await reader.read(1000)
+        writer.write(whole[:6])
+        await asyncio.sleep(0)
+        (client,) = server.clients
+        assert client.user == os.getuid()
+        rest = await reader.read()
+        assert json.loads(rest[8:])["code"] == "too-slow"
+        writer.close()
+        await server.close()
+
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder:
+        asyncio.run(work(Path(folder) / "s"))
