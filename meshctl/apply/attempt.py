@@ -60,6 +60,8 @@ class Attempt:
     trouble: str = ""
     # that it let nobody in, since it was last seen with the change in force
     shut_out: str = ""
+    # why it could not be reached, since it was last seen with the change in force
+    unreached: str = ""
     # decided against: from now on it is only ever taken back
     is_given_up: bool = False
     # what it does besides files may take so long before its window begins
@@ -68,6 +70,8 @@ class Attempt:
     radios: Radios = NO_RADIOS
     # the one of `places` where it was met
     met: Endpoint | None = None
+    # whether its services have taken up the change: only a connection opened after that proves anything
+    is_reloaded: bool = False
     forgetting: Forgetting = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -179,7 +183,7 @@ def reach(attempt: Attempt) -> SshConnection | None:
         try:
             connection = job.work.access.open(job.node, endpoint=endpoint)
         except NodeError as error:
-            attempt.trouble = str(error)
+            attempt.trouble = attempt.unreached = str(error)
             if isinstance(error, AuthenticationRefused):
                 attempt.shut_out = attempt.trouble
             continue
@@ -198,9 +202,9 @@ def look(attempt: Attempt, connection: SshConnection) -> Move:
     attempt.last = observe(connection)
     age_s = applied_age_s(attempt.status)
     if age_s is not None:
-        attempt.shut_out = ""
+        attempt.shut_out = attempt.unreached = ""
         attempt.forgetting.stands()
-    attempt.gaps = missing(job.expected, attempt.last, since_s=age_s)
+    attempt.gaps = missing(job.expected.with_bases(job.work.current_bases()), attempt.last, since_s=age_s)
     if age_s is not None and age_s < attempt.settle_s:
         attempt.gaps = (*attempt.gaps, "it has not settled yet")
     return next_move(
@@ -223,10 +227,15 @@ def _while_it_reloads(attempt: Attempt, connection: SshConnection) -> Move | Non
     except CommandFailed:
         # what is wrong there the observation tells
         return None
-    if status.change_id != attempt.id or status.state not in ("waiting", "applied") or status.reload_status is not None:
+    if status.change_id != attempt.id or status.state not in ("waiting", "applied"):
         return None
+    if status.reload_status is not None:
+        if attempt.is_reloaded or status.state != "applied":
+            return None
+        # this very connection may have been let in before the effects were in force
+        attempt.is_reloaded = True
     if status.state == "applied":
-        attempt.shut_out = ""
+        attempt.shut_out = attempt.unreached = ""
         attempt.forgetting.stands()
     attempt.gaps = (RELOADING,)
     leaving = attempt.job.work.interrupt.leaving

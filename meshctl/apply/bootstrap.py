@@ -24,6 +24,7 @@ from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Node
+from meshctl.topology import alternate_macs
 
 FACTORY_ADDRESS = "192.168.1.1"
 
@@ -62,12 +63,13 @@ class Recorder:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A device on the bench: which node it is, what it told, its host key."""
+    """A device on the bench: which node it is, what it told, its host key, and the keys that were pinned before."""
 
     place: BenchPlace
     node: Node
     seen: Observation
     key: HostKey
+    old_pins: tuple[HostKey, ...] = ()
 
 
 def find_node(fleet: Fleet, word: str) -> Node:
@@ -96,7 +98,9 @@ def identify(fleet: Fleet, seen: Observation, said: str, taken: Iterable[str] = 
     macs = {mac.lower() for mac in (seen.macs or {}).values()}
     if seen.board is not None and seen.board.label_mac:
         macs.add(seen.board.label_mac.lower())
-    by_mac = [node for node in fleet.managed() if _macs(node) & macs]
+    # a radio that is recorded by the address it had in the mesh shows another one now
+    others = {other for link in seen.links or () for other in alternate_macs(link.mac)}
+    by_mac = [node for node in fleet.managed() if _macs(node) & (macs | others)]
     shown = ", ".join(sorted(macs)) or "none"
     if len(by_mac) > 1:
         raise NodeError(f"its MACs ({shown}) belong to several nodes: {', '.join(node.name for node in by_mac)}")
@@ -158,12 +162,13 @@ def look_around(
             seen = observe_cleared(connection, _paths(renderer, place), signal)
             node = identify(renderer.fleet, seen, place.node, taken)
             assert recorder.key is not None
+            old_pins = trust.pinned(node.name)
             _pin(trust, node.name, recorder.key, replace_keys=replace_keys)
         except BaseException:
             connection.close()
             raise
         with lock:
-            found[node.name] = Found(place, node, seen, recorder.key)
+            found[node.name] = Found(place, node, seen, recorder.key, old_pins)
             access.newcomers[node.name] = replace(connection.endpoint, identity=node.name)
             if place.interface:
                 access.interfaces[node.name] = place.interface
@@ -199,6 +204,12 @@ def _pin(trust: TrustStore, name: str, key: HostKey, *, replace_keys: bool) -> N
             hint="if the device was reset or is a new one, run again with --replace-key",
         )
     trust.replace(name, key)
+
+
+def restore_pins(trust: TrustStore, arrivals: Arrivals, names: Iterable[str]) -> None:
+    """Trust the keys of before for these nodes: a device that was refused is not the node it was taken for."""
+    for name in names:
+        trust.replace(name, *arrivals.found[name].old_pins)
 
 
 def plan_arrivals(

@@ -6,7 +6,9 @@ import hashlib
 import secrets
 
 from meshctl.device.deadman import Change, NewFile
+from meshctl.device.framing import quoted
 from meshctl.device.observation import Observation
+from meshctl.device.scripts import script
 from meshctl.model import Backend, Fleet, Node, Secret
 from meshctl.plan import NodePlan, Wanted
 from meshctl.plan.seen import file_info, package_of, text_of
@@ -48,33 +50,20 @@ def _sha256_seen(path: str, before: Observation) -> str | None:
     return None if text is None else hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
 
 
-# netifd reads /lib/netifd/proto once, when it starts (proto_shell_init, 19.07 to 25.12): where the package came later,
-# it does not know batman-adv, and a reload leaves bat0 unmade.
-_LEARN_BATMAN = (
-    "if grep -q batadv /etc/config/network && known=$(ubus call network get_proto_handlers 2>/dev/null); then",
-    "\tcase $known in *'\"batadv\"'*) ;; *) /etc/init.d/network restart || status=$? ;; esac",
-    "fi",
-)
-
-
-# bat0 that was made anew knows nobody behind it, and tells the mesh of the node's own address only once the node has
-# sent something through it. Where br-lan has other ports, nothing makes it: its link never went down. Meanwhile the
-# batman-adv of others answers ARP requests for it out of memory, for 5 minutes (BATADV_DAT_ENTRY_TIMEOUT,
-# net/batman-adv/main.h), so nobody calls aloud either. Loop avoidance holds broadcasts for half a minute, but not what
-# goes to one station. So the node speaks to whom it was just spoken to by, each second until bat0 is surely there.
+# A bat0 that was created again speaks once a second for so long: loop avoidance holds broadcasts for half a minute, and
+# the batman-adv of others answers ARP requests for the node out of memory for 5 minutes (BATADV_DAT_ENTRY_TIMEOUT,
+# net/batman-adv/main.h), so that no request reaches it either.
 SPEAK_FRAMES = 60
-_SPEAK = f'[ -z "$SSH_CONNECTION" ] || ping -c {SPEAK_FRAMES} "${{SSH_CONNECTION%% *}}" >/dev/null 2>&1 </dev/null &'
 
 
 def reload_script(paths: set[str], services: tuple[str, ...]) -> str:
-    """POSIX sh that makes the node take up changed files; reload_config reloads the services whose package changed."""
-    lines = ["status=0"]
-    if any(package_of(path) is not None for path in paths):
-        lines.append("reload_config || status=$?")
-    if "etc/config/network" in paths:
-        lines += [*_LEARN_BATMAN, _SPEAK]
-    lines += [f"/etc/init.d/{service} restart || status=$?" for service in services]
-    return "\n".join([*lines, "exit $status"]) + "\n"
+    """POSIX sh that makes the node take up changed files and ends when the effects on who can log in are in force.
+
+    `paths` have no leading slash; `services` are restarted besides. See scripts/reload.sh.
+    """
+    packages = sorted(package for path in paths if (package := package_of(path)) is not None)
+    values = {"PACKAGES": " ".join(packages), "SERVICES": " ".join(services), "SPEAK_FRAMES": str(SPEAK_FRAMES)}
+    return "\n".join([*(f"{name}={quoted(value)}" for name, value in values.items()), script("reload.sh")])
 
 
 def services_of(fleet: Fleet, node: Node) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from meshctl.device.observation import Observation
 from meshctl.plan import Wanted
@@ -31,6 +31,10 @@ class Expectation:
     neighbours: frozenset[str] = frozenset()
     bases: frozenset[str] = frozenset()
     needs: Needs = NO_NEEDS
+
+    def with_bases(self, current: frozenset[str]) -> Expectation:
+        """The same, where the base may be reached by any of these MACs; a node that did not reach it need not now."""
+        return replace(self, bases=self.bases | current) if self.bases else self
 
 
 def expectation(wanted: Wanted, before: Observation, base_macs: Iterable[str] = ()) -> Expectation:
@@ -127,6 +131,9 @@ def _radio(iface: Section, channel: str, after: Observation) -> list[str]:
     # `up` in netifd does not prove that a cell was joined (openwrt-facts.md section 5)
     if link.joined is False:
         return [f"{name} has not joined its cell"]
+    # 23.05 and later join a mesh in the open where the supplicant cannot (wifi-scripts, mac80211.sh)
+    if iface.get("encryption", "none") != "none" and after.supplicants is not None and name not in after.supplicants:
+        return [f"{name} is not encrypted: wpa_supplicant does not run it"]
     if link.channel is not None and channel.isdigit() and link.channel != int(channel):
         return [f"{name} is on channel {link.channel}, not {channel}"]
     bssid = iface.get("bssid").lower()

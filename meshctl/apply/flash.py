@@ -27,7 +27,7 @@ from meshctl.device.ssh import SshConnection
 from meshctl.device.upload import upload
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError, NodeError
-from meshctl.firmware import check, image_path
+from meshctl.firmware import check, image_path, is_revision
 from meshctl.fleet import Outcome, Result
 from meshctl.model import HardwareProfile
 from meshctl.plan import Wanted
@@ -153,7 +153,7 @@ def _await_return(job: Job, marker: str, forgetting: Forgetting) -> Outcome:
             trouble = str(error)
             forgetting.while_silent()
         else:
-            job.work.remember(job.name, seen)
+            job.work.saw(job.name, seen)
             if seen.boot_id != job.before.boot_id:
                 forgetting.when_back(seen, rebooted=True)
                 return _verdict(job, seen, marker)
@@ -177,7 +177,7 @@ def _verdict(job: Job, seen: Observation, marker: str) -> Outcome:
     wanted = job.plan.firmware.to_revision if job.plan.firmware is not None else running
     info = seen.files.get(MARKER_PATH)
     problems = [
-        "" if running == wanted else f"it runs {running}, not {wanted}",
+        "" if is_revision(running, wanted) else f"it runs {running}, not {wanted}",
         "" if board == job.node.hardware.board else f"its board is {board}, not {job.node.hardware.board}",
         "" if info is not None and (info.text or "").strip() == marker else "its configuration is not the flashed one",
     ]

@@ -1,14 +1,16 @@
-"""Have a node's neighbours forget its radio when it starts anew, so that they take its frames again.
+"""Remove stale station entries: those that neighbors hold of a radio that has restarted since.
 
-A radio that starts anew counts its frames from 0. A neighbour goes on with the block acknowledgement window it had and
+A radio that restarts counts its frames from 0. A neighbor goes on with the block acknowledgement window it had and
 drops that node's unicast until the numbers have caught up, while broadcasts pass and batman-adv sees a perfect link
-(docs/lab.md). Without its station entry it learns the node anew from the next beacon. To forget a node that did *not*
-start anew does the same harm the other way round, because the neighbour then counts from 0: so each forgets once.
+(docs/lab.md). Without its station entry it learns the node from the next beacon. Removing the entry of a radio that did
+*not* restart does the same harm the other way round. So no entry is removed on an assumption: the holder removes it
+when it hears the neighbor and gets no answer from it (scripts/stale_station.sh), or, where it has no batman-adv to find
+that out, when the node itself was seen to have restarted that radio.
 
     observations -> who holds an entry of the node's radios (`entries_of`), who may hold one and did not say so
     (`silent_holders`), and whose way leads through the node (`behind`)
-    before the radio goes: what those behind it run, to watch it and to forget it by themselves (`watch_script`)
-    silence -> whether to ask the others by now, sparingly (`next_ask_s`), to forget what is older (`forget_script`)
+    before the radio goes: what those behind it, and the node itself, run to watch their entries (`watch_script`)
+    silence -> whether to ask the others by now, sparingly (`next_ask_s`), and what they run (`flush_script`)
 
 All of it is pure; `forgetting` asks.
 """
@@ -21,24 +23,21 @@ from dataclasses import dataclass
 
 from meshctl.device.framing import quoted
 from meshctl.device.observation import Observation
+from meshctl.device.scripts import script
 from meshctl.plan.radios import EVERY_RADIO, SLACK_S, Radios
 from meshctl.topology import NEIGHBOUR_FRESH_MS, mesh_macs
 
-# Asked too early, while the old radio still sends, an entry comes back as it was; asked too late, when the node is
-# behind another neighbour by then, nobody is there to ask: so they are asked again while the node is silent, after the
-# first pause, then after twice as long each time. A minute is the longest, because that long an ad-hoc cell of Linux
-# remembers whom it does not hear (IEEE80211_IBSS_INACTIVITY_LIMIT, net/mac80211/ibss.c).
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 10.0, 60.0
-# Who watches looks once a second. At first a radio that starts anew is expected, so a short silence is taken for it; a
-# neighbour is heard several times a second (beacons, batman-adv's OGMs and those it repeats). If there was none, the
-# radio was quicker than that. Later (it goes back, or reboots) only a silence that no bad link makes.
-EXPECTED_S, EXPECTED_SILENCE_MS, LATER_SILENCE_MS = 30, 1000, 3000
+# A node that is not heard has no stale entry to remove, and one whose radio has just come back is asked about again: so
+# they are asked again while the node is silent, after the first pause, then after twice as long each time. A minute is
+# the longest, because that long an ad-hoc cell of Linux remembers whom it does not hear
+# (IEEE80211_IBSS_INACTIVITY_LIMIT, net/mac80211/ibss.c).
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 5.0, 60.0
 # More neighbours than any radio here has; bounds what a hostile station table costs.
 MOST_ASKED = 16
-# What a holder says of an entry that was old enough.
-GONE, KEPT = "gone", "kept"
+# What a holder says of an entry that was old enough: removed, cannot be removed, not stale, cannot find out.
+GONE, KEPT, ANSWERS, UNKNOWN = "gone", "kept", "answers", "unknown"
 # iw's list of its interfaces, for sh; a name of Linux's holds no blank
-_EVERY_INTERFACE = "$(iw dev 2>/dev/null | sed -n 's/^[[:space:]]*Interface //p')"
+_EVERY_INTERFACE = "\"$(iw dev 2>/dev/null | sed -n 's/^[[:space:]]*Interface //p')\""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +71,12 @@ def entries_of(node: str, around: Mapping[str, Observation], radios: Radios = EV
         for station in seen.stations or ()
         if station.mac.lower() in macs
     )
+
+
+def own_entries(node: str, seen: Observation, radios: Radios = EVERY_RADIO) -> tuple[Entry, ...]:
+    """The entries that the node itself holds, of whomever these radios of it know."""
+    own = (Entry(node, station.ifname, station.mac) for station in seen.stations or () if station.ifname in radios)
+    return tuple(own)[:MOST_ASKED]
 
 
 def silent_holders(
@@ -141,55 +146,30 @@ def behind(node: str, around: Mapping[str, Observation], base_macs: Iterable[str
     )
 
 
-def forget_script(entries: Iterable[Entry], *, older_than_s: float) -> str:
-    """POSIX sh that removes those of a holder's entries that were made before the radio started anew, so long ago.
+def flush_script(entries: Iterable[Entry], *, older_than_s: float, has_restarted: bool = False) -> str:
+    """POSIX sh that removes those of a holder's entries that are at least that old and stale, or, where the radios were
+    seen to have restarted, all that are that old.
 
-    It prints `gone MAC` for each that it removed, and `kept MAC` for one that it could not.
+    It prints a line `gone|kept|answers|unknown MAC` for each that is old enough and whose neighbor is heard.
     """
-    return "".join(
-        f"for dev in {quoted(entry.ifname) if entry.ifname else _EVERY_INTERFACE}; do "
-        f'age=$({_told(entry, "connected time")}); [ "${{age:-0}}" -ge {math.ceil(older_than_s)} ] || continue; '
-        f'if iw dev "$dev" station del {quoted(entry.mac)} 2>/dev/null; then echo {GONE} {quoted(entry.mac)}; '
-        f"else echo {KEPT} {quoted(entry.mac)}; fi; done\n"
+    verb = "flush_restarted" if has_restarted else "flush_stale"
+    calls = [
+        f"{verb} {quoted(entry.ifname) if entry.ifname else _EVERY_INTERFACE} {quoted(entry.mac)} "
+        f"{math.ceil(older_than_s)}\n"
         for entry in entries
-    )
+    ]
+    return "".join((script("stale_station.sh"), *calls))
 
 
 def watch_script(node: str, entries: Iterable[Entry], *, for_s: float) -> str:
-    """POSIX sh that starts a process of the holder's own, which removes each entry when it falls silent, `for_s` long.
-
-    It takes the place of one that watches `node` already.
-    """
-    steps = []
-    for number, entry in enumerate(entries):
-        steps += [
-            f"dev={quoted(entry.ifname)}; age=$({_told(entry, 'inactive time')})",
-            f'if [ "${{age:-0}}" -ge $limit ] || [ "$late/$did{number}" = 1/ ]; '
-            f'then iw dev "$dev" station del {quoted(entry.mac)}; did{number}=1; fi',
-        ]
-    firsts = " ".join(f"did{number}=" for number in range(len(steps) // 2))
-    loop = "; ".join(
-        (
-            f"{firsts} at=0",
-            f"while [ $at -lt {math.ceil(for_s)} ]",
-            f"do sleep 1; at=$((at + 1)) late= limit={EXPECTED_SILENCE_MS}",
-            f"[ $at -lt {EXPECTED_S} ] || limit={LATER_SILENCE_MS}",
-            f"[ $at != {EXPECTED_S} ] || late=1",
-            *steps,
-            "done",
-        )
-    )
+    """POSIX sh that starts a process of the holder's own, which for `for_s` removes those of its entries that become
+    stale. It takes the place of one that watches for `node` already."""
+    watched = [f"{entry.ifname}/{entry.mac}" for entry in entries]
+    loop = f"{script('stale_station.sh')}watch_stale {math.ceil(for_s)} {quoted(*watched)}"
     pid_file = quoted(f"/tmp/meshctl/forget.{node}.pid")
     return (
         f"mkdir -p /tmp/meshctl; [ ! -f {pid_file} ] || kill $(cat {pid_file}) 2>/dev/null; rm -f {pid_file}\n"
         f"start-stop-daemon -S -q -b -m -p {pid_file} -x /bin/sh -- -c {quoted(loop)} && echo watching\n"
-    )
-
-
-def _told(entry: Entry, word: str) -> str:
-    """POSIX sh that prints the number iw has behind `word` for the entry on interface $dev."""
-    return (
-        f"iw dev \"$dev\" station get {quoted(entry.mac)} 2>/dev/null | sed -n 's/.*{word}:[^0-9]*\\([0-9]*\\).*/\\1/p'"
     )
 
 

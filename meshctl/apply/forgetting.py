@@ -1,14 +1,15 @@
-"""Ask a node's neighbours to forget its radio, whichever way it starts anew: what `forget` says, over SSH.
+"""Have a node's neighbors remove their stale station entries of its radios: what `forget` says, over SSH.
 
-    plan -> those who are known to hold an entry, and those who may and did not tell (`Forgetting`)
-    before the radio goes: those behind it are told to watch it (`beforehand`)
+    plan -> those known to hold an entry, and those that may and did not say so (`Forgetting`)
+    before the radio goes: those behind it, and the node itself, watch their entries (`beforehand`)
     while it is silent: the others, ever more seldom (`while_silent`); when it answers again: all that do not watch,
-    those that did not tell before, and those that it hears now (`when_back`)
-    when all nodes have ended: once more those that did not answer; the operator is told of the rest (`ask_the_rest`)
+    those that did not answer before, and those that it hears now (`when_back`)
+    when all nodes have ended: once more those that did not answer; the operator is shown the rest (`ask_the_rest`)
     a change that an earlier run lost sight of, or a reboot: the same, as soon as the node is seen again (`make_up_for`)
 
-All are asked at once, each within `ASK_S`. Nothing here is a reason for failure: a neighbour that does not answer, or
-cannot (19.07), changes no outcome; it is told.
+Asking does no harm where nothing restarted: each neighbor observes whether its entry is stale before it removes it. All
+are asked at once, each within `ASK_S`. Nothing here is a reason for failure: a neighbor that does not answer, or cannot
+(19.07), changes no outcome; a note names it.
 """
 
 from __future__ import annotations
@@ -26,13 +27,15 @@ from meshctl.apply.forget import (
     GONE,
     KEPT,
     MOST_ASKED,
+    UNKNOWN,
     Entry,
     behind,
     by_holder,
     entries_of,
-    forget_script,
+    flush_script,
     neighbours_now,
     next_ask_s,
+    own_entries,
     radio_macs,
     silent_holders,
     watch_script,
@@ -40,11 +43,12 @@ from meshctl.apply.forget import (
 from meshctl.apply.job import Job, Work
 from meshctl.device.connection import Deadlines
 from meshctl.device.observation import Observation
+from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
-from meshctl.plan.radios import EVERY_RADIO, Radios, started_within
+from meshctl.plan.radios import EVERY_RADIO, Radios, seen_to_restart, started_within
 
-# A neighbour's answer; over a kept connection it takes a round trip.
-ASK_S = 8.0
+# A neighbor's answer: it waits up to 3 s for an echo, once for each of a node's two radios.
+ASK_S = 10.0
 # It is no disaster when one cannot be asked, so a new connection may take less time than elsewhere.
 _DEADLINES = Deadlines(connect_s=5.0, handshake_s=10.0, auth_s=10.0, channel_s=ASK_S, run_s=ASK_S, silence_s=ASK_S)
 # A node whose connection is not there by then is silent: an SSH login takes a board two seconds.
@@ -99,7 +103,14 @@ class Forgetting:
         self._watching = frozenset(name for name, answer in answers.items() if answer)
         unwatched = [name for name in names if name not in self._watching]
         if unwatched:
-            work.note(f"{_listed(unwatched)} could not be told that its radio starts anew", self.node)
+            work.note(f"{_listed(unwatched)} did not answer, and cannot watch for its radio's restart", self.node)
+
+    def watch_itself(self, connection: SshConnection, *, for_s: float) -> None:
+        """Have the node watch its own entries: should a neighbor remove its entry although the radio did not restart,
+        the node removes its own, and both count from 0. Raises Unreachable."""
+        entries = own_entries(self.node, self.job.before, self.radios)
+        if entries:
+            connection.run(watch_script(self.node, entries, for_s=for_s))
 
     def begins(self) -> None:
         """From now on its radio may start anew."""
@@ -133,7 +144,7 @@ class Forgetting:
         names = [name for name in self._holders if name not in self._watching and (among is None or name in among)]
         if names:
             self._asked_s.append(now_s)
-            self._forget({name: self._holders[name] for name in names}, self._began_s)
+            self._flush({name: self._holders[name] for name in names}, self._began_s)
 
     def when_back(self, now: Observation | None = None, *, went_back: bool = False, rebooted: bool = False) -> None:
         """Ask all that do not watch, once the node answers for good. `now` is what it tells then; who has `rebooted`
@@ -145,10 +156,25 @@ class Forgetting:
             return
         self._since_s = since_s
         asked = self._possible_holders(now)
-        answers = self._forget(asked, since_s)
+        answers = self._flush(asked, since_s)
+        unsure = [name for name, said in answers.items() if UNKNOWN in said.split()]
+        if unsure and now is not None:
+            self._flush_seen(unsure, asked, now, since_s)
         self._left = {name: entries for name, entries in asked.items() if name not in answers}
         if self._left:
             self.job.work.later.append(self)
+
+    def _flush_seen(
+        self, unsure: Sequence[str], asked: Mapping[str, tuple[Entry, ...]], now: Observation, since_s: float
+    ) -> None:
+        """Those that cannot find out whether their entry is stale remove it for the radios that the node was seen to
+        have restarted."""
+        restarted = seen_to_restart(self.job.before, now, time.monotonic() - since_s)
+        if not restarted:
+            return
+        macs = frozenset(radio_macs(self.job.before, restarted)) | frozenset(radio_macs(now, restarted))
+        entries = {name: tuple(e for e in asked[name] if e.mac.lower() in macs) for name in unsure}
+        self._flush({name: some for name, some in entries.items() if some}, since_s, has_restarted=True)
 
     def _possible_holders(self, now: Observation | None) -> dict[str, tuple[Entry, ...]]:
         """Who holds an entry as they told; then, on any of their interfaces, those who did not tell, and those who came
@@ -156,7 +182,7 @@ class Forgetting:
         work, job = self.job.work, self.job
         asked = by_holder(entries_of(self.node, work.around, self.radios))
         told = {mac: name for name, seen in work.around.items() for mac in radio_macs(seen, EVERY_RADIO)}
-        names = {**work.names, **told}
+        names = {**work.current_names(), **told}
         fellows = [node.name for mesh in job.node.meshes for node in work.fleet.members(mesh)]
         others = (*silent_holders(self.node, work.around, names, fellows), *(neighbours_now(now, names) if now else ()))
         # the radio may have been another one's the last time, or another MAC: whatever is known of it
@@ -167,16 +193,24 @@ class Forgetting:
                 asked.setdefault(name, tuple(Entry(name, "", mac) for mac in macs))
         return {name: asked[name] for name in list(asked)[:MOST_ASKED] if name not in self._watching and asked[name]}
 
-    def _forget(self, asked: Mapping[str, Sequence[Entry]], since_s: float) -> dict[str, str]:
-        """Have them; what each said that answered."""
-        scripts = {name: partial(_forget_since, entries, since_s) for name, entries in asked.items()}
+    def _flush(
+        self, asked: Mapping[str, Sequence[Entry]], since_s: float, *, has_restarted: bool = False
+    ) -> dict[str, str]:
+        """Have them remove stale entries; what each said that answered."""
+        scripts = {
+            name: partial(_flush_since, entries, since_s, has_restarted=has_restarted)
+            for name, entries in asked.items()
+        }
         answers = self._ask("neighbours forget it", scripts)
         self.tell(answers)
         return answers
 
     def tell(self, answers: Mapping[str, str]) -> None:
-        """Note who forgot it and who could not, each once."""
-        for word, text in ((GONE, "forgot its radio, to hear it anew"), (KEPT, "cannot forget its radio" + MAY_LOSE)):
+        """Note who removed a stale entry and who could not, each once."""
+        for word, text in (
+            (GONE, "removed a stale entry of its radio"),
+            (KEPT, "cannot remove its stale entry" + MAY_LOSE),
+        ):
             news = [name for name, said in answers.items() if word in said.split() and name not in self._told_names]
             if news:
                 self._told_names.update(news)
@@ -189,7 +223,7 @@ class Forgetting:
 
     def left(self) -> dict[str, Script]:
         """Whom to ask once more, and with what."""
-        return {name: partial(_forget_since, entries, self._since_s) for name, entries in self._left.items()}
+        return {name: partial(_flush_since, entries, self._since_s) for name, entries in self._left.items()}
 
     def _ask(self, step: str, scripts: Mapping[str, Script]) -> dict[str, str]:
         """Run each node's script, all at once; what each printed that answered. The step is told once."""
@@ -218,7 +252,9 @@ def ask_the_rest(work: Work) -> dict[str, tuple[str, ...]]:
         silent = tuple(name for name in scripts if name not in answers)
         if silent:
             rest[forgetting.node] = silent
-            work.note(f"{_listed(silent)} could not be asked to forget its radio{MAY_LOSE}", forgetting.node)
+            work.note(
+                f"{_listed(silent)} did not answer and may hold a stale entry of its radio{MAY_LOSE}", forgetting.node
+            )
     return rest
 
 
@@ -232,8 +268,8 @@ def make_up_for(job: Job, ago_s: float) -> None:
     forgetting.when_back(job.before)
 
 
-def _forget_since(entries: Sequence[Entry], since_s: float) -> str:
-    return forget_script(entries, older_than_s=time.monotonic() - since_s)
+def _flush_since(entries: Sequence[Entry], since_s: float, *, has_restarted: bool = False) -> str:
+    return flush_script(entries, older_than_s=time.monotonic() - since_s, has_restarted=has_restarted)
 
 
 def _together(scripts: Iterable[Script]) -> str:

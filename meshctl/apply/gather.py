@@ -23,7 +23,7 @@ from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.fleet.process import is_dead
 from meshctl.model import Fleet, Node
-from meshctl.topology import Graph, Report, mesh_macs, observed_graph, report_of
+from meshctl.topology import Graph, Report, mesh_macs, observed_graph, report_of, with_alternates
 
 # How long a node may take to put back what a dead process had armed: its files, and a reload.
 CLEARING_S = 60.0
@@ -55,7 +55,8 @@ class Seen:
 
 
 def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
-    """MAC -> node, from the inventory and from what nodes told when they were last seen."""
+    """MAC -> node, from the inventory, from what nodes reported when they were last seen, and the other addresses by
+    which their radios may be heard now."""
     macs = {
         mac.lower(): name
         for name, last in known.items()
@@ -64,7 +65,7 @@ def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
     }
     for node in fleet.nodes.values():
         macs.update({radio.mac.lower(): node.name for radio in node.radios if radio.mac})
-    return macs
+    return with_alternates(macs)
 
 
 def gather(

@@ -16,6 +16,7 @@ from meshctl.fleet import Event, EventKind, Interrupt, Observer
 from meshctl.fleet.journal import Run
 from meshctl.model import Fleet, Node
 from meshctl.plan import NodePlan, Wanted
+from meshctl.topology import mesh_macs
 
 if TYPE_CHECKING:
     from meshctl.apply.forgetting import Forgetting
@@ -25,7 +26,11 @@ if TYPE_CHECKING:
 class Work:
     """What all nodes of a run share. `owner` names this process to the locks on the nodes; `remember` keeps what a
     node told, for later; `around` is what the nodes of their meshes told before anything was changed, `names` tells
-    whose the MACs of mesh radios are, `bases` which are the base's; `later` collects what is to be asked in the end."""
+    whose the MACs of mesh radios are, `bases` which are the base's; `later` collects what is to be asked in the end.
+
+    `macs` are those by which the mesh has known each node's radios during the run: OpenWrt 24.10 and 25.12 give a radio
+    interface that is created again another one.
+    """
 
     fleet: Fleet
     access: Access
@@ -39,6 +44,22 @@ class Work:
     names: Mapping[str, str] = field(default_factory=dict)
     bases: Sequence[str] = ()
     later: list[Forgetting] = field(default_factory=list)
+    macs: dict[str, frozenset[str]] = field(default_factory=dict)
+
+    def saw(self, name: str, seen: Observation) -> None:
+        """Keep what a node reported, for the rest of the run and for later ones."""
+        self.macs[name] = self.macs.get(name, frozenset()) | frozenset(mesh_macs(seen))
+        self.remember(name, seen)
+
+    def current_names(self) -> dict[str, str]:
+        """MAC -> node, with those that were learned during the run."""
+        return {**self.names, **{mac: name for name, macs in self.macs.items() for mac in macs}}
+
+    def current_bases(self) -> frozenset[str]:
+        """The MACs of the base's mesh radios: those of before the run, and those seen since."""
+        base = self.fleet.base_node
+        seen = frozenset[str]() if base is None else self.macs.get(base.name, frozenset())
+        return frozenset(mac.lower() for mac in self.bases) | seen
 
     def note(self, text: str, node: str = "") -> None:
         self.observer(Event(EventKind.NOTE, node, time.time(), text))

@@ -44,6 +44,7 @@ def carry(attempt: Attempt, connection: SshConnection) -> Outcome:
     try:
         prepare(attempt, connection)
         if attempt.radios:
+            attempt.forgetting.watch_itself(connection, for_s=_limit_s(attempt))
             attempt.forgetting.beforehand(for_s=_limit_s(attempt))
         begin(attempt, connection)
     except Unreachable as error:
@@ -77,7 +78,7 @@ def follow(attempt: Attempt) -> Outcome:
             finally:
                 connection.close()
             if attempt.last is not None:
-                work.remember(attempt.job.name, attempt.last)
+                work.saw(attempt.job.name, attempt.last)
             if outcome is not None:
                 _have_its_radio_forgotten(attempt, outcome)
                 return outcome
@@ -102,7 +103,8 @@ def _move(attempt: Attempt, connection: SshConnection) -> Outcome | None:
             return Outcome(name, Result.DONE)
         case Move.WENT_BACK:
             release(attempt, connection)
-            return Outcome(name, Result.ROLLED_BACK, why_it_went_back(attempt.status, attempt.gaps, attempt.shut_out))
+            why = why_it_went_back(attempt.status, attempt.gaps, attempt.shut_out, attempt.unreached)
+            return Outcome(name, Result.ROLLED_BACK, why)
         case Move.FOREIGN:
             status = attempt.status
             return Outcome(name, Result.REFUSED, f"a change of {status.owner} is {status.state} on it")

@@ -19,18 +19,22 @@ from meshctl.apply.node import carry
 from meshctl.device import deadman
 from meshctl.device.deadman import Change
 from meshctl.device.framing import quoted
+from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.device.upload import upload
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome
 from meshctl.plan import PackageStep
 from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS
+from meshctl.plan.seen import CONFIG
 
 DIRECTORY = "/tmp/meshctl/packages"
 # Unpacking packages into jffs2 takes a minute on the slowest boards, and as much again to keep what is removed.
 INSTALL_S = 300.0
 # What conflicts is the radios' supplicant: netifd sets each radio up with the one there is now.
 _WITH_THE_OTHER_SUPPLICANT = "[ ! -x /sbin/wifi ] || /sbin/wifi\n"
+# A package's uci-defaults edit /etc/config and commit it (base-files, default_postinst): taken up, or put back.
+_TAKE_UP = "reload_config\n"
 
 
 def install(job: Job, connection: SshConnection, step: PackageStep) -> Outcome:
@@ -71,10 +75,10 @@ def _attempt(job: Job, connection: SshConnection, script: str, *, has_other_supp
     """A change of packages alone: the node stays where it is, and has to hear whom it heard."""
     here = replace(connection.endpoint, identity=job.name)
     expected = Expectation(neighbours=job.expected.neighbours, bases=job.expected.bases, needs=job.wanted.needs)
-    reload = _WITH_THE_OTHER_SUPPLICANT if has_other_supplicant else "exit 0\n"
+    reload = _TAKE_UP + (_WITH_THE_OTHER_SUPPLICANT if has_other_supplicant else "exit 0\n")
     return Attempt(
         replace(job, expected=expected),
-        Change(new_change_id(), {}, reload, extra=script),
+        Change(new_change_id(), {}, reload, extra=script, covered=_configuration(job.before)),
         new_nonce(),
         job.node.confirm_window_s,
         here,
@@ -82,6 +86,11 @@ def _attempt(job: Job, connection: SshConnection, script: str, *, has_other_supp
         extra_s=INSTALL_S,
         radios=EVERY_RADIO if has_other_supplicant else NO_RADIOS,
     )
+
+
+def _configuration(before: Observation) -> tuple[str, ...]:
+    """The files below /etc/config, whatever a package's scripts do to them."""
+    return tuple(f"/{CONFIG}{package}" for package in sorted(before.uci or {}))
 
 
 def _local(job: Job, file: str) -> Path:

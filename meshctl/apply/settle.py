@@ -92,12 +92,12 @@ REASONS = {
 }
 
 
-def why_it_went_back(status: ChangeStatus, missing: Sequence[str], shut_out: str = "") -> str:
+def why_it_went_back(status: ChangeStatus, missing: Sequence[str], shut_out: str = "", unreached: str = "") -> str:
     """One sentence for an outcome. `shut_out` is that it let nobody in while the change was in force: what was missing
-    was then seen too late, after it went back."""
+    was then seen too late, after it went back. `unreached` is why it could not be reached at all."""
     word, _, rest = status.last_reason.partition("+")
     reason = REASONS.get(word, word or "for an unknown reason")
     if rest:
         reason += ", and packages that it installed could not be removed"
-    details = shut_out or "; ".join(missing)
+    details = shut_out or "; ".join(missing) or (unreached and f"it could not be reached: {unreached}")
     return f"{reason}: {details}" if details else reason

@@ -180,9 +180,17 @@ def _settle(run: _Switch, needed: Mapping[str, int]) -> dict[str, Outcome]:
     why = missing_of(proven, needed) if has_entry else "the base did not come back"
     if not why:
         return _keep(run)
-    absent = ", ".join(member.name for member in run.members if not member.is_proven)
-    run.work.note(f"{why}; without {absent}: everything goes back")
+    run.work.note(f"{why}; rolling back: {'; '.join(gap_of(member) for member in run.members if not member.is_proven)}")
     return _undo(run, why)
+
+
+def gap_of(member: Member) -> str:
+    """`b01: it has no way to the base`: what kept a member from proving itself when it was last looked for."""
+    attempt = member.attempt
+    if attempt is None or member.is_silent or not attempt.gaps:
+        last_error = "" if attempt is None else attempt.trouble
+        return f"{member.name}: it does not answer{f' ({last_error})' if last_error else ''}"
+    return f"{member.name}: {', '.join(attempt.gaps)}"
 
 
 def _have_forgotten(run: _Switch, proven: Sequence[Member]) -> None:
@@ -206,7 +214,7 @@ def _prove(member: Member) -> None:
     try:
         member.is_proven = look(attempt, connection) is Move.CONFIRM
         if attempt.last is not None:
-            member.job.work.remember(member.name, attempt.last)
+            member.job.work.saw(member.name, attempt.last)
     except NodeError as error:
         attempt.trouble = str(error)
     finally:
@@ -251,6 +259,7 @@ def _kept_outcome(member: Member) -> Outcome:
 
 def _undo(run: _Switch, why: str) -> dict[str, Outcome]:
     """Take back whoever can be reached, the farthest first, so that the way to the others lasts; then see them back."""
+    gaps = {member.name: gap_of(member) for member in run.members if not member.is_proven}
     for member in run.members:
         if member.attempt is None:
             continue
@@ -271,12 +280,17 @@ def _undo(run: _Switch, why: str) -> dict[str, Outcome]:
             ended[member.name] = follow(member.attempt)
 
     run.each(run.members, see)
-    return {member.name: _told(ended.get(member.name), member.name, why) for member in run.members}
+    return {
+        member.name: _told(ended.get(member.name), member.name, why, gaps.get(member.name, ""))
+        for member in run.members
+    }
 
 
-def _told(outcome: Outcome | None, name: str, why: str) -> Outcome:
+def _told(outcome: Outcome | None, name: str, why: str, gap: str) -> Outcome:
     if outcome is None:
         return Outcome(name, Result.PENDING, why)
     if outcome.result is Result.ROLLED_BACK:
-        return Outcome(name, Result.ROLLED_BACK, f"the whole mesh went back: {why}")
+        return Outcome(
+            name, Result.ROLLED_BACK, f"the whole mesh was rolled back: {'; '.join(filter(None, (why, gap)))}"
+        )
     return outcome

@@ -16,6 +16,7 @@ import typer
 
 from meshctl.apply.trusting import Shown, shown_keys
 from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.output import complain, echo, echo_bytes, echo_json
 from meshctl.cli.session import KeyFiles, Lab, Nodes, Session, chosen, exit_for, session
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result
@@ -45,7 +46,7 @@ def trust(
             opened.access, opened.trust, chosen(opened.fleet, nodes), parallel=opened.fleet.apply.parallel
         )
         if as_json:
-            typer.echo(json.dumps([_key_object(item) for item in shown], indent=1))
+            echo_json(json.dumps([_key_object(item) for item in shown], indent=1))
         left = 0
         for item in shown:
             left += not _decide(opened, item, may_replace=change, yes=yes, quiet=as_json)
@@ -68,7 +69,7 @@ def _decide(opened: Session, item: Shown, *, may_replace: bool, yes: bool, quiet
 
     def say(text: str) -> None:
         if not quiet:
-            typer.echo(text)
+            echo(text)
 
     name = item.node.name
     if item.key is None:
@@ -105,16 +106,26 @@ def run(
     ],
     inventory: InventoryPath = Path(),
     timeout: Annotated[float, typer.Option("--timeout", help="Seconds that a node may take.")] = 60.0,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="Pass the output through as it is: no names, control characters included.")
+    ] = False,
     as_json: AsJson = False,
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
     """Run a shell command on nodes, in parallel.
 
+    One word after -- goes to the node's shell as it stands: quote it once for your own shell, and pipes and variables
+    are the node's. Several words arrive there as these words, without expansion.
+
     Exit code: 0 when it ends with 0 on every node, else 1; 3 when no node answers.
 
     Example: meshctl run 'husky*' -- uptime
+
+    Example: meshctl run b01 b02 -- 'logread | grep -c batman'
     """
+    if raw and as_json:
+        raise InputError("expected --raw or --json, found both")
     patterns, command = _split(words)
     with session(inventory, key_files=key or (), lab=lab) as opened:
         wanted = {node.name: node for node in chosen(opened.fleet, patterns)}
@@ -125,20 +136,26 @@ def run(
                 done = connection.run(command, timeout_s=timeout)
             facts = {"exit_status": str(done.exit_status), "stdout": done.stdout, "stderr": done.stderr}
             with out:
-                _print(name, done.stdout, done.stderr, as_json=as_json, status=done.exit_status)
+                if raw:
+                    echo_bytes(done.stdout_bytes)
+                    echo_bytes(done.stderr_bytes, err=True)
+                else:
+                    _print(name, done.stdout, done.stderr, as_json=as_json, status=done.exit_status)
             result = Result.DONE if done.exit_status == 0 else Result.FAILED
             return Outcome(
                 name, result, "" if done.exit_status == 0 else f"exit status {done.exit_status}", facts=facts
             )
 
-        with opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)):
+        with opened.interrupt.on_signals(complain):
             ended = run_on_all(wanted, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt)
         for outcome in ended.values():
             if not outcome.result.is_good and "exit_status" not in outcome.facts:
                 if as_json:
-                    typer.echo(json.dumps({"node": outcome.node, "error": outcome.reason}))
+                    echo_json(json.dumps({"node": outcome.node, "error": outcome.reason}))
                 else:
-                    typer.echo(str(outcome), err=True)
+                    echo(str(outcome), err=True)
+                    if outcome.hint:
+                        echo(f"  hint: {outcome.hint}", err=True)
         raise typer.Exit(exit_for(ended.values(), opened.interrupt))
 
 
@@ -150,19 +167,24 @@ def _split(words: list[str]) -> tuple[list[str], str]:
     command = given[given.index("--") + 1 :]
     if not command or words[-len(command) :] != command:
         raise InputError("expected a command after `--`", hint="meshctl run b01 -- uptime")
-    return words[: -len(command)], " ".join(command) if len(command) == 1 else shlex.join(command)
+    return words[: -len(command)], shell_words(command)
+
+
+def shell_words(command: list[str]) -> str:
+    """What the node's shell gets: one word as it stands, several so that each arrives as one."""
+    return command[0] if len(command) == 1 else shlex.join(command)
 
 
 def _print(name: str, stdout: str, stderr: str, *, as_json: bool, status: int) -> None:
     if as_json:
-        typer.echo(json.dumps({"node": name, "exit_status": status, "stdout": stdout, "stderr": stderr}))
+        echo_json(json.dumps({"node": name, "exit_status": status, "stdout": stdout, "stderr": stderr}))
         return
     for line in stdout.splitlines():
-        typer.echo(f"{name}: {line}")
+        echo(f"{name}: {line}")
     for line in stderr.splitlines():
-        typer.echo(f"{name}: {line}", err=True)
+        echo(f"{name}: {line}", err=True)
     if status:
-        typer.echo(f"{name}: exit status {status}", err=True)
+        echo(f"{name}: exit status {status}", err=True)
 
 
 def ssh(
@@ -174,7 +196,7 @@ def ssh(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Log in to a node with the system's ssh, trusting what the fleet trusts.
+    """Log in to a node with the system's ssh, trusting what the fleet trusts. A command is quoted as for `run`.
 
     Exit code: that of ssh.
 
@@ -188,7 +210,7 @@ def ssh(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         (there,) = chosen(opened.fleet, [node])[:1]
         arguments = ssh_arguments(opened, there)
-    os.execv(program, [*arguments, *(command or [])])
+    os.execv(program, [*arguments, *([shell_words(command)] if command else [])])
 
 
 def ssh_arguments(opened: Session, node: Node) -> list[str]:

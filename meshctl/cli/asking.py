@@ -6,6 +6,7 @@ import sys
 
 import typer
 
+from meshctl.cli.output import echo
 from meshctl.errors import ExitCode, InputError
 
 
@@ -18,5 +19,5 @@ def must_agree(question: str) -> None:
     if not sys.stdin.isatty():
         raise InputError("nobody can be asked here", hint="look at what would be done, then run again with --yes")
     if not typer.confirm(question):
-        typer.echo("nothing was changed", err=True)
+        echo("nothing was changed", err=True)
         raise typer.Exit(int(ExitCode.FINDINGS))

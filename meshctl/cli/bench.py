@@ -13,16 +13,26 @@ from typing import Annotated, Any
 
 import typer
 
-from meshctl.apply.bootstrap import FACTORY_ADDRESS, BenchPlace, Found, find_node, look_around, plan_arrivals
+from meshctl.apply.bootstrap import (
+    FACTORY_ADDRESS,
+    BenchPlace,
+    Found,
+    find_node,
+    look_around,
+    plan_arrivals,
+    restore_pins,
+)
 from meshctl.apply.replace import give_up, heir_of, identity_edits, succeed
 from meshctl.cli.carry import SALT_BYTES, ask_and_carry_out, choices_of
 from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.output import complain, echo
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
 from meshctl.cli.session import KeyFiles, Lab, Session, exit_for, session
 from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Outcome, Result
 from meshctl.inventory.edit import Change, Editor, save, set_node
 from meshctl.model import Node, NodeState
+from meshctl.plan import Verdict
 from meshctl.report.progress import outcome_text
 
 Changes = tuple[Change, ...]
@@ -73,7 +83,7 @@ def bootstrap(
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
         places = _places(opened, nodes or [], _spots(at or [], interface or []))
-        with opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)):
+        with opened.interrupt.on_signals(complain):
             arrivals = look_around(
                 opened.renderer,
                 opened.access,
@@ -87,7 +97,7 @@ def bootstrap(
             _complain(outcome)
         if not as_json:
             for name, item in arrivals.found.items():
-                typer.echo(f"{name}: found at {item.place.endpoint.label}, host key {item.key.fingerprint}")
+                echo(f"{name}: found at {item.place.endpoint.label}, host key {item.key.fingerprint}")
         if not arrivals.found:
             raise typer.Exit(exit_for(arrivals.outcomes, opened.interrupt))
         prepared = plan_arrivals(
@@ -100,6 +110,8 @@ def bootstrap(
             choices=choices,
             interrupt=opened.interrupt,
         )
+        refused = [plan.node for plan in prepared.plan.of(Verdict.REFUSED) if plan.node in arrivals.found]
+        restore_pins(opened.trust, arrivals, refused)
         try:
             ask_and_carry_out(opened, prepared, "bootstrap", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
         except typer.Exit as ended:
@@ -109,11 +121,11 @@ def bootstrap(
 
 
 def _complain(outcome: Outcome) -> None:
-    typer.echo(f"{outcome_text(outcome)}", err=True)
+    echo(f"{outcome_text(outcome)}", err=True)
     is_silent = outcome.result is Result.UNREACHABLE and FACTORY_ADDRESS in outcome.node
     hint = outcome.hint or (SILENT_HINT if is_silent else "")
     if hint:
-        typer.echo(f"  hint: {hint}", err=True)
+        echo(f"  hint: {hint}", err=True)
 
 
 def _spots(at: list[str], interfaces: list[str]) -> list[BenchPlace]:
@@ -191,7 +203,7 @@ def replace(
         fleet = heir_of(opened.fleet, node, spare)
         opened = with_changes(opened, fleet=fleet, renderer=with_changes(opened.renderer, fleet=fleet))
         node = fleet.nodes[node.name]
-        with opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)):
+        with opened.interrupt.on_signals(complain):
             successor = succeed(
                 opened.renderer,
                 opened.access,
@@ -201,6 +213,8 @@ def replace(
                 place=place,
                 interrupt=opened.interrupt,
             )
+        if not as_json:
+            echo(_who_becomes_whom(node, spare, new, successor.arrivals.found.get(node.name)))
         status = int(ExitCode.FINDINGS)
         try:
             prepared = plan_arrivals(
@@ -221,8 +235,16 @@ def replace(
                 give_up(opened.trust, node, successor)
         if status == ExitCode.OK:
             changes = _learn_identity(opened, inventory, node, spare, successor.arrivals.found[node.name])
-            typer.echo("".join(change.diff() for change in changes), nl=False, err=as_json)
+            echo("".join(change.diff() for change in changes), nl=False, err=as_json)
         raise typer.Exit(status)
+
+
+def _who_becomes_whom(node: Node, spare: Node | None, new: str, found: Found | None) -> str:
+    """`spare2, found at 192.168.1.1, becomes husky1-b03 (10.42.0.13): its name, address and role; ...`."""
+    there = f", found at {found.place.endpoint.label}," if found is not None else ""
+    who = spare.name if spare is not None else f"the device on the {new}"
+    left = f"; the entry {spare.name} is retired" if spare is not None else ""
+    return f"{who}{there} becomes {node.name} ({node.address.ip}): its name, address and role{left}"
 
 
 def _spare(opened: Session, old: Node, new: str) -> Node | None:

@@ -12,10 +12,13 @@ import typer
 from meshctl.apply.execute import Setting, carry_out
 from meshctl.apply.planning import Choices, Prepared, prepare
 from meshctl.cli.asking import must_agree
+from meshctl.cli.options import line_width
+from meshctl.cli.output import complain, console, echo, echo_json
 from meshctl.cli.session import Session, chosen, exit_for, progress_for
 from meshctl.cli.streams import unheard
 from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Outcome, totals
+from meshctl.model import Fleet
 from meshctl.plan import Plan, Verdict
 
 # Bytes of salt for a plan's fingerprints; RFC 7914 asks for no more.
@@ -37,7 +40,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def prepared_for(opened: Session, nodes: list[str] | None, choices: Choices, salt: bytes | None = None) -> Prepared:
-    with opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)):
+    with opened.interrupt.on_signals(complain):
         prepared = prepare(
             opened.renderer,
             opened.access,
@@ -60,23 +63,22 @@ def write_text(path: Path, text: str) -> None:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def show(plan: Plan, *, brief: bool) -> None:
-    from rich.console import Console
+def show(plan: Plan, fleet: Fleet, *, brief: bool) -> None:
     from rich.text import Text
 
     from meshctl.report.plan_text import plan_lines
 
-    console = Console(soft_wrap=True, highlight=False)
-    for line in plan_lines(plan, with_diffs=not brief):
-        console.print(Text(line.text, line.style))
+    out = console()
+    for line in plan_lines(plan, with_diffs=not brief, width=line_width(), order=fleet.nodes):
+        out.print(Text(line.text, line.style), soft_wrap=True)
 
 
-def checked(plan: Plan, *, as_json: bool, brief: bool) -> ExitCode:
+def checked(plan: Plan, fleet: Fleet, *, as_json: bool, brief: bool) -> ExitCode:
     if as_json:
         told = {name: {"verdict": node.verdict.value, "reason": node.reason} for name, node in plan.nodes.items()}
-        typer.echo(json.dumps({"fleet": plan.fleet, "nodes": told}, indent=1))
+        echo_json(json.dumps({"fleet": plan.fleet, "nodes": told}, indent=1))
     else:
-        show(plan, brief=brief)
+        show(plan, fleet, brief=brief)
     if plan.of(Verdict.CHANGE) or plan.of(Verdict.REFUSED):
         return ExitCode.FINDINGS
     return ExitCode.UNREACHABLE if plan.of(Verdict.AWAY) else ExitCode.OK
@@ -96,7 +98,7 @@ def ask_and_carry_out(
     from meshctl.report.plan_text import question
 
     if not as_json:
-        show(prepared.plan, brief=brief)
+        show(prepared.plan, opened.fleet, brief=brief)
     if not prepared.plan.is_empty and not prepared.plan.refusal and not yes:
         must_agree(question(prepared.plan))
     carry_out_plan(opened, prepared, command, choices.with_firmware, as_json=as_json, rate=rate, choices=choices)
@@ -130,7 +132,7 @@ def carry_out_plan(
     try:
         with (
             progress_for(len(plan.nodes), as_json=as_json) as progress,
-            opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)),
+            opened.interrupt.on_signals(progress.stopping),
         ):
             setting = Setting(
                 opened.fleet,
@@ -147,10 +149,8 @@ def carry_out_plan(
         run.end(str(totals(outcomes.values())) if outcomes else "could not run")
     if run.trouble:
         with unheard():
-            typer.echo(f"the journal is incomplete: {run.trouble}", err=True)
-            typer.echo(
-                "hint: what it lacks counts as not done, so `meshctl resume` looks at those nodes again", err=True
-            )
+            echo(f"the journal is incomplete: {run.trouble}", err=True)
+            echo("hint: what it lacks counts as not done, so `meshctl resume` looks at those nodes again", err=True)
     # a reader that is gone (`| head`, a closed terminal) changes nothing about how it ended
     with unheard():
         _sum_up(outcomes, run.id, as_json=as_json)
@@ -163,8 +163,8 @@ def _sum_up(outcomes: dict[str, Outcome], run_id: int, *, as_json: bool) -> None
         from meshctl.report.progress import outcome_object
 
         told = [outcome_object(outcome) for outcome in outcomes.values()]
-        typer.echo(json.dumps({"event": "ended", "run": run_id, "totals": str(counted), "outcomes": told}))
+        echo_json(json.dumps({"event": "ended", "run": run_id, "totals": str(counted), "outcomes": told}))
         return
-    typer.echo(f"run {run_id}: {counted}")
+    echo(f"run {run_id}: {counted}")
     if not counted.all_good:
-        typer.echo("`meshctl resume` takes up what is not done", err=True)
+        echo("`meshctl resume` takes up what is not done", err=True)

@@ -27,6 +27,7 @@ _LAB = "Practise"
 COMMANDS: dict[str, Entry] = {
     "init": Entry("meshctl.cli.inventory", "init", "Write a commented starter inventory", _INVENTORY),
     "inventory": Entry("meshctl.cli.inventory", "app", "Show what the inventory says and why", _INVENTORY),
+    "deployed": Entry("meshctl.cli.deployed", "deployed", "Mark dropped beacons as deployed", _INVENTORY),
     "schema": Entry("meshctl.cli.inventory", "schema", "Print the inventory's JSON Schema for editors", _INVENTORY),
     "lint": Entry("meshctl.cli.lint", "lint", "Check inventories across all layers", _INVENTORY),
     "render": Entry("meshctl.cli.render", "render", "Write the files each node gets", _INVENTORY),

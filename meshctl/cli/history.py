@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import dataclass
 from datetime import datetime
+from itertools import islice
 from typing import Annotated, Any
 
 import typer
 
 from meshctl.cli.options import AsJson
+from meshctl.cli.output import echo, echo_json
 from meshctl.errors import InputError
 from meshctl.fleet.journal import Journal, RunRecord, default_path
 
@@ -17,6 +20,10 @@ from meshctl.fleet.journal import Journal, RunRecord, default_path
 def history(
     run: Annotated[int | None, typer.Argument(help="Number of a run, to see its nodes and steps.")] = None,
     node: Annotated[str | None, typer.Option("--node", help="Only this node: its runs, or its steps in a run.")] = None,
+    fleet: Annotated[str | None, typer.Option("--fleet", help="Only runs of the fleet with this name.")] = None,
+    lab: Annotated[
+        bool | None, typer.Option("--virtual/--real", help="Only runs in labs, or only of real nodes.")
+    ] = None,
     limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="How many runs to list.")] = 20,
     as_json: AsJson = False,
 ) -> None:
@@ -26,23 +33,57 @@ def history(
     """
     with Journal(default_path(os.environ)) as journal:
         if run is None:
-            _list_runs(journal, node, limit, as_json=as_json)
+            _list_runs(journal, _Wanted(node, fleet, lab), limit, as_json=as_json)
         else:
             _show_run(journal, run, node, as_json=as_json)
 
 
-def _list_runs(journal: Journal, node: str | None, limit: int, *, as_json: bool) -> None:
-    records = journal.runs(node=node, limit=limit)
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """Which runs are listed; None does not choose."""
+
+    node: str | None
+    fleet: str | None
+    is_virtual: bool | None
+
+    def takes(self, record: RunRecord) -> bool:
+        return self.fleet in (None, record.fleet) and self.is_virtual in (None, bool(record.lab))
+
+
+def _list_runs(journal: Journal, wanted: _Wanted, limit: int, *, as_json: bool) -> None:
+    found = journal.runs(node=wanted.node, limit=None)
+    records = tuple(islice((record for record in found if wanted.takes(record)), limit))
     if as_json:
-        typer.echo(json.dumps([_run_object(record) for record in records], indent=1))
+        echo_json(json.dumps([_run_object(record) for record in records], indent=1))
         return
+    # nodes of several fleets share a name: runs of one fleet stand together
+    by_fleet: dict[tuple[str, str], list[RunRecord]] = {}
     for record in records:
-        typer.echo(f"{record.id:>5}  {_moment(record.began_s)}  {record.command:<17} {record.fleet:<16} {record.state}")
-        for outcome in journal.outcomes(record.id) if node is not None else ():
-            if outcome.node == node:
-                typer.echo(f"       {outcome}")
+        by_fleet.setdefault((record.fleet, record.lab) if wanted.node is not None else ("", ""), []).append(record)
+    for number, (key, group) in enumerate(by_fleet.items()):
+        if wanted.node is not None and len(by_fleet) > 1:
+            echo(("\n" if number else "") + f"{wanted.node} of {_fleet_text(*key)}")
+        _list_group(journal, group, wanted.node)
     if not records:
-        typer.echo("no runs yet" if node is None else f"no runs of {node} yet")
+        echo("no runs yet" if wanted.node is None else f"no runs of {wanted.node} yet")
+
+
+def _list_group(journal: Journal, records: list[RunRecord], node: str | None) -> None:
+    rows = [("RUN", "BEGAN", "COMMAND", "FLEET", "RESULT")]
+    rows += [
+        (str(one.id), _moment(one.began_s), one.command, _fleet_text(one.fleet, one.lab), one.state) for one in records
+    ]
+    widths = [max(len(row[column]) for row in rows) for column in range(4)]
+    for row, record in zip(rows, [None, *records], strict=True):
+        cells = [cell.ljust(width) for cell, width in zip(row[1:4], widths[1:], strict=True)]
+        echo("  ".join([row[0].rjust(widths[0]), *cells, row[4]]).rstrip())
+        for outcome in journal.outcomes(record.id) if record is not None and node is not None else ():
+            if outcome.node == node:
+                echo(f"{'':{widths[0]}}  {outcome}")
+
+
+def _fleet_text(fleet: str, lab: str) -> str:
+    return f"{fleet} (lab)" if lab else fleet
 
 
 def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool) -> None:
@@ -62,18 +103,19 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool)
                 for s in steps
             ],
         }
-        typer.echo(json.dumps(told, indent=1))
+        echo_json(json.dumps(told, indent=1))
         return
-    typer.echo(f"run {record.id}: {record.command} of {record.fleet} by {record.owner}, {_moment(record.began_s)}")
-    typer.echo(f"  {record.inventory}: {record.state}")
+    fleet = _fleet_text(record.fleet, record.lab)
+    echo(f"run {record.id}: {record.command} of {fleet} by {record.owner}, {_moment(record.began_s)}")
+    echo(f"  {record.inventory}: {record.state}")
     width = max((len(step.step) for step in steps), default=0)
     for outcome in outcomes:
-        typer.echo(f"{outcome}" + (f" ({outcome.duration_s:.1f} s)" if outcome.duration_s else ""))
+        echo(f"{outcome}" + (f" ({outcome.duration_s:.1f} s)" if outcome.duration_s else ""))
         for step in steps:
             if step.node == outcome.node:
                 took = "cut short" if step.duration_s is None else f"{step.duration_s:.2f} s"
                 result = "" if step.result == "done" else step.result
-                typer.echo(f"  {step.step:<{width}} {took:>10}  {result}".rstrip())
+                echo(f"  {step.step:<{width}} {took:>10}  {result}".rstrip())
 
 
 def _run_object(record: RunRecord) -> dict[str, Any]:
@@ -81,6 +123,7 @@ def _run_object(record: RunRecord) -> dict[str, Any]:
         "run": record.id,
         "command": record.command,
         "fleet": record.fleet,
+        "lab": record.lab,
         "inventory": record.inventory,
         "owner": record.owner,
         "began_s": record.began_s,

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.output import echo, echo_json
 from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state
 from meshctl.inventory.explain import Why, explain
@@ -40,12 +41,10 @@ def init(
     key = _public_key(ssh_key)
     files = write_starter(directory, key)
     for file in files:
-        typer.echo(f"wrote {file}")
+        echo(f"wrote {file}")
     if not key:
-        typer.echo(
-            "no public key was found in ~/.ssh: enter yours as operators.ssh_keys, or nobody may log in", err=True
-        )
-    typer.echo(f"next: edit it, then `meshctl lint {directory}`")
+        echo("no public key was found in ~/.ssh: enter yours as operators.ssh_keys, or nobody may log in", err=True)
+    echo(f"next: edit it, then `meshctl lint {directory}`")
 
 
 def schema(
@@ -57,7 +56,7 @@ def schema(
     """
     text = json.dumps(json_schema(), indent=2) + "\n"
     if out is None:
-        typer.echo(text, nl=False)
+        echo(text, nl=False)
         return
     try:
         out.write_text(text, encoding="utf-8")
@@ -84,7 +83,7 @@ def list_nodes(
         if role in (None, node.role) and state in (None, node.state) and robot in ("", node.robot)
     ]
     if as_json:
-        typer.echo(json.dumps({"fleet": fleet.name, "nodes": rows}, indent=2))
+        echo_json(json.dumps({"fleet": fleet.name, "nodes": rows}, indent=2))
         return
     head = ("NODE", "ROLE", "STATE", "ADDRESS", "HARDWARE", "RELEASE", "MESHES", "ROBOT", "LABEL")
     _table([head, *([_cell(value) for value in row.values()] for row in rows)])
@@ -104,10 +103,10 @@ def show(
     fleet = load_fleet(inventory, environ=os.environ)
     values = explain(fleet, _node(fleet, node))
     if as_json:
-        typer.echo(json.dumps({"node": node, "values": [_record(value) for value in values]}, indent=2))
+        echo_json(json.dumps({"node": node, "values": [_record(value) for value in values]}, indent=2))
         return
     written = [value for value in values if value.value or value.origin.layer != "built-in"]
-    typer.echo(node)
+    echo(node)
     _table([_row(value, why) for value in written], indent="  ")
 
 
@@ -128,7 +127,7 @@ def change_state(
     set_state(editor, node, new)
     changes = editor.changes()
     for change in changes:
-        typer.echo(change.diff(), nl=False)
+        echo(change.diff(), nl=False)
     if not dry_run:
         save(changes)
 
@@ -199,4 +198,4 @@ def _table(rows: Sequence[Sequence[str]], indent: str = "") -> None:
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
-        typer.echo((indent + "  ".join(cells)).rstrip())
+        echo((indent + "  ".join(cells)).rstrip())

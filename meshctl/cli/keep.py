@@ -58,7 +58,7 @@ def backup(
 
         with (
             progress_for(len(wanted), as_json=as_json) as progress,
-            opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)),
+            opened.interrupt.on_signals(progress.stopping),
         ):
             ended = run(
                 wanted, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt, observer=progress
@@ -115,7 +115,7 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Out
     try:
         with (
             progress_for(1, as_json=as_json) as progress,
-            opened.interrupt.on_signals(lambda text: typer.echo(text, err=True)),
+            opened.interrupt.on_signals(progress.stopping),
         ):
             known = opened.journal.last_known(opened.fleet.name)
             around: dict[str, Observation] = {}

@@ -11,6 +11,7 @@ import typer
 
 from meshctl.cli import lab_ground
 from meshctl.cli.options import AsJson, LabDirectory, lab_directory
+from meshctl.cli.output import echo, echo_json
 from meshctl.errors import InputError
 from meshctl.lab.breaks import BREAKS, parse, told
 from meshctl.lab.console import run_shell
@@ -39,6 +40,9 @@ Where = Annotated[str, typer.Argument(help="A node (b03) or a link (b01-b02).")]
 @app.command("up")
 def up(
     inventory: Annotated[Path | None, typer.Argument(help="The fleet to copy; default: the example lab.")] = None,
+    chosen: Annotated[
+        Path | None, typer.Option("--inventory", "-i", help="The same as the argument, as other commands take it.")
+    ] = None,
     nodes: Annotated[int | None, typer.Option("--nodes", min=1, help="Only its first N nodes.")] = None,
     directory: LabDirectory = None,
     port: Annotated[int, typer.Option("--port", help="TCP port of all its addresses; 0 takes a free one.")] = 0,
@@ -50,19 +54,23 @@ def up(
 
     Example: meshctl lab up inventory/lab --nodes 6 --real
     """
+    if inventory is not None and chosen is not None:
+        raise InputError("expected one inventory, found an argument and --inventory")
     place = lab_directory(directory)
-    copy = prepare(inventory or shipped("inventory") / "lab", place)
+    copy = prepare(inventory or chosen or shipped("inventory") / "lab", place)
     spec = spec_of(copy.fleet, links=copy.links, nodes=nodes, port=port)
     if real:
-        typer.echo("starting a machine with real radios; its image is made at the first start")
+        echo("starting a machine with real radios; its image is made at the first start")
         fleet: VirtualFleet = RealFleet(spec, place).up(wait_s=_REAL_START_S + _REAL_BOOT_S * len(spec.nodes))
     else:
         fleet = VirtualFleet(spec, place).up(wait_s=_START_S + _BOOT_S * len(spec.nodes))
-    typer.echo(f"{len(spec.nodes)} nodes of {spec.name} are up, each at 192.168.1.1 on its own bench port")
-    typer.echo(f"inventory: {copy.inventory}")
-    typer.echo(f"reach it:  export MESHCTL_LAB={place} MESHCTL_INVENTORY={copy.inventory}")
-    typer.echo(f"by hand:   meshctl lab shell {fleet.spec.names[0]}")
-    typer.echo("then:      meshctl bootstrap --yes; meshctl lab unplug; meshctl topology")
+    echo(f"{len(spec.nodes)} nodes of {spec.name} are up, each at 192.168.1.1 on its own bench port")
+    if copy.kept is not None:
+        echo(f"kept:      {copy.kept} is the earlier copy of the inventory, which was edited")
+    echo(f"inventory: {copy.inventory}")
+    echo(f"reach it:  export MESHCTL_LAB={place} MESHCTL_INVENTORY={copy.inventory}")
+    echo(f"by hand:   meshctl lab shell {fleet.spec.names[0]}")
+    echo("then:      meshctl bootstrap --yes; meshctl lab unplug; meshctl topology")
 
 
 @app.command("down")
@@ -75,7 +83,7 @@ def down(directory: LabDirectory = None) -> None:
     name = end(place)
     if not name:
         raise LabError(f"no virtual fleet runs in {place}", hint="meshctl lab up starts one")
-    typer.echo(f"{name} is down")
+    echo(f"{name} is down")
 
 
 @app.command("status")
@@ -86,18 +94,18 @@ def status(directory: LabDirectory = None, as_json: AsJson = False) -> None:
     """
     state = VirtualFleet.attach(lab_directory(directory)).status()
     if as_json:
-        typer.echo(json.dumps(state, indent=2))
+        echo_json(json.dumps(state, indent=2))
         return
-    typer.echo(f"{state['fleet']}: process {state['pid']}, port {state['port']}")
+    echo(f"{state['fleet']}: process {state['pid']}, port {state['port']}")
     head = ("NODE", "POWER", "RELEASE", "ADDRESS", "PLUGGED", "MESH", "REACHED AT", "BROKEN")
     rows: list[tuple[str, ...]] = [head]
     rows += [_row(node) for node in state["nodes"]]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
-        typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
     for link in state["links"]:
         if not link["up"]:
-            typer.echo(f"link {'-'.join(link['between'])} is down")
+            echo(f"link {'-'.join(link['between'])} is down")
 
 
 @app.command("shell")
@@ -132,7 +140,7 @@ def break_(
 ) -> None:
     order = parse(what)
     VirtualFleet.attach(lab_directory(directory)).break_(where, what)
-    typer.echo(f"{where}: {told(order)}")
+    echo(f"{where}: {told(order)}")
 
 
 @app.command("mend")
@@ -145,7 +153,7 @@ def mend(
     Example: meshctl lab mend b03
     """
     VirtualFleet.attach(lab_directory(directory)).mend(where)
-    typer.echo(f"{where or 'everything'}: mended")
+    echo(f"{where or 'everything'}: mended")
 
 
 lab_ground.register(app)
@@ -192,7 +200,7 @@ def image(
         out.write_bytes(content)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from error
-    typer.echo(f"firmware: {{image: {out.name}, sha256: {hashlib.sha256(content).hexdigest()}, revision: {named}}}")
+    echo(f"firmware: {{image: {out.name}, sha256: {hashlib.sha256(content).hexdigest()}, revision: {named}}}")
 
 
 def _plug(directory: Path | None, names: list[str] | None, plugged: bool) -> None:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.cli.options import AsJson, LabDirectory, lab_directory
+from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.lab import ground_file, mission_file, standing
 from meshctl.lab.entries import share_of
@@ -65,7 +66,7 @@ def link(
     fleet.link(a, b, **changes)
     for now in fleet.status()["links"]:
         if set(now["between"]) == {a, b}:
-            typer.echo(_set(now))
+            echo(_set(now))
 
 
 def _set(now: dict[str, Any]) -> str:
@@ -92,7 +93,7 @@ def move(
     standing.move(fleet, node, (x, y))
     for one in links_of(standing.ground_of(fleet)):
         if node in one.ends and one.ends <= set(fleet.spec.names):
-            typer.echo(_described(one.seen_from(node)))
+            echo(_described(one.seen_from(node)))
 
 
 def ground(
@@ -112,7 +113,7 @@ def ground(
         standing.stand_on(fleet, wanted)
     now = standing.ground_of(fleet)
     if as_json:
-        typer.echo(ground_file.dump(now), nl=False)
+        echo(ground_file.dump(now), nl=False)
         return
     _show(now, fleet.spec.names)
 
@@ -136,24 +137,24 @@ def mission(
     fleet = VirtualFleet.attach(lab_directory(directory))
     absent = sorted(set(wanted.names) - set(fleet.spec.names))
     if absent:
-        typer.echo(f"not in this fleet: {', '.join(absent)}", err=True)
+        echo(f"not in this fleet: {', '.join(absent)}", err=True)
     say = _tell_json if as_json else _tell
     stopped_s = play(
         wanted, FleetStage(fleet), tell=say, clock=time.monotonic, wait=time.sleep, speed=speed, start_s=start_s
     )
     if stopped_s is not None:
-        typer.echo(f"stopped at {stopped_s:.1f} s; everything stays as it is", err=True)
-        typer.echo(f"go on with: meshctl lab mission {file} --from {stopped_s:.1f}", err=True)
+        echo(f"stopped at {stopped_s:.1f} s; everything stays as it is", err=True)
+        echo(f"go on with: meshctl lab mission {file} --from {stopped_s:.1f}", err=True)
         raise typer.Exit(int(ExitCode.INTERRUPTED))
 
 
 def _show(now: Ground, names: tuple[str, ...]) -> None:
     for name in names:
         place = now.places.get(name)
-        typer.echo(f"{name} at {place.at[0]:g}, {place.at[1]:g} m" if place else f"{name} has no place")
+        echo(f"{name} at {place.at[0]:g}, {place.at[1]:g} m" if place else f"{name} has no place")
     for one in links_of(now):
         if one.ends <= set(names):
-            typer.echo(_described(one))
+            echo(_described(one))
 
 
 def _described(one: LinkSpec) -> str:
@@ -184,7 +185,7 @@ _SAID = {
 
 def _tell(event: Event) -> None:
     place = "" if event.place is None else f"{event.place[0]:g}, {event.place[1]:g} m"
-    typer.echo(f"{event.at_s:8.1f} s  " + _SAID[event.what].format(who=event.who, other=event.other, place=place))
+    echo(f"{event.at_s:8.1f} s  " + _SAID[event.what].format(who=event.who, other=event.other, place=place))
 
 
 def _tell_json(event: Event) -> None:
@@ -195,4 +196,4 @@ def _tell_json(event: Event) -> None:
         "other": event.other or None,
         "place_m": event.place,
     }
-    typer.echo(json.dumps({key: value for key, value in content.items() if value is not None}))
+    echo_json(json.dumps({key: value for key, value in content.items() if value is not None}))

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
-import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from meshctl.cli.output import echo, echo_json
 from meshctl.diagnostics import Severity, sorted_diagnostics
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.codes import MEANINGS
@@ -44,10 +45,17 @@ def lint(
         list[Path] | None,
         typer.Argument(help="Inventories: YAML files or directories. Default: $MESHCTL_INVENTORY or here."),
     ] = None,
+    inventory: Annotated[
+        list[Path] | None, typer.Option("--inventory", "-i", help="The same as an argument, as other commands take it.")
+    ] = None,
+    files: Annotated[
+        bool,
+        typer.Option("--files", help="Paths are files: check each inventory one is part of, pass over the others."),
+    ] = False,
     format: Annotated[Format, typer.Option("--format", "-f", help="How to write the findings.")] = Format.TEXT,
     output: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write to this file.")] = None,
     select: Annotated[
-        list[str] | None, typer.Option(help="Only rules whose code starts so: MC3, or MC342,MC343.")
+        list[str] | None, typer.Option(help="Only findings whose code starts so: MC3, INV020, or MC342,MC343.")
     ] = None,
     ignore: Annotated[list[str] | None, typer.Option(help="Leave out rules whose code starts so.")] = None,
     fail_on: Annotated[Threshold, typer.Option(help="Exit with 1 from this severity on.")] = Threshold.WARNING,
@@ -69,24 +77,29 @@ def lint(
     Example: meshctl lint inventory/ --format sarif --out lint.sarif
     """
     if explain is not None:
-        typer.echo(_explained(explain), nl=False)
+        echo(_explained(explain), nl=False)
         return
     if list_rules:
         for rule in RULES:
-            typer.echo(f"{rule.code}  {rule.severity.value:<7}  {rule.title}")
+            echo(f"{rule.code}  {rule.severity.value:<7}  {rule.title}")
         return
     if write_baseline and baseline is None:
         raise InputError("--write-baseline needs --baseline FILE, the file to write")
     rules = chosen(select or (), ignore or ())
     database = load(regdb)
     if regdb is None and database.source == str(SHIPPED):
-        typer.echo(f"note: no regulatory database on this machine, using the shipped {shipped_version()}", err=True)
-    targets = list(paths or [Path(os.environ.get("MESHCTL_INVENTORY") or ".")])
+        echo(f"note: no regulatory database on this machine, using the shipped {shipped_version()}", err=True)
+    given = (*(paths or ()), *(inventory or ()))
+    targets = given or (Path(os.environ.get("MESHCTL_INVENTORY") or "."),)
+    if files:
+        targets = tuple(inventories_of(given))
     examined = [examine(path, database, os.environ, rules) for path in targets]
     findings = gathered(examined)
+    if select:
+        findings = _selected(findings, _prefixes(select, (*BY_CODE, *MEANINGS)))
     if write_baseline and baseline is not None:
         _write(baseline, baselines.dump(item for item in findings.diagnostics if item.code in BY_CODE))
-        typer.echo(f"{len(findings.diagnostics)} findings written to {baseline}", err=True)
+        echo(f"{len(findings.diagnostics)} findings written to {baseline}", err=True)
         return
     if baseline is not None:
         findings = _without_known(findings, baseline, rules)
@@ -94,7 +107,9 @@ def lint(
     if output is not None:
         _write(output, report)
     else:
-        sys.stdout.write(report)
+        # JSON and SARIF stay the same document, in the others a stand-in is shown
+        is_json = json or format in (Format.JSON, Format.SARIF)
+        (echo_json if is_json else echo)(report, nl=False)
     if not all(item.is_readable for item in examined):
         raise typer.Exit(int(ExitCode.COULD_NOT_RUN))
     least = Severity(fail_on.value).rank
@@ -102,12 +117,23 @@ def lint(
         raise typer.Exit(int(ExitCode.FINDINGS))
 
 
+def inventories_of(files: Iterable[Path]) -> Iterator[Path]:
+    """The inventory that each file is part of, once: the nearest directory above it, up to here, with a fleet.yaml."""
+    found: dict[Path, Path] = {}
+    for file in files:
+        above = (file, *file.parents) if file.is_dir() else tuple(file.parents)
+        holding = next((directory for directory in above if (directory / "fleet.yaml").is_file()), None)
+        if holding is not None:
+            found.setdefault(holding.resolve(), holding)
+    yield from found.values()
+
+
 def chosen(select: Iterable[str], ignore: Iterable[str]) -> tuple[Rule, ...]:
     """The rules whose code starts with a selected prefix (all without one) and with no ignored one.
 
     Prefixes may be joined by commas. Raises InputError for one that no rule has.
     """
-    wanted, unwanted = _prefixes(select), _prefixes(ignore)
+    wanted, unwanted = _prefixes(select, (*BY_CODE, *MEANINGS)), _prefixes(ignore, BY_CODE)
     return tuple(
         rule
         for rule in RULES
@@ -115,12 +141,24 @@ def chosen(select: Iterable[str], ignore: Iterable[str]) -> tuple[Rule, ...]:
     )
 
 
-def _prefixes(given: Iterable[str]) -> tuple[str, ...]:
+def _prefixes(given: Iterable[str], codes: Iterable[str]) -> tuple[str, ...]:
     prefixes = tuple(part.strip().upper() for text in given for part in text.split(",") if part.strip())
+    known = tuple(codes)
     for prefix in prefixes:
-        if not any(rule.code.startswith(prefix) for rule in RULES):
+        if not any(code.startswith(prefix) for code in known):
+            if any(code.startswith(prefix) for code in MEANINGS):
+                raise InputError(f"{prefix} cannot be left out: an inventory with such errors does not load")
             raise InputError(f"expected the start of a rule's code, found {prefix}", hint="`meshctl lint --list`")
     return prefixes
+
+
+def _selected(findings: Findings, prefixes: tuple[str, ...]) -> Findings:
+    """Where the loader's codes alone are selected, without its other findings; they stay where rules are selected too,
+    since what does not load was not looked at."""
+    if any(code.startswith(prefixes) for code in BY_CODE):
+        return findings
+    kept = tuple(item for item in findings.diagnostics if item.code.startswith(prefixes))
+    return replace(findings, diagnostics=kept)
 
 
 def gathered(examined: Iterable[Examined]) -> Findings:

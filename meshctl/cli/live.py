@@ -21,6 +21,8 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Generic, TextIO, TypeVar
 
+from meshctl.report.terminal import clean_styled
+
 T = TypeVar("T")
 
 # xterm's control sequences: other screen, hidden cursor, no wrapping of long lines
@@ -111,6 +113,7 @@ def page(lines: list[str], height: int) -> str:
     if len(lines) > room:
         hidden = len(lines) - room + 1
         lines = [*lines[: room - 1], f"... {hidden} more lines: enlarge the window, or show less (--alarm any)"]
+    lines = [clean_styled(line) for line in lines]
     return _HOME + f"{_END_OF_LINE}\r\n".join(lines) + _END_OF_LINE + _END_OF_PAGE
 
 

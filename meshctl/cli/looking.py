@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from typing import Annotated
 import typer
 
 from meshctl.cli.options import InventoryPath
+from meshctl.cli.output import is_plain
 from meshctl.cli.robots_crew import AskSudo, sudo_password
 from meshctl.cli.session import KeyFiles, Lab, Session, session
 from meshctl.cli.shared import Options, opening
@@ -154,7 +154,7 @@ def _progress(*, is_told: bool) -> Progress:
 
 def paint_of() -> Paint:
     """Colours on a terminal, unless NO_COLOR (no-color.org) is set."""
-    return paint if sys.stdout.isatty() and not os.environ.get("NO_COLOR") else plain
+    return paint if sys.stdout.isatty() and not is_plain() else plain
 
 
 def paint(text: str, style: str) -> str:

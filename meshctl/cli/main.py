@@ -14,9 +14,11 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 import typer
+from typer.core import DEFAULT_MARKUP_MODE
 
 from meshctl import __version__
 from meshctl.cli.commands import COMMANDS, Entry
+from meshctl.cli.output import echo, is_plain, prepare_streams
 from meshctl.cli.streams import unheard
 from meshctl.errors import ExitCode, MeshctlError
 
@@ -27,6 +29,7 @@ Exit codes: 0 well, 1 something to act on, 2 could not run, 3 needed nodes do no
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run meshctl with `arguments` (default: the process's own); always ends in SystemExit."""
+    prepare_streams()
     words = list(sys.argv[1:] if arguments is None else arguments)
     completing = os.environ.get("COMP_WORDS", "").split()[1:] if "_MESHCTL_COMPLETE" in os.environ else []
     meant = next((word for word in completing or words if not word.startswith("-")), "")
@@ -34,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         build(meant)(args=words, prog_name="meshctl")
     except KeyboardInterrupt:
         # while the command was being imported, which takes seconds on a busy machine
-        typer.echo("interrupted", err=True)
+        echo("interrupted", err=True)
         sys.exit(int(ExitCode.INTERRUPTED))
 
 
@@ -46,6 +49,8 @@ def build(meant: str) -> typer.Typer:
         epilog=_EPILOG,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
+        # without it help and usage errors are plain text
+        rich_markup_mode=None if is_plain() else DEFAULT_MARKUP_MODE,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     app.callback()(_root)
@@ -68,7 +73,7 @@ def _root(
 
 def _version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"meshctl {__version__}")
+        echo(f"meshctl {__version__}")
         raise typer.Exit
 
 
@@ -103,12 +108,12 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return command(*args, **kwargs)
         except MeshctlError as error:
-            typer.echo(f"error: {error}", err=True)
+            echo(f"error: {error}", err=True)
             if error.hint:
-                typer.echo(f"hint: {error.hint}", err=True)
+                echo(f"hint: {error.hint}", err=True)
             raise typer.Exit(int(error.exit_code)) from None
         except (KeyboardInterrupt, typer.Abort):
-            typer.echo("interrupted", err=True)
+            echo("interrupted", err=True)
             raise typer.Exit(int(ExitCode.INTERRUPTED)) from None
         except BrokenPipeError:
             # the reader (`| head`) has seen enough

@@ -15,9 +15,11 @@ from meshctl.apply.planning import Choices
 from meshctl.apply.resumed import settled
 from meshctl.cli.carry import ask_and_carry_out, carry_out_plan, checked, choices_of, prepared_for, show, write_text
 from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.output import echo, echo_json
 from meshctl.cli.session import KeyFiles, Lab, Nodes, Session, session
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet.journal import Journal, RunRecord
+from meshctl.plan import Plan, Verdict
 from meshctl.plan.saved import SavedPlan, as_agreed, dump, load
 
 NoFirmware = Annotated[bool, typer.Option("--no-firmware", help="Leave the firmware as it is.")]
@@ -27,7 +29,9 @@ LeaveBehind = Annotated[
 AcceptCut = Annotated[
     str, typer.Option("--accept-cut", help="Cut vertices (a,b,...; or all) that may be flashed nevertheless.")
 ]
-Brief = Annotated[bool, typer.Option("--brief/--full", help="Whether to leave out what changes inside the files.")]
+Brief = Annotated[
+    bool, typer.Option("--brief/--full", help="Hide the files' diffs; the settings that change are named all the same.")
+]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
 Rate = Annotated[float | None, typer.Option("--rate", help="Upload at most so many kilobytes per second to a node.")]
 
@@ -54,7 +58,10 @@ def plan(
         saved = SavedPlan(prepared.plan, prepared.salt, str(inventory), choices.with_firmware)
         if out is not None:
             write_text(out, dump(saved))
-        typer.echo(dump(saved), nl=False) if as_json else show(prepared.plan, brief=brief)
+        if as_json:
+            echo_json(dump(saved), nl=False)
+        else:
+            show(prepared.plan, opened.fleet, brief=brief)
         if prepared.plan.refusal:
             raise typer.Exit(ExitCode.FINDINGS)
 
@@ -107,7 +114,7 @@ def provision(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         prepared = prepared_for(opened, nodes, choices)
         if check:
-            raise typer.Exit(checked(prepared.plan, as_json=as_json, brief=brief))
+            raise typer.Exit(checked(prepared.plan, opened.fleet, as_json=as_json, brief=brief))
         ask_and_carry_out(opened, prepared, "provision", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
 
 
@@ -138,10 +145,10 @@ def resume(
             raise InputError(f"run {record.id} put a backup back, which the inventory does not know", hint=hint)
         names = _still_managed(opened, left)
         if not names:
-            typer.echo(f"run {record.id} left nothing to do", err=as_json)
+            echo(f"run {record.id} left nothing to do", err=as_json)
             return
         if not as_json:
-            typer.echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")
+            echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")
         told = json.loads(record.plan).get("choices", {}) if record.plan else {}
         added = choices_of(False, leave_behind, accept_cut)
         choices = Choices(
@@ -150,10 +157,24 @@ def resume(
             (*told.get("accept_cuts", ()), *added.accept_cuts),
         )
         prepared = prepared_for(opened, names, choices)
+        for line in bench_advice(record, prepared.plan):
+            echo(line, err=True)
         for name, text in settled(record.id, opened.journal.outcomes(record.id), prepared).items():
             line = json.dumps({"event": "note", "node": name, "at_s": round(time.time(), 3), "text": text})
-            typer.echo(line if as_json else f"{name}: {text}")
+            echo(line if as_json else f"{name}: {text}")
         ask_and_carry_out(opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
+
+
+def bench_advice(record: RunRecord, plan: Plan) -> tuple[str, ...]:
+    """What to do about nodes that a run on the bench left and that do not answer: resume reaches them by the address
+    that they may never have got."""
+    silent = [node.node for node in plan.of(Verdict.AWAY)]
+    if record.command not in ("bootstrap", "replace") or not silent:
+        return ()
+    return (
+        f"run {record.id} was a {record.command}: {', '.join(silent)} may still be factory fresh",
+        f"hint: plug in such a device on the bench and run `meshctl {record.command}` again",
+    )
 
 
 def _to_resume(journal: Journal, fleet: str, run_id: int | None) -> tuple[RunRecord, tuple[str, ...]]:
@@ -166,7 +187,7 @@ def _to_resume(journal: Journal, fleet: str, run_id: int | None) -> tuple[RunRec
             raise InputError(f"there is no run of fleet {fleet} to resume", hint="`meshctl provision` begins one")
         return latest, ()
     record = journal.run(number)
-    if record is None or record.fleet != fleet:
+    if record is None or (record.fleet, record.lab) != (fleet, journal.lab):
         raise InputError(f"there is no run {number} of fleet {fleet}", hint="`meshctl history` lists the runs")
     if not record.is_over:
         raise InputError(f"run {record.id} is still under way ({record.owner})", hint="wait for it, or interrupt it")
@@ -178,5 +199,5 @@ def _still_managed(opened: Session, names: Iterable[str]) -> list[str]:
     managed = {node.name for node in opened.fleet.managed()}
     wanted = list(names)
     if gone := [name for name in wanted if name not in managed]:
-        typer.echo(f"left out, since the inventory does not manage them any more: {', '.join(gone)}", err=True)
+        echo(f"left out, since the inventory does not manage them any more: {', '.join(gone)}", err=True)
     return [name for name in wanted if name in managed]

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 
 import typer
 
 from meshctl.cli.looking import Everybody, glance, paint_of, with_everybody
 from meshctl.cli.options import AsJson, line_width
+from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode
-from meshctl.status import assess
+from meshctl.status import Check, assess
 from meshctl.status import preflight as checks_of
 from meshctl.status.document import preflight_json
 from meshctl.status.memory import facts_to_keep
@@ -34,8 +36,13 @@ def preflight(everybody: Everybody, as_json: AsJson = False) -> None:
         if takes_part(robot.state) and robot.facts is not None and robot.facts.answers
     ]
     checks = checks_of(everybody.fleet, found, everybody.watcher.ping(talking))
-    is_go = all(check.is_go for check in checks)
-    typer.echo(
-        json.dumps(preflight_json(checks), indent=2) if as_json else preflight_text(checks, line_width(), paint_of())
-    )
-    raise typer.Exit(ExitCode.OK if is_go else ExitCode.FINDINGS)
+    show(checks, as_json=as_json)
+    raise typer.Exit(ExitCode.OK if all(check.is_go for check in checks) else ExitCode.FINDINGS)
+
+
+def show(checks: Sequence[Check], *, as_json: bool) -> None:
+    """Print the checks and the verdict."""
+    if as_json:
+        echo_json(json.dumps(preflight_json(checks), indent=2))
+    else:
+        echo(preflight_text(checks, line_width(), paint_of()), styled=True)

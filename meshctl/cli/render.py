@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.output import echo, echo_json
 from meshctl.cli.revision import opened
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory import load_fleet
@@ -56,14 +57,14 @@ def render(
     if imagebuilder:
         _warn_of_dead_ports(fleet, rendered)
     if as_json:
-        typer.echo(json.dumps(_report(rendered, folders, builds), indent=2, ensure_ascii=False))
+        echo_json(json.dumps(_report(rendered, folders, builds), indent=2, ensure_ascii=False))
     elif out is None and imagebuilder is None:
-        typer.echo("".join(f"### {item.node} ({item.release})\n{item.masked_text}" for item in rendered), nl=False)
+        echo("".join(f"### {item.node} ({item.release})\n{item.masked_text}" for item in rendered), nl=False)
     else:
         for node, folder in folders.items():
-            typer.echo(f"{node}: {folder}")
+            echo(f"{node}: {folder}")
         for build, folder in builds:
-            typer.echo(f"{build.name}: cd IMAGEBUILDER && sh {(folder / 'build.sh').resolve()}")
+            echo(f"{build.name}: cd IMAGEBUILDER && sh {(folder / 'build.sh').resolve()}")
 
 
 def _warn_of_dead_ports(fleet: Fleet, rendered: Iterable[Rendered]) -> None:
@@ -71,7 +72,7 @@ def _warn_of_dead_ports(fleet: Fleet, rendered: Iterable[Rendered]) -> None:
     dead = {item.node: fleet.nodes[item.node].unswitched_ports for item in rendered}
     for node, ports in dead.items():
         if ports:
-            typer.echo(
+            echo(
                 f"{node}: with this image {', '.join(ports)} may have no port behind it: "
                 "the inventory knows no switch_vlans of its hardware (MC530)",
                 err=True,
@@ -136,17 +137,20 @@ def _report(
 
 def diff(
     before: Annotated[str, typer.Argument(metavar="A", help="Inventory, or REVISION:PATH in git.")],
-    after: Annotated[str, typer.Argument(metavar="B", help="Inventory, or REVISION:PATH in git.")],
+    after: Annotated[
+        str | None, typer.Argument(metavar="[B]", help="Inventory, or REVISION:PATH in git; default: the inventory.")
+    ] = None,
+    inventory: InventoryPath = Path(),
     as_json: AsJson = False,
 ) -> None:
     """Show what changes on which node between two inventories; exit 1 when anything does. Needs no secrets.
 
     Example: meshctl diff HEAD~1:inventory/subt-final inventory/subt-final
     """
-    with opened(before) as old, opened(after) as new:
+    with opened(before) as old, opened(str(inventory) if after is None else after) as new:
         differences = list(compare_fleets(old.fleet(), new.fleet()))
     if as_json:
-        typer.echo(json.dumps({"nodes": [_as_json(item) for item in differences]}, indent=2, ensure_ascii=False))
+        echo_json(json.dumps({"nodes": [_as_json(item) for item in differences]}, indent=2, ensure_ascii=False))
     else:
         for item in differences:
             _show(item)
@@ -156,20 +160,20 @@ def diff(
 
 def _show(difference: NodeDifference) -> None:
     if difference.change is not NodeChange.CHANGED:
-        typer.echo(f"{difference.node}: {difference.change.value}")
+        echo(f"{difference.node}: {difference.change.value}")
         return
-    typer.echo(f"{difference.node}:")
+    echo(f"{difference.node}:")
     old, new = difference.release
     if old != new:
-        typer.echo(f"  release {old} -> {new}")
+        echo(f"  release {old} -> {new}")
     for file in difference.files:
         mark = "" if file.change is NodeChange.CHANGED else f" ({file.change.value})"
-        typer.echo(f"  /{file.path}{mark}")
+        echo(f"  /{file.path}{mark}")
         for line in file.lines:
-            typer.echo(f"    {line}")
+            echo(f"    {line}")
     for sign, packages in (("+", difference.packages_added), ("-", difference.packages_removed)):
         for package in packages:
-            typer.echo(f"  {sign} package {package}")
+            echo(f"  {sign} package {package}")
 
 
 def _as_json(difference: NodeDifference) -> dict[str, Any]:

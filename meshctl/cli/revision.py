@@ -61,6 +61,8 @@ def opened(argument: str) -> Iterator[OpenedInventory]:
         commit = _git("rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}", environ=environ)
         _git("-C", top, "read-tree", commit, environ=environ)
         _git("-C", top, "checkout-index", "--all", f"--prefix={tree}/", environ=environ)
+        # marks the unpacked tree as one, so that includes stay within it
+        (tree / ".git").touch()
         inside = Path(os.path.normpath(tree / prefix / path))
         if not inside.exists() or not inside.is_relative_to(tree):
             raise InputError(f"{argument}: expected a file or directory of {revision}, found none")

@@ -14,6 +14,7 @@ from typing import Annotated
 import typer
 
 from meshctl.cli.options import line_width
+from meshctl.cli.output import echo, echo_json
 from meshctl.cli.robots_change import rotate_key_command, topic_app
 from meshctl.cli.robots_crew import Crew, end, with_crew
 from meshctl.cli.robots_work import SERVICE_TIMEOUT_S, begin
@@ -62,11 +63,11 @@ def diff_command(crew: Crew) -> None:
         told = {
             name: {"result": one.result.value, "differences": one.reason.splitlines()} for name, one in outcomes.items()
         }
-        typer.echo(json.dumps(told, indent=1))
+        echo_json(json.dumps(told, indent=1))
     else:
         for name, one in outcomes.items():
             for line in (one.reason or "as the inventory says").splitlines():
-                typer.echo(f"{name}: {line}")
+                echo(f"{name}: {line}")
     if any(one.result in (Result.PENDING, Result.REFUSED) for one in outcomes.values()):
         raise typer.Exit(ExitCode.FINDINGS)
     raise typer.Exit(exit_for(outcomes.values(), crew.opened.interrupt))
@@ -88,7 +89,10 @@ def status_command(crew: Crew) -> None:
 
     outcomes = crew.on_each(work)
     rows = [found.get(name, RobotFacts(name, trouble=one.reason)) for name, one in outcomes.items()]
-    typer.echo(json.dumps([facts_object(one) for one in rows], indent=2) if crew.as_json else table(rows, line_width()))
+    if crew.as_json:
+        echo_json(json.dumps([facts_object(one) for one in rows], indent=2))
+    else:
+        echo(table(rows, line_width()))
     raise typer.Exit(exit_for(outcomes.values(), crew.opened.interrupt))
 
 
@@ -131,9 +135,9 @@ def logs_command(
     outcomes = crew.on_each(work)
     for name, one in outcomes.items():
         for line in one.facts.get("log", "").splitlines():
-            typer.echo(f"{name}: {line}")
+            echo(f"{name}: {line}")
         if not one.result.is_good:
-            typer.echo(str(one), err=True)
+            echo(str(one), err=True)
     raise typer.Exit(exit_for(outcomes.values(), crew.opened.interrupt))
 
 
@@ -182,21 +186,21 @@ def _trusted(crew: Crew, robot: str, *, change: bool, yes: bool) -> bool:
     try:
         shown = crew.reach.shown_key(robot)
     except NodeError as error:
-        typer.echo(f"{robot}: {error}" + (f"\n  hint: {error.hint}" if error.hint else ""))
+        echo(f"{robot}: {error}" + (f"\n  hint: {error.hint}" if error.hint else ""))
         return False
     assert shown is not None, "a completed handshake has shown a key"
     pinned = crew.opened.trust.pinned(name)
     line = f"{robot}: {shown.fingerprint} ({shown.key_type})"
     if shown in pinned:
-        typer.echo(f"{line}: pinned")
+        echo(f"{line}: pinned")
         return True
     if pinned and not change:
-        typer.echo(f"{line}: DIFFERS from the pinned {', '.join(one.fingerprint for one in pinned)}")
-        typer.echo("  hint: another computer, a new installation, or an attack; --replace once you know which")
+        echo(f"{line}: DIFFERS from the pinned {', '.join(one.fingerprint for one in pinned)}")
+        echo("  hint: another computer, a new installation, or an attack; --replace once you know which")
         return False
     if yes or (sys.stdin.isatty() and typer.confirm(f"{line}\n  Is this what the computer itself shows?")):
         crew.opened.trust.replace(name, shown)
-        typer.echo(f"{line}: pinned now")
+        echo(f"{line}: pinned now")
         return True
-    typer.echo(f"{line}: not pinned")
+    echo(f"{line}: not pinned")
     return False

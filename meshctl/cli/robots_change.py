@@ -15,6 +15,7 @@ from typing import Annotated
 import typer
 import yaml
 
+from meshctl.cli.output import echo
 from meshctl.cli.robots_crew import Crew, end, with_crew
 from meshctl.cli.robots_work import begin
 from meshctl.errors import InputError
@@ -92,11 +93,11 @@ def _change_topics(crew: Crew, topic: str, edit: Callable[[Editor], None]) -> No
     changed, changes = _edited(crew, edit)
     if not crew.as_json:
         for change in changes:
-            typer.echo(change.diff(), nl=False)
+            echo(change.diff(), nl=False)
     outcomes = begin(changed, "topic", topic=topic)
     if not any(outcome.result.is_good for outcome in outcomes.values()):
         _undo(changes)
-        typer.echo("no robot took the change, so the inventory is as it was", err=True)
+        echo("no robot took the change, so the inventory is as it was", err=True)
     raise end(changed, outcomes)
 
 
@@ -140,13 +141,13 @@ def rotate_key_command(
     outcomes: dict[str, Outcome] = {}
     for number, stage in enumerate(todo, start=1):
         if not crew.as_json:
-            typer.echo(f"step {number} of {len(todo)}: {stage.title}")
+            echo(f"step {number} of {len(todo)}: {stage.title}")
         crew, _ = _edited(crew, partial(_set_keys, keys=stage.keys))
         outcomes = begin(crew, "rotate-key", new_key=new_key)
         if not totals(outcomes.values()).all_good:
             late = ", ".join(name for name, outcome in outcomes.items() if not outcome.result.is_good)
-            typer.echo(f"stopped before the next step, nothing is cut off: {late} did not take this one", err=True)
-            typer.echo("run the same command again once they can be reached", err=True)
+            echo(f"stopped before the next step, nothing is cut off: {late} did not take this one", err=True)
+            echo("run the same command again once they can be reached", err=True)
             break
     raise end(crew, outcomes)
 

@@ -23,6 +23,7 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.output import complain, echo, echo_json
 from meshctl.cli.session import KeyFiles, Session, exit_for, progress_for, session
 from meshctl.cli.shared import opening
 from meshctl.device.connection import Connection
@@ -91,7 +92,9 @@ class Crew:
         order = replace(self.order, fleet=fleet, secrets=secrets, only_configuration=only_configuration)
         return replace(self, order=order, reach=replace(self.reach, fleet=fleet))
 
-    def on_each(self, work: Work, observer: Observer = silent) -> dict[str, Outcome]:
+    def on_each(
+        self, work: Work, observer: Observer = silent, say: Callable[[str], None] = complain
+    ) -> dict[str, Outcome]:
         """Connect to every chosen robot and work there, several at once. A second Ctrl-C closes all connections."""
         interrupt = self.opened.interrupt
         standing: list[Connection] = []
@@ -113,7 +116,7 @@ class Crew:
         watching = threading.Thread(target=leave, name="leave", daemon=True)
         watching.start()
         try:
-            with interrupt.on_signals(lambda text: typer.echo(text, err=True)):
+            with interrupt.on_signals(say):
                 return run(self.robots, one, parallel=self.fleet.apply.parallel, interrupt=interrupt, observer=observer)
         finally:
             ended.set()
@@ -145,7 +148,7 @@ class Crew:
                         yield
 
                 crew = replace(self, order=replace(self.order, step=step))
-                outcomes = crew.on_each(work(crew), Tee((progress, keep)))
+                outcomes = crew.on_each(work(crew), Tee((progress, keep)), progress.stopping)
         finally:
             journal_run.end(str(totals(outcomes.values())) if outcomes else "could not run")
         return outcomes
@@ -219,9 +222,9 @@ def end(crew: Crew, outcomes: dict[str, Outcome]) -> typer.Exit:
         from meshctl.report.progress import outcome_object
 
         told = [outcome_object(outcome) for outcome in outcomes.values()]
-        typer.echo(json.dumps({"event": "ended", "totals": str(counted), "outcomes": told}))
+        echo_json(json.dumps({"event": "ended", "totals": str(counted), "outcomes": told}))
     else:
-        typer.echo(str(counted))
+        echo(str(counted))
         if not counted.all_good:
-            typer.echo("`meshctl resume` takes up what is not done", err=True)
+            echo("`meshctl resume` takes up what is not done", err=True)
     return typer.Exit(exit_for(outcomes.values(), crew.opened.interrupt))

@@ -12,6 +12,7 @@ from typing import Any
 
 import typer
 
+from meshctl.cli.output import echo
 from meshctl.cli.robots_crew import Crew, Work, crew_in, end, sudo_password
 from meshctl.cli.session import Session
 from meshctl.errors import InputError
@@ -68,14 +69,14 @@ def take_up(opened: Session, inventory: Path, record: RunRecord, *, as_json: boo
     able = {name for name, robot in opened.fleet.robots.items() if robot.computer is not None}
     names = [name for name in opened.journal.unfinished(record.id) if name in able]
     if not names:
-        typer.echo(f"run {record.id} left nothing to do")
+        echo(f"run {record.id} left nothing to do")
         return typer.Exit()
     if command == "rotate-key":
         # its steps need all robots, and the inventory knows which is next
         again = f"meshctl robots rotate-key {told.get('new_key', 'NEW_KEY')}"
         raise InputError(f"run {record.id} changed keys in steps over all robots", hint=f"go on with `{again}`")
     if not as_json:
-        typer.echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")
+        echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")
     wheels, wait_s = told.get("wheels", ""), int(told.get("wait_s", 30))
     crew = crew_in(
         opened,

@@ -19,6 +19,7 @@ import typer
 
 from meshctl.apply.access import Access, Locate, as_written
 from meshctl.apply.wanted import Renderer
+from meshctl.cli.output import console
 from meshctl.device.trust import TrustStore
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Interrupt, Outcome, totals
@@ -65,10 +66,15 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
     fleet = load_fleet(inventory, environ=os.environ)
     trust = trust_of(fleet)
     virtual, locate = _lab(lab)
+    from meshctl.lab.place import lab_of
+
+    # commands without --lab work on the copy, too
+    lab_directory = str(virtual.directory) if virtual is not None else lab_of(str(inventory.resolve()))
     with (
-        Journal(default_path(os.environ)) as journal,
+        Journal(default_path(os.environ), lab=lab_directory) as journal,
         Access(fleet, trust, key_files=tuple(key_files), locate=locate) as access,
     ):
+        journal.separate(fleet.name, lab_of)
         yield Session(
             fleet,
             Renderer.of(fleet, SecretStore(os.environ, Path(fleet.base)).get),
@@ -128,9 +134,7 @@ def progress_for(count: int, *, as_json: bool) -> Progress:
     if as_json:
         return Aside(JsonProgress(sys.stdout))
     if sys.stdout.isatty():
-        from rich.console import Console
-
-        return Aside(LiveProgress(Console(), count))
+        return Aside(LiveProgress(console(), count))
     return Aside(PlainProgress(sys.stdout))
 
 

@@ -15,6 +15,7 @@ import typer
 from meshctl.cli.live import live
 from meshctl.cli.looking import Everybody, glance, paint_of, with_everybody
 from meshctl.cli.options import AsJson, line_width
+from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode
 from meshctl.status import FleetStatus, assess
 from meshctl.status.assess import Look
@@ -66,7 +67,10 @@ def status(
     view = _View(everybody, chosen, only, topics, wide)
     if watch is None:
         found = view.status(view.look(), time.time())
-        typer.echo(json.dumps(status_json(found), indent=2) if as_json else view.text(found))
+        if as_json:
+            echo_json(json.dumps(status_json(found), indent=2))
+        else:
+            echo(view.text(found), styled=True)
         raise typer.Exit(found.exit_code)
     if as_json or not sys.stdout.isatty():
         _follow(view, watch, as_json)
@@ -108,7 +112,10 @@ def _follow(view: _View, period_s: float, as_json: bool) -> None:
     while True:
         began = time.monotonic()
         found = view.status(view.look(), time.time())
-        typer.echo(json.dumps(status_json(found)) if as_json else view.text(found) + "\n")
+        if as_json:
+            echo_json(json.dumps(status_json(found)))
+        else:
+            echo(view.text(found) + "\n", styled=True)
         time.sleep(max(0.0, period_s - (time.monotonic() - began)))
 
 
@@ -128,5 +135,5 @@ def _watch(view: _View, period_s: float) -> None:
 
     latest = live(partial(view.look, is_told=False), draw, period_s, sys.stdout)
     if latest is not None:
-        typer.echo(view.text(view.status(latest, time.time())))
+        echo(view.text(view.status(latest, time.time())), styled=True)
     raise typer.Exit(ExitCode.INTERRUPTED)

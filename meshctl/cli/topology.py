@@ -11,13 +11,15 @@ import typer
 
 from meshctl.cli.looking import CONNECT_S, Timeout, glance, watcher
 from meshctl.cli.options import InventoryPath
+from meshctl.cli.output import echo
 from meshctl.cli.session import KeyFiles, Lab
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Backend
 from meshctl.status import assess
 from meshctl.status.picture import FORMATS, Picture, directions
-from meshctl.topology import report_of
+from meshctl.topology import observed_graph, report_of
+from meshctl.topology.cells import link_cells, mesh_reports
 
 
 class Format(str, Enum):  # noqa: UP042 - typer shows the values of a str enum
@@ -54,26 +56,33 @@ def topology(
         nodes = tuple(node for node in everybody.nodes if node.name in names)
         look = glance(everybody, nodes)
         found = assess(look, nodes, time.time())
-    reports = {name: report_of(name, one) for name, one in look.observations.items()}
+    if mesh:
+        reports = mesh_reports(fleet, look.observations, mesh)
+        wires = [(link.a, link.b) for link in look.graph.links if link.wired]
+        graph = observed_graph(reports.values(), known_macs=look.macs, wires=wires)
+    else:
+        reports = {name: report_of(name, one) for name, one in look.observations.items()}
+        graph = look.graph
     routing = next((m.backend for m in fleet.meshes.values() if m.name == mesh or not mesh), Backend.BATMAN)
     picture = Picture(
         mesh=mesh or fleet.name,
         entry=found.entry,
-        graph=look.graph,
+        graph=graph,
         directions=directions(reports, look.macs),
         ages_s={node.name: node.age_s for node in found.nodes if node.age_s is not None and not node.silent_because},
         addresses={node.name: str(node.address.ip) for node in fleet.nodes.values()},
         routing=routing.value,
+        cells=link_cells(fleet, look.observations, look.macs, (mesh,) if mesh else fleet.meshes),
     )
     drawn = FORMATS["json" if as_json else form.value](picture)
     if drawn:
-        typer.echo(drawn)
+        echo(drawn)
     if not look.observations:
         is_new = bool(nodes) and all(node.age_s is None for node in found.nodes)
         why = (
             "no node was ever seen: meshctl bootstrap takes factory devices in" if is_new else "meshctl status says why"
         )
-        typer.echo(f"nobody answered: {why}", err=True)
-    elif apart := [node.name for node in nodes if node.name not in look.graph]:
-        typer.echo(f"nobody tells of {', '.join(apart)}: meshctl status says why", err=True)
+        echo(f"nobody answered: {why}", err=True)
+    elif apart := [node.name for node in nodes if node.name not in graph]:
+        echo(f"nobody tells of {', '.join(apart)}: meshctl status says why", err=True)
     raise typer.Exit(ExitCode.OK if look.observations or not nodes else ExitCode.UNREACHABLE)

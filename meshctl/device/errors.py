@@ -17,6 +17,7 @@ __all__ = [
     "HostKeyUnknown",
     "IncompatibleServer",
     "NodeRefused",
+    "OutputTooLarge",
     "Timeout",
     "Unreachable",
     "UploadFailed",
@@ -82,6 +83,10 @@ class CommandFailed(NodeError):
         super().__init__(message, hint=hint)
         self.exit_status = exit_status
         self.stderr = stderr
+
+
+class OutputTooLarge(NodeError):
+    """A command on the node printed more than is read into memory; the connection is as good as before."""
 
 
 class UploadFailed(NodeError):

@@ -226,9 +226,13 @@ class Observation:
     tmp: Space | None = None
     macs: Mapping[str, str] | None = None
     """Interface name -> MAC address, from /sys/class/net."""
+    ifindexes: Mapping[str, int] | None = None
+    """Interface name -> the kernel's index, which an interface that is created again gets a new one of."""
     radios: tuple[RadioState, ...] | None = None
     links: tuple[WirelessLink, ...] | None = None
     stations: tuple[Station, ...] | None = None
+    supplicants: tuple[str, ...] | None = None
+    """The radio interfaces that wpa_supplicant runs; an encrypted mesh without it is an open one."""
     interfaces: tuple[NetInterface, ...] | None = None
     bridges: tuple[Bridge, ...] | None = None
     mesh: MeshInfo | None = None

@@ -95,6 +95,11 @@ class _Reader:
         """The second words of the sections `KIND WORD`."""
         return [name.split(" ", 1)[1] for name in self._sections if name.startswith(f"{kind} ")]
 
+    def found_nothing(self, name: str) -> bool:
+        """Whether a section's command failed without a word, as `command -v` does."""
+        section = self._sections.get(name)
+        return section is not None and section.status > 0 and not section.body.strip()
+
     def body(self, name: str) -> bytes | None:
         section = self._sections.get(name)
         return None if section is None or section.status != 0 else section.body
@@ -112,7 +117,11 @@ def interpret(sections: Mapping[str, Section], *, asked_at_s: float, answered_at
     links, stations = _wireless(reader)
     mesh, neighbours, originators = _mesh(reader)
     macs = reader.read("macs", system.parse_macs)
-    installed = reader.read("packages", packages.parse_packages)
+    indexes = reader.read("macs", system.parse_indexes, required=False) or {}
+    has_tool = not reader.found_nothing("package_tool")
+    if not has_tool:
+        reader.notes.append("no package manager: neither apk nor opkg was found")
+    installed = reader.read("packages", packages.parse_packages, required=has_tool)
     return Observation(
         asked_at_s=asked_at_s,
         answered_at_s=answered_at_s,
@@ -127,15 +136,17 @@ def interpret(sections: Mapping[str, Section], *, asked_at_s: float, answered_at
         root_in_ram=reader.read("root", system.parse_root, required=False),
         tmp=_space(space, "/tmp"),
         macs=None if macs is None else MappingProxyType(macs),
+        ifindexes=MappingProxyType({name: index for index, name in indexes.items()}) if indexes else None,
         radios=reader.read("ubus.wireless", ubus.parse_wireless),
         links=links,
         stations=stations,
+        supplicants=reader.read("supplicants", lambda text: tuple(text.split()), required=False),
         interfaces=reader.read("ubus.interfaces", ubus.parse_interfaces),
         bridges=reader.read("bridges", system.parse_bridges),
         mesh=mesh,
         neighbours=neighbours,
         originators=originators,
-        package_tool=reader.read("package_tool", packages.parse_package_tool),
+        package_tool=reader.read("package_tool", packages.parse_package_tool, required=has_tool),
         packages=None if installed is None else MappingProxyType(installed),
         uci=_uci(reader),
         uci_changes=_lines(reader, "uci.changes"),

@@ -23,6 +23,7 @@ from meshctl.device.errors import (
     ChannelClosed,
     ConnectionLost,
     IncompatibleServer,
+    OutputTooLarge,
     Timeout,
     Unreachable,
     UploadFailed,
@@ -259,7 +260,7 @@ class SshConnection(Connection):
                 with self._waiting(seconds, "a command"):
                     channel.exec_command(sent.command)
                     with _fed(channel, sent.preamble, pieces, inline=isinstance(stdin, bytes)) as feeder:
-                        out, err = _collect(channel)
+                        out, err = _collect(channel, self._endpoint.label)
                     status = channel.recv_exit_status()
                     if status < 0:
                         raise EOFError("no exit status: it was killed, or the link was cut")
@@ -357,8 +358,8 @@ def _chained(first: bytes, rest: Iterable[bytes]) -> Iterator[bytes]:
     yield from rest
 
 
-def _collect(channel: paramiko.Channel) -> tuple[bytes, bytes]:
-    """Both outputs, read side by side until the command has closed them and told its status."""
+def _collect(channel: paramiko.Channel, label: str) -> tuple[bytes, bytes]:
+    """Both outputs, read side by side until the command has closed them and told its status. Raises OutputTooLarge."""
     out, err = bytearray(), bytearray()
     poll = select.poll()
     poll.register(channel.fileno(), select.POLLIN)
@@ -369,7 +370,10 @@ def _collect(channel: paramiko.Channel) -> tuple[bytes, bytes]:
         while channel.recv_stderr_ready():
             err += channel.recv_stderr(_READ_BYTES)
         if len(out) + len(err) > MAX_OUTPUT_BYTES:
-            raise EOFError(f"it said more than {MAX_OUTPUT_BYTES >> 20} MiB")
+            raise OutputTooLarge(
+                f"{label}: the command printed more than {MAX_OUTPUT_BYTES >> 20} MiB, and was ended",
+                hint="print less there (`| tail -n 100`), or read it with `meshctl ssh NODE -- COMMAND > FILE`",
+            )
         if ended:
             return bytes(out), bytes(err)
         # the exit status has no file descriptor, so look again from time to time

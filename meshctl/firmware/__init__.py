@@ -1,6 +1,6 @@
 """OpenWrt images: trailers -> metadata -> board, release and revision; hash and signature beside them."""
 
-from meshctl.firmware.check import check, image_path, sha256
+from meshctl.firmware.check import check, image_path, image_version, is_revision, sha256
 from meshctl.firmware.metadata import Metadata, parse_metadata, read_metadata
 from meshctl.firmware.trailer import (
     DamagedImage,
@@ -23,6 +23,8 @@ __all__ = [
     "append_signature",
     "check",
     "image_path",
+    "image_version",
+    "is_revision",
     "parse_metadata",
     "parse_public_key",
     "read_metadata",

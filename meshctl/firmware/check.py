@@ -14,6 +14,7 @@ from meshctl.diagnostics import Diagnostic, Position, Severity
 from meshctl.firmware.metadata import Metadata, read_metadata
 from meshctl.firmware.trailer import DamagedImage
 from meshctl.firmware.usign import BadSignature, PublicKey, parse_public_key, verify
+from meshctl.inventory.boundary import irregular
 from meshctl.model import HardwareProfile
 
 # The codes, each with what it means (docs/render.md).
@@ -51,12 +52,23 @@ def image_path(profile: HardwareProfile) -> Path | None:
     return Path(firmware.base) / firmware.image if firmware.image else None
 
 
+def image_version(image: Path) -> str:
+    """OpenWrt's version by the image's metadata, such as `25.12.0-rc1`; empty when it cannot be read or has none."""
+    try:
+        metadata = read_metadata(_read(image, MAX_IMAGE_BYTES))
+    except (OSError, ValueError, DamagedImage):
+        return ""
+    return "" if metadata is None else metadata.version
+
+
 def sha256(content: bytes) -> str:
     """The hash as `sha256sum` prints it."""
     return hashlib.sha256(content).hexdigest()
 
 
 def _read(path: Path, limit: int) -> bytes:
+    if reason := irregular(path):
+        raise OSError(reason)
     with path.open("rb") as stream:
         content = stream.read(limit + 1)
     if len(content) > limit:
@@ -102,13 +114,13 @@ def _check_version(image: Path, metadata: Metadata, profile: HardwareProfile) ->
         message = "another release than the profile's"
         found.append(_error(WRONG_RELEASE, image, message, expected=release, found=metadata.version))
     wanted = profile.firmware.revision
-    if wanted and metadata.revision and not _is_revision(metadata.revision, wanted):
+    if wanted and metadata.revision and not is_revision(metadata.revision, wanted):
         message = "another revision than the inventory names"
         found.append(_error(WRONG_REVISION, image, message, expected=wanted, found=metadata.revision))
     return tuple(found)
 
 
-def _is_revision(found: str, wanted: str) -> bool:
+def is_revision(found: str, wanted: str) -> bool:
     """`r24106` names `r24106-10cc5fcd00`, too."""
     return found == wanted or found.startswith(f"{wanted}-")
 

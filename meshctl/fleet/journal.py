@@ -3,6 +3,9 @@
 One SQLite file in `$XDG_STATE_HOME/meshctl` (WAL, so that two meshctl processes write at once and a killed one leaves
 it readable). `Journal.begin` opens a run; `Run.step`, `Run.finish_node` and `Run.end` fill it; `runs`, `steps`,
 `outcomes`, `unfinished` and `last_known` read it. Nothing secret is ever written.
+
+A fleet that is practised with in a lab has the same name and the same nodes as the real one. Their runs and facts are
+kept apart: a journal opened for a lab reads and writes under the fleet's name and the lab's directory.
 """
 
 from __future__ import annotations
@@ -11,9 +14,9 @@ import json
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,8 @@ SCHEMA_VERSION = 1
 BUSY_TIMEOUT_S = 20.0
 # In the middle of a run nodes wait to be confirmed: a journal that somebody holds is written to later.
 STEP_TIMEOUT_S = 1.0
+# between the name of a fleet and the directory of its lab; ASCII's own character for this (unit separator)
+_LAB_SEPARATOR = "\x1f"
 _RUN_COLUMNS = "id, command, fleet, inventory, owner, process, plan, began_s, ended_s, result"
 # Outcomes of a node that leave open what became of a change begun before.
 _END_NOT_SEEN = (Result.UNCERTAIN, Result.PENDING, Result.UNREACHABLE)
@@ -67,6 +72,8 @@ class RunRecord:
     began_s: float
     ended_s: float | None
     result: str
+    lab: str = ""
+    """The lab's directory, for a run in a virtual fleet."""
 
     @property
     def is_over(self) -> bool:
@@ -100,8 +107,10 @@ class LastKnown:
 class Journal:
     """The file. Safe to use from several threads and processes; close it, or use it in a `with` block."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, lab: str = "") -> None:
+        """`lab` is the directory of the virtual fleet that is worked with, empty for real nodes."""
         self.path = path
+        self.lab = lab
         self._lock = threading.Lock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -189,7 +198,7 @@ class Journal:
             cursor = database.execute(
                 "INSERT INTO runs (command, fleet, inventory, owner, process, plan, began_s)"
                 " VALUES (?, ?, ?, ?, ?, ?, ?)",
-                (command, fleet, inventory, owner(), this_process(), plan, now),
+                (command, self._key(fleet), inventory, owner(), this_process(), plan, now),
             )
             run_id = int(cursor.lastrowid or 0)
             database.executemany(
@@ -198,19 +207,21 @@ class Journal:
             )
         return Run(self, run_id)
 
-    def runs(self, *, fleet: str | None = None, node: str | None = None, limit: int = 20) -> tuple[RunRecord, ...]:
-        """The latest runs (of a fleet, with a node), newest first."""
+    def runs(
+        self, *, fleet: str | None = None, node: str | None = None, limit: int | None = 20
+    ) -> tuple[RunRecord, ...]:
+        """The latest runs (of a fleet, with a node), newest first; `limit` None: all."""
         rows = self._read(
             f"SELECT {_RUN_COLUMNS} FROM runs WHERE (?1 IS NULL OR fleet = ?1)"
             " AND (?2 IS NULL OR EXISTS (SELECT 1 FROM outcomes WHERE run = id AND node = ?2))"
             " ORDER BY id DESC LIMIT ?3",
-            (fleet, node, limit),
+            (None if fleet is None else self._key(fleet), node, -1 if limit is None else limit),
         )
-        return tuple(RunRecord(*row) for row in rows)
+        return tuple(_record(row) for row in rows)
 
     def run(self, run_id: int) -> RunRecord | None:
         rows = self._read(f"SELECT {_RUN_COLUMNS} FROM runs WHERE id = ?", (run_id,))
-        return RunRecord(*rows[0]) if rows else None
+        return _record(rows[0]) if rows else None
 
     def outcomes(self, run_id: int) -> tuple[Outcome, ...]:
         rows = self._read(
@@ -244,7 +255,7 @@ class Journal:
             " AND later.node = outcomes.node AND after.id > runs.id"
             " AND (after.command LIKE 'robots %') = (runs.command LIKE 'robots %'))"
             " ORDER BY run DESC, outcomes.rowid",
-            (fleet,),
+            (self._key(fleet),),
         )
         left: dict[int, tuple[str, ...]] = {}
         for run_id, node, result in rows:
@@ -261,7 +272,7 @@ class Journal:
             " (SELECT 1 FROM outcomes AS later JOIN runs AS after ON after.id = later.run WHERE after.fleet = ?1"
             " AND later.node = steps.node AND later.run >= steps.run AND after.command NOT LIKE 'robots %'"
             f" AND later.result IN ({ended})) GROUP BY node ORDER BY node",
-            (fleet,),
+            (self._key(fleet),),
         )
         return dict(rows)
 
@@ -271,11 +282,35 @@ class Journal:
 
     def remember_all(self, fleet: str, facts: Mapping[str, Mapping[str, str]], seen_s: float) -> None:
         with self._write() as database:
-            database.executemany(_REMEMBER, [_sighting(fleet, node, told, seen_s) for node, told in facts.items()])
+            database.executemany(
+                _REMEMBER, [_sighting(self._key(fleet), node, told, seen_s) for node, told in facts.items()]
+            )
 
     def last_known(self, fleet: str) -> dict[str, LastKnown]:
-        rows = self._read("SELECT node, seen_s, facts FROM nodes WHERE fleet = ? ORDER BY node", (fleet,))
+        rows = self._read("SELECT node, seen_s, facts FROM nodes WHERE fleet = ? ORDER BY node", (self._key(fleet),))
         return {node: LastKnown(node, seen_s, json.loads(facts)) for node, seen_s, facts in rows}
+
+    def separate(self, fleet: str, lab_of: Callable[[str], str]) -> None:
+        """Give each lab its runs of `fleet` that an earlier version kept under the real fleet's name.
+
+        `lab_of` gives the lab's directory by a run's inventory, empty for a real one. What was known of the nodes goes
+        along if all runs were one lab's; otherwise its origin is unknown, and it stays.
+        """
+        rows = self._read("SELECT DISTINCT inventory FROM runs WHERE fleet = ?", (fleet,))
+        labs = {inventory: lab_of(inventory) for (inventory,) in rows}
+        moving = {inventory: lab for inventory, lab in labs.items() if lab}
+        if not moving:
+            return
+        with self._write() as database:
+            for inventory, lab in moving.items():
+                new = _key_of(fleet, lab)
+                database.execute("UPDATE runs SET fleet = ? WHERE fleet = ? AND inventory = ?", (new, fleet, inventory))
+            if len(set(labs.values())) == 1:
+                new = _key_of(fleet, next(iter(moving.values())))
+                database.execute("UPDATE OR IGNORE nodes SET fleet = ? WHERE fleet = ?", (new, fleet))
+
+    def _key(self, fleet: str) -> str:
+        return _key_of(fleet, self.lab)
 
     def _read(self, query: str, values: tuple[object, ...]) -> list[tuple[Any, ...]]:
         with self._lock:
@@ -317,7 +352,7 @@ class Run:
 
     def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
         """Keep what a node told in the course of this run."""
-        self._put(_REMEMBER, *_sighting(fleet, node, facts, seen_s))
+        self._put(_REMEMBER, *_sighting(self._journal._key(fleet), node, facts, seen_s))
 
     @contextmanager
     def step(self, node: str, name: str) -> Iterator[None]:
@@ -350,6 +385,17 @@ class Run:
     def end(self, result: str) -> None:
         ended = (time.time(), result, self.id)
         self._put("UPDATE runs SET ended_s = ?, result = ? WHERE id = ?", *ended, wait_s=BUSY_TIMEOUT_S)
+
+
+def _key_of(fleet: str, lab: str) -> str:
+    """What the tables have as a fleet. A fleet's name holds no control character, so the parts cannot be confused."""
+    return f"{fleet}{_LAB_SEPARATOR}{lab}" if lab else fleet
+
+
+def _record(row: tuple[Any, ...]) -> RunRecord:
+    record = RunRecord(*row)
+    fleet, _, lab = record.fleet.partition(_LAB_SEPARATOR)
+    return replace(record, fleet=fleet, lab=lab)
 
 
 def _sighting(fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> tuple[object, ...]:

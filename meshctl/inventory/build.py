@@ -134,6 +134,7 @@ def _hardware(name: str, document: HardwareDocument, root: MappingNode) -> Hardw
                 antenna=radio.antenna,
                 beamwidth_deg=radio.beamwidth_deg,
                 chains=radio.chains,
+                driver=radio.driver,
             )
             for radio_name, radio in document.radios.items()
         ),

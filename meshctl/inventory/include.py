@@ -9,6 +9,7 @@ from pathlib import Path
 
 from meshctl.diagnostics import Diagnostic
 from meshctl.inventory import codes
+from meshctl.inventory.boundary import HINT, Boundary
 from meshctl.inventory.compose import MAX_VALUES, compose
 from meshctl.inventory.source import Reader, Source, read_bytes, read_source
 from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, describe, position
@@ -35,8 +36,9 @@ def first_file(path: Path) -> Path:
 
 def gather(path: Path, environ: Mapping[str, str], read: Reader = read_bytes) -> Gathered:
     """Read `path` and its includes. An include's `~` is `HOME` of `environ`."""
-    gathering = _Gathering(environ, read)
-    root = gathering.file(first_file(path), ())
+    first = first_file(path)
+    gathering = _Gathering(environ, read, Boundary.of(first.parent, environ))
+    root = gathering.file(first, ())
     complete = root if not gathering.is_broken else None
     return Gathered(complete, tuple(gathering.files), tuple(gathering.diagnostics))
 
@@ -45,6 +47,7 @@ def gather(path: Path, environ: Mapping[str, str], read: Reader = read_bytes) ->
 class _Gathering:
     environ: Mapping[str, str]
     read: Reader
+    boundary: Boundary
     files: list[Path] = field(default_factory=list)
     diagnostics: list[Diagnostic] = field(default_factory=list)
     is_broken: bool = False
@@ -99,7 +102,10 @@ class _Gathering:
             if target is None:
                 continue
             real = os.path.realpath(target)
-            if real in above:
+            if objection := self.boundary.objection(target):
+                problem = codes.error(codes.INCLUDE, position(item), f"the include {target} is {objection}")
+                self._fail(replace(problem, hint=HINT if objection.startswith("outside") else ""))
+            elif real in above:
                 circle = " -> ".join(Path(name).name for name in (*above[above.index(real) :], real))
                 self._fail(codes.error(codes.INCLUDE, position(item), f"files include each other: {circle}"))
             elif any(os.path.realpath(known) == real for known in self.files):

@@ -15,9 +15,15 @@ SCHEMA_ID = "urn:meshctl:inventory:1"
 
 
 def json_schema() -> dict[str, Any]:
-    """The schema of `fleet.yaml`. An included file holds some of the same keys."""
-    schema = InventoryDocument.model_json_schema(by_alias=True, schema_generator=_Generator)
-    return {"$schema": _Generator.schema_dialect, "$id": SCHEMA_ID, **_untitled(schema)}
+    """The schema of every file of an inventory.
+
+    A file that names the format's version is the first one and holds what a fleet must have; one that does not is
+    included, and holds any of the same keys.
+    """
+    schema = _untitled(InventoryDocument.model_json_schema(by_alias=True, schema_generator=_Generator))
+    required = schema.pop("required")
+    whole = {"if": {"required": ["meshctl"]}, "then": {"required": required}}
+    return {"$schema": _Generator.schema_dialect, "$id": SCHEMA_ID, **schema, **whole}
 
 
 class _Generator(GenerateJsonSchema):

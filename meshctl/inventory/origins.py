@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from meshctl.inventory.layers import Layer, NodePlan
-from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, child, place_of
+from meshctl.inventory.ranges import expand
+from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, child, descend, place_of
 from meshctl.model import Origin
 
 # How an origin names a value of each section; `{}` is the entry's name.
@@ -17,21 +18,25 @@ _TITLES = {
     "topics": "topic {}",
     "defaults": "defaults",
 }
+# what a robot lists nodes under
+_NODE_LISTS = ("nodes", "carries")
 
 
 class Origins(Mapping[tuple[str, ...], Origin]):
     """Paths such as `("nodes", "b03", "radios", "radio0", "tx_power_dbm")` to origins.
 
     A node's values stand under the node's path with the layer they came from, a value of the file's other sections
-    under its own path, `("operators", "ssh_keys", "0")`.
+    under its own path, `("operators", "ssh_keys", "0")`. In a robot's lists of nodes a node's name is a path as well,
+    `("robots", "husky1", "carries", "b03")`: it leads to the element, perhaps a range, that makes the name.
     """
 
-    __slots__ = ("_plans", "_robot_of", "_root")
+    __slots__ = ("_elements", "_plans", "_robot_of", "_root")
 
     def __init__(self, root: MappingNode, plans: Mapping[str, NodePlan], robot_of: Mapping[str, str]) -> None:
         self._root = root
         self._plans = plans
         self._robot_of = robot_of
+        self._elements: dict[tuple[str, ...], dict[str, str]] = {}
 
     def __getitem__(self, path: tuple[str, ...]) -> Origin:
         found = self._node(path) if path[:1] == ("nodes",) and len(path) > 1 else self._section(path)
@@ -55,11 +60,26 @@ class Origins(Mapping[tuple[str, ...], Origin]):
         return sum(1 for _ in self)
 
     def _section(self, path: tuple[str, ...]) -> Origin | None:
+        if path[:1] == ("robots",) and len(path) == 4 and path[2] in _NODE_LISTS:
+            path = (*path[:3], self._element(path[:3]).get(path[3], path[3]))
         place = place_of(self._root, path) if path else None
         if place is None:
             return None
         title = _TITLES.get(path[0], "fleet")
         return Origin(place, title.format(path[1]) if len(path) > 1 else "fleet" if "{}" in title else title)
+
+    def _element(self, path: tuple[str, ...]) -> dict[str, str]:
+        """The place in a robot's list, as text, of each node that the list names."""
+        found = self._elements.get(path)
+        if found is None:
+            found = self._elements[path] = {}
+            tree = descend(self._root, path)
+            items = tree.items if isinstance(tree, SequenceNode) else ()
+            for number, item in enumerate(items):
+                if isinstance(item, Scalar):
+                    for name in expand(item.text):
+                        found.setdefault(name, str(number))
+        return found
 
     def _node(self, path: tuple[str, ...]) -> Origin | None:
         plan = self._plans.get(path[1])

@@ -15,6 +15,7 @@ import pyrage
 
 from meshctl.diagnostics import Position
 from meshctl.errors import InputError
+from meshctl.inventory.boundary import irregular
 from meshctl.inventory.compose import compose
 from meshctl.inventory.source import Source
 from meshctl.inventory.suggest import did_you_mean
@@ -106,6 +107,8 @@ class _NoSecret(Exception):
 
 
 def _read(path: Path) -> bytes:
+    if found := irregular(path):
+        raise _NoSecret(f"{path} is {found}")
     try:
         with path.open("rb") as stream:
             content = stream.read(MAX_SECRET_FILE_BYTES + 1)

@@ -136,14 +136,14 @@ def _known_keys(path: tuple[int | str, ...]) -> list[str]:
     """The keys of the model that stands at `path`."""
     kind: Any = InventoryDocument
     for part in path:
-        kind = _step(kind, part)
-    model = _model(kind)
+        kind = step_into(kind, part)
+    model = model_of(kind)
     return [] if model is None else [field.alias or name for name, field in model.model_fields.items()]
 
 
-def _step(kind: Any, part: int | str) -> Any:
+def step_into(kind: Any, part: int | str) -> Any:
     """The type one part further down."""
-    model = _model(kind)
+    model = model_of(kind)
     if model is not None:
         for name, field in model.model_fields.items():
             if (field.alias or name) == part:
@@ -154,7 +154,8 @@ def _step(kind: Any, part: int | str) -> Any:
     return arguments[-1] if arguments else None
 
 
-def _model(kind: Any) -> type[BaseModel] | None:
+def model_of(kind: Any) -> type[BaseModel] | None:
+    """The model of a field's type; None for a list, a dictionary or a value."""
     bare = _bare(kind)
     return bare if isinstance(bare, type) and issubclass(bare, BaseModel) else None
 

@@ -162,6 +162,12 @@ class Operations:
             "number": state.number,
         }
 
+    def console(self, node: str, lines: int) -> dict[str, Any]:
+        """The last lines of what its boot scripts printed, of all boots; it works for a node without power, too."""
+        file = self._fleet.hurt.find(node).home / "console.log"
+        text = file.read_text(encoding="utf-8", errors="replace") if file.exists() else ""
+        return {"text": "\n".join(text.splitlines()[-lines:])}
+
     async def execute(self, node: str, command: str, descriptors: list[int]) -> dict[str, Any]:
         self._fleet.hurt.find(node)
         event, _ = await self._fleet.ask_for({"do": "exec", "node": node, "command": command}, descriptors)

@@ -1,7 +1,8 @@
 """The operator's way in: one listening socket on 127/8 for each address that is reachable at this moment.
 
 A socket is closed as soon as its address is not reachable, so connecting there is refused; connections that are open
-then stall, as they do in the field.
+then stall, as they do in the field. It is closed, too, while the firewall that the node has loaded lets nobody in; that
+leaves open connections alone.
 """
 
 from __future__ import annotations
@@ -76,12 +77,14 @@ class Doors:
         for name, state in self._fleet.nodes.items():
             if not state.is_running:
                 continue
-            if self._fleet.ether.wire(name, FACTORY_ADDRESS) is not None:
+            if self._fleet.ether.wire(name, FACTORY_ADDRESS) is not None and state.effective.admits(FACTORY_ADDRESS):
                 door = Door(bench_of(state.number), name, FACTORY_ADDRESS, bench=True)
                 doors[door.host] = door
             for address in state.effective.addresses:
                 # many factory devices on one bench: each is told apart by its own port only
                 if address.address == FACTORY_ADDRESS and state.spec.medium is not Medium.BASE:
+                    continue
+                if not address.admitted:
                     continue
                 host = loopback_of(address.address)
                 if host not in doors and self._fleet.ether.way(name, address.address) is not None:

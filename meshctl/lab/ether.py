@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from meshctl.errors import InputError
 from meshctl.lab import air
 from meshctl.lab.forward import Shape
 from meshctl.lab.spec import LinkSpec, Medium, changed_link
+from meshctl.lab.stations import Stations
 
 if TYPE_CHECKING:
     from meshctl.lab.supervisor import Supervisor
@@ -37,6 +39,12 @@ class Ether:
         self._graph: dict[str, list[air.Edge]] = {}
         self._from_base: dict[str, air.Path] = {}
         self._timer: asyncio.TimerHandle | None = None
+        self._stations = Stations()
+        # of the nodes that run: which boot it is
+        self._boots: dict[str, int] = {}
+        # the boots in which nodes were last on the air
+        self._on_air: dict[str, int] = {}
+        self._expiry: asyncio.TimerHandle | None = None
         self._last_cost_s = 0.0
         self.condition = asyncio.Condition()
         self._notices: set[asyncio.Task[None]] = set()
@@ -105,6 +113,8 @@ class Ether:
         path = self._from_base.get(name)
         if path is None or not state.effective.holds(address, over="mesh"):
             return None
+        if not all(self._passes(sender, edge) for sender, edge in path.hops):
+            return None
         rates = [link.rate_kbps for link in path.links if link.rate_kbps is not None]
         arrives = 1.0
         for link in path.links:
@@ -125,6 +135,47 @@ class Ether:
         """The nodes that a mesh path from the base leads to."""
         return set(self._from_base)
 
+    # -- station tables --
+
+    def station_deleted(self, name: str, interface: str, mac: str) -> None:
+        """The node has deleted a station from its table (`iw dev INTERFACE station del MAC`)."""
+        self._stations.delete(name, interface, mac.lower(), time.time())
+        self.changed()
+
+    def _passes(self, sender: str, edge: air.Edge) -> bool:
+        return self._stations.passes(sender, self._boots, edge)
+
+    def _count_boots(self) -> None:
+        self._boots = {name: state.boots for name, state in self._fleet.nodes.items() if state.is_running}
+
+    def _update_stations(self) -> None:
+        for name, boot in self._boots.items():
+            if self._on_air.get(name, boot) != boot and not self._fleet.spec.quick_boot:
+                self._stations.forget_silent(name)
+            if self._graph.get(name):
+                self._on_air[name] = boot
+        self._stations.update(self._graph, self._boots, time.time())
+        if self._expiry is not None:
+            self._expiry.cancel()
+            self._expiry = None
+        due_s = self._stations.next_change_s()
+        if due_s is not None:
+            wait_s = max(1.0, due_s - time.time() + 0.1)
+            self._expiry = asyncio.get_running_loop().call_later(wait_s, self.changed)
+
+    def _known_to(self, name: str) -> list[air.Known]:
+        return [
+            air.Known(
+                entry.holder.interface,
+                entry.mac,
+                entry.signal_dbm,
+                entry.tq,
+                int(entry.since_s),
+                int(entry.silent_since_s or 0),
+            )
+            for entry in self._stations.of(name)
+        ]
+
     # -- computing --
 
     def _nodes(self) -> dict[str, air.Effective]:
@@ -141,6 +192,7 @@ class Ether:
 
     def _cut(self) -> None:
         """Take away what no longer stands; what is new waits for `_converge`."""
+        self._count_boots()
         now = self._paths_from_base(air.edges(self._nodes(), self.links()))
         self._from_base = {name: path for name, path in now.items() if name in self._from_base}
         self._tell()
@@ -149,12 +201,14 @@ class Ether:
         loop = asyncio.get_running_loop()
         begun = loop.time()
         self._timer = None
+        self._count_boots()
         nodes = self._nodes()
         self._graph = air.edges(nodes, self.links())
         self._from_base = self._paths_from_base(self._graph)
+        self._update_stations()
         for name, state in self._fleet.nodes.items():
             ways = air.paths(self._graph, name) if name in nodes else {}
-            text = air.heard(name, nodes, self._graph, ways)
+            text = air.heard(name, nodes, self._graph, ways, self._known_to(name), self._passes)
             if self._written.get(name) != text:
                 self._written[name] = text
                 _replace(state.home / "air" / "heard", text)

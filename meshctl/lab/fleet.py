@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import select
-import shutil
 import signal
 import subprocess
 import sys
@@ -22,7 +21,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from meshctl.device.connection import Completed, Endpoint
-from meshctl.lab import rom
+from meshctl.lab import place, rom
 from meshctl.lab.addresses import bench_of, loopback_of
 from meshctl.lab.client import is_running, request
 from meshctl.lab.errors import LabError
@@ -75,6 +74,10 @@ class VirtualNode:
         """What its boot scripts printed, of all boots."""
         return self._fleet.directory / "nodes" / self.name / "console.log"
 
+    def console(self, lines: int = 40) -> str:
+        """The last lines of its console: each boot, each boot script's start, and what they printed."""
+        return str(self._fleet.ask("console", node=self.name, lines=lines)["text"])
+
     @property
     def bench(self) -> Endpoint:
         """Its LAN port on the bench: answers while the node is plugged in there and has the address 192.168.1.1."""
@@ -116,11 +119,18 @@ class VirtualNode:
         self.wait_up(wait_s=wait_s)
 
     def wait_up(self, *, after_boots: int = 0, wait_s: float = 60.0) -> None:
-        """Wait until it is up (or proves not to start) and has booted more often than `after_boots`."""
+        """Wait until it is up (or its firmware proves not to start) and has booted more often than `after_boots`.
+
+        Raises LabError with the reason when this machine cannot start it.
+        """
 
         def settled() -> bool:
             state = self._state()
-            return state["boots"] > after_boots and Power(state["power"]) in (Power.UP, Power.DEAD, Power.FAILED)
+            if state["boots"] <= after_boots:
+                return False
+            if Power(state["power"]) is Power.FAILED:
+                raise LabError(f"this machine cannot start {self.name}: {state['reason']}")
+            return Power(state["power"]) in (Power.UP, Power.DEAD)
 
         wait_for(settled, f"{self.name} to boot", wait_s)
 
@@ -172,9 +182,9 @@ class VirtualFleet:
     def up(self, *, wait_s: float = 120.0) -> Self:
         """Start it and wait until every node has booted. Raises LabError with the reason and the log's path."""
         self._check_programs()
-        if is_running(self.directory):
-            raise LabError(f"a virtual fleet runs in {self.directory} already", hint="meshctl lab down ends it")
-        self._make_directory()
+        place.claim(self.directory)
+        place.clear(self.directory)
+        (self.directory / "spec.json").write_text(dump(self.spec), encoding="utf-8")
         log_path = self.directory / "log"
         with log_path.open("ab") as log:
             process = subprocess.Popen(
@@ -199,14 +209,6 @@ class VirtualFleet:
     def _check_programs(self) -> None:
         for program, package in (("busybox", "busybox-static"), ("dropbear", "dropbear-bin")):
             rom.find_program(program, package)
-
-    def _make_directory(self) -> None:
-        self.directory.mkdir(parents=True, exist_ok=True)
-        for leftover in ("rom", "nodes", "mnt"):
-            shutil.rmtree(self.directory / leftover, ignore_errors=True)
-        for leftover in ("bell", "failure", "control.sock", "supervisor.pid", "log", "ground.json"):
-            (self.directory / leftover).unlink(missing_ok=True)
-        (self.directory / "spec.json").write_text(dump(self.spec), encoding="utf-8")
 
     def _wait_booted(self, process: subprocess.Popen[bytes], wait_s: float) -> None:
         def booted() -> bool:

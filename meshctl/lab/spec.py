@@ -149,7 +149,9 @@ class LanSpec:
 class FleetSpec:
     """A whole fleet. `port` is the one TCP port all its loopback addresses listen on (`addresses.loopback_of`).
 
-    0 lets the supervisor choose a free one; `VirtualFleet.port` tells which.
+    0 lets the supervisor choose a free one; `VirtualFleet.port` tells which. `seed` decides what is left to chance on
+    the nodes: how long their services and radios take. A virtual boot takes a second, a real one about as long as
+    neighbours remember a station that is silent; `quick_boot` lets them remember it, as after a boot within a minute.
     """
 
     name: str
@@ -159,6 +161,8 @@ class FleetSpec:
     # how long a link takes until batman-adv knows it; real meshes need 10 to 20 s
     convergence_s: float = 0.2
     lans: tuple[LanSpec, ...] = ()
+    seed: int = 0
+    quick_boot: bool = False
 
     def __post_init__(self) -> None:
         names = [node.name for node in self.nodes]

@@ -51,8 +51,11 @@ class NodeState:
         return self.power in (Power.BOOTING, Power.UP, Power.FLASHING)
 
 
-def write_facts(state: NodeState, radios_mac: str) -> None:
-    """What the node is told about its own board, in files that its stand-ins source. Replaced atomically."""
+def write_facts(state: NodeState, radios_mac: str, seed: int = 0) -> None:
+    """What the node is told about its own board, in files that its stand-ins source. Replaced atomically.
+
+    `seed` decides what is left to chance on the node: how long its services take.
+    """
     spec = state.spec
     types = spec.host_key_types
     if types is None:
@@ -69,6 +72,7 @@ def write_facts(state: NodeState, radios_mac: str) -> None:
         "RADIOS": " ".join(radios),
         "HOST_KEY_TYPES": " ".join(types),
         "FLASH_S": f"{spec.flash_s:g}",
+        "SEED": str(seed * 1000 + state.number),
     }
     _replace(state.home / "board", "".join(f"{key}={shlex.quote(value)}\n" for key, value in facts.items()))
     _replace(state.home / "name", f"{spec.name} {state.number}\n")

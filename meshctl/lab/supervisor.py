@@ -136,7 +136,7 @@ class Supervisor:
     def _boot(self, state: NodeState) -> None:
         container = self.container(state)
         (state.home / "air" / "effective").unlink(missing_ok=True)
-        write_facts(state, label_mac(state.spec, state.number))
+        write_facts(state, label_mac(state.spec, state.number), self.spec.seed)
         prepare(container)
         state.power = Power.BOOTING
         state.reason = ""
@@ -231,8 +231,13 @@ class Supervisor:
             for line in os.read(bell, 65536).decode("utf-8", "replace").splitlines():
                 word, _, rest = line.partition(" ")
                 name, _, detail = rest.partition(" ")
-                if name in self.nodes:
+                if name not in self.nodes:
+                    continue
+                try:
                     self._rung(word, self.nodes[name], detail)
+                except (OSError, ValueError, LabError):
+                    # the lines behind it are other nodes'
+                    log.exception("bell-failed line=%s", line)
 
     def _rung(self, word: str, state: NodeState, detail: str) -> None:
         match word:
@@ -243,6 +248,9 @@ class Supervisor:
                 self._boot_next()
             case "changed" if state.is_running:
                 self._read_effective(state)
+            case "forgot" if len(detail.split()) == 2:
+                interface, mac = detail.split()
+                self.ether.station_deleted(state.spec.name, interface, mac)
             case "dead":
                 self._is_gone(state, Power.DEAD)
             case "cut" if state.is_running:

@@ -51,14 +51,14 @@ class Warden:
     """Serves requests on `channel` until the supervisor closes it.
 
     `put_devices` gives a new node (its process number) its network devices before its process 1 begins; `take_devices`
-    is told the network namespace of a node that has just ended, as a descriptor.
+    takes them back when the node (its name, its network namespace as a descriptor) has just ended.
     """
 
     def __init__(
         self,
         channel: socket.socket,
         put_devices: Callable[[Container, int], None] | None = None,
-        take_devices: Callable[[int], None] | None = None,
+        take_devices: Callable[[str, int], None] | None = None,
     ) -> None:
         self._channel = channel
         self._put_devices = put_devices
@@ -142,7 +142,7 @@ class Warden:
         _, status = os.waitpid(running.pid, 0)
         reason = os.read(report, 4096).decode("utf-8", "replace") if _readable(report) else ""
         if self._take_devices is not None:
-            self._take_devices(running.network)
+            self._take_devices(name, running.network)
         for descriptor in (running.pidfd, running.network, report):
             os.close(descriptor)
         self._tell({"event": "exit", "node": name, "status": os.waitstatus_to_exitcode(status), "reason": reason})
@@ -184,10 +184,21 @@ def _readable(descriptor: int) -> bool:
     return bool(select.select([descriptor], [], [], 0)[0])
 
 
+def _close_all_but(kept: Sequence[int]) -> None:
+    """Close what the warden had open. A shell may stay for hours, and a descriptor of another node's network would keep
+    that network for as long."""
+    for descriptor in map(int, os.listdir("/proc/self/fd")):
+        if descriptor > 2 and descriptor not in kept:
+            # one of them was that of the listing
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+
+
 def _enter_and_run(node: _Running, command: str, descriptors: Sequence[int]) -> None:
     """In a forked child: enter the node, run `command` in its shell, pass on its exit status."""
     try:
         ns.die_with_parent()
+        _close_all_but(descriptors)
         spaces = [(os.open(f"/proc/{node.pid}/ns/{kind}", os.O_RDONLY), flag) for kind, flag in _SPACES]
         pid_space = os.open(f"/proc/{node.pid}/ns/pid", os.O_RDONLY)
         with contextlib.suppress(FileNotFoundError):

@@ -7,7 +7,7 @@ rules about text, and for reports that show the line.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from meshctl.diagnostics import Diagnostic, sorted_diagnostics
@@ -17,12 +17,12 @@ from meshctl.inventory.codes import UNREADABLE
 from meshctl.inventory.secrets import SecretStore
 from meshctl.inventory.source import read_bytes
 from meshctl.lint.catalog import BY_CODE, RULES
-from meshctl.lint.context import LintContext, SecretLookup
+from meshctl.lint.context import LintContext, SecretLookup, SecretProblem
 from meshctl.lint.engine import lint, lint_texts
 from meshctl.lint.files import DiskFiles
 from meshctl.lint.rule import Rule
 from meshctl.lint.suppress import Suppressed, apply
-from meshctl.model import Secret, SecretRef
+from meshctl.model import Secret, SecretKind, SecretRef
 from meshctl.regdb import Regdb
 
 
@@ -50,7 +50,8 @@ def examine(path: Path, regdb: Regdb, environ: Mapping[str, str], rules: Iterabl
     found = [*loaded.diagnostics, *lint_texts(sources, chosen)]
     ran: set[str] = {rule.code for rule in chosen if rule.check_text is not None}
     if loaded.fleet is not None:
-        context = LintContext(regdb, DiskFiles(), _lookup(SecretStore(environ, Path(loaded.fleet.base))))
+        store = SecretStore(environ, Path(loaded.fleet.base))
+        context = LintContext(regdb, DiskFiles(), _lookup(store), _problem(store))
         found.extend(lint(loaded.fleet, context, chosen))
         ran = {rule.code for rule in chosen}
     divided = apply(sorted_diagnostics(found), sources, BY_CODE, ran)
@@ -69,3 +70,27 @@ def _lookup(store: SecretStore) -> SecretLookup:
             return None
 
     return secret
+
+
+def _problem(store: SecretStore) -> SecretProblem:
+    def problem(ref: SecretRef) -> str:
+        try:
+            store.get(ref)
+        except InputError as error:
+            if ref.kind is SecretKind.ENV and ref.where not in store.environ:
+                return ""
+            if ref.kind is SecretKind.AGE and not _opens(store, ref):
+                return ""
+            return str(error).removeprefix(f"secret {ref}: ")
+        return ""
+
+    return problem
+
+
+def _opens(store: SecretStore, ref: SecretRef) -> bool:
+    """Whether this machine has an identity for the encrypted file."""
+    try:
+        store.get(replace(ref, key=""))
+    except InputError:
+        return False
+    return True

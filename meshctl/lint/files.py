@@ -26,6 +26,7 @@ class DiskFiles:
 
     def __init__(self) -> None:
         self._firmware: dict[HardwareProfile, tuple[Diagnostic, ...]] = {}
+        self._versions: dict[HardwareProfile, str] = {}
         self._tracked: dict[Path, bool] = {}
 
     def size_bytes(self, path: Path) -> int | None:
@@ -35,6 +36,12 @@ class DiskFiles:
     def mode(self, path: Path) -> int | None:
         found = _status(path)
         return None if found is None else stat.S_IMODE(found.st_mode)
+
+    def is_special(self, path: Path) -> bool:
+        try:
+            return not stat.S_ISREG(path.stat().st_mode)
+        except (OSError, ValueError):
+            return False
 
     def text(self, path: Path) -> str | None:
         size = self.size_bytes(path)
@@ -56,6 +63,12 @@ class DiskFiles:
             self._firmware[profile] = () if image is None else firmware.check(image, profile)
         return self._firmware[profile]
 
+    def image_version(self, profile: HardwareProfile) -> str:
+        if profile not in self._versions:
+            image = firmware.image_path(profile)
+            self._versions[profile] = "" if image is None else firmware.image_version(image)
+        return self._versions[profile]
+
 
 def _status(path: Path) -> os.stat_result | None:
     """The status of a regular file, None for anything else."""
@@ -67,7 +80,11 @@ def _status(path: Path) -> os.stat_result | None:
 
 
 def _would_be_committed(path: Path) -> bool:
-    absolute = path.absolute()
+    # where the bytes are: `..` and symbolic links lead out of a work tree, and into one
+    try:
+        absolute = path.resolve()
+    except OSError:
+        return False
     if not any((parent / ".git").exists() for parent in absolute.parents):
         return False
     git = shutil.which("git")

@@ -120,6 +120,12 @@ class Node:
         return tuple(port for port in self.lan_ports if "." in port and port.rpartition(".")[2] not in vlans)
 
     @property
+    def mesh_interfaces(self) -> dict[str, str]:
+        """The mesh of each mesh interface, by the interface's name: `mesh0`, `mesh1`, ... in the radios' order."""
+        joined = (radio.mesh for radio in self.radios if radio.mesh is not None)
+        return {f"mesh{index}": mesh for index, mesh in enumerate(joined)}
+
+    @property
     def meshes(self) -> tuple[str, ...]:
         """The names of the meshes its radios join, each once, in the radios' order."""
         return tuple(dict.fromkeys(radio.mesh for radio in self.radios if radio.mesh is not None))

@@ -29,7 +29,8 @@ class RadioHardware:
     Powers are separate numbers, because the kernel knows nothing of an external amplifier: UCI's txpower is the drive
     level, `max_drive_dbm` its highest value (what the driver offers), `amplifier_gain_db` what an amplifier adds,
     `rated_power_dbm` what the box is sold as (30 for 1 W, 33 for 2 W), `antenna_gain_dbi` less `cable_loss_db` what the
-    antenna adds.
+    antenna adds. `driver` is the kernel's module by its name in OpenWrt (`ath9k`, `ath10k-ct`), empty where it is not
+    written.
     """
 
     name: str
@@ -43,6 +44,7 @@ class RadioHardware:
     antenna: AntennaKind = AntennaKind.OMNI
     beamwidth_deg: int = 360
     chains: int = 2
+    driver: str = ""
 
 
 @dataclass(frozen=True, slots=True)

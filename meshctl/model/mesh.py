@@ -64,7 +64,8 @@ class OperatorParts:
 @dataclass(frozen=True, slots=True)
 class Mesh:
     """`channel` and `htmode` as UCI has them; `network` holds every node's management address; `mtu` is the hard
-    interface's (batman-adv adds 32 bytes to 1500); `reconnect_s` is the wanted time to heal after a cut."""
+    interface's (batman-adv needs 32 bytes around 1500, and warns below 60); `reconnect_s` is the wanted time to heal
+    after a cut."""
 
     name: str
     ssid: str
@@ -79,7 +80,7 @@ class Mesh:
     mcast_rate_kbps: int = 12000
     distance_m: int = 1000
     beacon_interval_tu: int = 100
-    mtu: int = 1536
+    mtu: int = 1560
     lan_mtu: int = 1500
     reconnect_s: float = 5.0
     min_beacons: int = 0

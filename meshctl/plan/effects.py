@@ -1,13 +1,15 @@
 """Which services a change of configuration reloads, and what that cuts.
 
 `reload_config` reloads the service of each package that changed (procd's triggers); what that interrupts depends on
-what changed within it, since netifd takes down only what differs.
+what changed within it and on the release, since netifd takes down only what differs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from meshctl.model import Release
+from meshctl.plan.radios import RadioChange, radio_changes
 from meshctl.plan.values import Cut, Effect
 from meshctl.uci import Package, Section
 
@@ -15,31 +17,53 @@ from meshctl.uci import Package, Section
 _SIMPLE: Mapping[str, tuple[str, Cut]] = {
     "system": ("system, log", Cut.NOTHING),
     "dhcp": ("dnsmasq, odhcpd", Cut.NOTHING),
-    "firewall": ("firewall", Cut.NOTHING),
+    "firewall": ("firewall", Cut.LOGIN),
     "dropbear": ("dropbear", Cut.LOGIN),
-    "wireless": ("wifi", Cut.MESH),
 }
 
 
 def effects(
-    changed: Iterable[str], before: Mapping[str, Package | None], after: Mapping[str, Package | None]
+    changed: Iterable[str],
+    before: Mapping[str, Package | None],
+    after: Mapping[str, Package | None],
+    release: Release,
 ) -> tuple[Effect, ...]:
-    """The effects of changing these files (`etc/config/network`, ...), the worst first."""
-    found = [effect for path in changed for effect in _effects(path, before, after)]
+    """The effects of changing these files (`etc/config/network`, ...) on that release, the worst first."""
+    found = [effect for path in changed for effect in _effects(path, before, after, release)]
     return tuple(sorted(found, key=lambda effect: (-effect.cut, effect.service)))
 
 
-def _effects(path: str, before: Mapping[str, Package | None], after: Mapping[str, Package | None]) -> list[Effect]:
+def _effects(
+    path: str, before: Mapping[str, Package | None], after: Mapping[str, Package | None], release: Release
+) -> list[Effect]:
     if not path.startswith("etc/config/"):
         # keys and markers are read when they are needed
         return []
     package = path.rpartition("/")[2]
     if package == "network":
         return _network(before.get(package), after.get(package))
-    if package == "wireless" and not _has_live_radio(before.get(package)):
-        return [Effect("wifi", Cut.NOTHING, "radios were off")]
+    if package == "wireless":
+        return _wireless(before.get(package), after.get(package), release)
     service, cut = _SIMPLE.get(package, (package, Cut.MESH))
     return [Effect(service, cut, f"{package} changes")]
+
+
+def _wireless(before: Package | None, after: Package | None, release: Release) -> list[Effect]:
+    if not _has_live_radio(before):
+        return [Effect("wifi", Cut.NOTHING, "radios were off")]
+    if before is None or after is None:
+        return [Effect("wifi", Cut.MESH, "wireless changes")]
+    found = [_radio(change) for change in radio_changes(before, after, release)]
+    return found or [Effect("wifi", Cut.NOTHING, "no radio changes")]
+
+
+def _radio(change: RadioChange) -> Effect:
+    options = ", ".join(change.options)
+    if change.restarts:
+        return Effect("wifi", Cut.MESH, f"{change.radio} restarts: {options}")
+    if change.may_lose_range:
+        return Effect("wifi", Cut.MESH, f"{change.radio}: {options} set without a restart, weak links may break")
+    return Effect("wifi", Cut.NOTHING, f"{change.radio}: {options} set without a restart")
 
 
 def _has_live_radio(wireless: Package | None) -> bool:

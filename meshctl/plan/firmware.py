@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from meshctl.device.observation import Observation
+from meshctl.firmware import is_revision
 from meshctl.model import Node
 from meshctl.plan.values import FirmwareStep
 
@@ -11,7 +12,7 @@ def firmware_step(node: Node, seen: Observation) -> FirmwareStep | None:
     """The step to the inventory's revision; None when it runs, or when the inventory names no image or revision."""
     wanted = node.hardware.firmware
     running = seen.release.revision if seen.release else ""
-    if not wanted.image or not wanted.revision or running == wanted.revision:
+    if not wanted.image or not wanted.revision or is_revision(running, wanted.revision):
         return None
     return FirmwareStep(wanted.image, wanted.sha256, running or "unknown", wanted.revision)
 

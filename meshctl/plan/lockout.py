@@ -1,4 +1,4 @@
-"""Whether a plan would shut us out: the keys a node is to have against those that we can log in with. Pure.
+"""Whether a plan would shut us out: the keys a node is to have, and the SSH server that it starts at boot. Pure.
 
 A node proves its new configuration by letting us in with a key. Where none of ours is among those it gets, its password
 login would close behind us, nobody could confirm, and it would go back after its window: better not to begin.
@@ -13,7 +13,10 @@ from collections.abc import Mapping, Sequence
 from meshctl.device.connection import OwnKey, fingerprint_of
 from meshctl.model import Node
 from meshctl.plan.objections import Objection
+from meshctl.uci import Package
 
+# what libubox takes for false
+_OFF = frozenset({"0", "off", "false", "no", "disabled"})
 AUTHORIZED_KEYS = "etc/dropbear/authorized_keys"
 
 
@@ -37,6 +40,34 @@ def lockout(node: Node, files: Mapping[str, bytes], own: Sequence[OwnKey]) -> Ob
         f"the keys we have{release}: {ours}",
         "name the private key of one of them (--key, ssh.key_files) or load it into your agent, "
         "or add your public key to operators.ssh_keys",
+    )
+
+
+def server_lockout(packages: Mapping[str, Package]) -> Objection | None:
+    """The objection against a configuration (package name -> tree) whose dropbear would not listen after a boot.
+
+    On a running node `Interface` and `DirectInterface` of a network that is not there change nothing: dropbear listens
+    on all addresses (24.10 and later). At boot it waits for that network's trigger, for ever (dropbear.init, all
+    releases). So it may only name a network of the node with an address of its own.
+    """
+    dropbear, network = packages.get("dropbear"), packages.get("network")
+    if dropbear is None or network is None:
+        return None
+    steady = {section.name for section in network.of_type("interface") if section.get("proto") == "static"}
+    sections = [section for section in dropbear.of_type("dropbear") if section.get("enable", "1") not in _OFF]
+    options = ("DirectInterface", "Interface")
+    named = [(option, section.get(option)) for section in sections for option in options if section.get(option)]
+    bad = [(option, name) for option, name in named if name not in steady]
+    if sections and len(bad) < len(sections):
+        return None
+    if not sections:
+        return Objection("nobody could log in to it afterwards: its dropbear is off", "remove `enable` from extra_uci")
+    option, name = bad[0]
+    return Objection(
+        f"nobody could log in to it after its next boot: dropbear would wait for {option} {name}, "
+        "which is no network of it with a static address",
+        f"name one of {', '.join(sorted(str(one) for one in steady - {'loopback'})) or 'its networks'}, "
+        f"or remove {option} from extra_uci",
     )
 
 

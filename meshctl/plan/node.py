@@ -7,16 +7,16 @@ that differ, what their reload cuts, and what would part the node from its mesh.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from meshctl.device.connection import OwnKey
 from meshctl.device.observation import Observation
-from meshctl.model import Node, Release
-from meshctl.plan.cell import Cell, cells, split_differences
+from meshctl.model import Node
+from meshctl.plan.cell import cells, split_differences
 from meshctl.plan.effects import effects
 from meshctl.plan.firmware import firmware_step
-from meshctl.plan.lockout import lockout
+from meshctl.plan.lockout import lockout, server_lockout
 from meshctl.plan.masking import Fingerprints, masked_text, secrets_of
 from meshctl.plan.objections import objection
 from meshctl.plan.packages import NO_NEEDS, Needs, package_step
@@ -87,9 +87,11 @@ def node_plan(
     files = file_changes(wanted.files, seen)
     contents = {file.path: file.content for file in wanted.files} if files or firmware else {}
     shut_out = None if own_keys is None else lockout(node, contents, own_keys)
+    if shut_out is None and contents:
+        shut_out = server_lockout(after)
     if shut_out is not None:
         return replace(basis, verdict=Verdict.REFUSED, reason=shut_out.reason, hint=shut_out.hint)
-    told = effects((change.path for change in files), before, after)
+    told = effects((change.path for change in files), before, after, node.release)
     if firmware is not None:
         told = (Effect("firmware", Cut.NODE, f"{firmware.from_revision} -> {firmware.to_revision}"), *told)
     return replace(
@@ -101,7 +103,6 @@ def node_plan(
         effects=told,
         notes=(
             *seen.notes,
-            *_cautions(wanted, live_after, firmware),
             *_tagged_ports(node, seen, after.get("network")),
             *_lacking_scripts(node, seen, basis, firmware),
         ),
@@ -115,18 +116,6 @@ def _parted_from(node: Node, radios: Iterable[str]) -> tuple[str, ...]:
     if not names <= set(mesh_of):
         return node.meshes
     return tuple(dict.fromkeys(mesh for name, mesh in mesh_of.items() if name in names and mesh is not None))
-
-
-def _cautions(wanted: Wanted, cells_to_come: Mapping[str, Cell], firmware: FirmwareStep | None) -> tuple[str, ...]:
-    """What may go wrong although nothing forbids it."""
-    is_adhoc = any(cell.mode == "adhoc" for cell in cells_to_come.values())
-    if wanted.node.release < Release.V25_12 or not is_adhoc:
-        return ()
-    # their scripts take `mcast_rate` for a list (docs/facts/openwrt-checked.md); without it broadcasts go at 1 Mbit/s
-    caution = "some 25.12 builds join no ad-hoc cell with a multicast rate (MC334)"
-    if firmware is None:
-        return (f"{caution}: if this is one, the node goes back by itself",)
-    return (f"{caution}, and a flash is not undone: flash one node on the bench first",)
 
 
 def _tagged_ports(node: Node, seen: Observation, network: Package | None) -> tuple[str, ...]:

@@ -1,8 +1,8 @@
-"""Which of a node's radios start anew: told beforehand from its wireless settings, or afterwards by its radios. Pure.
+"""Which of a node's radios restart: expected from its wireless settings, or seen on its radios afterwards. Pure.
 
-A radio that starts anew counts its frames from 0, which those that know it have to be told (`apply/forget.py`). One
-that did not must not be taken for it, or it does not hear them for minutes itself. So what changes elsewhere, bat0 made
-anew included, is no reason, and of two radios only the one whose settings differ is meant.
+`radio_changes` says what netifd does with each radio, by release; the plan shows it. `restarted` names the radios that
+may restart at all, whose neighbors then look for stale station entries (`apply/forget.py`). `seen_to_restart` and
+`started_within` say which ones have.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from meshctl.device.observation import Observation
+from meshctl.model import Release
 from meshctl.uci import Package, Section
 
 # iw counts whole seconds, and a question takes its time.
@@ -35,8 +36,8 @@ EVERY_RADIO = Radios(every=True)
 
 
 def restarted(before: Package | None, after: Package | None) -> Radios:
-    """Those that netifd sets up anew when /etc/config/wireless becomes `after`: whole radios, each whose own section or
-    one of whose interfaces differs (netifd, wireless.c). A package that nobody can read may have held anything."""
+    """The radios that may restart when /etc/config/wireless becomes `after`: each whose own section or one of whose
+    interfaces differs. A package that cannot be read may have held anything."""
     if before is None or after is None:
         return EVERY_RADIO
     new = _by_device(after)
@@ -46,6 +47,61 @@ def restarted(before: Package | None, after: Package | None) -> Radios:
     return EVERY_RADIO if "" in ifnames else Radios(ifnames)
 
 
+# Options of a wifi-device that 23.05 and later set through `iw phy`, without touching the interfaces (wifi-scripts,
+# mac80211.sh and wdev.uc; txpower was run on 24.10 and 25.12). Up to 22.03 netifd takes the whole radio down and up for
+# every difference (wireless.c: IFC_RELOAD).
+IN_PLACE = frozenset({"txpower", "distance", "rts", "frag", "country", "antenna_gain"})
+# Of these, what may leave a weak link without one end: less range, or a shorter wait for acknowledgements.
+RANGE = frozenset({"txpower", "distance", "country", "antenna_gain"})
+
+
+@dataclass(frozen=True, slots=True)
+class RadioChange:
+    """What happens to one radio: `options` differ, in its own section or its interfaces'. `restarts`: its interfaces go
+    down and come up again; `may_lose_range`: they stay up, with less reach than before."""
+
+    radio: str
+    options: tuple[str, ...]
+    restarts: bool
+    may_lose_range: bool = False
+
+
+def radio_changes(before: Package, after: Package, release: Release) -> tuple[RadioChange, ...]:
+    """What becomes of each radio that differs when /etc/config/wireless changes, on that release."""
+    old, new = _by_device(before), _by_device(after)
+    changes = []
+    for name, parts in {**old, **new}.items():
+        old_parts, new_parts = old.get(name, ()), new.get(name, ())
+        if old_parts == new_parts:
+            continue
+        device = _differing(old_parts[:1], new_parts[:1])
+        faces = _differing(old_parts[1:], new_parts[1:])
+        in_place = set(IN_PLACE)
+        # wpa_supplicant's file names the country
+        if any(face.get("encryption", "none") != "none" or face.get("mode") == "mesh" for face in parts[1:]):
+            in_place.discard("country")
+        restarts = release < Release.V23_05 or bool(faces) or not device <= in_place
+        loses = bool(device & RANGE) and not _is_stronger(device, old_parts[0], new_parts[0])
+        changes.append(RadioChange(name, tuple(sorted(device | faces)), restarts, not restarts and loses))
+    return tuple(changes)
+
+
+def _differing(old: tuple[Section, ...], new: tuple[Section, ...]) -> set[str]:
+    """The options in which sections differ; the name of each section that only one side has."""
+    before, after = ({section.name: section for section in side} for side in (old, new))
+    found = {str(name) for name in before.keys() ^ after.keys()}
+    for name in before.keys() & after.keys():
+        first, second = dict(before[name].options), dict(after[name].options)
+        found |= {option for option in first.keys() | second.keys() if first.get(option) != second.get(option)}
+    return found
+
+
+def _is_stronger(options: set[str], old: Section, new: Section) -> bool:
+    """Whether nothing but the transmit power changes, upward."""
+    powers = old.get("txpower"), new.get("txpower")
+    return options & RANGE == {"txpower"} and all(p.isdigit() for p in powers) and int(powers[0]) < int(powers[1])
+
+
 def _by_device(wireless: Package) -> dict[str, tuple[Section, ...]]:
     """Each radio's own section and those of its interfaces."""
     return {
@@ -53,6 +109,17 @@ def _by_device(wireless: Package) -> dict[str, tuple[Section, ...]]:
         for device in wireless.of_type("wifi-device")
         if device.name is not None
     }
+
+
+def seen_to_restart(before: Observation, now: Observation, seconds: float) -> Radios:
+    """The radios that were seen to restart between two observations, the change being `seconds` old at the second: the
+    node booted, the interface has another index, or it knows no neighbor for longer than that."""
+    if before.boot_id != now.boot_id:
+        return EVERY_RADIO
+    old, new = before.ifindexes or {}, now.ifindexes or {}
+    created = frozenset(name for name in old.keys() & new.keys() if old[name] != new[name])
+    recent = started_within(now, seconds)
+    return EVERY_RADIO if recent.every else Radios(created | recent.ifnames)
 
 
 def started_within(seen: Observation, seconds: float) -> Radios:

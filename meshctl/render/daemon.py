@@ -74,13 +74,13 @@ def daemon_keys(fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> bytes |
     for index, ref in enumerate(fleet.udp_mesh.keys):
         path = ("udp_mesh", "keys", str(index))
         try:
-            text = secrets(ref).reveal().strip()
+            text = key_text(secrets(ref))
         except InputError as error:
             problems.append(_problem(fleet, path, "", "", message=str(error), hint=error.hint))
             continue
-        if not _is_key(text):
+        if key_bytes(text) is None:
             found = f"{len(text)} characters"
-            hint = "make one with `openssl rand -hex 32`"
+            hint = "make one with `openssl rand -hex 32`, or `udp-mesh keygen FILE`"
             expected = f"a key of {_KEY_BYTES} bytes as 64 hex digits or 44 characters of base64"
             problems.append(_problem(fleet, path, expected, found, hint=hint))
         lines.append(f"{text}\n")
@@ -89,12 +89,18 @@ def daemon_keys(fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> bytes |
     return "".join(lines).encode() or None
 
 
-def _is_key(text: str) -> bool:
+def key_text(secret: Secret) -> str:
+    """A fleet key as udp_mesh reads it from a line of a key file: `udp-mesh keygen` writes the key's id behind `#`."""
+    return secret.reveal().split("#", 1)[0].strip()
+
+
+def key_bytes(text: str) -> bytes | None:
+    """The 32 bytes of a key in hexadecimal or base64, None for anything else."""
     try:
         raw = bytes.fromhex(text) if len(text) == 2 * _KEY_BYTES else base64.b64decode(text, validate=True)
     except (ValueError, binascii.Error):
-        return False
-    return len(raw) == _KEY_BYTES
+        return None
+    return raw if len(raw) == _KEY_BYTES else None
 
 
 def _computer(fleet: Fleet, name: str) -> Computer:

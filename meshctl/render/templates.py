@@ -8,14 +8,16 @@ by file, and the operator's parts of a back end before both.
 
 from __future__ import annotations
 
+import os
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from jinja2 import (
     BaseLoader,
     ChoiceLoader,
+    Environment,
     FileSystemLoader,
     PrefixLoader,
     StrictUndefined,
@@ -27,7 +29,9 @@ from jinja2 import (
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
+from meshctl.inventory.boundary import HINT, Boundary
 from meshctl.model import Backend, Fleet, MeshMode, OperatorParts, Release
+from meshctl.render.bounded import LimitExceeded, Renderer
 from meshctl.render.quoting import only_quoted, quoted, revealed
 from meshctl.render.rendered import CONFIG_FOLDER
 from meshctl.resources import shipped
@@ -62,9 +66,12 @@ class TemplateFile:
 class Templates:
     """The templates of one fleet. Compiles each once, so share one between the nodes."""
 
-    def __init__(self, folders: tuple[Path, ...]) -> None:
+    def __init__(self, folders: tuple[Path, ...], boundary: Boundary | None = None) -> None:
         self._folders = folders
-        self._sets: dict[tuple[Backend, OperatorParts], _TemplateSet] = {}
+        self._boundary = boundary or Boundary(tuple(os.path.realpath(folder) for folder in folders))
+        self._sets: dict[tuple[Backend, OperatorParts], TemplateSet] = {}
+        # for templates that are not shipped
+        self._bounded = Renderer()
 
     @classmethod
     def of(cls, fleet: Fleet) -> Templates:
@@ -72,11 +79,13 @@ class Templates:
 
         Raises InvalidInput for a folder in it that no back end has the name of: its templates would count for nothing.
         """
+        boundary = Boundary.of(Path(fleet.base), os.environ)
         own = Path(fleet.base) / "templates"
         if not fleet.base or not own.is_dir():
-            return cls((shipped("templates"),))
+            return cls((shipped("templates"),), boundary)
+        _refuse_outside(own, boundary)
         _refuse_strays(own, fleet)
-        return cls((own, shipped("templates")))
+        return cls((own, shipped("templates")), boundary)
 
     def files(self, backend: Backend, parts: OperatorParts) -> tuple[TemplateFile, ...]:
         """The templates that make files for a back end, sorted by path. Raises InvalidInput when parts are missing."""
@@ -84,13 +93,48 @@ class Templates:
 
     def text(self, file: TemplateFile, backend: Backend, parts: OperatorParts, context: Mapping[str, object]) -> str:
         """The template's text for one node. Raises InvalidInput naming the template and its line."""
-        return self._set(backend, parts).text(file, context)
+        if self._folders == (shipped("templates"),) and not parts.templates:
+            return self._set(backend, parts).text(file, context)
+        try:
+            answer = self._bounded.text(self._folders, backend, parts, self._boundary, file, context)
+        except LimitExceeded as reason:
+            answer = {"exceeded": str(reason)}
+        if "exceeded" in answer:
+            place = Position(str(file.source))
+            raise InvalidInput([Diagnostic(TEMPLATE, Severity.ERROR, place, str(answer["exceeded"]))])
+        if "diagnostics" in answer:
+            raise InvalidInput(
+                Diagnostic(**{**one, "severity": Severity(one["severity"]), "position": Position(**one["position"])})
+                for one in answer["diagnostics"]
+            )
+        return str(answer["text"])
 
-    def _set(self, backend: Backend, parts: OperatorParts) -> _TemplateSet:
+    def _set(self, backend: Backend, parts: OperatorParts) -> TemplateSet:
         key = (backend, parts)
         if key not in self._sets:
-            self._sets[key] = _TemplateSet(self._folders, backend, parts)
+            self._sets[key] = TemplateSet(self._folders, backend, parts, self._boundary)
         return self._sets[key]
+
+
+def _refuse_outside(path: Path, boundary: Boundary) -> None:
+    """Raises InvalidInput for a folder or file of templates that an inventory may not name."""
+    if objection := boundary.objection(path):
+        hint = HINT if objection.startswith("outside") else ""
+        raise InvalidInput(
+            [Diagnostic(NO_TEMPLATE, Severity.ERROR, Position(str(path)), f"it is {objection}", hint=hint)]
+        )
+
+
+class _BoundedLoader(FileSystemLoader):
+    """A folder of templates whose links lead nowhere else, and whose files are files."""
+
+    def __init__(self, folder: Path, boundary: Boundary) -> None:
+        super().__init__(folder)
+        self._folder, self._boundary = folder, boundary
+
+    def get_source(self, environment: Environment, template: str) -> tuple[str, str, Callable[[], bool]]:
+        _refuse_outside(self._folder / template, self._boundary)
+        return super().get_source(environment, template)
 
 
 def _refuse_strays(own: Path, fleet: Fleet) -> None:
@@ -107,10 +151,10 @@ def _refuse_strays(own: Path, fleet: Fleet) -> None:
         raise InvalidInput(strays)
 
 
-class _TemplateSet:
+class TemplateSet:
     """The templates of one back end with one operator's parts."""
 
-    def __init__(self, folders: tuple[Path, ...], backend: Backend, parts: OperatorParts) -> None:
+    def __init__(self, folders: tuple[Path, ...], backend: Backend, parts: OperatorParts, boundary: Boundary) -> None:
         layers: list[tuple[str, Path]] = []
         loaders: list[BaseLoader] = []
         if parts.templates:
@@ -120,16 +164,18 @@ class _TemplateSet:
                     NO_TEMPLATE, Severity.ERROR, Position(str(own)), "", "", "a folder of templates", "none"
                 )
                 raise InvalidInput([found])
+            _refuse_outside(own, boundary)
             layers.append((backend.value, own))
-            loaders.append(PrefixLoader({backend.value: FileSystemLoader(own)}))
+            loaders.append(PrefixLoader({backend.value: _BoundedLoader(own, boundary)}))
         for folder in folders:
             layers.extend((part, folder / part) for part in (backend.value, COMMON))
-        loaders.append(FileSystemLoader(folders))
+            is_shipped = folder == shipped("templates")
+            loaders.append(FileSystemLoader(folder) if is_shipped else _BoundedLoader(folder, boundary))
         loader = ChoiceLoader(loaders)
         self._plain = _environment(loader)
         self._uci = _environment(loader, is_uci=True)
         self._compiled: dict[str, Template] = {}
-        self.files = _files(layers)
+        self.files = _files(layers, boundary)
 
     def text(self, file: TemplateFile, context: Mapping[str, object]) -> str:
         try:
@@ -143,12 +189,14 @@ class _TemplateSet:
             raise InvalidInput([_diagnostic(file, error)]) from error
 
 
-def _files(layers: list[tuple[str, Path]]) -> tuple[TemplateFile, ...]:
-    """One template per path on the device: the first layer that has it wins."""
+def _files(layers: list[tuple[str, Path]], boundary: Boundary) -> tuple[TemplateFile, ...]:
+    """One template per path on the device: the first layer that has it wins. Raises InvalidInput."""
     found: dict[str, TemplateFile] = {}
     for prefix, folder in layers:
         for source in sorted(folder.rglob(f"*{_SUFFIX}")):
             inside = source.relative_to(folder).as_posix()
+            if not folder.is_relative_to(shipped("templates")):
+                _refuse_outside(source, boundary)
             if not source.name.startswith("_") and source.is_file():
                 path = inside.removesuffix(_SUFFIX)
                 found.setdefault(path, TemplateFile(path, f"{prefix}/{inside}", source))

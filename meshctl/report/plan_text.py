@@ -1,14 +1,21 @@
-"""A plan for a person: a line of totals, the stages in order with their reasons, then what happens to each node.
+"""A plan for a person: a line of totals, the stages in order with their reasons, what happens to which nodes, and in
+the end the totals once more with who is left out.
 
 `plan_lines` gives plain text lines with a style name each; the command line prints them, coloured on a terminal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import textwrap
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from meshctl.plan import Cut, NodePlan, Plan, StageKind, Verdict
+from meshctl.report.settings import changed_lines, summary
+from meshctl.report.terminal import clean
+
+# narrower than this, words are no longer kept whole
+_LEAST_WIDTH = 20
 
 
 class Line(NamedTuple):
@@ -16,10 +23,28 @@ class Line(NamedTuple):
 
     text: str
     style: str = ""
+    is_diff: bool = False
 
 
-def plan_lines(plan: Plan, *, with_diffs: bool = True) -> Iterator[Line]:
-    """The whole plan. `with_diffs` False leaves out the files' contents."""
+def plan_lines(
+    plan: Plan, *, with_diffs: bool = True, width: int | None = None, order: Iterable[str] = ()
+) -> Iterator[Line]:
+    """The whole plan, safe for a terminal. Nodes to which the same happens are one block.
+
+    `with_diffs` False leaves out the files' contents, and says which settings change all the same. Lines are broken
+    at `width`, but for those of diffs. `order` is the inventory's order of nodes.
+    """
+    for line in _plan_lines(plan, with_diffs=with_diffs, order=order):
+        text = clean(line.text)
+        if width is None or line.is_diff or len(text) <= width:
+            yield line._replace(text=text)
+            continue
+        indent = " " * (len(text) - len(text.lstrip()) + 2)
+        for part in textwrap.wrap(text, max(width, _LEAST_WIDTH), subsequent_indent=indent, break_on_hyphens=False):
+            yield line._replace(text=part)
+
+
+def _plan_lines(plan: Plan, *, with_diffs: bool, order: Iterable[str]) -> Iterator[Line]:
     yield Line(f"fleet {plan.fleet}: {_totals(plan)}", "bold")
     if plan.entry:
         yield Line(f"reached through {plan.entry}", "dim")
@@ -29,8 +54,12 @@ def plan_lines(plan: Plan, *, with_diffs: bool = True) -> Iterator[Line]:
         yield from _stages(plan)
     for note in plan.notes:
         yield Line(f"note: {note}", "yellow")
-    for node in plan.nodes.values():
-        yield from _node(node, with_diffs=with_diffs)
+    places = {name: place for place, name in enumerate(order)}
+    nodes = sorted(plan.nodes.values(), key=lambda node: places.get(node.node, len(places)))
+    for group in _alike(nodes, with_diffs=with_diffs):
+        yield from _node(group, with_diffs=with_diffs)
+    if len(nodes) > 1:
+        yield from _once_more(plan, nodes)
     if plan.refusal:
         yield Line("")
         yield Line(f"refused: {plan.refusal}", "bold red")
@@ -51,15 +80,52 @@ def _totals(plan: Plan) -> str:
     return ", ".join(f"{count} {word}" for count, word in counts if count) or "no node"
 
 
+def _once_more(plan: Plan, nodes: Iterable[NodePlan]) -> Iterator[Line]:
+    """The totals, and who is left out and why: the first lines have left the screen."""
+    yield Line("")
+    yield Line(_totals(plan), "bold")
+    for node in nodes:
+        if node.verdict in (Verdict.AWAY, Verdict.REFUSED):
+            style = "yellow" if node.verdict is Verdict.AWAY else "red"
+            # a failed connection names its node itself
+            who = "" if node.reason.startswith(node.node) else f"{node.node}, "
+            yield Line(f"  {node.verdict.value}: {who}{node.reason}", style)
+
+
 def _stages(plan: Plan) -> Iterator[Line]:
     width = len(str(len(plan.stages)))
     for number, stage in enumerate(plan.stages, 1):
         names = ", ".join(stage.nodes)
         yield Line(f"  {number:>{width}}  {stage.kind.value:<8}{names}", "bold" if stage.cuts_off else "")
         yield Line(f"  {'':>{width}}          {stage.reason}", "dim")
+        if stage.kind is StageKind.SWITCH:
+            reasons: dict[str, list[str]] = {}
+            for name in stage.nodes:
+                why = ", ".join(plan.nodes[name].splits) if name in plan.nodes else ""
+                reasons.setdefault(why or "changes with its mesh", []).append(name)
+            for why, members in reasons.items():
+                yield Line(f"  {'':>{width}}          {', '.join(members)}: {why}", "dim")
 
 
-def _node(node: NodePlan, *, with_diffs: bool) -> Iterator[Line]:
+def _alike(nodes: Iterable[NodePlan], *, with_diffs: bool) -> Iterator[tuple[NodePlan, ...]]:
+    """The nodes in their order, each with the later ones to which the same happens."""
+    groups: dict[object, list[NodePlan]] = {}
+    for node in nodes:
+        groups.setdefault(_what_happens(node, with_diffs=with_diffs), []).append(node)
+    return (tuple(group) for group in groups.values())
+
+
+def _what_happens(node: NodePlan, *, with_diffs: bool) -> object:
+    if node.verdict is not Verdict.CHANGE:
+        return node.node
+    return (
+        *(node.cut, node.splits, node.firmware, node.packages, node.effects, node.notes),
+        tuple((one.path, one.kind, changed_lines(one) if with_diffs else summary(one)) for one in node.files),
+    )
+
+
+def _node(group: tuple[NodePlan, ...], *, with_diffs: bool) -> Iterator[Line]:
+    node = group[0]
     match node.verdict:
         case Verdict.SAME:
             return
@@ -74,7 +140,11 @@ def _node(node: NodePlan, *, with_diffs: bool) -> Iterator[Line]:
         case Verdict.CHANGE:
             pass
     yield Line("")
-    yield Line(f"{node.node}  cuts {node.cut.text}", "bold" if node.cut > Cut.LOGIN else "")
+    if len(group) == 1:
+        yield Line(f"{node.node}  cuts {node.cut.text}", "bold" if node.cut > Cut.LOGIN else "")
+    else:
+        yield Line(f"{len(group)} nodes  each cuts {node.cut.text}", "bold" if node.cut > Cut.LOGIN else "")
+        yield Line(f"  {', '.join(one.node for one in group)}")
     for split in node.splits:
         yield Line(f"  leaves its mesh: {split}", "yellow")
     if node.firmware is not None:
@@ -87,7 +157,8 @@ def _node(node: NodePlan, *, with_diffs: bool) -> Iterator[Line]:
     for effect in node.effects:
         yield Line(f"  reloads   {effect.service}: {effect.why}; cuts {effect.cut.text}")
     for change in node.files:
-        yield Line(f"  {change.kind:<9} {change.path}")
+        words = summary(change)
+        yield Line(f"  {change.kind:<9} {change.path}" + (f": {words}" if words else ""))
         if with_diffs:
             yield from (_diff_line(text) for text in change.diff.splitlines()[2:])
     for note in node.notes:
@@ -96,7 +167,7 @@ def _node(node: NodePlan, *, with_diffs: bool) -> Iterator[Line]:
 
 def _diff_line(text: str) -> Line:
     style = {"+": "green", "-": "red", "@": "cyan"}.get(text[:1], "dim")
-    return Line(f"    {text}", style)
+    return Line(f"    {text}", style, is_diff=True)
 
 
 def question(plan: Plan) -> str:
@@ -105,5 +176,5 @@ def question(plan: Plan) -> str:
     switched = sum(len(stage.nodes) for stage in plan.stages if stage.kind is StageKind.SWITCH)
     flashed = sum(1 for node in plan.nodes.values() if node.firmware is not None)
     extra = [f"{switched} change cell together" if switched else "", f"{flashed} get new firmware" if flashed else ""]
-    told = "; ".join(part for part in extra if part)
-    return f"Change {todo} node{'s' if todo != 1 else ''}" + (f" ({told})" if told else "") + "?"
+    more = "; ".join(part for part in extra if part)
+    return f"Change {todo} node{'s' if todo != 1 else ''}" + (f" ({more})" if more else "") + "?"

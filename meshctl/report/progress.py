@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import queue
+import sys
 import threading
 from collections import Counter
 from contextlib import AbstractContextManager, suppress
@@ -19,6 +20,7 @@ from rich.live import Live
 from rich.text import Text
 
 from meshctl.fleet import Event, EventKind, Outcome, Result
+from meshctl.report.terminal import clean, json_safe, one_line
 
 _STYLES = {
     Result.DONE: "green",
@@ -32,12 +34,18 @@ _STYLES = {
 }
 # Often enough to look alive, seldom enough to leave the processor to the work.
 REFRESH_PER_SECOND = 4
+# the totals, the state of stopping (which may take two lines), and the cursor's own
+_LINES_BELOW = 5
+_NAMES_SHOWN = 4
 
 
 class Progress(AbstractContextManager["Progress"], Protocol):
     """Shows events between entering and leaving."""
 
     def __call__(self, event: Event) -> None: ...
+
+    def stopping(self, text: str) -> None:
+        """A stop, or leaving at once, was requested; `text` explains it. May be called from a signal handler."""
 
 
 def outcome_text(outcome: Outcome) -> str:
@@ -46,8 +54,18 @@ def outcome_text(outcome: Outcome) -> str:
     return f"{outcome}{took}"
 
 
+def _complain(text: str) -> None:
+    # the terminal may be closed, and the work still has to be finished
+    with suppress(OSError):
+        sys.stderr.write(f"{clean(text)}\n")
+        sys.stderr.flush()
+
+
 class PlainProgress(Progress):
     """One line per step and outcome, for logs and pipes."""
+
+    def stopping(self, text: str) -> None:
+        _complain(text)
 
     def __init__(self, out: TextIO) -> None:
         self._out = out
@@ -67,6 +85,11 @@ class PlainProgress(Progress):
 
 
 def _line(event: Event) -> str:
+    """Clean; later lines of a text are indented, so that none looks like another node's."""
+    return clean(_raw_line(event)).replace("\n", "\n  ")
+
+
+def _raw_line(event: Event) -> str:
     match event.kind:
         case EventKind.STARTED | EventKind.PROGRESS:
             return ""
@@ -77,12 +100,15 @@ def _line(event: Event) -> str:
         case EventKind.FINISHED:
             if event.outcome is None:
                 return ""
-            hint = f"\n  hint: {event.outcome.hint}" if event.outcome.hint else ""
+            hint = f"\nhint: {event.outcome.hint}" if event.outcome.hint else ""
             return outcome_text(event.outcome) + hint
 
 
 class JsonProgress(Progress):
     """One JSON object per event: `{"event", "node", "at_s", ...}`."""
+
+    def stopping(self, text: str) -> None:
+        _complain(text)
 
     def __init__(self, out: TextIO) -> None:
         self._out = out
@@ -97,7 +123,7 @@ class JsonProgress(Progress):
         if event.outcome is not None:
             told["outcome"] = outcome_object(event.outcome)
         with self._lock:
-            self._out.write(json.dumps(told, ensure_ascii=False) + "\n")
+            self._out.write(json_safe(json.dumps(told, ensure_ascii=False)) + "\n")
             self._out.flush()
 
     def __exit__(
@@ -126,6 +152,7 @@ class LiveProgress(Progress):
         self._lock = threading.Lock()
         self._in_work: dict[str, tuple[str, float | None]] = {}
         self._counts: Counter[Result] = Counter()
+        self._stopping = ""
         self._live = Live(console=console, refresh_per_second=REFRESH_PER_SECOND, transient=True)
 
     def __enter__(self) -> LiveProgress:
@@ -156,15 +183,31 @@ class LiveProgress(Progress):
                         self._live.console.print(Text(_line(event), _STYLES[event.outcome.result]))
             self._live.update(self._picture())
 
+    def stopping(self, text: str) -> None:
+        with self._lock:
+            # stays on the screen, also when the live lines are gone
+            self._live.console.print(Text(clean(text), "bold yellow"))
+            self._stopping = text.partition(":")[0]
+            self._live.update(self._picture(), refresh=True)
+
     def _picture(self) -> Group:
         width = max((len(name) for name in self._in_work), default=0)
         lines = [
-            Text(f"{name:<{width}}  {text}" + (f" {fraction:.0%}" if fraction is not None else ""))
+            Text(f"{name:<{width}}  {one_line(text)}" + (f" {fraction:.0%}" if fraction is not None else ""))
             for name, (text, fraction) in self._in_work.items()
         ]
+        # what does not fit is cut off at the bottom, where the totals and the state of stopping stand
+        room = max(1, self._live.console.height - _LINES_BELOW)
+        if len(lines) > room:
+            lines = [*lines[: room - 1], Text(f"... and {len(lines) - room + 1} more in work")]
         ended = sum(self._counts.values())
         counts = ", ".join(f"{self._counts[result]} {result.value}" for result in Result if self._counts[result])
-        return Group(*lines, Text(f"{ended}/{self._total} nodes" + (f": {counts}" if counts else ""), "bold"))
+        totals = Text(f"{ended}/{self._total} nodes" + (f": {counts}" if counts else ""), "bold")
+        if not self._stopping:
+            return Group(*lines, totals)
+        names = ", ".join(list(self._in_work)[:_NAMES_SHOWN]) + (" ..." if len(self._in_work) > _NAMES_SHOWN else "")
+        doing = f"finishing {names}" if names else "nothing is in work any more"
+        return Group(*lines, totals, Text(f"{self._stopping.upper()}: {doing}; no other node is begun", "bold yellow"))
 
 
 class Aside(Progress):
@@ -176,7 +219,7 @@ class Aside(Progress):
 
     def __init__(self, shown: Progress) -> None:
         self._shown = shown
-        self._events: queue.SimpleQueue[Event | None] = queue.SimpleQueue()
+        self._events: queue.SimpleQueue[Event | str | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._show, name="progress", daemon=True)
 
     def __enter__(self) -> Aside:
@@ -195,10 +238,16 @@ class Aside(Progress):
     def __call__(self, event: Event) -> None:
         self._events.put(event)
 
+    def stopping(self, text: str) -> None:
+        self._events.put(text)
+
     def _show(self) -> None:
         with suppress(*_UNREAD):
             while (event := self._events.get()) is not None:
-                self._shown(event)
+                if isinstance(event, str):
+                    self._shown.stopping(event)
+                else:
+                    self._shown(event)
 
 
 # EPIPE and EIO; rich makes SystemExit of the former

@@ -62,7 +62,9 @@ def _backend_needs(mesh: Mesh) -> tuple[Need, ...]:
             return (*(Need((package,), reason) for package in mesh.operator_parts.packages), *tools)
 
 
-# wpa_supplicant builds with CONFIG_IBSS_RSN and SAE in mesh mode; `wpad-basic*` and `wpad-mini` have neither.
+# wpa_supplicant builds with CONFIG_IBSS_RSN; `wpad-basic*` and `wpad-mini` do not have it. SAE and 802.11s are in all
+# but the one without a TLS library, `wpad` (hostapd's Makefile and wpa_supplicant-full.config, 19.07 to 25.12).
+_WITHOUT_MESH = "wpad"
 FULL_SUPPLICANTS = (
     "wpad-mesh-mbedtls",
     "wpad-mesh-openssl",
@@ -82,7 +84,9 @@ def supplicant_need(mesh: Mesh, release: Release) -> Need | None:
     preferred = f"wpad-mesh-{library}"
     offered = tuple(name for name in FULL_SUPPLICANTS if release >= Release.V23_05 or not name.endswith("mbedtls"))
     what = "an encrypted ad-hoc cell" if mesh.mode is MeshMode.ADHOC else "an encrypted 802.11s mesh"
-    rest = tuple(name for name in offered if name != preferred)
+    # where it cannot join the mesh, 23.05 and later join it in the open, without a word (wifi-scripts, mac80211.sh)
+    lacking = () if mesh.mode is MeshMode.ADHOC else (_WITHOUT_MESH,)
+    rest = tuple(name for name in offered if name != preferred and name not in lacking)
     return Need((preferred, *rest), f"mesh {mesh.name} is {what}, which wpad-basic cannot join")
 
 

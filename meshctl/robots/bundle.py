@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from meshctl.errors import InputError
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Secret, SecretRef
+from meshctl.model.computers import ROS_1, ROS_2, ROS_TOO_OLD
 from meshctl.render.daemon import CONFIG_NAME, KEY_NAME, daemon_config, daemon_keys
 from meshctl.robots.scripts import shipped
 from meshctl.robots.wheels import Wheel
@@ -22,10 +23,6 @@ from meshctl.robots.wheels import Wheel
 UNIT_NAME = "udp-mesh.service"
 BRIDGE_UNIT_NAME = "udp-mesh-ros1.service"
 _CURRENT = "/opt/udp-mesh/current"
-# The one release of ROS 1 with a Python the bridge runs in; with ROS 2 a bridge is started by hand (docs/bridges.md).
-ROS_1 = "noetic"
-_TOO_OLD = ("indigo", "jade", "kinetic", "lunar", "melodic")
-_ROS_2 = ("foxy", "galactic", "humble", "iron", "jazzy", "kilted", "lyrical", "rolling")
 # Half of a SHA-256: nobody makes two bundles meet by accident, and people read it.
 _ID_DIGITS = 16
 _SECRET_MODE = 0o600
@@ -156,11 +153,11 @@ def has_bridge(fleet: Fleet, robot: str) -> bool:
     computer = fleet.robots[robot].computer
     ros = "" if computer is None else computer.ros
     place = f"robots.{robot}.computer.ros"
-    if ros in _TOO_OLD:
+    if ros in ROS_TOO_OLD:
         hint = "leave `ros` out: no bridge is deployed then"
         raise InputError(f"{place}: the Python of {ros} is older than 3.8, which the bridge needs", hint=hint)
-    if ros not in ("", ROS_1, *_ROS_2):
-        hint = did_you_mean(ros, (ROS_1, *_ROS_2)) or "leave `ros` out: no bridge is deployed then"
+    if ros not in ("", ROS_1, *ROS_2):
+        hint = did_you_mean(ros, (ROS_1, *ROS_2)) or "leave `ros` out: no bridge is deployed then"
         raise InputError(f"{place}: expected {ROS_1} or a release of ROS 2, found {ros!r}", hint=hint)
     return ros == ROS_1
 

@@ -17,7 +17,8 @@ from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet.process import is_dead
 from meshctl.model import Fleet, Secret, SecretRef
-from meshctl.robots.bundle import ROS_1, Bundle, bundle, has_bridge
+from meshctl.model.computers import ROS_1
+from meshctl.robots.bundle import Bundle, bundle, has_bridge
 from meshctl.robots.host import Host, Refused
 from meshctl.robots.tags import Target
 from meshctl.robots.target import (

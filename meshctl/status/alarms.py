@@ -45,6 +45,8 @@ class Seen:
     is_path_known: bool
     """Whether enough was asked to tell its path."""
     cuts_off: tuple[str, ...]
+    relays: tuple[str, ...]
+    """Nodes whose path to the base leads through it."""
     seconds_since_last_known: float | None
     """Time between the last look, if any, and this one."""
     own_lock: str
@@ -95,11 +97,14 @@ def _radios(seen: Seen) -> Iterator[Alarm]:
             why = "setup failed" if radio.setup_failed else "disabled" if radio.disabled else "down"
             hint = f"meshctl run {seen.node.name} -- logread -e netifd"
             yield Alarm(Level.ERROR, "radio", f"{radio.name} is {why}", hint)
-    channels = {seen.fleet.meshes[mesh].channel for mesh in seen.node.meshes}
+    every = {seen.fleet.meshes[mesh].channel for mesh in seen.node.meshes}
+    own = {name: {seen.fleet.meshes[mesh].channel} for name, mesh in seen.node.mesh_interfaces.items()}
     for link in seen.observation.links or ():
         if link.mode.upper() == "IBSS" and link.joined is False:
             hint = "look at channel, SSID, BSSID and key: meshctl topology shows who is in the cell"
             yield Alarm(Level.ERROR, "join", f"{link.ifname} has joined no cell", hint)
+        # each radio of a relay has its own mesh; an interface of another name was not made by us
+        channels = own.get(link.ifname, every)
         if link.mode.lower() in MESH_MODES and link.channel is not None and link.channel not in channels:
             told = f"{link.ifname} is on channel {link.channel}, its mesh on {', '.join(map(str, sorted(channels)))}"
             yield Alarm(Level.ERROR, "channel", told, f"meshctl plan {seen.node.name}")
@@ -117,6 +122,13 @@ def _mesh(seen: Seen) -> Iterator[Alarm]:
         yield Alarm(Level.WARNING, "weak", told, f"drop a beacon between {seen.node.name} and {seen.path.via}")
     if seen.cuts_off and seen.node.state is NodeState.DEPLOYED:
         yield Alarm(Level.NOTE, "cut-vertex", f"without it {some(seen.cuts_off)} would be cut off")
+
+
+def _dropped(seen: Seen) -> Iterator[Alarm]:
+    """A beacon that the inventory has in a rack, and that others need where it is."""
+    if seen.node.state is NodeState.CARRIED and seen.node.role is Role.BEACON and seen.relays:
+        text = f"carried by the inventory, and the way from {some(seen.relays)} to the base leads through it"
+        yield Alarm(Level.NOTE, "dropped", text, f"if it has been dropped: meshctl deployed {seen.node.name}")
 
 
 def _bridge(seen: Seen) -> Iterator[Alarm]:
@@ -181,6 +193,7 @@ _CONCERNS: tuple[Callable[[Seen], Iterator[Alarm]], ...] = (
     _drift,
     _radios,
     _mesh,
+    _dropped,
     _bridge,
     _resources,
     _changes,

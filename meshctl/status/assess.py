@@ -15,7 +15,7 @@ from meshctl.plan import NodePlan
 from meshctl.robots.facts import RobotFacts
 from meshctl.status.alarms import MESH_MODES, Seen, alarms, some
 from meshctl.status.robots import Crew, robot_status
-from meshctl.status.silence import NOT_ASKED, silent_alarm
+from meshctl.status.silence import NOT_ASKED, lost_relay_alarm, silent_alarm
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbour, NodeStatus, Silence, health_of
 from meshctl.topology import Graph, Report, Sighting, neighbours_of, report_of, seen_by
 
@@ -53,6 +53,10 @@ def assess(look: Look, nodes: Iterable[Node], now: float, robots: Iterable[str] 
     sightings = seen_by(reports.values(), look.macs)
     paths = {} if look.is_partial else look.graph.paths(look.entry)
     cuts = {} if look.is_partial else look.graph.cut_off_by(look.entry)
+    relays: dict[str, list[str]] = {}
+    for name, path in paths.items():
+        if path.hops and path.via != look.entry:
+            relays.setdefault(path.via, []).append(name)
     statuses = []
     for node in nodes:
         seen = look.observations.get(node.name)
@@ -69,6 +73,7 @@ def assess(look: Look, nodes: Iterable[Node], now: float, robots: Iterable[str] 
             path=paths.get(node.name),
             is_path_known=look.entry in paths,
             cuts_off=cuts.get(node.name, ()),
+            relays=tuple(name for name in relays.get(node.name, ()) if name != node.name),
             seconds_since_last_known=None if last is None else max(0.0, seen.answered_at_s - last.seen_s),
             own_lock=look.own_lock,
         )
@@ -122,10 +127,12 @@ def _silent(look: Look, node: Node, heard_by: tuple[Sighting, ...], now: float) 
         trust=f"meshctl trust {node.name}",
         take_in=f"not taken in yet? meshctl bootstrap {node.name}",
     )
+    lost_relay = lost_relay_alarm(node, why, last, now)
+    found = tuple(one for one in (lost_relay, alarm) if one is not None)
     return NodeStatus(
         node=node,
-        health=Health.UNREACHABLE if is_missed else Health.OFF if alarm is None else Health.DEGRADED,
-        alarms=() if alarm is None else (alarm,),
+        health=Health.UNREACHABLE if is_missed else Health.DEGRADED if found else Health.OFF,
+        alarms=found,
         age_s=None if last is None else now - last.seen_s,
         silent_because=why.reason,
         heard_by=heard_by,
@@ -160,4 +167,5 @@ def _answering(seen: Seen, now: float) -> NodeStatus:
         quality=seen.path.quality if seen.path else None,
         via=seen.path.via if seen.path and seen.path.hops else "",
         is_cut_vertex=bool(seen.cuts_off),
+        relays=seen.relays,
     )

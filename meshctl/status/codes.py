@@ -30,6 +30,7 @@ CODES: Mapping[str, str] = MappingProxyType(
         "alone": "it hears nobody, and should",
         "no-path": "no path through the mesh leads from it to the base",
         "weak": "its path to the base carries little",
+        "dropped": "a beacon carried by the inventory relays for others, or did when it was last seen",
         "cut-vertex": "others reach the base through it alone",
         "bridge": "a LAN port, or the mesh, is in no bridge",
         "flash": "hardly any flash is left",

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from meshctl.status.memory import typed
-from meshctl.status.preflight import Check
+from meshctl.status.preflight import Check, verdict
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus
 from meshctl.topology import Sighting
 
@@ -170,5 +170,9 @@ def preflight_json(checks: Iterable[Check]) -> dict[str, Any]:
     return {
         "version": VERSION,
         "go": all(check.is_go for check in listed),
-        "checks": [{"check": check.name, "go": check.is_go, "reason": check.reason} for check in listed],
+        "verdict": verdict(listed),
+        "checks": [
+            {"check": check.name, "go": check.is_go, "checked": check.is_checked, "reason": check.reason}
+            for check in listed
+        ],
     }

@@ -17,7 +17,7 @@ ROBOT_PREFIX = "robot."
 _NEIGHBOURS_KEPT = 4
 _INTEGERS = frozenset({"hops", "flash_free_bytes", "restarts", "urgent_bytes", "disk_free_kib"})
 _NUMBERS = frozenset({"uptime_s", "load", "memory_free", "quality", "clock_offset_s"})
-_LISTS = frozenset({"macs", "neighbours", "heard", "channels", "lan_ports", "online"})
+_LISTS = frozenset({"macs", "neighbours", "heard", "channels", "lan_ports", "online", "relays"})
 
 
 def facts_to_keep(status: FleetStatus) -> dict[str, dict[str, str]]:
@@ -42,6 +42,7 @@ def node_facts(node: NodeStatus) -> dict[str, str]:
         "hops": _number(node.hops),
         "quality": _number(node.quality),
         "via": node.via,
+        "relays": " ".join(node.relays),
         "heard": " ".join(neighbour.name for neighbour in node.neighbours[:_NEIGHBOURS_KEPT]),
     }
     return {name: value for name, value in facts.items() if value}

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from meshctl.status.alarms import duration
 from meshctl.topology import Graph, Report, neighbours_of
+from meshctl.topology.cells import LinkCell
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +26,8 @@ class Direction:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """`directions[a, b]` is what `a` tells of hearing `b`. `age_s` is how old a node's report is."""
+    """`directions[a, b]` is what `a` tells of hearing `b`, `cells[a, b]` in which cells. `age_s` is how old a node's
+    report is."""
 
     mesh: str
     entry: str
@@ -34,10 +36,18 @@ class Picture:
     ages_s: Mapping[str, float]
     addresses: Mapping[str, str]
     routing: str = "batman-adv"
+    cells: Mapping[tuple[str, str], tuple[LinkCell, ...]] = field(default_factory=dict)
 
     def age_s(self, name: str) -> float | None:
         """For programs: to the millisecond."""
         return round(self.ages_s[name], 3) if name in self.ages_s else None
+
+    def cells_of(self, a: str, b: str) -> tuple[LinkCell, ...]:
+        """The cells of a link, by what either end tells."""
+        return tuple(dict.fromkeys((*self.cells.get((a, b), ()), *self.cells.get((b, a), ()))))
+
+    def has_several_cells(self) -> bool:
+        return len({cell.mesh for cells in self.cells.values() for cell in cells}) > 1
 
     def direction(self, a: str, b: str) -> Direction:
         return self.directions.get((a, b), Direction())
@@ -58,14 +68,15 @@ def _share(value: float | None) -> str:
 
 def table(picture: Picture) -> str:
     """One line per link, the weakest first."""
-    lines = [("link", "there", "back", "signal", "heard", "")]
+    lines = [("link", "there", "back", "signal", "heard", "cell")]
     for link in sorted(picture.graph.links, key=lambda link: (link.quality, link.a, link.b)):
         there, back = picture.direction(link.a, link.b), picture.direction(link.b, link.a)
         signals = "/".join("-" if d.signal_dbm is None else str(d.signal_dbm) for d in (there, back))
         ages = [d.age_ms for d in (there, back) if d.age_ms is not None]
         lines.append(
             (f"{link.a} -- {link.b}", _share(there.quality), _share(back.quality), signals,
-             f"{max(ages)} ms ago" if ages else "-", "wired" if link.wired else "")
+             f"{max(ages)} ms ago" if ages else "-",
+             "wired" if link.wired else ", ".join(map(str, picture.cells_of(link.a, link.b))))
         )  # fmt: skip
     widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
     links = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in lines]
@@ -89,6 +100,8 @@ def tree(picture: Picture) -> str:
         path = paths[name]
         told = "" if name == picture.entry else f"  {path.hops} hop{'s' if path.hops > 1 else ''}, {path.quality:.0%}"
         age = f", {duration(picture.ages_s[name])} old" if name in picture.ages_s else ", does not answer"
+        if name != picture.entry and picture.has_several_cells():
+            told += "".join(f", {cell}" for cell in picture.cells_of(name, path.via))
         return f"{name}{star}{told}{age if name != picture.entry else ''}"
 
     waiting = [(picture.entry, "", "")] if picture.entry in paths else []
@@ -122,6 +135,10 @@ def as_json(picture: Picture) -> str:
     links = [
         {
             "a": link.a, "b": link.b, "quality": round(link.quality, 4), "wired": link.wired,
+            "cells": [
+                {"mesh": cell.mesh, "band": cell.band.value, "channel": cell.channel}
+                for cell in picture.cells_of(link.a, link.b)
+            ],
             "a_hears_b": _direction_json(picture.direction(link.a, link.b)),
             "b_hears_a": _direction_json(picture.direction(link.b, link.a)),
         }

@@ -7,7 +7,7 @@ computers, what the daemons tell of each other, and last whether urgent messages
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from meshctl.model import Fleet, NodeState, Role
 from meshctl.status.alarms import some
@@ -18,15 +18,21 @@ from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus,
 
 # More reasons than this make a line that nobody reads; `meshctl status` has them all.
 REASONS_SHOWN = 4
+# the check that stands for all of the robots' computers where they were not asked
+ROBOTS = "robots"
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One line: what was asked, whether it is a go, and why."""
+    """One line: what was asked, whether it is a go, and why.
+
+    An unchecked item does not block the run, and is not shown as `go`.
+    """
 
     name: str
     is_go: bool
     reason: str
+    is_checked: bool = True
 
 
 def preflight(fleet: Fleet, status: FleetStatus, pings: Pings | None = None) -> tuple[Check, ...]:
@@ -36,8 +42,19 @@ def preflight(fleet: Fleet, status: FleetStatus, pings: Pings | None = None) -> 
         checks += [check(fleet, status) for check in _ROBOT_CHECKS]
         checks.append(_delivery(fleet, status, pings or Pings()))
     elif _unasked(status):
-        checks.append(Check("robots", True, f"not checked: {_unasked(status)}"))
+        checks.append(Check(ROBOTS, True, _unasked(status), is_checked=False))
     return tuple(checks)
+
+
+def verdict(checks: Iterable[Check]) -> str:
+    """`GO`, `GO (radios only)`, `GO (not checked: links)`, or `NO-GO`."""
+    listed = tuple(checks)
+    if not all(check.is_go for check in listed):
+        return "NO-GO"
+    left_out = [check.name for check in listed if not check.is_checked]
+    if left_out == [ROBOTS]:
+        return "GO (radios only)"
+    return f"GO (not checked: {', '.join(left_out)})" if left_out else "GO"
 
 
 def _unasked(status: FleetStatus) -> str:
@@ -137,7 +154,9 @@ def _quality(fleet: Fleet, status: FleetStatus) -> Check:
     weak = [text for node in status.nodes if (text := _told(node.name, node.alarms, ("no-path", "weak")))]
     worst = min((node.quality for node in deployed if node.quality is not None), default=None)
     good = "no path to measure" if worst is None else f"every path carries, the weakest {worst:.0%}"
-    return _check("links", weak, good, _asked(status.nodes))
+    found = _check("links", weak, good, _asked(status.nodes))
+    has_paths = any(node.node.role is not Role.BASE for node in status.nodes if node.health is not Health.OFF)
+    return replace(found, is_checked=False) if found.is_go and worst is None and has_paths else found
 
 
 def _strangers(fleet: Fleet, status: FleetStatus) -> Check:

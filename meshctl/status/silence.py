@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from meshctl.device.errors import AuthenticationRefused, HostKeyChanged, HostKeyUnknown
 from meshctl.errors import NodeError, Unreachable
 from meshctl.fleet.journal import LastKnown
-from meshctl.status.alarms import duration
+from meshctl.model import Node, NodeState, Role
+from meshctl.status.alarms import duration, some
 from meshctl.status.values import Alarm, Level, Silence
 from meshctl.topology import Sighting
 
@@ -64,6 +65,19 @@ def silent_alarm(
         return Alarm(Level.ERROR, "unreachable", f"{why.reason}; {told}; {seen}", hint)
     hint = take_in if last is None else last_place(last)
     return Alarm(Level.ERROR, "unreachable", f"{why.reason}; {told}; nobody hears it", hint)
+
+
+def lost_relay_alarm(node: Node, why: Silence, last: LastKnown | None, now: float) -> Alarm | None:
+    """What is wrong with a beacon that is in a rack by the inventory and does not answer: None for one that was not
+    needed when it last did. One that others reached the base through had been dropped, and is gone."""
+    relayed = () if last is None else tuple(last.facts.get("relays", "").split())
+    is_racked = node.state is NodeState.CARRIED and node.role is Role.BEACON
+    if last is None or not relayed or not is_racked or why.code != "unreachable":
+        return None
+    text = f"{why.reason}; {some(relayed)} reached the base through it {duration(now - last.seen_s)} ago"
+    where = f"meshctl deployed {node.name}, and {last_place(last)}"
+    hint = f"if it was dropped: {where}; if it is back in its rack: switch it on there once"
+    return Alarm(Level.WARNING, "dropped", text, hint)
 
 
 def sighting(heard_by: Sequence[Sighting]) -> str:

@@ -10,6 +10,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from meshctl.report.terminal import one_line
 from meshctl.status.rows import COLUMNS, Cell, Column
 
 _GAP = "  "
@@ -61,7 +62,7 @@ def _left(columns: Sequence[Column], dropped: set[str]) -> tuple[Column, ...]:
 
 def _cell(row: Mapping[str, Cell], column: Column, is_short: bool) -> str:
     cell = row.get(column.key, Cell())
-    return (cell.least if is_short else cell.text) or "-"
+    return one_line(cell.least if is_short else cell.text) or "-"
 
 
 def _widths(rows: Sequence[Mapping[str, Cell]], columns: Sequence[Column], is_short: bool) -> list[int]:

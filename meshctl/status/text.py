@@ -10,8 +10,9 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 
 from meshctl.errors import ExitCode
+from meshctl.report.terminal import one_line
 from meshctl.status.alarms import duration, some
-from meshctl.status.preflight import Check
+from meshctl.status.preflight import Check, verdict
 from meshctl.status.rows import COMPUTER, row
 from meshctl.status.table import Paint, plain, table_lines
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus
@@ -122,6 +123,7 @@ def _wrapped(lead: str, told: str, width: int | None, paint: Paint, style: str) 
 
 def _beside(lead: str, told: str, width: int | None, indent: str = "") -> list[str]:
     """The text beside `lead`, in as many lines as it takes, later ones `indent`ed further."""
+    lead, told = one_line(lead), one_line(told)
     room = None if width is None else max(width - len(lead), _LEAST_ROOM)
     parts = [told] if room is None else textwrap.wrap(told, room, subsequent_indent=indent, break_on_hyphens=False)
     first, *others = parts or [""]
@@ -157,14 +159,25 @@ def _ago(age_s: float | None) -> str:
 
 
 def preflight_text(checks: Iterable[Check], width: int | None = None, paint: Paint = plain) -> str:
-    """One line per check, and in the end, where it is still seen, `GO` or `NO-GO` with the checks that say so."""
+    """One line per check (`go`, `NO-GO`, `?` for what was not checked), and in the end the verdict."""
     listed: Sequence[Check] = tuple(checks)
     room = max((len(check.name) for check in listed), default=0)
     lines = []
     for check in listed:
-        word, style = ("go   ", "ok") if check.is_go else ("NO-GO", "error")
+        word, style = _mark(check)
         first, *others = _beside(f"{word}  {check.name.ljust(room)}  ", check.reason, width)
         lines += [f"{paint(word, style)}{first[len(word) :]}", *others]
     failed = [check.name for check in listed if not check.is_go]
-    lines += list(_wrapped("NO-GO:", ", ".join(failed), width, paint, "error")) if failed else [paint("GO", "ok")]
+    if failed:
+        lines += _wrapped("NO-GO:", ", ".join(failed), width, paint, "error")
+    else:
+        is_whole = all(check.is_checked for check in listed)
+        lines.append(paint(verdict(listed), "ok" if is_whole else "warning"))
     return "\n".join(lines)
+
+
+def _mark(check: Check) -> tuple[str, str]:
+    """The word before a check, and its style."""
+    if not check.is_go:
+        return "NO-GO", "error"
+    return ("go   ", "ok") if check.is_checked else ("?    ", "warning")

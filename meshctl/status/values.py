@@ -104,6 +104,8 @@ class NodeStatus:
     """Of the whole path to the base, 0..1."""
     via: str = ""
     is_cut_vertex: bool = False
+    relays: tuple[str, ...] = ()
+    """Nodes whose path to the base leads through it."""
     heard_by: tuple[Sighting, ...] = ()
     last_known: Mapping[str, str] | None = None
 

@@ -1,5 +1,6 @@
 """The mesh as a graph: who hears whom, how far each node is from where we stand, what each node's loss cuts off."""
 
+from meshctl.topology.alternates import alternate_macs, with_alternates
 from meshctl.topology.graph import EMPTY, Graph, Link, Path, graph_of
 from meshctl.topology.observed import (
     NEIGHBOUR_FRESH_MS,
@@ -22,6 +23,7 @@ __all__ = [
     "Path",
     "Report",
     "Sighting",
+    "alternate_macs",
     "graph_of",
     "mesh_macs",
     "names_by_mac",
@@ -29,4 +31,5 @@ __all__ = [
     "observed_graph",
     "report_of",
     "seen_by",
+    "with_alternates",
 ]

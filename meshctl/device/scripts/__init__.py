@@ -8,5 +8,5 @@ _DIRECTORY = Path(__file__).resolve().parent
 
 
 def script(name: str) -> str:
-    """The text of one script: `observe.sh`, `deadman.sh`, `deadman.init`, `packages.sh`."""
+    """The text of one script, by its file name: `observe.sh`, `reload.sh`, ..."""
     return (_DIRECTORY / name).read_text(encoding="utf-8")

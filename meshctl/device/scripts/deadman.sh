@@ -8,7 +8,7 @@
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=4
+VERSION=5
 SELF=/usr/sbin/meshctl-deadman
 CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
@@ -16,9 +16,9 @@ RUN=/tmp/meshctl           # RAM: locks and timers; a reboot forgets them, as it
 SPARE_KIB=64               # flash that must stay free: uci, dropbear and jffs2's garbage collector write too
 GUARD_GRACE_CS=3000        # the second timer fires 30 s after the first should have
 START_LIMIT_CS=1500        # a loaded radio starts a process within 15 s, or something is wrong with it
-RELOAD_TURN_CS=1000       # reload_config takes a few seconds; a restore waits so long for one under way
+RELOAD_TURN_CS=1000        # a restore waits so long for a reload under way, then stops it
 EXTRA_LIMIT_CS=36000       # what else a change does (packages, into a slow jffs2) takes a minute or two
-RELOAD_LIMIT_CS=12000      # a reload of the restored state that takes over 120 s is stuck; then reboot
+RELOAD_LIMIT_CS=30000      # a reload of the restored state that takes over 300 s is stuck; then reboot
 
 # by its path: a busybox that prefers its own applets would leave no way to stand in for it
 sync() { /bin/sync; }
@@ -156,9 +156,13 @@ tidy() {
 
 # --- stage: build everything in a directory of this process, then rename it -----------------------------------------
 
+# rpcd, when LuCI applies and nobody confirms, copies its snapshot over the files that it changed
 no_foreign_changes() {
 	changes=$(uci changes 2>/dev/null)
 	[ -z "$changes" ] || refuse foreign-changes "uncommitted: $(echo "$changes" | tr '\n' ';')"
+	for f in /var/run/rpcd/snapshot-files/*; do
+		[ ! -e "$f" ] || refuse foreign-changes "rpcd waits for the confirmation of a change to ${f##*/} (LuCI: Save & Apply)"
+	done
 }
 
 # The last line of df, because a long device name breaks its row in two
@@ -236,13 +240,15 @@ drop() { # DIRECTORY CODE TEXT
 }
 
 # At the first boot / is RAM until jffs2 is ready, and what is copied into it then may lack what was written meanwhile
-# (fstools, overlay.c and mount.c name that mount so).
-in_flash() { ! grep -q '^overlayfs:/tmp/root / ' /proc/mounts; }
+# (fstools, overlay.c and mount.c name that mount so). An initramfs image has no flash below / at all.
+in_flash() {
+	! grep -q '^overlayfs:/tmp/root / ' /proc/mounts && ! ubus call system board 2>/dev/null | grep -q '"rootfs_type": "initramfs"'
+}
 
 stage() { # OWNER ID BUNDLE
 	need_lock "$1"
 	word "$2"
-	in_flash || refuse no-flash "/ is still in RAM: wait until its flash is ready, some minutes after the first boot"
+	in_flash || refuse no-flash "/ is in RAM: wait until its flash is ready, some minutes after the first boot; an initramfs image has none"
 	tidy
 	case $MARKER in armed | restoring) refuse busy "change $ID of $OWNER is $MARKER" ;; esac
 	{ [ -f "$3" ] && gzip -t "$3" 2>/dev/null; } || refuse bad-bundle "$3 is missing or damaged"
@@ -378,7 +384,9 @@ wait_until() {
 reload() { # SCRIPT: in the background, so that no hanging reload holds up the timer
 	rm -f "$RUN/reloaded"
 	(
-		sh "$1" >"$RUN/reload.log" 2>&1
+		sh "$1" >"$RUN/reload.log" 2>&1 &
+		echo $! >"$RUN/reload.pid"
+		wait $!
 		echo $? >"$RUN/reloaded"
 	) &
 	reload_pid=$!
@@ -390,7 +398,10 @@ end_reload() {
 	now
 	limit=$((NOW + RELOAD_TURN_CS))
 	until [ -e "$RUN/reloaded" ] || { now && [ $NOW -ge $limit ]; }; do doze; done
-	kill "$reload_pid" 2>/dev/null
+	[ ! -e "$RUN/reloaded" ] || return 0
+	read -r script_pid 2>/dev/null <"$RUN/reload.pid"
+	# the shell around it first, which would report its end
+	kill "$reload_pid" "$script_pid" 2>/dev/null
 }
 
 # restore REASON: the marker's rename decides who does it; nothing happens when the change was confirmed meanwhile

@@ -40,8 +40,13 @@ packages() {
 			/^$/ { if (name != "" && installed) print name " " version; name = "" }
 			END { if (name != "" && installed) print name " " version }' /usr/lib/opkg/status
 	else
-		opkg list-installed
+		command -v opkg >/dev/null && opkg list-installed
 	fi
+}
+
+# the radio interfaces that wpa_supplicant runs, by their control sockets
+supplicants() {
+	for socket in /var/run/wpa_supplicant/*; do [ ! -e "$socket" ] || echo "${socket##*/}"; done
 }
 
 package_tool() { command -v apk || command -v opkg; }
@@ -85,6 +90,7 @@ done
 for dev in /sys/class/net/bat*; do
 	[ ! -e "$dev" ] || mesh "${dev##*/}"
 done
+section supplicants supplicants
 section batctl.version batctl -v
 section bridges bridges
 section package_tool package_tool

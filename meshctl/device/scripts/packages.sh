@@ -47,7 +47,7 @@ do_it() {
 	# shellcheck disable=SC2086 # words are paths and names without blanks
 	case $TOOL in
 	apk)
-		[ -z "$REMOVE" ] || apk del $REMOVE || return 1
+		[ -z "$REMOVE" ] || apk del --no-network $REMOVE || return 1
 		# files given by path were verified by meshctl's own hash, not by a repository's key
 		apk add --no-network --allow-untrusted $FILES || return 1
 		;;

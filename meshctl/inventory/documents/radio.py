@@ -32,6 +32,8 @@ class RadioHardwareDocument(Document):
     """Horizontal width of its beam in degrees."""
     chains: Whole = Field(default=2, ge=1, le=8)
     """Number of antennas that send at once."""
+    driver: Text = Field(default="", pattern="^([a-z0-9]+(-[a-z0-9]+)*)?$")
+    """Kernel module by its name in OpenWrt: ath9k, ath10k, ath10k-ct, mt76...; lint knows what some cannot do."""
 
 
 class FirmwareDocument(Document):
@@ -149,8 +151,8 @@ class MeshDocument(Document):
     """Longest link in metres; sets the acknowledgement timeout."""
     beacon_interval_tu: Whole = Field(default=100, ge=15, le=65_535)
     """Interval of 802.11 beacons in time units of 1024 us."""
-    mtu: Whole = Field(default=1536, ge=68, le=9000)
-    """MTU of the radio's interface; 1532 carries a full Ethernet frame under batman-adv."""
+    mtu: Whole = Field(default=1560, ge=68, le=9000)
+    """MTU of the radio's interface: batman-adv needs 1532 for a full Ethernet frame, and logs a warning below 1560."""
     lan_mtu: Whole = Field(default=1500, ge=68, le=9000)
     """MTU of the LAN behind the nodes."""
     reconnect_s: Real = Field(default=5.0, gt=0, le=60)

@@ -21,8 +21,8 @@ from meshctl.lab.real.doors import RealDoors
 
 log = logging.getLogger("meshctl.lab.real.agent")
 _CHUNK_BYTES = 1 << 16
-# what a process that has ended may have left in its pipes is there already
-_DRAIN_S = 0.05
+# a terminal passes on what was written to it a little later
+_TERMINAL_DRAIN_S = 0.05
 _FAREWELL_S = 5.0
 
 
@@ -117,14 +117,13 @@ class Agent:
         streams = _Terminal(first["terminal"]) if first["terminal"] else _Pipes()
         loop = asyncio.get_running_loop()
         tasks = [asyncio.ensure_future(_feed(reader, streams))]
-        waiting = []
-        for number, descriptor in streams.outputs:
-            waiting.append(loop.create_task(_tell(number, descriptor, writer)))
+        ended = asyncio.Event()
+        waiting = [loop.create_task(_tell(number, source, writer, ended)) for number, source in streams.outputs]
         try:
             answer = await self._answer(first["request"], list(streams.theirs))
             streams.close_theirs()
-            # a process that stays behind may keep them open for ever
-            await asyncio.wait(waiting, timeout=_DRAIN_S)
+            ended.set()
+            await asyncio.wait(waiting, timeout=_TERMINAL_DRAIN_S if first["terminal"] else None)
             writer.write(channel.frame(channel.ANSWER, json.dumps(answer).encode()))
             await writer.drain()
         finally:
@@ -203,18 +202,25 @@ def _write_all(descriptor: int, content: bytes) -> None:
             content = content[os.write(descriptor, content) :]
 
 
-async def _tell(number: int, descriptor: int, writer: asyncio.StreamWriter) -> None:
-    """A process's output as frames, until it closes it."""
+async def _tell(number: int, descriptor: int, writer: asyncio.StreamWriter, ended: asyncio.Event) -> None:
+    """A process's output as frames, until it is closed. One that stays behind may keep it open for ever and go on: so
+    once the process has `ended`, what a pipe holds at most is read, as far as it is there."""
     loop = asyncio.get_running_loop()
     os.set_blocking(descriptor, False)
     ready = asyncio.Event()
     loop.add_reader(descriptor, ready.set)
+    waiting = asyncio.ensure_future(_set_with(ended, ready))
+    left = _CHUNK_BYTES
     try:
-        while True:
+        while left > 0:
             await ready.wait()
+            # asked before reading: what comes later is not the ended process's
+            has_ended = ended.is_set()
             try:
                 content = os.read(descriptor, _CHUNK_BYTES)
             except BlockingIOError:
+                if has_ended and not os.isatty(descriptor):
+                    return
                 ready.clear()
                 continue
             except OSError:
@@ -222,7 +228,15 @@ async def _tell(number: int, descriptor: int, writer: asyncio.StreamWriter) -> N
                 return
             if not content:
                 return
+            if has_ended:
+                left -= len(content)
             writer.write(channel.frame(number, content))
             await writer.drain()
     finally:
+        waiting.cancel()
         loop.remove_reader(descriptor)
+
+
+async def _set_with(cause: asyncio.Event, effect: asyncio.Event) -> None:
+    await cause.wait()
+    effect.set()

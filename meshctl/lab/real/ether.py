@@ -7,6 +7,7 @@ node that hears (`losses`). Nobody computes tables or paths here: batman-adv doe
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 log = logging.getLogger("meshctl.lab.real.ether")
 # so soon after the last change; many changes at once are one
 _SOON_S = 0.02
+# after something could not be applied to a node that goes on running
+_AGAIN_S = 1.0
 
 
 class RealEther(Ether):
@@ -57,8 +60,10 @@ class RealEther(Ether):
                 self._lay_cable(state)
                 self._lose(state)
             except LabError as error:
-                # a node that ends in this moment takes its devices with it
+                # a node that ends in this moment takes its devices with it, one that configures them makes them again
                 log.warning("not-applied node=%s reason=%s", state.spec.name, error)
+                if state.is_running:
+                    asyncio.get_running_loop().call_later(_AGAIN_S, self.changed)
         self._tell()
 
     def set_groups(self, masks: dict[str, int]) -> None:

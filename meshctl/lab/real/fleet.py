@@ -9,8 +9,8 @@ from meshctl.lab.real.machine import find_qemu
 class RealFleet(VirtualFleet):
     """`VirtualFleet` with the kernel's own radios, mesh and bridges.
 
-    Files of nodes are in the machine: `VirtualNode.flash_path` and `console_log` have nothing on this side, `exec`
-    reads them.
+    Files of nodes are in the machine: `VirtualNode.flash_path` and `console_log` have nothing on this side, `exec` and
+    `console` read them.
     """
 
     SUPERVISOR = "meshctl.lab.real.relay"

@@ -123,8 +123,11 @@ def main(arguments: Sequence[str]) -> int:
     def put_devices(container: Container, pid: int) -> None:
         hardware.put_devices(places[container.name], pid)
 
+    def take_devices(name: str, network: int) -> None:
+        hardware.take_devices(places[name], network)
+
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    fork_warden(lambda: Warden(theirs, put_devices, hardware.take_devices), theirs, close=ours)
+    fork_warden(lambda: Warden(theirs, put_devices, take_devices), theirs, close=ours)
     try:
         asyncio.run(RealSupervisor(spec, directory, ours).run())
     except LabError as error:

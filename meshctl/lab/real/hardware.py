@@ -2,11 +2,12 @@
 
 Each node has a cable from its first LAN port: on the bench it ends in the machine itself, else in the switch of the
 robot it belongs to, where the robot's computer is (a network namespace `pc.ROBOT`). Each of its radios is one of
-mac80211_hwsim's, moved into its namespace at every boot and back by the kernel when it ends.
+mac80211_hwsim's, moved into its namespace at every boot and taken back when it ends.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import subprocess
@@ -22,12 +23,11 @@ from meshctl.lab.spec import FleetSpec, LanSpec, Medium
 from meshctl.lab.state import label_mac
 
 log = logging.getLogger("meshctl.lab.real.hardware")
-# the kernel takes a dead namespace apart in the background; under emulation that can take seconds
+# only when `take_devices` failed: the kernel takes a dead namespace apart in the background, whenever it gets to it
 _RADIOS_BACK_S = 60.0
 _POLL_S = 0.02
 _PHYS = Path("/sys/class/ieee80211")
 _GROUPS = Path("/sys/kernel/debug/ieee80211")
-_ORPHAN_RETRIES = Path("/proc/sys/net/ipv4/tcp_orphan_retries")
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ def put_devices(place: Place, pid: int) -> None:
     for count, port in enumerate(others):
         batch.append(f"link add {place.cable}.{count} type veth peer name {port} address {place.mac} netns {pid}")
     deadline = time.monotonic() + _RADIOS_BACK_S
-    while any(not (_PHYS / phy).exists() for phy in place.phys) or (Path("/sys/class/net") / place.cable).exists():
+    while any(not (_PHYS / phy).exists() for phy in place.phys) or _cables(place):
         if time.monotonic() > deadline:
             raise LabError(f"the radios of {place.name} did not come back within {_RADIOS_BACK_S:g} s")
         time.sleep(_POLL_S)
@@ -116,24 +116,30 @@ def put_devices(place: Place, pid: int) -> None:
         run(("iw", "phy", phy, "set", "netns", str(pid)))
 
 
-def take_devices(network: int) -> None:
-    """Let the network of a node that has ended (a descriptor) go soon, and its radios with it.
+def take_devices(place: Place, network: int) -> None:
+    """Take radios and cables out of the network (a descriptor) of a node that has ended; they are here on return.
 
-    Connections whose processes are dead say farewell to nobody, eight times by default, and keep it a minute and more.
+    The kernel would return them too, but in the background and after everything else that a dead network leaves: seen
+    to take more than a minute on a busy host, and as long as a socket of the network retries its farewell.
     """
-    home = os.open("/proc/self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        ns.setns(network, ns.CLONE_NEWNET)
+    home = str(os.getpid())
+    # by number: names are looked up in /sys, which shows this network's radios alone
+    steps: list[tuple[Sequence[str], int]] = [
+        (("iw", f"phy#{phy.removeprefix('phy')}", "set", "netns", home), network) for phy in place.phys
+    ]
+    # a veth ends with its peer
+    steps += [(("ip", "link", "del", path.name), -1) for path in _cables(place)]
+    for words, where in steps:
         try:
-            # the file is that of the network that the process is in
-            _ORPHAN_RETRIES.write_text("1\n", encoding="ascii")
-        except OSError as error:
-            # then it takes a while longer
-            log.warning("connections-kept reason=%s", error)
-        finally:
-            ns.setns(home, ns.CLONE_NEWNET)
-    finally:
-        os.close(home)
+            run(words, network=where)
+        except LabError as error:
+            log.warning("device-not-taken node=%s reason=%s", place.name, error)
+
+
+def _cables(place: Place) -> list[Path]:
+    """The machine's ends of the node's cables that exist now."""
+    names = [place.cable, *(f"{place.cable}.{count}" for count in range(len(place.lan_ports) - 1))]
+    return [path for path in map(Path("/sys/class/net").joinpath, names) if path.exists()]
 
 
 def lay_cable(place: Place, spec: FleetSpec, *, on_bench: bool) -> None:
@@ -169,21 +175,22 @@ def ip(lines: Sequence[str], *, space: str = "") -> None:
     run(("ip", *where, "-batch", "-"), stdin="".join(f"{line}\n" for line in lines))
 
 
-def run(words: Sequence[str], *, stdin: str = "", node: int = 0) -> str:
-    """What a program of the machine prints, run in the network of the node whose process 1 is `node` (0: outside).
+def run(words: Sequence[str], *, stdin: str = "", node: int = 0, network: int = -1) -> str:
+    """What a program of the machine prints, run in the network of the node whose process 1 is `node` or in that of the
+    descriptor `network` (neither: outside).
 
     Raises LabError with its complaint. busybox' nsenter would run applets of its own where iproute2 is meant.
     """
-    try:
-        network = os.open(f"/proc/{node}/ns/net", os.O_RDONLY | os.O_CLOEXEC) if node else -1
-    except FileNotFoundError as error:
-        raise LabError("the node has just ended") from error
-    enter = (lambda: ns.setns(network, ns.CLONE_NEWNET)) if node else None
-    try:
-        done = subprocess.run(words, input=stdin, capture_output=True, text=True, check=False, preexec_fn=enter)
-    finally:
+    with contextlib.ExitStack() as stack:
         if node:
-            os.close(network)
+            try:
+                network = os.open(f"/proc/{node}/ns/net", os.O_RDONLY | os.O_CLOEXEC)
+            except OSError as error:
+                # ENOENT: it has ended; EACCES: it has been collected, too
+                raise LabError("the node has just ended") from error
+            stack.callback(os.close, network)
+        enter = (lambda: ns.setns(network, ns.CLONE_NEWNET)) if network >= 0 else None
+        done = subprocess.run(words, input=stdin, capture_output=True, text=True, check=False, preexec_fn=enter)
     if done.returncode != 0:
         raise LabError(f"{' '.join(words)}: {done.stderr.strip() or done.returncode}")
     return done.stdout

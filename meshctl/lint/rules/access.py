@@ -1,4 +1,4 @@
-"""Who may log in: operators' keys, host keys, passwords (MC421 to MC432)."""
+"""Who may log in: operators' keys, host keys, passwords (MC421 to MC433)."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import listed, repeated
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.identity import known_hosts_path
+from meshctl.lint.rules.secrets import logins
 from meshctl.lint.sshkey import BadKey, PublicKey, parse_public_key
 from meshctl.model import Fleet
 
@@ -238,7 +239,10 @@ def computer_as_root(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing=Example("operators: {known_hosts: known_hosts}", files={"known_hosts": f"base {_ALICE}"}),
 )
 def known_hosts_invalid(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    text = context.files.text(known_hosts_path(fleet))
+    path = known_hosts_path(fleet)
+    if context.files.is_special(path):
+        yield Finding(("operators", "known_hosts"), "not a regular file", "lines of NAME TYPE BASE64", str(path))
+    text = context.files.text(path)
     try:
         parse_pins(text or "", source=fleet.operators.known_hosts)
     except InputError as error:
@@ -260,3 +264,19 @@ def computer_without_user(fleet: Fleet, _context: LintContext) -> Iterator[Findi
         if robot.computer is not None and not robot.computer.ssh.user:
             path = ("robots", robot.name, "computer", "ssh", "user")
             yield Finding(path, "each operator logs in by their own name", "the robot's own user", "none")
+
+
+@fleet_rule(
+    "MC433",
+    Severity.ERROR,
+    "A public key is named where a private one is needed",
+    why="Logging in takes the private key; the file beside it with `.pub` only proves who has it. Every login fails.",
+    mend="Take `.pub` away.",
+    failing="nodes: {base: {ssh: {key_files: [id_ed25519.pub]}}}",
+    passing=Example("nodes: {base: {ssh: {key_files: [id_ed25519]}}}", files={"id_ed25519": "a private key"}),
+)
+def public_key_to_log_in(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for place, ssh in logins(fleet):
+        for index, file in enumerate(ssh.key_files):
+            if file.endswith(".pub"):
+                yield Finding((*place, "key_files", str(index)), "a public key", "a private key", file)

@@ -1,9 +1,9 @@
-"""Addresses and networks: unique, inside their network, reachable (MC201 to MC214)."""
+"""Addresses and networks: unique, inside their network, reachable (MC201 to MC215)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from ipaddress import IPv4Address, IPv4Interface, IPv4Network, ip_address
+from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address, ip_address
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
@@ -147,9 +147,12 @@ def networks_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 
 
 def _routed_as_one(mesh: Mesh, other: Mesh) -> bool:
-    """Two cells under one batman-adv interface, say one in each band: one network is what they are meant to have."""
-    both = mesh.backend is Backend.BATMAN and other.backend is Backend.BATMAN
-    return both and mesh.network == other.network and mesh.batman.routing_algo == other.batman.routing_algo
+    """Two cells under one routing interface, say one in each band: one network is what they are meant to have."""
+    if mesh.network != other.network or mesh.backend is not other.backend:
+        return False
+    if mesh.backend is Backend.BATMAN:
+        return mesh.batman.routing_algo == other.batman.routing_algo
+    return mesh.operator_parts.interface == other.operator_parts.interface
 
 
 @fleet_rule(
@@ -335,12 +338,17 @@ def time_server_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Fin
 def _out_of_reach(fleet: Fleet, host: str) -> bool:
     if any(node.gateway is not None for node in fleet.managed()):
         return False
+    address = as_address(host)
+    # a name needs a resolver, which is beyond a gateway as well
+    return address is None or not any(address in mesh.network for mesh in fleet.meshes.values())
+
+
+def as_address(host: str) -> IPv4Address | IPv6Address | None:
+    """The address that a host is written as, None for a name."""
     try:
-        address = ip_address(host)
+        return ip_address(host)
     except ValueError:
-        # a name needs a resolver, which is beyond a gateway as well
-        return True
-    return not any(address in mesh.network for mesh in fleet.meshes.values())
+        return None
 
 
 @fleet_rule(
@@ -369,3 +377,22 @@ def ssh_endpoint_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
         for name in names[1:]:
             path = ("nodes", name, "ssh", "host")
             yield Finding(path, f"{names[0]} is reached at the same place", "one of its own", f"{host}:{port}")
+
+
+@fleet_rule(
+    "MC215",
+    Severity.ERROR,
+    "A node's prefix length differs from its mesh's",
+    why="""With a longer prefix the node sends part of the mesh to a gateway that does not exist; with a shorter one it
+    looks on the air for stations that are elsewhere. Some nodes then reach it and others do not.""",
+    mend="Write the address without a prefix length: it takes the one of its mesh's network.",
+    failing="nodes: {b01: {address: 10.42.0.7/16}}",
+    passing="nodes: {b01: {address: 10.42.0.7}}",
+)
+def node_prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        holding = [mesh for mesh in _meshes_of(fleet, node) if node.address.ip in mesh.network]
+        if holding and not any(node.address.network == mesh.network for mesh in holding):
+            expected = f"/{holding[0].network.prefixlen} like mesh {holding[0].name}"
+            path = ("nodes", node.name, "address")
+            yield Finding(path, "prefix length differs", expected, f"/{node.address.network.prefixlen}")

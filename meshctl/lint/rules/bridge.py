@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import grouped, listed, repeated
+from meshctl.lint.places import first_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.routing import MESHMERIZE, PARTS
 from meshctl.model import Backend, Fleet, Mesh, Node
@@ -229,11 +230,15 @@ def port_and_vlan(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="nodes: {husky1-front: {lan_ports: [eth0]}}",
 )
 def robot_without_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    cut_off: list[tuple[tuple[str, ...], str]] = []
     for robot in fleet.robots.values():
         nodes = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
         if robot.computer is not None and nodes and not any(node.lan_ports for node in nodes):
-            path = ("nodes", nodes[0].name, "lan_ports")
-            yield Finding(path, f"the computer of {robot.name} is cut off", "at least one port", "none")
+            profile = ("hardware", nodes[0].hardware.name, "lan_ports")
+            cut_off.append((first_written(fleet, ("nodes", nodes[0].name, "lan_ports"), profile), robot.name))
+    # a profile without ports is one mistake, whatever the number of robots that have it
+    for path, robots in grouped(cut_off).items():
+        yield Finding(path, f"the computer of {listed(robots)} is cut off", "at least one port", "none")
 
 
 @fleet_rule(

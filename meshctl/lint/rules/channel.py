@@ -12,6 +12,9 @@ from meshctl.regdb import CHANNELS, Country, Flag, Verdict, judge, legal_channel
 
 # what keeps a station from starting a cell on its own
 _SILENT = Flag.DFS | Flag.NO_IR
+# its wifi-scripts alone have `mcast_rate` as an array (docs/facts/openwrt-checked.md)
+_NO_MCAST_RATE = "25.12.0-rc1"
+_IMAGE = 'image for {"supported_devices":["ubnt,rocket-m"],"version":{"version":"%s","revision":"r1-1"}}'
 
 
 def _shown(channels: tuple[int, ...]) -> str:
@@ -268,7 +271,7 @@ def htmode_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         meshes: {main: {channel: 149, band: 5g, htmode: HT40+, encryption: none, key: <removed>}}
         defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
         """,
-        also=("MC334", "MC408"),
+        also=("MC408",),
     ),
     passing=Example(
         """
@@ -276,7 +279,7 @@ def htmode_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         meshes: {main: {channel: 149, band: 5g, htmode: HT40, encryption: none, key: <removed>}}
         defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
         """,
-        also=("MC334", "MC408"),
+        also=("MC408",),
     ),
 )
 def htmode_sign_on_25_12(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
@@ -347,25 +350,34 @@ def channel_indoor(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 
 @fleet_rule(
     "MC334",
-    Severity.NOTE,
-    "Some 25.12 builds cannot join an ad-hoc cell with a multicast rate",
-    why="""Their wifi scripts take `mcast_rate` for a list and hand `iw` no number, so the radio joins no cell. A later
-    version of the scripts has it right. meshctl would notice and go back, but no change would ever hold.""",
-    mend="Try one node first: `meshctl provision NODE`; `iw dev mesh0 link` must name the cell. Or use 802.11s mode.",
+    Severity.WARNING,
+    "OpenWrt 25.12.0-rc1 joins no ad-hoc cell",
+    why="""The wifi scripts of this one build take `mcast_rate` for a list and give `iw` no number, so the radio joins
+    no cell. 25.12.0-rc2 and all later builds read it correctly.""",
+    mend="Use the image of 25.12.0 or later.",
     failing=Example(
         """
-        hardware: {rocket: {release: "25.12"}}
+        hardware: {rocket: {release: "25.12", firmware: {image: rc1.bin, sha256: <sha256 of rc1.bin>, revision: r1}}}
         meshes: {main: {encryption: none, key: <removed>}}
         """,
+        files={"rc1.bin": _IMAGE % "25.12.0-rc1"},
         also=("MC408",),
     ),
-    passing="""
-    hardware: {rocket: {release: "24.10"}}
-    """,
+    passing=Example(
+        """
+        hardware: {rocket: {release: "25.12", firmware: {image: new.bin, sha256: <sha256 of new.bin>, revision: r1}}}
+        meshes: {main: {encryption: none, key: <removed>}}
+        """,
+        files={"new.bin": _IMAGE % "25.12.0"},
+        also=("MC408",),
+    ),
 )
-def multicast_rate_on_25_12(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    new = {mesh for node in fleet.managed() if node.release >= Release.V25_12 for mesh in node.meshes}
-    for mesh in fleet.meshes.values():
-        if mesh.name in new and mesh.mode is MeshMode.ADHOC:
-            path = ("meshes", mesh.name, "mcast_rate_kbps")
-            yield Finding(path, "some 25.12 builds join no cell with it", "a build that was tried", "25.12, ad-hoc")
+def multicast_rate_on_25_12_0_rc1(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    adhoc = {mesh.name for mesh in fleet.meshes.values() if mesh.mode is MeshMode.ADHOC}
+    used = {node.hardware.name for node in fleet.managed() if adhoc.intersection(node.meshes)}
+    for profile in fleet.hardware.values():
+        is_asked = profile.name in used and profile.release >= Release.V25_12
+        version = context.files.image_version(profile) if is_asked else ""
+        if version == _NO_MCAST_RATE:
+            path = ("hardware", profile.name, "firmware", "image")
+            yield Finding(path, "joins no ad-hoc cell", "25.12.0 or later", version)

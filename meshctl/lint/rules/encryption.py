@@ -29,7 +29,7 @@ def _members(fleet: Fleet) -> Iterator[tuple[Node, Mesh]]:
     why="""25.12's wifi script looks for the cipher before it is set, so an ad-hoc cell with a key is joined without
     one. Everything looks right: the configuration says psk2, the node is in the mesh, and anybody else can be, too.""",
     mend="Use `mode: mesh` with `encryption: sae`, an earlier release, or write `encryption: none` and mean it.",
-    failing=Example("""hardware: {rocket: {release: "25.12"}}""", also=("MC334",)),
+    failing="""hardware: {rocket: {release: "25.12"}}""",
     passing="""
     hardware: {rocket: {release: "25.12"}}
     meshes: {main: {mode: mesh, encryption: sae}}

@@ -1,4 +1,4 @@
-"""Firmware images against what the inventory says of them, read from the images themselves (MC801 to MC811)."""
+"""Firmware images against what the inventory says of them, read from the images themselves (MC801 to MC812)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _METADATA = 'image for {"supported_devices":["%s"],"version":{"version":"%s","re
 ROCKET_IMAGE = _METADATA % ("ubnt,rocket-m", "24.10.2", "r28739-d9340319c6")
 _BULLET = _METADATA % ("ubnt,bullet-m-xw", "24.10.2", "r28739-d9340319c6")
 _OLD = _METADATA % ("ubnt,rocket-m", "23.05.5", "r24106-10cc5fcd00")
-_IMAGE = "hardware: {rocket: {firmware: {image: rocket.bin, sha256: <sha256 of rocket.bin>}}}"
+_IMAGE = "hardware: {rocket: {firmware: {image: rocket.bin, sha256: <sha256 of rocket.bin>, revision: r28739}}}"
 _OTHER_HASH = "0123456789abcdef0123456789abcdef0123456789abcdef0123456789abcdef"
 # what stays free on the flash for the configuration and packages (two erase blocks of 64 KiB and the boot loader)
 _FLASH_RESERVE_KIB = 512
@@ -53,7 +53,9 @@ def _found(fleet: Fleet, context: LintContext, code: str, *key: str) -> Iterator
     "A firmware image is missing",
     why="It is found out in the field, where there is no internet to fetch it from.",
     mend="Bring the image, or mend the path: it is relative to the file that names it.",
-    failing="hardware: {rocket: {firmware: {image: absent.bin, sha256: HASH}}}".replace("HASH", _OTHER_HASH),
+    failing="hardware: {rocket: {firmware: {image: absent.bin, revision: r28739, sha256: HASH}}}".replace(
+        "HASH", _OTHER_HASH
+    ),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
 def image_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
@@ -68,7 +70,7 @@ def image_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     file.""",
     mend="Fetch the image again; if it was replaced on purpose, write its new SHA-256 down.",
     failing=Example(
-        f"hardware: {{rocket: {{firmware: {{image: rocket.bin, sha256: {_OTHER_HASH}}}}}}}",
+        f"hardware: {{rocket: {{firmware: {{image: rocket.bin, revision: r28739, sha256: {_OTHER_HASH}}}}}}}",
         files={"rocket.bin": ROCKET_IMAGE},
     ),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
@@ -124,7 +126,7 @@ def image_wrong_board(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     why="""The configuration is rendered for the profile's release: on another one, bridges, radios or the firewall come
     up differently, or not at all.""",
     mend="Set the profile's `release` to the image's.",
-    failing=Example(_IMAGE, files={"rocket.bin": _OLD}),
+    failing=Example(_IMAGE.replace("r28739", "r24106"), files={"rocket.bin": _OLD}),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
 def image_wrong_release(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
@@ -138,12 +140,8 @@ def image_wrong_release(fleet: Fleet, context: LintContext) -> Iterator[Finding]
     why="""After a flash a node must report this revision to count as done: with another in the image, every flash ends
     as failed.""",
     mend="Write the revision that the image carries.",
-    failing=Example(
-        _IMAGE.replace("image: rocket.bin", "image: rocket.bin, revision: r24106"), files={"rocket.bin": ROCKET_IMAGE}
-    ),
-    passing=Example(
-        _IMAGE.replace("image: rocket.bin", "image: rocket.bin, revision: r28739"), files={"rocket.bin": ROCKET_IMAGE}
-    ),
+    failing=Example(_IMAGE.replace("revision: r28739", "revision: r24106"), files={"rocket.bin": ROCKET_IMAGE}),
+    passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
 def image_wrong_revision(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     yield from _found(fleet, context, WRONG_REVISION, "revision")
@@ -172,7 +170,9 @@ def image_signature(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "A firmware image has no hash",
     why="Any file of that name would be flashed, also half of one.",
     mend="Write its SHA-256 down: `sha256sum IMAGE`.",
-    failing=Example("hardware: {rocket: {firmware: {image: rocket.bin}}}", files={"rocket.bin": ROCKET_IMAGE}),
+    failing=Example(
+        "hardware: {rocket: {firmware: {image: rocket.bin, revision: r28739}}}", files={"rocket.bin": ROCKET_IMAGE}
+    ),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
 def image_without_hash(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
@@ -234,3 +234,20 @@ def _package_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], str, tuple[s
         if member is not None:
             place = ("meshes", mesh.name, "operator_parts", "package_files")
             yield place, parts.base or fleet.base, parts.package_files, member.hardware
+
+
+@fleet_rule(
+    "MC812",
+    Severity.WARNING,
+    "A firmware image has no revision, so it is never flashed",
+    why="""meshctl flashes a node whose revision differs from the one written down, and knows by it that the flash is
+    done. Without one the image is checked and never used: plan, apply and status say that all is well.""",
+    mend="Write the image's revision: `ubus call system board` of a node that runs it, release.revision.",
+    failing=Example(_IMAGE.replace(", revision: r28739", ""), files={"rocket.bin": ROCKET_IMAGE}),
+    passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
+)
+def image_without_revision(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in _profiles(fleet):
+        if not profile.firmware.revision:
+            path = ("hardware", profile.name, "firmware")
+            yield Finding(path, "the image is never flashed", "`revision`", "none")

@@ -1,17 +1,21 @@
-"""Hardware profiles and packages: what the boxes are, and what they need to be part of the mesh (MC821 to MC831)."""
+"""Hardware profiles and packages: what the boxes are, and what they need to be part of the mesh (MC821 to MC834)."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from difflib import get_close_matches
 from pathlib import PurePath
 
+from meshctl import firmware
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import listed
+from meshctl.lint.openwrt_names import SUBTARGETS, TARGETS, chip_target, meant_package
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.encryption import packages_path
 from meshctl.lint.rules.firmware import ROCKET_IMAGE
+from meshctl.lint.rules.references import known
 from meshctl.model import Fleet, Release
 from meshctl.resolve import package_needs
 
@@ -58,7 +62,7 @@ def needed_package_removed(fleet: Fleet, _context: LintContext) -> Iterator[Find
         hardware:
           rocket:
             packages: [iw, wpad-openssl]
-            firmware: {image: rocket.bin, sha256: <sha256 of rocket.bin>}
+            firmware: {image: rocket.bin, sha256: <sha256 of rocket.bin>, revision: r28739}
         """,
         files={"rocket.bin": ROCKET_IMAGE},
     ),
@@ -67,7 +71,7 @@ def needed_package_removed(fleet: Fleet, _context: LintContext) -> Iterator[Find
         hardware:
           rocket:
             packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl]
-            firmware: {image: rocket.bin, sha256: <sha256 of rocket.bin>}
+            firmware: {image: rocket.bin, sha256: <sha256 of rocket.bin>, revision: r28739}
         """,
         files={"rocket.bin": ROCKET_IMAGE},
     ),
@@ -180,7 +184,7 @@ def release_unmaintained(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     failing="hardware: {rocket: {memory_mib: 32}}",
     passing="hardware: {rocket: {memory_mib: 64}}",
 )
-def device_too_small(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+def device_too_small(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for profile in fleet.hardware.values():
         if profile.release < Release.V22_03:
             continue
@@ -189,8 +193,9 @@ def device_too_small(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             ("flash_mib", profile.flash_mib, _LEAST_FLASH_MIB),
         )
         for key, size, least in sizes:
-            # a ready image that fits has been held against the flash by its own rule
-            if size < least and not (key == "flash_mib" and profile.firmware.image):
+            # an image at hand is held against the flash by a rule of its own
+            image = firmware.image_path(profile) if key == "flash_mib" else None
+            if size < least and (image is None or context.files.size_bytes(image) is None):
                 path = ("hardware", profile.name, key)
                 yield Finding(path, f"too small for {profile.release}", f"at least {least}", str(size))
 
@@ -237,30 +242,110 @@ def profile_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Findi
 @fleet_rule(
     "MC831",
     Severity.WARNING,
-    "The address was chosen by a second radio's network",
-    why="""A node's management address belongs to its first mesh; with the address in another of its meshes, the bridge
-    is put onto that one, and the robot's switch hangs on the cell that was meant as a relay.""",
-    mend="List the mesh of the address at the first radio, or use an address of the first mesh.",
+    "A robot's switch hangs on another mesh than its computer",
+    why="""A node with radios in several networks bridges its wired ports with the one that holds its address. With the
+    address in one network and the robot's computer in another, the computer is on the wrong side: it hears nothing.""",
+    mend="Give the node an address in its computer's network.",
     failing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
                encryption: psk2+ccmp, key: {env: MESH_KEY}}
     nodes: {base: {address: 10.43.0.1, radios: {radio1: {mesh: second, tx_power_dbm: 20}}}}
     """,
+    # the address may well belong to the second radio: which one is radio0 is the board's choice
     passing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
                encryption: psk2+ccmp, key: {env: MESH_KEY}}
-    nodes: {base: {radios: {radio1: {mesh: second, tx_power_dbm: 20}}}}
+    nodes: {base: {address: 10.43.0.1, radios: {radio1: {mesh: second, tx_power_dbm: 20}}}}
+    robots: {base-station: {computer: {address: 10.43.0.100/24}}}
     """,
 )
-def address_of_second_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+def switch_on_other_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
+        robot = fleet.robots.get(node.robot)
         meshes = [fleet.meshes[name] for name in node.meshes if name in fleet.meshes]
-        if len(meshes) < 2 or node.address.ip in meshes[0].network:
-            continue
         holding = next((mesh for mesh in meshes if node.address.ip in mesh.network), None)
-        if holding is not None:
+        if robot is None or robot.computer is None or holding is None or not node.lan_ports:
+            continue
+        computer = robot.computer.address.ip
+        meant = next((mesh for mesh in meshes if computer in mesh.network), None)
+        if meant is not None and computer not in holding.network:
             path = ("nodes", node.name, "address")
-            message = f"the robot's switch would hang on mesh {holding.name}"
-            yield Finding(path, message, f"an address of mesh {meshes[0].name}", str(node.address.ip))
+            message = f"the switch of {robot.name} would hang on mesh {holding.name}, its computer is in {meant.name}"
+            yield Finding(path, message, f"an address in {meant.network}", str(node.address.ip))
+
+
+@fleet_rule(
+    "MC832",
+    Severity.WARNING,
+    "A package's name is misspelt",
+    why="""The ImageBuilder stops at a package that no feed has, and opkg finds none on the bench. Where the mesh
+    needs the package, meshctl adds the right name beside the wrong one.""",
+    mend="Correct the name.",
+    failing="hardware: {rocket: {packages: [kmod-batman-adb, batctl-default, iw, wpad-openssl]}}",
+    passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, my-own-tool]}}",
+)
+def package_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    judged: dict[str, str | None] = {}
+    for node in fleet.managed():
+        for written in (*node.hardware.packages, *node.packages):
+            name = written.removeprefix("-")
+            if name not in judged:
+                judged[name] = meant_package(name)
+            meant = judged[name]
+            if meant is not None:
+                hint = f"did you mean {meant}?"
+                yield Finding(packages_path(node, written), "no package of this name is known", meant, name, hint)
+
+
+@fleet_rule(
+    "MC833",
+    Severity.WARNING,
+    "OpenWrt has no such target",
+    why="The ImageBuilder is fetched by its target, and an image's metadata names it: with a slip, neither fits.",
+    mend="Read the target off the device: `ubus call system board`, release.target.",
+    failing="hardware: {rocket: {target: ath97/generic}}",
+    passing="hardware: {rocket: {target: ath79/generic}}",
+)
+def target_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in fleet.hardware.values():
+        target, slash, subtarget = profile.target.partition("/")
+        path = ("hardware", profile.name, "target")
+        if not slash:
+            continue
+        # OpenWrt gets new ones with each release: only what is near to a known one is taken for a slip
+        if target not in TARGETS:
+            _, hint = known(TARGETS, target)
+            if hint:
+                yield Finding(path, "no such target", "a target of OpenWrt", profile.target, hint)
+        elif target in SUBTARGETS and subtarget not in SUBTARGETS[target]:
+            near = get_close_matches(subtarget, sorted(SUBTARGETS[target]), 1)
+            for meant in near:
+                expected = f"{target}/{meant}"
+                yield Finding(path, "no such subtarget", expected, profile.target, f"did you mean {expected}?")
+
+
+@fleet_rule(
+    "MC834",
+    Severity.WARNING,
+    "The target is of another chip than the radio",
+    why="""The radio's path says which chip it is part of. An image for another chip does not boot; forced onto the
+    board, it leaves a device that only a serial cable revives.""",
+    mend="Read both off the device: release.target of `ubus call system board`, `uci get wireless.radio0.path`.",
+    failing="""
+    hardware: {rocket: {target: ramips/mt7621, radios: {radio0: {path: platform/ahb/18100000.wmac}}}}
+    """,
+    passing="""
+    hardware: {rocket: {target: ath79/generic, radios: {radio0: {path: platform/ahb/18100000.wmac}}}}
+    """,
+)
+def target_of_other_chip(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in fleet.hardware.values():
+        target = profile.target.partition("/")[0]
+        for radio in profile.radios:
+            expected = chip_target(radio.path)
+            if expected is not None and target in TARGETS and target != expected:
+                message = f"{radio.name} is at {radio.path}"
+                yield Finding(("hardware", profile.name, "target"), message, f"{expected}/...", profile.target)
+                break

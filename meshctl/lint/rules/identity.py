@@ -12,6 +12,7 @@ from meshctl.diagnostics import Severity
 from meshctl.errors import InputError
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import listed, repeated
+from meshctl.lint.places import is_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Fleet, Node, NodeState
 
@@ -25,12 +26,22 @@ def normal_mac(mac: str) -> str:
     return mac.strip().lower().replace("-", ":")
 
 
-def _collisions(marks: Iterable[tuple[str, Node]], key: str, what: str) -> Iterator[Finding]:
-    """One finding for every later node whose mark an earlier node has."""
-    for mark, nodes in repeated(marks):
-        first, *later = dict.fromkeys(node.name for node in nodes)
-        for name in later:
-            yield Finding(("nodes", name, key), f"{first} has the same {what}", f"a {what} of its own", mark)
+def _collisions(fleet: Fleet, marks: Iterable[tuple[str, tuple[str, ...]]], what: str) -> Iterator[Finding]:
+    """One finding for every node but one that has a mark of another. A mark stands at a path that begins with the node.
+
+    The one without a finding is the first whose mark is not written (a host name that is the node's own name), or
+    else the first of all.
+    """
+    for mark, paths in repeated(marks):
+        by_node: dict[str, tuple[str, ...]] = {}
+        for path in paths:
+            by_node.setdefault(path[1], path)
+        innocent = next(
+            (path for path in by_node.values() if not is_written(fleet, path)), next(iter(by_node.values()))
+        )
+        for path in by_node.values():
+            if path != innocent:
+                yield Finding(path, f"{innocent[1]} has the same {what}", f"a {what} of its own", mark)
 
 
 @fleet_rule(
@@ -43,7 +54,8 @@ def _collisions(marks: Iterable[tuple[str, Node]], key: str, what: str) -> Itera
     passing="nodes: {b01: {hostname: beacon-1}}",
 )
 def hostname_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    yield from _collisions(((node.hostname.lower(), node) for node in fleet.managed()), "hostname", "hostname")
+    marks = ((node.hostname.lower(), ("nodes", node.name, "hostname")) for node in fleet.managed())
+    yield from _collisions(fleet, marks, "hostname")
 
 
 @fleet_rule(
@@ -73,9 +85,10 @@ def hostname_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="nodes: {b99: {address: 10.42.0.99, hostname: other, role: beacon}}",
 )
 def names_by_case(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for lowered, names in repeated((name.lower(), name) for name in fleet.nodes):
-        for name in names[1:]:
-            yield Finding(("nodes", name), f"differs from {names[0]} in capitals only", "another name", lowered)
+    for section, every in (("nodes", fleet.nodes), ("robots", fleet.robots), ("meshes", fleet.meshes)):
+        for lowered, names in repeated((name.lower(), name) for name in every):
+            for name in names[1:]:
+                yield Finding((section, name), f"differs from {names[0]} in capitals only", "another name", lowered)
 
 
 @fleet_rule(
@@ -97,15 +110,17 @@ def names_by_case(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     """,
 )
 def mac_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    yield from _collisions(_macs(fleet), "mac", "MAC address")
+    yield from _collisions(fleet, _macs(fleet), "MAC address")
 
 
-def _macs(fleet: Fleet) -> Iterator[tuple[str, Node]]:
+def _macs(fleet: Fleet) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Every MAC with its place; a device's own and its radio's may be one and the same."""
     for node in fleet.nodes.values():
-        # a device's own MAC and its radio's may be one and the same
-        own = {normal_mac(mac) for mac in (node.mac, *(radio.mac for radio in node.radios)) if mac}
-        for mac in sorted(own):
-            yield mac, node
+        if node.mac:
+            yield normal_mac(node.mac), ("nodes", node.name, "mac")
+        for radio in node.radios:
+            if radio.mac:
+                yield normal_mac(radio.mac), ("nodes", node.name, "radios", radio.name, "mac")
 
 
 @fleet_rule(
@@ -158,7 +173,10 @@ def host_key_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         first, *later = nodes
         for name in later:
             found = f"{key[:24]}...{key[-8:]}"
-            yield Finding(("nodes", name, "host_keys"), f"{first} has the same host key", "a key of its own", found)
+            pinned = [" ".join(text.split()[:2]) for text in fleet.nodes[name].host_keys]
+            element = (str(pinned.index(key)),) if key in pinned else ()
+            path = ("nodes", name, "host_keys", *element)
+            yield Finding(path, f"{first} has the same host key", "a key of its own", found)
 
 
 def _host_keys(fleet: Fleet, context: LintContext) -> Iterator[tuple[str, str]]:
@@ -183,7 +201,8 @@ def _host_keys(fleet: Fleet, context: LintContext) -> Iterator[tuple[str, str]]:
     passing="nodes: {base: {label: BASE}, b01: {label: B1}}",
 )
 def label_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    yield from _collisions(((node.label, node) for node in fleet.managed() if node.label), "label", "label")
+    marks = ((node.label, ("nodes", node.name, "label")) for node in fleet.managed() if node.label)
+    yield from _collisions(fleet, marks, "label")
 
 
 @fleet_rule(
@@ -196,8 +215,8 @@ def label_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="nodes: {base: {serial: A1}, b01: {serial: A2}}",
 )
 def serial_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    marks = ((node.serial, node) for node in fleet.nodes.values() if node.serial)
-    yield from _collisions(marks, "serial", "serial number")
+    marks = ((node.serial, ("nodes", node.name, "serial")) for node in fleet.nodes.values() if node.serial)
+    yield from _collisions(fleet, marks, "serial number")
 
 
 @fleet_rule(

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import grouped
+from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import AntennaKind, Fleet, Mesh, Node, Radio
 from meshctl.regdb import CHANNELS, judge, primary
@@ -59,8 +60,10 @@ def _has_conducted_limit(fleet: Fleet, mesh: Mesh) -> bool:
     )
 
 
-def _at(node: Node, radio: Radio) -> tuple[str, ...]:
-    return ("nodes", node.name, "radios", radio.name, "tx_power_dbm")
+def _at(fleet: Fleet, node: Node, radio: Radio) -> tuple[str, ...]:
+    """Where the drive level comes from: the node's layers, or else the most that the driver offers."""
+    written = ("nodes", node.name, "radios", radio.name, "tx_power_dbm")
+    return first_written(fleet, written, ("hardware", node.hardware.name, "radios", radio.name, "max_drive_dbm"))
 
 
 @fleet_rule(
@@ -94,7 +97,7 @@ def eirp_above_country(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         )
         excess = radio.eirp_dbm - verdict.max_eirp_dbm
         expected = f"at most {_dbm(verdict.max_eirp_dbm)} dBm EIRP (country {country.alpha2}, channel {mesh.channel})"
-        yield Finding(_at(node, radio), f"{_dbm(round(excess, 2))} dB too much", expected, total)
+        yield Finding(_at(fleet, node, radio), f"{_dbm(round(excess, 2))} dB too much", expected, total)
 
 
 @fleet_rule(
@@ -125,7 +128,7 @@ def conducted_above_fcc(fleet: Fleet, _context: LintContext) -> Iterator[Finding
         less = f": 30 less {_dbm(excess_gain)} for an antenna of {_dbm(gain)} dBi" if excess_gain else ""
         allowed = f"at most {_dbm(limit)} dBm conducted (country {fleet.country}{less})"
         total = f"{power_sum(radio)} = {_dbm(radio.conducted_dbm)} dBm"
-        yield Finding(_at(node, radio), f"{_dbm(round(excess, 2))} dB too much", allowed, total)
+        yield Finding(_at(fleet, node, radio), f"{_dbm(round(excess, 2))} dB too much", allowed, total)
 
 
 def _is_limited(fleet: Fleet, mesh: Mesh) -> bool:
@@ -145,7 +148,7 @@ def drive_above_driver(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     for node, radio, _ in _transmitting(fleet):
         if radio.tx_power_dbm > radio.hardware.max_drive_dbm:
             expected = f"at most {radio.hardware.max_drive_dbm} (hardware {node.hardware.name})"
-            yield Finding(_at(node, radio), "the driver offers less", expected, str(radio.tx_power_dbm))
+            yield Finding(_at(fleet, node, radio), "the driver offers less", expected, str(radio.tx_power_dbm))
 
 
 @fleet_rule(
@@ -171,7 +174,7 @@ def amplifier_overdriven(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         if radio.tx_power_dbm <= hardware.max_drive_dbm and driven > hardware.rated_power_dbm + _ROUNDING_DB:
             found = f"{radio.tx_power_dbm} drive + {_dbm(hardware.amplifier_gain_db)} amplifier = {_dbm(driven)} dBm"
             expected = f"at most {_dbm(hardware.rated_power_dbm)} dBm (hardware {node.hardware.name})"
-            yield Finding(_at(node, radio), "more than the box is rated for", expected, found)
+            yield Finding(_at(fleet, node, radio), "more than the box is rated for", expected, found)
 
 
 @fleet_rule(
@@ -270,7 +273,7 @@ def powers_far_apart(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
                 expected = f"at least {_dbm(strong.conducted_dbm - _ASYMMETRY_DB)} dBm conducted"
                 message = f"{strongest.name} in mesh {name} sends with {_dbm(strong.conducted_dbm)} dBm"
                 found = f"{_dbm(radio.conducted_dbm)} dBm"
-                yield Finding(_at(node, radio), message, expected, found)
+                yield Finding(_at(fleet, node, radio), message, expected, found)
 
 
 @fleet_rule(

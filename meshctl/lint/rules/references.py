@@ -8,9 +8,9 @@ from functools import lru_cache
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import listed
+from meshctl.lint.grouping import grouped, listed
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.model import Fleet
+from meshctl.model import Fleet, Role
 
 # comparing a name with more than these takes longer than a person would wait
 _COMPARED = 500
@@ -32,13 +32,12 @@ def _nearest(choices: tuple[str, ...], wrong: str) -> str:
 
 
 def _unknown(fleet: Fleet, path: tuple[str, ...], names: Sequence[str]) -> Iterator[Finding]:
-    """One finding for all of a list's names that no node has."""
-    wrong = [name for name in names if name not in fleet.nodes]
-    if wrong:
+    """One finding for each element of a list that makes names which no node has."""
+    unknown = dict.fromkeys(name for name in names if name not in fleet.nodes)
+    for wrong in grouped((fleet.where(*path, name).position, name) for name in unknown).values():
         _, hint = known(fleet.nodes, wrong[0])
-        yield Finding(
-            path, "no such node" if len(wrong) == 1 else "no such nodes", "names of `nodes`", listed(wrong), hint
-        )
+        message = "no such node" if len(wrong) == 1 else "no such nodes"
+        yield Finding((*path, wrong[0]), message, "names of `nodes`", listed(wrong), hint)
 
 
 @fleet_rule(
@@ -185,7 +184,7 @@ def empty_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def node_without_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
-        if not node.meshes:
+        if not node.meshes and node.role is not Role.BASE:
             yield Finding(("nodes", node.name), "no radio joins a mesh", "at least one", "none")
 
 

@@ -1,4 +1,4 @@
-"""batman-adv: options, intervals, airtime of originator messages, MTU budget (MC501 to MC516)."""
+"""batman-adv: options, intervals, airtime of originator messages, MTU budget (MC501 to MC517)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from dataclasses import replace
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import grouped, listed
+from meshctl.lint.places import first_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Backend, Fleet, Mesh, NodeState
 from meshctl.resolve import MEASURED_HEAL_S, UnreachableTarget, batman_intervals, heal_s, originator_airtime
 
 # batman-adv's header around a full Ethernet frame (openwrt-facts: 1500 + 32)
 _BATMAN_BYTES = 32
+# what batman-adv compares the MTU with, network coding's header included: batadv_max_header_len()
+_BATMAN_WARNS_BYTES = 60
 # IEEE 802.11-2020 9.2.4.7.1: the largest MSDU, less the eight bytes of LLC and SNAP
 _LARGEST_MTU = 2304 - 8
 # IPv4 and UDP around a fragment of udp_mesh, and its own header and tag
@@ -147,14 +150,14 @@ def interval_misses_target(fleet: Fleet, _context: LintContext) -> Iterator[Find
     "Full frames do not fit and may not be split",
     why="""batman-adv puts 32 bytes around each frame. With a smaller MTU on the radio and fragmentation off, small
     messages pass and large ones vanish: ping works, the video does not.""",
-    mend="Set `mtu: 1532` or more, or turn `fragmentation` on.",
+    mend="Set `mtu: 1560` (1532 is the minimum), or turn `fragmentation` on.",
     failing="meshes: {main: {mtu: 1500, batman: {fragmentation: false}}}",
-    passing="meshes: {main: {mtu: 1532, batman: {fragmentation: false}}}",
+    passing="meshes: {main: {mtu: 1560, batman: {fragmentation: false}}}",
 )
 def mtu_without_fragmentation(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in _batman_meshes(fleet):
         if mesh.mtu < mesh.lan_mtu + _BATMAN_BYTES and not mesh.batman.fragmentation:
-            yield _budget(mesh, "large frames vanish")
+            yield _budget(fleet, mesh, "large frames vanish")
 
 
 @fleet_rule(
@@ -162,19 +165,20 @@ def mtu_without_fragmentation(fleet: Fleet, _context: LintContext) -> Iterator[F
     Severity.WARNING,
     "Full frames are split in two",
     why="Every full frame goes over the air as two, at twice the cost and twice the chance of loss.",
-    mend="Set `mtu: 1532` or more.",
+    mend="Remove `mtu` (the default is 1560), or set 1532 at least.",
     failing="meshes: {main: {mtu: 1500}}",
-    passing="meshes: {main: {mtu: 1536}}",
+    passing="meshes: {main: {mtu: 1560}}",
 )
 def mtu_with_fragmentation(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in _batman_meshes(fleet):
         if mesh.mtu < mesh.lan_mtu + _BATMAN_BYTES and mesh.batman.fragmentation:
-            yield _budget(mesh, "full frames are split")
+            yield _budget(fleet, mesh, "full frames are split")
 
 
-def _budget(mesh: Mesh, message: str) -> Finding:
+def _budget(fleet: Fleet, mesh: Mesh, message: str) -> Finding:
     expected = f"at least {mesh.lan_mtu + _BATMAN_BYTES} ({mesh.lan_mtu} LAN + {_BATMAN_BYTES} batman-adv)"
-    return Finding(("meshes", mesh.name, "mtu"), message, expected, str(mesh.mtu))
+    path = first_written(fleet, ("meshes", mesh.name, "mtu"), ("meshes", mesh.name, "lan_mtu"))
+    return Finding(path, message, expected, str(mesh.mtu))
 
 
 @fleet_rule(
@@ -183,7 +187,7 @@ def _budget(mesh: Mesh, message: str) -> Finding:
     "The MTU is larger than a radio can carry",
     why="""An 802.11 frame holds at most 2304 bytes: the kernel refuses the MTU, and netifd does not bring the interface
     up.""",
-    mend="Set `mtu` to 1532 up to 2296.",
+    mend="Remove `mtu` (the default is 1560), or set 1532 to 2296.",
     failing="meshes: {main: {mtu: 4000}}",
     passing="meshes: {main: {mtu: 2000}}",
 )
@@ -212,7 +216,8 @@ def fragment_too_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     if fleet.udp_mesh.fragment_bytes > room:
         message = f"IP would split it: mesh {mesh.name} has a LAN of {mesh.lan_mtu} bytes"
         expected = f"at most {room} ({mesh.lan_mtu} - {_DATAGRAM_BYTES} for IP, UDP and the seal)"
-        yield Finding(("udp_mesh", "fragment_bytes"), message, expected, str(fleet.udp_mesh.fragment_bytes))
+        path = first_written(fleet, ("udp_mesh", "fragment_bytes"), ("meshes", mesh.name, "lan_mtu"))
+        yield Finding(path, message, expected, str(fleet.udp_mesh.fragment_bytes))
 
 
 @fleet_rule(
@@ -388,3 +393,23 @@ def operator_parts_incomplete(fleet: Fleet, _context: LintContext) -> Iterator[F
 )
 def originators_cost(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     yield from _airtime(fleet, _AIRTIME_SHOWN, _AIRTIME_FELT)
+
+
+@fleet_rule(
+    "MC517",
+    Severity.NOTE,
+    "batman-adv warns of the MTU",
+    why="""Full frames fit, but batman-adv also counts the header of network coding: below the LAN's MTU + 60, it logs
+    "The MTU of interface mesh0 is too small" at each activation, and the next operator looks for a fault that is
+    none.""",
+    mend="Remove `mtu`: the default is 1560, and mac80211 radios such as ath9k carry up to 2304.",
+    failing="meshes: {main: {mtu: 1536}}",
+    passing="meshes: {main: {mtu: 1560}}",
+)
+def mtu_warned_of(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for mesh in _batman_meshes(fleet):
+        least = mesh.lan_mtu + _BATMAN_WARNS_BYTES
+        if mesh.lan_mtu + _BATMAN_BYTES <= mesh.mtu < least:
+            path = first_written(fleet, ("meshes", mesh.name, "mtu"), ("meshes", mesh.name, "lan_mtu"))
+            expected = f"at least {least} ({mesh.lan_mtu} LAN + {_BATMAN_WARNS_BYTES})"
+            yield Finding(path, "works, with a warning at each activation", expected, str(mesh.mtu))

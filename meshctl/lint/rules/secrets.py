@@ -1,22 +1,24 @@
-"""Where secrets are and how strong: never in the inventory, never in the repository (MC441 to MC449)."""
+"""Where secrets are and how strong: never in the inventory, never in the repository (MC441 to MC453)."""
 
 from __future__ import annotations
 
-import base64
 import os.path
 import re
 from collections.abc import Hashable, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 from meshctl.diagnostics import Position, Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import repeated
 from meshctl.lint.rule import Example, Finding, fleet_rule, text_rule
-from meshctl.model import Fleet, SecretKind, SecretRef
+from meshctl.model import Fleet, Secret, SecretKind, SecretRef, SshSettings
+from meshctl.render.daemon import key_bytes, key_text
 
 # what udp_mesh takes (udp_mesh/crypto/keys.py)
 _KEY_BYTES = 32
 _SAFE_MODE_MASK = 0o077
+_LEAST_DIFFERENT_BYTES = 16
 _TRANSPORT_KEY = "b4f8e7f0c3a94c21a1d2d9a0f5c36e7722d1b6c8e3f04a5b9c7d8e1f2a3b4c5d"
 
 _MATERIAL = (
@@ -61,12 +63,20 @@ def _secret_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], Path, str]]:
                 pass
     # nodes of a group share one list: judge each file once
     seen: set[str] = set()
-    for node in fleet.nodes.values():
-        for index, file in enumerate(node.ssh.key_files):
+    for place, ssh in logins(fleet):
+        for index, file in enumerate(ssh.key_files):
             if file not in seen and not file.endswith(".pub"):
                 seen.add(file)
-                place = ("nodes", node.name, "ssh", "key_files", str(index))
-                yield place, _path(fleet, file, fleet.base), "the private key"
+                yield (*place, "key_files", str(index)), _path(fleet, file, fleet.base), "the private key"
+
+
+def logins(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SshSettings]]:
+    """How each node and each computer is logged in to, with the place of it."""
+    for node in fleet.nodes.values():
+        yield ("nodes", node.name, "ssh"), node.ssh
+    for robot in fleet.robots.values():
+        if robot.computer is not None:
+            yield ("robots", robot.name, "computer", "ssh"), robot.computer.ssh
 
 
 @text_rule(
@@ -155,26 +165,20 @@ def secret_file_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]
     why="""udp_mesh takes 32 random bytes, as 64 hexadecimal digits or in base64, and refuses to start with anything
     else. A word or a short key would be found by trying: a few seconds of recorded traffic are enough to try
     against.""",
-    mend="Make a new one: `openssl rand -hex 32`.",
+    mend="Make a new one: `udp-mesh keygen FILE` or `openssl rand -hex 32`.",
     failing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": "husky2021"}),
-    passing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": _TRANSPORT_KEY}),
+    # as `udp-mesh keygen` writes it, with the key's id behind it
+    passing=Example(
+        "udp_mesh: {keys: [{file: mode-0600.key}]}", files={"mode-0600.key": f"{_TRANSPORT_KEY}  # 5d3c1a90\n"}
+    ),
 )
 def transport_key_invalid(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for index, ref in enumerate(fleet.udp_mesh.keys):
         secret = context.secret(ref)
-        if secret is not None and not _is_transport_key(secret.reveal().strip()):
+        if secret is not None and key_bytes(key_text(secret)) is None:
             expected = f"{_KEY_BYTES} bytes: {2 * _KEY_BYTES} hexadecimal digits, or base64"
-            found = f"{len(secret.reveal().strip())} characters"
+            found = f"{len(key_text(secret))} characters"
             yield Finding(("udp_mesh", "keys", str(index)), "no key", expected, found)
-
-
-def _is_transport_key(text: str) -> bool:
-    try:
-        if len(text) == 2 * _KEY_BYTES:
-            return len(bytes.fromhex(text)) == _KEY_BYTES
-        return len(base64.b64decode(text, validate=True)) == _KEY_BYTES
-    except ValueError:
-        return False
 
 
 @fleet_rule(
@@ -214,7 +218,7 @@ def secret_shared(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 def _mark(context: LintContext, ref: SecretRef) -> Hashable:
     """What two references to one secret share: its value where that is at hand, else where it is."""
     secret = context.secret(ref)
-    return (ref.kind, ref.where, ref.key) if secret is None else secret
+    return (ref.kind, ref.where, ref.key) if secret is None else Secret(key_text(secret))
 
 
 @fleet_rule(
@@ -248,3 +252,89 @@ def too_many_transport_keys(fleet: Fleet, _context: LintContext) -> Iterator[Fin
     if len(fleet.udp_mesh.keys) > 2:
         found = str(len(fleet.udp_mesh.keys))
         yield Finding(("udp_mesh", "keys", "2"), "never tried", "at most two keys", found)
+
+
+@fleet_rule(
+    "MC450",
+    Severity.ERROR,
+    "A file of secrets lacks the secret",
+    why="""The file is here, and what the inventory looks for in it is not: rendering and provisioning stop at this
+    reference, in the field if not here.""",
+    mend="Correct `key`, or add the entry to the file.",
+    failing=Example(
+        "udp_mesh: {keys: [{file: mode-0600.yaml, key: udp-mesh}]}",
+        files={"mode-0600.yaml": f"udp_mesh: {_TRANSPORT_KEY}\n"},
+    ),
+    passing=Example(
+        "udp_mesh: {keys: [{file: mode-0600.yaml, key: udp_mesh}]}",
+        files={"mode-0600.yaml": f"udp_mesh: {_TRANSPORT_KEY}\n"},
+    ),
+)
+def secret_absent(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for place, ref in secret_refs(fleet):
+        path = _path(fleet, ref.where, ref.base)
+        is_here = ref.kind is not SecretKind.ENV and (
+            context.files.mode(path) is not None or context.files.is_special(path)
+        )
+        problem = context.secret_problem(ref) if is_here else ""
+        if problem:
+            key = "key" if ref.key else ref.kind.value
+            yield Finding(
+                (*place, key), "no secret there", f"a text under `{ref.key}`" if ref.key else "a text", problem
+            )
+
+
+@fleet_rule(
+    "MC451",
+    Severity.WARNING,
+    "The variable of a secret is empty",
+    why="""The variable is set, to nothing: a misspelt name on the right of `export`, or a CI job without access to its
+    secrets. Rendering refuses it like one that is not set.""",
+    mend="Export the secret, or unset the variable where secrets are not needed.",
+    failing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": ""}),
+    passing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": _TRANSPORT_KEY}),
+)
+def variable_empty(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for place, ref in secret_refs(fleet):
+        if ref.kind is SecretKind.ENV and context.secret_problem(ref):
+            yield Finding((*place, "env"), "set, and empty", "the secret", f"{ref.where}=")
+
+
+@fleet_rule(
+    "MC452",
+    Severity.NOTE,
+    "A file with a key is not on this machine",
+    why="""Continuous integration has no keys, and need not. The operator's laptop must have them: without the file,
+    rendering or logging in fails.""",
+    mend="Copy the file to this machine, or correct the path: it is relative to the file that names it.",
+    failing="nodes: {base: {ssh: {key_files: [absent_ed25519]}}}",
+    passing=Example("nodes: {base: {ssh: {key_files: [id_ed25519]}}}", files={"id_ed25519": "a private key"}),
+)
+def key_file_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for place, path, what in _secret_files(fleet):
+        if context.files.mode(path) is None and not context.files.is_special(path):
+            yield Finding(place, f"{what} is not here", "a file", str(path))
+
+
+@fleet_rule(
+    "MC453",
+    Severity.ERROR,
+    "The transport's key can be guessed",
+    why="""32 bytes of zeros, one byte repeated or a count are keys in form only: they are the first ones to be tried,
+    and anyone who finds one can stop every robot.""",
+    mend="Make a new one: `udp-mesh keygen FILE` or `openssl rand -hex 32`.",
+    failing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": "0" * 64}),
+    passing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": _TRANSPORT_KEY}),
+)
+def transport_key_guessable(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for index, ref in enumerate(fleet.udp_mesh.keys):
+        secret = context.secret(ref)
+        raw = None if secret is None else key_bytes(key_text(secret))
+        if raw is not None and _is_pattern(raw):
+            yield Finding(("udp_mesh", "keys", str(index)), "not random", "32 random bytes", "a pattern")
+
+
+def _is_pattern(raw: bytes) -> bool:
+    """Few different bytes (32 random ones have 30, and never below 16), or all of them at one distance."""
+    distances = {(second - first) % 256 for first, second in pairwise(raw)}
+    return len(set(raw)) < _LEAST_DIFFERENT_BYTES or len(distances) == 1

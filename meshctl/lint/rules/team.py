@@ -1,5 +1,5 @@
 """Robots, roles and reach: who rides where, whether every mesh reaches the base, how carefully it is changed
-(MC601 to MC617)."""
+(MC601 to MC619)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import grouped, listed, repeated
+from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, NodeState, Role
 
@@ -85,10 +86,7 @@ def _reached_from_base(fleet: Fleet) -> set[str]:
     why="""Plans order nodes by their distance from the operator, and keep the way to them open until the last. Without
     a base there is no such order.""",
     mend="Give the operator's radio `role: base`.",
-    failing="""
-    nodes: {base: {role: robot}}
-    robots: {base-station: {is_base: false}}
-    """,
+    failing="nodes: {base: {role: robot}}",
     passing="nodes: {base: {role: base}}",
 )
 def no_base(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
@@ -145,16 +143,31 @@ def two_bases(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="robots: {base-station: {nodes: [base]}}",
 )
 def node_of_two_robots(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    # a radio that is mounted on one robot and carried by another belongs to a robot that is brought along, say a UAV
     claims = (
-        (name, (robot.name, key))
+        ((key, name), robot.name)
         for robot in fleet.robots.values()
         for key, names in (("nodes", robot.nodes), ("carries", robot.carries))
         for name in names
     )
-    for name, ((first, _), *others) in repeated(claims):
-        for robot, key in others:
+    for (key, name), (first, *others) in repeated(claims):
+        for robot in others:
             message = f"{name} is claimed by {first} already"
-            yield Finding(("robots", robot, key), message, "one robot for each node", name)
+            yield Finding(("robots", robot, key, name), message, "one robot for each node", name)
+    for robot_name, name in _own_freight(fleet):
+        message = f"{name} is mounted on {robot_name} itself"
+        yield Finding(("robots", robot_name, "carries", name), message, "under `nodes` or under `carries`", name)
+
+
+def _own_freight(fleet: Fleet) -> Iterator[tuple[str, str]]:
+    for robot in fleet.robots.values():
+        mounted = set(robot.nodes)
+        yield from ((robot.name, name) for name in dict.fromkeys(robot.carries) if name in mounted)
+
+
+def _mounted(fleet: Fleet) -> set[str]:
+    """The nodes that some robot has under `nodes`."""
+    return {name for robot in fleet.robots.values() for name in robot.nodes}
 
 
 @fleet_rule(
@@ -182,20 +195,28 @@ def robot_disagrees(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC607",
     Severity.WARNING,
     "A robot carries what is no beacon",
-    why="What a robot carries is dropped. A base radio or another robot's radio in its list is a slip.",
-    mend="List beacons under `carries`, and mounted radios under `nodes`.",
+    why="""What a robot carries is dropped, or flies off: a beacon, or the radio of a robot that is brought along and
+    has an entry of its own. A base radio, or a robot's radio that no robot has under `nodes`, is a slip.""",
+    mend="List beacons and the radios of carried robots under `carries`, and mounted radios under `nodes`.",
     failing="""
     nodes: {extra: {role: robot, address: 10.42.0.60, robot: husky1}}
     robots: {husky1: {carries: [b01, extra]}}
     """,
-    passing="robots: {husky1: {carries: [b01]}}",
+    passing="""
+    nodes: {uav1-radio: {role: robot, state: carried, address: 10.42.0.60}}
+    robots:
+      uav1: {nodes: [uav1-radio], computer: {address: 10.42.0.61/24, ssh: {user: robot}}}
+      husky1: {carries: [b01, uav1-radio]}
+    """,
 )
 def carries_no_beacon(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    mounted = _mounted(fleet)
     for robot in fleet.robots.values():
         for name in robot.carries:
             node = fleet.nodes.get(name)
-            if node is not None and node.role is not Role.BEACON:
-                path = ("robots", robot.name, "carries")
+            is_brought = node is not None and node.role is Role.ROBOT and name in mounted and name not in robot.nodes
+            if node is not None and node.role is not Role.BEACON and not is_brought:
+                path = ("robots", robot.name, "carries", name)
                 yield Finding(path, f"{name} is not dropped", "a node with role beacon", node.role.value)
 
 
@@ -377,3 +398,36 @@ def peer_without_computer(fleet: Fleet, _context: LintContext) -> Iterator[Findi
                 if robot is not None and robot.computer is None and robot.fielded is None:
                     path = ("topics", topic.name, key, str(index))
                     yield Finding(path, f"{name} runs no udp_mesh", "a robot with a computer", name)
+
+
+@fleet_rule(
+    "MC618",
+    Severity.WARNING,
+    "No robot is the base station",
+    why="""udp_mesh runs on computers, and none of them is the operator's: status cannot say who reaches the base, nor
+    preflight whether the emergency stop does.""",
+    mend="Set `is_base: true` at the robot that stands for the operator's computer.",
+    failing="robots: {base-station: {is_base: false}}",
+    passing="robots: {base-station: {is_base: true}}",
+)
+def no_base_station(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    has_computers = any(robot.computer is not None for robot in fleet.robots.values())
+    if has_computers and not any(robot.is_base for robot in fleet.robots.values()):
+        # the one that says `is_base: false`, if any does
+        path = first_written(fleet, *(("robots", name, "is_base") for name in fleet.robots), ("robots",))
+        yield Finding(path, "none is the operator's", "one robot with `is_base: true`", "none")
+
+
+@fleet_rule(
+    "MC619",
+    Severity.ERROR,
+    "The base joins no mesh",
+    why="Every way to the fleet begins at the base. Without a radio in a mesh nothing behind it can be reached.",
+    mend="Name the mesh at one of its radios.",
+    failing="nodes: {base: {radios: {radio0: {mesh: null}}}}",
+    passing="nodes: {base: {radios: {radio0: {mesh: main}}}}",
+)
+def base_without_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        if node.role is Role.BASE and not node.meshes:
+            yield Finding(("nodes", node.name), "no radio joins a mesh", "at least one", "none")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
+from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Mesh, NodeState, Topic, TopicClass
 from meshctl.regdb import width_mhz
@@ -239,9 +240,8 @@ def port_taken(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 def log_port_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     hosts = {str(robot.computer.address.ip) for robot in fleet.robots.values() if robot.computer is not None}
     if fleet.system.log_host in hosts and fleet.system.log_port == fleet.udp_mesh.port:
-        yield Finding(
-            ("system", "log_port"), "the daemon's port on that computer", "another port", str(fleet.system.log_port)
-        )
+        path = first_written(fleet, ("system", "log_port"), ("udp_mesh", "port"))
+        yield Finding(path, "the daemon's port on that computer", "another port", str(fleet.system.log_port))
 
 
 @fleet_rule(
@@ -285,8 +285,9 @@ def metrics_port_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding
 def offline_too_soon(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     settings = fleet.udp_mesh
     if settings.offline_after_s < 3 * settings.heartbeat_s:
+        path = first_written(fleet, ("udp_mesh", "offline_after_s"), ("udp_mesh", "heartbeat_s"))
         expected = f"at least {3 * settings.heartbeat_s:g} s (3 heartbeats)"
-        yield Finding(("udp_mesh", "offline_after_s"), "", expected, f"{settings.offline_after_s:g} s")
+        yield Finding(path, "offline after less than 3 heartbeats", expected, f"{settings.offline_after_s:g} s")
 
 
 @fleet_rule(

@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from meshctl.diagnostics import Diagnostic, Position, Severity
+from meshctl.inventory.visible import Excerpts
 from meshctl.lint import Suppressed
+from meshctl.report.terminal import one_line
 
 # more of a line tells a reader nothing, and a minified file must not fill the screen
 _LONGEST_LINE = 160
@@ -26,24 +28,21 @@ class Findings:
     known: tuple[Diagnostic, ...] = ()
     files: tuple[str, ...] = ()
 
-    def lines(self) -> dict[str, list[str]]:
-        """The lines of the files in which something was found."""
+    def excerpts(self) -> dict[str, Excerpts]:
+        """The files in which something was found, as they may be shown."""
         wanted = {item.position.file for item in self.diagnostics}
-        # as editors and PyYAML count them, not str.splitlines, which also ends lines at form feeds
-        return {file: text.split("\n") for file, text in self.sources.items() if file in wanted}
+        return {file: Excerpts(text) for file, text in self.sources.items() if file in wanted}
 
     def count(self) -> Counter[Severity]:
         """How many findings there are of each severity."""
         return Counter(item.severity for item in self.diagnostics)
 
 
-def shown_line(lines: dict[str, list[str]], position: Position) -> str | None:
-    """The line of a place, None when its text is not known or it is too long to show."""
-    known = lines.get(position.file)
-    if known is None or not 1 <= position.line <= len(known):
-        return None
-    line = known[position.line - 1].rstrip()
-    return line if len(line) <= _LONGEST_LINE else None
+def shown_line(excerpts: Mapping[str, Excerpts], position: Position) -> tuple[str, int] | None:
+    """The line of a place without secrets, and the column in it; None when it is not known or too long to show."""
+    known = excerpts.get(position.file)
+    found = None if known is None else known.line(position.line, position.column)
+    return None if found is None or len(found[0]) > _LONGEST_LINE else found
 
 
 def counted(number: int, noun: str) -> str:
@@ -52,5 +51,5 @@ def counted(number: int, noun: str) -> str:
 
 
 def printable(text: str) -> str:
-    """Text whose control characters, which could move a terminal's cursor, are shown as `?`."""
-    return "".join(letter if letter.isprintable() or letter == "\t" else "?" for letter in text)
+    """Text within a line, with a stand-in for each character that could move a terminal's cursor."""
+    return one_line(text)

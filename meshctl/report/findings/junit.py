@@ -1,10 +1,16 @@
 """Findings as JUnit XML, in the form that GitLab, Jenkins and others read: a suite for each file, a case for each
-finding; a file without findings is one case that passed."""
+finding; a file without findings is one case that passed.
+
+The document is valid by the strict schema (JUnit.xsd of Apache Ant's reports), which allows neither totals at the root
+nor text in a case that passed: a note's words are in its suite's output.
+"""
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable
+from datetime import UTC, datetime
 from xml.etree import ElementTree
 
 from meshctl.diagnostics import Diagnostic, Severity
@@ -14,48 +20,65 @@ from meshctl.report.findings.document import Findings
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
-def junit(findings: Findings) -> str:
-    """An XML document, ending with a line end. Errors and warnings are failures, notes are not."""
-    root = ElementTree.Element("testsuites", name="meshctl lint")
+def junit(findings: Findings, moment: datetime | None = None) -> str:
+    """An XML document, ending with a line end. Errors and warnings are failures, notes are not.
+
+    `moment` is when lint ran; without it $SOURCE_DATE_EPOCH (seconds, for reports that can be reproduced), or now.
+    """
+    stamp = (moment or _now()).strftime("%Y-%m-%dT%H:%M:%S")
+    root = ElementTree.Element("testsuites")
     by_file: dict[str, list[Diagnostic]] = {file: [] for file in findings.files}
     for item in findings.diagnostics:
         by_file.setdefault(item.position.file, []).append(item)
-    failures = 0
-    for file, items in by_file.items():
-        suite = _suite(file, items)
-        failures += _failing(items)
+    for number, (file, items) in enumerate(by_file.items()):
+        suite = _suite(file, items, stamp)
+        suite.set("id", str(number))
         root.append(suite)
-    root.set("tests", str(sum(max(len(items), 1) for items in by_file.values())))
-    root.set("failures", str(failures))
     ElementTree.indent(root)
     body = ElementTree.tostring(root, encoding="unicode")
     return f'<?xml version="1.0" encoding="utf-8"?>\n{body}\n'
 
 
-def _suite(file: str, items: list[Diagnostic]) -> ElementTree.Element:
+def _now() -> datetime:
+    written = os.environ.get("SOURCE_DATE_EPOCH", "")
+    return datetime.fromtimestamp(int(written), UTC) if written.isdecimal() else datetime.now(UTC)
+
+
+def _suite(file: str, items: list[Diagnostic], stamp: str) -> ElementTree.Element:
     suite = ElementTree.Element(
-        "testsuite", name=_clean(file), tests=str(max(len(items), 1)), failures=str(_failing(items)), errors="0"
+        "testsuite",
+        name=_clean(file) or "inventory",
+        package="meshctl.lint",
+        timestamp=stamp,
+        hostname="localhost",
+        tests=str(max(len(items), 1)),
+        failures=str(_failing(items)),
+        errors="0",
+        time="0",
     )
+    ElementTree.SubElement(suite, "properties")
     if not items:
-        ElementTree.SubElement(suite, "testcase", classname=_clean(file), name="lint")
+        ElementTree.SubElement(suite, "testcase", classname=_clean(file), name="lint", time="0")
     for item in items:
         suite.append(_case(file, item))
+    notes = [_words(item) for item in items if item.severity is Severity.NOTE]
+    ElementTree.SubElement(suite, "system-out").text = "\n".join(notes)
+    ElementTree.SubElement(suite, "system-err")
     return suite
 
 
 def _case(file: str, item: Diagnostic) -> ElementTree.Element:
-    name = f"{item.code} {item.path or item.position}"
-    case = ElementTree.Element("testcase", classname=_clean(file), name=_clean(name))
-    if item.position.line:
-        case.set("file", _clean(file))
-        case.set("line", str(item.position.line))
-    words = _clean(f"{item.position}: {item.text} [{item.code}]" + (f"\n{item.hint}" if item.hint else ""))
-    if item.severity is Severity.NOTE:
-        ElementTree.SubElement(case, "system-out").text = words
-    else:
+    # the place tells two findings of one kind apart, and is what CI shows first
+    name = f"{item.code} {item.path} at {item.position}" if item.path else f"{item.code} at {item.position}"
+    case = ElementTree.Element("testcase", classname=_clean(file), name=_clean(name), time="0")
+    if item.severity is not Severity.NOTE:
         failure = ElementTree.SubElement(case, "failure", type=item.severity.value, message=_clean(item.text))
-        failure.text = words
+        failure.text = _words(item)
     return case
+
+
+def _words(item: Diagnostic) -> str:
+    return _clean(f"{item.position}: {item.text} [{item.code}]" + (f"\n{item.hint}" if item.hint else ""))
 
 
 def _failing(items: Iterable[Diagnostic]) -> int:

@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from meshctl.diagnostics import Diagnostic, Severity
+from meshctl.inventory.visible import Excerpts
 from meshctl.report.findings.document import Findings, counted, printable, shown_line
 
 
 def text(findings: Findings) -> str:
     """Plain text without colours, one block for each finding; ends with a line end."""
-    lines = findings.lines()
+    lines = findings.excerpts()
     blocks = ["\n".join(_block(item, lines)) for item in findings.diagnostics]
     return "\n".join([*blocks, _summary(findings)]) + "\n"
 
 
-def _block(item: Diagnostic, lines: dict[str, list[str]]) -> Iterator[str]:
+def _block(item: Diagnostic, lines: Mapping[str, Excerpts]) -> Iterator[str]:
     yield f"{item.position}: {item.severity.value}: {printable(item.text)} [{item.code}]"
-    line = shown_line(lines, item.position)
-    if line:
+    found = shown_line(lines, item.position)
+    if found is not None and found[0]:
+        line, column = found
         number = str(item.position.line)
         yield f"  {number} | {printable(line)}"
-        if item.position.column:
+        if column:
             # a tab before the column keeps its width under the caret
-            before = "".join("\t" if letter == "\t" else " " for letter in line[: item.position.column - 1])
+            before = "".join("\t" if letter == "\t" else " " for letter in line[: column - 1])
             yield f"  {' ' * len(number)} | {before}^"
     if item.hint:
         yield f"  = {printable(item.hint)}"

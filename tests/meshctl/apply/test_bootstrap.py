@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import MappingProxyType
 
 import pytest
 
-from meshctl.apply.bootstrap import find_node, identify
+from meshctl.apply.bootstrap import Arrivals, BenchPlace, Found, find_node, identify, restore_pins
 from meshctl.apply.replace import identity_edits
 from meshctl.device.observation import BoardInfo, Observation
+from meshctl.device.trust import HostKey, TrustStore
 from meshctl.errors import InputError, NodeError
 from meshctl.model import Fleet, NodeState
 from tests.meshctl.plan.support import factory, fleet
@@ -69,3 +71,17 @@ def test_a_spare_hands_over_its_mac_label_and_serial_and_retires() -> None:
     mine, theirs = identity_edits(team.nodes["b01"], spare, device("02:4d:00:00:00:02"))
     assert mine == {"mac": "02:4d:00:00:00:02", "label": "S1"}
     assert theirs == {"state": "retired"}
+
+
+def test_a_device_that_was_refused_leaves_the_pins_of_before(tmp_path: Path) -> None:
+    trust = TrustStore(tmp_path / "known_hosts")
+    old, new = (HostKey("ssh-ed25519", b"\0\0\0\x0bssh-ed25519\0\0\0 " + bytes([number]) * 32) for number in (1, 2))
+    trust.replace("b01", old)
+    for name in ("b01", "b02"):
+        trust.replace(name, new)
+    found = {
+        name: Found(BenchPlace(node=name), fleet().nodes[name], device(), new, pins)
+        for name, pins in (("b01", (old,)), ("b02", ()))
+    }
+    restore_pins(trust, Arrivals(found, ()), ["b01", "b02"])
+    assert (trust.pinned("b01"), trust.pinned("b02")) == ((old,), ())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -16,6 +17,7 @@ from meshctl.device.observation import (
     Originator,
     WirelessLink,
 )
+from meshctl.uci import dump, parse
 from tests.meshctl.plan.support import fleet, running, wanted
 
 BASE = "02:00:00:00:00:01"
@@ -99,3 +101,33 @@ def test_a_node_alone_on_the_bench_need_hear_nobody() -> None:
 def test_the_base_counts_only_if_it_was_reached_before() -> None:
     before = replace(good(), originators=())
     assert expectation(wanted(fleet(), "b01"), before, [BASE]).bases == frozenset()
+
+
+def test_the_base_may_be_reached_by_an_address_that_it_got_during_the_run() -> None:
+    expected = expectation(wanted(fleet(), "b01"), good(), [BASE])
+    moved = "42:00:00:00:00:01"
+    after = replace(good(), originators=(Originator(moved, moved, "mesh0", 200, True, 250),))
+    assert missing(expected, after) == ("it has no way to the base",)
+    assert missing(expected.with_bases(frozenset({moved})), after) == ()
+    assert expectation(wanted(fleet(), "b01"), good()).with_bases(frozenset({moved})).bases == frozenset()
+
+
+@pytest.mark.parametrize(
+    ("encryption", "supplicants", "gaps"),
+    [
+        ("psk2+ccmp", ("global", "mesh0"), ()),
+        ("psk2+ccmp", ("global",), ("mesh0 is not encrypted: wpa_supplicant does not run it",)),
+        ("none", ("global",), ()),
+        # a release, or a lab, that does not say
+        ("psk2+ccmp", None, ()),
+    ],
+)
+def test_an_encrypted_radio_that_joined_in_the_open_has_not_proven_itself(
+    encryption: str, supplicants: tuple[str, ...] | None, gaps: tuple[str, ...]
+) -> None:
+    expected = expectation(wanted(fleet(), "b01"), good(), [BASE])
+    assert expected.wireless is not None
+    text = re.sub("option encryption '.*'", f"option encryption '{encryption}'", dump(expected.wireless))
+    assert f"'{encryption}'" in text
+    sealed = replace(expected, wireless=parse(text, "wireless"))
+    assert missing(sealed, replace(good(), supplicants=supplicants)) == gaps

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import subprocess
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshctl.apply.forget import (
-    EXPECTED_S,
     FIRST_PAUSE_S,
     LONGEST_PAUSE_S,
     MOST_ASKED,
@@ -20,9 +19,10 @@ from meshctl.apply.forget import (
     booted_unforgotten_s,
     by_holder,
     entries_of,
-    forget_script,
+    flush_script,
     neighbours_now,
     next_ask_s,
+    own_entries,
     silent_holders,
     watch_script,
 )
@@ -154,28 +154,65 @@ def test_those_whose_best_way_to_the_base_begins_with_the_node_are_behind_it() -
     assert behind("b02", around, ()) == frozenset()
 
 
-# iw of a holder: `get` tells the age that stands in line N of `ages` at second N, `del` writes down when it was called;
-# the clock is what sleeps
+def test_a_node_watches_its_own_entries_on_the_radios_that_may_restart() -> None:
+    seen = knows("b02", ("mesh0", OTHER), ("mesh1", BASE))
+    assert own_entries("b02", seen, Radios(frozenset({"mesh1"}))) == (Entry("b02", "mesh1", BASE),)
+    assert own_entries("b02", seen, NO_RADIOS) == ()
+
+
+@dataclass(frozen=True)
+class Second:
+    """What iw and batctl of a holder print about its neighbor within one second of its clock."""
+
+    inactive_ms: int
+    connected_s: int
+    echo: str
+
+
+ANSWERED = "20 bytes from 02:00:00:00:01:02 icmp_seq=1 ttl=50 time=1.10 ms"
+LOST = "Reply from host 02:00:00:00:01:02 timed out"
+UNREACHABLE = "From 02:00:00:00:01:02: Destination Host Unreachable (icmp_seq 1)"
+# Tools of a holder: line N of `seconds` is what they print at second N; the clock is what sleeps. `del` writes down
+# when it was called, and the entry is a new one from then on where `renews` is there.
 FAKES = {
     "iw": """now=$(cat "$HERE/now")
 [ $# != 1 ] || printf 'phy#0\\n\\tInterface mesh0\\nphy#1\\n\\tInterface mesh1\\n'
+IFS='|' read -r inactive connected _ <<END
+$(sed -n "${now}p" "$HERE/seconds")
+END
+[ ! -f "$HERE/renewed" ] || connected=0
 case $4 in
-get) sed -n "${now}s/.*/Station $5\\n\\tinactive time:\\t& ms\\n\\tconnected time:\\t& seconds/p" "$HERE/ages" ;;
-del) echo "$now $2 $5" >>"$HERE/deleted"; [ "$5" != unknown ] ;;
+get)
+    [ -n "$inactive" ] || exit 0
+    printf 'Station %s\\n\\tinactive time:\\t%s ms\\n' "$5" "$inactive"
+    printf '\\tconnected time:\\t%s seconds\\n' "$connected"
+    ;;
+del) echo "$now $2 $5" >>"$HERE/deleted"; [ ! -f "$HERE/renews" ] || : >"$HERE/renewed"; [ "$5" != unknown ] ;;
 esac""",
-    "sleep": 'now=$(cat "$HERE/now"); echo $((now + $1)) >"$HERE/now"',
+    "batctl": """echo "$@" >>"$HERE/asked"
+[ ! -f "$HERE/renewed" ] || { echo "20 bytes from x"; exit 0; }
+sed -n "$(cat "$HERE/now")s/.*|//p" "$HERE"/seconds
+""",
+    "sleep": 'now=$(($(cat "$HERE/now") + $1)); echo $now >"$HERE/now"; echo $((1000 + now)).00 1.00 >"$HERE/uptime"',
     "start-stop-daemon": 'while [ "$1" != -- ]; do shift; done; shift; exec sh "$@"',
     "mkdir": ":",
 }
 
 
-def deletions(place: Path, ages: list[int], text: str) -> tuple[str, list[str]]:
-    """What a script prints on a holder whose entry has these ages, second by second, and what it deletes when."""
+def deletions(place: Path, seconds: list[Second], text: str, *, bat: str = "bat0") -> tuple[str, list[str]]:
+    """What a script prints on a holder whose tools print this, second by second, and what it deletes when."""
     for name, body in FAKES.items():
         (place / name).write_text(f"#!/bin/sh\n{body}\n", encoding="ascii")
         (place / name).chmod(0o755)
     (place / "now").write_text("1")
-    (place / "ages").write_text("".join(f"{age}\n" for age in ages))
+    (place / "uptime").write_text("1001.00 1.00")
+    (place / "seconds").write_text("".join(f"{one.inactive_ms}|{one.connected_s}|{one.echo}\n" for one in seconds))
+    if bat:
+        (place / "net" / "mesh0").mkdir(parents=True, exist_ok=True)
+        (place / "net" / bat).mkdir(exist_ok=True)
+        (place / "net" / "mesh0" / "master").unlink(missing_ok=True)
+        (place / "net" / "mesh0" / "master").symlink_to(f"../{bat}")
+    text = text.replace("/sys/class/net", str(place / "net")).replace("/proc/uptime", str(place / "uptime"))
     environ = {"PATH": f"{place}:/usr/bin:/bin", "HERE": str(place)}
     done = subprocess.run(
         ("sh", "-c", text), env=environ, cwd=place, capture_output=True, text=True, check=False, timeout=120
@@ -185,46 +222,96 @@ def deletions(place: Path, ages: list[int], text: str) -> tuple[str, list[str]]:
     return done.stdout, log.read_text().splitlines() if log.exists() else []
 
 
-def watched(place: Path, ages: list[int]) -> list[int]:
-    """When an entry with these ages is deleted by who watches it."""
-    _, deleted = deletions(place, [0, *ages], watch_script("b02", [Entry("b01", "mesh0", MAC)], for_s=len(ages)))
-    assert all(line.endswith(f" mesh0 {MAC}") for line in deleted)
-    return [int(line.split()[0]) - 1 for line in deleted]
+def flushed(place: Path, now: Second, *, bat: str = "bat0", has_restarted: bool = False) -> str:
+    """What a holder with such an entry prints when it is asked for entries of at least 11.2 s."""
+    text = flush_script([Entry("b01", "mesh0", MAC)], older_than_s=11.2, has_restarted=has_restarted)
+    printed, deleted = deletions(place, [now], text, bat=bat)
+    assert deleted == ([f"1 mesh0 {MAC}"] if printed == f"gone {MAC}\n" else [])
+    return printed
 
 
-def test_who_watches_forgets_a_radio_in_the_short_silence_in_which_it_starts_anew_and_not_again(tmp_path: Path) -> None:
-    ages = [100] * 4 + [1200] + [50] * 60
-    assert watched(tmp_path, ages) == [5]
-
-
-def test_a_radio_that_was_too_quick_to_be_missed_is_forgotten_once_when_it_must_have_started(tmp_path: Path) -> None:
-    assert watched(tmp_path, [100] * 65) == [EXPECTED_S]
-
-
-def test_later_only_a_long_silence_counts(tmp_path: Path) -> None:
-    ages = [100] * 4 + [1200] + [50] * 30 + [2900] + [50] * 10 + [3100] + [50] * 5
-    assert watched(tmp_path, ages) == [5, 47]
-
-
-@pytest.mark.parametrize(("age_s", "is_deleted"), [(11, False), (12, True)])
-def test_only_an_entry_from_before_is_forgotten_when_asked_and_printed(
-    tmp_path: Path, age_s: int, is_deleted: bool
+@pytest.mark.parametrize(
+    ("now", "printed"),
+    [
+        (Second(100, 50, LOST), f"gone {MAC}\n"),
+        # it never restarted, or the neighbor has removed the stale entry already
+        (Second(100, 50, ANSWERED), f"answers {MAC}\n"),
+        # newer than the change
+        (Second(100, 11, LOST), ""),
+        # off the air: there is nothing to hear, so nothing is known to be dropped
+        (Second(5000, 50, LOST), ""),
+        # batman-adv has no path, which proves nothing about the link; nor does a tool without `ping`
+        (Second(100, 50, UNREACHABLE), f"unknown {MAC}\n"),
+        (Second(100, 50, "Error - unknown command: ping"), f"unknown {MAC}\n"),
+    ],
+)
+def test_an_entry_is_removed_only_where_its_neighbor_is_heard_and_does_not_answer(
+    tmp_path: Path, now: Second, printed: str
 ) -> None:
-    text = forget_script([Entry("b01", "mesh0", MAC), Entry("b01", "mesh0", "unknown")], older_than_s=11.2)
-    printed, deleted = deletions(tmp_path, [age_s], text)
-    # one that is not there cannot be removed
-    assert printed == (f"gone {MAC}\nkept unknown\n" if is_deleted else "")
-    assert deleted == ([f"1 mesh0 {MAC}", "1 mesh0 unknown"] if is_deleted else [])
+    assert flushed(tmp_path, now) == printed
 
 
-def test_who_did_not_tell_looks_on_all_of_its_interfaces(tmp_path: Path) -> None:
-    printed, deleted = deletions(tmp_path, [50], forget_script([Entry("b01", "", MAC)], older_than_s=11.2))
+def test_one_lost_echo_request_is_not_enough(tmp_path: Path) -> None:
+    flushed(tmp_path, Second(100, 50, LOST))
+    assert (tmp_path / "asked").read_text() == f"meshif bat0 ping -c 3 -t 1 {MAC}\n"
+
+
+def test_the_batctl_of_19_07_is_asked_in_its_own_words(tmp_path: Path) -> None:
+    assert flushed(tmp_path, Second(100, 50, "Error - unknown command: meshif")) == f"unknown {MAC}\n"
+    asked = (tmp_path / "asked").read_text().splitlines()
+    assert asked == [f"{word} bat0 ping -c 3 -t 1 {MAC}" for word in ("meshif", "-m")]
+
+
+def test_where_there_is_no_batman_adv_only_a_restart_that_was_seen_counts(tmp_path: Path) -> None:
+    assert flushed(tmp_path, Second(100, 50, LOST), bat="") == f"unknown {MAC}\n"
+    assert flushed(tmp_path, Second(100, 50, ANSWERED), bat="", has_restarted=True) == f"gone {MAC}\n"
+
+
+def test_an_entry_that_cannot_be_removed_is_reported(tmp_path: Path) -> None:
+    text = flush_script([Entry("b01", "mesh0", "unknown")], older_than_s=1)
+    assert deletions(tmp_path, [Second(100, 50, LOST)], text)[0] == "kept unknown\n"
+
+
+def test_a_holder_that_did_not_answer_before_looks_on_all_of_its_interfaces(tmp_path: Path) -> None:
+    text = flush_script([Entry("b01", "", MAC)], older_than_s=11.2)
+    printed, deleted = deletions(tmp_path, [Second(100, 50, LOST)], text)
     assert printed == f"gone {MAC}\n" * 2
     assert deleted == [f"1 mesh0 {MAC}", f"1 mesh1 {MAC}"]
 
 
+def watched(place: Path, seconds: list[Second]) -> list[int]:
+    """When an entry like this is deleted by a holder that watches it."""
+    text = watch_script("b02", [Entry("b01", "mesh0", MAC)], for_s=len(seconds))
+    _, deleted = deletions(place, [*seconds, *seconds[-1:]], text)
+    assert all(line.endswith(f" mesh0 {MAC}") for line in deleted)
+    return [int(line.split()[0]) for line in deleted]
+
+
+def test_a_radio_that_keeps_answering_is_never_removed(tmp_path: Path) -> None:
+    assert watched(tmp_path, [Second(100, 500 + at, ANSWERED) for at in range(65)]) == []
+
+
+def test_a_radio_that_is_silent_and_then_heard_without_answering_is_removed_once(tmp_path: Path) -> None:
+    (tmp_path / "renews").touch()
+    away = [Second(1000 * at, 500 + at, LOST) for at in range(2, 20)]
+    back = [Second(100, 520 + at, LOST) for at in range(40)]
+    (when,) = watched(tmp_path, [Second(100, 500, ANSWERED), *away, *back])
+    assert len(away) < when <= len(away) + 5
+
+
+def test_a_radio_that_comes_back_as_a_new_station_is_left_alone(tmp_path: Path) -> None:
+    away = [Second(1000 * at, 500 + at, LOST) for at in range(2, 20)]
+    assert watched(tmp_path, [*away, *(Second(100, at, LOST) for at in range(40))]) == []
+
+
+def test_where_removing_it_does_not_help_it_is_not_repeated_for_ever(tmp_path: Path) -> None:
+    assert len(watched(tmp_path, [Second(100, 500 + at, LOST) for at in range(60)])) == 3
+
+
 def test_no_word_of_a_node_is_run(tmp_path: Path) -> None:
     evil = [Entry("b01", "mesh0; touch x", "$(touch x)"), Entry("b01", "'; touch x; '", "`touch x`")]
-    deletions(tmp_path, [5000] * 4, forget_script(evil, older_than_s=1) + watch_script("b02", evil, for_s=2))
-    assert len((tmp_path / "deleted").read_text().splitlines()) >= 4
-    assert not (tmp_path / "x").exists()
+    for has_restarted in (False, True):
+        text = flush_script(evil, older_than_s=1, has_restarted=has_restarted) + watch_script("b02", evil, for_s=4)
+        deletions(tmp_path, [Second(100, 5000, LOST)] * 9, text)
+        assert (tmp_path / "deleted").exists()
+        assert not (tmp_path / "x").exists()

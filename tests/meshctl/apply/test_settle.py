@@ -97,3 +97,10 @@ def test_that_it_let_nobody_in_counts_more_than_what_was_missing_afterwards() ->
     late = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
     told = why_it_went_back(late, ("its LAN is down",), "b01: let root in with none of: key a")
     assert told == "it was not confirmed in time: b01: let root in with none of: key a"
+
+
+def test_that_it_could_not_be_reached_is_said_where_nothing_was_missing_afterwards() -> None:
+    late = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
+    told = why_it_went_back(late, (), "", "cannot connect: Connection refused")
+    assert told == "it was not confirmed in time: it could not be reached: cannot connect: Connection refused"
+    assert "reached" not in why_it_went_back(late, ("its LAN is down",), "", "cannot connect")

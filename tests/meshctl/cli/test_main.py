@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 
 from meshctl import __version__
 from meshctl.cli import main as root
@@ -57,6 +60,30 @@ def test_each_command_has_help_with_an_example(name: str) -> None:
     done = run(name, "--help", COLUMNS="200", TERM="dumb")
     assert done.returncode == 0, done.stderr
     assert COMMANDS[name].attribute == "app" or f"meshctl {name}" in done.stdout.split("Usage:", 1)[1].split("\n", 1)[1]
+
+
+# these read no inventory: they make one, describe the format, show the journal, or act on a running virtual fleet
+_IN_THE_LAB = "down status shell break mend plug unplug image link move ground mission"
+WITHOUT_INVENTORY = {"init", "schema", "history", *(f"lab {name}" for name in _IN_THE_LAB.split())}
+
+
+def _leaves(command: Any, words: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
+    inner_commands = getattr(command, "commands", None)
+    if inner_commands is not None:
+        for name, inner in inner_commands.items():
+            yield from _leaves(inner, (*words, name))
+    else:
+        yield " ".join(words), command
+
+
+def test_every_command_that_reads_an_inventory_takes_it_as_an_option() -> None:
+    options: dict[str, set[str]] = {}
+    for name in COMMANDS:
+        group: Any = typer.main.get_command(root.build(name))
+        for words, command in _leaves(group.commands[name], (name,)):
+            options[words] = {option for parameter in command.params for option in parameter.opts}
+    lacking = {words for words, found in options.items() if not {"--inventory", "-i"} <= found}
+    assert lacking == WITHOUT_INVENTORY
 
 
 def test_completion_offers_the_commands(tmp_path: Path) -> None:

@@ -181,6 +181,7 @@ def test_diff_names_each_change_and_needs_no_key(
     assert ran.code == 1
     change = "  /etc/config/wireless\n    ~ wireless.radio0.channel: '6' -> '11'\n"
     assert ran.out == f"base:\n{change}b01:\n{change}b02:\n{change}b03: removed\n"
+    assert run("diff", inventory, "-i", other) == ran
     report = json.loads(run("diff", inventory, other, "--json").out)
     assert [(item["node"], item["change"]) for item in report["nodes"]] == [
         ("base", "changed"),

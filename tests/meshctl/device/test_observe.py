@@ -206,7 +206,7 @@ def test_the_script_runs_on_the_real_ash_and_tells_what_is_there(connection: Ssh
     assert len(seen.authorized_keys) == 1
     assert seen.mesh is None
     assert seen.change is not None
-    assert (seen.change.state, seen.change.version) == ("idle", "4")
+    assert (seen.change.state, seen.change.version) == ("idle", "5")
     assert seen.root_in_ram is False
     secret, large, nowhere, init = (seen.files[path] for path in paths)
     assert secret is not None
@@ -305,3 +305,11 @@ def test_a_root_in_memory_is_told_from_one_in_flash() -> None:
     ram = "/dev/root /rom squashfs ro 0 0\noverlayfs:/tmp/root / overlay rw,noatime 0 0\n"
     assert system.parse_root(ram)
     assert not system.parse_root(ram.replace("overlayfs:/tmp/root", "overlayfs:/overlay"))
+
+
+def test_a_node_without_a_package_manager_has_one_note_that_says_so() -> None:
+    sections = split_sections((RECORDED / "24.10" / "mesh" / "observe.out").read_bytes(), "NONCE")
+    without = {**sections, "package_tool": Section(b"", 127), "packages": Section(b"", 127)}
+    seen = interpret(without, asked_at_s=1785311990.0, answered_at_s=1785311994.0)
+    assert seen.notes == ("no package manager: neither apk nor opkg was found",)
+    assert (seen.package_tool, seen.packages) == (None, None)

@@ -23,6 +23,7 @@ from meshctl.device.errors import (
     HostKeyChanged,
     HostKeyUnknown,
     IncompatibleServer,
+    OutputTooLarge,
     Timeout,
     Unreachable,
 )
@@ -121,6 +122,17 @@ def test_a_command_whose_input_nobody_takes_is_stopped_by_its_deadline(connectio
 def test_a_command_killed_on_the_node_is_told_from_one_that_failed(connection: SshConnection) -> None:
     with pytest.raises(ChannelClosed):
         connection.run("kill -9 $$")
+    assert connection.run("echo still here").stdout == "still here\n"
+
+
+def test_output_that_does_not_fit_is_the_command_s_failure_and_not_the_node_s_silence(
+    connection: SshConnection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("meshctl.device.ssh.MAX_OUTPUT_BYTES", 1 << 20)
+    with pytest.raises(OutputTooLarge, match="printed more than 1 MiB") as caught:
+        connection.run("head -c 3000000 /dev/zero")
+    assert "| tail" in caught.value.hint
+    assert not isinstance(caught.value, Unreachable)
     assert connection.run("echo still here").stdout == "still here\n"
 
 

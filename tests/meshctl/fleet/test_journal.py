@@ -230,3 +230,45 @@ def test_a_journal_that_cannot_be_written_is_not_called_damaged(path: Path) -> N
     with pytest.raises(MeshctlError, match="cannot open the journal") as told:
         Journal(path)
     assert "XDG_STATE_HOME" in told.value.hint
+
+
+def test_a_lab_and_the_real_fleet_of_the_same_name_share_nothing(path: Path) -> None:
+    with Journal(path) as field, Journal(path, lab="/lab") as lab:
+        practised = lab.begin("provision", fleet="f", inventory="/lab/inventory", nodes=("a",))
+        with practised.step("a", "apply"):
+            pass
+        practised.finish_node(Outcome("a", Result.UNCERTAIN))
+        practised.remember("f", "a", {"macs": "02:4d:00:00:00:01"}, 1.0)
+        lab.remember("f", "b", {"version": "virtual"}, 1.0)
+        field.remember("f", "b", {"version": "real"}, 2.0)
+        assert field.left("f") == {}
+        assert field.lost_sight_of("f") == {}
+        assert {node: dict(last.facts) for node, last in field.last_known("f").items()} == {"b": {"version": "real"}}
+        assert lab.left("f") == {practised.id: ("a",)}
+        assert set(lab.lost_sight_of("f")) == {"a"}
+        assert lab.last_known("f")["b"].facts == {"version": "virtual"}
+        assert [(run.fleet, run.lab) for run in field.runs()] == [("f", "/lab")], "a journal without a lab lists all"
+        assert (field.runs(fleet="f"), len(lab.runs(fleet="f"))) == ((), 1)
+        record = lab.run(practised.id)
+        assert record is not None
+        assert (record.fleet, record.lab) == ("f", "/lab")
+
+
+def test_runs_that_an_earlier_version_kept_under_the_real_fleet_s_name_go_to_their_lab(path: Path) -> None:
+    def lab_of(inventory: str) -> str:
+        return "/lab" if inventory == "/lab/inventory" else ""
+
+    with Journal(path) as field, Journal(path, lab="/lab") as lab:
+        virtual = field.begin("provision", fleet="f", inventory="/lab/inventory", nodes=("a",))
+        only_virtual = field.begin("provision", fleet="practice", inventory="/lab/inventory", nodes=("a",))
+        real = field.begin("provision", fleet="f", inventory="/fleets/f", nodes=("a",))
+        field.remember("f", "a", {"version": "x"}, 1.0)
+        field.remember("practice", "a", {"version": "x"}, 1.0)
+        for fleet in ("f", "practice"):
+            field.separate(fleet, lab_of)
+            field.separate(fleet, lab_of)
+        assert [run.id for run in field.runs(fleet="f")] == [real.id]
+        assert [run.id for run in lab.runs(fleet="f")] == [virtual.id]
+        assert [run.id for run in lab.runs(fleet="practice")] == [only_virtual.id]
+        assert set(field.last_known("f")) == {"a"}, "their origin is unknown: they stay"
+        assert (field.last_known("practice"), set(lab.last_known("practice"))) == ({}, {"a"})

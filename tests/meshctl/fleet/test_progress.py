@@ -6,6 +6,7 @@ import io
 import json
 import threading
 
+import pytest
 from rich.console import Console
 
 from meshctl.fleet import Event, EventKind, Outcome, Result
@@ -84,3 +85,52 @@ def test_a_reader_that_is_gone_ends_the_lines_and_no_work() -> None:
             for event in EVENTS:
                 progress(event)
         assert out.getvalue() == ""
+
+
+STOPPING = "stopping: finishing the nodes in work, taking up no more (again to leave at once)"
+
+
+def test_the_state_of_stopping_stands_in_the_live_lines_with_what_is_finished() -> None:
+    screen = io.StringIO()
+    console = Console(file=screen, force_terminal=True, width=100, height=30)
+    with Aside(LiveProgress(console, 3)) as progress:
+        progress(EVENTS[0])
+        progress(Event(EventKind.STARTED, "b02", 1.0))
+        progress.stopping(STOPPING)
+        progress(EVENTS[-1])
+        progress(Event(EventKind.STEP, "b02", 2.0, "confirm"))
+    shown = screen.getvalue()
+    assert STOPPING in shown, "and stays when the live lines are gone"
+    assert "STOPPING: finishing b01, b02; no other node is begun" in shown
+    assert "STOPPING: finishing b02; no other node is begun" in shown
+
+
+def test_the_second_request_replaces_the_first_ones_state() -> None:
+    screen = io.StringIO()
+    console = Console(file=screen, force_terminal=True, width=100, height=30)
+    with LiveProgress(console, 1) as progress:
+        progress(EVENTS[0])
+        progress.stopping(STOPPING)
+        progress.stopping("leaving: what is armed on a node goes back by itself")
+    assert "LEAVING: finishing b01" in screen.getvalue()
+
+
+def test_more_nodes_than_lines_leave_room_for_the_totals_and_the_state_of_stopping() -> None:
+    screen = io.StringIO()
+    console = Console(file=screen, force_terminal=True, width=100, height=12)
+    with LiveProgress(console, 40) as progress:
+        for number in range(40):
+            progress(Event(EventKind.STARTED, f"b{number:02}", 1.0))
+        progress.stopping(STOPPING)
+    assert "... and 34 more in work" in screen.getvalue()
+    last = screen.getvalue().rpartition("... and 34 more in work")[2]
+    assert "0/40 nodes" in last
+    assert "STOPPING: finishing b00, b01, b02, b03 ...; no other node is begun" in last
+
+
+def test_logs_and_scripts_are_told_on_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
+    for kind in (PlainProgress, JsonProgress):
+        out = io.StringIO()
+        with kind(out) as progress:
+            progress.stopping(STOPPING)
+        assert (out.getvalue(), capsys.readouterr().err) == ("", f"{STOPPING}\n")

@@ -11,7 +11,7 @@ from meshctl.inventory import include, source
 from meshctl.inventory.codes import MAX_DIAGNOSTICS, MEANINGS
 from meshctl.inventory.compose import MAX_DEPTH, MAX_VALUES
 from meshctl.inventory.documents import InventoryDocument
-from meshctl.inventory.ranges import MAX_NAMES
+from meshctl.inventory.ranges import MAX_NAMES, expand
 from meshctl.model import NodeState
 from tests.meshctl.inventory.inventories import HEAD, SHIPPED, load_text
 
@@ -25,6 +25,13 @@ def _examples() -> list[str]:
 def test_every_code_stands_in_the_table() -> None:
     rows = dict(re.findall(r"^\| (INV\d{3}) \| (.*) \|$", _TEXT, re.MULTILINE))
     assert rows == MEANINGS
+
+
+def test_each_range_of_the_table_makes_what_it_says() -> None:
+    rows = re.findall(r"^\| `([^`]*\[[^`]*)` \| (.*) \|$", _TEXT, re.MULTILINE)
+    assert len(rows) == 4
+    for pattern, made in rows:
+        assert ", ".join(f"`{name}`" for name in expand(pattern)) == made
 
 
 def test_every_section_and_state_is_named() -> None:

@@ -47,6 +47,20 @@ def test_the_examples_satisfy_it(validator: Draft202012Validator) -> None:
     assert list(validator.iter_errors(starter)) == []
 
 
+def test_an_included_file_satisfies_it_by_itself(validator: Draft202012Validator) -> None:
+    topics = yaml.safe_load((SHIPPED / "subt-final" / "topics.yaml").read_text())
+    assert "meshctl" not in topics
+    assert list(validator.iter_errors(topics)) == []
+    assert list(validator.iter_errors({**topics, "tpoics": {}})) != []
+
+
+@pytest.mark.parametrize("key", ["fleet", "country"])
+def test_the_first_file_must_say_what_a_fleet_must_have(key: str, validator: Draft202012Validator) -> None:
+    document = _example()
+    del document[key]
+    assert list(validator.iter_errors(document)) != []
+
+
 @pytest.mark.parametrize(
     ("path", "value"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from ipaddress import IPv4Interface
 from pathlib import Path
 
@@ -164,13 +165,33 @@ def test_includes_add_sections_and_entries_and_keep_their_own_directory(tmp_path
 
 
 def test_an_include_below_home_follows_the_given_environment(tmp_path: Path) -> None:
-    home = tmp_path / "home"
+    home, inventory = tmp_path / "home", tmp_path / "fleet"
     home.mkdir()
+    inventory.mkdir()
     (home / "t.yaml").write_text("topics: {chat: {priority: 4}}\n")
-    (tmp_path / "fleet.yaml").write_text(HEAD + "include: [~/t.yaml]\n")
-    loaded = load(tmp_path, environ={"HOME": str(home)})
+    (inventory / "fleet.yaml").write_text(HEAD + "include: [~/t.yaml]\n")
+    loaded = load(inventory, environ={"HOME": str(home), "MESHCTL_INCLUDE_PATH": str(home)})
     assert loaded.fleet is not None
-    assert load(tmp_path).diagnostics[0].code == "INV010"
+    refused = load(inventory, environ={"HOME": str(home)}).diagnostics[0]
+    assert refused.code == "INV010"
+    assert refused.hint == "move it there, or allow its directory: export MESHCTL_INCLUDE_PATH=DIR"
+    assert load(inventory).diagnostics[0].code == "INV010"
+
+
+def test_an_include_outside_the_tree_a_link_there_and_a_pipe_are_refused_unread(tmp_path: Path) -> None:
+    inventory = tmp_path / "fleet"
+    inventory.mkdir()
+    (tmp_path / "token.yaml").write_text("HUNTER2: secret\n")
+    (inventory / "link.yaml").symlink_to(tmp_path / "token.yaml")
+    os.mkfifo(inventory / "pipe.yaml")
+    for name in ("../token.yaml", "link.yaml", "pipe.yaml", "/dev/zero", str(tmp_path / "token.yaml")):
+        (inventory / "fleet.yaml").write_text(HEAD + f"include: [{name}]\n")
+        (found,) = load(inventory).diagnostics
+        assert (found.code, found.position.file) == ("INV010", str(inventory / "fleet.yaml")), name
+        assert "HUNTER2" not in str(found)
+    (tmp_path / ".git").mkdir()
+    (inventory / "fleet.yaml").write_text(HEAD + "include: [../token.yaml]\n")
+    assert load(inventory).diagnostics[0].code == "INV020", "in the same work tree it is read"
 
 
 def test_aliases_share_values_and_a_byte_order_mark_and_crlf_are_read(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -22,6 +23,9 @@ from meshctl.lab.spec import LinkSpec
 from meshctl.lab.state import Power
 from tests.meshctl.lab.conftest import answers, in_mesh
 from tests.waiting import until
+
+# a station that is heard sends several times a second
+HEARD_MS = 2000
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
 
@@ -50,8 +54,10 @@ def mac_of(fleet: VirtualFleet, name: str) -> str:
 
 
 def signals(fleet: VirtualFleet, name: str) -> list[int]:
+    """The signals of the stations that a node hears now; an entry outlasts its station by a minute."""
     dump = fleet.node(name).exec("iw dev mesh0 station dump").stdout
-    return [int(line.split()[1]) for line in dump.splitlines() if line.strip().startswith("signal: ")]
+    found = re.findall(r"inactive time:\s*(\d+) ms.*?signal:\s*(-?\d+)", dump, re.DOTALL)
+    return [int(signal) for inactive_ms, signal in found if int(inactive_ms) < HEARD_MS]
 
 
 def lab(fleet: VirtualFleet, *words: str, status: int = 0) -> str:

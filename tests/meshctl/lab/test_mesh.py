@@ -128,13 +128,14 @@ def test_the_same_release_encrypts_only_with_a_full_supplicant(mesh: VirtualFlee
     near = mesh.node("near")
     near.exec("opkg remove wpad-openssl").check("remove")
     near.exec("uci set wireless.mesh0.encryption=psk2+ccmp; uci set wireless.mesh0.key=secret-123; uci commit; wifi")
-    assert near.exec("iw dev mesh0 link").stdout == "Not connected.\n"
+    until(lambda: near.exec("iw dev mesh0 link").stdout == "Not connected.\n", "the radio")
 
 
 def test_25_12_joins_open_when_asked_to_encrypt(fleet: VirtualFleet) -> None:
     new = fleet.node("new")
     new.exec(MESH.format(address="10.42.9.9", channel=6)).check("configure")
     new.exec("uci set wireless.mesh0.encryption=psk2+ccmp; uci set wireless.mesh0.key=secret-123; uci commit; wifi")
+    asked = "grep -q 'key=secret-123' /tmp/run/netifd/radios && iw dev mesh0 link"
+    until(lambda: new.exec(asked).stdout.startswith("Joined IBSS"), "the cell")
     info = json.loads(new.exec('ubus call iwinfo info \'{"device":"mesh0"}\'').stdout)
     assert info["encryption"]["enabled"] is False
-    assert new.exec("iw dev mesh0 link").stdout.startswith("Joined IBSS")

@@ -15,7 +15,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -25,9 +25,12 @@ from meshctl.lab.copybook import prepare
 from meshctl.lab.fleet import VirtualNode
 from meshctl.lab.real import control
 from meshctl.lab.real.fleet import RealFleet
+from meshctl.lab.spec import FleetSpec
 from meshctl.lab.twin import spec_of
+from meshctl.topology import with_alternates
 from tests import waiting
 from tests.conftest import TRIED_AGAIN
+from tests.meshctl.fleet_report import report
 
 INVENTORY = Path(__file__).with_name("inventory")
 SETUP = Path(__file__).parents[3] / "scripts" / "setup-lab"
@@ -36,6 +39,8 @@ START_S = 900.0
 # a run of meshctl over several hops, each login of which is emulated, that ends with a window of ten minutes
 COMMAND_S = 900.0
 _TRIES = 3
+# six emulated nodes that started at once took up to 200 s on two processors with twenty other programs at work
+WAIT_S = 600.0
 NODES = ("base", "b01", "b02", "husky-front", "husky-rear")
 
 
@@ -187,8 +192,8 @@ class Lab:
         return found
 
     def names(self) -> dict[str, str]:
-        """The MAC address of each node's radio -> its name."""
-        return {radio.mac: node.name for node in self.fleet.spec.nodes for radio in node.radios}
+        """The MAC addresses of each node's radio, the board's and its alternates -> its name."""
+        return with_alternates({radio.mac: node.name for node in self.fleet.spec.nodes for radio in node.radios})
 
     def settle(self) -> None:
         """Wait until every node is up and the base's batman-adv has a route to every other one."""
@@ -209,6 +214,7 @@ class Lab:
             for mac, owner in names.items():
                 text = text.replace(mac, owner)
             told.append(f"--- {name}\n{text}")
+        told.append("--- switches and computers\n" + control.run(self.fleet.directory, _LANS).stdout)
         return "\n".join(told)
 
 
@@ -219,6 +225,7 @@ batctl meshif bat0 originators -H
 batctl meshif bat0 transglobal -H
 batctl meshif bat0 gwl -H 2>/dev/null
 batctl meshif bat0 claimtable -H 2>/dev/null
+batctl meshif bat0 backbonetable -H 2>/dev/null
 for dev in $(iw dev | sed -n 's/^.*Interface //p'); do
     iw dev $dev station dump | grep -E 'Station|time:|bytes|packets|failed'
 done
@@ -228,9 +235,19 @@ uptime
 """
 
 
+_LANS = """
+bridge fdb show | grep -v permanent
+for space in $(ip netns list | cut -d ' ' -f 1); do
+    echo "$space"
+    ip -n "$space" neigh
+    ip -n "$space" -s link show dev eth0
+done
+"""
+
+
 def until(condition: Callable[[], bool], what: str) -> None:
     """`waiting.until`, as long and as seldom as befits machines that QEMU emulates."""
-    waiting.until(condition, what, wait_s=180.0, look_s=0.2)
+    waiting.until(condition, what, wait_s=WAIT_S, look_s=0.2)
 
 
 @contextmanager
@@ -241,7 +258,7 @@ def fielded(kind: type[L], inventory: Path, place: Path, *, before: Callable[[L]
     set_up_host()
     for turn in ("lab", "again"):
         copy = prepare(inventory, place / turn)
-        fleet = RealFleet(spec_of(copy.fleet, links=copy.links), place / turn)
+        fleet = RealFleet(_quick(spec_of(copy.fleet, links=copy.links)), place / turn)
         try:
             fleet.up(wait_s=START_S)
             made = kind(fleet, copy.inventory, place / f"state-{turn}")
@@ -250,14 +267,21 @@ def fielded(kind: type[L], inventory: Path, place: Path, *, before: Callable[[L]
             try:
                 made.take_in()
             except AssertionError as error:
+                # here, because the fleet is down when the fixture has failed
+                error.add_note(report(fleet, str(error)))
                 if turn == "again":
                     raise
-                _tried_again.append(str(error))
+                _tried_again.append("\n".join((str(error), *error.__notes__)))
                 continue
             yield made
             return
         finally:
             fleet.down()
+
+
+def _quick(spec: FleetSpec) -> FleetSpec:
+    """With one kind of host key: to make an RSA key takes an emulated node three to five seconds of a processor."""
+    return replace(spec, nodes=tuple(replace(node, host_key_types=("ed25519",)) for node in spec.nodes))
 
 
 # why a machine was made once more, until a test's report can carry it

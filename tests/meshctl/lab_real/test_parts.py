@@ -175,12 +175,13 @@ config wifi-iface 'mesh0'
 
 
 def planned(run: Path, config: str) -> list[list[str]]:
-    """What the stand-in for netifd wants of the kernel, as lines of fields."""
-    run.mkdir()
+    """What the stand-in for netifd wants of the kernel, as lines of fields; of one directory, one after the other."""
+    run.mkdir(exist_ok=True)
     awk = rom.STAND_INS / "lab" / "netifd.awk"
     variables = {
         "mode": "up", "series": "23.05", "radios": "radio0,platform/ahb/18100000.wmac,2g,02:4d:00:00:00:10,27",
         "ports": "eth0", "lan_mac": "02:4d:00:00:00:00", "batman": "1", "ibss_rsn": "", "now": "5", "run": str(run),
+        "phase": "2",
     }  # fmt: skip
     words = [word for name, value in variables.items() for word in ("-v", f"{name}={value}")]
     busybox = rom.find_program("busybox", "busybox-static")
@@ -188,25 +189,39 @@ def planned(run: Path, config: str) -> list[list[str]]:
         (busybox, "awk", *words, "-f", awk, "-f", REAL_ROOT / "lab" / "netifd_kernel.awk"),
         input=config, text=True, check=True, timeout=60,
     )  # fmt: skip
+    (run / "radios.new").replace(run / "radios")
     return [line.split("\t") for line in (run / "kernel.new").read_text().splitlines()]
 
 
 def test_the_files_become_the_kernels_devices_in_the_order_of_making(tmp_path: Path) -> None:
     plan = planned(tmp_path / "run", CONFIG.format(channel=6))
     assert [line[:2] for line in plan] == [
-        ["soft", "bat0"], ["radio", "mesh0"], ["bridge", "br-lan"], ["port", "br-lan"], ["port", "br-lan"],
-        ["hard", "mesh0"], ["addr", "br-lan"],
+        ["soft", "bat0"], ["radio", "mesh0"], ["tune", "mesh0"], ["bridge", "br-lan"], ["port", "br-lan"],
+        ["port", "br-lan"], ["hard", "mesh0"], ["addr", "br-lan"],
     ]  # fmt: skip
     assert plan[0][2:] == ["BATMAN_V", "orig_interval=500"]
     assert plan[1][2:9] == ["0", "adhoc", "2437", "HT20", "a team", "02:ca:fe:00:00:01", "12000"]
-    assert plan[5][2:4] == ["bat0", "1536"]
-    assert plan[6][2] == "10.42.0.11/24"
+    assert plan[2][2:5] == ["0", "24", "-"]
+    assert plan[6][2:4] == ["bat0", "1536"]
+    assert plan[7][2] == "10.42.0.11/24"
 
 
 def test_another_channel_makes_the_radio_and_what_hangs_on_it_anew_and_nothing_else(tmp_path: Path) -> None:
-    before = planned(tmp_path / "before", CONFIG.format(channel=6))
-    after = planned(tmp_path / "after", CONFIG.format(channel=11))
-    assert [line[:2] for line in after if line not in before] == [["radio", "mesh0"], ["hard", "mesh0"]]
+    before = planned(tmp_path / "run", CONFIG.format(channel=6))
+    assert planned(tmp_path / "run", CONFIG.format(channel=6)) == before
+    after = planned(tmp_path / "run", CONFIG.format(channel=11))
+    changed = [line for line in after if line not in before]
+    assert [line[:2] for line in changed] == [["radio", "mesh0"], ["tune", "mesh0"], ["hard", "mesh0"]]
+    # another number of making, and the other address, because the old interface still stands when it is chosen
+    assert [(line[9], line[10]) for line in (before[1], changed[0])] == [
+        ("21", "02:4d:00:00:00:10"), ("22", "42:4d:00:00:00:10"),
+    ]  # fmt: skip
+
+
+def test_another_power_is_set_in_place(tmp_path: Path) -> None:
+    before = planned(tmp_path / "run", CONFIG.format(channel=6))
+    after = planned(tmp_path / "run", CONFIG.format(channel=6).replace("txpower '24'", "txpower '10'"))
+    assert [line[:5] for line in after if line not in before] == [["tune", "mesh0", "0", "10", "-"]]
 
 
 @pytest.mark.parametrize("script", sorted(path.name for path in (REAL_ROOT / "lab").iterdir() if path.is_file()))

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+import yaml
 
 from meshctl.cli.main import main
 from meshctl.lint.example import BASE, ENVIRONMENT
@@ -19,6 +20,7 @@ def _secrets(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name, value in ENVIRONMENT.items():
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("MESHCTL_INVENTORY", raising=False)
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "0")
     monkeypatch.chdir(tmp_path)
 
 
@@ -72,6 +74,14 @@ def test_the_default_is_the_variable_and_then_the_directory(monkeypatch: pytest.
     assert _lint() == 1
 
 
+def test_the_inventory_is_named_as_for_every_other_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert _lint("-i", _file("faulty.yaml", _FAULTY)) == 1
+    capsys.readouterr()
+    assert _lint("--inventory", "faulty.yaml", _file("clean.yaml", BASE), "--format", "json") == 1
+    document = json.loads(capsys.readouterr().out)
+    assert document["summary"]["files"] == ["clean.yaml", "faulty.yaml"]
+
+
 def test_severities_below_the_threshold_do_not_count() -> None:
     note = _file("note.yaml", BASE.replace("    mac: 00:15:6d:00:00:01\n", ""))
     assert _lint(note) == 0
@@ -88,6 +98,47 @@ def test_rules_are_chosen_by_the_start_of_their_codes(capsys: pytest.CaptureFixt
     suppressed = _FAULTY.rstrip() + "  # meshctl: ignore MC614, MC615 -- bench\n"
     # a rule that did not run leaves its comments alone
     assert _lint(_file("suppressed.yaml", suppressed), "--select", "MC614,MC002") == 0
+
+
+def test_the_loaders_codes_are_selected_like_the_rules(capsys: pytest.CaptureFixture[str]) -> None:
+    broken = _file("wrong.yaml", BASE.replace("channel: 6", "channel: six").replace("country:", "contry:"))
+    assert _lint(broken, "--select", "INV020") == 1
+    out = capsys.readouterr().out
+    assert "[INV020]" in out
+    assert "[INV021]" not in out
+    assert _lint(_file("faulty.yaml", _FAULTY), "--select", "INV") == 0
+    # the rules did not run on what does not load, so that is said beside them
+    wrong = _file("type.yaml", BASE.replace("channel: 6", "channel: six"))
+    assert _lint(wrong, "--select", "INV020") == 0
+    assert _lint(wrong, "--select", "MC3,INV020") == 1
+    assert "[INV021]" in capsys.readouterr().out
+    assert _lint(broken, "--select", "MC3") == 1
+    assert "[INV021]" in capsys.readouterr().out
+    assert _lint(broken, "--ignore", "INV020") == 2
+    assert "INV020 cannot be left out" in capsys.readouterr().err
+
+
+def test_changed_files_are_checked_with_the_inventories_they_are_part_of(capsys: pytest.CaptureFixture[str]) -> None:
+    for folder, text in (("one", _FAULTY), ("two/deep", BASE)):
+        Path(folder, "topics").mkdir(parents=True)
+        _file(f"{folder}/fleet.yaml", text)
+        _file(f"{folder}/topics/all.yaml", "topics: {}")
+    _file("workflow.yaml", "on: push")
+    files = ["one/topics/all.yaml", "one/fleet.yaml", "two/deep/topics/all.yaml", "workflow.yaml"]
+    assert _lint("--files", *files, "--format", "json") == 1
+    summary = json.loads(capsys.readouterr().out)["summary"]
+    assert (summary["files"], summary["warning"]) == (["one/fleet.yaml", "two/deep/fleet.yaml"], 2)
+    assert _lint("--files", "workflow.yaml") == 0
+    assert _lint("--files") == 0
+
+
+def test_the_pre_commit_hook_needs_no_arguments(capsys: pytest.CaptureFixture[str]) -> None:
+    (hook,) = yaml.safe_load((Path(__file__).parents[3] / ".pre-commit-hooks.yaml").read_text(encoding="utf-8"))
+    program, command, *options = hook["entry"].split()
+    assert (program, command, hook.get("pass_filenames", True)) == ("meshctl", "lint", True)
+    Path("inventory").mkdir()
+    assert _lint(*options, _file("inventory/fleet.yaml", _FAULTY), _file("other.yml", "a: b")) == 1
+    assert "2 warnings in 1 file" in capsys.readouterr().out
 
 
 def test_several_inventories_are_reported_together(capsys: pytest.CaptureFixture[str]) -> None:

@@ -80,7 +80,7 @@ meshes: {main: {backend: meshmerize, operator_parts:
 @pytest.mark.parametrize(
     "fragment",
     [
-        "hardware: {rocket: {firmware: {image: PATH, usign_key: PATH}}}",
+        "hardware: {rocket: {firmware: {image: PATH, revision: r1, usign_key: PATH}}}",
         "hardware: {rocket: {package_files: [PATH]}}",
         "udp_mesh: {keys: [{file: PATH}]}",
         "udp_mesh: {keys: [{age: PATH, identity: PATH}]}",
@@ -91,4 +91,4 @@ meshes: {main: {backend: meshmerize, operator_parts:
 def test_a_path_that_leads_nowhere_is_a_finding_or_nothing(fragment: str, path: str, tmp_path: Path) -> None:
     example = Example(fragment.replace("PATH", path))
     codes = {item.code for item in examine(write(example, tmp_path), _REGDB, environment(example)).diagnostics}
-    assert codes <= {"MC444", "MC801", "MC804", "MC808", "MC809", "MC811", "MC901"}
+    assert codes <= {"MC444", "MC450", "MC452", "MC801", "MC804", "MC808", "MC809", "MC811", "MC901"}

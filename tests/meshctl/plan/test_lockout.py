@@ -5,10 +5,13 @@ from __future__ import annotations
 import base64
 from dataclasses import replace
 
+import pytest
+
 from meshctl.device.connection import OwnKey
 from meshctl.model import Release
 from meshctl.plan import Verdict, Wanted
-from meshctl.plan.lockout import AUTHORIZED_KEYS, lockout
+from meshctl.plan.lockout import AUTHORIZED_KEYS, lockout, server_lockout
+from meshctl.uci import parse
 from tests.meshctl.plan.support import factory, fleet, planned, running, wanted
 
 TEAM = fleet()
@@ -68,3 +71,44 @@ def test_a_line_that_is_no_key_is_told_as_one() -> None:
     refused = lockout(want.node, {AUTHORIZED_KEYS: b"ssh-rsa AAAA! x\n"}, ())
     assert refused is not None
     assert "it gets the keys one that cannot be read" in refused.reason
+
+
+NETWORK = """\
+config interface 'loopback'
+	option proto 'static'
+
+config interface 'lan'
+	option proto 'static'
+
+config interface 'wan'
+	option proto 'dhcp'
+"""
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ("", ""),
+        ("\toption Interface 'lan'\n", ""),
+        ("\toption enable '0'\n", "its dropbear is off"),
+        ("\toption enable 'off'\n", "its dropbear is off"),
+        ("\toption Interface 'nosuch'\n", "dropbear would wait for Interface nosuch"),
+        # a network that is there, whose address may never come
+        ("\toption Interface 'wan'\n", "dropbear would wait for Interface wan"),
+        ("\toption DirectInterface 'nosuch'\n", "dropbear would wait for DirectInterface nosuch"),
+    ],
+)
+def test_a_dropbear_that_would_not_listen_after_a_boot_is_refused(options: str, reason: str) -> None:
+    packages = {
+        "network": parse(NETWORK, "network"),
+        "dropbear": parse(f"config dropbear 'main'\n\toption Port '22'\n{options}", "dropbear"),
+    }
+    found = server_lockout(packages)
+    assert (found is not None) == bool(reason)
+    assert found is None or reason in found.reason
+    assert found is None or "extra_uci" in found.hint
+
+
+def test_one_server_that_listens_is_enough() -> None:
+    text = "config dropbear 'main'\n\toption enable '1'\n\nconfig dropbear 'other'\n\toption Interface 'nosuch'\n"
+    assert server_lockout({"network": parse(NETWORK, "network"), "dropbear": parse(text, "dropbear")}) is None

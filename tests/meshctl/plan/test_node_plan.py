@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from meshctl.device.observation import BoardInfo, ChangeStatus, ReleaseInfo
-from meshctl.model import Release
 from meshctl.plan import Cut, Verdict, node_plan
 from meshctl.plan.masking import Fingerprints
 from meshctl.uci import Section
@@ -141,23 +140,6 @@ def test_a_fingerprint_depends_on_the_files_and_the_salt_and_not_on_order() -> N
     assert one.of({"a": "1", "b": "2"}) != one.of({"a": "12", "b": ""})
     assert one.of({"a": "1"}) != Fingerprints(b"pepper").of({"a": "1"})
     assert one.of({"a": "key x"}, ["x"]) != one.of({"a": "key y"}, ["y"])
-
-
-def test_an_ad_hoc_cell_on_25_12_is_planned_with_a_word_of_caution() -> None:
-    team = fleet()
-    new = replace(team.nodes["b01"], release=Release.V25_12)
-    stock = factory(team, "b01")
-    seen = replace(
-        stock,
-        release=ReleaseInfo("OpenWrt", "25.12.0", "r1", "ath79/generic"),
-        packages={**(stock.packages or {}), "wifi-scripts": "1"},
-    )
-    plan = node_plan(replace(wanted(team, "b01"), node=new), seen, FINGERPRINTS)
-    assert plan.notes == (
-        "some 25.12 builds join no ad-hoc cell with a multicast rate (MC334): if this is one, "
-        "the node goes back by itself",
-    )
-    assert planned(team, "b01", factory(team, "b01")).notes == ()
 
 
 def test_a_node_without_the_radios_own_scripts_is_planned_with_a_word_of_caution() -> None:

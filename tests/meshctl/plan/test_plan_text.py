@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
-from meshctl.plan import Plan, fleet_plan
+import pytest
+
+from meshctl.plan import Cut, Effect, FileChange, NodePlan, Plan, Stage, StageKind, Verdict, fleet_plan
 from meshctl.report.plan_text import plan_lines, question
+from meshctl.report.settings import settings
 from tests.meshctl.plan.support import PASS_PHRASE, fleet, graph, plans, running
 
 LINE = graph("base-b01", "b01-b02")
 
 
-def read(plan: Plan, *, with_diffs: bool = True) -> str:
-    return "\n".join(line.text for line in plan_lines(plan, with_diffs=with_diffs))
+def read(plan: Plan, *, with_diffs: bool = True, width: int | None = None, order: Iterable[str] = ()) -> str:
+    return "\n".join(line.text for line in plan_lines(plan, with_diffs=with_diffs, width=width, order=order))
 
 
 def another_host_name() -> Plan:
@@ -20,7 +24,7 @@ def another_host_name() -> Plan:
     for name in ("b01", "b02"):
         old = seen[name].uci
         assert old is not None
-        seen[name] = replace(seen[name], uci={**old, "wireless": old["wireless"].replace("27", "20")})
+        seen[name] = replace(seen[name], uci={**old, "wireless": old["wireless"].replace("'100'", "'200'")})
     return fleet_plan(fleet(), plans(fleet(), seen), LINE, now_s=0.0)
 
 
@@ -33,10 +37,12 @@ def test_it_begins_with_the_totals_and_gives_every_stage_its_reason() -> None:
 
 def test_it_tells_what_is_cut_and_shows_masked_differences() -> None:
     text = read(another_host_name())
-    assert "b01  cuts its mesh links" in text
-    assert "-\toption txpower '20'" in text
+    assert "2 nodes  each cuts its mesh links\n  b01, b02\n" in text
+    assert "-\toption beacon_int '200'" in text
     assert PASS_PHRASE not in text
-    assert "txpower" not in read(another_host_name(), with_diffs=False)
+    brief = read(another_host_name(), with_diffs=False)
+    assert "  changed   etc/config/wireless: beacon_int 200 -> 100\n" in brief
+    assert "option" not in brief
 
 
 def test_a_refusal_stands_at_its_end_with_its_remedy() -> None:
@@ -53,3 +59,81 @@ def test_the_question_counts_what_is_dangerous() -> None:
     new = fleet(channel=11)
     everybody = plans(new, {name: running(fleet(), name) for name in new.nodes})
     assert question(fleet_plan(new, everybody, LINE, now_s=0.0)) == "Change 6 nodes (6 change cell together)?"
+
+
+HEAD = "--- a/etc/config/wireless\n+++ b/etc/config/wireless\n@@ -1,9 +1,9 @@\n"
+CHANNEL = FileChange(
+    "etc/config/wireless",
+    "changed",
+    HEAD + " config wifi-device 'radio0'\n-\toption channel '149'\n+\toption channel '157'\n"
+    "-\toption txpower '27'\n+\toption txpower '25'\n \toption htmode 'HT20'\n",
+)
+
+
+def large() -> Plan:
+    """Fourteen alike, of which one is at another place of its file, one other, one refused, one away."""
+    moved = replace(CHANNEL, diff=CHANNEL.diff.replace("@@ -1,9 +1,9 @@", "@@ -4,9 +4,9 @@").replace("HT20", "VHT80"))
+    effects = (Effect("network", Cut.MESH, "wireless changes"),)
+    names = [f"b{number:02}" for number in range(13)]
+    nodes = {
+        name: NodePlan(
+            name, Verdict.CHANGE, files=(moved if name == "b07" else CHANNEL,), effects=effects, splits=("channel",)
+        )
+        for name in reversed(names)
+    }
+    nodes["odd"] = NodePlan("odd", Verdict.CHANGE, files=(FileChange("etc/banner", "added", HEAD + "+hi\n"),))
+    nodes["uav1-radio"] = NodePlan("uav1-radio", Verdict.REFUSED, reason="no port eth0.1 (it has eth0)")
+    nodes["gone"] = NodePlan("gone", Verdict.AWAY, reason="did not answer")
+    stage = Stage(StageKind.SWITCH, (*names, "odd"), "mesh main changes its cell", mesh="main")
+    return Plan("team", 0.0, "b00", nodes, stages=(stage,))
+
+
+ORDER = (*(f"b{number:02}" for number in range(13)), "uav1-radio", "gone", "odd")
+
+
+@pytest.mark.parametrize("with_diffs", [True, False])
+def test_nodes_to_which_the_same_happens_are_one_block_in_the_inventory_s_order(with_diffs: bool) -> None:
+    text = read(large(), with_diffs=with_diffs, order=ORDER)
+    assert "13 nodes  each cuts its mesh links\n  b00, b01, b02, b03," in text
+    assert "  changed   etc/config/wireless: radio0: channel 149 -> 157, txpower 27 -> 25\n" in text
+    assert text.count("etc/config/wireless: ") == 1
+    assert text.index("13 nodes") < text.index("uav1-radio  refused") < text.index("odd  cuts")
+
+
+def test_the_last_lines_repeat_the_totals_and_who_is_left_out_and_why() -> None:
+    assert read(large(), order=ORDER).splitlines()[-3:] == [
+        "14 to change, 1 away, 1 refused",
+        "  refused: uav1-radio, no port eth0.1 (it has eth0)",
+        "  away: gone, did not answer",
+    ]
+
+
+def test_a_switch_tells_each_member_s_reason() -> None:
+    text = read(large(), order=ORDER)
+    assert ", b11, b12: channel\n" in text
+    assert "odd: changes with its mesh\n" in text
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 120])
+def test_no_line_but_a_diff_s_is_wider_than_the_terminal(width: int) -> None:
+    lines = list(plan_lines(large(), width=width, order=ORDER))
+    assert max(len(line.text) for line in lines if not line.is_diff) <= width
+    joined = " ".join(" ".join(line.text.split()) for line in lines)
+    assert ", ".join(ORDER[:13]) in joined, "and nothing is lost"
+
+
+def test_settings_are_named_with_their_section_and_both_values() -> None:
+    diff = (
+        " config interface 'lan'\n-\tlist ports 'eth0'\n-\tlist ports 'eth1'\n+\tlist ports 'eth0'\n"
+        "+\toption mtu '1532'\n"
+        "@@ -9,4 +9,2 @@\n-\toption proto 'none'\n+config device 'br'\n+\toption type 'bridge'\n"
+    )
+    assert settings(FileChange("etc/config/network", "changed", HEAD + diff)) == (
+        "br: new section",
+        "lan: ports eth0 eth1 -> eth0",
+        "proto removed (was none)",
+        "lan: mtu set to 1532",
+    )
+    assert settings(FileChange("etc/x", "changed", "mode 0644 -> 0600\n")) == ("mode 0644 -> 0600",)
+    assert settings(FileChange("etc/x", "added", HEAD + "+a\n")) == ()
+    assert settings(FileChange("etc/x", "changed", HEAD + "-a\n+b\n")) == ("2 lines",)

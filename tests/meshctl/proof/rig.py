@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from meshctl.inventory import load_fleet
 from meshctl.lab.fleet import VirtualFleet
 from meshctl.lab.spec import MESH_PACKAGES, FleetSpec, LinkSpec, Medium, NodeSpec
-from meshctl.model import Secret, SecretRef
+from meshctl.model import Release, Secret, SecretRef
 from meshctl.render import DeviceFacts, render_node
 from meshctl.uci import parse
 
@@ -44,7 +44,7 @@ hardware:
     board: compex,wpj344-16m
     profile: compex_wpj344-16m
     target: ath79/generic
-    release: "23.05"
+    release: "{release}"
     lan_ports: [eth0]
     confirm_window_s: {window_s}
     radios:
@@ -96,7 +96,8 @@ class Rig:
 
     directory: Path
     count: int
-    window_s: int = 10
+    # a reload alone takes 3 s, and more on a busy machine
+    window_s: int = 40
     parallel: int = 8
     # further lines of the hardware profile, by inventory
     firmware: Mapping[str, str] = field(default_factory=dict)
@@ -104,6 +105,7 @@ class Rig:
     packages: tuple[str, ...] = MESH_PACKAGES
     # whether meshctl is told of the virtual fleet; without, it goes by addresses and cables as in the field
     is_told_of_lab: bool = True
+    release: Release = Release.V23_05
     fleet: VirtualFleet = field(init=False)
     # which of the inventories a and b the nodes run
     current: str = "a"
@@ -129,12 +131,14 @@ class Rig:
                 channel=SPLIT_CHANNELS[number] if variant == "split" else 6,
                 distance=1000 + number,
                 penalty=30 + number,
+                release=self.release.value,
             )
             self.inventory(variant).write_text(text, encoding="utf-8")
         names = ["base", *self.names]
         nodes = tuple(
             NodeSpec(
                 name,
+                release=self.release,
                 medium=Medium.BASE if name == "base" else Medium.BENCH,
                 host_key_types=("ed25519",),
                 packages=self.packages,
@@ -142,9 +146,9 @@ class Rig:
             for name in names
         )
         links = tuple(LinkSpec("base", name) for name in self.names)
-        self.fleet = VirtualFleet(FleetSpec("proof", nodes, links), self.directory / "lab").up(
-            wait_s=60.0 + 5.0 * self.count
-        )
+        # nodes boot within a second: those around them still know their radios
+        spec = FleetSpec("proof", nodes, links, quick_boot=True)
+        self.fleet = VirtualFleet(spec, self.directory / "lab").up(wait_s=60.0 + 5.0 * self.count)
         return self
 
     def __exit__(

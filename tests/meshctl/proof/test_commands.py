@@ -77,4 +77,6 @@ def test_a_command_runs_on_all_nodes_and_a_failure_is_told(rig: Rig) -> None:
 def test_the_journal_tells_every_run_with_its_steps(rig: Rig) -> None:
     first = json.loads(rig.meshctl("history", "", "1", "--json").out)
     assert (first["command"], {outcome["result"] for outcome in first["outcomes"]}) == ("bootstrap", {"done"})
-    assert [step["step"] for step in first["steps"] if step["node"] == "n001"] == ["stage", "arm", "apply", "prove"]
+    steps = [step["step"] for step in first["steps"] if step["node"] == "n001"]
+    # where a machine is slow enough for the node to seem silent, its neighbors are asked meanwhile
+    assert [step for step in steps if not step.startswith("neighbours ")] == ["stage", "arm", "apply", "prove"]

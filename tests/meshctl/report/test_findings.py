@@ -2,6 +2,7 @@
 
 import json
 import re
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -27,7 +28,7 @@ _CHANNEL = Diagnostic(
 )
 _UNREADABLE = Diagnostic("INV001", Severity.ERROR, Position("absent.yaml"), "cannot be read: No such file")
 _NOTE = Diagnostic("MC408", Severity.NOTE, Position("inventory/fleet.yaml", 3, 1), "anyone in reach can join")
-_SOURCES = {"inventory/fleet.yaml": "meshes:\n  main: {\tchannel: 13}\nlast: 1\n"}
+_SOURCES = {"inventory/fleet.yaml": "meshes:\n  main: {\tchannel: 13}\nmeshctl: 1\n"}
 _FINDINGS = Findings(
     (_CHANNEL, _NOTE),
     _SOURCES,
@@ -46,7 +47,7 @@ def test_text_shows_the_line_with_a_caret_the_remedy_and_a_summary() -> None:
         "    |          \t         ^\n"
         "  = Choose a channel that the country allows.\n"
         "inventory/fleet.yaml:3:1: note: anyone in reach can join [MC408]\n"
-        "  3 | last: 1\n"
+        "  3 | meshctl: 1\n"
         "    | ^\n"
         "1 error, 1 note in 1 file (1 suppressed, 1 in the baseline)\n"
     )
@@ -146,16 +147,50 @@ def test_sarif_names_files_relative_to_the_working_directory_or_absolutely(
 
 def test_junit_counts_errors_and_warnings_as_failures() -> None:
     root = ElementTree.fromstring(junit(_FINDINGS).encode())
-    assert (root.tag, root.get("tests"), root.get("failures")) == ("testsuites", "2", "1")
     (suite,) = root
     assert (suite.get("name"), suite.get("tests"), suite.get("failures")) == ("inventory/fleet.yaml", "2", "1")
-    failed, noted = suite
+    failed, noted = suite.iter("testcase")
     failure = failed.find("failure")
     assert failure is not None
     assert failure.get("type") == "error"
     assert "expected one of 1-11" in (failure.text or "")
-    assert failed.get("line") == "2"
+    assert "inventory/fleet.yaml:2" in failed.get("name", "")
     assert noted.find("failure") is None
+    assert _NOTE.code in (suite.findtext("system-out") or "")
+
+
+# by the strict schema, JUnit.xsd of Apache Ant: an element's attributes, and its children in their order
+_STRICT = {
+    "testsuites": (set(), ["testsuite"]),
+    "testsuite": (
+        {"name", "package", "id", "timestamp", "hostname", "tests", "failures", "errors", "time"},
+        ["properties", "testcase", "system-out", "system-err"],
+    ),
+    "properties": (set(), []),
+    "testcase": ({"name", "classname", "time"}, ["failure"]),
+    "failure": ({"type", "message"}, []),
+    "system-out": (set(), []),
+    "system-err": (set(), []),
+}
+
+
+@pytest.mark.parametrize("findings", [_FINDINGS, _NOTHING, Findings((_NOTE,))])
+def test_junit_is_valid_by_the_strict_schema(findings: Findings) -> None:
+    root = ElementTree.fromstring(junit(findings, datetime(2026, 1, 2, 3, 4, 5)).encode())
+    assert root.tag == "testsuites"
+    for element in root.iter():
+        attributes, children = _STRICT[element.tag]
+        assert set(element.attrib) == attributes
+        ranks = [children.index(child.tag) for child in element]
+        assert ranks == sorted(ranks)
+    for number, suite in enumerate(root):
+        assert (suite.get("id"), suite.get("timestamp")) == (str(number), "2026-01-02T03:04:05")
+        assert [child.tag for child in suite if child.tag != "testcase"] == ["properties", "system-out", "system-err"]
+
+
+def test_junit_names_the_moment_that_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    assert 'timestamp="1970-01-02T00:00:00"' in junit(_NOTHING)
 
 
 def test_junit_has_a_passed_case_for_a_clean_file() -> None:

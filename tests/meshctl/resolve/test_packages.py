@@ -60,3 +60,14 @@ def test_older_releases_are_not_offered_mbedtls() -> None:
     assert need is not None
     assert not any("mbedtls" in name for name in need.any_of)
     assert "ad-hoc" in need.reason
+
+
+@pytest.mark.parametrize("release", list(Release))
+def test_only_a_supplicant_with_a_tls_library_joins_an_encrypted_802_11s_mesh(release: Release) -> None:
+    ad_hoc = supplicant_need(fleets.mesh(encryption=Encryption.PSK2), release)
+    mesh = supplicant_need(fleets.mesh(mode=MeshMode.MESH, encryption=Encryption.SAE), release)
+    assert ad_hoc is not None
+    assert mesh is not None
+    assert "wpad" in ad_hoc.any_of
+    assert "wpad" not in mesh.any_of
+    assert set(mesh.any_of) == set(ad_hoc.any_of) - {"wpad"}

@@ -136,7 +136,24 @@ def test_robots_that_were_not_asked_are_told_and_not_judged(fleet: Fleet) -> Non
     )
     found = {check.name: check for check in preflight(fleet, status)}
     assert stopped(found) == []
-    assert found["robots"].reason == "not checked: not asked"
+    assert (found["robots"].reason, found["robots"].is_checked) == ("not asked", False)
+    shown = preflight_text(found.values()).splitlines()
+    assert shown[-1] == "GO (radios only)"
+    assert [line for line in shown if line.startswith("?    ")] == ["?      robots         not asked"]
+    written = preflight_json(found.values())
+    assert (written["go"], written["verdict"]) == (True, "GO (radios only)")
+    assert [check["check"] for check in written["checks"] if not check["checked"]] == ["robots"]
+
+
+def test_an_unmeasured_path_is_neither_go_nor_no_go(fleet: Fleet) -> None:
+    unmeasured = {name: seen(name, {}) for name in HEALTHY}
+    status = status_of(fleet, unmeasured, known=KNOWN)
+    status = replace(
+        status, nodes=tuple(replace(node, quality=None, alarms=(), neighbours=()) for node in status.nodes)
+    )
+    found = {check.name: check for check in preflight(fleet, status, DELIVERED)}
+    assert (found["links"].is_go, found["links"].is_checked) == (True, False)
+    assert preflight_text(found.values()).splitlines()[-1] == "GO (not checked: links)"
 
 
 def test_pings_are_read_line_by_line_and_what_is_missing_has_no_answer() -> None:

@@ -187,3 +187,49 @@ def test_what_is_kept_of_a_node_comes_back_when_it_is_silent(fleet: Fleet) -> No
 
 def test_a_fact_that_another_version_wrote_otherwise_is_no_error() -> None:
     assert typed({"hops": "two", "quality": "", "later": "x"}) == {"hops": None, "quality": None, "later": "x"}
+
+
+# b02 is carried by the inventory, and lies between b01 and the robot
+_DROPPED = {
+    "base": seen("base", {"b01": 250}),
+    "b01": seen("b01", {"base": 250, "b02": 220}),
+    "b02": seen("b02", {"b01": 220, "rover": 220}),
+    "rover": seen("rover", {"b02": 220}),
+}
+
+
+def test_a_carried_beacon_that_others_need_is_said_to_be_dropped(fleet: Fleet) -> None:
+    status = status_of(fleet, _DROPPED)
+    alarm = alarms(status, "b02")["dropped"]
+    assert alarm.text == "carried by the inventory, and the way from rover to the base leads through it"
+    assert alarm.hint == "if it has been dropped: meshctl deployed b02"
+    assert "dropped" not in alarms(status, "b01")
+    assert status.exit_code is ExitCode.OK
+
+
+def test_a_dropped_beacon_that_dies_is_an_alarm_although_nobody_marked_it(fleet: Fleet) -> None:
+    kept = facts_to_keep(status_of(fleet, _DROPPED))
+    known = remembered({name: LastKnown(name, NOW - 600, facts) for name, facts in kept.items()})
+    status = status_of(fleet, known=known, silent={"b02": Silence("no answer to connect within 5 s")})
+    alarm = alarms(status, "b02")["dropped"]
+    assert alarm.text == "no answer to connect within 5 s; rover reached the base through it 10 min ago"
+    assert health(status)["b02"] is Health.DEGRADED
+    assert status.exit_code is ExitCode.FINDINGS
+
+
+def test_a_carried_beacon_that_nobody_needed_may_be_switched_off(fleet: Fleet) -> None:
+    on = {**HEALTHY, "b02": seen("b02", {"b01": 220})}
+    kept = facts_to_keep(status_of(fleet, on))
+    known = remembered({name: LastKnown(name, NOW - 600, facts) for name, facts in kept.items()})
+    status = status_of(fleet, known=known, silent={"b02": Silence("no answer to connect within 5 s")})
+    assert alarms(status, "b02") == {}
+    assert status.exit_code is ExitCode.OK
+
+
+def test_a_beacon_that_was_picked_up_and_switched_on_once_is_no_longer_missed(fleet: Fleet) -> None:
+    first = facts_to_keep(status_of(fleet, _DROPPED))
+    again = facts_to_keep(status_of(fleet, {**HEALTHY, "b02": seen("b02", {"b01": 220})}))
+    # the journal keeps the newest facts of each device
+    known = remembered({name: LastKnown(name, NOW - 60, facts) for name, facts in {**first, **again}.items()})
+    status = status_of(fleet, known=known, silent={"b02": Silence("no answer to connect within 5 s")})
+    assert alarms(status, "b02") == {}

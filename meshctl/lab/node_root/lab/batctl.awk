@@ -1,6 +1,6 @@
 # batctl's stand-in, the printing part. effective: cell lines of this node's radios; heard: N neighbour, O originator.
 BEGIN { FS = "\t" }
-FILENAME ~ /effective$/ && $1 == "cell" && $11 == soft { faces[++nfaces] = $3; index_of[$3] = 6 + nfaces; address[$3] = $10; algorithm = $12 }
+FILENAME ~ /effective$/ && $1 == "cell" && $11 == soft { faces[++nfaces] = $3; index_of[$3] = $13; address[$3] = $10; algorithm = $12 }
 FILENAME ~ /heard$/ && $1 == "N" && $2 in index_of { neighbour[++n] = $3; n_face[n] = $2; n_age[n] = $4; n_tq[n] = $5 }
 FILENAME ~ /heard$/ && $1 == "O" && $2 in index_of { origin[++o] = $3; o_face[o] = $2; o_hop[o] = $4; o_tq[o] = $5; o_age[o] = $6; best[o] = $7 }
 # BATMAN_V measures throughput: taken from the same quality, 100 Mbit/s at most

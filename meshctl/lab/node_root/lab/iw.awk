@@ -1,5 +1,5 @@
-# iw's stand-in, the printing part. A station that is deleted is known again from its next beacon, which is at once; of the
-# others the node has known since it started.
+# iw's stand-in, the printing part. A station that is deleted is known again from its next beacon, which is at once; one that
+# has fallen silent stays in the table for a minute, and gone when it is deleted. `now` is Unix time, as in air/heard.
 BEGIN {
 	FS = "\t"
 	while ((getline line < "/tmp/run/netifd/forgotten") > 0) { split(line, told, " "); since[told[1] " " told[2]] = told[3] }
@@ -8,7 +8,7 @@ BEGIN {
 }
 function describe(indent, face,    width, type) {
 	type = face[2] == "adhoc" ? "IBSS" : face[2] == "mesh" ? "mesh point" : face[2] == "sta" ? "managed" : "AP"
-	printf "%sifindex %d\n%swdev 0x%x\n%saddr %s\n", indent, face[4] + 7, indent, face[4] * 4294967296 + 2, indent, face[3]
+	printf "%sifindex %d\n%swdev 0x%x\n%saddr %s\n", indent, face[14], indent, face[4] * 4294967296 + 2, indent, face[3]
 	if (face[11]) printf "%s%s %s\n", indent, (type == "mesh point" ? "ssid" : "ssid"), face[8]
 	printf "%stype %s\n", indent, type
 	if (indent == "\t") printf "%swiphy %d\n", indent, face[4]
@@ -36,12 +36,15 @@ FILENAME ~ /iw$/ {
 		else print "Not connected."
 	}
 }
+# deleted, and not heard since
+FILENAME ~ /heard$/ && $1 == "S" && $8 && since[$2 " " $3] >= $8 { next }
 FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" && act == "del" { if ($3 == mac) known = 1; next }
 FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" && (act == "dump" || $3 == mac) {
 	known = 1
-	printf "Station %s (on %s)\n\tinactive time:\t%d ms\n\trx bytes:\t96000\n\trx packets:\t1200\n\ttx bytes:\t88000\n\ttx packets:\t1100\n\ttx retries:\t12\n\ttx failed:\t0\n\trx drop misc:\t0\n", $3, device, $5
+	made = $7 > since[device " " $3] ? $7 : since[device " " $3]
+	printf "Station %s (on %s)\n\tinactive time:\t%d ms\n\trx bytes:\t96000\n\trx packets:\t1200\n\ttx bytes:\t88000\n\ttx packets:\t1100\n\ttx retries:\t12\n\ttx failed:\t0\n\trx drop misc:\t0\n", $3, device, $5 + ($8 ? (now - $8) * 1000 : 0)
 	printf "\tsignal:  \t%d [%d, %d] dBm\n\tsignal avg:\t%d [%d, %d] dBm\n", $4, $4 - 2, $4 - 4, $4, $4 - 2, $4 - 4
-	printf "\ttx bitrate:\t%.1f MBit/s MCS 15 short GI\n\trx bitrate:\t%.1f MBit/s MCS 15 short GI\n\texpected throughput:\t%.2fMbps\n\tauthorized:\tyes\n\tauthenticated:\tyes\n\tassociated:\tyes\n\tconnected time:\t%d seconds\n", $6, $6, $6 * 0.4, uptime - since[device " " $3]
+	printf "\ttx bitrate:\t%.1f MBit/s MCS 15 short GI\n\trx bitrate:\t%.1f MBit/s MCS 15 short GI\n\texpected throughput:\t%.2fMbps\n\tauthorized:\tyes\n\tauthenticated:\tyes\n\tassociated:\tyes\n\tconnected time:\t%d seconds\n", $6, $6, $6 * 0.4, made ? now - made : uptime
 }
 function fail(text, number) { printf "command failed: %s (-%d)\n", text, number > "/dev/stderr"; exit 256 - number }
 END {
@@ -49,5 +52,5 @@ END {
 	# ad-hoc cells: Linux 5.7 and later; 19.07 has the wireless stack of 4.19
 	if (verb == "station" && act == "del" && type == "adhoc" && series == "19.07") fail("Operation not supported", 95)
 	if (verb == "station" && act != "dump" && !known) fail("No such file or directory", 2)
-	if (verb == "station" && act == "del") print device, mac, uptime >>"/tmp/run/netifd/forgotten"
+	if (verb == "station" && act == "del") print device, mac, now >>"/tmp/run/netifd/forgotten"
 }

@@ -1,7 +1,7 @@
 # Stand-in for rpcd's iwinfo object: `info` and `assoclist` of one device, from netifd's and the air's files.
 BEGIN { FS = "\t" }
 FILENAME ~ /iw$/ && $1 == device { found = 1; n = split($0, face, "\t") }
-FILENAME ~ /heard$/ && $1 == "S" && $2 == device { mac[++stations] = $3; signal[stations] = $4; age[stations] = $5; rate[stations] = $6 }
+FILENAME ~ /heard$/ && $1 == "S" && $2 == device { mac[++stations] = $3; signal[stations] = $4; age[stations] = $5 + ($8 ? (now - $8) * 1000 : 0); connected[stations] = $7 ? now - $7 : 60; rate[stations] = $6 }
 END {
 	if (!found) exit 1
 	if (want == "info") {
@@ -25,8 +25,8 @@ END {
 	for (i = 1; i <= stations; i++) {
 		printf "%s\n\t\t{\n\t\t\t\"mac\": \"%s\",\n\t\t\t\"signal\": %d,\n\t\t\t\"signal_avg\": %d,\n\t\t\t\"noise\": -95,\n\t\t\t\"inactive\": %d,\n", \
 			(i > 1 ? "," : ""), toupper(mac[i]), signal[i], signal[i], age[i]
-		printf "\t\t\t\"connected_time\": 60,\n\t\t\t\"thr\": %d,\n\t\t\t\"rx\": {\n\t\t\t\t\"drop_misc\": 0,\n\t\t\t\t\"packets\": 1200,\n\t\t\t\t\"bytes\": 96000,\n\t\t\t\t\"ht\": true,\n\t\t\t\t\"vht\": false,\n\t\t\t\t\"mhz\": 20,\n\t\t\t\t\"rate\": %d,\n\t\t\t\t\"mcs\": 15,\n\t\t\t\t\"40mhz\": false,\n\t\t\t\t\"short_gi\": true\n\t\t\t},\n", \
-			rate[i] * 400, rate[i] * 1000
+		printf "\t\t\t\"connected_time\": %d,\n\t\t\t\"thr\": %d,\n\t\t\t\"rx\": {\n\t\t\t\t\"drop_misc\": 0,\n\t\t\t\t\"packets\": 1200,\n\t\t\t\t\"bytes\": 96000,\n\t\t\t\t\"ht\": true,\n\t\t\t\t\"vht\": false,\n\t\t\t\t\"mhz\": 20,\n\t\t\t\t\"rate\": %d,\n\t\t\t\t\"mcs\": 15,\n\t\t\t\t\"40mhz\": false,\n\t\t\t\t\"short_gi\": true\n\t\t\t},\n", \
+			connected[i], rate[i] * 400, rate[i] * 1000
 		printf "\t\t\t\"tx\": {\n\t\t\t\t\"failed\": 0,\n\t\t\t\t\"retries\": 12,\n\t\t\t\t\"packets\": 1100,\n\t\t\t\t\"bytes\": 88000,\n\t\t\t\t\"ht\": true,\n\t\t\t\t\"vht\": false,\n\t\t\t\t\"mhz\": 20,\n\t\t\t\t\"rate\": %d,\n\t\t\t\t\"mcs\": 15,\n\t\t\t\t\"40mhz\": false,\n\t\t\t\t\"short_gi\": true\n\t\t\t}\n\t\t}", rate[i] * 1000
 	}
 	print "\n\t]\n}"

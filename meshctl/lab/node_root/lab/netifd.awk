@@ -1,7 +1,12 @@
-# netifd's stand-in, the computing part. Input: `uci export network; uci export wireless; uci export firewall`.
+# netifd's stand-in, the computing part. Input: `uci export network; uci export wireless`.
 #
 # sections -> which radio interfaces come up -> which devices exist -> which interfaces are up
 #   -> run/dump, run/wireless (JSON for ubus), run/iw, run/addresses.new, run/effective, run/sys (a shell script)
+#
+# Setting radios up takes time, so a change comes in two phases. Phase 1: everything else is as configured; radios whose
+# configuration differs from run/radios are pending, and their interfaces that are to be made anew are gone. Phase 2: all is
+# as configured, and run/radios.new says what stands: lines "device NAME OPTIONS" and "face NAME KEY MAC IFINDEX". A board's
+# own MAC address is base; from 23.05 on one that replaces an interface which still stands gets the other (wdev.uc).
 
 /^package / { package = $2; next }
 /^config / {
@@ -21,6 +26,85 @@ function get(id, option, otherwise) { return (id, option) in opt ? opt[id, optio
 function yes(value) { return value ~ /^(1|on|true|yes|enabled)$/ }
 function json(text) { gsub(/\\/, "\\\\", text); gsub(/"/, "\\\"", text); return "\"" text "\"" }
 function shell(text) { gsub(/'/, "'\\''", text); return "'" text "'" }
+
+# --- what stands already, and what a change does to it ------------------------------------------------------------------
+
+function read_standing(    line, part) {
+	while ((getline line < (run "/radios")) > 0) {
+		split(line, part, "\t")
+		if (part[1] == "device") { was_device[part[2]] = part[3]; was_up[part[2]] = part[4] }
+		else { was_key[part[2]] = part[3]; was_mac[part[2]] = part[4]; was_index[part[2]] = part[5]; was_on[part[2]] = part[6]; was_by[part[2]] = part[7] }
+	}
+	close(run "/radios")
+	last_index = 20
+	if ((getline line < (run "/last_index")) > 0) last_index = line + 0
+	close(run "/last_index")
+}
+
+# every option of a section in its order, as netifd compares them up to 24.10
+function all_options(id,    n, i, list, text) {
+	n = split(names[id], list, " ")
+	for (i = 1; i <= n; i++) text = text " " list[i] "=" opt[id, list[i]]
+	gsub(/[\t\n]/, " ", text)
+	return text
+}
+
+function iw_width(htmode) {
+	sub(/^(VHT|HE)20$/, "HT20", htmode); sub(/^(VHT|HE)40/, "HT40", htmode)
+	return htmode == "" || htmode == "NONE" ? "NOHT" : htmode
+}
+
+# from 23.05 on: what makes an interface anew when it differs (wdev.uc's object, or wpa_supplicant's file)
+function own_key(id, device, by,    d, n, i, list, text) {
+	d = id_of(device)
+	text = by " " get(id, "mode", "ap") " " get(id, "ssid", "") get(id, "mesh_id", "") " " band(d) " " get(d, "channel", "auto") " " \
+		iw_width(get(d, "htmode", "")) " " (get(id, "mode", "") == "mesh" ? "" : get(id, "bssid", "")) " " get(d, "beacon_int", "") " " \
+		get(d, "basic_rate", "") " " get(d, "path", "") " " get(id, "mcast_rate", "") " " get(id, "macaddr", "") " " \
+		get(id, "encryption", "none") " " get(id, "key", "") " " (by == "supplicant" ? get(d, "country", "") : "")
+	n = split(names[id], list, " ")
+	for (i = 1; i <= n; i++) if (list[i] ~ /^mesh_/) text = text " " list[i] "=" opt[id, list[i]]
+	gsub(/[\t\n]/, " ", text)
+	return text
+}
+
+# the address that the interface gets when there is one of this name already (keep: it stays)
+function other_mac(base,    first) {
+	first = index("0123456789abcdef", tolower(substr(base, 2, 1))) - 1
+	# a globally administered one becomes local, as on ath9k (04: -> 06:); a local one 42:.., as on hwsim (02: -> 42:)
+	if (int(first / 2) % 2 == 0) return substr(base, 1, 1) substr("0123456789abcdef", first + 3, 1) substr(base, 3)
+	first = index("0123456789abcdef", tolower(substr(base, 1, 1))) - 1
+	return substr("456789ab0123cdef", first + 1, 1) substr(base, 2)
+}
+
+# whether the radio, and whether this interface of it, is made anew
+function judge_device(device,    text, n, i, list) {
+	text = all_options(id_of(device))
+	for (i = 1; i <= sections; i++) if (kind[order[i]] == "wireless.wifi-iface" && get(order[i], "device", "") == device) text = text " |" label[order[i]] all_options(order[i])
+	options_of[device] = text
+	differs[device] = !(device in was_device) || was_device[device] != text
+	whole[device] = !(device in was_device) || was_up[device] != (device in radio_up ? 1 : 0)
+	if (series == "19.07" || series == "21.02" || series == "22.03") whole[device] = whole[device] || differs[device]
+	else if (antennas(was_device[device]) != antennas(text)) whole[device] = 1
+	# a radio that is off is set up by nobody
+	pending[device] = differs[device] && ((device in radio_up) || was_up[device])
+}
+function antennas(text,    found) { return (match(text, / txantenna=[^ ]*/) ? substr(text, RSTART, RLENGTH) : "") (match(text, / rxantenna=[^ ]*/) ? substr(text, RSTART, RLENGTH) : "") }
+
+function judge_face(id, device, ifname, path, algo, mode,    by, base, key) {
+	by = algo != "none" || (mode == "mesh" && ibss_rsn) ? "supplicant" : "wdev"
+	if (mode == "adhoc" && series == "25.12") by = "wdev"
+	key = own_key(id, device, by)
+	base = mac_of[path]
+	anew = whole[device] || !(ifname in was_key) || was_key[ifname] != key || was_on[ifname] != device
+	if (!anew) mac[ifname] = was_mac[ifname]
+	else if (get(id, "macaddr", "") ~ /:/) mac[ifname] = tolower(get(id, "macaddr", ""))
+	else if (series ~ /^(19.07|21.02|22.03)$/ || whole[device] || !(ifname in was_mac) || (by == "supplicant" && was_by[ifname] == "supplicant")) mac[ifname] = base
+	else mac[ifname] = was_mac[ifname] == base ? other_mac(base) : base
+	if (anew && phase == 1) { held[ifname] = 1; pending[device] = 1; return }
+	if (anew) index_of[ifname] = ++last_index
+	else index_of[ifname] = was_index[ifname]
+	standing = standing "face\t" ifname "\t" key "\t" mac[ifname] "\t" index_of[ifname] "\t" device "\t" by "\n"
+}
 
 function frequency(band, channel) {
 	channel += 0
@@ -68,6 +152,7 @@ function radio_interfaces(    i, id, device, path, phy, channel, freq, mode, ifn
 		if (!(path in phy_of)) { radio_failed[device] = 1; continue }
 		radio_up[device] = 1
 	}
+	for (i = 1; i <= ndevices; i++) judge_device(devices[i])
 	for (i = 1; i <= sections; i++) if (kind[order[i]] == "wireless.wifi-iface") {
 		id = order[i]
 		device = get(id, "device", "")
@@ -79,21 +164,25 @@ function radio_interfaces(    i, id, device, path, phy, channel, freq, mode, ifn
 		faces[device] = faces[device] " " id
 		if (!(device in radio_up) || mode_down) continue
 		iface_name[id] = ifname
-		exists[ifname] = 1; mac[ifname] = mac_of[path]; is_radio[ifname] = 1
+		algo = get(id, "encryption", "none"); key = get(id, "key", "")
+		sub(/\+.*/, "", algo)
+		if (algo == "") algo = "none"
+		judge_face(id, device, ifname, path, algo, mode)
+		if (ifname in held) { delete iface_name[id]; continue }
+		exists[ifname] = 1; is_radio[ifname] = 1
 		split(get(id, "network", ""), wanted, " ")
 		network_of[ifname] = wanted[1]
 		if (mode == "ap" && wanted[1] != "") attach(wanted[1], ifname)
 		freq = band(id_of(device)) == band_of[path] ? frequency(band_of[path], get(id_of(device), "channel", "auto")) : 0
-		algo = get(id, "encryption", "none"); key = get(id, "key", "")
-		sub(/\+.*/, "", algo)
-		if (algo == "none" || algo == "") key = ""
+		if (algo == "none") key = ""
 		# an IBSS cannot choose its channel, and encrypts only with a full supplicant; 25.12 then joins open, silently
 		if (mode == "adhoc" && algo != "none" && series == "25.12") { algo = "none"; key = "" }
 		joined = freq && (algo == "none" || ibss_rsn)
+		if (joined && algo != "none") encrypted[ifname] = 1
 		width = get(id_of(device), "htmode", "NOHT")
 		iw_line = iw_line ifname "\t" mode "\t" mac[ifname] "\t" phy "\t" freq "\t" get(id_of(device), "channel", "0") "\t" width "\t" \
 			(mode == "mesh" ? get(id, "mesh_id", "") : get(id, "ssid", "OpenWrt")) "\t" get(id, "bssid", "00:00:00:00:00:00") "\t" \
-			power(device, path) "\t" (joined ? 1 : 0) "\t" algo "\t" get(id_of(device), "country", "00") "\n"
+			power(device, path) "\t" (joined ? 1 : 0) "\t" algo "\t" get(id_of(device), "country", "00") "\t" index_of[ifname] "\n"
 		if (joined && (mode == "adhoc" || mode == "mesh")) {
 			cell[ifname] = device "\t" ifname "\t" mode "\t" freq "\t" \
 				(mode == "mesh" ? get(id, "mesh_id", "") "\t-" : get(id, "ssid", "") "\t" get(id, "bssid", "")) "\t" algo "\t" key "\t" mac[ifname]
@@ -149,19 +238,6 @@ function reaches(device, flag,    n, i, list) {
 	return 0
 }
 
-# whether the firewall lets SSH to this network's address in: its zone's input, else the defaults' (REJECT from 23.05)
-function admitted(network,    i, id, n, list, j, verdict) {
-	verdict = "ACCEPT"
-	for (i = 1; i <= sections; i++) if (kind[order[i]] == "firewall.defaults") verdict = get(order[i], "input", "REJECT")
-	for (i = 1; i <= sections; i++) {
-		id = order[i]
-		if (kind[id] != "firewall.zone") continue
-		n = split(get(id, "network", ""), list, " ")
-		for (j = 1; j <= n; j++) if (list[j] == network) return get(id, "input", verdict) == "ACCEPT"
-	}
-	return verdict == "ACCEPT"
-}
-
 function interfaces(    i, id, proto, device, n, list, j, ifname, separator, address, mask, line, errors, up) {
 	dump = "{\n\t\"interface\": ["
 	separator = "\n"
@@ -192,7 +268,7 @@ function interfaces(    i, id, proto, device, n, list, j, ifname, separator, add
 		if (yes(get(id, "disabled", "0")) || !(get(id, "auto", "1") ~ /1/) || mode == "down") up = 0
 		if (up && address != "") {
 			printf "%s %s/%s\n", device, address, prefix(mask) > (run "/addresses.new")
-			if (label[id] != "loopback" && admitted(label[id]))
+			if (label[id] != "loopback")
 				effective = effective "addr\t" label[id] "\t" device "\t" address "\t" prefix(mask) "\t" reaches(device, "soft") "\t" reaches(device, "wired") "\n"
 		}
 		dump = dump separator "\t\t{\n\t\t\t\"interface\": " json(label[id]) ",\n\t\t\t\"up\": " (up ? "true" : "false") \
@@ -214,8 +290,8 @@ function wireless_status(    i, d, text, n, list, j, id, m, k, o, first) {
 	text = "{"
 	for (i = 1; i <= ndevices; i++) {
 		d = devices[i]
-		text = text (i > 1 ? "," : "") "\n\t" json(d) ": {\n\t\t\"up\": " ((d in radio_up) && !mode_down ? "true" : "false") \
-			",\n\t\t\"pending\": false,\n\t\t\"autostart\": " (d in radio_failed ? "false" : "true") \
+		text = text (i > 1 ? "," : "") "\n\t" json(d) ": {\n\t\t\"up\": " ((d in radio_up) && !mode_down && !(phase == 1 && pending[d]) ? "true" : "false") \
+			",\n\t\t\"pending\": " (phase == 1 && pending[d] && !mode_down ? "true" : "false") ",\n\t\t\"autostart\": " (d in radio_failed ? "false" : "true") \
 			",\n\t\t\"disabled\": " (d in radio_disabled ? "true" : "false") \
 			",\n\t\t\"retry_setup_failed\": " (d in radio_failed ? "true" : "false") ",\n\t\t\"config\": {"
 		text = text options(id_of(d), "\t\t\t", " ") "\n\t\t},\n\t\t\"interfaces\": ["
@@ -256,13 +332,22 @@ function options(id, indent, without,    n, list, k, name, value, text, parts, m
 
 # --- /sys ------------------------------------------------------------------------------------------------------------
 
+# numbers of the devices that stay: lo, ports, bridges, bat0
+function device_index(name,    n, i, list) {
+	if (name == "lo") return 1
+	n = split(ports, list, " ")
+	for (i = 1; i <= n; i++) if (list[i] == name) return 1 + i
+	return name in is_soft ? 9 + length(name) % 4 : 13 + length(name) % 7
+}
+
 function sys_script(    d, file, port, n, i, list, dir) {
 	file = run "/sys"
 	print "cd /sys/class/net || exit 1" > file
 	# what the last call made and this one does not
 	print "for d in *; do case \" lo " ports " \" in *\" $d \"*) ;; *) [ -e '/tmp/run/netifd/has.'\"$d\" ] || rm -rf \"$d\" ;; esac; done" > (run "/sys.end")
 	close(run "/sys.end")
-	printf "rm -f /tmp/run/netifd/has.*\n" > file
+	printf "rm -f /tmp/run/netifd/has.*\nrm -rf /var/run/wpa_supplicant; mkdir -p /var/run/wpa_supplicant\n" > file
+	for (d in encrypted) printf ": >/var/run/wpa_supplicant/%s\n", d > file
 	for (d in exists) {
 		printf ": >/tmp/run/netifd/has.%s\n", d > file
 		printf "[ -d %s ] || mkdir %s\necho %s >%s/address\necho %s >%s/operstate\necho %s >%s/mtu\necho 1 >%s/carrier\n", \
@@ -272,6 +357,7 @@ function sys_script(    d, file, port, n, i, list, dir) {
 			n = split(bridge_ports[d], list, " ")
 			for (i = 1; i <= n; i++) printf "mkdir %s/brif/%s\n", d, list[i] > file
 		}
+		printf "echo %d >%s/ifindex\n", (d in index_of ? index_of[d] : device_index(d)), d > file
 		if (d in is_radio) printf "mkdir -p %s/wireless %s/phy80211\n", d, d > file
 		if (d in is_soft) printf "mkdir -p /sys/module/batman_adv %s/mesh\n", d > file
 		if (d in bridge_of) printf "rm -f %s/master; ln -s ../%s %s/master\n", d, bridge_of[d], d > file
@@ -285,14 +371,25 @@ END {
 	mode_down = mode != "up"
 	printf "" > (run "/addresses.new")
 	board_radios()
+	read_standing()
 	radio_interfaces()
 	all_devices()
 	interfaces()
 	wireless_status()
 	printf "%s", iw_line > (run "/iw")
 	for (i = 1; i <= ncells; i++) {
-		effective = effective "cell\t" cell[cells[i]] "\t" (cells[i] in master ? master[cells[i]] "\t" algorithm[master[cells[i]]] : "-\t-") "\n"
+		effective = effective "cell\t" cell[cells[i]] "\t" (cells[i] in master ? master[cells[i]] "\t" algorithm[master[cells[i]]] : "-\t-") "\t" index_of[cells[i]] "\n"
 	}
 	printf "%s", effective > (run "/effective")
+	if (phase == 2) {
+		if (mode_down) standing = ""
+		else for (i = 1; i <= ndevices; i++) standing = standing "device\t" devices[i] "\t" options_of[devices[i]] "\t" (devices[i] in radio_up ? 1 : 0) "\n"
+		printf "%s", standing > (run "/radios.new")
+		print last_index > (run "/last_index")
+	} else {
+		waits = ""
+		for (i = 1; i <= ndevices; i++) if (pending[devices[i]]) waits = waits " " devices[i]
+		print waits > (run "/waits")
+	}
 	sys_script()
 }

@@ -1,11 +1,13 @@
 # netifd's stand-in on real radios, the computing part: after netifd.awk, what the kernel is to have -> run/kernel.new.
 #
 # One line per device, port or address, tab-separated, in the order of making. A line ends with the lines it stands on:
-# when a radio or bat0 is made anew, so is what hangs on it.
+# when a radio or bat0 is made anew, so is what hangs on it. MAKING counts how often netifd.awk had the interface made anew;
+# what acts in place on this release is another line, and so is the country, which all radios share.
 #
 #   bridge NAME MAC
 #   soft   NAME ALGORITHM OPTIONS
-#   radio  NAME NUMBER MODE MHZ WIDTH SSID BSSID MCAST_KBPS DBM MAC BEACON_TU DISTANCE_M COUNTRY ALGORITHM KEY FORWARDING
+#   radio  NAME NUMBER MODE MHZ WIDTH SSID BSSID MCAST_KBPS MAKING MAC BEACON_TU - - ALGORITHM KEY FORWARDING
+#   tune   NAME NUMBER DBM DISTANCE_M
 #   hard   NAME MASTER MTU OPTIONS
 #   port   BRIDGE NAME
 #   addr   DEVICE ADDRESS/PREFIX
@@ -24,7 +26,7 @@ function add(name, line) { made_of[name] = line; plan = plan line "\n" }
 # without the tabs, so that a line's own fields can be told from those of what it stands on
 function standing_on(name,    text) { text = made_of[name]; gsub(/\t/, "|", text); return field(text) }
 
-function plan_radios(    i, id, device, ifname, path) {
+function plan_radios(    i, id, device, ifname, path, country) {
 	for (i = 1; i <= sections; i++) {
 		id = order[i]
 		if (!(id in iface_name)) continue
@@ -32,11 +34,12 @@ function plan_radios(    i, id, device, ifname, path) {
 		if (!(ifname in cell)) continue
 		device = get(id, "device", ""); path = radio_path[device]
 		split(cell[ifname], part, "\t")
+		if ((country = get(id_of(device), "country", "")) != "") plan = plan "reg" field(country) "\n"
 		add(ifname, "radio" field(ifname) field(phy_of[path]) field(get(id, "mode", "")) field(part[4]) \
 			field(get(id_of(device), "htmode", "NOHT")) field(part[5]) field(part[6]) field(get(id, "mcast_rate", "")) \
-			field(power(device, path)) field(mac_of[path]) field(get(id_of(device), "beacon_int", "100")) \
-			field(get(id_of(device), "distance", "")) field(get(id_of(device), "country", "")) field(part[7]) field(part[8]) \
-			field(yes(get(id, "mesh_fwding", "1")) ? 1 : 0))
+			field(index_of[ifname]) field(mac[ifname]) field(get(id_of(device), "beacon_int", "100")) \
+			field("") field("") field(part[7]) field(part[8]) field(yes(get(id, "mesh_fwding", "1")) ? 1 : 0))
+		plan = plan "tune" field(ifname) field(phy_of[path]) field(power(device, path)) field(get(id_of(device), "distance", "")) standing_on(ifname) "\n"
 	}
 }
 

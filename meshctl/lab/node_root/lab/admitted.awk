@@ -1,0 +1,14 @@
+# The loaded rules (lab/firewall_rules.awk) and netifd's lines -> the same lines, each `addr` with 1 or 0 at its end:
+# whether a new connection to its port 22 is let in. The first rule that fits decides; no firewall lets everything in.
+BEGIN { FS = OFS = "\t" }
+FILENAME ~ /loaded$/ { device[++n] = $2; address[n] = $3; verdict[n] = $4; next }
+$1 == "addr" {
+	admitted = 1
+	for (i = 1; i <= n; i++) if ((device[i] == "*" || device[i] == $3) && (address[i] == "*" || address[i] == $4)) {
+		admitted = verdict[i] == "ACCEPT"
+		break
+	}
+	print $0, admitted
+	next
+}
+{ print }

@@ -1,0 +1,77 @@
+"""Names of OpenWrt that an inventory writes: targets, packages, and the paths of radios that are part of a chip.
+
+None of the lists is complete, so a name that is on none of them is not wrong; one that is a slip away from a name on
+them is. Sources: target/linux and package/ of OpenWrt 19.07 to 25.12.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from meshctl.resolve import FULL_SUPPLICANTS
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+TARGETS = _words(
+    """airoha apm821xx ar71xx archs38 armsr armvirt at91 ath25 ath79 bcm27xx bcm47xx bcm4908 bcm53xx bcm63xx bmips
+    brcm2708 brcm47xx brcm63xx cns3xxx d1 econet gemini imx imx6 ipq40xx ipq806x ipq807x ixp4xx kirkwood lantiq
+    layerscape loongarch64 malta mediatek microchipsw mpc85xx mvebu mxs nxp octeon octeontx omap oxnas pistachio qoriq
+    qualcommax qualcommbe ramips rb532 realtek rockchip sifiveu siflower starfive stm32 sunxi tegra uml x86 zynq"""
+)
+SUBTARGETS: Mapping[str, frozenset[str]] = MappingProxyType(
+    {
+        "ath79": _words("generic mikrotik nand tiny"),
+        "ramips": _words("mt7620 mt7621 mt76x8 rt288x rt305x rt3883"),
+        "mediatek": _words("filogic mt7622 mt7623 mt7629"),
+        "ipq40xx": _words("chromium generic mikrotik"),
+        "ipq806x": _words("chromium generic"),
+        "x86": _words("64 generic geode legacy"),
+    }
+)
+# the radio of a system on a chip by its path in the device tree: it exists on boards of this target alone
+_CHIPS = (
+    (re.compile(r"platform/ahb/.*\.wmac"), "ath79"),
+    (re.compile(r"platform/(ar9\w+|qca9\w+)_wmac"), "ar71xx"),
+    (re.compile(r"platform/10(18|30)0000\.wmac"), "ramips"),
+    (re.compile(r"platform/(soc/)?18000000\.(wmac|wifi)"), "mediatek"),
+    (re.compile(r"platform/soc/a[08]00000\.wifi"), "ipq40xx"),
+    (re.compile(r"platform/soc@0/c000000\.wifi"), "qualcommax"),
+)
+PACKAGES = frozenset(FULL_SUPPLICANTS) | _words(
+    """wpad-basic wpad-basic-mbedtls wpad-basic-openssl wpad-basic-wolfssl wpad-mini wpa-supplicant hostapd
+    hostapd-common wifi-scripts batctl-default batctl-full batctl-tiny kmod-batman-adv iw-full iwinfo kmod-ath5k
+    kmod-ath6kl kmod-ath9k kmod-ath9k-htc kmod-ath10k kmod-ath10k-ct kmod-ath10k-ct-smallbuffers kmod-ath11k kmod-mt76
+    kmod-mt7603 kmod-mt7615e kmod-mt7915e kmod-mac80211 kmod-cfg80211 ethtool tcpdump tcpdump-mini ip-full ip-tiny
+    ip-bridge iperf3 iperf fping mtr-json dnsmasq dropbear firewall firewall4 odhcpd-ipv6only odhcp6c ppp-mod-pppoe
+    luci luci-ssl uhttpd zoneinfo-core openssh-sftp-server rsync collectd socat alfred batmand olsrd babeld snmpd
+    lldpd"""
+)
+# shorter names are a slip away from too much
+_LEAST_LETTERS = 6
+
+
+def chip_target(radio_path: str) -> str | None:
+    """The target whose boards have a radio at this path, None where any may (PCI, USB)."""
+    return next((target for pattern, target in _CHIPS if pattern.fullmatch(radio_path)), None)
+
+
+def meant_package(name: str) -> str | None:
+    """The known package that is one slip away from `name`; None for a package that is known, or near to none."""
+    if name in PACKAGES or len(name) < _LEAST_LETTERS:
+        return None
+    return next((known for known in sorted(PACKAGES) if len(known) >= _LEAST_LETTERS and one_slip(name, known)), None)
+
+
+def one_slip(one: str, other: str) -> bool:
+    """Whether one letter is missing, added, wrong, or has changed places with its neighbour."""
+    if abs(len(one) - len(other)) > 1 or one == other:
+        return False
+    start = next((i for i, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other)))
+    rest, other_rest = one[start:], other[start:]
+    swapped = rest[1:2] + rest[:1] + rest[2:]
+    return other_rest in (rest[1:], swapped) or rest == other_rest[1:] or rest[1:] == other_rest[1:]

@@ -1,0 +1,47 @@
+"""Time zones: their names, the POSIX string of each, and whether a text is such a string.
+
+The table is made from tzdata by `scripts/update-zones`, so that lint says the same on every machine.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType
+
+_TABLE = Path(__file__).with_name("zones.tsv")
+
+_NAME = r"(?:[A-Za-z]{3,}|<[A-Za-z0-9+-]{3,}>)"
+_TIME = r"[+-]?\d{1,3}(?::\d{2}){0,2}"
+_RULE = rf",(?:M\d{{1,2}}\.[1-5]\.[0-6]|J?\d{{1,3}})(?:/{_TIME})?"
+# IEEE 1003.1, chapter 8.3, TZ; three-digit hours by RFC 8536
+_POSIX = re.compile(rf"{_NAME}{_TIME}(?:{_NAME}(?:{_TIME})?(?:{_RULE}{_RULE})?)?")
+
+
+@cache
+def zones() -> Mapping[str, str]:
+    """The POSIX time zone of every name, such as `MST7MDT,M3.2.0,M11.1.0` of `America/Denver`."""
+    rows = (line.split("\t") for line in _TABLE.read_text(encoding="utf-8").splitlines() if not line.startswith("#"))
+    return MappingProxyType({row[0]: row[1] for row in rows})
+
+
+def is_posix(text: str) -> bool:
+    """Whether OpenWrt's libc reads the text as a time zone; `UTC`, OpenWrt's own default, counts as one."""
+    return text in ("UTC", "GMT") or _POSIX.fullmatch(text) is not None
+
+
+def posix_of(name: str) -> str | None:
+    """The POSIX string of a zone by its name, with spaces or underscores; None for a name that no zone has."""
+    return zones().get(name.replace(" ", "_"))
+
+
+def same_clock(one: str, other: str) -> bool:
+    """Whether two POSIX strings name the same clock, however they abbreviate it."""
+    return _unnamed(one) == _unnamed(other)
+
+
+def _unnamed(posix: str) -> str:
+    """Without abbreviations; `UTC` is an offset of zero."""
+    return "x0" if posix in ("UTC", "GMT") else re.sub(_NAME, "x", posix)

@@ -1,0 +1,81 @@
+"""Which settings a file's diff changes, in a few words: `radio0: channel 149 -> 157, txpower 27 -> 25`.
+
+Reads the unified diff of a plan, whose secrets are masked; for a file that is not UCI, the number of changed lines.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+
+from meshctl.plan import FileChange
+
+# more settings of a file than these are counted
+SETTINGS_SHOWN = 8
+
+_SECTION = re.compile(r"config\s+(\S+)(?:\s+'(.*)')?")
+_OPTION = re.compile(r"(?:option|list)\s+(\S+)\s+'(.*)'")
+
+
+def changed_lines(change: FileChange) -> tuple[str, ...]:
+    """The lines that go and come, without their places and what stands around them."""
+    body = change.diff.splitlines()
+    return tuple(line for line in body[2:] if line[:1] in "+-" and line[1:].strip()) or tuple(body[:1])
+
+
+def settings(change: FileChange) -> tuple[str, ...]:
+    """One text for each setting that changes, by section; empty for a file that comes or goes as a whole."""
+    if change.kind != "changed":
+        return ()
+    body = change.diff.splitlines()
+    if not body or not body[0].startswith("---"):
+        return tuple(body[:1])
+    found = tuple(_by_section(body[2:]))
+    return found or (f"{len(changed_lines(change))} lines",)
+
+
+def _by_section(lines: Iterable[str]) -> Iterator[str]:
+    section = ""
+    old: dict[tuple[str, str], list[str]] = {}
+    new: dict[tuple[str, str], list[str]] = {}
+    whole: dict[str, str] = {}
+    for line in lines:
+        if line.startswith("@@"):
+            # the section that goes on here may begin further above
+            section = ""
+            continue
+        sign, text = line[:1], line[1:].strip()
+        if head := _SECTION.fullmatch(text):
+            section = head[2] or head[1]
+            if sign in "+-":
+                whole[section] = "new section" if sign == "+" else "section removed"
+        elif (option := _OPTION.fullmatch(text)) and sign in "+-":
+            (old if sign == "-" else new).setdefault((section, option[1]), []).append(option[2])
+    yield from (_named(section, what) for section, what in whole.items())
+    for key in dict.fromkeys((*old, *new)):
+        section, name = key
+        if section not in whole:
+            yield _named(section, f"{name} {_change(old.get(key, []), new.get(key, []))}")
+
+
+def _named(section: str, what: str) -> str:
+    return f"{section}: {what}" if section else what
+
+
+def _change(old: list[str], new: list[str]) -> str:
+    was, becomes = " ".join(old), " ".join(new)
+    if not new:
+        return f"removed (was {was})"
+    return f"{was} -> {becomes}" if old else f"set to {becomes}"
+
+
+def summary(change: FileChange) -> str:
+    """The settings as one line; empty for a file that comes or goes as a whole."""
+    found = settings(change)
+    if len(found) > SETTINGS_SHOWN:
+        return f"{len(found)} settings"
+    parts: dict[str, list[str]] = {}
+    for text in found:
+        section, colon, rest = text.partition(": ")
+        parts.setdefault(section if colon else "", []).append(rest if colon else text)
+    return "; ".join((f"{section}: " if section else "") + ", ".join(texts) for section, texts in parts.items())

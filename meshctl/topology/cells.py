@@ -1,0 +1,73 @@
+"""One mesh out of what nodes with several tell: an observation cut down to the interfaces of one mesh, and the cells
+that each link runs through.
+
+A node's batman-adv spans its meshes, so its tables name the neighbours of all of them; each entry names the interface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+from meshctl.device.observation import Observation
+from meshctl.model import Band, Fleet, Node
+from meshctl.topology.observed import Report, neighbours_of
+from meshctl.topology.reports import report_of
+
+
+@dataclass(frozen=True, slots=True)
+class LinkCell:
+    """The cell of a link: its mesh, and the channel that the radio is on (the inventory's where it did not tell)."""
+
+    mesh: str
+    band: Band
+    channel: int
+
+    def __str__(self) -> str:
+        return f"{self.mesh} {self.band.value} ch {self.channel}"
+
+
+def within(seen: Observation, node: Node, mesh: str) -> Observation:
+    """What the node tells of one of its meshes; of a node with one mesh, everything."""
+    if len(node.meshes) < 2:
+        return seen
+    names = {name for name, joined in node.mesh_interfaces.items() if joined == mesh}
+    hard = None if seen.mesh is None else tuple(name for name in seen.mesh.hard_interfaces if name in names)
+    return replace(
+        seen,
+        macs={name: mac for name, mac in (seen.macs or {}).items() if name in names},
+        links=tuple(link for link in seen.links or () if link.ifname in names),
+        stations=tuple(station for station in seen.stations or () if station.ifname in names),
+        neighbours=None if seen.neighbours is None else tuple(n for n in seen.neighbours if n.ifname in names),
+        originators=None if seen.originators is None else tuple(o for o in seen.originators if o.ifname in names),
+        mesh=None if seen.mesh is None or hard is None else replace(seen.mesh, hard_interfaces=hard),
+    )
+
+
+def mesh_reports(fleet: Fleet, observations: Mapping[str, Observation], mesh: str) -> dict[str, Report]:
+    """The reports of a mesh's members about this mesh alone."""
+    return {
+        name: report_of(name, within(seen, fleet.nodes[name], mesh))
+        for name, seen in observations.items()
+        if name in fleet.nodes and mesh in fleet.nodes[name].meshes
+    }
+
+
+def link_cells(
+    fleet: Fleet, observations: Mapping[str, Observation], names: Mapping[str, str], meshes: Iterable[str]
+) -> dict[tuple[str, str], tuple[LinkCell, ...]]:
+    """The cells in which `a` hears `b`, in the order of `meshes`; `names` maps lower-case MACs to nodes."""
+    found: dict[tuple[str, str], tuple[LinkCell, ...]] = {}
+    for mesh in meshes:
+        for name, report in mesh_reports(fleet, observations, mesh).items():
+            for other in neighbours_of(report, names):
+                cell = LinkCell(
+                    mesh, fleet.meshes[mesh].band, _channel(fleet, fleet.nodes[name], observations[name], mesh)
+                )
+                found[name, other] = (*found.get((name, other), ()), cell)
+    return found
+
+
+def _channel(fleet: Fleet, node: Node, seen: Observation, mesh: str) -> int:
+    observed = (link.channel for link in within(seen, node, mesh).links or () if link.channel is not None)
+    return next(observed, fleet.meshes[mesh].channel)

@@ -1,0 +1,288 @@
+"""Laws of scripts/reload.sh: which effects it waits for, and what it does not take for one.
+
+The node's tools are scripts that play recorded behaviour (docs/facts): procd runs a trigger's script a moment after the
+event, `fw4 reload` ends with 0 whether or not nft took the ruleset, dropbear's instance is replaced some time after.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+import pytest
+
+from meshctl.apply.change import SPEAK_FRAMES, reload_script
+
+DROPBEAR = '{"dropbear": {"instances": {"instance1": {\n"running": true,\n"pid": %s,\n"command": ["-p", "%s"]\n}}}}'
+# `service set` keeps the trigger's file, an event with its name creates it (once `procd` says so); each call is logged
+UBUS = """echo "ubus $*" >>"$HERE/log"
+case "$2 $3" in
+'service set') [ ! -e "$HERE/no-triggers" ] || exit 2
+    echo "$4" | sed 's/.*"touch","\\([^"]*\\)".*/\\1/' >"$HERE/trigger" ;;
+'service event') case $4 in *meshctl-barrier*) [ -e "$HERE/stuck" ] || : >"$(cat "$HERE/trigger")" ;; esac ;;
+'service list') cat "$HERE/dropbear"; [ ! -f "$HERE/dropbear.next" ] || mv "$HERE/dropbear.next" "$HERE/dropbear"
+    ;;
+'network.wireless status') [ ! -e "$HERE/pending" ] || { echo '"pending": true'; rm "$HERE/pending"; } ;;
+'network get_proto_handlers') cat "$HERE/handlers" 2>/dev/null ;;
+esac"""
+
+
+class Node:
+    """The tools of a node in one directory, and what was called."""
+
+    def __init__(self, place: Path) -> None:
+        self.place = place
+        for folder in ("bin", "init.d", "run", "net"):
+            (place / folder).mkdir()
+        self.tool("ubus", UBUS)
+        self.tool("reload_config", 'echo reload_config >>"$HERE/log"')
+        self.tool("sleep", 'echo "sleep $1" >>"$HERE/log"')
+        self.tool("uci", 'cat "$HERE/wireless" 2>/dev/null')
+        self.tool("fw4", ":")
+        self.tool("nft", 'cat "$HERE/rules"')
+        self.service("network")
+        self.service("firewall", 'case $1 in reload | start) echo new >>"$HERE/rules" ;; esac')
+        (place / "rules").write_text("old\n")
+        (place / "run" / "fw4.state").touch()
+        (place / "dropbear").write_text(DROPBEAR % (1, 22))
+        (place / "network").write_text("option proto 'batadv'")
+        (place / "handlers").write_text('{"static": {}, "batadv": {}}')
+
+    def tool(self, name: str, body: str, folder: str = "bin") -> None:
+        (self.place / folder / name).write_text(f"#!/bin/sh\n{body}\n")
+        (self.place / folder / name).chmod(0o755)
+
+    def service(self, name: str, body: str = ":") -> None:
+        self.tool(name, f'echo "{name} $1" >>"$HERE/log"\n{body}', "init.d")
+
+    def script(self, *packages: str, services: tuple[str, ...] = ()) -> str:
+        text = reload_script({f"etc/config/{package}" for package in packages}, services)
+        for path, own in {
+            "/etc/config/network": "network",
+            "/etc/init.d": "init.d",
+            "/var/run": "run",
+            "/tmp/meshctl": "run/meshctl",
+            "/sys/class/net": "net",
+            "/sbin/wifi": "bin/wifi",
+        }.items():
+            text = text.replace(path, str(self.place / own))
+        return text
+
+    def reload(
+        self, *packages: str, services: tuple[str, ...] = (), environ: Mapping[str, str] = MappingProxyType({})
+    ) -> tuple[int, str]:
+        """The exit status and what was said about a failure."""
+        done = subprocess.run(
+            ["sh", "-c", self.script(*packages, services=services)],
+            env={"PATH": f"{self.place}/bin:/usr/bin:/bin", "HERE": str(self.place), **environ},
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=120,
+        )
+        return done.returncode, done.stderr.strip()
+
+    @property
+    def log(self) -> list[str]:
+        log = self.place / "log"
+        return log.read_text().splitlines() if log.exists() else []
+
+    def slept_s(self) -> int:
+        return sum(int(line.split()[1]) for line in self.log if line.startswith("sleep "))
+
+
+@pytest.fixture
+def node(tmp_path: Path) -> Node:
+    return Node(tmp_path)
+
+
+def test_nothing_is_reloaded_for_a_file_that_is_no_package(node: Node) -> None:
+    assert node.reload() == (0, "")
+    assert [line for line in node.log if "service list" not in line] == []
+
+
+def test_every_changed_package_has_its_event_sent_and_procd_is_waited_for(node: Node) -> None:
+    assert node.reload("system", "dhcp") == (0, "")
+    events = [line for line in node.log if "service event" in line]
+    assert all(name in event for name, event in zip(("dhcp", "system", "barrier"), events, strict=True))
+    assert "service delete" in node.log[-1]
+    assert not list((node.place / "run" / "meshctl").iterdir())
+
+
+def test_a_procd_that_never_runs_its_reloads_is_a_failure(node: Node) -> None:
+    (node.place / "stuck").touch()
+    status, said = node.reload("system")
+    assert status == 1
+    assert "procd did not run the reloads within 90 s" in said
+
+
+def test_where_procd_takes_no_trigger_its_reloads_are_waited_for_blindly(node: Node) -> None:
+    (node.place / "no-triggers").touch()
+    assert node.reload("system") == (0, "")
+    assert node.slept_s() == 10
+
+
+def test_a_ruleset_that_nft_refuses_is_a_failure_although_fw4_ends_with_0(node: Node) -> None:
+    node.service("firewall")
+    status, said = node.reload("firewall")
+    assert (status, said) == (1, "failed: the firewall's new ruleset is not loaded")
+
+
+def test_the_firewall_is_loaded_after_procd_and_the_interfaces_are_done(node: Node) -> None:
+    assert node.reload("network", "firewall") == (0, "")
+    barriers = [at for at, line in enumerate(node.log) if "service delete" in line]
+    assert len(barriers) == 2
+    assert barriers[1] < node.log.index("firewall reload")
+
+
+def test_a_firewall_that_does_not_run_is_started_now_and_not_at_the_next_boot(node: Node) -> None:
+    (node.place / "run" / "fw4.state").unlink()
+    assert node.reload("firewall") == (0, "")
+    assert "firewall start" in node.log
+
+
+def test_a_firewall_that_is_disabled_is_left_alone(node: Node) -> None:
+    node.service("firewall", '[ "$1" != enabled ]')
+    assert node.reload("firewall") == (0, "")
+    assert [line for line in node.log if line.startswith("firewall")] == ["firewall enabled"]
+
+
+def test_a_firewall_that_failed_before_stops_no_change_of_the_network(node: Node) -> None:
+    node.service("firewall")
+    assert node.reload("network") == (0, "")
+
+
+def test_on_releases_with_fw3_its_exit_status_counts(node: Node) -> None:
+    (node.place / "bin" / "fw4").unlink()
+    (node.place / "run" / "fw4.state").rename(node.place / "run" / "fw3.state")
+    assert node.reload("firewall") == (0, "")
+    node.service("firewall", '[ "$1" != reload ]')
+    assert node.reload("firewall")[0] == 1
+
+
+def test_a_dropbear_that_keeps_its_options_is_not_waited_for(node: Node) -> None:
+    assert node.reload("dropbear") == (0, "")
+    assert node.slept_s() == 0
+
+
+def test_a_dropbear_that_gets_other_options_is_waited_for_until_its_old_process_has_ended(node: Node) -> None:
+    with subprocess.Popen(["sleep", "600"]) as old:
+        (node.place / "dropbear").write_text(DROPBEAR % (old.pid, 22))
+        (node.place / "dropbear.next").write_text(DROPBEAR % (old.pid, 2222))
+        # procd lists the new command while the old process still runs
+        node.tool("sleep", f'echo "sleep $1" >>"$HERE/log"; kill {old.pid}')
+        reaper = threading.Thread(target=old.wait)
+        reaper.start()
+        try:
+            assert node.reload("dropbear") == (0, "")
+        finally:
+            old.kill()
+            reaper.join()
+    assert node.slept_s() >= 1
+
+
+def test_a_dropbear_that_does_not_end_is_a_failure(node: Node) -> None:
+    (node.place / "dropbear").write_text(DROPBEAR % (os.getpid(), 22))
+    (node.place / "dropbear.next").write_text(DROPBEAR % (os.getpid(), 2222))
+    assert node.reload("dropbear") == (1, "failed: dropbear still runs with its old options")
+    assert node.slept_s() == 15
+
+
+def test_radios_that_netifd_is_setting_up_are_waited_for(node: Node) -> None:
+    (node.place / "pending").touch()
+    assert node.reload("wireless") == (0, "")
+    assert node.slept_s() == 1
+
+
+WIRELESS = """wireless.radio0=wifi-device
+wireless.radio0.disabled='%s'
+wireless.mesh0=wifi-iface
+wireless.mesh0.device='radio0'
+wireless.mesh0.ifname='mesh0'
+wireless.default_radio0=wifi-iface
+wireless.default_radio0.device='radio0'
+"""
+
+
+@pytest.mark.parametrize(
+    ("disabled", "before", "after", "is_reset"),
+    [
+        (0, True, True, False),
+        # taken away and never created again
+        (0, True, False, True),
+        # missing all along: not what the change did
+        (0, False, False, False),
+        # it goes on sending although it is off
+        (1, True, True, True),
+        (1, True, False, False),
+    ],
+)
+def test_radios_that_were_lost_or_stay_on_are_taken_down_and_up_once(
+    node: Node, disabled: int, before: bool, after: bool, is_reset: bool
+) -> None:
+    node.tool("wifi", 'echo "wifi $1" >>"$HERE/log"')
+    (node.place / "wireless").write_text(WIRELESS % disabled)
+    (node.place / "net" / "lo").mkdir()
+    if before:
+        (node.place / "net" / "mesh0").mkdir()
+    if before and not after:
+        node.tool("reload_config", 'rmdir "$HERE/net/mesh0"')
+    assert node.reload("wireless") == (0, "")
+    assert [line for line in node.log if line.startswith("wifi")] == (["wifi down", "wifi up"] if is_reset else [])
+
+
+@pytest.mark.parametrize(
+    ("network", "handlers", "restarts"),
+    [
+        ("option proto 'batadv'", '{"static": {}, "batadv": {}}', False),
+        ("option proto 'batadv'", '{"static": {}}', True),
+        ("option proto 'static'", '{"static": {}}', False),
+    ],
+)
+def test_netifd_restarts_where_it_does_not_know_batman_adv_yet(
+    node: Node, network: str, handlers: str, restarts: bool
+) -> None:
+    (node.place / "network").write_text(network)
+    (node.place / "handlers").write_text(handlers)
+    assert node.reload("network") == (0, "")
+    assert ("network restart" in node.log) is restarts
+
+
+def test_a_back_ends_service_is_restarted_and_its_failure_counts(node: Node) -> None:
+    node.service("meshmerize")
+    assert node.reload("network", services=("meshmerize",)) == (0, "")
+    assert "meshmerize restart" in node.log
+    node.service("meshmerize", "exit 1")
+    assert node.reload("network", services=("meshmerize",)) == (1, "failed: restart of meshmerize")
+
+
+@pytest.mark.parametrize(
+    ("client", "pings"),
+    [({"SSH_CONNECTION": "10.42.0.2 51000 10.42.0.11 22"}, [f"-c {SPEAK_FRAMES} 10.42.0.2"]), ({}, [])],
+)
+def test_a_node_whose_network_changes_speaks_to_the_address_it_was_reached_from_and_waits_for_no_answer(
+    node: Node, client: dict[str, str], pings: list[str]
+) -> None:
+    os.mkfifo(node.place / "go")
+    node.tool("ping", 'read -r _ <"$HERE/go"\necho "$@" >>"$HERE/pings"')
+    # it ends although the ping has not
+    assert node.reload("network", environ=client) == (0, "")
+    if pings:
+        (node.place / "go").write_text("\n")
+    log = node.place / "pings"
+    deadline = time.monotonic() + 60
+    while pings and not (log.exists() and log.read_text()):
+        assert time.monotonic() < deadline, "it did not speak"
+        time.sleep(0.01)
+    assert (log.read_text().splitlines() if log.exists() else []) == pings
+
+
+def test_the_radios_alone_make_nobody_speak(node: Node) -> None:
+    node.tool("ping", 'echo "$@" >>"$HERE/log"')
+    assert node.reload("wireless", environ={"SSH_CONNECTION": "10.42.0.2 51000 10.42.0.11 22"}) == (0, "")
+    assert not [line for line in node.log if "10.42.0.2" in line]

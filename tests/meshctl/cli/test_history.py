@@ -1,0 +1,66 @@
+"""Earlier runs: a heading over the columns, and no node of one fleet among those of another."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from meshctl.cli.main import main
+from meshctl.fleet import Outcome, Result
+from meshctl.fleet.journal import Journal
+
+
+@pytest.fixture
+def journal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    path = tmp_path / "meshctl" / "journal.sqlite"
+    with Journal(path) as field, Journal(path, lab="/lab") as lab:
+        for place, fleet in ((field, "mine"), (lab, "mine"), (field, "ruins"), (field, "mine")):
+            run = place.begin("provision", fleet=fleet, inventory="/x", nodes=("b01",))
+            run.finish_node(Outcome("b01", Result.DONE))
+            run.end("1 done")
+
+
+def said(capfd: pytest.CaptureFixture[str], *words: str) -> str:
+    with pytest.raises(SystemExit) as ended:
+        main(["history", *words])
+    assert ended.value.code == 0
+    return capfd.readouterr().out
+
+
+@pytest.mark.usefixtures("journal")
+def test_runs_stand_below_a_heading_newest_first(capfd: pytest.CaptureFixture[str]) -> None:
+    lines = said(capfd).splitlines()
+    assert lines[0].split() == ["RUN", "BEGAN", "COMMAND", "FLEET", "RESULT"]
+    assert [line.split()[0] for line in lines[1:]] == ["4", "3", "2", "1"]
+    assert "mine (lab)" in lines[3]
+
+
+@pytest.mark.usefixtures("journal")
+def test_a_node_s_runs_stand_fleet_by_fleet(capfd: pytest.CaptureFixture[str]) -> None:
+    text = said(capfd, "--node", "b01")
+    blocks = [block.splitlines() for block in text.split("\n\n")]
+    assert [block[0] for block in blocks] == ["b01 of mine", "b01 of ruins", "b01 of mine (lab)"]
+    assert [line.split()[0] for line in blocks[0] if line.strip()[:1].isdigit()] == ["4", "1"]
+    assert "b01: done" in blocks[2][-1]
+
+
+@pytest.mark.usefixtures("journal")
+@pytest.mark.parametrize(
+    ("words", "runs"),
+    [
+        (("--fleet", "mine"), [4, 2, 1]),
+        (("--fleet", "mine", "--real"), [4, 1]),
+        (("--virtual",), [2]),
+        (("--fleet", "ruins", "--node", "b01"), [3]),
+        (("--real", "--limit", "2"), [4, 3]),
+    ],
+)
+def test_runs_are_chosen_by_fleet_and_by_what_is_real(
+    capfd: pytest.CaptureFixture[str], words: tuple[str, ...], runs: list[int]
+) -> None:
+    listed = json.loads(said(capfd, *words, "--json"))
+    assert [run["run"] for run in listed] == runs
+    assert {run["lab"] for run in listed} <= {"", "/lab"}

@@ -1,0 +1,74 @@
+"""What the commands say at the prompt: without colours where those are unwanted, with the remedy that fits."""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+
+import pytest
+
+from meshctl.cli.access import shell_words
+from meshctl.cli.main import main
+from meshctl.cli.output import console
+from meshctl.cli.plan import bench_advice
+from meshctl.fleet.journal import RunRecord
+from meshctl.plan import NodePlan, Plan, Verdict
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+STYLES = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def run_of(command: str) -> RunRecord:
+    return RunRecord(7, command, "f", "/x", "me", "p", "", 0.0, 1.0, "1 unreachable")
+
+
+@pytest.mark.parametrize("words", [["--help"], ["plan", "--help"], ["robots", "deploy", "--help"], ["plan", "--nope"]])
+def test_no_color_leaves_out_colours_and_bold_everywhere(monkeypatch: pytest.MonkeyPatch, words: list[str]) -> None:
+    def shown() -> str:
+        out, err = Terminal(), Terminal()
+        monkeypatch.setattr(sys, "stdout", out)
+        monkeypatch.setattr(sys, "stderr", err)
+        with pytest.raises(SystemExit):
+            main(words)
+        return out.getvalue() + err.getvalue()
+
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("NO_COLOR", "1")
+    plain = shown()
+    assert plain
+    assert not STYLES.search(plain)
+
+
+def test_no_color_leaves_plans_and_live_lines_plain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    for value, is_styled in (("", True), ("1", False)):
+        out = Terminal()
+        monkeypatch.setattr(sys, "stdout", out)
+        monkeypatch.setenv("NO_COLOR", value)
+        console().print("words", style="bold red")
+        assert bool(STYLES.search(out.getvalue())) is is_styled
+
+
+@pytest.mark.parametrize(
+    ("command", "sent"),
+    [(["ps | grep x"], "ps | grep x"), (["echo", "a  b", "$HOME"], "echo 'a  b' '$HOME'"), (["uptime"], "uptime")],
+)
+def test_one_word_is_the_node_s_shell_s_and_several_arrive_as_they_are(command: list[str], sent: str) -> None:
+    assert shell_words(command) == sent
+
+
+def test_a_resumed_bootstrap_says_that_silent_nodes_belong_on_the_bench() -> None:
+    nodes = {"b01": NodePlan("b01", Verdict.AWAY, reason="no answer"), "b02": NodePlan("b02", Verdict.SAME)}
+    plan = Plan("f", 0.0, "base", nodes)
+    assert bench_advice(run_of("bootstrap"), plan) == (
+        "run 7 was a bootstrap: b01 may still be factory fresh",
+        "hint: plug in such a device on the bench and run `meshctl bootstrap` again",
+    )
+    assert bench_advice(run_of("provision"), plan) == ()
+    assert bench_advice(run_of("bootstrap"), Plan("f", 0.0, "base", {"b02": nodes["b02"]})) == ()

@@ -1,0 +1,351 @@
+"""What a newcomer's trial reported: findings that were false, missing, or at the wrong place."""
+
+from pathlib import Path
+
+import pytest
+
+from meshctl.diagnostics import Diagnostic
+from meshctl.lint import Example, examine
+from meshctl.lint.example import ENVIRONMENT, compose, environment, write
+from meshctl.lint.openwrt_names import PACKAGES, meant_package, one_slip
+from meshctl.lint.zones import is_posix, zones
+from meshctl.regdb import SHIPPED, load
+
+_REGDB = load(SHIPPED)
+_KEY = ENVIRONMENT["UDP_MESH_KEY"]
+
+
+def _found(example: Example | str, directory: Path) -> list[Diagnostic]:
+    given = Example(example) if isinstance(example, str) else example
+    return list(examine(write(given, directory), _REGDB, environment(given)).diagnostics)
+
+
+def _codes(example: Example | str, directory: Path) -> list[str]:
+    return [item.code for item in _found(example, directory)]
+
+
+def test_a_secret_above_the_repository_is_not_inside_it(tmp_path: Path) -> None:
+    repository = tmp_path / "repository"
+    (repository / ".git").mkdir(parents=True)
+    (tmp_path / "id").write_text(_KEY, encoding="utf-8")
+    (tmp_path / "id").chmod(0o600)
+    fragment = "{udp_mesh: {keys: [{file: ../id}]}, nodes: {base: {ssh: {key_files: [../id]}}}}"
+    assert _codes(fragment, repository) == []
+
+
+def test_a_link_to_a_secret_outside_the_repository_is_not_the_secret(tmp_path: Path) -> None:
+    repository = tmp_path / "repository"
+    (repository / ".git").mkdir(parents=True)
+    (tmp_path / "id").write_text(_KEY, encoding="utf-8")
+    (tmp_path / "id").chmod(0o600)
+    (repository / "id").symlink_to(tmp_path / "id")
+    assert _codes("udp_mesh: {keys: [{file: id}]}", repository) == []
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (repository / "own").write_text(_KEY, encoding="utf-8")
+    (repository / "own").chmod(0o600)
+    (outside / "link").symlink_to(repository / "own")
+    assert _codes("udp_mesh: {keys: [{file: link}]}", outside) == ["MC443"]
+
+
+def test_known_hosts_that_is_a_directory_is_said_to_be_one(tmp_path: Path) -> None:
+    (tmp_path / "pins").mkdir()
+    (finding,) = _found("operators: {known_hosts: pins}", tmp_path)
+    assert (finding.code, finding.message) == ("MC431", "not a regular file")
+
+
+@pytest.mark.parametrize(
+    ("key", "codes"),
+    [
+        (bytes(range(32)).hex(), ["MC453"]),
+        ("ab" * 32, ["MC453"]),
+        ("tPjn8MOpTCGh0tmg9cNudyLRtsjj8EpbnH2OHyo7TF0= # 5d3c1a90", []),
+        (f"{_KEY}\n{_KEY}", ["MC445"]),
+    ],
+)
+def test_a_transport_key_is_read_as_udp_mesh_reads_it(key: str, codes: list[str], tmp_path: Path) -> None:
+    example = Example("udp_mesh: {keys: [{file: mode-0600.key}]}", files={"mode-0600.key": key})
+    assert _codes(example, tmp_path) == codes
+
+
+def test_one_key_with_and_without_its_id_is_one_key(tmp_path: Path) -> None:
+    example = Example(
+        "udp_mesh: {keys: [{env: UDP_MESH_KEY}, {file: mode-0600.key}]}", files={"mode-0600.key": f"{_KEY}  # 5d3c1a90"}
+    )
+    assert _codes(example, tmp_path) == ["MC448"]
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("udp_mesh: [not, text]\n", "has no entry 'udp_mesh' with a text"),
+        ("udp-mesh: abc\n", "has no entry 'udp_mesh' with a text"),
+        ("udp_mesh: {", "is not valid YAML"),
+    ],
+)
+def test_a_file_of_secrets_at_hand_must_hold_the_secret(text: str, found: str, tmp_path: Path) -> None:
+    fragment = "udp_mesh: {keys: [{file: mode-0600.yaml, key: udp_mesh}]}"
+    (finding,) = _found(Example(fragment, files={"mode-0600.yaml": text}), tmp_path)
+    assert finding.code == "MC450"
+    assert found in finding.found
+    written = compose(Example(fragment)).splitlines()[finding.position.line - 1]
+    assert written[finding.position.column - 1 :].startswith("udp_mesh")
+    assert "abc" not in repr(finding)
+
+
+def test_a_directory_is_no_file_of_secrets(tmp_path: Path) -> None:
+    (tmp_path / "keys").mkdir()
+    assert _codes("udp_mesh: {keys: [{file: keys}]}", tmp_path) == ["MC450"]
+
+
+def _at(finding: Diagnostic, directory: Path) -> str:
+    """The inventory's text from the finding's place to the end of its line."""
+    lines = (directory / "fleet.yaml").read_text(encoding="utf-8").splitlines()
+    return lines[finding.position.line - 1][finding.position.column - 1 :]
+
+
+_SECOND_CELL = """
+meshes:
+  main: {backend: meshmerize, operator_parts: PARTS}
+  second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.42.0.0/24,
+           encryption: psk2+ccmp, key: {env: MESH_KEY}, backend: meshmerize, operator_parts: PARTS}
+nodes: {base: {radios: {radio1: {mesh: second}}}}
+""".replace("PARTS", "{templates: parts, service: mm, interface: mm0, status_command: mm-status, packages: [mm]}")
+
+
+def test_two_cells_under_one_meshmerize_interface_share_their_network(tmp_path: Path) -> None:
+    files = {"parts/etc/config/mm.j2": "config mm\n"}
+    assert _codes(Example(_SECOND_CELL, files=files), tmp_path) == []
+    other = _SECOND_CELL.replace("interface: mm0", "interface: mm1", 1)
+    assert "MC205" in _codes(Example(other, files=files), tmp_path)
+
+
+def test_a_relay_whose_first_radio_is_in_another_network_may_keep_its_address(tmp_path: Path) -> None:
+    """A box whose radio0 is the 2.4 GHz one, with the backbone at 5 GHz."""
+    fragment = """
+meshes:
+  second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
+           encryption: psk2+ccmp, key: {env: MESH_KEY}}
+nodes:
+  base: {radios: {radio1: {mesh: second}}}
+  relay: {role: beacon, address: 10.43.0.7, radios: {radio1: {mesh: second}}}
+"""
+    assert _codes(fragment, tmp_path) == []
+
+
+_UAV = """
+nodes: {uav1-radio: {role: robot, state: carried, address: 10.42.0.60}}
+robots:
+  uav1: {nodes: [uav1-radio], computer: {address: 10.42.0.61/24, ssh: {user: robot}}}
+  husky1: {carries: [b01, uav1-radio]}
+"""
+
+
+def test_a_robot_may_carry_another_robot(tmp_path: Path) -> None:
+    assert _codes(_UAV, tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("fragment", "code", "text"),
+    [
+        ("robots: {base-station: {nodes: [base, husky1-front]}}", "MC605", "husky1-front"),
+        ("robots: {husky1: {nodes: [base, husky1-front]}}", "MC605", "base"),
+        ("robots: {husky1: {nodes: [husky1-front, b01]}}", "MC605", "b01"),
+        ("robots: {base-station: {carries: [b01]}}", "MC605", "b01"),
+        ("robots: {husky1: {nodes: [husky1-front, absent]}}", "MC103", "absent"),
+        ("robots: {husky1: {carries: [b01, 'c[1-2]']}}", "MC104", "c[1-2]"),
+        ("robots: {husky1: {carries: [b01, base]}}", "MC607", "base"),
+    ],
+)
+def test_a_robots_list_is_blamed_at_its_element(fragment: str, code: str, text: str, tmp_path: Path) -> None:
+    (finding,) = (item for item in _found(fragment, tmp_path) if item.code == code)
+    assert _at(finding, tmp_path).strip("- '\"").startswith(text)
+
+
+def test_each_wrong_element_of_a_list_is_a_finding_and_a_range_is_one(tmp_path: Path) -> None:
+    found = _found("robots: {husky1: {carries: [b01, x1, 'c[1-9]', x2]}}", tmp_path)
+    assert [(item.code, item.found) for item in found] == [
+        ("MC104", "x1"),
+        ("MC104", "c1, c2, c3, c4 and 5 more"),
+        ("MC104", "x2"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("fragment", "place"),
+    [
+        ("robots: {Husky1: {nodes: [husky1-front]}}", "robots.Husky1"),
+        ("nodes: {B01: {address: 10.42.0.99, hostname: other, role: beacon}}", "nodes.B01"),
+    ],
+)
+def test_names_that_differ_in_capitals_are_found_in_every_section(fragment: str, place: str, tmp_path: Path) -> None:
+    assert place in [item.path for item in _found(fragment, tmp_path) if item.code == "MC112"]
+
+
+def test_a_zone_written_as_the_time_zone_is_answered_with_its_posix_string(tmp_path: Path) -> None:
+    (finding,) = _found("system: {timezone: America/Denver}", tmp_path)
+    assert finding.expected == "MST7MDT,M3.2.0,M11.1.0"
+    assert finding.hint == "write `timezone: MST7MDT,M3.2.0,M11.1.0` and `zonename: America/Denver`"
+    assert _at(finding, tmp_path) == "America/Denver"
+
+
+def test_a_misspelt_zone_is_answered_with_the_nearest(tmp_path: Path) -> None:
+    (finding,) = _found("system: {zonename: America/Dever}", tmp_path)
+    assert (finding.code, finding.hint) == ("MC232", "did you mean America/Denver?")
+
+
+def test_every_zone_of_the_table_has_a_posix_string() -> None:
+    assert len(zones()) > 400
+    assert [name for name, posix in zones().items() if not is_posix(posix)] == []
+
+
+@pytest.mark.parametrize("text", ["UTC", "UTC0", "EST5", "<+0330>-3:30", "EST5EDT", "CET-1CEST,M3.5.0,M10.5.0/3"])
+def test_a_posix_time_zone_is_one(text: str) -> None:
+    assert is_posix(text)
+
+
+@pytest.mark.parametrize("text", ["", "CET", "Europe/Berlin", "UTC+", "5EST", "CET-1CEST,M3.5.0", "<+03>"])
+def test_what_the_c_library_cannot_read_is_no_posix_time_zone(text: str) -> None:
+    assert not is_posix(text)
+
+
+@pytest.mark.parametrize(
+    ("timezone", "zonename", "codes"),
+    [
+        ("UTC", "UTC", []),
+        ("UTC", "Etc/UTC", []),
+        ("GMT0", "UTC", []),
+        ("UTC", "America/Denver", ["MC233"]),
+        ("MST7MDT,M3.2.0,M11.1.0", "America/Boise", []),
+        ("<-07>7<-06>,M3.2.0,M11.1.0", "America/Denver", []),
+        ("EST5EDT,M3.2.0,M11.1.0", "America/New York", []),
+        # the name left at its default
+        ("MST7MDT,M3.2.0,M11.1.0", "UTC", []),
+    ],
+)
+def test_time_zone_and_name_are_held_against_each_other(
+    timezone: str, zonename: str, codes: list[str], tmp_path: Path
+) -> None:
+    assert _codes(f"system: {{timezone: '{timezone}', zonename: '{zonename}'}}", tmp_path) == codes
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [("abcd", "abd"), ("abcd", "abxcd"), ("abcd", "abxd"), ("abcd", "acbd"), ("abcd", "abcde"), ("abc", "xabc")],
+)
+def test_one_slip_is_one_letter_or_one_exchange(one: str, other: str) -> None:
+    assert one_slip(one, other)
+    assert one_slip(other, one)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"), [("abcd", "abcd"), ("abcd", "ab"), ("abcd", "axyd"), ("abcd", "dcba"), ("", "ab")]
+)
+def test_two_slips_are_not_one(one: str, other: str) -> None:
+    assert not one_slip(one, other)
+    assert not one_slip(other, one)
+
+
+def test_no_known_package_is_taken_for_another() -> None:
+    assert [name for name in PACKAGES if meant_package(name) is not None] == []
+
+
+def test_flash_that_is_too_small_is_found_where_the_image_is_not_at_hand(tmp_path: Path) -> None:
+    image = "{image: absent.bin, revision: r1, sha256: " + "ab" * 32 + "}"
+    assert sorted(_codes(f"hardware: {{rocket: {{flash_mib: 4, firmware: {image}}}}}", tmp_path)) == ["MC801", "MC828"]
+
+
+@pytest.mark.parametrize("target", ["newchip9000/generic", "ramips/en7581"])
+def test_a_target_that_is_near_to_none_may_be_a_new_one(target: str, tmp_path: Path) -> None:
+    assert _codes(f"hardware: {{rocket: {{target: {target}}}}}", tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("fragment", "code", "hint"),
+    [
+        ("hardware: {rocket: {target: ath79/genric}}", "MC833", "did you mean ath79/generic?"),
+        ("hardware: {rocket: {target: ath97/generic}}", "MC833", "did you mean ath79?"),
+        ("robots: {husky1: {computer: {arch: arm64}}}", "MC631", "write aarch64"),
+        ("robots: {husky1: {computer: {ros: melodic}}}", "MC632", ""),
+        ("nodes: {b01: {packages: [kmod-ath9]}}", "MC832", "did you mean kmod-ath9k?"),
+    ],
+)
+def test_a_slip_is_answered_with_what_was_meant(fragment: str, code: str, hint: str, tmp_path: Path) -> None:
+    (finding,) = _found(fragment, tmp_path)
+    assert finding.code == code
+    assert hint in finding.hint
+    assert _at(finding, tmp_path).rstrip("]}").endswith(finding.found)
+
+
+@pytest.mark.parametrize(
+    ("fragment", "code", "text"),
+    [
+        # base wrote the name; b01 has it because that is what it is called
+        ("nodes: {base: {hostname: b01}}", "MC110", "b01"),
+        ("nodes: {husky1-front: {hostname: x1}, b01: {hostname: x1}}", "MC110", "x1"),
+        ("nodes: {b01: {radios: {radio0: {mac: '00:15:6d:00:00:01'}}}}", "MC113", "00:15:6d:00:00:01"),
+        ("udp_mesh: {heartbeat_s: 1000}", "MC739", "1000"),
+        ("udp_mesh: {offline_after_s: 2}", "MC739", "2"),
+        ("meshes: {main: {lan_mtu: 1600}}", "MC506", "1600"),
+        ("meshes: {main: {lan_mtu: 1400}}", "MC508", "1400"),
+        ("{system: {log_host: 10.42.0.100}, udp_mesh: {port: 514}}", "MC737", "514"),
+        ("robots: {base-station: {is_base: false}}", "MC618", "false"),
+        ("hardware: {rocket: {radios: {radio0: {amplifier_gain_db: 9}}}}", "MC344", "28"),
+        ("hardware: {rocket: {lan_ports: []}}", "MC528", "lan_ports: []"),
+        ("hardware: {rocket: {radios: {radio0: {max_drive_dbm: 31}}}}", "MC344", "31"),
+    ],
+)
+def test_a_finding_about_two_values_points_at_the_one_that_is_written(
+    fragment: str, code: str, text: str, tmp_path: Path
+) -> None:
+    (finding,) = (item for item in _found(fragment, tmp_path) if item.code == code)
+    assert _at(finding, tmp_path).strip("'\"") == text
+
+
+def test_a_profile_without_ports_is_one_finding_for_all_robots_that_have_it(tmp_path: Path) -> None:
+    (finding,) = (item for item in _found("hardware: {rocket: {lan_ports: []}}", tmp_path) if item.code == "MC528")
+    assert finding.path == "hardware.rocket.lan_ports"
+    assert finding.message == "the computer of base-station, husky1 is cut off"
+
+
+def test_a_host_key_twice_is_found_at_the_key(tmp_path: Path) -> None:
+    key = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f"
+    own = key[:-4] + "HR4g"
+    fragment = f"nodes: {{base: {{host_keys: ['{key}']}}, b01: {{host_keys: ['{own}', '{key}']}}}}"
+    (finding,) = (item for item in _found(fragment, tmp_path) if item.code == "MC115")
+    assert finding.path == "nodes.b01.host_keys.1"
+
+
+_AT_5G = "meshes: {main: {band: 5g, channel: 149}}\ndefaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}\n"
+_PACKAGES = "hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, DRIVER]}}\n"
+
+
+@pytest.mark.parametrize(
+    ("driver", "more", "codes"),
+    [
+        ("kmod-ath10k", "", ["MC841"]),
+        ("kmod-ath10k-smallbuffers", "", ["MC841"]),
+        ("kmod-ath10k-ct", "", []),
+        ("kmod-ath9k", "", []),
+        # what is written at a radio is known better than what is in the image
+        ("kmod-ath10k", "radios: {radio1: {driver: ath9k}}", []),
+    ],
+)
+def test_a_package_says_what_drives_a_radio_at_5_ghz(driver: str, more: str, codes: list[str], tmp_path: Path) -> None:
+    hardware = _PACKAGES.replace("DRIVER", driver).rstrip("}\n") + (f", {more}" if more else "") + "}}\n"
+    found = _found(_AT_5G + hardware, tmp_path)
+    assert [item.code for item in found] == codes
+    assert all(_at(item, tmp_path).startswith(driver) for item in found)
+
+
+def test_a_package_for_5_ghz_says_nothing_of_the_other_radio(tmp_path: Path) -> None:
+    assert _codes(_PACKAGES.replace("DRIVER", "kmod-ath10k"), tmp_path) == []
+
+
+def test_802_11s_is_what_those_drivers_have(tmp_path: Path) -> None:
+    fragment = (
+        "{meshes: {main: {mode: mesh, encryption: sae}}, hardware: {rocket: {radios: {radio0: {driver: DRIVER}}}}}"
+    )
+    assert _codes(fragment.replace("DRIVER", "ath11k"), tmp_path) == []
+    (tmp_path / "other").mkdir()
+    assert _codes(fragment.replace("DRIVER", "brcmfmac"), tmp_path / "other") == ["MC841"]

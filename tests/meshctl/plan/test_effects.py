@@ -1,0 +1,94 @@
+"""Laws of what a change cuts: what the services of each release really take down, and what decides who can log in."""
+
+from __future__ import annotations
+
+import pytest
+
+from meshctl.model import RELEASES, Release
+from meshctl.plan import Cut
+from meshctl.plan.effects import effects
+from meshctl.plan.values import Effect
+from meshctl.uci import Package, parse
+
+WIRELESS = """\
+config wifi-device 'radio0'
+	option channel '6'
+	option htmode 'HT20'
+	option country 'US'
+	option txpower '27'
+	option rts '2347'
+
+config wifi-iface 'mesh0'
+	option device 'radio0'
+	option ifname 'mesh0'
+	option mode 'adhoc'
+	option encryption 'none'
+"""
+
+
+def wireless(old: str = "", new: str = "") -> Package:
+    assert old in WIRELESS
+    return parse(WIRELESS.replace(old, new, 1), "wireless")
+
+
+def cut_by(old: str, new: str, release: Release) -> Effect:
+    (effect,) = effects(["etc/config/wireless"], {"wireless": wireless()}, {"wireless": wireless(old, new)}, release)
+    return effect
+
+
+@pytest.mark.parametrize("release", RELEASES)
+def test_another_channel_restarts_the_radio_on_every_release(release: Release) -> None:
+    assert cut_by("channel '6'", "channel '11'", release) == Effect("wifi", Cut.MESH, "radio0 restarts: channel")
+
+
+@pytest.mark.parametrize("release", RELEASES)
+@pytest.mark.parametrize(("old", "new"), [("txpower '27'", "txpower '28'"), ("rts '2347'", "rts '500'")])
+def test_up_to_22_03_every_difference_restarts_the_radio_and_later_some_options_do_not(
+    old: str, new: str, release: Release
+) -> None:
+    option = old.partition(" ")[0]
+    expected = (
+        Effect("wifi", Cut.MESH, f"radio0 restarts: {option}")
+        if release < Release.V23_05
+        else Effect("wifi", Cut.NOTHING, f"radio0: {option} set without a restart")
+    )
+    assert cut_by(old, new, release) == expected
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("txpower '27'", "txpower '9'"), ("country 'US'", "country 'DE'"), ("option txpower '27'\n", "")]
+)
+def test_less_range_may_cut_the_mesh_links_without_a_restart(old: str, new: str) -> None:
+    effect = cut_by(old, new, Release.V24_10)
+    assert effect.cut is Cut.MESH
+    assert effect.why.endswith("set without a restart, weak links may break")
+
+
+def test_wpa_supplicant_names_the_country_and_restarts_for_another() -> None:
+    before = WIRELESS.replace("'none'", "'psk2+ccmp'")
+    after = before.replace("'US'", "'DE'")
+    (effect,) = effects(
+        ["etc/config/wireless"],
+        {"wireless": parse(before, "wireless")},
+        {"wireless": parse(after, "wireless")},
+        Release.V24_10,
+    )
+    assert effect == Effect("wifi", Cut.MESH, "radio0 restarts: country")
+
+
+def test_an_interface_that_differs_restarts_its_radio() -> None:
+    assert cut_by("mode 'adhoc'", "mode 'mesh'", Release.V24_10).cut is Cut.MESH
+
+
+def test_a_radio_that_is_added_or_removed_restarts() -> None:
+    without = parse("config wifi-device 'radio1'\n\toption channel '36'\n", "wireless")
+    found = effects(["etc/config/wireless"], {"wireless": wireless()}, {"wireless": without}, Release.V24_10)
+    assert {effect.why.partition(" ")[0] for effect in found} == {"radio0", "radio1"}
+    assert {effect.cut for effect in found} == {Cut.MESH}
+
+
+def test_what_decides_who_can_log_in_cuts_logins() -> None:
+    empty = {"firewall": Package("firewall"), "dropbear": Package("dropbear")}
+    for package in empty:
+        (effect,) = effects([f"etc/config/{package}"], empty, empty, Release.V24_10)
+        assert effect.cut is Cut.LOGIN
