@@ -28,11 +28,11 @@ from typing import Any
 from benchmarks.page import fill
 from benchmarks.reconvergence_udp_mesh import airtime_us
 from meshctl.errors import MeshctlError
-from meshctl.lab.copybook import prepare
-from meshctl.lab.real import control
-from meshctl.lab.real.fleet import RealFleet
-from meshctl.lab.twin import spec_of
 from meshctl.model import Fleet
+from meshlab.from_inventory import spec_of
+from meshlab.inventory_copy import prepare
+from meshlab.qemu import control
+from meshlab.qemu.fleet import RealFleet
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "arp_airtime.jsonl"

@@ -24,18 +24,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from udp_mesh.core import intake
+from udp_mesh.core import receive
 from udp_mesh.core.events import PeerOffline, PeerOnline
+from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.node import Node
-from udp_mesh.core.seams import Datagram
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
 from udp_mesh.crypto import channel
-from udp_mesh.sim.agenda import Agenda
+from udp_mesh.sim.event_queue import Agenda
 
 # All receivers of a broadcast open it with one key and decode the same bytes to the same frozen frames: one processor,
 # which plays them all, does it once, and 1,000 robots that know each other fit into its memory.
-intake.decode = functools.lru_cache(maxsize=64)(intake.decode)  # type: ignore[attr-defined]
-intake.parse_header = functools.lru_cache(maxsize=64)(intake.parse_header)  # type: ignore[assignment, attr-defined]
+receive.decode = functools.lru_cache(maxsize=64)(receive.decode)  # type: ignore[attr-defined]
+receive.parse_header = functools.lru_cache(maxsize=64)(receive.parse_header)  # type: ignore[assignment, attr-defined]
 channel.AESGCM = functools.lru_cache(maxsize=4096)(channel.AESGCM)  # type: ignore[assignment, attr-defined]
 
 RESULTS = Path(__file__).with_name("results") / "discovery.jsonl"

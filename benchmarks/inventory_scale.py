@@ -22,7 +22,7 @@ from pathlib import Path
 
 from meshctl.diagnostics import Severity
 from meshctl.inventory import load, load_fleet
-from meshctl.lint import DiskFiles, LintContext, examine, lint
+from meshctl.lint import DiskFiles, LintContext, check_path, lint
 from meshctl.model import Secret
 from meshctl.regdb import load as load_regdb
 from meshctl.render import render_nodes
@@ -108,7 +108,7 @@ def measure(nodes: int) -> Measured:
         regdb = load_regdb()
         context = LintContext(regdb, DiskFiles())
         rules_s = _best(lambda: lint(fleet, context), runs)
-        lint_s = _best(lambda: examine(path, regdb, {}), runs)
+        lint_s = _best(lambda: check_path(path, regdb, {}), runs)
         found = lint(fleet, context)
         names = list(fleet.nodes)
         render_s = _best(lambda: render_nodes(fleet, names, lambda _: Secret("unused")), runs)

@@ -32,8 +32,8 @@ from pathlib import Path
 from typing import Any
 
 from meshctl.errors import MeshctlError
-from meshctl.lab.fleet import VirtualFleet
 from meshctl.render import DeviceFacts
+from meshlab.fleet import VirtualFleet
 from tests.meshctl.proof.rig import Rig
 
 RESULTS = Path(__file__).with_name("results") / "provisioning.jsonl"

@@ -25,9 +25,9 @@ from pathlib import Path
 from typing import Any
 
 from meshctl.device.connection import Completed
-from meshctl.lab.real import control
-from meshctl.lab.real.fleet import RealFleet
-from meshctl.lab.spec import FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
+from meshlab.qemu import control
+from meshlab.qemu.fleet import RealFleet
+from meshlab.spec import FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
 
 PROGRAMS = Path(__file__).with_name("in_machine")
 RELAYS = ("one", "other")

@@ -53,7 +53,7 @@ def test_the_wheel_carries_templates_examples_pages_scripts_and_scenarios(wheel:
         "meshctl/_shipped/inventory/lab/fleet.yaml",
         "meshctl/_shipped/lint/MC",
         "meshctl/device/scripts/",
-        "meshctl/lab/node_root/",
+        "meshlab/node_root/",
         "udp_mesh/sim/scenarios/final-run.yaml",
         "udp_mesh/daemon/units/",
     ):

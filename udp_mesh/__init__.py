@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from udp_mesh.core.settings import Settings as Settings
     from udp_mesh.core.settings import Topic as Topic
     from udp_mesh.crypto.keys import Key as Key
-    from udp_mesh.daemon.library import Node as Node
-    from udp_mesh.daemon.library import SendRefusedError as SendRefusedError
+    from udp_mesh.daemon.api_node import Node as Node
+    from udp_mesh.daemon.api_node import SendRefusedError as SendRefusedError
     from udp_mesh.daemon.outbox import DirectoryStore as DirectoryStore
     from udp_mesh.links.attachments import LinkWish as LinkWish
 
 __version__ = "0.1.0"
 
 _EXPORTS = {
-    "Node": "udp_mesh.daemon.library",
-    "SendRefusedError": "udp_mesh.daemon.library",
+    "Node": "udp_mesh.daemon.api_node",
+    "SendRefusedError": "udp_mesh.daemon.api_node",
     "LinkWish": "udp_mesh.links.attachments",
     "DirectoryStore": "udp_mesh.daemon.outbox",
     "Settings": "udp_mesh.core.settings",

@@ -11,19 +11,19 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from meshctl.apply.access import Access
-from meshctl.apply.gather import Seen, observe_cleared
-from meshctl.apply.neighbourhood import look_around as look_at_neighbours
-from meshctl.apply.planning import Choices, Prepared, assemble, other_paths
-from meshctl.apply.wanted import Renderer
+from meshctl.apply.neighbor_query import look_around as look_at_neighbours
+from meshctl.apply.prepare import Choices, Prepared, assemble, other_paths
 from meshctl.device.connection import Endpoint
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection, connect
-from meshctl.device.trust import HostKey, TrustStore
+from meshctl.device.trust import HostKey, Recorder, TrustStore
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Node
+from meshctl.nodes.collect import Seen, observe_cleared
+from meshctl.nodes.connections import Access
+from meshctl.nodes.desired import Renderer
 from meshctl.topology import alternate_macs
 
 FACTORY_ADDRESS = "192.168.1.1"
@@ -46,19 +46,6 @@ class BenchPlace:
     def __str__(self) -> str:
         where = self.endpoint.label
         return f"{self.node} at {where}" if self.node else where
-
-
-class Recorder:
-    """Believes any host key, and keeps it: on the bench a cable is the proof, and the key is pinned right after."""
-
-    def __init__(self) -> None:
-        self.key: HostKey | None = None
-
-    def known(self, endpoint: Endpoint) -> tuple[HostKey, ...]:
-        return ()
-
-    def check(self, endpoint: Endpoint, key: HostKey) -> None:
-        self.key = key
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from meshctl.apply.attempt import Attempt, await_flash
-from meshctl.apply.change import new_change_id, new_nonce
-from meshctl.apply.checks import Expectation
-from meshctl.apply.job import Job
-from meshctl.apply.node import carry
+from meshctl.apply.change_in_progress import Attempt, await_flash
+from meshctl.apply.change_set import new_change_id, new_nonce
+from meshctl.apply.commit_confirm import carry
+from meshctl.apply.context import Job
+from meshctl.apply.health_checks import Expectation
 from meshctl.device import deadman
 from meshctl.device.deadman import Change
 from meshctl.device.framing import quoted

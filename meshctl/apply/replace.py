@@ -11,17 +11,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from meshctl.apply.access import Access
-from meshctl.apply.bootstrap import Arrivals, BenchPlace, Found, Recorder
-from meshctl.apply.gather import observe_cleared
-from meshctl.apply.planning import other_paths
-from meshctl.apply.wanted import Renderer
+from meshctl.apply.bootstrap import Arrivals, BenchPlace, Found
+from meshctl.apply.prepare import other_paths
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import connect
-from meshctl.device.trust import HostKey, TrustStore
+from meshctl.device.trust import HostKey, Recorder, TrustStore
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Interrupt
 from meshctl.model import Fleet, Node, NodeState
+from meshctl.nodes.collect import observe_cleared
+from meshctl.nodes.connections import Access
+from meshctl.nodes.desired import Renderer
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class Entry(NamedTuple):
-    """`attribute` of `module` is the command's function, or the Typer app of a group."""
+    """`attribute` of `module` is the command's function, or the Typer app of a group; no module: an extension's."""
 
     module: str
     attribute: str
@@ -37,16 +37,16 @@ COMMANDS: dict[str, Entry] = {
     "provision": Entry("meshctl.cli.plan", "provision", "Plan, ask, apply", _CHANGE),
     "resume": Entry("meshctl.cli.plan", "resume", "Take up what an earlier run left", _CHANGE),
     "history": Entry("meshctl.cli.history", "history", "Show earlier runs, steps and outcomes", _CHANGE),
-    "bootstrap": Entry("meshctl.cli.bench", "bootstrap", "Take factory devices into the fleet", _CHANGE),
-    "replace": Entry("meshctl.cli.bench", "replace", "Give a dead node's identity to a spare", _CHANGE),
-    "backup": Entry("meshctl.cli.keep", "backup", "Fetch a node's whole state", _CHANGE),
-    "restore": Entry("meshctl.cli.keep", "restore", "Put a node's saved state back", _CHANGE),
+    "bootstrap": Entry("meshctl.cli.bootstrap", "bootstrap", "Take factory devices into the fleet", _CHANGE),
+    "replace": Entry("meshctl.cli.bootstrap", "replace", "Give a dead node's identity to a spare", _CHANGE),
+    "backup": Entry("meshctl.cli.backup", "backup", "Fetch a node's whole state", _CHANGE),
+    "restore": Entry("meshctl.cli.backup", "restore", "Put a node's saved state back", _CHANGE),
     "status": Entry("meshctl.cli.status", "status", "Show the whole fleet, and what is wrong with it", _WATCH),
     "preflight": Entry("meshctl.cli.preflight", "preflight", "Go or no-go for the run, with reasons", _WATCH),
     "topology": Entry("meshctl.cli.topology", "topology", "Draw the mesh as its nodes see it", _WATCH),
-    "trust": Entry("meshctl.cli.access", "trust", "Pin the host keys of nodes", _WATCH),
-    "run": Entry("meshctl.cli.access", "run", "Run a command on nodes", _WATCH),
-    "ssh": Entry("meshctl.cli.access", "ssh", "Log in to a node", _WATCH),
+    "trust": Entry("meshctl.cli.ssh", "trust", "Pin the host keys of nodes", _WATCH),
+    "run": Entry("meshctl.cli.ssh", "run", "Run a command on nodes", _WATCH),
+    "ssh": Entry("meshctl.cli.ssh", "ssh", "Log in to a node", _WATCH),
     "robots": Entry("meshctl.cli.robots", "app", "Deploy and watch udp_mesh on the robots' computers", _ROBOTS),
-    "lab": Entry("meshctl.cli.lab", "app", "A virtual fleet on this machine", _LAB),
+    "lab": Entry("", "app", "A virtual fleet on this machine", _LAB),
 }

@@ -15,7 +15,7 @@ from meshctl.cli.output import echo, echo_json
 from meshctl.diagnostics import Severity, sorted_diagnostics
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.codes import MEANINGS
-from meshctl.lint import BY_CODE, RULES, Examined, Rule, examine
+from meshctl.lint import BY_CODE, RULES, Examined, Rule, check_path
 from meshctl.lint import baseline as baselines
 from meshctl.lint.pages import page
 from meshctl.regdb import SHIPPED, load, shipped_version
@@ -93,7 +93,7 @@ def lint(
     targets = given or (Path(os.environ.get("MESHCTL_INVENTORY") or "."),)
     if files:
         targets = tuple(inventories_of(given))
-    examined = [examine(path, database, os.environ, rules) for path in targets]
+    examined = [check_path(path, database, os.environ, rules) for path in targets]
     findings = gathered(examined)
     if select:
         findings = _selected(findings, _prefixes(select, (*BY_CODE, *MEANINGS)))

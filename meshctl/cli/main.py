@@ -18,6 +18,7 @@ from typer.core import DEFAULT_MARKUP_MODE
 
 from meshctl import __version__
 from meshctl.cli.commands import COMMANDS, Entry
+from meshctl.cli.extensions import load
 from meshctl.cli.output import echo, is_plain, prepare_streams
 from meshctl.cli.streams import unheard
 from meshctl.errors import ExitCode, MeshctlError
@@ -82,7 +83,7 @@ def _not_meant() -> None:
 
 
 def _register(app: typer.Typer, name: str, entry: Entry) -> None:
-    target = getattr(importlib.import_module(entry.module), entry.attribute)
+    target = getattr(importlib.import_module(entry.module), entry.attribute) if entry.module else load(name)
     if isinstance(target, typer.Typer):
         _guard_group(target)
         app.add_typer(target, name=name, help=entry.summary, rich_help_panel=entry.panel, no_args_is_help=True)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from meshctl.report.terminal import clean, clean_styled, json_safe
+from meshctl.report.terminal_escapes import clean, clean_styled, json_safe
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -11,12 +11,20 @@ from typing import Annotated
 
 import typer
 
-from meshctl.apply.planning import Choices
-from meshctl.apply.resumed import settled
-from meshctl.cli.carry import ask_and_carry_out, carry_out_plan, checked, choices_of, prepared_for, show, write_text
+from meshctl.apply.prepare import Choices
+from meshctl.apply.resume import settled
+from meshctl.cli.context import KeyFiles, Lab, Nodes, Session, session
+from meshctl.cli.journaled_run import (
+    ask_and_carry_out,
+    carry_out_plan,
+    checked,
+    choices_of,
+    prepared_for,
+    show,
+    write_text,
+)
 from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.output import echo, echo_json
-from meshctl.cli.session import KeyFiles, Lab, Nodes, Session, session
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet.journal import Journal, RunRecord
 from meshctl.plan import Plan, Verdict

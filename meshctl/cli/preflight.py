@@ -8,14 +8,14 @@ from collections.abc import Sequence
 
 import typer
 
-from meshctl.cli.looking import Everybody, glance, paint_of, with_everybody
+from meshctl.cli.fleet_view import Everybody, glance, paint_of, with_everybody
 from meshctl.cli.options import AsJson, line_width
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode
 from meshctl.status import Check, assess
 from meshctl.status import preflight as checks_of
-from meshctl.status.document import preflight_json
-from meshctl.status.memory import facts_to_keep
+from meshctl.status.json_output import preflight_json
+from meshctl.status.last_known import facts_to_keep
 from meshctl.status.robots import takes_part
 from meshctl.status.text import preflight_text
 

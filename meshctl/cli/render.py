@@ -11,9 +11,9 @@ from typing import Annotated, Any
 
 import typer
 
+from meshctl.cli.git_revision import opened
 from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.output import echo, echo_json
-from meshctl.cli.revision import opened
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory import load_fleet
 from meshctl.inventory.secrets import SecretStore

@@ -1,7 +1,7 @@
 """`meshctl robots`: udp_mesh on the robots' computers, deployed, watched and taken away.
 
-Each command gets a `Crew` (robots_crew.py), works on all chosen robots at once (robots_work.py), and tells one outcome
-for each. Topics and keys, which change the inventory too, are in robots_change.py.
+Each command gets a `Crew` (robots_context.py), works on all chosen robots at once (robots_work.py), and tells one
+outcome for each. Topics and keys, which change the inventory too, are in robots_topics.py.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from typing import Annotated
 
 import typer
 
+from meshctl.cli.context import exit_for
 from meshctl.cli.options import line_width
 from meshctl.cli.output import echo, echo_json
-from meshctl.cli.robots_change import rotate_key_command, topic_app
-from meshctl.cli.robots_crew import Crew, end, with_crew
+from meshctl.cli.robots_context import Crew, end, with_crew
+from meshctl.cli.robots_topics import rotate_key_command, topic_app
 from meshctl.cli.robots_work import SERVICE_TIMEOUT_S, begin
-from meshctl.cli.session import exit_for
 from meshctl.errors import ExitCode, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.robots.deploy import planned
 from meshctl.robots.facts import RobotFacts, expectation, facts_object, gather
 from meshctl.robots.host import Host
-from meshctl.robots.watch import difference, table
+from meshctl.robots.status_table import difference, table
 
 app = typer.Typer(help="udp_mesh on the robots' computers: deploy, watch, change.", no_args_is_help=True)
 app.add_typer(topic_app, name="topic")

@@ -12,9 +12,9 @@ from typing import Any
 
 import typer
 
+from meshctl.cli.context import Session
 from meshctl.cli.output import echo
-from meshctl.cli.robots_crew import Crew, Work, crew_in, end, sudo_password
-from meshctl.cli.session import Session
+from meshctl.cli.robots_context import Crew, Work, crew_in, end, sudo_password
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet.journal import RunRecord

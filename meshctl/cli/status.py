@@ -12,16 +12,16 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.live import live
-from meshctl.cli.looking import Everybody, glance, paint_of, with_everybody
+from meshctl.cli.fleet_view import Everybody, glance, paint_of, with_everybody
+from meshctl.cli.live_screen import live
 from meshctl.cli.options import AsJson, line_width
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode
 from meshctl.status import FleetStatus, assess
 from meshctl.status.assess import Look
-from meshctl.status.document import as_json as status_json
 from meshctl.status.filters import ROLES, STATES, Filter
-from meshctl.status.memory import facts_to_keep
+from meshctl.status.json_output import as_json as status_json
+from meshctl.status.last_known import facts_to_keep
 from meshctl.status.text import text
 
 Names = Annotated[

@@ -9,15 +9,15 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.looking import CONNECT_S, Timeout, glance, watcher
+from meshctl.cli.context import KeyFiles, Lab
+from meshctl.cli.fleet_view import CONNECT_S, Timeout, glance, watcher
 from meshctl.cli.options import InventoryPath
 from meshctl.cli.output import echo
-from meshctl.cli.session import KeyFiles, Lab
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Backend
 from meshctl.status import assess
-from meshctl.status.picture import FORMATS, Picture, directions
+from meshctl.status.topology_formats import FORMATS, Picture, directions
 from meshctl.topology import observed_graph, report_of
 from meshctl.topology.cells import link_cells, mesh_reports
 

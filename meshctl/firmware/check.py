@@ -14,7 +14,7 @@ from meshctl.diagnostics import Diagnostic, Position, Severity
 from meshctl.firmware.metadata import Metadata, read_metadata
 from meshctl.firmware.trailer import DamagedImage
 from meshctl.firmware.usign import BadSignature, PublicKey, parse_public_key, verify
-from meshctl.inventory.boundary import irregular
+from meshctl.inventory.file_access import irregular
 from meshctl.model import HardwareProfile
 
 # The codes, each with what it means (docs/render.md).

@@ -24,7 +24,7 @@ from meshctl.inventory.documents import (
 )
 from meshctl.inventory.layers import NodePlan
 from meshctl.inventory.nodes import build_nodes, ssh_settings
-from meshctl.inventory.origins import Origins
+from meshctl.inventory.provenance import Origins
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
 from meshctl.inventory.tree import MappingNode, descend, place_of
 from meshctl.model import (

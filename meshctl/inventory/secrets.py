@@ -15,8 +15,8 @@ import pyrage
 
 from meshctl.diagnostics import Position
 from meshctl.errors import InputError
-from meshctl.inventory.boundary import irregular
 from meshctl.inventory.compose import compose
+from meshctl.inventory.file_access import irregular
 from meshctl.inventory.source import Source
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, Scalar

@@ -1,14 +1,14 @@
 """Rules over the whole inventory, each a small function with a stable code, a page and two examples.
 
 The flow: `rules/` (the functions) -> `catalog` (all of them) -> `engine` (fleet -> findings) -> `suppress`, `baseline`
-(what is excused) -> `examine` (a path -> everything to report). `context` and `files` hold what rules may look at
+(what is excused) -> `check_path` (a path -> everything to report). `context` and `files` hold what rules may look at
 besides the fleet. `example` and `pages` turn each rule into its page under docs/lint/.
 """
 
 from meshctl.lint.catalog import BY_CODE, RULES
+from meshctl.lint.check_path import Examined, check_path
 from meshctl.lint.context import Files, LintContext, no_secret
 from meshctl.lint.engine import lint
-from meshctl.lint.examine import Examined, examine
 from meshctl.lint.files import DiskFiles
 from meshctl.lint.rule import Example, Finding, Rule
 from meshctl.lint.suppress import Suppressed
@@ -24,7 +24,7 @@ __all__ = [
     "LintContext",
     "Rule",
     "Suppressed",
-    "examine",
+    "check_path",
     "lint",
     "no_secret",
 ]

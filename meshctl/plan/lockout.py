@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 
 from meshctl.device.connection import OwnKey, fingerprint_of
 from meshctl.model import Node
-from meshctl.plan.objections import Objection
+from meshctl.plan.preconditions import Objection
 from meshctl.uci import Package
 
 # what libubox takes for false

@@ -18,8 +18,8 @@ from meshctl.plan.effects import effects
 from meshctl.plan.firmware import firmware_step
 from meshctl.plan.lockout import lockout, server_lockout
 from meshctl.plan.masking import Fingerprints, masked_text, secrets_of
-from meshctl.plan.objections import objection
 from meshctl.plan.packages import NO_NEEDS, Needs, package_step
+from meshctl.plan.preconditions import objection
 from meshctl.plan.seen import file_info, fingerprint_texts, is_meshed, packages_seen, parsed, text_of
 from meshctl.plan.values import Cut, Effect, FileChange, FirmwareStep, NodePlan, Verdict
 from meshctl.render import MARKER_PATH, RenderedFile

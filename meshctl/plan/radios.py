@@ -1,8 +1,8 @@
 """Which of a node's radios restart: expected from its wireless settings, or seen on its radios afterwards. Pure.
 
 `radio_changes` says what netifd does with each radio, by release; the plan shows it. `restarted` names the radios that
-may restart at all, whose neighbors then look for stale station entries (`apply/forget.py`). `seen_to_restart` and
-`started_within` say which ones have.
+may restart at all, whose neighbors then look for stale station entries (`apply/stale_stations.py`). `seen_to_restart`
+and `started_within` say which ones have.
 """
 
 from __future__ import annotations

@@ -29,11 +29,11 @@ from jinja2 import (
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
-from meshctl.inventory.boundary import HINT, Boundary
+from meshctl.inventory.file_access import HINT, Boundary
 from meshctl.model import Backend, Fleet, MeshMode, OperatorParts, Release
-from meshctl.render.bounded import LimitExceeded, Renderer
 from meshctl.render.quoting import only_quoted, quoted, revealed
 from meshctl.render.rendered import CONFIG_FOLDER
+from meshctl.render.sandbox import LimitExceeded, Renderer
 from meshctl.resources import shipped
 
 # The codes of this package, each with what it means (docs/render.md).

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from meshctl.plan import Cut, NodePlan, Plan, StageKind, Verdict
-from meshctl.report.settings import changed_lines, summary
-from meshctl.report.terminal import clean
+from meshctl.report.changed_options import changed_lines, summary
+from meshctl.report.terminal_escapes import clean
 
 # narrower than this, words are no longer kept whole
 _LEAST_WIDTH = 20

@@ -20,7 +20,7 @@ from rich.live import Live
 from rich.text import Text
 
 from meshctl.fleet import Event, EventKind, Outcome, Result
-from meshctl.report.terminal import clean, json_safe, one_line
+from meshctl.report.terminal_escapes import clean, json_safe, one_line
 
 _STYLES = {
     Result.DONE: "green",

@@ -20,8 +20,7 @@ from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.model.computers import ROS_1
 from meshctl.robots.bundle import Bundle, bundle, has_bridge
 from meshctl.robots.host import Host, Refused
-from meshctl.robots.tags import Target
-from meshctl.robots.target import (
+from meshctl.robots.preconditions import (
     Facts,
     changed_files,
     clock_remark,
@@ -30,6 +29,7 @@ from meshctl.robots.target import (
     parse_facts,
     room_objection,
 )
+from meshctl.robots.wheel_tags import Target
 from meshctl.robots.wheels import Wheel, choose, fetch, has_all, keep, stock_units
 
 _WHEEL_DIRECTORY = "/opt/udp-mesh/wheels"

@@ -20,7 +20,7 @@ from functools import cache
 from pathlib import Path
 
 from meshctl.errors import InputError
-from meshctl.robots.tags import Target, WheelName, parse_wheel, pip_options, takes
+from meshctl.robots.wheel_tags import Target, WheelName, parse_wheel, pip_options, takes
 
 # What udp_mesh imports besides the standard library, and what that needs in turn.
 REQUIREMENTS = ("cryptography", "cffi", "pycparser")

@@ -13,9 +13,9 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Node, NodeState
 from meshctl.plan import NodePlan
 from meshctl.robots.facts import RobotFacts
-from meshctl.status.alarms import MESH_MODES, Seen, alarms, some
+from meshctl.status.node_alarms import MESH_MODES, Seen, alarms, some
 from meshctl.status.robots import Crew, robot_status
-from meshctl.status.silence import NOT_ASKED, lost_relay_alarm, silent_alarm
+from meshctl.status.unreachable import NOT_ASKED, lost_relay_alarm, silent_alarm
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbour, NodeStatus, Silence, health_of
 from meshctl.topology import Graph, Report, Sighting, neighbours_of, report_of, seen_by
 

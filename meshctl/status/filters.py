@@ -13,7 +13,7 @@ from fnmatch import fnmatchcase
 from meshctl.errors import InputError
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Node, NodeState, Role
-from meshctl.status.codes import CODES
+from meshctl.status.alarm_codes import CODES
 from meshctl.status.robots import robot_state
 from meshctl.status.rows import COMPUTER
 from meshctl.status.values import Alarm, FleetStatus, Level

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from meshctl.model import Fleet, NodeState, Role
-from meshctl.status.alarms import some
+from meshctl.status.node_alarms import some
 from meshctl.status.pings import Pings
 from meshctl.status.robots import takes_part
 from meshctl.status.topics import is_urgent

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Robot
 from meshctl.robots.facts import RobotFacts
-from meshctl.status.alarms import duration
+from meshctl.status.node_alarms import duration
 from meshctl.status.topics import is_urgent, urgent_priorities
 from meshctl.status.values import Alarm, Level, TopicStatus
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, NodeState, Robot
 from meshctl.robots.facts import RobotFacts
-from meshctl.status.memory import ROBOT_PREFIX
+from meshctl.status.last_known import ROBOT_PREFIX
 from meshctl.status.robot_alarms import RobotSeen, robot_alarms, urgent_bytes
-from meshctl.status.silence import NOT_ASKED, silent_alarm
 from meshctl.status.topics import topic_statuses
+from meshctl.status.unreachable import NOT_ASKED, silent_alarm
 from meshctl.status.values import Alarm, Health, Level, RobotStatus, Silence, health_of
 from meshctl.topology import Sighting
 

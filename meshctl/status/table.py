@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from meshctl.report.terminal import one_line
+from meshctl.report.terminal_escapes import one_line
 from meshctl.status.rows import COLUMNS, Cell, Column
 
 _GAP = "  "

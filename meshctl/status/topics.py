@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from meshctl.model import Fleet, Topic, TopicClass
 from meshctl.robots.facts import RobotFacts, TopicFacts
-from meshctl.status.alarms import duration
+from meshctl.status.node_alarms import duration
 from meshctl.status.values import TopicStatus
 
 # A topic misses this many of its periods before it counts as silent: one lost message is no alarm.

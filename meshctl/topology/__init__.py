@@ -1,6 +1,6 @@
 """The mesh as a graph: who hears whom, how far each node is from where we stand, what each node's loss cuts off."""
 
-from meshctl.topology.alternates import alternate_macs, with_alternates
+from meshctl.topology.alternate_macs import alternate_macs, with_alternates
 from meshctl.topology.graph import EMPTY, Graph, Link, Path, graph_of
 from meshctl.topology.observed import (
     NEIGHBOUR_FRESH_MS,

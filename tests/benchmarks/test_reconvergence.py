@@ -12,7 +12,7 @@ import pytest
 from benchmarks import reconvergence_udp_mesh as command
 from benchmarks.reconvergence_fleet import OVERHEARD_S, TELEMETRY_S, Bench, Case, NoPauseError, longest_pause
 from benchmarks.reconvergence_udp_mesh import Measuring, airtime_us, forget, recorded, share_of_air, table
-from meshctl.lab.errors import LabError
+from meshlab.errors import LabError
 
 # DIFS, half of the first contention window
 SPACING_US = 28 + 67.5

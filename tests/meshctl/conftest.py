@@ -6,7 +6,7 @@ from collections.abc import Generator
 
 import pytest
 
-from tests.meshctl.fleet_report import fleets_of, report
+from tests.meshlab.fleet_report import fleets_of, report
 
 
 @pytest.hookimpl(wrapper=True)

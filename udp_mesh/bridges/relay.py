@@ -13,8 +13,8 @@ import hashlib
 from collections import OrderedDict, deque
 from typing import Deque, Iterable, Literal, Mapping, NamedTuple, Union
 
-from udp_mesh.bridges.exchange import Definition, ExchangeError, Hello, Want, decode, encode
 from udp_mesh.bridges.names import Route, inbound_name, ros_word
+from udp_mesh.bridges.protocol import Definition, ExchangeError, Hello, Want, decode, encode
 from udp_mesh.bridges.types import Definitions, Mark, MessageKind, TypeKey, kind_text, parse_kind
 
 MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 64, 32 << 20

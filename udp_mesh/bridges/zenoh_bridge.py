@@ -24,8 +24,8 @@ try:
 except ModuleNotFoundError as error:
     raise SystemExit("udp_mesh.bridges.zenoh_bridge: {} (pip install eclipse-zenoh)".format(error)) from error
 
+from udp_mesh.bridges.daemon_client import MeshPort
 from udp_mesh.bridges.envelope import TYPE, Envelope, EnvelopeError, open_envelope, seal
-from udp_mesh.bridges.port import MeshPort
 from udp_mesh.bridges.rmw_zenoh import (
     CARRIED,
     HISTORY,

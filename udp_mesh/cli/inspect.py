@@ -12,7 +12,7 @@ from typing import NoReturn
 from udp_mesh.cli.output import Exit, fields_text, say, say_json, say_json_line, say_part, say_screen
 from udp_mesh.cli.views import Json, peers_view, status_view, topics_view
 from udp_mesh.client.mesh_client import MeshClient, MeshError
-from udp_mesh.report.terminal import clean
+from udp_mesh.report.terminal_escapes import clean
 
 HOME, END_OF_LINE, BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
 """Go to the upper left corner; clear to the end of the line; clear all below (ECMA-48)."""

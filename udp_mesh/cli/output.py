@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from enum import IntEnum
 
-from udp_mesh.report.terminal import clean, json_safe
+from udp_mesh.report.terminal_escapes import clean, json_safe
 
 
 class Exit(IntEnum):

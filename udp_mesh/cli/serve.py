@@ -19,7 +19,7 @@ from udp_mesh.daemon.toml_source import ConfigurationError
 def run_daemon(arguments: argparse.Namespace) -> int:
     """Runs until it is stopped."""
     # The transport itself: every other command starts in half the time without it.
-    from udp_mesh.daemon.program import run
+    from udp_mesh.daemon.main import run
 
     logging.basicConfig(level=arguments.log_level.upper(), format="%(levelname)s %(message)s")
     try:

@@ -9,7 +9,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from udp_mesh.core.events import MessageId
-from udp_mesh.core.message import Channel
+from udp_mesh.core.sender.message import Channel
 
 LEVEL = 1
 """zlib's fastest: an embedded core compresses several times faster than a mesh carries."""

@@ -4,12 +4,12 @@ A driver repeats: `receive` what arrived, `handle_timer` when `next_timer` has c
 returns none, then `next_event` until None.
 """
 
-from udp_mesh.core import acceptance, changes, dispatch, survey
+from udp_mesh.core import publish, reconfigure, survey, transmit
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.events import Event, MessageId, Rejected
-from udp_mesh.core.intake import take_datagram
-from udp_mesh.core.legacy_peers import LegacyPeers
-from udp_mesh.core.seams import Datagram, RandomSource, Store
+from udp_mesh.core.interfaces import Datagram, RandomSource, Store
+from udp_mesh.core.legacy.peers import LegacyPeers
+from udp_mesh.core.receive import take_datagram
 from udp_mesh.core.settings import Address, LinkInfo, Settings
 from udp_mesh.core.state import State
 from udp_mesh.wire.header import MARK
@@ -28,7 +28,7 @@ class Node:
             raise ValueError(f"boot_id: expected {BOOT_ID_BYTES} bytes, found {len(boot_id)}")
         self._state = State(settings, boot_id, rng, now, store)
         self._legacy = LegacyPeers(self._state)
-        changes.restore_outboxes(self._state, now)
+        reconfigure.restore_outboxes(self._state, now)
 
     @property
     def settings(self) -> Settings:
@@ -51,31 +51,31 @@ class Node:
 
         Call again while it `has_datagrams`. With `max_bytes` a driver whose socket is full asks for less.
         """
-        out = dispatch.collect(self._state, now, max_bytes)
+        out = transmit.collect(self._state, now, max_bytes)
         if self._legacy:
             out = self._legacy.covered(out)
             self._legacy.leave(now, out)
         if out:
-            dispatch.count_sent(self._state, out)
+            transmit.count_sent(self._state, out)
         return out
 
     def next_timer(self) -> float | None:
         """When `handle_timer` wants to be called next (None: never). Cheap; may be in the past."""
-        at = dispatch.next_timer(self._state)
+        at = transmit.next_timer(self._state)
         if self._legacy and at is not None:
             return min(at, self._legacy.next_at())
         return at
 
     def handle_timer(self, now: float) -> None:
         """Do what is due at `now`. Calling early or late is harmless."""
-        dispatch.handle_timer(self._state, now)
+        transmit.handle_timer(self._state, now)
         if self._legacy:
             self._legacy.handle_timer(now)
 
     @property
     def has_datagrams(self) -> bool:
         """Whether `datagrams_to_send` may return something; False right after it returned all there was."""
-        return bool(self._legacy) or dispatch.has_datagrams(self._state)
+        return bool(self._legacy) or transmit.has_datagrams(self._state)
 
     @property
     def is_quiet(self) -> bool:
@@ -83,7 +83,7 @@ class Node:
 
         True after most datagrams of a bulk, of which only every few ask for an answer.
         """
-        return not self._legacy and dispatch.is_quiet(self._state)
+        return not self._legacy and transmit.is_quiet(self._state)
 
     def next_event(self) -> Event | None:
         """The oldest event not yet fetched."""
@@ -97,22 +97,22 @@ class Node:
         Per destination of a reliable topic exactly one outcome event follows. A message to all that fits one datagram
         is broadcast and has no outcome. A peer never heard of is `UNKNOWN_PEER` unless an outbox may hold the message.
         """
-        return acceptance.send(self._state, topic, payload, destination, type_name, now)
+        return publish.send(self._state, topic, payload, destination, type_name, now)
 
     def link_up(self, link: LinkInfo, now: float) -> None:
         """A network attachment appeared, or changed its addresses or MTU (same name)."""
-        changes.link_up(self._state, link, now)
+        reconfigure.link_up(self._state, link, now)
 
     def link_down(self, name: str, now: float) -> None:
         """The attachment is gone; peers reached over it are reached over others as they are heard there."""
-        changes.link_down(self._state, name)
+        reconfigure.link_down(self._state, name)
 
     def apply(self, settings: Settings, now: float) -> list[str]:
         """Change topics, window, rates, limits, keys and neighbours; returns one line per change made.
 
         Drops no accepted message. A changed name or port raises ValueError: these need a new run.
         """
-        lines = changes.apply(self._state, settings, now)
+        lines = reconfigure.apply(self._state, settings, now)
         self._legacy.apply()
         return lines
 
@@ -122,4 +122,4 @@ class Node:
 
     def close(self, now: float) -> None:
         """Say good-bye: fetch the last datagrams and events after it. Reliable messages still open end as expired."""
-        changes.close(self._state, now)
+        reconfigure.close(self._state, now)

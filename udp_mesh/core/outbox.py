@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from heapq import heapify, heappop, heappush
 
 from udp_mesh.core.events import ExpiryReason
-from udp_mesh.core.message import Accepted, Outgoing
-from udp_mesh.core.seams import Store, StoredMessage
+from udp_mesh.core.interfaces import Store, StoredMessage
+from udp_mesh.core.sender.message import Accepted, Outgoing
 from udp_mesh.core.settings import Outbox
 
 

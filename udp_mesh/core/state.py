@@ -8,22 +8,22 @@ state and of `now`.
 from collections.abc import Iterator
 from heapq import heappop, heappush
 
-from udp_mesh.core.casts import CastQueue, Repairs
+from udp_mesh.core.broadcast import CastQueue, Repairs
 from udp_mesh.core.compression import PackingQueue
-from udp_mesh.core.crowd import Crowd
-from udp_mesh.core.discovery import Discovery
-from udp_mesh.core.ledger import Ledger
-from udp_mesh.core.limiter import Gate
-from udp_mesh.core.message import Channel
+from udp_mesh.core.congestion.channel_share import Crowd
+from udp_mesh.core.event_queue import Ledger
+from udp_mesh.core.interfaces import Datagram, RandomSource, Store
 from udp_mesh.core.meter import Meter
-from udp_mesh.core.mismatches import Mismatches
-from udp_mesh.core.outbound import Outbound
 from udp_mesh.core.outbox import Outboxes
-from udp_mesh.core.roster import Roster
-from udp_mesh.core.seams import Datagram, RandomSource, Store
-from udp_mesh.core.session import Peer, Session
+from udp_mesh.core.peers.heartbeat import Discovery
+from udp_mesh.core.peers.key_mismatch import Mismatches
+from udp_mesh.core.peers.peer_table import Roster
+from udp_mesh.core.peers.session import Peer, Session
+from udp_mesh.core.priority_backoff import Yielding
+from udp_mesh.core.sender.message import Channel
+from udp_mesh.core.sender.rate_limit import Gate
+from udp_mesh.core.sender.sender import Outbound
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
-from udp_mesh.core.yielding import Yielding
 from udp_mesh.crypto import Key, Keyring, SendChannel
 
 _NEVER = float("inf")

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions, Stranger
-from udp_mesh.core.discovery import MISSED_HEARTBEATS
 from udp_mesh.core.meter import Meter
-from udp_mesh.core.outbound import Outbound
-from udp_mesh.core.session import Peer, Session
+from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
+from udp_mesh.core.peers.session import Peer, Session
+from udp_mesh.core.sender.sender import Outbound
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
 

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Protocol, cast
 
 from udp_mesh.client.mesh_client import Frame, Header, encode_frame
+from udp_mesh.daemon.framing import BadFrame, RequestReader
 from udp_mesh.daemon.listener import Listener
-from udp_mesh.daemon.request_frames import BadFrame, RequestReader
 
 CLIENT_BACKLOG_BYTES = 32 << 20
 """Bytes written to one client and not yet read by it: a stopped subscriber. A few of the largest usual messages."""

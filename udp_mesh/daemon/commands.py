@@ -26,7 +26,7 @@ from udp_mesh.daemon.configuration import (
     read_rates,
     topic_from_values,
 )
-from udp_mesh.daemon.files import FILE_S, is_below, off_loop
+from udp_mesh.daemon.file_access import FILE_S, is_below, off_loop
 from udp_mesh.daemon.neighbours import (
     NODE_NAME,
     TOPIC_NAME,

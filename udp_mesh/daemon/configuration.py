@@ -27,7 +27,7 @@ from udp_mesh.core.settings import (
     Topic,
 )
 from udp_mesh.crypto import Key
-from udp_mesh.daemon.files import is_exposed, read_regular
+from udp_mesh.daemon.file_access import is_exposed, read_regular
 from udp_mesh.daemon.neighbours import (
     NODE_NAME,
     TOPIC_NAME,

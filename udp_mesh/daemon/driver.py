@@ -18,10 +18,10 @@ from collections.abc import Callable, Sequence
 
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.events import Event, MessageId, Rejected
+from udp_mesh.core.interfaces import Datagram, RandomSource, Store
 from udp_mesh.core.node import Node
-from udp_mesh.core.seams import Datagram, RandomSource, Store
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
-from udp_mesh.daemon.refusals import REVIEW_S, Refusals
+from udp_mesh.daemon.send_errors import REVIEW_S, Refusals
 from udp_mesh.links.attachments import Address, LinkWish
 from udp_mesh.links.hub import LinkHub
 from udp_mesh.links.netlink import InterfaceMonitor

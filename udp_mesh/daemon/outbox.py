@@ -23,7 +23,7 @@ import zlib
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from udp_mesh.core.seams import StoredMessage
+from udp_mesh.core.interfaces import StoredMessage
 
 log = logging.getLogger(__name__)
 

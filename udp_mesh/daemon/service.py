@@ -26,7 +26,7 @@ from udp_mesh.core.events import (
     Rejected,
     RejectReason,
 )
-from udp_mesh.core.seams import RandomSource
+from udp_mesh.core.interfaces import RandomSource
 from udp_mesh.core.settings import Settings, Topic
 from udp_mesh.daemon.api import Client, RequestError
 from udp_mesh.daemon.configuration import (

@@ -20,7 +20,7 @@ def main(arguments: Sequence[str]) -> int:
     from udp_mesh.report.figures import summary
     from udp_mesh.report.page import write_page
     from udp_mesh.report.recording import RecordingError, read
-    from udp_mesh.report.terminal import clean
+    from udp_mesh.report.terminal_escapes import clean
 
     parser = argparse.ArgumentParser(
         prog="udp-mesh report",

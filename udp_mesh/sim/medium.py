@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 
-from udp_mesh.sim.agenda import Agenda
+from udp_mesh.sim.event_queue import Agenda
 
 # IP and UDP headers, and what 802.11 and batman-adv add to a frame
 IP_UDP_BYTES = 28

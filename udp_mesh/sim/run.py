@@ -25,7 +25,7 @@ from udp_mesh.core.events import (
 from udp_mesh.core.settings import Settings
 from udp_mesh.report import recording
 from udp_mesh.sim.medium import Counts
-from udp_mesh.sim.place import Course
+from udp_mesh.sim.mobility import Course
 from udp_mesh.sim.scenario import MAX_MESSAGE_BYTES, Flow, Incident, Scenario
 from udp_mesh.sim.team import Ledger, Team
 

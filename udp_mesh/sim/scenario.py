@@ -17,7 +17,7 @@ import yaml
 
 from udp_mesh.core.settings import Outbox, Settings, Topic
 from udp_mesh.sim.medium import Channel
-from udp_mesh.sim.place import Air, Course, Wall, course, standing
+from udp_mesh.sim.mobility import Air, Course, Wall, course, standing
 
 EVERYBODY = "*"
 _PROBLEMS_SHOWN = 20

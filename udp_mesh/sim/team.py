@@ -24,7 +24,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
-from udp_mesh.sim.agenda import Agenda
+from udp_mesh.sim.event_queue import Agenda
 from udp_mesh.sim.medium import Channel, Frame, Loss, Medium
 
 LINK = "mesh0"

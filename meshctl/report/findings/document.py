@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from meshctl.diagnostics import Diagnostic, Position, Severity
-from meshctl.inventory.visible import Excerpts
+from meshctl.inventory.redaction import Excerpts
 from meshctl.lint import Suppressed
-from meshctl.report.terminal import one_line
+from meshctl.report.terminal_escapes import one_line
 
 # more of a line tells a reader nothing, and a minified file must not fill the screen
 _LONGEST_LINE = 160

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from meshctl.diagnostics import Diagnostic, Severity
-from meshctl.inventory.visible import Excerpts
+from meshctl.inventory.redaction import Excerpts
 from meshctl.report.findings.document import Findings, counted, printable, shown_line
 
 

@@ -16,7 +16,7 @@ from types import MappingProxyType
 
 import pytest
 
-from meshctl.apply.change import SPEAK_FRAMES, reload_script
+from meshctl.apply.change_set import SPEAK_FRAMES, reload_script
 
 DROPBEAR = '{"dropbear": {"instances": {"instance1": {\n"running": true,\n"pid": %s,\n"command": ["-p", "%s"]\n}}}}'
 # `service set` keeps the trigger's file, an event with its name creates it (once `procd` says so); each call is logged

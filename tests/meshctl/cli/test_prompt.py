@@ -8,10 +8,10 @@ import sys
 
 import pytest
 
-from meshctl.cli.access import shell_words
 from meshctl.cli.main import main
 from meshctl.cli.output import console
 from meshctl.cli.plan import bench_advice
+from meshctl.cli.ssh import shell_words
 from meshctl.fleet.journal import RunRecord
 from meshctl.plan import NodePlan, Plan, Verdict
 

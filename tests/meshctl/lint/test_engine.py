@@ -9,7 +9,7 @@ import pytest
 
 from meshctl.diagnostics import Diagnostic, Severity
 from meshctl.inventory import load_fleet
-from meshctl.lint import BY_CODE, RULES, DiskFiles, Example, LintContext, examine, lint
+from meshctl.lint import BY_CODE, RULES, DiskFiles, Example, LintContext, check_path, lint
 from meshctl.lint.example import BASE, ENVIRONMENT, environment, write
 from meshctl.model import Fleet
 from meshctl.regdb import SHIPPED, load
@@ -20,7 +20,7 @@ _REGDB = load(SHIPPED)
 
 def _found(fragment: str, directory: Path) -> list[Diagnostic]:
     example = Example(fragment)
-    return list(examine(write(example, directory), _REGDB, environment(example)).diagnostics)
+    return list(check_path(write(example, directory), _REGDB, environment(example)).diagnostics)
 
 
 def test_a_value_that_a_group_shares_is_reported_once_where_it_is_written(tmp_path: Path) -> None:
@@ -43,7 +43,7 @@ def test_findings_come_in_the_order_of_the_file(tmp_path: Path) -> None:
 
 def test_the_power_sum_is_shown(tmp_path: Path) -> None:
     example = BY_CODE["MC342"].failing
-    (finding,) = examine(write(example, tmp_path), _REGDB, environment(example)).diagnostics
+    (finding,) = check_path(write(example, tmp_path), _REGDB, environment(example)).diagnostics
     assert finding.found == "27 drive + 6 amplifier = 33 dBm"
     assert finding.expected == "at most 30 dBm conducted (country US)"
     assert "3 dB too much" in finding.message
@@ -68,7 +68,7 @@ hardware: {rocket: {radios: {radio0: {rated_power_dbm: 30, amplifier_gain_db: 3,
 
 def test_secrets_are_judged_but_never_shown(tmp_path: Path) -> None:
     example = Example("{udp_mesh: {port: 8701}}", environment={"MESH_KEY": "zu-kurz", "UDP_MESH_KEY": "geheimnis-1234"})
-    examined = examine(write(example, tmp_path), _REGDB, environment(example))
+    examined = check_path(write(example, tmp_path), _REGDB, environment(example))
     assert {item.code for item in examined.diagnostics} == {"MC409", "MC445"}
     assert "zu-kurz" not in repr(examined)
     assert "geheimnis" not in repr(examined)
@@ -76,7 +76,7 @@ def test_secrets_are_judged_but_never_shown(tmp_path: Path) -> None:
 
 def test_without_the_secrets_at_hand_nothing_is_said_of_them(tmp_path: Path) -> None:
     example = Example("udp_mesh: {port: 8701}")
-    assert examine(write(example, tmp_path), _REGDB, {}).diagnostics == ()
+    assert check_path(write(example, tmp_path), _REGDB, {}).diagnostics == ()
 
 
 def test_key_material_is_found_even_when_no_fleet_loads(tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_key_material_is_found_even_when_no_fleet_loads(tmp_path: Path) -> None:
     path.write_text(
         "meshctl: 1\nnonsense: |\n  -----BEGIN OPENSSH PRIVATE KEY-----\n  b3BlbnNzaC1rZXk\n", encoding="utf-8"
     )
-    examined = examine(path, _REGDB, {})
+    examined = check_path(path, _REGDB, {})
     assert [(item.code, item.position.line) for item in examined.diagnostics if item.code == "MC441"] == [("MC441", 3)]
     assert any(item.code.startswith("INV") for item in examined.diagnostics)
 
@@ -101,14 +101,14 @@ def test_key_material_is_found_even_when_no_fleet_loads(tmp_path: Path) -> None:
 def test_a_key_on_any_line_is_found_and_not_repeated(line: str, tmp_path: Path) -> None:
     path = tmp_path / "fleet.yaml"
     path.write_text(f"meshctl: 1\n{line}\n", encoding="utf-8")
-    found = [item for item in examine(path, _REGDB, {}).diagnostics if item.code == "MC441"]
+    found = [item for item in check_path(path, _REGDB, {}).diagnostics if item.code == "MC441"]
     assert [item.position.line for item in found] == [2]
     assert not any(word in str(found) for word in ("b4f8e7", "tPjn8M", "1QQQQQ", "correcthorse"))
 
 
 def test_a_hash_is_no_key(tmp_path: Path) -> None:
     example = BY_CODE["MC801"].passing
-    assert examine(write(example, tmp_path), _REGDB, environment(example)).diagnostics == ()
+    assert check_path(write(example, tmp_path), _REGDB, environment(example)).diagnostics == ()
 
 
 def test_references_to_secrets_are_not_taken_for_secrets(tmp_path: Path) -> None:
@@ -122,12 +122,12 @@ operators: {password_login: false}
 
 @pytest.mark.parametrize(("name", "expected"), [("subt-final", []), ("starter", ["MC423"])])
 def test_the_shipped_inventories_lack_nothing_but_what_their_owner_must_add(name: str, expected: list[str]) -> None:
-    found = examine(shipped("inventory") / name, _REGDB, ENVIRONMENT).diagnostics
+    found = check_path(shipped("inventory") / name, _REGDB, ENVIRONMENT).diagnostics
     assert [item.code for item in found if item.severity is not Severity.NOTE] == expected
 
 
 def test_a_missing_inventory_is_a_finding_that_says_so(tmp_path: Path) -> None:
-    examined = examine(tmp_path / "absent.yaml", _REGDB, {})
+    examined = check_path(tmp_path / "absent.yaml", _REGDB, {})
     assert not examined.is_readable
     assert [item.code for item in examined.diagnostics] == ["INV001"]
 
@@ -178,5 +178,5 @@ def test_a_host_key_pinned_twice_is_found_across_inventory_and_known_hosts(tmp_p
     example = Example(
         "operators: {known_hosts: pins}", files={"pins": f"base {key}\nb01,other {key}\n@revoked b02 {key}\n"}
     )
-    (finding,) = examine(write(example, tmp_path), _REGDB, environment(example)).diagnostics
+    (finding,) = check_path(write(example, tmp_path), _REGDB, environment(example)).diagnostics
     assert (finding.code, finding.path) == ("MC115", "nodes.b01.host_keys")

@@ -11,7 +11,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from meshctl.lint import RULES, Example, examine
+from meshctl.lint import RULES, Example, check_path
 from meshctl.lint.example import ENVIRONMENT, compose, environment, write
 from meshctl.regdb import SHIPPED, load
 
@@ -64,7 +64,7 @@ def test_an_inventory_with_any_values_changed_gives_findings(
         inside[last] = copy.deepcopy(value)
     path = tmp_path_factory.mktemp("any") / "fleet.yaml"
     path.write_text(yaml.safe_dump(changed), encoding="utf-8")
-    for item in examine(path, _REGDB, ENVIRONMENT).diagnostics:
+    for item in check_path(path, _REGDB, ENVIRONMENT).diagnostics:
         assert item.position.file == str(path) or item.code in ("MC901",)
         assert item.position.line >= 1
         assert item.text
@@ -90,5 +90,5 @@ meshes: {main: {backend: meshmerize, operator_parts:
 )
 def test_a_path_that_leads_nowhere_is_a_finding_or_nothing(fragment: str, path: str, tmp_path: Path) -> None:
     example = Example(fragment.replace("PATH", path))
-    codes = {item.code for item in examine(write(example, tmp_path), _REGDB, environment(example)).diagnostics}
+    codes = {item.code for item in check_path(write(example, tmp_path), _REGDB, environment(example)).diagnostics}
     assert codes <= {"MC444", "MC450", "MC452", "MC801", "MC804", "MC808", "MC809", "MC811", "MC901"}

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from meshctl.lint import RULES, Example, Rule, examine
+from meshctl.lint import RULES, Example, Rule, check_path
 from meshctl.lint.example import environment, write
 from meshctl.lint.rules.housekeeping import STALE_BASELINE
 from meshctl.regdb import SHIPPED, load
@@ -16,7 +16,7 @@ _CHECKED = [rule for rule in RULES if rule is not STALE_BASELINE]
 
 def _codes(example: Example, directory: Path) -> set[str]:
     path = write(example, directory)
-    return {item.code for item in examine(path, _REGDB, environment(example)).diagnostics}
+    return {item.code for item in check_path(path, _REGDB, environment(example)).diagnostics}
 
 
 @pytest.mark.parametrize("rule", _CHECKED, ids=lambda rule: rule.code)

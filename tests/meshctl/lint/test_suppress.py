@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from meshctl.lint import examine
+from meshctl.lint import check_path
 from meshctl.lint.example import BASE, ENVIRONMENT
 from meshctl.lint.suppress import find
 from meshctl.regdb import SHIPPED, load
@@ -16,7 +16,7 @@ def _lint(tail: str, directory: Path) -> tuple[list[str], list[str]]:
     """The codes that stay and those that are excused."""
     path = directory / "fleet.yaml"
     path.write_text(BASE + tail, encoding="utf-8")
-    examined = examine(path, _REGDB, ENVIRONMENT)
+    examined = check_path(path, _REGDB, ENVIRONMENT)
     return [item.code for item in examined.diagnostics], [item.diagnostic.code for item in examined.excused]
 
 

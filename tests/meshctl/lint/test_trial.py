@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from meshctl.diagnostics import Diagnostic
-from meshctl.lint import Example, examine
+from meshctl.lint import Example, check_path
 from meshctl.lint.example import ENVIRONMENT, compose, environment, write
 from meshctl.lint.openwrt_names import PACKAGES, meant_package, one_slip
 from meshctl.lint.zones import is_posix, zones
@@ -17,7 +17,7 @@ _KEY = ENVIRONMENT["UDP_MESH_KEY"]
 
 def _found(example: Example | str, directory: Path) -> list[Diagnostic]:
     given = Example(example) if isinstance(example, str) else example
-    return list(examine(write(given, directory), _REGDB, environment(given)).diagnostics)
+    return list(check_path(write(given, directory), _REGDB, environment(given)).diagnostics)
 
 
 def _codes(example: Example | str, directory: Path) -> list[str]:

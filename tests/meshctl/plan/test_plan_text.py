@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from meshctl.plan import Cut, Effect, FileChange, NodePlan, Plan, Stage, StageKind, Verdict, fleet_plan
+from meshctl.report.changed_options import settings
 from meshctl.report.plan_text import plan_lines, question
-from meshctl.report.settings import settings
 from tests.meshctl.plan.support import PASS_PHRASE, fleet, graph, plans, running
 
 LINE = graph("base-b01", "b01-b02")

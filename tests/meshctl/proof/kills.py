@@ -13,7 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from meshctl.lab.state import Power
+from meshlab.state import Power
 from tests.meshctl.proof.rig import Ended, Rig
 
 # After its window a node puts its files back and reloads.

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from meshctl.lab.images import firmware_image
 from meshctl.model import Release
+from meshlab.images import firmware_image
 from tests.meshctl.proof.kills import Case, strike_meshctl, strike_nodes
 from tests.meshctl.proof.rig import Rig
 

@@ -22,11 +22,11 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from meshctl.inventory import load_fleet
-from meshctl.lab.fleet import VirtualFleet
-from meshctl.lab.spec import MESH_PACKAGES, FleetSpec, LinkSpec, Medium, NodeSpec
 from meshctl.model import Release, Secret, SecretRef
 from meshctl.render import DeviceFacts, render_node
 from meshctl.uci import parse
+from meshlab.fleet import VirtualFleet
+from meshlab.spec import MESH_PACKAGES, FleetSpec, LinkSpec, Medium, NodeSpec
 
 # Far above what any command needs on a busy machine; a hang ends here.
 COMMAND_LIMIT_S = 600.0

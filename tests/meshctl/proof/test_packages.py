@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from meshctl.lab.images import opkg_package
+from meshlab.images import opkg_package
 from tests.meshctl.proof.rig import Rig
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab"), pytest.mark.timeout(600)]

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from meshctl.lab.namespaces import CLONE_NEWNET, setns, unshare
+from meshlab.namespaces import CLONE_NEWNET, setns, unshare
 from tests.meshctl.device.servers import PATIENCE_S
 
 OPERATOR = "10.42.0.250"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from meshctl.robots.facts import Expectation, RobotFacts, facts_object, parse_robot_facts
-from meshctl.robots.watch import table
+from meshctl.robots.status_table import table
 
 NOW_S = 1_800_000_000.0
 WANTED = Expectation({"etc/udp-mesh.toml": "1111", "udp-mesh.service": "2222"}, wheel="9999")

@@ -12,11 +12,11 @@ from meshctl.errors import InputError
 from meshctl.fleet import Result
 from meshctl.model import Computer, Robot, SecretKind, SecretRef
 from meshctl.robots.bundle import UNIT_NAME, Bundle, File, service_unit
+from meshctl.robots.connection import chosen_robots
 from meshctl.robots.deploy import switched
-from meshctl.robots.reach import chosen_robots
-from meshctl.robots.rotation import parse_ref, stages, written
-from meshctl.robots.tags import Target, parse_wheel, pip_options, takes
-from meshctl.robots.target import Facts, changed_files, clock_remark, objections, parse_facts, room_objection
+from meshctl.robots.key_rotation import parse_ref, stages, written
+from meshctl.robots.preconditions import Facts, changed_files, clock_remark, objections, parse_facts, room_objection
+from meshctl.robots.wheel_tags import Target, parse_wheel, pip_options, takes
 from meshctl.robots.wheels import own_wheel, stock_units
 from tests.meshctl.render import fleets
 

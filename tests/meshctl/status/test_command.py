@@ -20,10 +20,10 @@ from typer.testing import CliRunner, Result
 
 from meshctl.cli.main import build
 from meshctl.inventory import load_fleet
-from meshctl.lab.fleet import VirtualFleet
-from meshctl.lab.spec import FleetSpec, LinkSpec, Medium, NodeSpec
 from meshctl.model import Secret, SecretRef
 from meshctl.render import render_node
+from meshlab.fleet import VirtualFleet
+from meshlab.spec import FleetSpec, LinkSpec, Medium, NodeSpec
 from tests.meshctl.status.terminal import PATIENCE_S, Terminal
 from tests.waiting import until
 

@@ -19,9 +19,9 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
 from meshctl.plan import FileChange, NodePlan, Verdict
 from meshctl.status import FleetStatus, assess, preflight
-from meshctl.status.codes import CODES
-from meshctl.status.document import as_json, preflight_json
+from meshctl.status.alarm_codes import CODES
 from meshctl.status.filters import Filter
+from meshctl.status.json_output import as_json, preflight_json
 from meshctl.status.preflight import Check
 from meshctl.status.rows import COLUMNS, Cell
 from meshctl.status.table import layout, table_lines

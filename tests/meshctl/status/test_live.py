@@ -15,7 +15,7 @@ ENTERED, LEFT = r"\x1b\[\?1049h", r"\x1b\[\?1049l"
 # How a look goes, by the word the program gets; `look` counts the looks.
 PROGRAM = """\
 import sys, threading
-from meshctl.cli.live import live
+from meshctl.cli.live_screen import live
 looks = 0
 def look():
     global looks

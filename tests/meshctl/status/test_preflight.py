@@ -11,7 +11,7 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Robot
 from meshctl.robots.facts import RobotFacts, ServiceFacts
 from meshctl.status import Check, preflight
-from meshctl.status.document import preflight_json
+from meshctl.status.json_output import preflight_json
 from meshctl.status.pings import Pings, parse_pings, pings_of
 from meshctl.status.text import preflight_text
 from meshctl.status.values import Alarm, Level

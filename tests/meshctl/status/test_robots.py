@@ -12,7 +12,7 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
 from meshctl.robots.facts import ComputerFacts, RobotFacts, ServiceFacts, TopicFacts
 from meshctl.status import Health, Level
-from meshctl.status.memory import facts_to_keep, remembered
+from meshctl.status.last_known import facts_to_keep, remembered
 from meshctl.status.text import text
 from meshctl.status.topics import limit_s
 from meshctl.status.values import Silence

@@ -24,9 +24,9 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
 from meshctl.plan import FileChange, NodePlan, Verdict
 from meshctl.status import Health
-from meshctl.status.memory import facts_to_keep, remembered, typed
-from meshctl.status.silence import silence_of
+from meshctl.status.last_known import facts_to_keep, remembered, typed
 from meshctl.status.text import text
+from meshctl.status.unreachable import silence_of
 from meshctl.status.values import Silence
 from tests.meshctl.status.fleets import HEALTHY, MACS, NOW, alarms, health, seen, status_of
 

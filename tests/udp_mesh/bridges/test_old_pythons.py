@@ -27,7 +27,9 @@ GENERIC = {"dict", "list", "set", "tuple", "type", "frozenset", "deque", "Ordere
 RUNS = """
 import sys
 before = set(sys.modules)
-from udp_mesh.bridges import envelope, exchange, names, port, relay, rmw_zenoh, types
+from udp_mesh.bridges import envelope, names, relay, rmw_zenoh, types
+from udp_mesh.bridges import protocol
+from udp_mesh.bridges import daemon_client
 from udp_mesh.bridges.ros1 import publications
 from udp_mesh.bridges.ros2 import quality
 from udp_mesh.client import mesh_client

@@ -5,8 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udp_mesh.bridges.exchange import Definition, ExchangeError, Hello, Want, decode, encode
 from udp_mesh.bridges.names import Route
+from udp_mesh.bridges.protocol import Definition, ExchangeError, Hello, Want, decode, encode
 from udp_mesh.bridges.relay import (
     ASK_AGAIN_S,
     GIVE_UP_S,

@@ -8,7 +8,7 @@ import pytest
 
 from tests.udp_mesh.bridges.ros_processes import BridgeProcess, Master, Robot
 from tests.udp_mesh.daemon.processes import poll, two_daemons
-from udp_mesh.bridges.exchange import TOPIC_SETTINGS, Definition, decode, encode
+from udp_mesh.bridges.protocol import TOPIC_SETTINGS, Definition, decode, encode
 from udp_mesh.bridges.types import MessageKind, TypeKey, kind_text
 from udp_mesh.client.mesh_client import Message
 

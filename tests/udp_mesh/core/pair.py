@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from udp_mesh.core.events import Event
+from udp_mesh.core.interfaces import Datagram, Store
 from udp_mesh.core.node import Node
-from udp_mesh.core.seams import Datagram, Store
 from udp_mesh.core.settings import Address, LinkInfo, LinkKind, Settings, Topic
 from udp_mesh.crypto import Key
 

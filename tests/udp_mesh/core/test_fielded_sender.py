@@ -12,9 +12,9 @@ import pytest
 from tests.udp_mesh.core.pair import World, settings
 from tests.udp_mesh.core.test_legacy import OLD, OldRobot, pieces
 from udp_mesh.core.events import MessageDelivered, MessageExpired, MessageReceived
-from udp_mesh.core.legacy_acks import LegacyAcks
-from udp_mesh.core.legacy_peers import MOST_TOPICS, SETTLE_S
-from udp_mesh.core.seams import Datagram
+from udp_mesh.core.interfaces import Datagram
+from udp_mesh.core.legacy.acks import LegacyAcks
+from udp_mesh.core.legacy.peers import MOST_TOPICS, SETTLE_S
 from udp_mesh.core.settings import Neighbour, Outbox, Topic
 from udp_mesh.wire.legacy import (
     Host,

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.udp_mesh.core.pair import KEY, Pair, World, pair, settings
-from udp_mesh.core.discovery import MOST_TO_ANSWER
 from udp_mesh.core.events import MessageDelivered, MessageReceived
-from udp_mesh.core.roster import RETIRED_REMEMBERED
-from udp_mesh.core.session import OWED_FRAMES
+from udp_mesh.core.peers.heartbeat import MOST_TO_ANSWER
+from udp_mesh.core.peers.peer_table import RETIRED_REMEMBERED
+from udp_mesh.core.peers.session import OWED_FRAMES
 from udp_mesh.core.settings import Limits, Neighbour, Topic
 from udp_mesh.crypto import TO_ALL, SendChannel
 from udp_mesh.wire.codec import encode

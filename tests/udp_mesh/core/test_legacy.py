@@ -18,10 +18,10 @@ from udp_mesh.core.events import (
     Rejected,
     RejectReason,
 )
-from udp_mesh.core.legacy_receive import LegacyReassembly
-from udp_mesh.core.legacy_send import LAST_SEQUENCE
+from udp_mesh.core.interfaces import Datagram
+from udp_mesh.core.legacy.reassembly import LegacyReassembly
+from udp_mesh.core.legacy.sender import LAST_SEQUENCE
 from udp_mesh.core.node import Node
-from udp_mesh.core.seams import Datagram
 from udp_mesh.core.settings import Limits, LinkInfo, LinkKind, Neighbour, Settings, Topic
 from udp_mesh.wire.legacy import (
     Host,

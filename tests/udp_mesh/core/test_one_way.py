@@ -8,7 +8,7 @@ from udp_mesh.core.events import (
     PeerOffline,
     PeerOnline,
 )
-from udp_mesh.core.seams import Datagram
+from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.settings import Outbox, Topic
 
 TOPICS = (Topic("map"), Topic("art", outbox=Outbox.ALL))

@@ -6,8 +6,7 @@ from types import FrameType
 import pytest
 
 from tests.udp_mesh.core.pair import World, settings
-from tests.udp_mesh.core.test_casts import Disk
-from udp_mesh.core.acceptance import RELEASED_AT_ONCE
+from tests.udp_mesh.core.test_broadcast import Disk
 from udp_mesh.core.events import (
     ExpiryReason,
     MessageDelivered,
@@ -16,7 +15,8 @@ from udp_mesh.core.events import (
     PeerOffline,
     PeerOnline,
 )
-from udp_mesh.core.seams import Store, StoredMessage
+from udp_mesh.core.interfaces import Store, StoredMessage
+from udp_mesh.core.publish import RELEASED_AT_ONCE
 from udp_mesh.core.settings import Outbox, Topic
 
 LOG = Topic("log", priority=8, outbox=Outbox.ALL)

@@ -6,14 +6,14 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.udp_mesh.core.test_scheduler import outgoing
-from udp_mesh.core.acks import AckState
+from tests.udp_mesh.core.sender.test_scheduler import outgoing
 from udp_mesh.core.compression import compress, decompress
-from udp_mesh.core.flight import Flight, Mark, Packet
-from udp_mesh.core.limiter import Gate
-from udp_mesh.core.pacing import MOST_DEBT_S, Pacer
+from udp_mesh.core.congestion.pacer import MOST_DEBT_S, Pacer
 from udp_mesh.core.ranges import RangeSet
-from udp_mesh.core.reassembly import PIECE_OVERHEAD_BYTES, Reassembly, Verdict, Whole
+from udp_mesh.core.receiver.acks import AckState
+from udp_mesh.core.receiver.reassembly import PIECE_OVERHEAD_BYTES, Reassembly, Verdict, Whole
+from udp_mesh.core.sender.rate_limit import Gate
+from udp_mesh.core.sender.sent_packets import Flight, Mark, Packet
 from udp_mesh.core.settings import Limits
 from udp_mesh.wire.frames import Fragment, MessageFlag, MessageHead
 

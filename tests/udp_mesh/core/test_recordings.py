@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from tests.udp_mesh.core.pair import KEY, Pair, World, pair, settings
-from udp_mesh.core import discovery, dispatch
+from udp_mesh.core import transmit
 from udp_mesh.core.events import (
     ExpiryReason,
     MessageDelivered,
@@ -18,9 +18,10 @@ from udp_mesh.core.events import (
     PeerOffline,
     PeerOnline,
 )
-from udp_mesh.core.freshness import ACCEPT_AGE_S, Freshness, clock_ms
-from udp_mesh.core.paths import challenge
-from udp_mesh.core.seams import Datagram
+from udp_mesh.core.interfaces import Datagram
+from udp_mesh.core.peers import heartbeat
+from udp_mesh.core.peers.path_validation import challenge
+from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, Freshness, clock_ms
 from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
 from udp_mesh.crypto import Key, ReceiveChannel, SendChannel
 from udp_mesh.wire.frames import Feature
@@ -60,10 +61,10 @@ def replay(both: Pair, recorded: list[Datagram]) -> None:
 
 def without_dates(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both nodes as the first version was: neither says when it sends, nor takes it."""
-    monkeypatch.setattr(discovery, "OWN_FEATURES", Feature.ZLIB | Feature.REPAIR)
-    monkeypatch.setattr(dispatch, "OWN_FEATURES", Feature.ZLIB | Feature.REPAIR)
-    monkeypatch.setattr(discovery, "clock_ms", lambda now: None)
-    monkeypatch.setattr(dispatch, "clock_ms", lambda now: None)
+    monkeypatch.setattr(heartbeat, "OWN_FEATURES", Feature.ZLIB | Feature.REPAIR)
+    monkeypatch.setattr(transmit, "OWN_FEATURES", Feature.ZLIB | Feature.REPAIR)
+    monkeypatch.setattr(heartbeat, "clock_ms", lambda now: None)
+    monkeypatch.setattr(transmit, "clock_ms", lambda now: None)
 
 
 @pytest.mark.parametrize("topic", [STOP, BEST, replace(BEST, reliable=True)])

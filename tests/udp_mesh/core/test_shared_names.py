@@ -12,7 +12,7 @@ from udp_mesh.core.events import (
     PeerOnline,
 )
 from udp_mesh.core.node import Node
-from udp_mesh.core.presence import REPORT_AGAIN_S
+from udp_mesh.core.peer_lifecycle import REPORT_AGAIN_S
 from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
 
 MAP = Topic("map", priority=7)

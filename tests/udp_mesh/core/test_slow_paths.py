@@ -3,8 +3,8 @@
 import pytest
 
 from tests.udp_mesh.core.pair import World, settings
-from udp_mesh.core.allowance import URGENT_WAIT_S
 from udp_mesh.core.events import MessageDelivered, MessageReceived
+from udp_mesh.core.sender.send_quota import URGENT_WAIT_S
 from udp_mesh.core.settings import Topic
 
 TOPICS = (Topic("status", priority=0), Topic("map", priority=7), Topic("video", priority=9, reliable=False))

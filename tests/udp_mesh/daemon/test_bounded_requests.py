@@ -20,8 +20,8 @@ from udp_mesh.client import MeshClient, MeshError
 from udp_mesh.client.mesh_client import encode_frame
 from udp_mesh.daemon import api, commands, metrics_server
 from udp_mesh.daemon.configuration import read_keys
-from udp_mesh.daemon.files import is_below, is_exposed, read_regular
-from udp_mesh.daemon.request_frames import BadFrame, RequestReader
+from udp_mesh.daemon.file_access import is_below, is_exposed, read_regular
+from udp_mesh.daemon.framing import BadFrame, RequestReader
 from udp_mesh.daemon.toml_source import ConfigurationError, parse
 
 METRICS_PORT = free_port()

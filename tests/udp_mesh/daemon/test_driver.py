@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from tests.udp_mesh.daemon.test_library import make, online, run
+from tests.udp_mesh.daemon.test_api_node import make, online, run
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
 from udp_mesh import Node
 from udp_mesh.core.events import MessageDelivered
-from udp_mesh.core.seams import Datagram
+from udp_mesh.core.interfaces import Datagram
 from udp_mesh.daemon.driver import BLOCKED_DATAGRAMS
 from udp_mesh.links.attachments import Address
 from udp_mesh.links.netlink import NetlinkError

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tests.udp_mesh.daemon.disks import standing_disk
 from tests.udp_mesh.links.sockets import WAIT_S
 from tests.waiting import until
-from udp_mesh.core.seams import StoredMessage
+from udp_mesh.core.interfaces import StoredMessage
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 
 
@@ -136,7 +136,7 @@ def test_a_message_flushed_before_sigkill_is_loaded_after(tmp_path: Path) -> Non
     script = f"""
 import os, signal
 from pathlib import Path
-from udp_mesh.core.seams import StoredMessage
+from udp_mesh.core.interfaces import StoredMessage
 from udp_mesh.daemon.outbox import DirectoryStore
 store = DirectoryStore(Path({str(tmp_path)!r}), 1 << 20)
 for key in range(20):
@@ -192,7 +192,7 @@ def test_a_disk_that_takes_no_more_refuses_counts_and_is_left_clean(tmp_path: Pa
     script = f"""
 import resource
 from pathlib import Path
-from udp_mesh.core.seams import StoredMessage
+from udp_mesh.core.interfaces import StoredMessage
 from udp_mesh.daemon.outbox import DirectoryStore
 store = DirectoryStore(Path({str(tmp_path)!r}), 1 << 30)
 resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 import random
 
-from udp_mesh.sim.agenda import Agenda
+from udp_mesh.sim.event_queue import Agenda
 from udp_mesh.sim.medium import FRAME_BYTES, IP_UDP_BYTES, Channel, Frame, Medium
-from udp_mesh.sim.place import Air, Wall, course
+from udp_mesh.sim.mobility import Air, Wall, course
 
 
 class Line:

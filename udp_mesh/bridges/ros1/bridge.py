@@ -17,7 +17,7 @@ from typing import Callable
 import rosgraph
 import rospy
 
-from udp_mesh.bridges.joint import Joint
+from udp_mesh.bridges.daemon_client import CONDITIONS_TOPIC, MeshPort
 from udp_mesh.bridges.names import (
     Route,
     outbound_name,
@@ -26,9 +26,9 @@ from udp_mesh.bridges.names import (
     routes,
     undeclared_route,
 )
-from udp_mesh.bridges.port import CONDITIONS_TOPIC, MeshPort
 from udp_mesh.bridges.relay import Relay, ToRos
 from udp_mesh.bridges.ros1.graph import MASTER_ERRORS, Graph, Parameters, log_to_ros, parameters
+from udp_mesh.bridges.runtime import Joint
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 
 log = logging.getLogger(__name__)

@@ -23,7 +23,7 @@ from std_msgs.msg import String
 
 from udp_mesh.bridges.names import Route
 from udp_mesh.bridges.relay import ToRos
-from udp_mesh.bridges.ros1 import fielded
+from udp_mesh.bridges.ros1 import legacy
 from udp_mesh.bridges.ros1.publications import Outgoing, Publications
 from udp_mesh.bridges.types import TypeKey
 
@@ -98,10 +98,10 @@ class Graph:
         self._publications = Publications(_Opaque, _subscribers_of, time.monotonic)
         self._unknown: set[TypeKey] = set()
         self._conditions: Mapping[str, Any] | None = None
-        self._stats = rospy.Publisher(prefix + "mesh_status", fielded.NetworkStats, queue_size=1)
-        self._hosts = rospy.Publisher(prefix + "hosts", fielded.HostEntry, queue_size=100)
+        self._stats = rospy.Publisher(prefix + "mesh_status", legacy.NetworkStats, queue_size=1)
+        self._hosts = rospy.Publisher(prefix + "hosts", legacy.HostEntry, queue_size=100)
         self._text = rospy.Publisher(prefix + "mesh_conditions", String, queue_size=1)
-        self._service = rospy.Service(prefix + "getHosts", fielded.GetHosts, self._get_hosts)
+        self._service = rospy.Service(prefix + "getHosts", legacy.GetHosts, self._get_hosts)
         self._settings = rospy.Subscriber(prefix + "mesh_settings", rospy.AnyMsg, self._settings_arrived, on_window)
 
     def start(self, stop: threading.Event) -> None:
@@ -160,13 +160,13 @@ class Graph:
     def publish_conditions(self, conditions: Mapping[str, Any], text: str) -> None:
         """The network's conditions: to programs of the fielded system, and whole (`text`) for the autonomy."""
         self._conditions = conditions
-        self._stats.publish(fielded.network_stats(conditions))
-        for entry in fielded.host_entries(conditions):
+        self._stats.publish(legacy.network_stats(conditions))
+        for entry in legacy.host_entries(conditions):
             self._hosts.publish(entry)
         self._text.publish(String(text))
 
     def _get_hosts(self, _request: object) -> Any:
-        return fielded.hosts_response(self._conditions)
+        return legacy.hosts_response(self._conditions)
 
     # The master
 

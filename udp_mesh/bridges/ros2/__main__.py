@@ -17,11 +17,11 @@ import time
 from collections import deque
 from typing import Any, Deque, Sequence
 
-from udp_mesh.bridges.joint import Joint
+from udp_mesh.bridges.daemon_client import MeshPort
 from udp_mesh.bridges.names import Route, ros_word, routes
-from udp_mesh.bridges.port import MeshPort
 from udp_mesh.bridges.relay import Relay, ToRos
 from udp_mesh.bridges.ros2.quality import Quality, parse_quality, quality_text, ros2_name, shared
+from udp_mesh.bridges.runtime import Joint
 from udp_mesh.bridges.types import TypeKey
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 

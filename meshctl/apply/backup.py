@@ -1,0 +1,233 @@
+"""A node's whole state, kept outside of it: fetched as one archive, put back under the dead-man's switch.
+
+`fetch` takes `sysupgrade -b`'s archive (configuration, keys, accounts, what packages declare as theirs), checks it
+(`read_backup`, pure) and adds what it was taken from. `put_back` makes a change of it like any other: undone by itself
+unless the node proves that it can be reached with it.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import re
+import tarfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from ipaddress import IPv4Address
+from types import MappingProxyType
+
+from meshctl.apply.change_in_progress import Attempt
+from meshctl.apply.change_set import new_change_id, new_nonce, reload_script
+from meshctl.apply.commit_confirm import carry
+from meshctl.apply.context import Job
+from meshctl.device import openwrt
+from meshctl.device.connection import OwnKey
+from meshctl.device.deadman import Change, NewFile
+from meshctl.device.observation import Observation
+from meshctl.device.ssh import SshConnection
+from meshctl.errors import InputError, NodeError
+from meshctl.fleet import Outcome, Result
+from meshctl.model import Node
+from meshctl.plan.lockout import lockout
+from meshctl.plan.preconditions import Objection
+from meshctl.plan.radios import NO_RADIOS, Radios, restarted
+from meshctl.plan.seen import WIRELESS, packages_seen, parsed
+from meshctl.render import MARKER_PATH
+
+INFO_NAME = "meshctl-backup.json"
+# Far above a router's /etc, far below what would hurt: bounds a hostile or broken archive.
+MAX_FILES, MAX_BYTES = 4000, 64 << 20
+# What the dead-man's switch takes: absolute paths of at least two parts, of plain characters, and not its own state.
+_PATH = re.compile(r"(/[A-Za-z0-9._+@-]+){2,}")
+_OWN = ("/etc/meshctl/change", "/etc/meshctl/last", "/tmp/", "/var/", "/dev/", "/proc/", "/sys/")
+# From 24.10 on sysupgrade puts a script into every archive that disables, at the next boot, what was disabled when it
+# was taken (base-files, sbin/sysupgrade). It is no file of the node's, nothing would undo what it does, and the boot
+# hook of the dead-man's switch may be among what it names: it is told, not put back. So is whatever else waits there.
+_ONCE_AT_BOOT = "/etc/uci-defaults/"
+_DISABLES = re.compile(r"^\s*/etc/init\.d/(\S+) disable\s*$", re.MULTILINE)
+
+
+@dataclass(frozen=True, slots=True)
+class Backup:
+    """A node's files by absolute path, and what they were taken from."""
+
+    node: str
+    board: str
+    revision: str
+    taken_s: float
+    packages: tuple[str, ...]
+    files: Mapping[str, NewFile] = field(repr=False)
+    # services that did not start at boot then
+    disabled: tuple[str, ...] = ()
+
+
+def fetch(connection: SshConnection, node: str, seen: Observation) -> bytes:
+    """The node's backup as one tar.gz file. Raises NodeError when what came is no such archive."""
+    info = {
+        "node": node,
+        "board": seen.board.board_name if seen.board else "",
+        "revision": seen.release.revision if seen.release else "",
+        "taken_s": round(seen.answered_at_s, 3),
+        "packages": sorted(seen.packages or ()),
+    }
+    archive = openwrt.backup(connection)
+    try:
+        # sysupgrade keeps no file of ours; the marker tells later which configuration this was
+        own = openwrt.fetch_files(connection, [f"/{MARKER_PATH}"])
+        whole = with_info(archive, info, {path: file.content for path, file in own.items()})
+        read_backup(whole, node)
+    except InputError as error:
+        raise NodeError(f"{node}: what it sent is no backup: {error}") from error
+    return whole
+
+
+def with_info(archive: bytes, info: Mapping[str, object], extra: Mapping[str, bytes] = MappingProxyType({})) -> bytes:
+    """The archive of `sysupgrade -b` with what it was taken from in front, and further public files by absolute path.
+
+    Raises InputError for a damaged archive.
+    """
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w", format=tarfile.GNU_FORMAT) as new:
+        _add(new, INFO_NAME, json.dumps(info, indent=1).encode(), 0o600)
+        for path, content in extra.items():
+            _add(new, path.lstrip("/"), content, 0o644)
+        for member, content in _members(archive, "the archive"):
+            if member.isreg():
+                new.addfile(member, io.BytesIO(content))
+            elif member.issym():
+                new.addfile(member)
+    return gzip.compress(out.getvalue(), mtime=0)
+
+
+def _add(tar: tarfile.TarFile, name: str, content: bytes, mode: int) -> None:
+    entry = tarfile.TarInfo(name)
+    entry.size, entry.mode = len(content), mode
+    tar.addfile(entry, io.BytesIO(content))
+
+
+def read_backup(data: bytes, file: str) -> Backup:
+    """What `fetch` wrote. Raises InputError naming the file and what is wrong with it."""
+    files: dict[str, NewFile] = {}
+    disabled: list[str] = []
+    info: dict[str, object] | None = None
+    for member, content in _members(data, file):
+        if member.name == INFO_NAME:
+            info = _info(content, file)
+        elif member.isreg():
+            path = "/" + member.name.removeprefix("./").lstrip("/")
+            if path.startswith(_ONCE_AT_BOOT):
+                disabled += _DISABLES.findall(content.decode("utf-8", "replace"))
+            elif _PATH.fullmatch(path) and ".." not in path.split("/") and not path.startswith(_OWN):
+                files[path] = NewFile(content, member.mode & 0o7777)
+    if info is None:
+        raise InputError(f"{file}: no {INFO_NAME} in it", hint="expected a file that `meshctl backup` wrote")
+    if not any(path.startswith("/etc/config/") for path in files):
+        raise InputError(f"{file}: no configuration in it")
+    packages = info.get("packages")
+    taken = info.get("taken_s")
+    return Backup(
+        str(info.get("node", "")),
+        str(info.get("board", "")),
+        str(info.get("revision", "")),
+        float(taken) if isinstance(taken, int | float) else 0.0,
+        tuple(str(name) for name in packages) if isinstance(packages, list) else (),
+        files,
+        tuple(disabled),
+    )
+
+
+def _info(content: bytes, file: str) -> dict[str, object]:
+    try:
+        told = json.loads(content)
+    except ValueError as error:
+        raise InputError(f"{file}: {INFO_NAME} is damaged: {error}") from error
+    if not isinstance(told, dict):
+        raise InputError(f"{file}: {INFO_NAME} is damaged: expected an object")
+    return told
+
+
+def _members(data: bytes, file: str) -> list[tuple[tarfile.TarInfo, bytes]]:
+    found: list[tuple[tarfile.TarInfo, bytes]] = []
+    room = MAX_BYTES
+    try:
+        with tarfile.open(fileobj=io.BytesIO(data), mode="r:gz") as tar:
+            for member in tar:
+                room -= member.size
+                if len(found) >= MAX_FILES or room < 0:
+                    raise InputError(f"{file}: more than {MAX_FILES} files or {MAX_BYTES >> 20} MiB in it")
+                stream = tar.extractfile(member) if member.isreg() else None
+                found.append((member, stream.read() if stream is not None else b""))
+    except (tarfile.TarError, OSError, EOFError, zlib.error) as error:
+        raise InputError(f"{file}: expected a tar.gz archive: {error}") from error
+    return found
+
+
+def put_back(job: Job, connection: SshConnection, backup: Backup) -> Outcome:
+    """Make the node what the backup has, under its dead-man's switch. Owns `connection`.
+
+    Raises NodeError only when nothing was changed on the node.
+
+    Files that the node has now and the backup has not stay: `sysupgrade -b` does not name what it left out.
+    """
+    live = job.before.uci or {}
+    files = {path: new for path, new in backup.files.items() if _differs(path, new, live)}
+    if not files:
+        job.work.access.keep(job.name, connection)
+        return Outcome(job.name, Result.UNCHANGED)
+    change = Change(new_change_id(), files, reload_script({path.lstrip("/") for path in files}, ()))
+    address = _address(backup)
+    attempt = Attempt(
+        job,
+        change,
+        new_nonce(),
+        job.node.confirm_window_s,
+        connection.endpoint,
+        job.work.access.places(job.node, address),
+        radios=_radios(files, job.before),
+    )
+    return carry(attempt, connection)
+
+
+def _radios(files: Mapping[str, NewFile], before: Observation) -> Radios:
+    """Which radios start anew with these files."""
+    wireless = files.get(f"/{WIRELESS}")
+    if wireless is None:
+        return NO_RADIOS
+    after = parsed(wireless.content.decode("utf-8", "replace"), "wireless")
+    return restarted(packages_seen([WIRELESS], before)["wireless"], after)
+
+
+def _differs(path: str, new: NewFile, live: Mapping[str, str]) -> bool:
+    package = path.removeprefix("/etc/config/")
+    return package == path or live.get(package) != new.content.decode("utf-8", "replace")
+
+
+def _address(backup: Backup) -> IPv4Address | None:
+    """The management address that the backup brings."""
+    network = backup.files.get("/etc/config/network")
+    tree = None if network is None else parsed(network.content.decode("utf-8", "replace"), "network")
+    lan = None if tree is None else tree.section("lan")
+    text = "" if lan is None else lan.get("ipaddr").partition("/")[0]
+    return IPv4Address(text) if text else None
+
+
+def lockout_by(backup: Backup, node: Node, own: Sequence[OwnKey]) -> Objection | None:
+    """The objection against a backup after which none of our keys would be let in, or None."""
+    return lockout(node, {path.lstrip("/"): new.content for path, new in backup.files.items()}, own)
+
+
+def objection_to(backup: Backup, node: str, seen: Observation) -> str:
+    """Why a backup must not go onto this device; empty when it may."""
+    board = seen.board.board_name if seen.board else ""
+    if backup.board and board != backup.board:
+        return f"the backup is of board {backup.board}, {node} is {board or 'of an unknown one'}"
+    if backup.node and backup.node != node:
+        return f"the backup is of {backup.node}, not of {node}"
+    return ""
+
+
+def lacking_packages(backup: Backup, seen: Observation) -> tuple[str, ...]:
+    """Packages that were installed when the backup was taken and are not now."""
+    return tuple(name for name in backup.packages if name not in (seen.packages or {}))

@@ -1,0 +1,288 @@
+"""Carry out a plan, stage by stage: every node of it ends with exactly one outcome, in the journal as it happens.
+
+`carry_out` runs each stage's nodes together (`_one_node`: firmware, or packages and then files), a switch as one. A
+failed canary, a spent failure budget or Ctrl-C stops what has not begun; what is in work comes to its own end.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from meshctl.apply.commit_confirm import configure
+from meshctl.apply.context import Job, Work
+from meshctl.apply.health_checks import expectation
+from meshctl.apply.mesh_commit import switch
+from meshctl.apply.neighbor_query import look_around
+from meshctl.apply.packages import install
+from meshctl.apply.prepare import Prepared, base_macs
+from meshctl.apply.stale_stations import booted_unforgotten_s
+from meshctl.apply.station_flush import NOT_ASKED, ask_the_rest, make_up_for
+from meshctl.apply.sysupgrade import checked_image, flash
+from meshctl.device.ssh import SshConnection
+from meshctl.errors import NodeError
+from meshctl.fleet import (
+    Event,
+    EventKind,
+    FailureBudget,
+    Interrupt,
+    Observer,
+    Outcome,
+    Result,
+    Tee,
+    outcome_of_error,
+    run,
+)
+from meshctl.fleet.journal import Journal, Run
+from meshctl.model import Fleet, NodeState
+from meshctl.nodes.collect import facts_of, known_macs
+from meshctl.nodes.connections import Access
+from meshctl.nodes.last_seen import ask_around
+from meshctl.plan import NodePlan, Plan, Stage, StageKind, Verdict
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Where and for whom a plan is carried out."""
+
+    fleet: Fleet
+    access: Access
+    journal: Journal
+    run: Run
+    owner: str
+    interrupt: Interrupt
+    observer: Observer
+    rate_bytes_per_s: float | None = None
+
+
+def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
+    """Apply the plan. Raises InputError and InvalidInput before anything is changed: an image or package file that is
+    not what the inventory says."""
+    plan, fleet = prepared.plan, setting.fleet
+    images = {
+        node.hardware.name: checked_image(node.hardware)
+        for node in (fleet.nodes[name] for name, planned in plan.nodes.items() if planned.firmware is not None)
+    }
+    unforgotten = _unforgotten(prepared, setting)
+    work = _work(prepared, setting, unforgotten)
+    outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _without_work(fleet, made))}
+    for outcome in outcomes.values():
+        _tell(setting, outcome)
+    jobs = _jobs(prepared, work)
+    for name, since_s in unforgotten.items():
+        make_up_for(_job(prepared, work, name), max(0.0, time.time() - since_s))
+    budget = FailureBudget(fleet.apply.stop_after_failures)
+    stopped = ""
+    for stage in plan.stages:
+        # a canary that was left in the middle is no canary that failed
+        reason = "interrupted before its turn" if setting.interrupt.stopping else stopped
+        if reason:
+            ended = {name: Outcome(name, Result.PENDING, reason) for name in stage.nodes}
+            for outcome in ended.values():
+                _tell(setting, outcome)
+        else:
+            ended = _stage(stage, jobs, plan, work, setting, budget, images)
+        outcomes.update(ended)
+        if stage.kind is StageKind.CANARY and any(outcome.result.is_failure for outcome in ended.values()):
+            stopped = f"stopped: the canary {stage.nodes[0]} failed"
+        elif budget.spent:
+            stopped = budget.reason
+    outcomes.update(_searched(prepared, setting, jobs, outcomes))
+    outcomes.update(_with_those_not_asked(work, outcomes))
+    return {name: outcomes[name] for name in plan.nodes}
+
+
+def _unforgotten(prepared: Prepared, setting: Setting) -> dict[str, float]:
+    """The nodes that answered whose radios may have started anew without their neighbours having been told, and since
+    when (Unix time): of a change's beginning the end was not seen, or they have booted since they were last known."""
+    seen = prepared.seen.observations
+    lost = setting.journal.lost_sight_of(setting.fleet.name)
+    booted = {name: booted_unforgotten_s(name, seen) for name in prepared.plan.nodes}
+    since = {name: at_s for name, at_s in booted.items() if at_s is not None} | lost
+    return {name: at_s for name, at_s in since.items() if name in prepared.plan.nodes and name in seen}
+
+
+def _work(prepared: Prepared, setting: Setting, unforgotten: Iterable[str]) -> Work:
+    fleet, seen = setting.fleet, prepared.seen.observations
+    known = setting.journal.last_known(fleet.name)
+    around = {**seen, **prepared.around}
+    if again := {name: seen[name] for name in unforgotten}:
+        around = look_around(setting.access, fleet, again, known, told=around, interrupt=setting.interrupt)
+    return Work(
+        fleet,
+        setting.access,
+        setting.run,
+        setting.observer,
+        setting.interrupt,
+        setting.owner,
+        remember=lambda name, told: setting.run.remember(fleet.name, name, facts_of(told), told.answered_at_s),
+        rate_bytes_per_s=setting.rate_bytes_per_s,
+        around=around,
+        names=known_macs(fleet, known),
+        bases=base_macs(fleet, seen, known),
+    )
+
+
+# Results of a node that was in work and is out of sight.
+_LOST = (Result.UNCERTAIN, Result.UNREACHABLE)
+
+
+def _searched(
+    prepared: Prepared, setting: Setting, jobs: Mapping[str, Job], outcomes: Mapping[str, Outcome]
+) -> dict[str, Outcome]:
+    """The outcomes of nodes that did not return, with what was last seen of them, and by whom."""
+    lost = [name for name in jobs if outcomes[name].result in _LOST]
+    if not lost or setting.interrupt.leaving:
+        return {}
+    fleet = setting.fleet
+    known = setting.journal.last_known(fleet.name)
+    found = ask_around(setting.access, fleet, lost, prepared.seen, known, interrupt=setting.interrupt)
+    told = {}
+    for name, place in found.items():
+        text = place.text(time.time())
+        outcome = outcomes[name]
+        told[name] = replace(outcome, reason=f"{outcome.reason}; {text}", facts={**outcome.facts, **place.facts})
+        setting.run.finish_node(told[name])
+        setting.observer(Event(EventKind.NOTE, name, time.time(), text))
+    return told
+
+
+def _with_those_not_asked(work: Work, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
+    """The outcomes of nodes that some neighbour may not hear for a while, with who that is."""
+    told = {}
+    for name, silent in ask_the_rest(work).items():
+        told[name] = replace(outcomes[name], facts={**outcomes[name].facts, NOT_ASKED: " ".join(silent)})
+        work.run.finish_node(told[name])
+    return told
+
+
+def _tell(setting: Setting, outcome: Outcome) -> None:
+    setting.run.finish_node(outcome)
+    setting.observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
+
+
+def _without_work(fleet: Fleet, plan: NodePlan) -> Outcome | None:
+    """The outcome of a node that nothing is done to; None for one that is changed."""
+    match plan.verdict:
+        case Verdict.SAME:
+            return Outcome(plan.node, Result.UNCHANGED)
+        case Verdict.REFUSED:
+            return Outcome(plan.node, Result.REFUSED, plan.reason, hint=plan.hint)
+        case Verdict.AWAY:
+            must_answer = fleet.nodes[plan.node].state is NodeState.DEPLOYED
+            return Outcome(plan.node, Result.UNREACHABLE if must_answer else Result.PENDING, plan.reason)
+        case Verdict.CHANGE:
+            return None
+
+
+def _jobs(prepared: Prepared, work: Work) -> dict[str, Job]:
+    changing = (name for name, plan in prepared.plan.nodes.items() if plan.verdict is Verdict.CHANGE)
+    return {name: _job(prepared, work, name) for name in changing}
+
+
+def _job(prepared: Prepared, work: Work, name: str) -> Job:
+    seen, wanted = prepared.seen.observations[name], prepared.wanted[name]
+    expected = expectation(wanted, seen, work.bases)
+    return Job(work, work.fleet.nodes[name], prepared.plan.nodes[name], wanted, seen, expected)
+
+
+def _stage(
+    stage: Stage,
+    jobs: Mapping[str, Job],
+    plan: Plan,
+    work: Work,
+    setting: Setting,
+    budget: FailureBudget,
+    images: Mapping[str, Path],
+) -> dict[str, Outcome]:
+    observer = Tee((_journaling(setting.run), setting.observer))
+    if stage.kind is StageKind.SWITCH:
+        ended = _switch_stage(stage, jobs, plan, work, observer)
+        for outcome in ended.values():
+            budget.count(outcome)
+        return ended
+    return run(
+        stage.nodes,
+        lambda name: _one_node(jobs[name], images),
+        # a stage says who may be down together, the policy how many we can work on at once
+        parallel=max(1, work.fleet.apply.parallel),
+        budget=budget,
+        interrupt=setting.interrupt,
+        observer=observer,
+    )
+
+
+def _journaling(journal_run: Run) -> Observer:
+    def write(event: Event) -> None:
+        if event.outcome is not None:
+            journal_run.finish_node(event.outcome)
+
+    return write
+
+
+def _one_node(job: Job, images: Mapping[str, Path]) -> Outcome:
+    """Firmware, or packages and then files. NodeError means that nothing was changed."""
+    if job.plan.firmware is not None:
+        return flash(job, _connection(job), images[job.node.hardware.name])
+    outcome = Outcome(job.name, Result.DONE)
+    if job.plan.packages is not None:
+        outcome = install(job, _connection(job), job.plan.packages)
+    if not job.plan.files or not outcome.result.is_good:
+        return outcome
+    try:
+        return configure(job, _connection(job))
+    except NodeError as error:
+        if job.plan.packages is None:
+            raise
+        # its packages are there to stay, and a resume has only the files left to do
+        failed = outcome_of_error(job.name, error)
+        return replace(failed, result=Result.FAILED, reason=f"its packages are installed, its files not: {error}")
+
+
+def _connection(job: Job) -> SshConnection:
+    """The kept connection, or a new one to where the node is now: on the bench, if it was met there."""
+    access = job.work.access
+    return access.take(job.name) or access.open(job.node, endpoint=access.newcomers.get(job.name))
+
+
+def _switch_stage(
+    stage: Stage, jobs: Mapping[str, Job], plan: Plan, work: Work, observer: Observer
+) -> dict[str, Outcome]:
+    """Packages first, which cut nothing; then everybody at one moment."""
+    began = time.monotonic()
+    for name in stage.nodes:
+        observer(Event(EventKind.STARTED, name, time.time()))
+    failed = _packages_first(stage, jobs)
+    if failed:
+        reason = f"the switch was called off: {', '.join(failed)} was not ready"
+        ended = {name: failed.get(name) or Outcome(name, Result.PENDING, reason) for name in stage.nodes}
+    else:
+        ended = switch(
+            work,
+            [jobs[name] for name in stage.nodes],
+            quorum=work.fleet.apply.quorum,
+            parallel=work.fleet.apply.parallel,
+            entry=plan.entry,
+        )
+    took_s = round(time.monotonic() - began, 3)
+    told = {name: replace(outcome, duration_s=took_s) for name, outcome in ended.items()}
+    for outcome in told.values():
+        observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
+    return told
+
+
+def _packages_first(stage: Stage, jobs: Mapping[str, Job]) -> dict[str, Outcome]:
+    failed: dict[str, Outcome] = {}
+    for name in stage.nodes:
+        step = jobs[name].plan.packages
+        if step is None:
+            continue
+        try:
+            outcome = install(jobs[name], _connection(jobs[name]), step)
+        except NodeError as error:
+            outcome = outcome_of_error(name, error)
+        if not outcome.result.is_good:
+            failed[name] = outcome
+    return failed

@@ -1,0 +1,235 @@
+"""From an inventory and the fleet as it is to a plan, with everything that carrying it out will need.
+
+`prepare`: render -> gather -> one plan per node -> the rest of their meshes, where those are cut -> the fleet's order;
+the journal remembers what every node told.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+
+from meshctl.device.observation import Observation
+from meshctl.diagnostics import InvalidInput
+from meshctl.errors import InputError
+from meshctl.fleet import Interrupt, Observer, silent
+from meshctl.fleet.journal import Journal, LastKnown
+from meshctl.model import Fleet, Node, NodeState
+from meshctl.nodes.collect import Seen, facts_of, gather, known_macs
+from meshctl.nodes.connections import Access
+from meshctl.nodes.desired import Renderer
+from meshctl.nodes.last_seen import WITNESSES, whereabouts
+from meshctl.plan import Cut, NodePlan, Plan, Verdict, Wanted, fleet_plan, node_plan
+from meshctl.plan.masking import Fingerprints
+from meshctl.plan.seen import package_of
+from meshctl.topology import mesh_macs
+
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """What a person decided about a plan."""
+
+    with_firmware: bool = True
+    leave_behind: tuple[str, ...] = ()
+    accept_cuts: tuple[str, ...] = ()
+    entry: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A plan, and what was rendered and seen for it; `around` is what others told who may know these nodes' radios."""
+
+    plan: Plan
+    wanted: Mapping[str, Wanted] = field(repr=False)
+    seen: Seen = field(repr=False)
+    salt: bytes = b""
+    around: Mapping[str, Observation] = field(default_factory=dict, repr=False)
+
+
+def prepare(
+    renderer: Renderer,
+    access: Access,
+    nodes: Iterable[Node],
+    journal: Journal,
+    *,
+    salt: bytes,
+    owner: str,
+    choices: Choices | None = None,
+    interrupt: Interrupt | None = None,
+    observer: Observer = silent,
+) -> Prepared:
+    """The plan for these nodes. Raises InvalidInput when one of them cannot be rendered.
+
+    Where a running mesh is cut by it, the rest of that mesh is looked at, too: who is far, and who cuts off whom, does
+    not show in a part of it.
+    """
+    fleet = renderer.fleet
+    chosen = tuple(nodes)
+    first = {node.name: renderer.wanted(node) for node in chosen}
+    seen = gather(
+        access,
+        chosen,
+        parallel=fleet.apply.parallel,
+        paths=lambda node: other_paths(first[node.name]),
+        interrupt=interrupt,
+        observer=observer,
+    )
+    _remember(journal, fleet, seen)
+    decided = choices or Choices()
+    single = _node_plans(renderer, access, first, seen, salt=salt, owner=owner, choices=decided)
+    rest = _rest_of_their_meshes(fleet, single.plans.values()) or _witnesses(
+        fleet, single.plans.values(), journal.last_known(fleet.name)
+    )
+    if rest and not (interrupt is not None and interrupt.stopping):
+        around = gather(access, rest, parallel=fleet.apply.parallel, interrupt=interrupt, observer=observer)
+        _remember(journal, fleet, around)
+        seen = replace(seen, observations={**seen.observations, **around.observations})
+        single = replace(single, around=_plans_around(renderer, around, salt, owner))
+    return _in_order(fleet, single, seen, journal.last_known(fleet.name), salt=salt, choices=decided)
+
+
+def _remember(journal: Journal, fleet: Fleet, seen: Seen) -> None:
+    facts = {name: facts_of(observation) for name, observation in seen.observations.items()}
+    journal.remember_all(fleet.name, facts, time.time())
+
+
+def _rest_of_their_meshes(fleet: Fleet, plans: Iterable[NodePlan]) -> tuple[Node, ...]:
+    """The deployed nodes beside these that share a mesh which one of these would cut, leave or come back to."""
+    planned = {plan.node: plan for plan in plans}
+    meshes = {
+        mesh
+        for plan in planned.values()
+        if plan.verdict is Verdict.CHANGE and (plan.splits or (plan.is_meshed and plan.cut > Cut.LOGIN))
+        for mesh in plan.meshes
+    }
+    members = {node.name: node for mesh in sorted(meshes) for node in fleet.members(mesh)}
+    return tuple(node for name, node in members.items() if name not in planned and node.state is NodeState.DEPLOYED)
+
+
+def _witnesses(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[str, LastKnown]) -> tuple[Node, ...]:
+    """Who may tell of those that do not answer: the neighbours they had when they were last seen, and the base."""
+    chosen = {plan.node: plan for plan in plans}
+    macs = known_macs(fleet, known)
+    away = [name for name, plan in chosen.items() if plan.verdict is Verdict.AWAY]
+    near = [
+        macs[mac]
+        for name in away
+        if name in known
+        for mac in known[name].facts.get("neighbours", "").split()
+        if mac in macs
+    ]
+    base = [fleet.base_node.name] if away and fleet.base_node is not None else []
+    names = [name for name in dict.fromkeys((*near, *base)) if name not in chosen]
+    return tuple(fleet.nodes[name] for name in names[:WITNESSES])
+
+
+def _plans_around(renderer: Renderer, around: Seen, salt: bytes, owner: str) -> dict[str, NodePlan]:
+    """What would be done to these, had they been chosen, as far as it tells which cell they run."""
+    plans = {}
+    for name, observation in around.observations.items():
+        # a node that was not asked for may not be the reason why nothing can be done to the others
+        with suppress(InvalidInput, InputError):
+            wanted = renderer.wanted(renderer.fleet.nodes[name], observation)
+            plans[name] = node_plan(wanted, observation, Fingerprints(salt), owner=owner, with_firmware=False)
+    return plans
+
+
+def assemble(
+    renderer: Renderer,
+    access: Access,
+    first: Mapping[str, Wanted],
+    seen: Seen,
+    known: Mapping[str, LastKnown],
+    *,
+    salt: bytes,
+    owner: str,
+    choices: Choices,
+) -> Prepared:
+    """The plan for what was rendered without the devices' facts (`first`) and what was seen."""
+    single = _node_plans(renderer, access, first, seen, salt=salt, owner=owner, choices=choices)
+    return _in_order(renderer.fleet, single, seen, known, salt=salt, choices=choices)
+
+
+@dataclass(frozen=True, slots=True)
+class _Single:
+    """Each node for itself; `around`: others of their meshes, to which nothing is done."""
+
+    plans: Mapping[str, NodePlan]
+    wanted: Mapping[str, Wanted] = field(repr=False)
+    around: Mapping[str, NodePlan] = field(default_factory=dict)
+
+
+def _node_plans(
+    renderer: Renderer,
+    access: Access,
+    first: Mapping[str, Wanted],
+    seen: Seen,
+    *,
+    salt: bytes,
+    owner: str,
+    choices: Choices,
+) -> _Single:
+    fingerprints = Fingerprints(salt)
+    wanted: dict[str, Wanted] = {}
+    plans: dict[str, NodePlan] = {}
+    for name, want in first.items():
+        observation = seen.observations.get(name)
+        wanted[name] = want if observation is None else renderer.wanted(want.node, observation)
+        made = node_plan(
+            wanted[name],
+            observation,
+            fingerprints,
+            away=seen.away.get(name, ""),
+            owner=owner,
+            with_firmware=choices.with_firmware,
+            own_keys=None if observation is None else access.own_keys(want.node),
+        )
+        error = seen.refused.get(name)
+        if error is not None:
+            made = replace(made, verdict=Verdict.REFUSED, reason=str(error), hint=error.hint)
+        plans[name] = made
+    return _Single(plans, wanted)
+
+
+def _in_order(
+    fleet: Fleet,
+    single: _Single,
+    seen: Seen,
+    known: Mapping[str, LastKnown],
+    *,
+    salt: bytes,
+    choices: Choices,
+) -> Prepared:
+    plans = dict(single.plans)
+    away = [name for name, made in plans.items() if made.verdict is Verdict.AWAY]
+    for name, place in whereabouts(fleet, away, seen.observations, known).items():
+        plans[name] = replace(plans[name], reason=f"{plans[name].reason}; {place.text(time.time())}")
+    plan = fleet_plan(
+        fleet,
+        plans,
+        seen.graph(fleet, known),
+        now_s=time.time(),
+        around=single.around,
+        entry=choices.entry,
+        leave_behind=choices.leave_behind,
+        accept_cuts=choices.accept_cuts,
+        never_meshed=[name for name in single.plans if name in known and known[name].facts.get("cell") == "none"],
+    )
+    return Prepared(plan, single.wanted, seen, salt)
+
+
+def other_paths(wanted: Wanted) -> tuple[str, ...]:
+    """The absolute paths of a node's files that are no UCI packages."""
+    return tuple(f"/{file.path}" for file in wanted.files if package_of(file.path) is None)
+
+
+def base_macs(fleet: Fleet, seen: Mapping[str, Observation], known: Mapping[str, LastKnown]) -> tuple[str, ...]:
+    """The mesh MACs of the base's radio, seen now or known from before."""
+    base = fleet.base_node
+    if base is None:
+        return ()
+    if base.name in seen:
+        return mesh_macs(seen[base.name])
+    return tuple(known[base.name].facts.get("macs", "").split()) if base.name in known else ()

@@ -1,0 +1,46 @@
+"""What became of the nodes that an earlier run left uncertain: its outcomes and a fresh look -> a line for each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from meshctl.apply.mesh_commit import LEFT_BEHIND
+from meshctl.apply.next_action import REASONS
+from meshctl.apply.prepare import Prepared
+from meshctl.device.observation import ChangeStatus
+from meshctl.fleet import Outcome, Result
+from meshctl.plan import Verdict
+
+
+def settled(run_id: int, earlier: Iterable[Outcome], now: Prepared) -> dict[str, str]:
+    """Node -> what became of it, for each that ended as UNCERTAIN. Pure."""
+    told = {}
+    for outcome in earlier:
+        plan = now.plan.nodes.get(outcome.node)
+        if outcome.result is not Result.UNCERTAIN or plan is None:
+            continue
+        seen = now.seen.observations.get(outcome.node)
+        match plan.verdict:
+            case Verdict.SAME:
+                what = "it is as wanted"
+            case Verdict.CHANGE:
+                what = f"it runs what it ran before{_why(None if seen is None else seen.change)}, and is changed again"
+            case Verdict.REFUSED:
+                what = f"it answers, and is refused: {plan.reason}"
+            case Verdict.AWAY:
+                what = "it is still not seen" + _left(outcome)
+        told[outcome.node] = f"uncertain after run {run_id}; now {what}"
+    return told
+
+
+def _why(change: ChangeStatus | None) -> str:
+    if change is None or change.last_outcome != "restored":
+        return ""
+    return f" ({REASONS.get(change.last_reason, change.last_reason)})"
+
+
+def _left(outcome: Outcome) -> str:
+    parted = outcome.facts.get(LEFT_BEHIND)
+    if not parted:
+        return ""
+    return f": it stayed in its mesh's old cell ({parted}), where only a cable, or a node taken back to it, reaches it"

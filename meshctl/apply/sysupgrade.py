@@ -1,0 +1,187 @@
+"""Replace one node's firmware: everything that can fail is tried before anything is stopped, success is proven.
+
+`flash`: image checked here (`checked_image`), memory on the node, upload, `sysupgrade -T`, the recovery recipe told,
+then `sysupgrade -n -f` detached, with the rendered configuration, the node's own host keys, the dead-man's switch and a
+marker in the archive (`archive`, pure). Proof of success is a new boot id, the wanted revision, the board, the marker.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import secrets
+import tarfile
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from meshctl.apply.change_in_progress import LOCK_SLACK_S, install_switch
+from meshctl.apply.context import Job
+from meshctl.apply.station_flush import Forgetting
+from meshctl.device import deadman, openwrt
+from meshctl.device.observation import Observation
+from meshctl.device.observe import observe
+from meshctl.device.openwrt import FetchedFile
+from meshctl.device.ssh import SshConnection
+from meshctl.device.upload import upload
+from meshctl.diagnostics import InvalidInput
+from meshctl.errors import InputError, NodeError
+from meshctl.firmware import check, image_path, is_revision
+from meshctl.fleet import Outcome, Result
+from meshctl.model import HardwareProfile
+from meshctl.nodes.backoff import Pace
+from meshctl.plan import Wanted
+
+IMAGE_PATH = "/tmp/meshctl/firmware.bin"
+ARCHIVE_PATH = "/tmp/meshctl/firmware.tgz"
+MARKER_PATH = "/etc/meshctl/flashed"
+HOST_KEYS = "/etc/dropbear/dropbear_*_host_key"
+# sysupgrade's own copy of busybox and what it runs in RAM; less and the kernel kills it half way.
+HEADROOM_BYTES = 4 << 20
+# Writing 16 MB of NOR takes up to 3 minutes, the first boot 2 more, and making keys or joining the mesh its own.
+RETURN_S = 900.0
+# sysupgrade that has not taken the node down by then has given up.
+START_S = 120.0
+
+
+def checked_image(profile: HardwareProfile) -> Path:
+    """The profile's image, once it has passed every check that needs no device. Raises InvalidInput, InputError."""
+    path = image_path(profile)
+    if path is None:
+        raise InputError(f"hardware {profile.name}: the inventory names no firmware image")
+    problems = check(path, profile)
+    if problems:
+        raise InvalidInput(problems)
+    return path
+
+
+def flash(job: Job, connection: SshConnection, image: Path) -> Outcome:
+    """Flash a node and prove it. Owns `connection`. Raises NodeError only while nothing on the node has stopped."""
+    forgetting = Forgetting(job)
+    try:
+        marker = _send(job, connection, image, forgetting)
+    except NodeError:
+        with suppress(NodeError):
+            deadman.unlock(connection, job.work.owner)
+        raise
+    finally:
+        connection.close()
+    with job.step("flash"):
+        return _await_return(job, marker, forgetting)
+
+
+def _send(job: Job, connection: SshConnection, image: Path, forgetting: Forgetting) -> str:
+    """Everything up to the moment sysupgrade starts; returns the marker that the new system will hold."""
+    size = image.stat().st_size
+    with job.step("check"):
+        _check_memory(job.before, size)
+        # for its lock: a device fresh from its box has none
+        install_switch(job, connection)
+        deadman.lock(connection, job.work.owner, ttl_s=int(RETURN_S) + LOCK_SLACK_S)
+    with job.step("upload"):
+        upload(
+            connection, image, IMAGE_PATH, rate_bytes_per_s=job.work.rate_bytes_per_s, progress=job.progress, mode=0o600
+        )
+    with job.step("test"):
+        tested = openwrt.check_firmware(connection, IMAGE_PATH)
+        if not tested.valid:
+            raise NodeError(f"{job.name}: its own sysupgrade refuses the image: {tested.reason}")
+        if tested.available_bytes is not None and tested.available_bytes < HEADROOM_BYTES:
+            raise NodeError(
+                f"{job.name}: {tested.available_bytes >> 20} MiB of memory left beside the image, "
+                f"{HEADROOM_BYTES >> 20} needed",
+                hint="stop services on it, or flash it by cable",
+            )
+        keys = openwrt.fetch_files(connection, [HOST_KEYS])
+        if not keys:
+            raise NodeError(f"{job.name}: its host keys cannot be read, so they could not be kept")
+        marker = secrets.token_hex(16)
+        upload(connection, archive(job.wanted, keys, marker), ARCHIVE_PATH, mode=0o600)
+    recipe = job.node.hardware.recovery or "none is written down in its hardware profile"
+    job.work.note(f"if it does not come back: {recipe}", job.name)
+    forgetting.beforehand(for_s=RETURN_S)
+    forgetting.begins()
+    openwrt.start_sysupgrade(connection, IMAGE_PATH, ARCHIVE_PATH)
+    return marker
+
+
+def _check_memory(before: Observation, size: int) -> None:
+    needed = size + HEADROOM_BYTES
+    if before.memory is not None and before.memory.available < needed:
+        raise NodeError(
+            f"the image needs {needed >> 20} MiB of memory, {before.memory.available >> 20} are available",
+            hint="stop services on it, or flash it by cable",
+        )
+
+
+def archive(wanted: Wanted, host_keys: Mapping[str, FetchedFile], marker: str) -> bytes:
+    """The tar.gz that the new system unpacks at its first boot: same in, same bytes out."""
+    files = [(f"/{file.path}", file.content, file.mode) for file in wanted.files]
+    files += [(path, file.content, file.mode) for path, file in host_keys.items()]
+    files += [(path, content, mode) for path, (mode, content) in deadman.installed_files().items()]
+    files.append((MARKER_PATH, f"{marker}\n".encode(), 0o644))
+    link = f"../init.d/{deadman.INIT_SCRIPT.rpartition('/')[2]}"
+    return gzip.compress(_tar(sorted(files), [(deadman.INIT_LINK, link)]), mtime=0)
+
+
+def _tar(files: Iterable[tuple[str, bytes, int]], links: Iterable[tuple[str, str]]) -> bytes:
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        for path, content, mode in files:
+            info = tarfile.TarInfo(path.lstrip("/"))
+            info.size, info.mode = len(content), mode
+            tar.addfile(info, io.BytesIO(content))
+        for path, target in links:
+            info = tarfile.TarInfo(path.lstrip("/"))
+            info.type, info.linkname, info.mode = tarfile.SYMTYPE, target, 0o777
+            tar.addfile(info)
+    return out.getvalue()
+
+
+def _await_return(job: Job, marker: str, forgetting: Forgetting) -> Outcome:
+    """Look for the node until it is back and proven, or it is clear that it will not be."""
+    pace = Pace(RETURN_S, job.work.interrupt)
+    trouble = ""
+    while not pace.is_over and not job.work.interrupt.leaving:
+        try:
+            connection = job.work.access.open(job.node)
+            try:
+                seen = observe(connection, extra_paths=[MARKER_PATH])
+            finally:
+                connection.close()
+        except NodeError as error:
+            trouble = str(error)
+            forgetting.while_silent()
+        else:
+            job.work.saw(job.name, seen)
+            if seen.boot_id != job.before.boot_id:
+                forgetting.when_back(seen, rebooted=True)
+                return _verdict(job, seen, marker)
+            if pace.elapsed_s > START_S:
+                return Outcome(
+                    job.name, Result.FAILED, "sysupgrade did not take it down; it runs what it ran", hint="see its log"
+                )
+        pace.pause()
+    return Outcome(
+        job.name,
+        Result.UNCERTAIN,
+        f"not back after it was flashed ({trouble})",
+        hint=job.node.hardware.recovery or "`meshctl resume` looks at it again",
+    )
+
+
+def _verdict(job: Job, seen: Observation, marker: str) -> Outcome:
+    """Whether the node that came back is the one that was meant to, piece by piece."""
+    running = seen.release.revision if seen.release else "unknown"
+    board = seen.board.board_name if seen.board else "unknown"
+    wanted = job.plan.firmware.to_revision if job.plan.firmware is not None else running
+    info = seen.files.get(MARKER_PATH)
+    problems = [
+        "" if is_revision(running, wanted) else f"it runs {running}, not {wanted}",
+        "" if board == job.node.hardware.board else f"its board is {board}, not {job.node.hardware.board}",
+        "" if info is not None and (info.text or "").strip() == marker else "its configuration is not the flashed one",
+    ]
+    told = "; ".join(problem for problem in problems if problem)
+    if told:
+        return Outcome(job.name, Result.FAILED, f"it came back, but {told}")
+    return Outcome(job.name, Result.DONE, facts={"revision": running, "boot_id": seen.boot_id or ""})

@@ -1,0 +1,164 @@
+"""`meshctl backup` and `meshctl restore`: a node's whole state, kept and put back."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from meshctl.apply.backup import Backup, fetch, lacking_packages, lockout_by, objection_to, put_back, read_backup
+from meshctl.apply.context import Job, Work
+from meshctl.apply.health_checks import Expectation
+from meshctl.apply.neighbor_query import look_around
+from meshctl.apply.prepare import base_macs
+from meshctl.apply.station_flush import NOT_ASKED, ask_the_rest
+from meshctl.cli.asking import must_agree
+from meshctl.cli.context import KeyFiles, Lab, Nodes, Session, chosen, exit_for, progress_for, session
+from meshctl.cli.journaled_run import Refused
+from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.plan import Yes
+from meshctl.device.observation import Observation
+from meshctl.errors import InputError
+from meshctl.fleet import Outcome, Result, run
+from meshctl.nodes.collect import facts_of, known_macs, observe_cleared
+from meshctl.plan import Cut, Effect, NodePlan, Verdict
+
+
+def backup(
+    nodes: Nodes = None,
+    out: Annotated[Path, typer.Option("--out", help="Directory to write NODE-TIME.tgz to.")] = Path("backups"),
+    inventory: InventoryPath = Path(),
+    as_json: AsJson = False,
+    key: KeyFiles = None,
+    lab: Lab = None,
+) -> None:
+    """Fetch the whole state of nodes: configuration, keys, accounts. The files hold secrets, and get mode 0600.
+
+    Example: meshctl backup 'husky*' --out backups
+    """
+    with session(inventory, key_files=key or (), lab=lab) as opened:
+        wanted = {node.name: node for node in chosen(opened.fleet, nodes)}
+        try:
+            out.mkdir(parents=True, exist_ok=True, mode=0o700)
+        except OSError as error:
+            raise InputError(f"{out}: cannot be made: {error.strerror}") from error
+
+        def work(name: str) -> Outcome:
+            with opened.access.lease(wanted[name]) as connection:
+                seen = observe_cleared(connection, (), opened.interrupt)
+                data = fetch(connection, name, seen)
+            path = out / f"{name}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(seen.answered_at_s))}.tgz"
+            _write_private(path, data)
+            opened.journal.remember(opened.fleet.name, name, facts_of(seen), seen.answered_at_s)
+            return Outcome(name, Result.DONE, str(path))
+
+        with (
+            progress_for(len(wanted), as_json=as_json) as progress,
+            opened.interrupt.on_signals(progress.stopping),
+        ):
+            ended = run(
+                wanted, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt, observer=progress
+            )
+        raise typer.Exit(exit_for(ended.values(), opened.interrupt))
+
+
+def _write_private(path: Path, data: bytes) -> None:
+    # half a backup must not look like one
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def restore(
+    node: Annotated[str, typer.Argument(help="Name of the node.")],
+    file: Annotated[Path, typer.Argument(help="A file that `meshctl backup` wrote.")],
+    inventory: InventoryPath = Path(),
+    yes: Yes = False,
+    as_json: AsJson = False,
+    key: KeyFiles = None,
+    lab: Lab = None,
+) -> None:
+    """Put a node's saved state back. Like every change it undoes itself unless the node can be reached with it.
+
+    Example: meshctl restore b03 backups/b03-20260701T090000Z.tgz
+    """
+    try:
+        saved = read_backup(file.read_bytes(), str(file))
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read: {error.strerror}") from error
+    with session(inventory, key_files=key or (), lab=lab) as opened:
+        (there,) = chosen(opened.fleet, [node])[:1]
+        if not yes:
+            taken = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(saved.taken_s))
+            must_agree(f"Make {there.name} what it was on {taken}?")
+        outcome = _restore(opened, there.name, saved, as_json=as_json)
+    raise typer.Exit(exit_for([outcome], opened.interrupt))
+
+
+def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Outcome:
+    node = opened.fleet.nodes[name]
+    journal_run = opened.journal.begin(
+        "restore", fleet=opened.fleet.name, inventory=opened.inventory, nodes=(name,), plan=""
+    )
+    ended: dict[str, Outcome] = {}
+    try:
+        with (
+            progress_for(1, as_json=as_json) as progress,
+            opened.interrupt.on_signals(progress.stopping),
+        ):
+            known = opened.journal.last_known(opened.fleet.name)
+            around: dict[str, Observation] = {}
+            work = Work(
+                opened.fleet,
+                opened.access,
+                journal_run,
+                progress,
+                opened.interrupt,
+                opened.owner,
+                around=around,
+                names=known_macs(opened.fleet, known),
+                bases=base_macs(opened.fleet, around, known),
+            )
+
+            def one(only: str) -> Outcome:
+                connection = opened.access.open(node)
+                try:
+                    seen = observe_cleared(connection, (), opened.interrupt)
+                    problem = objection_to(saved, name, seen)
+                    if problem:
+                        raise Refused(problem)
+                    shut_out = lockout_by(saved, node, opened.access.own_keys(node))
+                    if shut_out is not None:
+                        raise Refused(shut_out.reason, hint=shut_out.hint)
+                    around.update(
+                        look_around(opened.access, opened.fleet, {name: seen}, known, interrupt=opened.interrupt)
+                    )
+                    for package in lacking_packages(saved, seen):
+                        work.note(f"package {package} was installed then and is not now", name)
+                    if saved.disabled:
+                        work.note(f"disabled then, and left as they are: {', '.join(saved.disabled)}", name)
+                    plan = NodePlan(name, Verdict.CHANGE, effects=(Effect("everything", Cut.MESH, "restored"),))
+                    job = Job(work, node, plan, opened.renderer.wanted(node, seen), seen, Expectation())
+                except BaseException:
+                    connection.close()
+                    raise
+                return put_back(job, connection, saved)
+
+            ended = run([name], one, parallel=1, interrupt=opened.interrupt, observer=progress)
+            for silent in ask_the_rest(work).values():
+                ended[name] = replace(ended[name], facts={NOT_ASKED: " ".join(silent)})
+            journal_run.finish_node(ended[name])
+    finally:
+        journal_run.end(ended[name].result.value if ended else "could not run")
+    return ended[name]

@@ -1,0 +1,170 @@
+"""From a session to a plan on the screen, and from an agreed plan to outcomes and an exit code."""
+
+from __future__ import annotations
+
+import json
+import secrets
+from dataclasses import asdict
+from pathlib import Path
+
+import typer
+
+from meshctl.apply.executor import Setting, carry_out
+from meshctl.apply.prepare import Choices, Prepared, prepare
+from meshctl.cli.asking import must_agree
+from meshctl.cli.context import Session, chosen, exit_for, progress_for
+from meshctl.cli.options import line_width
+from meshctl.cli.output import complain, console, echo, echo_json
+from meshctl.cli.streams import unheard
+from meshctl.errors import ExitCode, InputError, MeshctlError
+from meshctl.fleet import Outcome, totals
+from meshctl.model import Fleet
+from meshctl.plan import Plan, Verdict
+
+# Bytes of salt for a plan's fingerprints; RFC 7914 asks for no more.
+SALT_BYTES = 16
+
+
+class Refused(MeshctlError):
+    """A plan that meshctl will not carry out as it stands."""
+
+    exit_code = ExitCode.FINDINGS
+
+
+def choices_of(no_firmware: bool, leave_behind: str, accept_cut: str) -> Choices:
+    return Choices(not no_firmware, _names(leave_behind), _names(accept_cut))
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def prepared_for(opened: Session, nodes: list[str] | None, choices: Choices, salt: bytes | None = None) -> Prepared:
+    with opened.interrupt.on_signals(complain):
+        prepared = prepare(
+            opened.renderer,
+            opened.access,
+            chosen(opened.fleet, nodes),
+            opened.journal,
+            salt=salt or secrets.token_bytes(SALT_BYTES),
+            owner=opened.owner,
+            choices=choices,
+            interrupt=opened.interrupt,
+        )
+    if opened.interrupt.stopping:
+        raise KeyboardInterrupt
+    return prepared
+
+
+def write_text(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def show(plan: Plan, fleet: Fleet, *, brief: bool) -> None:
+    from rich.text import Text
+
+    from meshctl.report.plan_text import plan_lines
+
+    out = console()
+    for line in plan_lines(plan, with_diffs=not brief, width=line_width(), order=fleet.nodes):
+        out.print(Text(line.text, line.style), soft_wrap=True)
+
+
+def checked(plan: Plan, fleet: Fleet, *, as_json: bool, brief: bool) -> ExitCode:
+    if as_json:
+        told = {name: {"verdict": node.verdict.value, "reason": node.reason} for name, node in plan.nodes.items()}
+        echo_json(json.dumps({"fleet": plan.fleet, "nodes": told}, indent=1))
+    else:
+        show(plan, fleet, brief=brief)
+    if plan.of(Verdict.CHANGE) or plan.of(Verdict.REFUSED):
+        return ExitCode.FINDINGS
+    return ExitCode.UNREACHABLE if plan.of(Verdict.AWAY) else ExitCode.OK
+
+
+def ask_and_carry_out(
+    opened: Session,
+    prepared: Prepared,
+    command: str,
+    choices: Choices,
+    *,
+    yes: bool,
+    as_json: bool,
+    brief: bool,
+    rate: float | None,
+) -> None:
+    from meshctl.report.plan_text import question
+
+    if not as_json:
+        show(prepared.plan, opened.fleet, brief=brief)
+    if not prepared.plan.is_empty and not prepared.plan.refusal and not yes:
+        must_agree(question(prepared.plan))
+    carry_out_plan(opened, prepared, command, choices.with_firmware, as_json=as_json, rate=rate, choices=choices)
+
+
+def carry_out_plan(
+    opened: Session,
+    prepared: Prepared,
+    command: str,
+    with_firmware: bool,
+    *,
+    as_json: bool,
+    rate: float | None,
+    choices: Choices | None = None,
+) -> None:
+    """Apply, journal, tell the totals, exit."""
+    plan = prepared.plan
+    if plan.refusal:
+        raise Refused(plan.refusal, hint=plan.refusal_hint)
+    told = choices or Choices(with_firmware)
+    run = opened.journal.begin(
+        command,
+        fleet=opened.fleet.name,
+        inventory=opened.inventory,
+        nodes=tuple(plan.nodes),
+        plan=json.dumps(
+            {"choices": asdict(told), "stages": [[stage.kind.value, *stage.nodes] for stage in plan.stages]}
+        ),
+    )
+    outcomes: dict[str, Outcome] = {}
+    try:
+        with (
+            progress_for(len(plan.nodes), as_json=as_json) as progress,
+            opened.interrupt.on_signals(progress.stopping),
+        ):
+            setting = Setting(
+                opened.fleet,
+                opened.access,
+                opened.journal,
+                run,
+                opened.owner,
+                opened.interrupt,
+                progress,
+                None if rate is None else rate * 1000,
+            )
+            outcomes = carry_out(prepared, setting)
+    finally:
+        run.end(str(totals(outcomes.values())) if outcomes else "could not run")
+    if run.trouble:
+        with unheard():
+            echo(f"the journal is incomplete: {run.trouble}", err=True)
+            echo("hint: what it lacks counts as not done, so `meshctl resume` looks at those nodes again", err=True)
+    # a reader that is gone (`| head`, a closed terminal) changes nothing about how it ended
+    with unheard():
+        _sum_up(outcomes, run.id, as_json=as_json)
+    raise typer.Exit(exit_for(outcomes.values(), opened.interrupt))
+
+
+def _sum_up(outcomes: dict[str, Outcome], run_id: int, *, as_json: bool) -> None:
+    counted = totals(outcomes.values())
+    if as_json:
+        from meshctl.report.progress import outcome_object
+
+        told = [outcome_object(outcome) for outcome in outcomes.values()]
+        echo_json(json.dumps({"event": "ended", "run": run_id, "totals": str(counted), "outcomes": told}))
+        return
+    echo(f"run {run_id}: {counted}")
+    if not counted.all_good:
+        echo("`meshctl resume` takes up what is not done", err=True)

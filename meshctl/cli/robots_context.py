@@ -1,0 +1,230 @@
+"""What every `meshctl robots` command opens first: a `Crew` of chosen robots, the way to them, what they shall be.
+
+`with_crew` gives a command the options they all share, and the crew they make. `Crew.on_each` works on all robots at
+once; `Crew.change` does so for what changes them, shows it go on, and writes it into the journal, from which
+`meshctl resume` takes it up (robots_work.py has the work).
+"""
+
+from __future__ import annotations
+
+import getpass
+import inspect
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from meshctl.cli.context import KeyFiles, Session, exit_for, progress_for, session
+from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.output import complain, echo, echo_json
+from meshctl.cli.shared import opening
+from meshctl.device.connection import Connection
+from meshctl.errors import InputError, MeshctlError
+from meshctl.fleet import Event, EventKind, Observer, Outcome, Tee, outcome_of_error, run, silent, totals
+from meshctl.inventory.secrets import SecretStore
+from meshctl.model import Fleet, Secret
+from meshctl.render.daemon import daemon_keys
+from meshctl.robots.bundle import configuration
+from meshctl.robots.connection import Reach, chosen_robots
+from meshctl.robots.deploy import Order, Wheelhouse
+from meshctl.robots.host import Host
+from meshctl.robots.wheels import stock_units
+
+Robots = Annotated[list[str] | None, typer.Argument(help="Robots, or patterns such as 'husky*'; default: all.")]
+Named = Annotated[list[str], typer.Argument(metavar="ROBOTS", help="Robots, or patterns such as 'husky*'.")]
+Wheels = Annotated[
+    Path | None,
+    typer.Option("--wheels", help="Directory with the wheels the robots need; without it pip downloads them here."),
+]
+AskSudo = Annotated[
+    bool, typer.Option("--ask-sudo", help="Ask for the password that sudo wants (or set MESHCTL_SUDO_PASSWORD).")
+]
+Wait = Annotated[int, typer.Option("--wait", min=2, help="Seconds a daemon has to prove itself before it goes back.")]
+
+Work = Callable[[Host, str], Outcome]
+# How often somebody looks whether all connections shall be closed at once.
+_LEAVING_LOOK_S = 0.25
+
+# The options that commands share, by the name `crew_of` knows them by, in the order of the help.
+_SHARED: dict[str, tuple[Any, Any]] = {
+    "robots": (Robots, None),
+    # the same, for commands that nobody means for all by leaving it out
+    "named": (Named, inspect.Parameter.empty),
+    "inventory": (InventoryPath, Path()),
+    "wheels": (Wheels, None),
+    "wait_s": (Wait, 30),
+    "ask_sudo": (AskSudo, False),
+    "as_json": (AsJson, False),
+    "key": (KeyFiles, None),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Crew:
+    """Everything open for one command. `robots` are the chosen ones; `wheels` is the directory named for them."""
+
+    opened: Session
+    reach: Reach
+    robots: tuple[str, ...]
+    order: Order
+    inventory: Path
+    wheels: Path | None
+    as_json: bool
+
+    @property
+    def fleet(self) -> Fleet:
+        return self.order.fleet
+
+    def at(self, fleet: Fleet, *, only_configuration: bool = False) -> Crew:
+        """The same crew under a (changed) inventory. Raises InvalidInput and InputError for what no robot takes."""
+        secrets = SecretStore(os.environ, Path(fleet.base)).get
+        daemon_keys(fleet, secrets)
+        for robot in self.robots:
+            configuration(fleet, robot, secrets, stock_units())
+        order = replace(self.order, fleet=fleet, secrets=secrets, only_configuration=only_configuration)
+        return replace(self, order=order, reach=replace(self.reach, fleet=fleet))
+
+    def on_each(
+        self, work: Work, observer: Observer = silent, say: Callable[[str], None] = complain
+    ) -> dict[str, Outcome]:
+        """Connect to every chosen robot and work there, several at once. A second Ctrl-C closes all connections."""
+        interrupt = self.opened.interrupt
+        standing: list[Connection] = []
+        ended = threading.Event()
+
+        def one(robot: str) -> Outcome:
+            try:
+                with self.reach.host(robot, opened=standing.append) as host:
+                    return work(host, robot)
+            except MeshctlError as error:
+                return outcome_of_error(robot, error)
+
+        def leave() -> None:
+            while not ended.wait(_LEAVING_LOOK_S):
+                if interrupt.leaving:
+                    for connection in tuple(standing):
+                        connection.close()
+
+        watching = threading.Thread(target=leave, name="leave", daemon=True)
+        watching.start()
+        try:
+            with interrupt.on_signals(say):
+                return run(self.robots, one, parallel=self.fleet.apply.parallel, interrupt=interrupt, observer=observer)
+        finally:
+            ended.set()
+            watching.join()
+
+    def change(
+        self, command: str, work: Callable[[Crew], Work], told: Mapping[str, object] | None = None
+    ) -> dict[str, Outcome]:
+        """`on_each` for what changes robots: shown, and in the journal as `robots COMMAND` with `told` to resume by."""
+        journal_run = self.opened.journal.begin(
+            f"robots {command}",
+            fleet=self.fleet.name,
+            inventory=self.opened.inventory,
+            nodes=self.robots,
+            plan=json.dumps({"robots": dict(told or {})}),
+        )
+        outcomes: dict[str, Outcome] = {}
+        try:
+            with progress_for(len(self.robots), as_json=self.as_json) as progress:
+
+                def keep(event: Event) -> None:
+                    if event.kind is EventKind.FINISHED and event.outcome is not None:
+                        journal_run.finish_node(event.outcome)
+
+                @contextmanager
+                def step(robot: str, name: str, text: str) -> Iterator[None]:
+                    progress(Event(EventKind.STEP, robot, time.time(), f"{name} {text}".rstrip()))
+                    with journal_run.step(robot, name):
+                        yield
+
+                crew = replace(self, order=replace(self.order, step=step))
+                outcomes = crew.on_each(work(crew), Tee((progress, keep)), progress.stopping)
+        finally:
+            journal_run.end(str(totals(outcomes.values())) if outcomes else "could not run")
+        return outcomes
+
+
+@contextmanager
+def crew_of(
+    inventory: Path,
+    robots: list[str] | None = None,
+    *,
+    key: list[Path] | None = None,
+    ask_sudo: bool = False,
+    wheels: Path | None = None,
+    wait_s: int = 30,
+    as_json: bool = False,
+) -> Iterator[Crew]:
+    """Open all of it. Raises InvalidInput and InputError for an inventory or a choice that cannot be worked with."""
+    password = sudo_password(ask_sudo)
+    with session(inventory, key_files=key or ()) as opened:
+        yield crew_in(opened, inventory, robots, password, wheels=wheels, wait_s=wait_s, as_json=as_json)
+
+
+def crew_in(
+    opened: Session,
+    inventory: Path,
+    robots: list[str] | None,
+    password: Secret | None,
+    *,
+    wheels: Path | None = None,
+    wait_s: int = 30,
+    as_json: bool = False,
+) -> Crew:
+    """A crew in a session that stands."""
+    fleet = opened.fleet
+    secrets = SecretStore(os.environ, Path(fleet.base)).get
+    order = Order(fleet, secrets, Wheelhouse(wheels, _cache()).wheels, time.time, wait_s)
+    reach = Reach(fleet, opened.access, lambda: password, opened.owner)
+    return Crew(opened, reach, chosen_robots(fleet, robots), order, inventory, wheels, as_json)
+
+
+def with_crew(*shared: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A command of a crew and options of its own becomes one that also has these shared options, and opens the crew."""
+
+    def opened(**given: Any) -> AbstractContextManager[Crew]:
+        return crew_of(**{"robots" if name == "named" else name: value for name, value in given.items()})
+
+    return opening("crew", opened, {name: option for name, option in _SHARED.items() if name in shared})
+
+
+def sudo_password(ask: bool) -> Secret | None:
+    """What sudo on the robots gets where it wants one: asked for, or of MESHCTL_SUDO_PASSWORD, or none."""
+    given = os.environ.get("MESHCTL_SUDO_PASSWORD", "")
+    if ask:
+        if not sys.stdin.isatty():
+            raise InputError("nobody can be asked for a password here", hint="set MESHCTL_SUDO_PASSWORD")
+        given = getpass.getpass("sudo password on the robots: ")
+    return Secret(given) if given else None
+
+
+def _cache() -> Path:
+    """XDG Base Directory 0.8: what can be fetched again."""
+    named = os.environ.get("XDG_CACHE_HOME", "")
+    root = Path(named) if named.startswith("/") else Path(os.environ.get("HOME", "~")).expanduser() / ".cache"
+    return root / "meshctl" / "wheels"
+
+
+def end(crew: Crew, outcomes: dict[str, Outcome]) -> typer.Exit:
+    """Tell the totals; the exit to raise."""
+    counted = totals(outcomes.values())
+    if crew.as_json:
+        from meshctl.report.progress import outcome_object
+
+        told = [outcome_object(outcome) for outcome in outcomes.values()]
+        echo_json(json.dumps({"event": "ended", "totals": str(counted), "outcomes": told}))
+    else:
+        echo(str(counted))
+        if not counted.all_good:
+            echo("`meshctl resume` takes up what is not done", err=True)
+    return typer.Exit(exit_for(outcomes.values(), crew.opened.interrupt))

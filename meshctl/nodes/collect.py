@@ -1,0 +1,148 @@
+"""Observe many nodes: who answers and what they tell, who does not and why, and the mesh as they see it.
+
+`gather` looks at every node in parallel over connections it keeps; what a dead meshctl of this machine left behind on a
+node (a lock, an armed change) is cleared away first, because nobody else ever will before it runs out.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+from meshctl.device import deadman
+from meshctl.device.errors import NodeRefused
+from meshctl.device.observation import ChangeStatus, Observation
+from meshctl.device.observe import observe
+from meshctl.device.ssh import SshConnection
+from meshctl.errors import NodeError, Unreachable
+from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
+from meshctl.fleet.journal import LastKnown
+from meshctl.fleet.process import is_dead
+from meshctl.model import Fleet, Node
+from meshctl.nodes.backoff import Pace
+from meshctl.nodes.connections import Access
+from meshctl.topology import Graph, Report, mesh_macs, observed_graph, report_of, with_alternates
+
+# How long a node may take to put back what a dead process had armed: its files, and a reload.
+CLEARING_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """`observations` of the nodes that answered; `away` and `refused`: why others gave none (silence, or a host key or
+    login that does not fit)."""
+
+    observations: Mapping[str, Observation]
+    away: Mapping[str, str]
+    refused: Mapping[str, NodeError] = field(default_factory=dict)
+
+    @property
+    def reports(self) -> tuple[Report, ...]:
+        return tuple(report_of(name, seen) for name, seen in self.observations.items())
+
+    def graph(self, fleet: Fleet, known: Mapping[str, LastKnown]) -> Graph:
+        """The mesh as these nodes see it. A robot's radios on its switch count as wired together."""
+        wires = [
+            (first, second)
+            for robot in fleet.robots.values()
+            for index, first in enumerate(robot.nodes)
+            for second in robot.nodes[index + 1 :]
+            if first in self.observations and second in self.observations
+        ]
+        return observed_graph(self.reports, known_macs=known_macs(fleet, known), wires=wires)
+
+
+def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
+    """MAC -> node, from the inventory, from what nodes reported when they were last seen, and the other addresses by
+    which their radios may be heard now."""
+    macs = {
+        mac.lower(): name
+        for name, last in known.items()
+        for mac in last.facts.get("macs", "").split()
+        if name in fleet.nodes
+    }
+    for node in fleet.nodes.values():
+        macs.update({radio.mac.lower(): node.name for radio in node.radios if radio.mac})
+    return with_alternates(macs)
+
+
+def gather(
+    access: Access,
+    nodes: Iterable[Node],
+    *,
+    parallel: int,
+    paths: Callable[[Node], Iterable[str]] = lambda node: (),
+    interrupt: Interrupt | None = None,
+    observer: Observer = silent,
+) -> Seen:
+    """Observe these nodes; `paths` names the files beside UCI's to look at. Connections stay with `access`."""
+    wanted = {node.name: node for node in nodes}
+    found: dict[str, Observation] = {}
+    errors: dict[str, NodeError] = {}
+    lock = threading.Lock()
+    signal = interrupt or Interrupt()
+
+    def look(name: str) -> Outcome:
+        try:
+            with access.lease(wanted[name]) as connection:
+                seen = observe_cleared(connection, tuple(paths(wanted[name])), signal)
+        except NodeError as error:
+            with lock:
+                errors[name] = error
+            raise
+        with lock:
+            found[name] = seen
+        return Outcome(name, Result.DONE)
+
+    outcomes = run(wanted, look, parallel=parallel, interrupt=signal, observer=observer)
+    away = {
+        name: outcome.reason
+        for name, outcome in outcomes.items()
+        if name not in found and (name not in errors or isinstance(errors[name], Unreachable))
+    }
+    refused = {name: error for name, error in errors.items() if not isinstance(error, Unreachable)}
+    return Seen({name: found[name] for name in wanted if name in found}, away, refused)
+
+
+def observe_cleared(connection: SshConnection, paths: tuple[str, ...], interrupt: Interrupt) -> Observation:
+    """One observation, after clearing away what a dead meshctl of this machine left on the node."""
+    seen = observe(connection, extra_paths=paths)
+    change = seen.change
+    if change is None or not (is_dead(change.lock_owner) or (is_dead(change.owner) and change.state != "idle")):
+        return seen
+    pace = Pace(CLEARING_S, interrupt)
+    while not pace.is_over and not interrupt.leaving:
+        _clear(connection, change)
+        seen = observe(connection, extra_paths=paths)
+        change = seen.change
+        if change is None or not is_dead(change.owner) or change.state in ("idle", "staged"):
+            break
+        pace.pause()
+    return seen
+
+
+def _clear(connection: SshConnection, change: ChangeStatus) -> None:
+    # what the node refuses here it will tell in its next status
+    with suppress(NodeRefused):
+        if is_dead(change.owner) and change.change_id and change.state not in ("idle", "restoring"):
+            deadman.abort(connection, change.owner, change.change_id)
+    with suppress(NodeRefused):
+        if is_dead(change.lock_owner):
+            deadman.unlock(connection, change.lock_owner)
+
+
+def facts_of(seen: Observation) -> dict[str, str]:
+    """What the journal keeps of a node: enough to find it again and to say how it was."""
+    facts = {
+        "macs": " ".join(mesh_macs(seen)),
+        "boot_id": seen.boot_id or "",
+        "uptime_s": "" if seen.uptime_s is None else f"{seen.uptime_s:.0f}",
+        "board": seen.board.board_name if seen.board else "",
+        "version": seen.release.version if seen.release else "",
+        "revision": seen.release.revision if seen.release else "",
+        "cell": "" if seen.links is None else "some" if mesh_macs(seen) else "none",
+        "neighbours": " ".join(neighbour.mac for neighbour in seen.neighbours or ()),
+    }
+    return {key: value for key, value in facts.items() if value}

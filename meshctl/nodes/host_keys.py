@@ -1,0 +1,64 @@
+"""Which host keys nodes show, against those that are pinned: what `meshctl trust` asks about."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from meshctl.device.errors import AuthenticationRefused
+from meshctl.device.trust import HostKey, Recorder, TrustStore
+from meshctl.errors import NodeError
+from meshctl.fleet import Outcome, Result, run
+from meshctl.model import Node
+from meshctl.nodes.connections import Access
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A node's key as it shows it; None with `trouble` when it does not answer. `pinned` are fingerprints."""
+
+    node: Node
+    key: HostKey | None
+    pinned: tuple[str, ...] = ()
+    trouble: str = ""
+
+    @property
+    def is_pinned(self) -> bool:
+        return self.key is not None and self.key.fingerprint in self.pinned
+
+    @property
+    def is_changed(self) -> bool:
+        return self.key is not None and bool(self.pinned) and not self.is_pinned
+
+    @property
+    def state(self) -> str:
+        if self.key is None:
+            return "unreachable"
+        return "pinned" if self.is_pinned else "changed" if self.is_changed else "new"
+
+
+def shown_keys(access: Access, trust: TrustStore, nodes: Iterable[Node], *, parallel: int) -> tuple[Shown, ...]:
+    """Ask every node for its host key, believing nothing."""
+    wanted = {node.name: node for node in nodes}
+    found: dict[str, Shown] = {}
+    lock = threading.Lock()
+
+    def look(name: str) -> Outcome:
+        node = wanted[name]
+        recorder = Recorder()
+        trouble = ""
+        try:
+            access.open(node, policy=recorder).close()
+        except AuthenticationRefused:
+            # the key was shown before the login was refused, and it is the key that was asked for
+            pass
+        except NodeError as error:
+            trouble = str(error)
+        pinned = tuple(key.fingerprint for key in trust.pinned(name))
+        with lock:
+            found[name] = Shown(node, recorder.key, pinned, trouble)
+        return Outcome(name, Result.DONE)
+
+    run(wanted, look, parallel=parallel)
+    return tuple(found[name] for name in wanted)

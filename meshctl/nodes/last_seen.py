@@ -1,0 +1,144 @@
+"""What is known of a node that does not answer: what it told when it was last seen, and who still hears it.
+
+`ask_around` looks at the nodes that may hear it, `whereabouts` (pure) puts together what they and the journal know,
+`Whereabouts.text` says it in one line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from meshctl.device.observation import Observation
+from meshctl.fleet import Interrupt
+from meshctl.fleet.journal import LastKnown
+from meshctl.model import Fleet
+from meshctl.nodes.collect import Seen, gather, known_macs
+from meshctl.nodes.connections import Access
+from meshctl.topology import Sighting, names_by_mac, report_of, seen_by
+
+# batman-adv forgets whom it has not heard for 200 s (PURGE_TIMEOUT, net/batman-adv/main.h).
+REMEMBERED_MS = 200_000
+# Neighbours come first; so many nodes tell enough, and looking at more would hold up a big fleet's end.
+WITNESSES = 12
+# How many of those that hear it are named.
+NAMED = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Whereabouts:
+    """`heard` by direct neighbours, `routed` by nodes that had a way to it, both latest first; `asked` is how many
+    nodes told."""
+
+    last: LastKnown | None
+    heard: tuple[Sighting, ...]
+    routed: tuple[Sighting, ...]
+    asked: int
+
+    def text(self, now_s: float) -> str:
+        """`last seen 40 s ago (12:03:05 UTC), up 2 h, r24106; heard by b02 0.4 s ago (-61 dBm)`."""
+        return "; ".join(part for part in (self._last(now_s), self._witnesses()) if part)
+
+    def _last(self, now_s: float) -> str:
+        if self.last is None:
+            return "never seen before"
+        moment = datetime.fromtimestamp(self.last.seen_s, UTC)
+        age_s = max(0.0, now_s - self.last.seen_s)
+        # the time of day alone misleads about another day
+        shown = moment.strftime("%H:%M:%S UTC" if age_s < 12 * 3600 else "%Y-%m-%d %H:%M UTC")
+        told = [f"last seen {_span(age_s)} ago ({shown})"]
+        uptime = self.last.facts.get("uptime_s", "")
+        if uptime.isdigit():
+            told.append(f"up {_span(float(uptime))} then")
+        told += [text for key in ("version", "revision") if (text := self.last.facts.get(key))]
+        return ", ".join(told)
+
+    def _witnesses(self) -> str:
+        if self.heard:
+            return "heard by " + ", ".join(_sighting(one) for one in self.heard[:NAMED])
+        if self.routed:
+            return "no neighbour that answers hears it; a way to it was known by " + ", ".join(
+                _sighting(one) for one in self.routed[:NAMED]
+            )
+        if not self.asked:
+            return "no other node could be asked"
+        return f"heard by none of the {self.asked} node{'s' if self.asked != 1 else ''} that answered"
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """For scripts, beside an outcome."""
+        told = {
+            "last_seen_s": "" if self.last is None else f"{self.last.seen_s:.0f}",
+            "heard_by": " ".join(f"{one.by}:{one.age_ms}ms" for one in self.heard),
+            "routed_by": " ".join(f"{one.by}:{one.age_ms}ms" for one in self.routed),
+            "asked": str(self.asked),
+        }
+        return {key: value for key, value in told.items() if value}
+
+
+def _sighting(one: Sighting) -> str:
+    age_s = one.age_ms / 1000
+    signal = f" ({one.signal_dbm} dBm)" if one.signal_dbm is not None else ""
+    return f"{one.by} {age_s:.1f} s ago{signal}" if age_s < 10 else f"{one.by} {_span(age_s)} ago{signal}"
+
+
+def _span(seconds: float) -> str:
+    for unit, length_s in (("d", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * length_s:
+            return f"{seconds / length_s:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def whereabouts(
+    fleet: Fleet, names: Iterable[str], observations: Mapping[str, Observation], known: Mapping[str, LastKnown]
+) -> dict[str, Whereabouts]:
+    """What is known of each of `names` from what other nodes were seen to hear and from the journal."""
+    lost = tuple(names)
+    told = {name: seen for name, seen in observations.items() if name not in lost}
+    reports = [report_of(name, seen) for name, seen in told.items()]
+    macs = known_macs(fleet, known)
+    heard = seen_by(reports, macs, fresh_ms=REMEMBERED_MS)
+    routed = _routed(told, names_by_mac(reports, macs))
+    return {name: Whereabouts(known.get(name), heard.get(name, ()), routed.get(name, ()), len(told)) for name in lost}
+
+
+def _routed(observations: Mapping[str, Observation], names: Mapping[str, str]) -> dict[str, tuple[Sighting, ...]]:
+    """Who has an originator's entry of whom, the latest of each."""
+    latest: dict[str, dict[str, int]] = {}
+    for by, seen in observations.items():
+        for entry in seen.originators or ():
+            name = names.get(entry.mac.lower())
+            if name is not None and name != by and entry.last_seen_ms <= REMEMBERED_MS:
+                ages = latest.setdefault(name, {})
+                ages[by] = min(entry.last_seen_ms, ages.get(by, REMEMBERED_MS))
+    return {
+        name: tuple(sorted((Sighting(by, age) for by, age in ages.items()), key=lambda s: (s.age_ms, s.by)))
+        for name, ages in latest.items()
+    }
+
+
+def ask_around(
+    access: Access,
+    fleet: Fleet,
+    names: Iterable[str],
+    before: Seen,
+    known: Mapping[str, LastKnown],
+    *,
+    interrupt: Interrupt,
+) -> dict[str, Whereabouts]:
+    """The same, from a new look at those who heard them before, at the base, and at some others that answered then."""
+    lost = tuple(names)
+    graph = before.graph(fleet, known)
+    near = [other for name in lost for other in graph.neighbours.get(name, ())]
+    base = [fleet.base_node.name] if fleet.base_node is not None else []
+    witnesses = [
+        name for name in dict.fromkeys((*near, *base, *before.observations)) if name in fleet.nodes and name not in lost
+    ]
+    seen = gather(
+        access,
+        [fleet.nodes[name] for name in witnesses[:WITNESSES]],
+        parallel=max(1, fleet.apply.parallel),
+        interrupt=interrupt,
+    )
+    return whereabouts(fleet, lost, seen.observations, known)

@@ -1,0 +1,231 @@
+"""What a robot's computer is and has: the probe's lines -> `Facts` -> the reasons it cannot take a bundle.
+
+Pure. All reasons are told at once, and before anything on the computer is changed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from meshctl.errors import InputError
+from meshctl.model import Computer, Fleet
+from meshctl.robots.wheel_tags import Target
+
+# udp_mesh uses asyncio.timeout and tomllib.
+LEAST_PYTHON = (3, 11)
+# A clock this far off has lost its battery.
+MAX_CLOCK_SKEW_S = 24 * 3600.0
+# What other programs on the computer need while a release is unpacked.
+SPARE_KIB = 32 << 10
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """`files` are hash by path of the current release as its manifest lists them; `damaged` are paths that are no
+    longer so. `releases` and `trees` are those that are whole. `python` is None where there is none that runs."""
+
+    arch: str = ""
+    now_s: float = 0.0
+    uid: int = -1
+    has_systemd: bool = False
+    missing_tools: tuple[str, ...] = ()
+    missing_ros: str = ""
+    python: tuple[int, int, int] | None = None
+    implementation: str = ""
+    bits: int = 0
+    libc: str = ""
+    libc_version: tuple[int, int] = (0, 0)
+    executable: str = ""
+    missing_modules: tuple[str, ...] = ()
+    free_kib: int = 0
+    is_writable: bool = False
+    runs_programs: bool = True
+    current: str = ""
+    previous: str = ""
+    releases: tuple[str, ...] = ()
+    trees: tuple[str, ...] = ()
+    files: tuple[tuple[str, str], ...] = ()
+    damaged: tuple[str, ...] = ()
+    is_proven: bool = True
+    services: tuple[tuple[str, str, str], ...] = ()
+
+    @property
+    def units(self) -> tuple[tuple[str, str, str], ...]:
+        """(unit, active, enabled) of the units that the current release has, the daemon's first."""
+        ours = {path for path, _ in self.files}
+        return tuple(service for service in self.services if service[0] in ours)
+
+    @property
+    def target(self) -> Target | None:
+        """None where no Python runs there."""
+        if self.python is None:
+            return None
+        return Target(self.python[:2], _arch_of_python(self.arch, self.bits), self.libc, self.libc_version)
+
+    @property
+    def runs(self) -> bool:
+        """Whether all its units do, and will at the next boot."""
+        return bool(self.units) and all(tuple(state) == ("active", "enabled") for _, *state in self.units)
+
+    @property
+    def masked(self) -> tuple[str, ...]:
+        """Units that somebody there has forbidden to start (`systemctl mask`), for good or until the next boot."""
+        return tuple(unit for unit, _, enabled in self.services if enabled.startswith("masked"))
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the current release runs, has proved itself, and is on the disk as it was put there."""
+        return self.is_proven and not self.damaged and self.runs
+
+
+def parse_facts(text: str) -> Facts:
+    """The lines of `scripts/probe.sh`; lines it does not know are passed over."""
+    one: dict[str, str] = {}
+    many: dict[str, list[str]] = {}
+    for line in text.splitlines():
+        name, equals, value = line.partition("=")
+        if equals:
+            one[name] = value
+            many.setdefault(name, []).append(value)
+    libc, libc_version = _libc(one.get("libc", ""))
+    return Facts(
+        arch=one.get("arch", ""),
+        now_s=float(_number(one.get("now", ""))),
+        uid=_number(one.get("uid", "-1"), -1),
+        has_systemd=one.get("systemd") == "yes",
+        missing_tools=tuple(one.get("missing", "").split()),
+        missing_ros=one.get("no_ros", ""),
+        python=_version(one.get("python", "")),
+        implementation=one.get("implementation", ""),
+        bits=_number(one.get("bits", "")),
+        libc=libc,
+        libc_version=libc_version,
+        executable=one.get("executable", ""),
+        missing_modules=tuple(many.get("no_module", ())),
+        free_kib=_number(one.get("free_kib", "")),
+        is_writable=one.get("writable") == "yes",
+        runs_programs=one.get("noexec") != "yes",
+        current=one.get("current", ""),
+        previous=one.get("previous", ""),
+        releases=tuple(many.get("release", ())),
+        trees=tuple(many.get("tree", ())),
+        files=tuple((path, digest) for digest, _, path in (row.partition("  ") for row in many.get("file", ()))),
+        damaged=tuple(many.get("damaged", ())),
+        is_proven=one.get("proven") == "yes",
+        services=tuple(_service(row) for row in many.get("unit", ())),
+    )
+
+
+def _service(row: str) -> tuple[str, str, str]:
+    """`NAME ACTIVE ENABLED`; systemd says nothing of what it does not know."""
+    name, active, enabled, *_ = (*row.split(), "", "", "")
+    return name, active, enabled
+
+
+def _number(text: str, default: int = 0) -> int:
+    return int(text) if re.fullmatch(r"-?\d+", text) else default
+
+
+def _version(text: str) -> tuple[int, int, int] | None:
+    found = re.fullmatch(r"(\d+)\.(\d+)\.(\d+)", text)
+    return (int(found[1]), int(found[2]), int(found[3])) if found else None
+
+
+def _libc(text: str) -> tuple[str, tuple[int, int]]:
+    """`glibc 2.36`; platform.libc_ver knows no musl before Python 3.13 and says nothing there."""
+    found = re.fullmatch(r"(glibc|musl) ?(\d+)\.(\d+).*", text)
+    return (found[1], (int(found[2]), int(found[3]))) if found else ("musl", (1, 2))
+
+
+def _arch_of_python(machine: str, bits: int) -> str:
+    """The platform's name in wheels: a 32-bit system may run on a 64-bit kernel (Raspberry Pi OS does)."""
+    if bits == 32:
+        return {"x86_64": "i686", "aarch64": "armv7l"}.get(machine, machine)
+    return machine
+
+
+def computer_of(fleet: Fleet, robot: str) -> Computer:
+    """Raises InputError for a robot that has none."""
+    computer = fleet.robots[robot].computer
+    if computer is None:
+        raise InputError(f"robot {robot} has no computer in the inventory", hint=f"write robots.{robot}.computer")
+    return computer
+
+
+def clock_remark(facts: Facts, now_s: float) -> tuple[str, str]:
+    """(what is wrong with its clock, how to mend it), empty where nothing is.
+
+    A wrong clock keeps nothing from working, since no step here and nothing in the daemon believes it; but its logs
+    and recordings lie.
+    """
+    skew_s = facts.now_s - now_s
+    if abs(skew_s) <= MAX_CLOCK_SKEW_S:
+        return "", ""
+    side = "ahead of" if skew_s > 0 else "behind"
+    return f"its clock is {_days(abs(skew_s))} {side} ours", "its logs lie until it is set: `date -s`, or NTP"
+
+
+def objections(facts: Facts, *, robot: str, arch: str, python: str) -> Iterator[tuple[str, str]]:
+    """Why the computer cannot run udp_mesh as the inventory (`arch`, `python`) has it: (reason, how to mend it)."""
+    if facts.uid != 0:
+        yield "the scripts did not run as root", "log in as root, or as a user who may use sudo"
+    if not facts.has_systemd:
+        yield "systemd does not run there", "udp_mesh is deployed as a systemd service"
+    if facts.missing_tools:
+        yield f"it lacks {', '.join(facts.missing_tools)}", "they are in coreutils, util-linux, tar and mawk"
+    if facts.missing_ros:
+        hint = f"install ROS there, or take `ros` out of robots.{robot}.computer"
+        yield f"ROS is not there: no {facts.missing_ros}", hint
+    if facts.arch != arch:
+        hint = f"write `arch: {facts.arch}` at robots.{robot}.computer, if it is the right computer"
+        yield f"wrong CPU: the inventory says {arch}, it is {facts.arch}", hint
+    yield from _python_objections(facts, robot, python)
+    if not facts.is_writable:
+        yield "its disk is read-only", "remount it, or look at its log for disk errors"
+    if not facts.runs_programs:
+        yield "/opt is mounted noexec: nothing there can be started", "remount it with exec, and mend /etc/fstab"
+    if facts.masked:
+        hint = f"ask who did, then `systemctl unmask {' '.join(facts.masked)}` there"
+        yield f"somebody has masked {' and '.join(facts.masked)} there", hint
+
+
+def _python_objections(facts: Facts, robot: str, python: str) -> Iterator[tuple[str, str]]:
+    least = ".".join(map(str, LEAST_PYTHON))
+    name_it = f"install Python {least} or newer beside it and name it as robots.{robot}.computer.python"
+    if facts.python is None:
+        yield f"no {python} runs there", name_it
+        return
+    found = ".".join(map(str, facts.python))
+    if facts.python[:2] < LEAST_PYTHON:
+        yield f"wrong Python: {python} is {found}, udp_mesh needs {least} or newer", name_it
+    if facts.implementation != "CPython":
+        yield f"wrong Python: {python} is {facts.implementation}, the wheels are for CPython", name_it
+    if facts.missing_modules:
+        lacking = ", ".join(facts.missing_modules)
+        yield (
+            f"{python} lacks the standard modules {lacking}",
+            "install the whole of Python (python3, not python3-minimal)",
+        )
+
+
+def room_objection(facts: Facts, needed_bytes: int) -> Iterator[tuple[str, str]]:
+    """Whether a release of that many bytes, unpacked, fits beside what is there."""
+    needed_kib = needed_bytes // 1024 + SPARE_KIB
+    if facts.free_kib < needed_kib:
+        found = f"{facts.free_kib >> 10} MiB are free"
+        yield f"full disk: {(needed_kib >> 10) + 1} MiB are needed at /opt, {found}", "make room there"
+
+
+def _days(seconds: float) -> str:
+    days = seconds / 86_400
+    return f"{days / 365.25:.1f} years" if days > 365 else f"{days:.1f} days"
+
+
+def changed_files(facts: Facts, wanted: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+    """Paths whose hash differs between the current release and a wanted manifest, in the wanted order."""
+    here = dict(facts.files)
+    wanted = tuple(wanted)
+    gone = [path for path in here if path not in dict(wanted)]
+    return (*(path for path, digest in wanted if here.get(path) != digest), *gone)

@@ -1,0 +1,110 @@
+"""What the robots told, for people: `RobotFacts` -> a table; and what a deploy would change (`difference`).
+
+Pure.
+"""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from collections.abc import Iterable
+
+from meshctl.robots.bundle import UNIT_NAME, Bundle
+from meshctl.robots.facts import RobotFacts
+from meshctl.robots.preconditions import Facts, changed_files
+
+_HEADINGS = ("robot", "service", "release", "version", "up", "peers", "queued", "last message", "load", "keys")
+# On a narrow terminal these go first, in this order: `--json` has them all.
+_GIVE_WAY = ("load", "release", "keys", "version", "last message", "up")
+_GAP = "  "
+
+
+def table(rows: Iterable[RobotFacts], width: int | None = None) -> str:
+    """One line a robot: what runs, for how long, whom it sees, what waits, when it last heard or said something; below
+    them what is wrong. No line of the table is longer than `width` where columns can be left out for it."""
+    robots = list(rows)
+    lines = [_HEADINGS, *(_row(one) for one in robots)]
+    widths = {name: max(len(line[at]) for line in lines) for at, name in enumerate(_HEADINGS)}
+    shown = list(_HEADINGS)
+    for name in _GIVE_WAY:
+        if width is None or sum(widths[one] + len(_GAP) for one in shown) - len(_GAP) <= width:
+            break
+        shown.remove(name)
+    drawn = [
+        _GAP.join(
+            cell.ljust(widths[name]) for name, cell in zip(_HEADINGS, line, strict=True) if name in shown
+        ).rstrip()
+        for line in lines
+    ]
+    for one in robots:
+        if one.trouble or one.remark:
+            drawn += textwrap.wrap(
+                f"{one.robot}: {one.trouble or one.remark}", width or sys.maxsize, subsequent_indent=_GAP
+            )
+    if len(shown) < len(_HEADINGS):
+        left_out = ", ".join(name for name in _HEADINGS if name not in shown)
+        drawn += textwrap.wrap(f"no room for {left_out}: --json has them", width or sys.maxsize)
+    return "\n".join(drawn)
+
+
+def _row(one: RobotFacts) -> tuple[str, ...]:
+    if one.trouble:
+        return (one.robot, "?", *["-"] * (len(_HEADINGS) - 2))
+    load = one.computer.load
+    return (
+        one.robot,
+        one.service.active or "absent",
+        one.release or "-",
+        one.version or "-",
+        _duration(one.daemon_uptime_s),
+        f"{len(one.online)}/{len(one.peers)}" if one.answers else "-",
+        _queued(one) if one.answers else "-",
+        _last_message(one),
+        f"{load[0]:.1f}" if load else "-",
+        "UNKEYED" if one.unkeyed else " ".join(key[:8] for key in one.keys) or "-",
+    )
+
+
+def _queued(one: RobotFacts) -> str:
+    """Most urgent first, since that is where waiting is worst: `p0: 3, p9: 120`."""
+    return ", ".join(f"p{queue.priority}: {queue.messages}" for queue in one.queues if queue.messages) or "0"
+
+
+def _last_message(one: RobotFacts) -> str:
+    ages = {topic.name: topic.last_ago_s for topic in one.topics}
+    heard = {name: age for name, age in ages.items() if age is not None}
+    if not heard:
+        return "-"
+    name = min(heard, key=lambda each: heard[each])
+    return f"{name} {_duration(heard[name])} ago"
+
+
+def _duration(seconds: float | None) -> str:
+    if seconds is None:
+        return "-"
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+
+
+def difference(facts: Facts, release: Bundle) -> tuple[str, ...]:
+    """One line for each way in which a robot is not as the inventory says; none when a deploy would do nothing.
+
+    Files are named, not shown: what is on the robot is known by its hash.
+    """
+    if not facts.current:
+        return (f"nothing is installed; deploy would install {release.id}",)
+    lines = [f"changed on the robot: {path}" for path in facts.damaged]
+    lines += [f"differs from the inventory: {path}" for path in changed_files(facts, release.hashes)]
+    if not facts.is_proven:
+        lines.append("a switch was cut short")
+    for unit, active, enabled in facts.units:
+        if active != "active":
+            lines.append(f"{_called(unit)} is {active or 'absent'}")
+        if enabled != "enabled":
+            lines.append(f"{_called(unit)} is {enabled or 'absent'}: it will not start at boot")
+    return tuple(lines)
+
+
+def _called(unit: str) -> str:
+    return "the service" if unit == UNIT_NAME else "the ROS bridge"

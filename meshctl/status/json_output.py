@@ -1,0 +1,178 @@
+"""The status for scripts, as JSON values. docs/status.md describes the shape; VERSION changes when a field does.
+
+Times are seconds, shares 0 to 1; a fact that is not known is null, never 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from meshctl.status.last_known import typed
+from meshctl.status.preflight import Check, verdict
+from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus
+from meshctl.topology import Sighting
+
+VERSION = 1
+
+
+def as_json(status: FleetStatus) -> dict[str, Any]:
+    """Everything that the table tells, and what has no room there."""
+    everywhere = [*status.alarms, *(alarm for one in status for alarm in one.alarms)]
+    return {
+        "version": VERSION,
+        "fleet": status.fleet,
+        "taken_s": round(status.taken_s, 3),
+        "took_s": round(status.took_s, 3),
+        "entry": status.entry,
+        "exit_code": int(status.exit_code),
+        "totals": {
+            "nodes": {health.value: sum(one.health is health for one in status.nodes) for health in Health},
+            "robots": {health.value: sum(one.health is health for one in status.robots) for health in Health},
+            "alarms": {level.text: sum(alarm.level is level for alarm in everywhere) for level in Level},
+        },
+        "alarms": _alarms(status.alarms),
+        "strangers": list(status.strangers),
+        "nodes": [_node(node) for node in status.nodes],
+        "robots": [_robot(robot) for robot in status.robots],
+    }
+
+
+def _alarms(alarms: Iterable[Alarm]) -> list[dict[str, str]]:
+    return [{"level": a.level.text, "code": a.code, "text": a.text, "hint": a.hint} for a in alarms]
+
+
+def _sightings(heard_by: Iterable[Sighting]) -> list[dict[str, Any]]:
+    return [{"by": s.by, "age_s": s.age_ms / 1000, "signal_dbm": s.signal_dbm} for s in heard_by]
+
+
+def _rounded(value: float | None, digits: int = 3) -> float | None:
+    return None if value is None else round(value, digits)
+
+
+def _node(node: NodeStatus) -> dict[str, Any]:
+    answers = not node.silent_because
+    return {
+        "name": node.name,
+        "role": node.node.role.value,
+        "state": node.node.state.value,
+        "robot": node.node.robot or None,
+        "address": str(node.node.address.ip),
+        "health": node.health.value,
+        "answers": answers,
+        "silent_because": node.silent_because or None,
+        "age_s": _rounded(node.age_s),
+        "alarms": _alarms(node.alarms),
+        "version": node.version or None,
+        "revision": node.revision or None,
+        "drift": None if node.drift is None else list(node.drift),
+        "uptime_s": node.uptime_s,
+        "load": _rounded(node.load),
+        "memory_free": _rounded(node.memory_free),
+        "flash_free_bytes": node.flash_free_bytes,
+        "clock_offset_s": _rounded(node.clock_offset_s),
+        "channels": list(node.channels) if answers else None,
+        "tx_power_dbm": node.tx_power_dbm,
+        "bridge_ports": None if node.lan_ports is None else list(node.lan_ports),
+        "neighbours": [
+            {"name": n.name, "age_s": n.age_ms / 1000, "quality": _rounded(n.quality), "signal_dbm": n.signal_dbm}
+            for n in node.neighbours
+        ]
+        if answers
+        else None,
+        "hops": node.hops,
+        "quality": _rounded(node.quality),
+        "via": node.via or None,
+        "is_cut_vertex": node.is_cut_vertex if answers else None,
+        "heard_by": _sightings(node.heard_by),
+        "last_known": None if node.last_known is None else typed(node.last_known),
+    }
+
+
+def _robot(robot: RobotStatus) -> dict[str, Any]:
+    base = {
+        "name": robot.name,
+        "is_base": robot.robot.is_base,
+        "state": None if robot.state is None else robot.state.value,
+        "radios": list(robot.robot.nodes),
+        "address": None if robot.robot.computer is None else str(robot.robot.computer.address.ip),
+        "health": robot.health.value,
+        "answers": robot.facts is not None,
+        "silent_because": robot.silent_because or None,
+        "age_s": _rounded(robot.age_s),
+        "alarms": _alarms(robot.alarms),
+        "heard_by": _sightings(robot.heard_by),
+        "last_known": None if robot.last_known is None else typed(robot.last_known),
+    }
+    facts = robot.facts
+    if facts is None:
+        return {**base, "computer": None, "daemon": None, "bridge": None, "peers": None, "queues": None, "topics": None}
+    computer = facts.computer
+    return {
+        **base,
+        "computer": {
+            "uptime_s": computer.uptime_s,
+            "load": None if computer.load is None else computer.load[0],
+            "processors": computer.cpus or None,
+            "memory_kib": computer.memory_kib or None,
+            "memory_free_kib": computer.memory_free_kib if computer.memory_kib else None,
+            "disk_kib": computer.disk_kib or None,
+            "disk_free_kib": computer.disk_free_kib if computer.disk_kib else None,
+            "clock_ahead_s": _rounded(computer.clock_ahead_s),
+        },
+        "daemon": {
+            "answers": facts.answers,
+            "service": facts.service.active or None,
+            "enabled": facts.service.enabled or None,
+            "restarts": facts.service.restarts,
+            "version": facts.version or None,
+            "release": facts.release or None,
+            "previous": facts.previous or None,
+            "is_proven": facts.is_proven,
+            "drift": list(facts.drift) if robot.is_compared else None,
+            "uptime_s": facts.daemon_uptime_s,
+            "keys": list(facts.keys),
+            "unkeyed": facts.unkeyed,
+        },
+        "bridge": None if facts.bridge is None else {"service": facts.bridge.active or None},
+        "peers": [
+            {
+                "name": peer.name,
+                "online": peer.online,
+                "heard_ago_s": _rounded(peer.heard_ago_s),
+                "round_trip_s": _rounded(peer.round_trip_s, 6),
+                "loss": _rounded(peer.loss),
+                "outbox_messages": peer.outbox_messages,
+            }
+            for peer in facts.peers
+        ],
+        "queues": [
+            {"priority": q.priority, "messages": q.messages, "bytes": q.bytes, "oldest_s": _rounded(q.oldest_s)}
+            for q in facts.queues
+        ],
+        "topics": [
+            {
+                "name": topic.name,
+                "priority": topic.priority,
+                "sent_ago_s": _rounded(topic.sent_ago_s),
+                "received_ago_s": _rounded(topic.received_ago_s),
+                "limit_s": _rounded(topic.limit_s),
+                "trouble": topic.trouble or None,
+            }
+            for topic in robot.topics
+        ],
+    }
+
+
+def preflight_json(checks: Iterable[Check]) -> dict[str, Any]:
+    """`go` for the whole, then each check."""
+    listed = tuple(checks)
+    return {
+        "version": VERSION,
+        "go": all(check.is_go for check in listed),
+        "verdict": verdict(listed),
+        "checks": [
+            {"check": check.name, "go": check.is_go, "checked": check.is_checked, "reason": check.reason}
+            for check in listed
+        ],
+    }

@@ -1,0 +1,207 @@
+"""The mesh as its nodes see it, for people and for other programs: table, tree, JSON, NetJSON NetworkGraph, DOT.
+
+Every link carries its quality both ways and how old the reports are; cut vertices are marked.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from meshctl.status.node_alarms import duration
+from meshctl.topology import Graph, Report, neighbours_of
+from meshctl.topology.cells import LinkCell
+
+
+@dataclass(frozen=True, slots=True)
+class Direction:
+    """What one end tells of a link; None everywhere when that end did not answer."""
+
+    quality: float | None = None
+    signal_dbm: int | None = None
+    age_ms: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """`directions[a, b]` is what `a` tells of hearing `b`, `cells[a, b]` in which cells. `age_s` is how old a node's
+    report is."""
+
+    mesh: str
+    entry: str
+    graph: Graph
+    directions: Mapping[tuple[str, str], Direction]
+    ages_s: Mapping[str, float]
+    addresses: Mapping[str, str]
+    routing: str = "batman-adv"
+    cells: Mapping[tuple[str, str], tuple[LinkCell, ...]] = field(default_factory=dict)
+
+    def age_s(self, name: str) -> float | None:
+        """For programs: to the millisecond."""
+        return round(self.ages_s[name], 3) if name in self.ages_s else None
+
+    def cells_of(self, a: str, b: str) -> tuple[LinkCell, ...]:
+        """The cells of a link, by what either end tells."""
+        return tuple(dict.fromkeys((*self.cells.get((a, b), ()), *self.cells.get((b, a), ()))))
+
+    def has_several_cells(self) -> bool:
+        return len({cell.mesh for cells in self.cells.values() for cell in cells}) > 1
+
+    def direction(self, a: str, b: str) -> Direction:
+        return self.directions.get((a, b), Direction())
+
+
+def directions(reports: Mapping[str, Report], macs: Mapping[str, str]) -> dict[tuple[str, str], Direction]:
+    """What every reporting node tells of each neighbour heard lately."""
+    return {
+        (name, other): Direction(heard.quality, heard.signal_dbm, heard.last_seen_ms)
+        for name, report in reports.items()
+        for other, heard in neighbours_of(report, macs).items()
+    }
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0%}"
+
+
+def table(picture: Picture) -> str:
+    """One line per link, the weakest first."""
+    lines = [("link", "there", "back", "signal", "heard", "cell")]
+    for link in sorted(picture.graph.links, key=lambda link: (link.quality, link.a, link.b)):
+        there, back = picture.direction(link.a, link.b), picture.direction(link.b, link.a)
+        signals = "/".join("-" if d.signal_dbm is None else str(d.signal_dbm) for d in (there, back))
+        ages = [d.age_ms for d in (there, back) if d.age_ms is not None]
+        lines.append(
+            (f"{link.a} -- {link.b}", _share(there.quality), _share(back.quality), signals,
+             f"{max(ages)} ms ago" if ages else "-",
+             "wired" if link.wired else ", ".join(map(str, picture.cells_of(link.a, link.b))))
+        )  # fmt: skip
+    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
+    links = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in lines]
+    cuts = picture.graph.cut_off_by(picture.entry)
+    told = [f"cut vertex: {name} (holds {', '.join(lost)})" for name, lost in cuts.items()]
+    return "\n".join([*links, *told])
+
+
+def tree(picture: Picture) -> str:
+    """Every node below the next one on its best path to the entry; cut vertices carry a star."""
+    paths = picture.graph.paths(picture.entry)
+    children: dict[str, list[str]] = {}
+    for name, path in sorted(paths.items()):
+        if name != picture.entry:
+            children.setdefault(path.via, []).append(name)
+    cuts = picture.graph.cut_vertices(picture.entry)
+    lines: list[str] = []
+
+    def label(name: str) -> str:
+        star = " *" if name in cuts else ""
+        path = paths[name]
+        told = "" if name == picture.entry else f"  {path.hops} hop{'s' if path.hops > 1 else ''}, {path.quality:.0%}"
+        age = f", {duration(picture.ages_s[name])} old" if name in picture.ages_s else ", does not answer"
+        if name != picture.entry and picture.has_several_cells():
+            told += "".join(f", {cell}" for cell in picture.cells_of(name, path.via))
+        return f"{name}{star}{told}{age if name != picture.entry else ''}"
+
+    waiting = [(picture.entry, "", "")] if picture.entry in paths else []
+    while waiting:
+        name, lead, below = waiting.pop()
+        lines.append(f"{lead}{label(name)}")
+        inner = children.get(name, [])
+        for index in range(len(inner) - 1, -1, -1):
+            last = index == len(inner) - 1
+            waiting.append((inner[index], below + ("`- " if last else "|- "), below + ("   " if last else "|  ")))
+    apart = [name for name in picture.graph.nodes if name not in paths]
+    lines += [f"no path to {picture.entry or 'the base'}: {', '.join(apart)}"] if apart else []
+    lines += ["* without it others would be cut off"] if cuts else []
+    return "\n".join(lines)
+
+
+def as_json(picture: Picture) -> str:
+    """Nodes and links with both directions."""
+    paths = picture.graph.paths(picture.entry)
+    cuts = picture.graph.cut_off_by(picture.entry)
+    nodes: list[dict[str, Any]] = [
+        {
+            "name": name, "address": picture.addresses.get(name), "age_s": picture.age_s(name),
+            "hops": paths[name].hops if name in paths else None,
+            "quality": round(paths[name].quality, 4) if name in paths else None,
+            "via": paths[name].via if name in paths and name != picture.entry else None,
+            "cuts_off": list(cuts.get(name, ())),
+        }
+        for name in picture.graph.nodes
+    ]  # fmt: skip
+    links = [
+        {
+            "a": link.a, "b": link.b, "quality": round(link.quality, 4), "wired": link.wired,
+            "cells": [
+                {"mesh": cell.mesh, "band": cell.band.value, "channel": cell.channel}
+                for cell in picture.cells_of(link.a, link.b)
+            ],
+            "a_hears_b": _direction_json(picture.direction(link.a, link.b)),
+            "b_hears_a": _direction_json(picture.direction(link.b, link.a)),
+        }
+        for link in picture.graph.links
+    ]  # fmt: skip
+    return json.dumps({"mesh": picture.mesh, "entry": picture.entry, "nodes": nodes, "links": links}, indent=2)
+
+
+def _direction_json(direction: Direction) -> dict[str, Any]:
+    quality = None if direction.quality is None else round(direction.quality, 4)
+    return {"quality": quality, "signal_dbm": direction.signal_dbm, "age_ms": direction.age_ms}
+
+
+def netjson(picture: Picture) -> str:
+    """NetJSON NetworkGraph (netjson.org, draft 00): `cost` is 1 / quality, as expected transmissions are."""
+    return json.dumps(
+        {
+            "type": "NetworkGraph",
+            "protocol": picture.routing,
+            "version": None,
+            "metric": "ETX",
+            "label": picture.mesh,
+            "nodes": [
+                {
+                    "id": picture.addresses.get(name, name),
+                    "label": name,
+                    "properties": {"age_s": picture.age_s(name)},
+                }
+                for name in picture.graph.nodes
+            ],
+            "links": [
+                {
+                    "source": picture.addresses.get(link.a, link.a),
+                    "target": picture.addresses.get(link.b, link.b),
+                    "cost": round(1.0 / max(link.quality, 1e-3), 4),
+                    "properties": {"wired": link.wired},
+                }
+                for link in picture.graph.links
+            ],
+        },
+        indent=2,
+    )
+
+
+def dot(picture: Picture) -> str:
+    """Graphviz: cut vertices as boxes, quality as label and thickness."""
+    cuts = picture.graph.cut_vertices(picture.entry)
+    lines = [f"graph {json.dumps(picture.mesh)} {{"]
+    for name in picture.graph.nodes:
+        shape = "doublecircle" if name == picture.entry else "box" if name in cuts else "ellipse"
+        lines.append(f"  {json.dumps(name)} [shape={shape}];")
+    for link in picture.graph.links:
+        style = (
+            ' style="dashed"' if link.wired else f' label="{link.quality:.0%}" penwidth="{1 + 3 * link.quality:.1f}"'
+        )
+        lines.append(f"  {json.dumps(link.a)} -- {json.dumps(link.b)} [{style.strip()}];")
+    return "\n".join([*lines, "}"])
+
+
+FORMATS: dict[str, Callable[[Picture], str]] = {
+    "table": table,
+    "tree": tree,
+    "json": as_json,
+    "netjson": netjson,
+    "dot": dot,
+}

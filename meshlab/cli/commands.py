@@ -1,0 +1,223 @@
+"""`meshctl lab`: a virtual fleet on this machine; who hears whom in it is `lab_ground`'s part."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from meshctl.cli.options import AsJson, LabDirectory, lab_directory
+from meshctl.cli.output import echo, echo_json
+from meshctl.errors import InputError
+from meshctl.model import Release
+from meshctl.resources import shipped
+from meshlab.cli import links
+from meshlab.console import run_shell
+from meshlab.errors import LabError
+from meshlab.faults import BREAKS, parse, told
+from meshlab.fleet import VirtualFleet, end
+from meshlab.from_inventory import spec_of
+from meshlab.images import firmware_image
+from meshlab.inventory_copy import prepare
+from meshlab.qemu.fleet import RealFleet
+from meshlab.releases import facts
+
+app = typer.Typer(help="A virtual fleet on this machine.", no_args_is_help=True)
+
+# seconds for one node to boot on a machine that has much else to do, and for the first one to begin
+_BOOT_S = 2.0
+_START_S = 60.0
+# the same for a machine under emulation: packages are fetched, its kernel boots, at worst twice
+_REAL_BOOT_S = 10.0
+_REAL_START_S = 600.0
+
+Where = Annotated[str, typer.Argument(help="A node (b03) or a link (b01-b02).")]
+
+
+@app.command("up")
+def up(
+    inventory: Annotated[Path | None, typer.Argument(help="The fleet to copy; default: the example lab.")] = None,
+    chosen: Annotated[
+        Path | None, typer.Option("--inventory", "-i", help="The same as the argument, as other commands take it.")
+    ] = None,
+    nodes: Annotated[int | None, typer.Option("--nodes", min=1, help="Only its first N nodes.")] = None,
+    directory: LabDirectory = None,
+    port: Annotated[int, typer.Option("--port", help="TCP port of all its addresses; 0 takes a free one.")] = 0,
+    real: Annotated[
+        bool, typer.Option("--real", help="In a machine with the kernel's own 802.11 radios and batman-adv (QEMU).")
+    ] = False,
+) -> None:
+    """Start a fleet of factory-fresh OpenWrt-like nodes, as the inventory describes them.
+
+    Example: meshctl lab up inventory/lab --nodes 6 --real
+    """
+    if inventory is not None and chosen is not None:
+        raise InputError("expected one inventory, found an argument and --inventory")
+    place = lab_directory(directory)
+    copy = prepare(inventory or chosen or shipped("inventory") / "lab", place)
+    spec = spec_of(copy.fleet, links=copy.links, nodes=nodes, port=port)
+    if real:
+        echo("starting a machine with real radios; its image is made at the first start")
+        fleet: VirtualFleet = RealFleet(spec, place).up(wait_s=_REAL_START_S + _REAL_BOOT_S * len(spec.nodes))
+    else:
+        fleet = VirtualFleet(spec, place).up(wait_s=_START_S + _BOOT_S * len(spec.nodes))
+    echo(f"{len(spec.nodes)} nodes of {spec.name} are up, each at 192.168.1.1 on its own bench port")
+    if copy.kept is not None:
+        echo(f"kept:      {copy.kept} is the earlier copy of the inventory, which was edited")
+    echo(f"inventory: {copy.inventory}")
+    echo(f"reach it:  export MESHCTL_LAB={place} MESHCTL_INVENTORY={copy.inventory}")
+    echo(f"by hand:   meshctl lab shell {fleet.spec.names[0]}")
+    echo("then:      meshctl bootstrap --yes; meshctl lab unplug; meshctl topology")
+
+
+@app.command("down")
+def down(directory: LabDirectory = None) -> None:
+    """End the fleet; its directory stays, for a look at flash and logs.
+
+    Example: meshctl lab down
+    """
+    place = lab_directory(directory)
+    name = end(place)
+    if not name:
+        raise LabError(f"no virtual fleet runs in {place}", hint="meshctl lab up starts one")
+    echo(f"{name} is down")
+
+
+@app.command("status")
+def status(directory: LabDirectory = None, as_json: AsJson = False) -> None:
+    """Show every node's power, address, way in, and what was broken.
+
+    Example: meshctl lab status --json
+    """
+    state = VirtualFleet.attach(lab_directory(directory)).status()
+    if as_json:
+        echo_json(json.dumps(state, indent=2))
+        return
+    echo(f"{state['fleet']}: process {state['pid']}, port {state['port']}")
+    head = ("NODE", "POWER", "RELEASE", "ADDRESS", "PLUGGED", "MESH", "REACHED AT", "BROKEN")
+    rows: list[tuple[str, ...]] = [head]
+    rows += [_row(node) for node in state["nodes"]]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    for row in rows:
+        echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    for link in state["links"]:
+        if not link["up"]:
+            echo(f"link {'-'.join(link['between'])} is down")
+
+
+@app.command("shell")
+def shell(
+    node: Annotated[str, typer.Argument(help="Name of the node.")],
+    command: Annotated[list[str] | None, typer.Argument(help="A command; without it an interactive shell.")] = None,
+    directory: LabDirectory = None,
+) -> None:
+    """Open a node's serial console, which works without its network.
+
+    Example: meshctl lab shell b01 -- uci show network
+    """
+    fleet = VirtualFleet.attach(lab_directory(directory))
+    raise typer.Exit(run_shell(fleet, fleet.node(node).name, " ".join(command or ())))
+
+
+_BREAK_HELP = "\n\n".join(
+    (
+        "Break something, now or at a step; `meshctl lab mend` undoes it.",
+        *(f"{one.value}: {text}" for one, text in BREAKS.items()),
+        "Example: meshctl lab break b03 'power-cut@reload_config'",
+        "Example: meshctl lab break b01-b02 link-down",
+    )
+)
+
+
+@app.command("break", help=_BREAK_HELP)
+def break_(
+    where: Where,
+    what: Annotated[str, typer.Argument(help="What happens to it, some with @STEP: power-cut@7, power-cut@flash.")],
+    directory: LabDirectory = None,
+) -> None:
+    order = parse(what)
+    VirtualFleet.attach(lab_directory(directory)).break_(where, what)
+    echo(f"{where}: {told(order)}")
+
+
+@app.command("mend")
+def mend(
+    where: Annotated[str, typer.Argument(help="A node or a link; without it everything.")] = "",
+    directory: LabDirectory = None,
+) -> None:
+    """Undo what was broken: power and links back, flash freed, dead firmware recovered as on a bench.
+
+    Example: meshctl lab mend b03
+    """
+    VirtualFleet.attach(lab_directory(directory)).mend(where)
+    echo(f"{where or 'everything'}: mended")
+
+
+links.register(app)
+
+
+@app.command("plug")
+def plug(
+    nodes: Annotated[list[str] | None, typer.Argument(help="Nodes; none: all.")] = None, directory: LabDirectory = None
+) -> None:
+    """Plug nodes' LAN ports into this machine, as on a bench.
+
+    Example: meshctl lab plug b01
+    """
+    _plug(directory, nodes, True)
+
+
+@app.command("unplug")
+def unplug(
+    nodes: Annotated[list[str] | None, typer.Argument(help="Nodes; none: all but the base.")] = None,
+    directory: LabDirectory = None,
+) -> None:
+    """Pull nodes' LAN ports out: from then on only the mesh leads to them.
+
+    Example: meshctl lab unplug
+    """
+    _plug(directory, nodes, False)
+
+
+@app.command("image")
+def image(
+    release: Annotated[Release, typer.Argument(help="Release series, such as 24.10.")],
+    board: Annotated[str, typer.Argument(help="Board name, such as compex,wpj344-16m.")],
+    out: Annotated[Path, typer.Argument(help="The file to write.")],
+    package: Annotated[list[str] | None, typer.Option("--package", help="Baked in beside the mesh's own.")] = None,
+    revision: Annotated[str, typer.Option("--revision", help="Build; default: the one nodes start with.")] = "",
+) -> None:
+    """Write a firmware image for virtual nodes, checked as a real one is, and tell its line in the inventory.
+
+    Example: meshctl lab image 23.05 compex,wpj344-16m wpj344.bin --revision r24107-0123456789
+    """
+    named = revision or facts(release).revision
+    content = firmware_image(release, board=board, extra=tuple(package or ()), revision=named)
+    try:
+        out.write_bytes(content)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+    echo(f"firmware: {{image: {out.name}, sha256: {hashlib.sha256(content).hexdigest()}, revision: {named}}}")
+
+
+def _plug(directory: Path | None, names: list[str] | None, plugged: bool) -> None:
+    fleet = VirtualFleet.attach(lab_directory(directory))
+    for node in (fleet.node(name) for name in names) if names else fleet.nodes:
+        if names or plugged or not node.is_base:
+            node.plug(plugged)
+
+
+def _row(node: dict[str, Any]) -> tuple[str, ...]:
+    return (
+        node["name"],
+        node["power"],
+        node["release"],
+        node["address"] or "-",
+        "yes" if node["plugged"] else "no",
+        "yes" if node["in_mesh"] else "no",
+        " ".join(node["reached_at"]) or "-",
+        " ".join(node["breaks"]) or "-",
+    )

@@ -1,0 +1,56 @@
+"""Requests to a running fleet's supervisor, over the socket in its directory."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from meshctl.errors import InputError
+from meshlab.control import address_of
+from meshlab.errors import LabError
+from meshlab.node_runner import MESSAGE_BYTES
+
+
+def request(
+    directory: Path, message: dict[str, Any], descriptors: Sequence[int] = (), *, timeout_s: float | None = 60.0
+) -> dict[str, Any]:
+    """Send one request and return the answer.
+
+    Raises LabError when no fleet runs in `directory`, the fleet ends meanwhile or `timeout_s` passes; InputError for
+    what the fleet refused.
+    """
+    try:
+        folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise LabError(f"no virtual fleet in {directory}", hint="meshctl lab up starts one") from error
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+            connection.settimeout(timeout_s)
+            connection.connect(address_of(directory, folder))
+            socket.send_fds(connection, [json.dumps(message).encode()], list(descriptors))
+            answer = connection.recv(MESSAGE_BYTES * 4)
+    except TimeoutError as error:
+        raise LabError(f"the fleet in {directory} did not answer {message['op']} within {timeout_s:g} s") from error
+    except OSError as error:
+        raise LabError(f"no virtual fleet runs in {directory}", hint="meshctl lab up starts one") from error
+    finally:
+        os.close(folder)
+    if not answer:
+        raise LabError(f"the fleet in {directory} has just ended")
+    result: dict[str, Any] = json.loads(answer)
+    if "error" in result:
+        raise InputError(result["error"], hint=result.get("hint", ""))
+    return result
+
+
+def is_running(directory: Path) -> bool:
+    """Whether a supervisor answers there."""
+    try:
+        request(directory, {"op": "status"})
+    except LabError:
+        return False
+    return True

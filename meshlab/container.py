@@ -1,0 +1,172 @@
+"""What the kernel gives one node: its own root, processes, network, host name and uptime.
+
+`become_node` runs in a process that was just cloned into new namespaces, turns it into the node's process 1 and never
+returns. What the node finds under /lab/node on its own file system is the fleet directory's `nodes/NAME`:
+
+    flash/      what survives power cuts (`current` points at the valid copy of /etc, /root, /usr, /lib)
+    firmware/   what is written in its flash chip: release, packages
+    board       what its board is: name, MAC addresses, radios
+    air/        what its radios do (written by the node) and hear (written by the fleet)
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+import uuid
+from dataclasses import dataclass
+from pathlib import Path
+
+from meshlab import namespaces as ns
+from meshlab.rootfs import library_folders
+
+FLAGS = ns.CLONE_NEWNS | ns.CLONE_NEWPID | ns.CLONE_NEWNET | ns.CLONE_NEWUTS | ns.CLONE_NEWIPC
+_DEVICES = ("null", "zero", "full", "random", "urandom", "tty")
+# /tmp takes at most half of the memory, as the kernel's tmpfs does by default
+_TMP_SHARE = 2
+_ENVIRONMENT = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/", "TERM": "vt102"}
+
+
+@dataclass(frozen=True, slots=True)
+class Container:
+    """Sizes in KiB; `fleet` is the fleet's directory. `deny_setgroups` is true inside an unprivileged namespace."""
+
+    name: str
+    fleet: Path
+    overlay_kib: int
+    memory_kib: int
+    deny_setgroups: bool
+    # its devices are the kernel's own (a machine with radios), where they otherwise are files in /sys
+    real_devices: bool = False
+
+    @property
+    def home(self) -> Path:
+        return self.fleet / "nodes" / self.name
+
+    @property
+    def mount_point(self) -> Path:
+        return self.fleet / "mnt" / self.name
+
+
+def prepare(container: Container) -> None:
+    """Make the directories and the files that differ with every boot: a new boot id and the memory's size."""
+    for folder in ("flash", "firmware", "air", "proc"):
+        (container.home / folder).mkdir(parents=True, exist_ok=True)
+    container.mount_point.mkdir(parents=True, exist_ok=True)
+    (container.home / "proc" / "boot_id").write_text(f"{uuid.uuid4()}\n", encoding="ascii")
+    write_meminfo(container, available_kib=container.memory_kib * 3 // 5)
+
+
+def write_meminfo(container: Container, *, available_kib: int) -> None:
+    """Set what /proc/meminfo tells; the kernel tells every container the host's memory."""
+    total = container.memory_kib
+    lines = (
+        ("MemTotal", total),
+        ("MemFree", available_kib * 9 // 10),
+        ("MemAvailable", available_kib),
+        ("Buffers", total // 50),
+        ("Cached", total // 10),
+        ("Shmem", total // 100),
+    )
+    text = "".join(f"{f'{key}:':<16}{value:>8} kB\n" for key, value in lines)
+    # in place: the file is bind-mounted into the node, and a new file would not be seen there
+    (container.home / "proc" / "meminfo").write_text(text, encoding="ascii")
+
+
+def become_node(container: Container, report: int, gate: int | None = None) -> None:
+    """Turn this process into the node; on failure write the reason to the descriptor `report` and exit.
+
+    It waits until something arrives on `gate`: its devices are being put in.
+    """
+    try:
+        ns.die_with_parent()
+        if gate is not None and not os.read(gate, 1):
+            os._exit(111)
+        _restore_signals()
+        _own_uptime()
+        _mounts(container)
+        if container.deny_setgroups:
+            ns.accept_setgroups()
+        os.execve("/bin/sh", ["/bin/sh", "/rom/lab/init"], _ENVIRONMENT)
+    except OSError as error:
+        os.write(report, str(error).encode())
+    finally:
+        os._exit(111)
+
+
+def _restore_signals() -> None:
+    for number in (signal.SIGPIPE, signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGCHLD):
+        signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+
+
+def _own_uptime() -> None:
+    """Start the node's clocks of uptime at zero. Kernels before 5.6 cannot: then it has the host's uptime."""
+    if not os.path.exists("/proc/self/timens_offsets"):
+        return
+    ns.unshare(ns.CLONE_NEWTIME)
+    # to the nanosecond: a node must never seem to have booted before it was switched on
+    monotonic, boottime = (
+        divmod(-time.clock_gettime_ns(clock), 10**9) for clock in (time.CLOCK_MONOTONIC, time.CLOCK_BOOTTIME)
+    )
+    with open("/proc/self/timens_offsets", "w", encoding="ascii") as offsets:
+        offsets.write(f"monotonic {monotonic[0]} {monotonic[1]}\nboottime {boottime[0]} {boottime[1]}\n")
+
+
+def _mounts(container: Container) -> None:
+    ns.make_private()
+    root, home = container.mount_point, container.home
+    rom = container.fleet / "rom"
+    ns.mount("overlay", str(root), "tmpfs", ns.MS_NOATIME, f"size={container.overlay_kib}k,mode=755")
+    for folder in ("dev", "etc", "lab", "lib", "mnt", "overlay", "proc", "rom", "root", "sys", "tmp", "usr"):
+        (root / folder).mkdir()
+    for link, target in (("bin", "rom/bin"), ("sbin", "rom/sbin"), ("var", "tmp")):
+        (root / link).symlink_to(target)
+    for folder in library_folders(rom):
+        # /lib and /usr/lib are the node's own; whatever else holds libraries is taken as it is
+        if folder not in ("lib", "usr/lib") and not (root / folder).exists():
+            (root / folder).parent.mkdir(parents=True, exist_ok=True)
+            (root / folder).symlink_to(f"/rom/{folder}")
+    ns.bind(str(rom), f"{root}/rom", read_only=True)
+    ns.mount("lab", f"{root}/lab", "tmpfs", 0, "size=16k,mode=755")
+    (root / "lab" / "node").mkdir()
+    ns.bind(str(home), f"{root}/lab/node")
+    (root / "lab" / "bell").touch()
+    ns.bind(str(container.fleet / "bell"), f"{root}/lab/bell")
+    ns.mount("tmpfs", f"{root}/tmp", "tmpfs", ns.MS_NOSUID, f"size={container.memory_kib // _TMP_SHARE}k,mode=1777")
+    ns.mount("sysfs", f"{root}/sys", "tmpfs", 0, "size=1m,mode=755")
+    if container.real_devices:
+        _real_devices(root)
+    _devices(root)
+    ns.mount("proc", f"{root}/proc", "proc", ns.MS_NOSUID | ns.MS_NODEV | ns.MS_NOEXEC)
+    ns.bind(str(home / "proc" / "boot_id"), f"{root}/proc/sys/kernel/random/boot_id")
+    ns.bind(str(home / "proc" / "meminfo"), f"{root}/proc/meminfo")
+    ns.pivot_root(str(root))
+    ns.bind("/", "/overlay")
+
+
+def _real_devices(root: Path) -> None:
+    """The kernel's own view of the node's network devices; radios are at the paths of the board (lab/phys)."""
+    (root / "lab" / "sysfs").mkdir()
+    ns.mount("sysfs", f"{root}/lab/sysfs", "sysfs")
+    (root / "sys" / "class").mkdir()
+    for link in ("class/net", "module"):
+        (root / "sys" / link).symlink_to(f"/lab/sysfs/{link}")
+
+
+def _devices(root: Path) -> None:
+    ns.mount("tmpfs", f"{root}/dev", "tmpfs", ns.MS_NOSUID, "size=64k,mode=755")
+    for name in _DEVICES:
+        (root / "dev" / name).touch()
+        ns.bind(f"/dev/{name}", f"{root}/dev/{name}")
+    (root / "dev" / "pts").mkdir()
+    ns.mount("devpts", f"{root}/dev/pts", "devpts", 0, "newinstance,ptmxmode=0666,mode=600")
+    for link, target in (
+        ("ptmx", "pts/ptmx"),
+        ("fd", "/proc/self/fd"),
+        ("stdin", "fd/0"),
+        ("stdout", "fd/1"),
+        ("stderr", "fd/2"),
+    ):
+        (root / "dev" / link).symlink_to(target)

@@ -1,0 +1,227 @@
+"""The supervisor's socket: one JSON request per datagram, one JSON answer; descriptors ride beside `exec`.
+
+The operations are the methods of `Operations` by name; `fleet` holds the other end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import re
+import socket
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from meshctl.errors import MeshctlError
+from meshlab.node_runner import MESSAGE_BYTES
+from meshlab.spec import LinkSpec
+from meshlab.state import NodeState
+
+if TYPE_CHECKING:
+    from meshlab.supervisor import Supervisor
+
+log = logging.getLogger("meshlab.control")
+_NAME = "control.sock"
+
+
+def address_of(directory: Path, descriptor: int) -> str:
+    """The socket's path through the open directory, because a socket's own path may not exceed 107 bytes."""
+    return f"/proc/self/fd/{descriptor}/{_NAME}"
+
+
+Answer = Callable[[dict[str, Any], list[int]], Awaitable[dict[str, Any]]]
+
+
+class Control:
+    """Listens in the fleet's directory; `answer` gets each request with the descriptors beside it."""
+
+    def __init__(self, directory: Path, answer: Answer) -> None:
+        self._directory = directory
+        self._answer = answer
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def open(self) -> None:
+        loop = asyncio.get_running_loop()
+        folder = os.open(self._directory, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            self._listener.bind(address_of(self._directory, folder))
+        finally:
+            os.close(folder)
+        (self._directory / _NAME).chmod(0o600)
+        self._listener.listen(64)
+        self._listener.setblocking(False)
+        loop.add_reader(self._listener, self._accept)
+
+    def close(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._listener)
+        self._listener.close()
+        (self._directory / _NAME).unlink(missing_ok=True)
+        for task in self._tasks:
+            task.cancel()
+
+    def _accept(self) -> None:
+        connection, _ = self._listener.accept()
+        connection.setblocking(False)
+        task = asyncio.ensure_future(self._serve(connection))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _serve(self, connection: socket.socket) -> None:
+        with connection:
+            while True:
+                await _readable(connection)
+                try:
+                    message, descriptors, _, _ = socket.recv_fds(connection, MESSAGE_BYTES, 3)
+                except OSError:
+                    return
+                if not message:
+                    return
+                try:
+                    answer = await self._answer(json.loads(message), descriptors)
+                finally:
+                    for descriptor in descriptors:
+                        os.close(descriptor)
+                with contextlib.suppress(OSError):
+                    connection.setblocking(True)
+                    connection.send(json.dumps(answer).encode())
+                    connection.setblocking(False)
+
+
+class Operations:
+    """What a client may ask for; every public method but `answer` is an operation and returns a JSON object or None."""
+
+    def __init__(self, fleet: Supervisor) -> None:
+        self._fleet = fleet
+
+    async def answer(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
+        """The answer to one request; what went wrong is one, too."""
+        asked = request.get("op")
+        try:
+            return await self.carry_out(request, descriptors)
+        except MeshctlError as error:
+            return {"error": str(error), "hint": error.hint}
+        except Exception as error:
+            # a fault of the lab's own: whoever asked hears of it, the log has the whole, and the fleet goes on
+            log.exception("request-failed op=%s", asked)
+            return {
+                "error": f"the lab failed at {asked!r}: {type(error).__name__}: {error}",
+                "hint": "its log has more",
+            }
+
+    async def carry_out(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
+        """What the request asks for. Raises MeshctlError for what the fleet refuses, anything for a fault of ours."""
+        if request["op"] == "exec":
+            return await self.execute(request["node"], request["command"], descriptors)
+        result = getattr(self, request.pop("op"))(**request)
+        if asyncio.iscoroutine(result):
+            result = await result
+        return result or {}
+
+    def status(self) -> dict[str, Any]:
+        fleet = self._fleet
+        reached = fleet.ether.reached()
+        doors: dict[str, list[str]] = {}
+        for host, door in fleet.doors.wanted().items():
+            doors.setdefault(door.node, []).append(host)
+        nodes = [
+            {
+                "name": name,
+                "power": state.power.value,
+                "reason": state.reason,
+                "pid": max(state.pid, 0),
+                "boots": state.boots,
+                "release": _release(state),
+                "address": _address(state.effective.addresses),
+                "plugged": state.plugged,
+                "in_mesh": name in reached,
+                "reached_at": sorted(doors.get(name, [])),
+                "breaks": state.breaks,
+            }
+            for name, state in fleet.nodes.items()
+        ]
+        links = [
+            {"between": [link.a, link.b], "up": link.up, "tq": link.tq_to(link.b), "delay_ms": link.delay_ms,
+             "loss": link.loss, "loss_back": link.loss_to(link.a), "rate_kbps": link.rate_kbps}
+            for link in fleet.ether.links()
+        ]  # fmt: skip
+        return {"fleet": fleet.spec.name, "pid": os.getpid(), "port": fleet.doors.port, "nodes": nodes, "links": links}
+
+    def node(self, node: str) -> dict[str, Any]:
+        state = self._fleet.hurt.find(node)
+        return {
+            "power": state.power.value,
+            "reason": state.reason,
+            "boots": state.boots,
+            "boot_id": state.boot_id,
+            "address": _address(state.effective.addresses),
+            "number": state.number,
+        }
+
+    def console(self, node: str, lines: int) -> dict[str, Any]:
+        """The last lines of what its boot scripts printed, of all boots; it works for a node without power, too."""
+        file = self._fleet.hurt.find(node).home / "console.log"
+        text = file.read_text(encoding="utf-8", errors="replace") if file.exists() else ""
+        return {"text": "\n".join(text.splitlines()[-lines:])}
+
+    async def execute(self, node: str, command: str, descriptors: list[int]) -> dict[str, Any]:
+        self._fleet.hurt.find(node)
+        event, _ = await self._fleet.ask_for({"do": "exec", "node": node, "command": command}, descriptors)
+        return {"status": event["status"], "reason": event.get("reason", "")}
+
+    async def power_cut(self, node: str, unsynced: str, back: bool) -> None:
+        await self._fleet.hurt.power_cut(self._fleet.hurt.find(node), unsynced, back=back)
+
+    def power_on(self, node: str) -> None:
+        self._fleet.power_on(self._fleet.hurt.find(node).spec.name)
+
+    async def do_break(self, where: str, what: str) -> None:
+        await self._fleet.hurt.do(where, what)
+
+    async def mend(self, where: str) -> None:
+        await self._fleet.hurt.mend(where)
+
+    def link(self, a: str, b: str, changes: dict[str, Any]) -> None:
+        self._fleet.ether.set_link(a, b, changes)
+
+    def links(self, part: list[dict[str, Any]], is_last: bool) -> None:
+        """Who hears whom from now on, in parts because a request has its limit (`standing.stand_on`)."""
+        self._fleet.ether.coming += [LinkSpec(**link) for link in part]
+        if is_last:
+            links, self._fleet.ether.coming = self._fleet.ether.coming, []
+            self._fleet.ether.set_ground(links)
+
+    def plug(self, node: str, plugged: bool) -> None:
+        self._fleet.hurt.find(node).plugged = plugged
+        self._fleet.ether.changed()
+
+    async def record_steps(self, node: str) -> None:
+        await self._fleet.hurt.count_steps(self._fleet.hurt.find(node))
+
+    def down(self) -> None:
+        self._fleet.stopping.set()
+
+
+def _release(state: NodeState) -> str:
+    """What is in its flash chip, which a flash changes."""
+    text = (state.home / "firmware" / "env").read_text(encoding="utf-8", errors="replace")
+    found = re.search(r"^VERSION='([^']*)'", text, re.MULTILINE)
+    return found[1] if found else "-"
+
+
+def _address(addresses: Any) -> str | None:
+    return next((one.address for one in addresses if one.over_wire or one.over_mesh), None)
+
+
+async def _readable(connection: socket.socket) -> None:
+    loop = asyncio.get_running_loop()
+    ready = asyncio.Event()
+    loop.add_reader(connection, ready.set)
+    try:
+        await ready.wait()
+    finally:
+        loop.remove_reader(connection)

@@ -1,0 +1,349 @@
+"""The Python face of a virtual fleet: start it, reach into its nodes, hurt it, end it.
+
+`VirtualFleet(spec, directory).up()` starts the fleet's supervisor as a process of its own and waits until every node
+has booted; everything else is one request over the supervisor's socket. `VirtualFleet.attach(directory)` finds a
+fleet that another process started.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from meshctl.device.connection import Completed, Endpoint
+from meshlab import fleet_directory, rootfs
+from meshlab.addresses import bench_of, loopback_of
+from meshlab.client import is_running, request
+from meshlab.errors import LabError
+from meshlab.spec import FleetSpec, Medium, dump, load
+from meshlab.state import Power
+
+# how often a waiting caller asks again
+_POLL_S = 0.05
+_LOG_LINES = 15
+# then its supervisor, and all nodes with it, is ended by force
+_DOWN_S = 30.0
+
+
+class VirtualNode:
+    """One node of a running fleet, seen from outside: its power switch, its console, its flash."""
+
+    def __init__(self, fleet: VirtualFleet, name: str) -> None:
+        self._fleet = fleet
+        self.name = name
+        self.spec = fleet.spec.node(name)
+
+    def _state(self) -> dict[str, Any]:
+        return self._fleet.ask("node", node=self.name)
+
+    @property
+    def address(self) -> str | None:
+        """Its LAN's IPv4 address at this moment (`10.42.0.11`); None while it is off or has none."""
+        address: str | None = self._state()["address"]
+        return address
+
+    @property
+    def boot_id(self) -> str | None:
+        """Changes with every boot; None while it is off or still booting."""
+        return self._state()["boot_id"] or None
+
+    @property
+    def power(self) -> Power:
+        return Power(self._state()["power"])
+
+    @property
+    def flash_path(self) -> Path:
+        """The directory that is its flash, what survives a power cut: `flash_path / "etc/config/network"`.
+
+        Valid until the node's next `sync`, which makes a new copy.
+        """
+        return (self._fleet.directory / "nodes" / self.name / "flash" / "current").resolve()
+
+    @property
+    def console_log(self) -> Path:
+        """What its boot scripts printed, of all boots."""
+        return self._fleet.directory / "nodes" / self.name / "console.log"
+
+    def console(self, lines: int = 40) -> str:
+        """The last lines of its console: each boot, each boot script's start, and what they printed."""
+        return str(self._fleet.ask("console", node=self.name, lines=lines)["text"])
+
+    @property
+    def bench(self) -> Endpoint:
+        """Its LAN port on the bench: answers while the node is plugged in there and has the address 192.168.1.1."""
+        return Endpoint(bench_of(self._state()["number"]), self._fleet.port, identity=self.name)
+
+    def exec(self, command: str, *, stdin: bytes = b"", timeout_s: float = 60.0) -> Completed:
+        """Run a shell command on its serial console, which works without network or SSH server.
+
+        Raises LabError when the node is off, the fleet is gone or `timeout_s` passes.
+        """
+        with tempfile.TemporaryFile() as source, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+            source.write(stdin)
+            source.seek(0)
+            descriptors = (source.fileno(), out.fileno(), err.fileno())
+            answer = self._fleet.ask_with(descriptors, timeout_s, "exec", node=self.name, command=command)
+            if answer["reason"]:
+                raise LabError(f"{self.name}: {answer['reason']}")
+            out.seek(0)
+            err.seek(0)
+            return Completed(out.read(), err.read(), answer["status"])
+
+    def reboot(self, *, wait_s: float = 60.0) -> None:
+        """An orderly reboot (`reboot` on the node); returns when it is up again."""
+        boots = self._state()["boots"]
+        self.exec("reboot")
+        self.wait_up(after_boots=boots, wait_s=wait_s)
+
+    def power_cut(self, *, unsynced: str = "lost", back: bool = True, wait_s: float = 60.0) -> None:
+        """Take its power away at once; what was written and not synced is `lost`, `kept`, or `torn` (files there but
+        empty). `back` gives power again and waits until it is up (or proves not to start)."""
+        boots = self._state()["boots"]
+        self._fleet.ask("power_cut", node=self.name, unsynced=unsynced, back=back)
+        if back:
+            self.wait_up(after_boots=boots, wait_s=wait_s)
+
+    def power_on(self, *, wait_s: float = 60.0) -> None:
+        """Give it power again; returns when it is up (or proves not to start)."""
+        self._fleet.ask("power_on", node=self.name)
+        self.wait_up(wait_s=wait_s)
+
+    def wait_up(self, *, after_boots: int = 0, wait_s: float = 60.0) -> None:
+        """Wait until it is up (or its firmware proves not to start) and has booted more often than `after_boots`.
+
+        Raises LabError with the reason when this machine cannot start it.
+        """
+
+        def settled() -> bool:
+            state = self._state()
+            if state["boots"] <= after_boots:
+                return False
+            if Power(state["power"]) is Power.FAILED:
+                raise LabError(f"this machine cannot start {self.name}: {state['reason']}")
+            return Power(state["power"]) in (Power.UP, Power.DEAD)
+
+        wait_for(settled, f"{self.name} to boot", wait_s)
+
+    def is_up(self) -> bool:
+        return self.power is Power.UP
+
+    @property
+    def is_base(self) -> bool:
+        """Whether the operator sits at its LAN."""
+        return self.spec.medium is Medium.BASE
+
+    def plug(self, plugged: bool = True) -> None:
+        """Plug its LAN port into the operator's machine, or pull it out: then only the mesh leads there."""
+        self._fleet.ask("plug", node=self.name, plugged=plugged)
+
+    def record_steps(self) -> None:
+        """From now on write down each external command it runs, for `steps()`. `sleep` and shells are not counted."""
+        self._fleet.ask("record_steps", node=self.name)
+
+    def steps(self) -> tuple[str, ...]:
+        """The external commands since `record_steps()`, in order; the n-th (from 1) is what `power-cut@n` strikes."""
+        return tuple(
+            self.exec("/rom/lab/genuine/busybox cat /tmp/lab/steps.log")
+            .check(f"{self.name}: read its steps")
+            .stdout.splitlines()
+        )
+
+
+class VirtualFleet:
+    """A fleet in `directory` (made if needed). Use as a context manager, or call `up()` and `down()`."""
+
+    # the module whose process stands behind the running fleet
+    SUPERVISOR = "meshlab.supervisor"
+
+    def __init__(self, spec: FleetSpec, directory: Path) -> None:
+        self.spec = spec
+        self.directory = directory.resolve()
+        self._port = spec.port
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @classmethod
+    def attach(cls, directory: Path) -> Self:
+        """The fleet that runs in `directory`; raises LabError when none does."""
+        request(directory, {"op": "status"})
+        return cls(load((directory / "spec.json").read_text(encoding="utf-8")), directory)
+
+    # -- life --
+
+    def up(self, *, wait_s: float = 120.0) -> Self:
+        """Start it and wait until every node has booted. Raises LabError with the reason and the log's path."""
+        self._check_programs()
+        fleet_directory.claim(self.directory)
+        fleet_directory.clear(self.directory)
+        (self.directory / "spec.json").write_text(dump(self.spec), encoding="utf-8")
+        log_path = self.directory / "log"
+        with log_path.open("ab") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", self.SUPERVISOR, str(self.directory)],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                cwd="/",
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+            )
+        try:
+            self._wait_booted(process, wait_s)
+        except BaseException:
+            process.terminate()
+            process.wait()
+            raise
+        self._process = process
+        weakref.finalize(self, _let_go, process)
+        return self
+
+    def _check_programs(self) -> None:
+        for program, package in (("busybox", "busybox-static"), ("dropbear", "dropbear-bin")):
+            rootfs.find_program(program, package)
+
+    def _wait_booted(self, process: subprocess.Popen[bytes], wait_s: float) -> None:
+        def booted() -> bool:
+            failure = self.directory / "failure"
+            if process.poll() is not None:
+                words = failure.read_text(encoding="utf-8").splitlines() if failure.exists() else []
+                reason = words[0] if words else f"its process ended with status {process.returncode}"
+                hint = words[1] if len(words) > 1 and words[1] else self._last_words()
+                raise LabError(f"the virtual fleet did not start: {reason}", hint=hint)
+            if not (self.directory / "supervisor.pid").exists() or not is_running(self.directory):
+                return False
+            nodes = self.status()["nodes"]
+            for node in nodes:
+                if node["power"] == Power.FAILED.value:
+                    raise LabError(
+                        f"this machine cannot start {node['name']}: {node['reason']}",
+                        hint="MESHCTL_LAB_PRIVILEGES=root (as root) or =user chooses the other way of isolation; "
+                        "containers need --privileged",
+                    )
+            return all(node["power"] in (Power.UP.value, Power.DEAD.value) for node in nodes)
+
+        wait_for(booted, f"{len(self.spec.nodes)} nodes to boot; see {self.directory / 'log'}", wait_s)
+
+    def _last_words(self) -> str:
+        lines = (self.directory / "log").read_text(encoding="utf-8", errors="replace").splitlines()
+        return "\n".join(lines[-_LOG_LINES:])
+
+    def down(self) -> None:
+        """End it: every process, mount and namespace is gone when this returns. `directory` stays, for a look.
+
+        Returns quietly when no fleet runs there.
+        """
+        if end(self.directory) and self._process is not None:
+            self._process.wait()
+
+    # -- nodes, addresses, links --
+
+    def node(self, name: str) -> VirtualNode:
+        """Raises InputError for a name the fleet does not have."""
+        return VirtualNode(self, name)
+
+    @property
+    def nodes(self) -> tuple[VirtualNode, ...]:
+        return tuple(VirtualNode(self, name) for name in self.spec.names)
+
+    @property
+    def port(self) -> int:
+        """The TCP port that all its loopback addresses listen on."""
+        if not self._port:
+            self._port = int(self.ask("status")["port"])
+        return self._port
+
+    def endpoint(self, address: str, *, identity: str = "") -> Endpoint:
+        """Where on this machine a node's address is reached: 10.42.0.11 -> 127.42.0.11, port `port`.
+
+        It refuses connections unless a node holds that address and a path from the base to it exists at that moment.
+        """
+        return Endpoint(loopback_of(address), self.port, identity=identity)
+
+    @property
+    def node_names(self) -> tuple[str, ...]:
+        return tuple(self.spec.names)
+
+    def bench_endpoint(self, name: str) -> Endpoint:
+        """`VirtualNode.bench` of the node called `name`."""
+        return self.node(name).bench
+
+    def break_(self, where: str, what: str) -> None:
+        """`where` is a node or a link (`b01-b02`), `what` one of `breaks.BREAKS` (`power-cut@7`, `full-flash`, ...)."""
+        self.ask("do_break", where=where, what=what)
+
+    def mend(self, where: str = "") -> None:
+        """Undo every break (of one node or link): links up, power on, flash freed, bricked nodes recovered."""
+        self.ask("mend", where=where)
+
+    def link(self, a: str, b: str, **changes: Any) -> None:
+        """Change a link's fields as seen from `a` (`spec.changed_link`), or make a link; `mend` undoes it."""
+        self.ask("link", a=a, b=b, changes=changes)
+
+    def status(self) -> dict[str, Any]:
+        """What `meshctl lab status --json` prints: fleet, pid, port, and per node power, address, mesh, breaks."""
+        return self.ask("status")
+
+    def ask(self, operation: str, **words: Any) -> dict[str, Any]:
+        """One request to the supervisor (`control.Operations`)."""
+        return request(self.directory, {"op": operation, **words})
+
+    def ask_with(
+        self, descriptors: tuple[int, ...], timeout_s: float | None, operation: str, **words: Any
+    ) -> dict[str, Any]:
+        """The same with descriptors for a process on a node."""
+        return request(self.directory, {"op": operation, **words}, descriptors, timeout_s=timeout_s)
+
+    def __enter__(self) -> Self:
+        return self.up()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.down()
+
+
+def end(directory: Path) -> str:
+    """End the fleet that runs in `directory`, whatever version started it; its name, or nothing when none runs."""
+    try:
+        status = request(directory, {"op": "status"})
+    except LabError:
+        return ""
+    watched = os.pidfd_open(int(status["pid"]))
+    try:
+        request(directory, {"op": "down"})
+        deadline = time.monotonic() + _DOWN_S
+        while not _has_ended(watched):
+            if time.monotonic() > deadline:
+                signal.pidfd_send_signal(watched, signal.SIGKILL)
+            time.sleep(_POLL_S)
+    finally:
+        os.close(watched)
+    return str(status["fleet"])
+
+
+def wait_for(condition: Callable[[], bool], what: str, wait_s: float) -> None:
+    """Poll until `condition()`; raises LabError naming `what` was waited for."""
+    deadline = time.monotonic() + wait_s
+    while not condition():
+        if time.monotonic() > deadline:
+            raise LabError(f"waited {wait_s:g} s for {what}")
+        time.sleep(_POLL_S)
+
+
+def _let_go(process: subprocess.Popen[bytes]) -> None:
+    """The supervisor outlives whoever started it: Popen need not warn about that."""
+    if process.returncode is None:
+        process.returncode = 0
+
+
+def _has_ended(pidfd: int) -> bool:
+    return bool(select.select([pidfd], [], [], 0)[0])

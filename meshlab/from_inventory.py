@@ -1,0 +1,78 @@
+"""From an inventory to its virtual twin: nodes as factory devices, links as a graph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+from meshctl.model import Fleet, Node, Robot, Role
+from meshlab.spec import MESH_PACKAGES, FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
+
+# up to here a fleet's default shape is a chain
+_CHAIN_NODES = 12
+# locally administered, so that no real device has it: two bytes of fleet-wide prefix, then the node, then the radio
+_MAC = "02:4d:{:02x}:{:02x}:00:{:02x}"
+
+
+def spec_of(
+    fleet: Fleet, *, links: Sequence[LinkSpec] | None = None, nodes: int | None = None, port: int = 0
+) -> FleetSpec:
+    """The virtual twin of an inventory: its first `nodes` managed nodes (all by default), fresh from the box.
+
+    Every node stands on the bench; a node with the role `base` is the one the operator sits at. `links` None:
+    `default_links` in the inventory's order.
+    """
+    chosen = tuple(fleet.managed())[:nodes]
+    names = [node.name for node in chosen]
+    wanted = default_links(names) if links is None else [one for one in links if one.a in names and one.b in names]
+    return FleetSpec(
+        name=fleet.name,
+        nodes=tuple(_node_spec(node, number) for number, node in enumerate(chosen)),
+        links=tuple(wanted),
+        port=port,
+        lans=tuple(_lan_spec(robot, names) for robot in fleet.robots.values() if set(robot.nodes) & set(names)),
+    )
+
+
+def default_links(names: Sequence[str]) -> list[LinkSpec]:
+    """A chain with a weaker link past every second node; for more than a team, a tree, every node having three behind
+    it: batman-adv's quality is used up after some thirty hops."""
+    if len(names) > _CHAIN_NODES:
+        return [LinkSpec(names[(number - 1) // 3], name, tq=250) for number, name in enumerate(names) if number]
+    chain = [LinkSpec(a, b, tq=250, signal_dbm=-58) for a, b in pairwise(names)]
+    past = [LinkSpec(a, b, tq=120, signal_dbm=-79) for a, b in list(zip(names, names[2:], strict=False))[::2]]
+    return chain + past
+
+
+def _lan_spec(robot: Robot, names: Sequence[str]) -> LanSpec:
+    computer = robot.computer
+    nodes = tuple(name for name in robot.nodes if name in names)
+    return LanSpec(robot.name, nodes, str(computer.address) if computer else "")
+
+
+def _node_spec(node: Node, number: int) -> NodeSpec:
+    hardware = node.hardware
+    radios = tuple(
+        RadioSpec(
+            name=radio.name,
+            path=radio.hardware.path,
+            band=radio.hardware.band.value,
+            mac=radio.mac or _MAC.format(number // 256, number % 256, 16 + place),
+            max_tx_power_dbm=radio.hardware.max_drive_dbm,
+        )
+        for place, radio in enumerate(node.radios)
+    )
+    return NodeSpec(
+        name=node.name,
+        board=hardware.board,
+        model=hardware.name,
+        target=hardware.target,
+        release=node.release,
+        packages=tuple(dict.fromkeys((*MESH_PACKAGES, *hardware.packages, *node.packages))),
+        radios=radios,
+        lan_ports=hardware.lan_ports or node.lan_ports,
+        mac=node.mac or _MAC.format(number // 256, number % 256, 0),
+        medium=Medium.BASE if node.role is Role.BASE else Medium.BENCH,
+        overlay_kib=max(1024, hardware.flash_mib * 1024 // 2),
+        memory_kib=hardware.memory_mib * 1024,
+    )

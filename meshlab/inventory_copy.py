@@ -1,0 +1,83 @@
+"""A copy of an inventory for its virtual twin: the same fleet, with a login key made for this fleet alone.
+
+The user's inventory stays as it is. `prepare` claims DIRECTORY for the lab, copies the inventory's files into
+`DIRECTORY/inventory`, makes a key pair in `DIRECTORY/keys`, and writes the public key and the key file's path into the
+copy. Host keys stay with the copy: the fleet's own known_hosts is neither copied nor written.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
+
+from meshctl.fleet.lab_directory import INVENTORY, KEY_COMMENT
+from meshctl.inventory import load_fleet
+from meshctl.inventory.edit import Editor, save
+from meshctl.model import Fleet
+from meshlab import fleet_directory, propagation_file
+from meshlab.propagation import links_of
+from meshlab.spec import LinkSpec
+
+# beside fleet.yaml, if the fleet's own shape matters
+LINKS_FILE = "links.yaml"
+# beside the copy, whatever the fleet's own file is: virtual nodes' host keys must not get among real ones
+_KNOWN_HOSTS = "known_hosts"
+
+
+@dataclass(frozen=True, slots=True)
+class Copy:
+    """The copied inventory's path, what it says, its login key, and the links file's content (None: no file).
+
+    `kept` is where an earlier copy with edits was moved to, None when there was none.
+    """
+
+    inventory: Path
+    fleet: Fleet
+    key_file: Path
+    links: list[LinkSpec] | None
+    kept: Path | None = None
+
+
+def prepare(source: Path, directory: Path, *, environ: Mapping[str, str] = os.environ) -> Copy:
+    """Copy the inventory `source` (a file or a directory) into `directory`; a key that is there is kept.
+
+    `source` may be the earlier copy. Raises InvalidInput with the diagnostics of an inventory that has errors, LabError
+    when `directory` has other contents or a fleet runs there, InputError when files cannot be copied. Nothing is
+    replaced then.
+    """
+    fleet = load_fleet(source, environ=environ)
+    folder = source if source.is_dir() else source.parent
+    fleet_directory.claim(directory)
+    kept = fleet_directory.replace_inventory(folder, directory, without=(_KNOWN_HOSTS, f".{_KNOWN_HOSTS}.lock"))
+    target = directory / INVENTORY
+    copied = target if source.is_dir() else target / source.name
+    key_file = directory / "keys" / "operator"
+    public = _key_pair(key_file)
+    editor = Editor.open(copied, environ=environ)
+    editor.set(("operators", "ssh_keys"), list(dict.fromkeys([*fleet.operators.ssh_keys, public])))
+    editor.set(("defaults", "ssh", "key_files"), [str(key_file)])
+    if fleet.operators.known_hosts != _KNOWN_HOSTS:
+        editor.set(("operators", "known_hosts"), _KNOWN_HOSTS)
+    save(editor.changes())
+    fleet_directory.note_inventory(directory)
+    links = target / LINKS_FILE
+    heard = list(links_of(propagation_file.load(links))) if links.exists() else None
+    return Copy(copied, load_fleet(copied, environ=environ), key_file, heard, kept)
+
+
+def _key_pair(path: Path) -> str:
+    """The public key's line; the pair is made when it is not there."""
+    public_path = path.with_name(path.name + ".pub")
+    if not (path.exists() and public_path.exists()):
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        key = Ed25519PrivateKey.generate()
+        path.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.OpenSSH, NoEncryption()))
+        path.chmod(0o600)
+        public = key.public_key().public_bytes(Encoding.OpenSSH, PublicFormat.OpenSSH).decode()
+        public_path.write_text(f"{public} {KEY_COMMENT}\n", encoding="ascii")
+    return public_path.read_text(encoding="ascii").strip()

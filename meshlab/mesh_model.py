@@ -1,0 +1,244 @@
+"""Who hears whom: what the nodes' radios send, turned into neighbours, paths and what each node's batman-adv knows.
+
+effective text per node -> Effective -> edges (both radios up, same cell, link there) -> best paths -> `heard` text
+
+Pure: the supervisor reads and writes the files, and asks again whenever one of them or a link changes. A path's
+quality is the product of its links' TQ, less a hop penalty, as BATMAN_IV has it; the same figures serve BATMAN_V.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+from meshlab.quality import TQ_MAX
+from meshlab.spec import LinkSpec
+
+# batman-adv's default hop_penalty, on its scale of TQ
+HOP_PENALTY = 30
+# the highest rate of two streams in 20 MHz with short guard interval, MCS 15
+_BEST_RATE_MBIT_S = 144.4
+# of a frame to one station (docs/lab.md, "Who hears whom")
+_ATTEMPTS = 7
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One radio interface that is up: everything that must be equal for two of them to hear each other, and its MAC.
+
+    `soft` is the batman-adv interface it belongs to, `-` for none.
+    """
+
+    interface: str
+    mode: str
+    frequency_mhz: int
+    ssid: str
+    bssid: str
+    algorithm: str
+    key: str
+    mac: str
+    soft: str
+    routing: str
+    # the kernel's number of the interface: another one, when it was made anew
+    index: int = 0
+
+    @property
+    def medium(self) -> tuple[str, int, str, str, str, str]:
+        return (self.mode, self.frequency_mhz, self.ssid, self.bssid.lower(), self.algorithm, self.key)
+
+    def hears(self, other: Cell) -> bool:
+        return self.medium == other.medium
+
+    def routes_with(self, other: Cell) -> bool:
+        """Both feed a batman-adv of the same routing algorithm; IV and V do not understand each other."""
+        return self.soft != "-" and other.soft != "-" and self.routing == other.routing
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """An IPv4 address a node has; whether its device is bridged with the mesh, and with a LAN port.
+
+    `admitted`: the firewall that is loaded lets new SSH connections in there; open ones it leaves alone.
+    """
+
+    interface: str
+    address: str
+    prefix: int
+    over_mesh: bool
+    over_wire: bool
+    admitted: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Effective:
+    """What a node really does at this moment, as its netifd stand-in wrote it."""
+
+    cells: tuple[Cell, ...] = ()
+    addresses: tuple[Address, ...] = ()
+
+    def holds(self, address: str, *, over: str) -> bool:
+        """Whether it answers at `address` to packets that come over the `mesh` or a `wire`."""
+        return any(
+            one.address == address and (one.over_mesh if over == "mesh" else one.over_wire) for one in self.addresses
+        )
+
+    def admits(self, address: str) -> bool:
+        """Whether the firewall lets a new SSH connection to `address` in."""
+        return any(one.address == address and one.admitted for one in self.addresses)
+
+    @property
+    def bridges_lan_and_mesh(self) -> bool:
+        return any(one.over_mesh and one.over_wire for one in self.addresses)
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """A cell that hears another, `peer` of `node`; `tq` (0..255) is the quality of sending there, 0 when it is deaf."""
+
+    own: Cell
+    peer: Cell
+    node: str
+    link: LinkSpec
+    tq: int
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """The best way from one node to another: TQ at its end, first hop, the links on it, and each hop with who sends."""
+
+    tq: int
+    first: Edge
+    links: tuple[LinkSpec, ...]
+    hops: tuple[tuple[str, Edge], ...] = ()
+
+
+def parse_effective(text: str) -> Effective:
+    """The content of air/effective: `cell` and `addr` lines, tab-separated (node_root/lab/netifd.awk, admitted.awk)."""
+    cells, addresses = [], []
+    for line in text.splitlines():
+        match line.split("\t"):
+            case ["cell", _, interface, mode, frequency, ssid, bssid, algorithm, key, mac, soft, routing, *index]:
+                number = int(index[0]) if index else 0
+                cells.append(
+                    Cell(interface, mode, int(frequency), ssid, bssid, algorithm, key, mac, soft, routing, number)
+                )
+            case ["addr", interface, _, address, prefix, over_mesh, over_wire, *admitted]:
+                flags = over_mesh == "1", over_wire == "1", admitted != ["0"]
+                addresses.append(Address(interface, address, int(prefix), *flags))
+    return Effective(tuple(cells), tuple(addresses))
+
+
+def edges(nodes: Mapping[str, Effective], links: Iterable[LinkSpec]) -> dict[str, list[Edge]]:
+    """Whom each node hears: over links that are up, in a cell they share, unless the link loses everything."""
+    found: dict[str, list[Edge]] = {name: [] for name in nodes}
+    for link in links:
+        if not link.up or link.a not in nodes or link.b not in nodes:
+            continue
+        for own, other in ((link.a, link.b), (link.b, link.a)):
+            if link.loss_to(own) >= 1.0:
+                continue
+            tq = link.tq_to(other)
+            found[own].extend(
+                Edge(cell, peer, other, link, tq)
+                for cell in nodes[own].cells
+                for peer in nodes[other].cells
+                if cell.hears(peer)
+            )
+    return found
+
+
+def paths(graph: Mapping[str, list[Edge]], start: str) -> dict[str, Path]:
+    """The best batman-adv path from `start` to every node it reaches."""
+    best: dict[str, Path] = {}
+    count = itertools.count()
+    queue: list[tuple[int, int, str, int, tuple[tuple[str, Edge], ...]]] = [(-TQ_MAX, 0, start, next(count), ())]
+    settled: set[str] = set()
+    while queue:
+        negative, _, name, _, hops = heapq.heappop(queue)
+        if name in settled:
+            continue
+        settled.add(name)
+        if hops:
+            best[name] = Path(-negative, hops[0][1], tuple(edge.link for _, edge in hops), hops)
+        for edge in graph.get(name, ()):
+            if edge.node in settled or not edge.own.routes_with(edge.peer):
+                continue
+            tq = -negative * edge.tq // TQ_MAX
+            if hops:
+                tq = tq * (TQ_MAX - HOP_PENALTY) // TQ_MAX
+            if tq > 0:
+                # equal paths: fewer hops first, then the name, then who was found first, so that tables do not flap
+                heapq.heappush(queue, (-tq, len(hops) + 1, edge.node, next(count), (*hops, (name, edge))))
+    return best
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """One line of a station table, for `heard`: since when (Unix time, s), and since when it is silent (0: heard)."""
+
+    interface: str
+    mac: str
+    signal_dbm: int
+    tq: int
+    since_s: int
+    silent_since_s: int
+
+
+def heard(
+    name: str,
+    nodes: Mapping[str, Effective],
+    graph: Mapping[str, list[Edge]],
+    ways: Mapping[str, Path],
+    stations: Iterable[Known] | None = None,
+    passes: Callable[[str, Edge], bool] = lambda name, edge: True,
+) -> str:
+    """The file air/heard of one node: S stations, N batman neighbours, O originators (read by the stand-ins).
+
+    S interface mac signal_dbm age_ms rate_mbit_s since silent_since; N interface mac age_ms tq arrives;
+    O interface mac next_hop tq age_ms best arrives. `arrives` is how many of 1000 frames to that station alone do,
+    there and back; batman-adv's own broadcasts tell nothing of it. `stations`: the node's table, None: who is heard.
+    """
+    if stations is None:
+        stations = (
+            Known(edge.own.interface, edge.peer.mac, edge.link.signal_at(name), edge.tq, 0, 0)
+            for edge in graph.get(name, ())
+        )
+    lines = []
+    for one in stations:
+        rate = _BEST_RATE_MBIT_S * one.tq / TQ_MAX
+        lines.append(
+            f"S\t{one.interface}\t{one.mac}\t{one.signal_dbm}\t{_age_ms(name, one.mac)}\t{rate:.1f}"
+            f"\t{one.since_s}\t{one.silent_since_s}"
+        )
+    for edge in graph.get(name, ()):
+        own, peer = edge.own, edge.peer
+        if own.routes_with(peer):
+            arrives = _arrives([(name, edge)], passes)
+            lines.append(f"N\t{own.interface}\t{peer.mac}\t{_age_ms(name, peer.mac)}\t{edge.tq}\t{arrives}")
+    for target, path in sorted(ways.items()):
+        own, hop = path.first.own, path.first.peer.mac
+        mac = next(cell.mac for cell in nodes[target].cells if cell.soft != "-")
+        arrives = _arrives(path.hops, passes)
+        lines.append(f"O\t{own.interface}\t{mac}\t{hop}\t{path.tq}\t{_age_ms(name, mac)}\t1\t{arrives}")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _arrives(hops: Iterable[tuple[str, Edge]], passes: Callable[[str, Edge], bool]) -> int:
+    """Of 1000 frames to the station at the end of the hops and their answers, how many come back."""
+    share = 1.0
+    for name, edge in hops:
+        if not passes(name, edge):
+            return 0
+        # 802.11 repeats a frame to one station up to seven times
+        if edge.link.loss or edge.link.loss_back:
+            for end in (edge.link.a, edge.link.b):
+                share *= 1 - edge.link.loss_to(end) ** _ATTEMPTS
+    return round(1000 * share)
+
+
+def _age_ms(name: str, mac: str) -> int:
+    # below one originator interval, and the same at every reading: nothing here depends on it
+    return 20 + zlib.crc32(f"{name}{mac}".encode()) % 900

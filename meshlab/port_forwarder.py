@@ -1,0 +1,176 @@
+"""The operator's way in: one listening socket on 127/8 for each address that is reachable at this moment.
+
+A socket is closed as soon as its address is not reachable, so connecting there is refused; connections that are open
+then stall, as they do in the field. It is closed, too, while the firewall that the node has loaded lets nobody in; that
+leaves open connections alone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import random
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from meshlab.addresses import FACTORY_ADDRESS, bench_of, loopback_of
+from meshlab.errors import LabError
+from meshlab.shaped_tunnel import Shape, Tunnel, reset
+from meshlab.spec import Medium
+
+if TYPE_CHECKING:
+    from meshlab.supervisor import Supervisor
+
+log = logging.getLogger("meshlab.port_forwarder")
+_SSH_PORT = 22
+_BACKLOG = 16
+# ports tried for a fleet that asked for none
+_FIRST_PORT, _LAST_PORT = 20022, 20999
+
+
+@dataclass(frozen=True, slots=True)
+class Door:
+    """Where a connection to `host` leads; `bench`: through the LAN port alone."""
+
+    host: str
+    node: str
+    address: str
+    bench: bool
+
+
+class Doors:
+    """Keeps the listening sockets in step with what is reachable."""
+
+    def __init__(self, fleet: Supervisor) -> None:
+        self._fleet = fleet
+        self._listening: dict[Door, tuple[socket.socket, asyncio.Task[None]]] = {}
+        self._tunnels: set[asyncio.Task[None]] = set()
+        self.port = fleet.spec.port
+        self._claim: socket.socket | None = None
+        # the same dice in every fleet: losses are part of the scenario
+        self._dice = random.Random(1)
+
+    def open(self) -> None:
+        """Settle on a port; it is held on 127.255.255.254 for as long as the fleet runs.
+
+        Raises LabError when it is taken (or all are).
+        """
+        self._claim, self.port = claim_port(self.port)
+
+    async def close(self) -> None:
+        for listener, task in self._listening.values():
+            task.cancel()
+            listener.close()
+        tasks = [task for _, task in self._listening.values()] + list(self._tunnels)
+        for task in self._tunnels:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        if self._claim is not None:
+            self._claim.close()
+
+    def wanted(self) -> dict[str, Door]:
+        """What is reachable now, by loopback address. Of several nodes with one address the first in order answers."""
+        doors: dict[str, Door] = {}
+        for name, state in self._fleet.nodes.items():
+            if not state.is_running:
+                continue
+            if self._fleet.ether.wire(name, FACTORY_ADDRESS) is not None and state.effective.admits(FACTORY_ADDRESS):
+                door = Door(bench_of(state.number), name, FACTORY_ADDRESS, bench=True)
+                doors[door.host] = door
+            for address in state.effective.addresses:
+                # many factory devices on one bench: each is told apart by its own port only
+                if address.address == FACTORY_ADDRESS and state.spec.medium is not Medium.BASE:
+                    continue
+                if not address.admitted:
+                    continue
+                host = loopback_of(address.address)
+                if host not in doors and self._fleet.ether.way(name, address.address) is not None:
+                    doors[host] = Door(host, name, address.address, bench=False)
+        return doors
+
+    def refresh(self) -> None:
+        """Open and close sockets until they are what `wanted` says."""
+        wanted = set(self.wanted().values())
+        for door in self._listening.keys() - wanted:
+            listener, task = self._listening.pop(door)
+            task.cancel()
+            listener.close()
+        for door in wanted - self._listening.keys():
+            listener = socket.socket()
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                listener.bind((door.host, self.port))
+            except OSError as error:
+                listener.close()
+                log.error("door-taken host=%s port=%d error=%s", door.host, self.port, error)
+                continue
+            listener.listen(_BACKLOG)
+            listener.setblocking(False)
+            self._listening[door] = (listener, asyncio.ensure_future(self._accept(door, listener)))
+
+    async def _accept(self, door: Door, listener: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            client, _ = await loop.sock_accept(listener)
+            client.setblocking(False)
+            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            task = asyncio.ensure_future(self._serve(door, client))
+            self._tunnels.add(task)
+            task.add_done_callback(self._tunnels.discard)
+
+    async def _serve(self, door: Door, client: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        state = self._fleet.nodes[door.node]
+        boots = state.boots
+        if state.hung:
+            await self._hang(client)
+            return
+        answer, descriptors = await self._fleet.ask_for({"do": "dial", "node": door.node})
+        if not descriptors:
+            log.info("dial-failed node=%s reason=%s", door.node, answer.get("error"))
+            reset(client)
+            client.close()
+            return
+        node = socket.socket(fileno=descriptors[0])
+        node.setblocking(False)
+        node.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        try:
+            await loop.sock_connect(node, (door.address, _SSH_PORT))
+        except OSError as error:
+            log.info("refused node=%s reason=%s", door.node, errno.errorcode.get(error.errno or 0))
+            reset(client)
+            client.close()
+            node.close()
+            return
+        way = self._fleet.ether.wire if door.bench else self._fleet.ether.way
+        shape: Callable[[], Shape | None] = lambda: None if state.hung else way(door.node, door.address)  # noqa: E731
+        await Tunnel(client, node, shape, self._fleet.ether.condition, lambda: state.boots == boots, self._dice).run()
+
+    async def _hang(self, client: socket.socket) -> None:
+        """Keep the connection and answer nothing until the other side gives up."""
+        loop = asyncio.get_running_loop()
+        try:
+            while await loop.sock_recv(client, 4096):
+                pass
+        except OSError:
+            pass
+        finally:
+            client.close()
+
+
+def claim_port(wanted: int) -> tuple[socket.socket, int]:
+    """A fleet's port, `wanted` or (0) a free one, and what holds it. Raises LabError when it is taken (or all are)."""
+    for port in (wanted,) if wanted else range(_FIRST_PORT, _LAST_PORT + 1):
+        claim = socket.socket()
+        try:
+            claim.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            claim.bind(("127.255.255.254", port))
+            claim.listen(1)
+        except OSError:
+            claim.close()
+            continue
+        return claim, port
+    raise LabError(f"port {wanted or f'{_FIRST_PORT}-{_LAST_PORT}'} on 127.255.255.254 is taken by another fleet")

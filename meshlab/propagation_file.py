@@ -1,0 +1,130 @@
+"""A ground as a YAML file: `load` and `parse` read it, `dump` writes one that reads back as the same ground.
+
+    nodes: {base: [0, 0], b01: {at: [80, 0], tx_power_dbm: 33}}      # metres
+    walls: [{a: [40, 10], b: [200, 10], loss_db: 40}]
+    air: {exponent: 3.5}                                             # `ground.Air` has the keys and what they mean
+    links: [{between: [base, b01], loss: 30%, loss_back: 5%}]        # `spec.LinkSpec` has the keys
+
+A link given by hand holds wherever its nodes are. docs/lab-ground.md explains all of it.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+from meshlab.propagation import Air, Ground, Place, Wall
+from meshlab.quality import TQ_MAX
+from meshlab.spec import LinkSpec
+from meshlab.yaml_entries import Entry, entry_of, read
+
+_LINK_KEYS = tuple(item.name for item in fields(LinkSpec) if item.name not in ("a", "b"))
+# least and most that make sense for each of `Air`'s numbers
+_AIR_BOUNDS = {
+    "tx_power_dbm": (-20.0, 60.0),
+    "antenna_gain_dbi": (-20.0, 40.0),
+    "frequency_mhz": (100.0, 100_000.0),
+    "exponent": (1.0, 10.0),
+    "sensitivity_dbm": (-150.0, 0.0),
+    "fading_db": (0.1, 30.0),
+}
+
+
+def load(path: Path) -> Ground:
+    """Read a ground. Raises InvalidInput with every problem found, each with file, line and column."""
+    return _ground_of(read(path))
+
+
+def parse(text: str, file: str) -> Ground:
+    """As `load`, from the file's text; `file` is the name that problems show."""
+    return _ground_of(entry_of(text, file))
+
+
+def _ground_of(root: Entry) -> Ground:
+    ground = ground_in(root.mapping(("nodes", "walls", "air", "links")))
+    if not root.is_there:
+        root.problem("a mapping")
+    root.finish()
+    return ground
+
+
+def ground_in(keys: dict[str, Entry]) -> Ground:
+    """The ground that the entries `nodes`, `walls`, `air` and `links` describe; problems are noted in them."""
+    places = {name: _place(entry) for name, entry in keys["nodes"].mapping().items()}
+    links: dict[frozenset[str], LinkSpec] = {}
+    for entry in keys["links"].items():
+        link = _link(entry)
+        if link is not None and link.ends in links:
+            entry.problem("each pair once", f"{link.a}-{link.b} again")
+        elif link is not None:
+            links[link.ends] = link
+    return Ground(places, tuple(_wall(entry) for entry in keys["walls"].items()), _air(keys["air"]), (*links.values(),))
+
+
+def _place(entry: Entry) -> Place:
+    """`[x, y]`, or `{at: [x, y], tx_power_dbm: 33}`."""
+    if entry.is_list:
+        return Place(entry.point())
+    keys = entry.mapping(("at", "tx_power_dbm"), required=("at",))
+    power = keys["tx_power_dbm"]
+    least, most = _AIR_BOUNDS["tx_power_dbm"]
+    return Place(
+        keys["at"].point() if keys["at"].is_there else (0.0, 0.0),
+        power.number(0.0, least, most) if power.is_there else None,
+    )
+
+
+def _wall(entry: Entry) -> Wall:
+    keys = entry.mapping(("a", "b", "loss_db"), required=("a", "b"))
+    ends = [keys[end].point() if keys[end].is_there else (0.0, 0.0) for end in ("a", "b")]
+    return Wall(ends[0], ends[1], keys["loss_db"].number(Wall(ends[0], ends[1]).loss_db, 0.0, 1000.0))
+
+
+def _air(entry: Entry) -> Air:
+    keys = entry.mapping(tuple(_AIR_BOUNDS))
+    standard = asdict(Air())
+    return Air(**{name: keys[name].number(standard[name], *bounds) for name, bounds in _AIR_BOUNDS.items()})
+
+
+def _link(entry: Entry) -> LinkSpec | None:
+    keys = entry.mapping(("between", *_LINK_KEYS), required=("between",))
+    ends = [item.text() for item in keys["between"].items()]
+    if len(ends) != 2 or ends[0] == ends[1] or not all(ends):
+        if keys["between"].is_there:
+            keys["between"].problem("two different nodes")
+        return None
+    rate, loss_back, signal_back = keys["rate_kbps"], keys["loss_back"], keys["signal_back_dbm"]
+    standard = LinkSpec(ends[0], ends[1])
+    return LinkSpec(
+        ends[0],
+        ends[1],
+        tq=keys["tq"].whole(standard.tq, 0, TQ_MAX),
+        signal_dbm=keys["signal_dbm"].whole(standard.signal_dbm, -120, 30),
+        delay_ms=keys["delay_ms"].number(standard.delay_ms, 0.0, 60_000.0),
+        loss=keys["loss"].share(standard.loss),
+        rate_kbps=rate.whole(1, 1, 10_000_000) if rate.is_there else None,
+        up=keys["up"].flag(standard.up),
+        loss_back=loss_back.share(0.0) if loss_back.is_there else None,
+        signal_back_dbm=signal_back.whole(0, -120, 30) if signal_back.is_there else None,
+    )
+
+
+def dump(ground: Ground) -> str:
+    """The ground as text that `parse` reads as the same ground; JSON, which is YAML as well."""
+
+    def given(value: Any) -> dict[str, Any]:
+        return {key: item for key, item in asdict(value).items() if item is not None}
+
+    links = []
+    for link in ground.links:
+        keys = given(link)
+        links.append({"between": [keys.pop("a"), keys.pop("b")], **keys})
+    content = {
+        "nodes": {name: given(place) for name, place in ground.places.items()},
+        "walls": [asdict(wall) for wall in ground.walls],
+        "air": asdict(ground.air),
+        "links": links,
+    }
+    return json.dumps(content, indent=1) + "\n"

@@ -1,0 +1,248 @@
+"""The process behind a fleet of real radios on this side: it runs the machine, and carries everything into it.
+
+It starts as `python -m meshlab.qemu.host_proxy DIRECTORY`, in whose spec.json the fleet is:
+
+    image -> machine (one more try, the reason in the log) -> a watch on its doors
+    control.sock: requests, and processes with their descriptors, as a virtual fleet's supervisor takes them
+    127.b.c.d, one port: a listening socket for each door, each connection dialled in the machine
+
+It ends with the machine, or when asked to (`down`), and the machine ends with it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import secrets
+import signal
+import socket
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from meshlab.control import Control
+from meshlab.errors import LabError
+from meshlab.port_forwarder import claim_port
+from meshlab.qemu import guest_protocol, initramfs
+from meshlab.qemu.qemu import TCG, Machine, accelerator_here, find_qemu
+from meshlab.qemu.remote_exec import carry_process
+from meshlab.shaped_tunnel import reset
+from meshlab.spec import load
+
+log = logging.getLogger("meshlab.qemu.host_proxy")
+_BACKLOG = 16
+_CHUNK_BYTES = 1 << 16
+_POLL_S = 0.5
+# from QEMU's first instruction until the supervisor is there: under emulation, on a machine with much else to do
+_START_S = 180.0
+_TRIES = 2
+_ANSWER_S = 60.0
+
+
+class Relay:
+    """Carries requests and connections to the machine until `stopping`."""
+
+    def __init__(self, directory: Path, machine: Machine, token: str, port: int) -> None:
+        self._directory = directory
+        self._machine = machine
+        self._token = token
+        self._wanted_port = port
+        self.port = 0
+        self.stopping = asyncio.Event()
+        self._listening: dict[str, tuple[socket.socket, asyncio.Task[None]]] = {}
+        self._tunnels: set[asyncio.Task[None]] = set()
+
+    async def run(self) -> None:
+        loop = asyncio.get_running_loop()
+        for ending in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(ending, self.stopping.set)
+        claim, self.port = claim_port(self._wanted_port)
+        control = Control(self._directory, self.answer)
+        control.open()
+        watching = asyncio.ensure_future(self._watch())
+        machine = os.pidfd_open(self._machine.pid)
+        loop.add_reader(machine, self._machine_ended)
+        try:
+            await self.stopping.wait()
+        finally:
+            loop.remove_reader(machine)
+            os.close(machine)
+            control.close()
+            for task in (watching, *self._tunnels):
+                task.cancel()
+            self._open({})
+            await asyncio.gather(watching, *self._tunnels, return_exceptions=True)
+            claim.close()
+
+    def _machine_ended(self) -> None:
+        log.error("machine-ended\n%s", self._machine.last_words())
+        self.stopping.set()
+
+    # -- requests --
+
+    async def answer(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
+        """One request of `control.sock` (`control.Answer`)."""
+        if request["op"] == "down":
+            self.stopping.set()
+            return {}
+        try:
+            if descriptors:
+                return await carry_process(self._connect, request, descriptors)
+            reader, writer = await self._connect("request", request=request)
+            try:
+                answer: dict[str, Any] = json.loads(await reader.readline())
+            finally:
+                writer.close()
+        except (OSError, ValueError, asyncio.IncompleteReadError) as error:
+            return {"error": f"the machine does not answer: {error}", "hint": f"see {self._machine.console}"}
+        if request["op"] == "status" and "error" not in answer:
+            answer |= {"pid": os.getpid(), "port": self.port}
+        return answer
+
+    async def _connect(self, kind: str, **words: Any) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        reader, writer = await asyncio.open_connection("127.0.0.1", self._machine.port, limit=guest_protocol.LINE_BYTES)
+        writer.write(guest_protocol.line({"token": self._token, "kind": kind, **words}))
+        await writer.drain()
+        return reader, writer
+
+    # -- doors --
+
+    async def _watch(self) -> None:
+        """Keep the listening sockets in step with what the machine says."""
+        while True:
+            with contextlib.suppress(OSError, ValueError):
+                reader, writer = await self._connect("watch")
+                try:
+                    while line := await reader.readline():
+                        self._open(json.loads(line)["doors"])
+                finally:
+                    writer.close()
+            await asyncio.sleep(_POLL_S)
+
+    def _open(self, doors: dict[str, str]) -> None:
+        for host in self._listening.keys() - doors.keys():
+            listener, task = self._listening.pop(host)
+            task.cancel()
+            listener.close()
+        for host in doors.keys() - self._listening.keys():
+            listener = socket.socket()
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                listener.bind((host, self.port))
+            except OSError as error:
+                listener.close()
+                log.error("door-taken host=%s port=%d error=%s", host, self.port, error)
+                continue
+            listener.listen(_BACKLOG)
+            listener.setblocking(False)
+            self._listening[host] = (listener, asyncio.ensure_future(self._accept(host, listener)))
+
+    async def _accept(self, host: str, listener: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            client, _ = await loop.sock_accept(listener)
+            client.setblocking(False)
+            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            task = asyncio.ensure_future(self._serve(host, client))
+            self._tunnels.add(task)
+            task.add_done_callback(self._tunnels.discard)
+
+    async def _serve(self, host: str, client: socket.socket) -> None:
+        try:
+            reader, writer = await self._connect("dial", host=host)
+            try:
+                answer = json.loads(await reader.readline())
+                if "error" in answer:
+                    log.info("dial-failed host=%s reason=%s", host, answer["error"])
+                    raise ConnectionResetError(answer["error"])
+                await asyncio.gather(_to_machine(client, writer), _from_machine(reader, client))
+            finally:
+                writer.close()
+        except (OSError, ValueError):
+            reset(client)
+        finally:
+            client.close()
+
+
+async def _to_machine(client: socket.socket, writer: asyncio.StreamWriter) -> None:
+    loop = asyncio.get_running_loop()
+    while data := await loop.sock_recv(client, _CHUNK_BYTES):
+        writer.write(data)
+        await writer.drain()
+    writer.write_eof()
+
+
+async def _from_machine(reader: asyncio.StreamReader, client: socket.socket) -> None:
+    loop = asyncio.get_running_loop()
+    while data := await reader.read(_CHUNK_BYTES):
+        await loop.sock_sendall(client, data)
+    with contextlib.suppress(OSError):
+        client.shutdown(socket.SHUT_WR)
+
+
+def start(directory: Path, spec_text: str, token: str) -> Machine:
+    """The fleet's machine, ready. Raises LabError when it does not start twice in a row; its consoles are kept."""
+    find_qemu()
+    cache = initramfs.cache_folder()
+    base = initramfs.base(cache)
+    initrd = initramfs.product(base, spec_text, token, directory)
+    spec = load(spec_text)
+    radios = sum(len(node.radios) for node in spec.nodes)
+    how = accelerator_here(base.kernel, cache)
+    log.info("accelerator words=%s", " ".join(how.words))
+    machine = Machine(directory, base.kernel, initrd, radios=radios, nodes=len(spec.nodes))
+    for attempt in range(1, _TRIES + 1):
+        try:
+            machine.start(how, _START_S)
+            _wait_answer(machine, token)
+            break
+        except LabError as error:
+            machine.stop()
+            log.error("start-failed attempt=%d reason=%s\n%s", attempt, error, error.hint)
+            kept = machine.console.rename(directory / f"console.failed-{attempt}") if machine.console.exists() else None
+            if attempt == _TRIES:
+                raise LabError(f"{error} ({_TRIES} times); consoles are kept: {kept}", hint=error.hint) from error
+            # what a short boot did not show, a long one may
+            how = TCG
+    initrd.unlink()
+    return machine
+
+
+def _wait_answer(machine: Machine, token: str) -> None:
+    """A machine that says it is ready must be reached, too. Raises LabError when it is not."""
+    try:
+        with socket.create_connection(("127.0.0.1", machine.port), timeout=_ANSWER_S) as connection:
+            connection.sendall(guest_protocol.line({"token": token, "kind": "request", "request": {"op": "status"}}))
+            if connection.recv(1):
+                return
+            reason = "it closed the connection"
+    except OSError as error:
+        reason = str(error)
+    raise LabError(f"the machine is ready and does not answer: {reason}", hint=machine.last_words())
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Become the process behind the fleet in DIRECTORY. Errors go to `failure` there, as the virtual fleet's do."""
+    directory = Path(arguments[1]).resolve()
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
+    spec_text = (directory / "spec.json").read_text(encoding="utf-8")
+    token = secrets.token_hex(16)
+    try:
+        machine = start(directory, spec_text, token)
+        try:
+            (directory / "supervisor.pid").write_text(f"{os.getpid()}\n", encoding="ascii")
+            asyncio.run(Relay(directory, machine, token, load(spec_text).port).run())
+        finally:
+            machine.stop()
+    except (LabError, OSError) as error:
+        (directory / "failure").write_text(f"{error}\n{getattr(error, 'hint', '')}\n", encoding="utf-8")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv))

@@ -1,0 +1,156 @@
+"""The read-only part of every node of a fleet: busybox, dropbear, the libraries they need, and the stand-ins.
+
+find the programs -> copy them -> take from busybox what OpenWrt's lacks -> check that the shell behaves
+
+Debian's busybox is a "standalone shell": its ash runs its own applets before it looks at PATH, so no stand-in for
+`sync`, `reboot` or `logread` would ever be called. OpenWrt's is not. Applet names lie in one sorted table of the
+program, so the fleet's copies get the names that must not be found there overwritten, order kept.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from meshlab.errors import LabError
+
+STAND_INS = Path(__file__).resolve().parent / "node_root"
+
+# applets that stand-ins replace: the fleet's busybox must not answer to these names
+_REPLACED = frozenset({"date", "sync", "fsync", "reboot", "poweroff", "halt", "logread", "logger", "sh", "ash"})
+_APPLETS = STAND_INS / "lab" / "applets"
+_SEARCH_PATHS = ("/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin")
+
+
+def build(
+    rom: Path, *, sysroot: Path | None = None, more: Path | None = None, library_folders: Sequence[str] = ()
+) -> None:
+    """Make the ROM in the new directory `rom`. Raises LabError naming the package that is missing.
+
+    `sysroot`: take the programs from another root of this architecture; the caller then puts the libraries into
+    `library_folders`. `more` is laid over the stand-ins.
+    """
+    busybox = find_program("busybox", "busybox-static", sysroot=sysroot)
+    dropbear = find_program("dropbear", "dropbear-bin", sysroot=sysroot)
+    dropbearkey = find_program("dropbearkey", "dropbear-bin", sysroot=sysroot)
+    shutil.copytree(STAND_INS, rom, ignore=shutil.ignore_patterns("__pycache__"))
+    if more is not None:
+        shutil.copytree(more, rom, dirs_exist_ok=True)
+    for folder in ("bin", "sbin", "usr/bin", "usr/sbin", "lab", "lib"):
+        (rom / folder).mkdir(parents=True, exist_ok=True)
+    for script in (path for path in rom.rglob("*") if path.is_file()):
+        # a wheel does not keep the executable bit
+        script.chmod(0o755 if script.read_bytes().startswith(b"#!") else 0o644)
+    for name, program in (("dropbear", dropbear), ("dropbearkey", dropbearkey)):
+        shutil.copy2(program, rom / "lab" / name)
+    if sysroot is None:
+        _copy_libraries((busybox, dropbear, dropbearkey), rom)
+    else:
+        _note_library_folders(library_folders, rom)
+    _install_busybox(busybox, rom)
+
+
+def find_program(name: str, package: str, *, sysroot: Path | None = None) -> Path:
+    """The program's path. Raises LabError naming Debian's package when it is not installed (in `sysroot`)."""
+    places = ":".join(f"{sysroot or ''}{folder}" for folder in _SEARCH_PATHS)
+    found = (None if sysroot else shutil.which(name)) or shutil.which(name, path=places)
+    if found is None:
+        raise LabError(f"the virtual fleet needs {name}, which is not installed", hint=f"apt install {package}")
+    return Path(found).resolve()
+
+
+def library_paths(program: Path) -> tuple[str, ...]:
+    """The absolute paths of the shared libraries and the loader that `program` needs; empty for a static one."""
+    listed = subprocess.run(["ldd", str(program)], capture_output=True, text=True, check=False)
+    paths = re.findall(r"(?:=> |^\s*)(/\S+) \(0x", listed.stdout, re.MULTILINE)
+    return tuple(dict.fromkeys(paths))
+
+
+def library_folders(rom: Path) -> tuple[str, ...]:
+    """The folders of libraries in the ROM, relative to the root, as `_copy_libraries` noted them."""
+    return tuple((rom / "lab" / "library_folders").read_text(encoding="utf-8").split())
+
+
+def _copy_libraries(programs: Sequence[Path], rom: Path) -> None:
+    folders = set()
+    for path in {path for program in programs for path in library_paths(program)}:
+        target = rom / path.lstrip("/")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(Path(path).resolve(), target)
+        folders.add(str(Path(path).parent).lstrip("/"))
+    _note_library_folders(folders, rom)
+
+
+def _note_library_folders(folders: Iterable[str], rom: Path) -> None:
+    (rom / "lab" / "library_folders").write_text("\n".join(sorted(folders)) + "\n", encoding="utf-8")
+
+
+def _install_busybox(busybox: Path, rom: Path) -> None:
+    image = busybox.read_bytes()
+    names = subprocess.run([str(busybox), "--list"], capture_output=True, text=True, check=True).stdout.split()
+    # each is called busybox, because that is how it knows that the next word names the applet
+    shell, tools, genuine = (rom / "lab" / use / "busybox" for use in ("shell", "tools", "genuine"))
+    for program in (shell, tools, genuine):
+        program.parent.mkdir()
+    # for the stand-ins themselves
+    shutil.copy2(busybox, genuine)
+    applets = _applets()
+    if _is_standalone(busybox):
+        shell.write_bytes(without_applets(image, names, set(names) - {"ash", "sh"}, keep=("ash", "sh")))
+        keep = tuple(name for name in applets if name not in _REPLACED)
+        tools.write_bytes(without_applets(image, names, _REPLACED, keep=keep))
+    else:
+        shutil.copy2(busybox, shell)
+        shutil.copy2(busybox, tools)
+    shell.chmod(0o755)
+    tools.chmod(0o755)
+    if _is_standalone(shell):
+        raise LabError(f"the shell of {busybox} runs its own applets whatever PATH says", hint="install busybox-static")
+    present = set(names)
+    for name in applets:
+        use = "shell" if name in ("sh", "ash") else "tools"
+        link = rom / "bin" / name
+        if name in present and not link.exists() and not any((rom / d / name).exists() for d in ("sbin", "usr/sbin")):
+            link.symlink_to(f"/rom/lab/{use}/busybox")
+    (rom / "bin" / "busybox").symlink_to("/rom/lab/tools/busybox")
+
+
+def _applets() -> list[str]:
+    lines = _APPLETS.read_text(encoding="utf-8").splitlines()
+    return [name for line in lines if not line.startswith("#") for name in line.split()]
+
+
+def _is_standalone(shell: Path) -> bool:
+    """Whether this busybox's ash finds `cat` with nothing in PATH."""
+    found = subprocess.run(
+        [str(shell), "ash", "-c", "PATH=/nonexistent; cat /dev/null"], capture_output=True, check=False
+    )
+    return found.returncode == 0
+
+
+def without_applets(image: bytes, names: Sequence[str], hidden: Iterable[str], *, keep: Sequence[str]) -> bytes:
+    """The busybox `image` with the applets `hidden` renamed, so that no lookup finds them.
+
+    The table of `names` is searched by comparison, so a new name must stay on the same side of every name in `keep`.
+    Raises LabError when the table is not in the image as `busybox --list` prints it.
+    """
+    table = b"\0".join(name.encode() for name in names) + b"\0"
+    start = image.find(table)
+    if start < 0:
+        raise LabError("this busybox keeps its applet names in another way than known", hint="install busybox-static")
+    hidden = set(hidden)
+    renamed = b"".join((_renamed(name, keep) if name in hidden else name.encode()) + b"\0" for name in names)
+    return image[:start] + renamed + image[start + len(table) :]
+
+
+def _renamed(name: str, keep: Sequence[str]) -> bytes:
+    own = name.encode()
+    for ending in (1, 127, own[-1] - 1, own[-1] + 1):
+        new = own[:-1] + bytes((ending,))
+        if all(new != other.encode() and (new < other.encode()) == (name < other) for other in keep):
+            return new
+    # a name of one letter (`[`, `w`) may fit nowhere; ash has `[` built in, and nothing here is called `w`
+    return own

@@ -1,0 +1,226 @@
+"""What a virtual fleet consists of: nodes, radios, links, as frozen values that travel as JSON.
+
+A spec is made from an inventory (`twin.spec_of`) or by hand in a test; the supervisor reads it from the fleet's
+directory, so everything here converts to JSON and back without loss.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from enum import Enum
+from typing import Any
+
+from meshctl.errors import InputError
+from meshctl.model import Release
+from meshlab.quality import TQ_MAX, tq_of
+
+# what an image needs to take part in an encrypted mesh (openwrt-facts.md section 10)
+MESH_PACKAGES = ("kmod-batman-adv", "batctl-default", "wpad-openssl")
+
+
+class Medium(Enum):
+    """How the operator's machine is wired to a node's LAN port."""
+
+    # not wired: reached through the mesh alone
+    NONE = "none"
+    # on the bench: its LAN port is plugged into the operator's machine, whatever address it has
+    BENCH = "bench"
+    # the base: the operator's machine sits on its LAN, and reaches the mesh through it
+    BASE = "base"
+
+
+@dataclass(frozen=True, slots=True)
+class RadioSpec:
+    """One radio as the board has it; the UCI section's name, the kernel's path, `2g` or `5g`, its MAC address."""
+
+    name: str = "radio0"
+    path: str = "platform/ahb/18100000.wmac"
+    band: str = "2g"
+    mac: str = ""
+    max_tx_power_dbm: int = 27
+
+
+@dataclass(frozen=True, slots=True)
+class NodeSpec:
+    """One node as it comes out of its box: factory image, factory address 192.168.1.1, no password.
+
+    `release` names the series; its revision and kernel are the lab's (`releases`). `packages` are baked into its image
+    beside the release's own. `mac` is the label's address, on the first LAN port; radios without one get `mac` + 1, ...
+    `overlay_kib` is the flash left for changes, `memory_kib` the RAM. `host_key_types` None: as the release makes them
+    (19.07 RSA, later RSA and ed25519); naming `("ed25519",)` alone makes big fleets start faster.
+    `flash_s` is how long writing an image takes.
+    """
+
+    name: str
+    board: str = "compex,wpj344-16m"
+    model: str = "Compex WPJ344 (16MB flash)"
+    target: str = "ath79/generic"
+    release: Release = Release.V23_05
+    packages: tuple[str, ...] = MESH_PACKAGES
+    radios: tuple[RadioSpec, ...] = (RadioSpec(),)
+    lan_ports: tuple[str, ...] = ("eth0",)
+    mac: str = ""
+    medium: Medium = Medium.BENCH
+    overlay_kib: int = 8192
+    memory_kib: int = 128 * 1024
+    host_key_types: tuple[str, ...] | None = None
+    flash_s: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSpec:
+    """Two nodes that can hear each other while their radios share a cell.
+
+    `loss` is the share (0..1) of frames from `a` that `b` misses, `loss_back` that of frames from `b` (None: the same);
+    1.0 is deafness. `signal_dbm` is how strong `b` hears `a`, `signal_back_dbm` how strong `a` hears `b` (None: the
+    same). `tq` is the best quality (0..255) that batman-adv may give the link, losses lower it. `delay_ms` is one way,
+    `rate_kbps` None: unlimited.
+    """
+
+    a: str
+    b: str
+    tq: int = TQ_MAX
+    signal_dbm: int = -58
+    delay_ms: float = 0.0
+    loss: float = 0.0
+    rate_kbps: int | None = None
+    up: bool = True
+    loss_back: float | None = None
+    signal_back_dbm: int | None = None
+
+    @property
+    def ends(self) -> frozenset[str]:
+        return frozenset((self.a, self.b))
+
+    def loss_to(self, name: str) -> float:
+        """The share of frames that the end `name` misses of the other end's."""
+        return self.loss if name == self.b or self.loss_back is None else self.loss_back
+
+    def signal_at(self, name: str) -> int:
+        """How strong the end `name` hears the other end, in dBm."""
+        return self.signal_dbm if name == self.b or self.signal_back_dbm is None else self.signal_back_dbm
+
+    def tq_to(self, name: str) -> int:
+        """batman-adv's quality (0..255) of sending over this link to the end `name`."""
+        there = self.loss_to(name)
+        back = self.loss_to(self.a if name == self.b else self.b)
+        return min(self.tq, tq_of(there, back))
+
+    def seen_from(self, name: str) -> LinkSpec:
+        """The same link with the end `name` as its `a`."""
+        if name == self.a:
+            return self
+        loss, signal_dbm = self.loss_to(self.a), self.signal_at(self.a)
+        back = None if self.loss_back is None else self.loss
+        signal_back_dbm = None if self.signal_back_dbm is None else self.signal_dbm
+        return replace(
+            self, a=self.b, b=self.a, loss=loss, signal_dbm=signal_dbm, loss_back=back, signal_back_dbm=signal_back_dbm
+        )
+
+
+def changed_link(link: LinkSpec, changes: Mapping[str, Any]) -> LinkSpec:
+    """The link with other fields, as seen from its `a`; `loss_to_b` is the loss in that direction alone.
+
+    A new loss decides the quality: `tq` no longer limits it, unless it is among the changes. A new `loss` holds both
+    ways unless `loss_back` is among them. Raises TypeError for a field that links have not.
+    """
+    wanted = dict(changes)
+    if "loss_to_b" in wanted:
+        wanted = {"loss_back": link.loss_to(link.a), **wanted, "loss": wanted["loss_to_b"]}
+        del wanted["loss_to_b"]
+    if "loss" in wanted:
+        wanted = {"tq": TQ_MAX, "loss_back": None, **wanted}
+    return replace(link, **wanted)
+
+
+@dataclass(frozen=True, slots=True)
+class LanSpec:
+    """A robot's wired network in the field: one switch, the LAN ports of `nodes`, and its computer with an address
+    such as `10.42.0.21/24`. Only fleets of real radios have LANs."""
+
+    name: str
+    nodes: tuple[str, ...]
+    computer: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FleetSpec:
+    """A whole fleet. `port` is the one TCP port all its loopback addresses listen on (`addresses.loopback_of`).
+
+    0 lets the supervisor choose a free one; `VirtualFleet.port` tells which. `seed` decides what is left to chance on
+    the nodes: how long their services and radios take. A virtual boot takes a second, a real one about as long as
+    neighbours remember a station that is silent; `quick_boot` lets them remember it, as after a boot within a minute.
+    """
+
+    name: str
+    nodes: tuple[NodeSpec, ...]
+    links: tuple[LinkSpec, ...] = ()
+    port: int = 0
+    # how long a link takes until batman-adv knows it; real meshes need 10 to 20 s
+    convergence_s: float = 0.2
+    lans: tuple[LanSpec, ...] = ()
+    seed: int = 0
+    quick_boot: bool = False
+
+    def __post_init__(self) -> None:
+        names = [node.name for node in self.nodes]
+        doubles = sorted({name for name in names if names.count(name) > 1})
+        if doubles:
+            raise InputError(f"lab fleet {self.name}: expected each node once, found twice: {', '.join(doubles)}")
+        for link in self.links:
+            for end in (link.a, link.b):
+                if end not in names:
+                    raise InputError(f"lab fleet {self.name}: link {link.a}-{link.b}: no node named {end}")
+
+    def node(self, name: str) -> NodeSpec:
+        for node in self.nodes:
+            if node.name == name:
+                return node
+        raise InputError(f"lab fleet {self.name}: no node named {name}", hint=f"nodes: {', '.join(self.names)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(node.name for node in self.nodes)
+
+
+def dump(spec: FleetSpec) -> str:
+    """The spec as JSON text."""
+
+    def plain(value: Any) -> Any:
+        return value.value if isinstance(value, Enum) else value
+
+    return json.dumps(asdict(spec, dict_factory=lambda items: {key: plain(value) for key, value in items}), indent=1)
+
+
+def load(text: str) -> FleetSpec:
+    """The spec that `dump` wrote. Raises InputError for the text of a fleet that another version of meshctl started."""
+    try:
+        return _loaded(json.loads(text))
+    except (KeyError, TypeError, ValueError) as error:
+        found = f"nothing under {error}" if isinstance(error, KeyError) else str(error)
+        raise InputError(
+            f"spec.json of the lab's fleet: expected what this version of meshctl writes, found {found}",
+            hint="the fleet was started by another version: `meshctl lab down`, then start it anew",
+        ) from error
+
+
+def _loaded(data: dict[str, Any]) -> FleetSpec:
+    nodes = tuple(
+        NodeSpec(
+            **{
+                **node,
+                "release": Release(node["release"]),
+                "medium": Medium(node["medium"]),
+                "packages": tuple(node["packages"]),
+                "lan_ports": tuple(node["lan_ports"]),
+                "radios": tuple(RadioSpec(**radio) for radio in node["radios"]),
+                "host_key_types": None if node["host_key_types"] is None else tuple(node["host_key_types"]),
+            }
+        )
+        for node in data.pop("nodes")
+    )
+    links = tuple(LinkSpec(**link) for link in data.pop("links"))
+    lans = tuple(LanSpec(**{**lan, "nodes": tuple(lan["nodes"])}) for lan in data.pop("lans"))
+    return FleetSpec(nodes=nodes, links=links, lans=lans, **data)

@@ -1,0 +1,343 @@
+"""The process behind a running fleet: power, air, and the operator's way in.
+
+It starts as `python -m meshlab.supervisor DIRECTORY`, becomes root of a user namespace if it is not root, forks the
+warden, and then serves four things from one loop: events of the warden (nodes that ended), the bell (a pipe on which
+nodes say that they are up or have changed), connections of the operator, and requests on `control.sock`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from meshlab import namespaces as ns
+from meshlab import rootfs
+from meshlab.container import Container, prepare
+from meshlab.control import Control, Operations
+from meshlab.errors import LabError
+from meshlab.fault_injection import Hurt
+from meshlab.link_state import Ether
+from meshlab.mesh_model import parse_effective
+from meshlab.node_runner import MESSAGE_BYTES, Warden
+from meshlab.port_forwarder import Doors
+from meshlab.spec import FleetSpec, Medium, load
+from meshlab.state import NodeState, Power, label_mac, write_facts, write_firmware
+
+log = logging.getLogger("meshlab")
+# more at once only makes each of them slower
+_BOOTING_AT_ONCE = 4 * (os.cpu_count() or 1)
+
+
+class Supervisor:
+    """All nodes of one fleet. Not thread-safe: everything runs in one event loop."""
+
+    def __init__(self, spec: FleetSpec, directory: Path, warden: socket.socket, *, deny_setgroups: bool) -> None:
+        self.spec = spec
+        self.directory = directory
+        self.nodes: dict[str, NodeState] = {}
+        self.stopping = asyncio.Event()
+        self._warden = warden
+        self._deny_setgroups = deny_setgroups
+        self._waiting: list[str] = []
+        self._requests: dict[int, asyncio.Future[tuple[dict[str, Any], list[int]]]] = {}
+        self._serial = 0
+        self.ether = self._make_ether()
+        self.doors = self._make_doors()
+        self.hurt = Hurt(self)
+        self.operations = self._make_operations()
+
+    def _make_ether(self) -> Ether:
+        return Ether(self)
+
+    def _make_doors(self) -> Doors:
+        return Doors(self)
+
+    def _make_operations(self) -> Operations:
+        return Operations(self)
+
+    # -- life --
+
+    async def run(self) -> None:
+        """Boot every node, serve until `stopping` is set."""
+        loop = asyncio.get_running_loop()
+        self._warden.setblocking(False)
+        loop.add_reader(self._warden, self._warden_event)
+        bell = os.open(self.directory / "bell", os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+        loop.add_reader(bell, self._bell, bell)
+        for ending in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(ending, self.stopping.set)
+        self.doors.open()
+        for number, node in enumerate(self.spec.nodes):
+            self._make(number)
+            self.power_on(node.name)
+        control = Control(self.directory, self.operations.answer)
+        control.open()
+        try:
+            await self.stopping.wait()
+        finally:
+            control.close()
+            await self.doors.close()
+            loop.remove_reader(self._warden)
+            loop.remove_reader(bell)
+            os.close(bell)
+
+    def _make(self, number: int) -> None:
+        node = self.spec.nodes[number]
+        home = self.directory / "nodes" / node.name
+        state = NodeState(node, number, home, plugged=node.medium is not Medium.NONE)
+        self.nodes[node.name] = state
+        for folder in ("flash", "air"):
+            (home / folder).mkdir(parents=True, exist_ok=True)
+        (home / "air" / "heard").write_text("", encoding="ascii")
+        if not (home / "firmware" / "env").exists():
+            write_firmware(home, node.release, node.packages, node.target)
+
+    def power_on(self, name: str) -> None:
+        """Boot a node that is off, as soon as not too many others are booting."""
+        state = self.nodes[name]
+        state.want_on = True
+        if state.is_running or name in self._waiting:
+            return
+        self._waiting.append(name)
+        self._boot_next()
+
+    def power_off(self, name: str, *, back: bool) -> None:
+        """Take a node's power away at this moment; `back` gives it again."""
+        state = self.nodes[name]
+        state.want_on = back
+        if name in self._waiting:
+            if not back:
+                self._waiting.remove(name)
+            return
+        if state.is_running:
+            # connections stall from here on; that its processes end is no farewell
+            self._is_gone(state, Power.OFF)
+            self.ask({"do": "kill", "node": name})
+        elif back:
+            self.power_on(name)
+
+    def _boot_next(self) -> None:
+        while self._waiting and sum(s.power is Power.BOOTING for s in self.nodes.values()) < _BOOTING_AT_ONCE:
+            name = next((one for one in self._waiting if not self.nodes[one].pid), None)
+            if name is None:
+                return
+            self._waiting.remove(name)
+            self._boot(self.nodes[name])
+
+    def _boot(self, state: NodeState) -> None:
+        container = self.container(state)
+        (state.home / "air" / "effective").unlink(missing_ok=True)
+        write_facts(state, label_mac(state.spec, state.number), self.spec.seed)
+        prepare(container)
+        state.power = Power.BOOTING
+        state.reason = ""
+        state.boots += 1
+        # set at once, so that nobody starts it twice; the warden tells the real one
+        state.pid = -1
+        self.ask(
+            {
+                "do": "boot",
+                "node": state.spec.name,
+                "fleet": str(self.directory),
+                "overlay_kib": container.overlay_kib,
+                "memory_kib": container.memory_kib,
+                "deny_setgroups": self._deny_setgroups,
+            }
+        )
+
+    def container(self, state: NodeState) -> Container:
+        return Container(
+            state.spec.name, self.directory, state.spec.overlay_kib, state.spec.memory_kib, self._deny_setgroups
+        )
+
+    def _is_gone(self, state: NodeState, power: Power) -> None:
+        state.power = power
+        state.boot_id = ""
+        state.effective = parse_effective("")
+        self.ether.changed()
+
+    # -- the warden --
+
+    def ask(self, request: dict[str, Any], descriptors: Sequence[int] = ()) -> None:
+        """Send one request without an answer of its own."""
+        # the warden answers quickly; a full buffer only means that it is a few requests behind
+        self._warden.setblocking(True)
+        try:
+            socket.send_fds(self._warden, [json.dumps(request).encode()], list(descriptors))
+        finally:
+            self._warden.setblocking(False)
+
+    async def ask_for(
+        self, request: dict[str, Any], descriptors: Sequence[int] = ()
+    ) -> tuple[dict[str, Any], list[int]]:
+        """Send one request and wait for the event with its id."""
+        self._serial += 1
+        serial = self._serial
+        future: asyncio.Future[tuple[dict[str, Any], list[int]]] = asyncio.get_running_loop().create_future()
+        self._requests[serial] = future
+        try:
+            self.ask({**request, "id": serial}, descriptors)
+            return await future
+        finally:
+            self._requests.pop(serial, None)
+
+    def _warden_event(self) -> None:
+        message, descriptors, _, _ = socket.recv_fds(self._warden, MESSAGE_BYTES, 1)
+        if not message:
+            log.error("warden-ended")
+            self.stopping.set()
+            return
+        event = json.loads(message)
+        if "id" in event:
+            future = self._requests.get(event["id"])
+            if future is None or future.done():
+                for descriptor in descriptors:
+                    os.close(descriptor)
+            else:
+                future.set_result((event, descriptors))
+        elif event["event"] == "started":
+            self.nodes[event["node"]].pid = event["pid"]
+        elif event["event"] == "exit":
+            self._exited(self.nodes[event["node"]], event["status"], event["reason"])
+
+    def _exited(self, state: NodeState, status: int, reason: str) -> None:
+        state.pid = 0
+        power = state.power
+        if power in (Power.BOOTING, Power.UP, Power.FLASHING):
+            log.info("node-ended node=%s status=%d reason=%s", state.spec.name, status, reason)
+            self._is_gone(state, Power.OFF)
+        if reason:
+            state.power, state.reason = Power.FAILED, reason
+        elif power is Power.DEAD or status in (_DEAD, _POWER_OFF):
+            state.power = Power.DEAD if status == _DEAD or power is Power.DEAD else Power.OFF
+            state.want_on = state.want_on and status != _POWER_OFF
+        elif state.want_on:
+            self.power_on(state.spec.name)
+        self._boot_next()
+
+    # -- the bell --
+
+    def _bell(self, bell: int) -> None:
+        with contextlib.suppress(BlockingIOError):
+            for line in os.read(bell, 65536).decode("utf-8", "replace").splitlines():
+                word, _, rest = line.partition(" ")
+                name, _, detail = rest.partition(" ")
+                if name not in self.nodes:
+                    continue
+                try:
+                    self._rung(word, self.nodes[name], detail)
+                except (OSError, ValueError, LabError):
+                    # the lines behind it are other nodes'
+                    log.exception("bell-failed line=%s", line)
+
+    def _rung(self, word: str, state: NodeState, detail: str) -> None:
+        match word:
+            case "up" if state.power is Power.BOOTING:
+                state.power = Power.UP
+                state.boot_id = detail
+                self._read_effective(state)
+                self._boot_next()
+            case "changed" if state.is_running:
+                self._read_effective(state)
+            case "forgot" if len(detail.split()) == 2:
+                interface, mac = detail.split()
+                self.ether.station_deleted(state.spec.name, interface, mac)
+            case "dead":
+                self._is_gone(state, Power.DEAD)
+            case "cut" if state.is_running:
+                self.power_off(state.spec.name, back=True)
+            case "sever":
+                self.hurt.sever(state)
+            case "flashing" if state.is_running:
+                state.power = Power.FLASHING
+                if state.cut_at_flash:
+                    state.cut_at_flash = False
+                    half = state.spec.flash_s / 2
+                    asyncio.get_running_loop().call_later(half, lambda: self.power_off(state.spec.name, back=True))
+
+    def _read_effective(self, state: NodeState) -> None:
+        try:
+            text = (state.home / "air" / "effective").read_text(encoding="utf-8", errors="replace")
+        except FileNotFoundError:
+            text = ""
+        effective = parse_effective(text)
+        if effective != state.effective:
+            state.effective = effective
+            self.ether.changed()
+
+
+# exit status of a node's process 1 (node_root/lab/init)
+_POWER_OFF = 10
+_DEAD = 20
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Become the supervisor of the fleet in DIRECTORY; its spec.json is there already. Errors go to `failure`."""
+    directory = Path(arguments[1]).resolve()
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
+    try:
+        deny_setgroups = _take_privileges()
+        rootfs.build(directory / "rom")
+        (directory / "mnt").mkdir(exist_ok=True)
+        os.mkfifo(directory / "bell", 0o622)
+        (directory / "bell").chmod(0o622)
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        fork_warden(lambda: Warden(theirs), theirs, close=ours)
+        spec = load((directory / "spec.json").read_text(encoding="utf-8"))
+        supervise: Callable[[], Any] = Supervisor(spec, directory, ours, deny_setgroups=deny_setgroups).run
+        (directory / "supervisor.pid").write_text(f"{os.getpid()}\n", encoding="ascii")
+        asyncio.run(supervise())
+        ours.close()
+    except (LabError, OSError) as error:
+        (directory / "failure").write_text(f"{error}\n{getattr(error, 'hint', '')}\n", encoding="utf-8")
+        return 1
+    return 0
+
+
+def _take_privileges() -> bool:
+    """Root of a new user namespace where the kernel lets us, else root itself; whether setgroups is denied."""
+    if not ns.machine_is_known():
+        raise LabError("the virtual fleet knows the system calls of x86_64 and aarch64 only")
+    wanted = os.environ.get("MESHCTL_LAB_PRIVILEGES", "")
+    if wanted != "root":
+        try:
+            ns.enter_user_namespace()
+        except OSError as error:
+            if wanted == "user" or os.geteuid() != 0:
+                raise LabError(
+                    f"the kernel lets this user make no user namespaces ({error})",
+                    hint="run as root, or allow them: sysctl kernel.unprivileged_userns_clone=1 (Debian), "
+                    "kernel.apparmor_restrict_unprivileged_userns=0 (Ubuntu); containers need --privileged",
+                ) from error
+        else:
+            return True
+    return False
+
+
+def fork_warden(make: Callable[[], Warden], channel: socket.socket, *, close: socket.socket) -> None:
+    """Let the warden, whose end of the pair is `channel`, serve in a process of its own."""
+    if os.fork() != 0:
+        channel.close()
+        return
+    ns.die_with_parent()
+    close.close()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        make().serve()
+    except BaseException:
+        log.exception("warden-failed")
+        os._exit(1)
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv))

@@ -1,0 +1,106 @@
+"""Laws of a backup: it reads back as it was, says what it is of, and nothing else is taken for one."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import io
+import tarfile
+from base64 import b64decode
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from meshctl.apply.backup import Backup, lacking_packages, lockout_by, objection_to, read_backup, with_info
+from meshctl.device.connection import OwnKey
+from meshctl.device.deadman import NewFile
+from meshctl.device.observation import BoardInfo
+from meshctl.errors import InputError
+from tests.meshctl.plan.support import fleet, running
+
+INFO = {"node": "b01", "board": "compex,wpj344-16m", "revision": "r1", "taken_s": 12.5, "packages": ["iw", "wpad"]}
+
+
+def archive(*members: tuple[str, bytes]) -> bytes:
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w:gz") as tar:
+        for name, content in members:
+            entry = tarfile.TarInfo(name)
+            entry.size, entry.mode = len(content), 0o600
+            tar.addfile(entry, io.BytesIO(content))
+    return out.getvalue()
+
+
+def saved(*members: tuple[str, bytes]) -> Backup:
+    return read_backup(with_info(archive(("etc/config/network", b"config x\n"), *members), INFO), "b.tgz")
+
+
+def test_a_backup_reads_back_with_what_it_was_taken_from() -> None:
+    backup = saved(("etc/dropbear/authorized_keys", b"key"))
+    assert (backup.node, backup.board, backup.taken_s, backup.packages) == ("b01", INFO["board"], 12.5, ("iw", "wpad"))
+    assert {path: new.content for path, new in backup.files.items()} == {
+        "/etc/config/network": b"config x\n",
+        "/etc/dropbear/authorized_keys": b"key",
+    }
+    assert backup.files["/etc/config/network"].mode == 0o600
+
+
+@pytest.mark.parametrize("path", ["../../etc/passwd", "etc/../../x", "tmp/x/y", "etc/meshctl/change/armed", "a b/c"])
+def test_paths_that_must_not_be_written_are_left_out(path: str) -> None:
+    assert set(saved((path, b"x")).files) == {"/etc/config/network"}
+
+
+def test_what_would_disable_services_at_the_next_boot_is_told_and_not_put_back() -> None:
+    script = b"/etc/init.d/odhcpd disable\n/etc/init.d/meshctl-deadman disable\n\nexit 0\n"
+    backup = saved(("./etc/uci-defaults/10_disable_services", script))
+    assert set(backup.files) == {"/etc/config/network"}
+    assert backup.disabled == ("odhcpd", "meshctl-deadman")
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "expected a tar.gz archive"),
+        (b"not gzip at all", "expected a tar.gz archive"),
+        (gzip.compress(b"no tar"), "expected a tar.gz archive"),
+        (archive(("etc/config/network", b"x")), "no meshctl-backup.json in it"),
+        (with_info(archive(("etc/passwd", b"x")), INFO), "no configuration in it"),
+        (archive(("meshctl-backup.json", b"["), ("etc/config/x", b"")), "meshctl-backup.json is damaged"),
+        (archive(("meshctl-backup.json", b"[]"), ("etc/config/x", b"")), "expected an object"),
+    ],
+    # the archives hold the time they were made at, which must not be part of a test's name
+    ids=["empty", "no gzip", "no tar", "no description", "nothing of ours", "broken description", "no object"],
+)
+def test_what_is_no_backup_is_refused_with_its_file(data: bytes, message: str) -> None:
+    with pytest.raises(InputError, match=r"^b\.tgz: ") as caught:
+        read_backup(data, "b.tgz")
+    assert message in str(caught.value)
+
+
+@given(st.binary(max_size=200), st.integers(0, 400))
+def test_damaged_bytes_give_an_error_or_a_backup_and_nothing_else(noise: bytes, at: int) -> None:
+    data = bytearray(with_info(archive(("etc/config/network", b"config x\n")), INFO))
+    data[at : at + len(noise)] = noise
+    with contextlib.suppress(InputError):
+        read_backup(bytes(data), "b.tgz")
+
+
+def test_a_backup_goes_onto_its_own_node_and_board_only() -> None:
+    seen = running(fleet(), "b01")
+    assert objection_to(saved(), "b01", seen) == ""
+    assert "the backup is of b01, not of b02" in objection_to(saved(), "b02", seen)
+    assert "is ubnt,rocket-m" in objection_to(saved(), "b01", replace(seen, board=BoardInfo("ubnt,rocket-m")))
+    assert lacking_packages(saved(), replace(seen, packages={"iw": "1"})) == ("wpad",)
+
+
+def test_a_backup_that_lets_in_none_of_our_keys_is_refused_and_one_without_keys_is_not() -> None:
+    node = fleet().nodes["b01"]
+    keys = {"/etc/dropbear/authorized_keys": NewFile(f"{fleet().operators.ssh_keys[0]}\n".encode(), 0o600)}
+    ours = OwnKey("agent key", "ssh-ed25519", b64decode(fleet().operators.ssh_keys[0].split()[1]))
+    assert lockout_by(saved(), node, ()) is None
+    assert lockout_by(replace(saved(), files=keys), node, (ours,)) is None
+    refused = lockout_by(replace(saved(), files=keys), node, ())
+    assert refused is not None
+    assert f"it gets the keys {ours.fingerprint} (alice)" in refused.reason

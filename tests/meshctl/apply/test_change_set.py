@@ -1,0 +1,50 @@
+"""Laws of a change: it holds what differs, knows what was there, and reloads what changed."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+
+from meshctl.apply.change_set import change_of, new_change_id, new_nonce, reload_script
+from meshctl.device.deadman import bundle
+from tests.meshctl.plan.support import PASS_PHRASE, factory, fleet, planned, running, wanted
+
+
+def test_a_change_holds_exactly_the_files_that_differ_and_what_was_there() -> None:
+    team, seen = fleet(channel=11), running(fleet(), "b01")
+    change = change_of("c1", planned(team, "b01", seen), wanted(team, "b01"), seen, ())
+    assert set(change.files) == {"/etc/config/wireless", "/etc/meshctl/node"}
+    assert seen.uci is not None
+    assert change.expected["/etc/config/wireless"] == hashlib.sha256(seen.uci["wireless"].encode()).hexdigest()
+    assert change.reload == reload_script({"etc/config/wireless"}, ())
+
+
+def test_what_is_not_there_yet_is_expected_to_be_absent() -> None:
+    seen = factory(fleet(), "b01")
+    change = change_of("c1", planned(fleet(), "b01", seen), wanted(fleet(), "b01"), seen, ())
+    assert change.expected["/etc/dropbear/authorized_keys"] is None
+
+
+def test_bytes_that_were_lost_on_the_way_are_not_expected() -> None:
+    team, seen = fleet(channel=11), running(fleet(), "b01")
+    assert seen.uci is not None
+    odd = replace(seen, uci={**seen.uci, "wireless": seen.uci["wireless"] + "# \ufffd\n"})
+    change = change_of("c1", planned(team, "b01", odd), wanted(team, "b01"), odd, ())
+    assert "/etc/config/wireless" not in change.expected
+
+
+def test_every_rendered_path_is_one_that_the_switch_takes() -> None:
+    seen = factory(fleet(), "b01")
+    assert bundle(change_of("c1", planned(fleet(), "b01", seen), wanted(fleet(), "b01"), seen, ()))
+
+
+def test_a_change_is_never_printed_with_its_secrets() -> None:
+    seen = factory(fleet(), "b01")
+    plan = planned(fleet(), "b01", seen)
+    assert PASS_PHRASE not in repr(change_of("c1", plan, wanted(fleet(), "b01"), seen, ()))
+    assert PASS_PHRASE not in repr(wanted(fleet(), "b01"))
+
+
+def test_ids_and_nonces_never_repeat() -> None:
+    assert len({new_change_id() for _ in range(100)}) == 100
+    assert len({new_nonce().reveal() for _ in range(100)}) == 100

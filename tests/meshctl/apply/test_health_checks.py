@@ -1,0 +1,133 @@
+"""Laws of the proof: a node keeps its new configuration only when everything it had is there again."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from meshctl.apply.health_checks import expectation, missing
+from meshctl.device.observation import (
+    Bridge,
+    ChangeStatus,
+    MeshNeighbour,
+    NetInterface,
+    Observation,
+    Originator,
+    WirelessLink,
+)
+from meshctl.uci import dump, parse
+from tests.meshctl.plan.support import fleet, running, wanted
+
+BASE = "02:00:00:00:00:01"
+OTHER = "02:00:00:00:00:02"
+
+
+def good() -> Observation:
+    return running(
+        fleet(),
+        "b01",
+        neighbours=(BASE, OTHER),
+        originators=(Originator(BASE, BASE, "mesh0", 200, True, 250),),
+        links=(WirelessLink("mesh0", "IBSS", bssid="02:ca:fe:00:00:01", channel=6, joined=True),),
+        interfaces=(NetInterface("lan", True, False, "static", "br-lan", ("10.42.0.101/24",)),),
+        bridges=(Bridge("br-lan", ("bat0", "eth0")),),
+        change=ChangeStatus("applied", "c1", window_s=60, left_s=40.0, reload_status=0),
+    )
+
+
+def gaps(after: Observation, since_s: float | None = 20.0) -> tuple[str, ...]:
+    return missing(expectation(wanted(fleet(), "b01"), good(), [BASE]), after, since_s=since_s)
+
+
+def test_a_node_with_all_it_had_has_proven_itself() -> None:
+    assert gaps(good()) == ()
+
+
+@pytest.mark.parametrize(
+    ("after", "gap"),
+    [
+        (
+            replace(good(), change=ChangeStatus("applied", "c1", reload_status=None)),
+            "its services are still reloading",
+        ),
+        (
+            replace(good(), change=ChangeStatus("applied", "c1", reload_status=2)),
+            "reloading its services failed with status 2",
+        ),
+        (replace(good(), interfaces=()), "its LAN is down"),
+        (
+            replace(good(), interfaces=(NetInterface("lan", True, False, "static", "br-lan", ("10.42.0.9/24",)),)),
+            "its LAN has 10.42.0.9/24, not 10.42.0.101",
+        ),
+        (replace(good(), bridges=(Bridge("br-lan", ("bat0",)),)), "eth0 not in its bridge br-lan"),
+        (replace(good(), links=()), "mesh0 is not there"),
+        (
+            replace(good(), links=(WirelessLink("mesh0", "IBSS", channel=6, joined=False),)),
+            "mesh0 has not joined its cell",
+        ),
+        (
+            replace(good(), links=(WirelessLink("mesh0", "IBSS", channel=1, joined=True),)),
+            "mesh0 is on channel 1, not 6",
+        ),
+        (
+            replace(good(), links=(WirelessLink("mesh0", "IBSS", bssid="06:00:00:00:00:07", channel=6),)),
+            "mesh0 is in cell 06:00:00:00:00:07, not 02:ca:fe:00:00:01",
+        ),
+        (replace(good(), neighbours=()), "it hears 0 mesh neighbours of the 2 it had"),
+        (replace(good(), originators=()), "it has no way to the base"),
+    ],
+)
+def test_what_is_not_there_is_named(after: Observation, gap: str) -> None:
+    assert gaps(after) == (gap,)
+
+
+def test_half_of_the_neighbours_is_enough_since_robots_move() -> None:
+    assert gaps(replace(good(), neighbours=(MeshNeighbour("02:00:00:00:00:77", "mesh0", 10),))) == ()
+
+
+def test_what_was_heard_before_the_change_does_not_count() -> None:
+    stale = replace(good(), neighbours=(MeshNeighbour(OTHER, "mesh0", 8000), MeshNeighbour(BASE, "mesh0", 8000)))
+    assert gaps(stale, since_s=20.0) == ()
+    assert gaps(stale, since_s=5.0) == ("it hears 0 mesh neighbours of the 2 it had",)
+
+
+def test_a_node_alone_on_the_bench_need_hear_nobody() -> None:
+    alone = replace(good(), neighbours=(), originators=())
+    assert missing(expectation(wanted(fleet(), "b01"), alone, [BASE]), alone) == ()
+
+
+def test_the_base_counts_only_if_it_was_reached_before() -> None:
+    before = replace(good(), originators=())
+    assert expectation(wanted(fleet(), "b01"), before, [BASE]).bases == frozenset()
+
+
+def test_the_base_may_be_reached_by_an_address_that_it_got_during_the_run() -> None:
+    expected = expectation(wanted(fleet(), "b01"), good(), [BASE])
+    moved = "42:00:00:00:00:01"
+    after = replace(good(), originators=(Originator(moved, moved, "mesh0", 200, True, 250),))
+    assert missing(expected, after) == ("it has no way to the base",)
+    assert missing(expected.with_bases(frozenset({moved})), after) == ()
+    assert expectation(wanted(fleet(), "b01"), good()).with_bases(frozenset({moved})).bases == frozenset()
+
+
+@pytest.mark.parametrize(
+    ("encryption", "supplicants", "gaps"),
+    [
+        ("psk2+ccmp", ("global", "mesh0"), ()),
+        ("psk2+ccmp", ("global",), ("mesh0 is not encrypted: wpa_supplicant does not run it",)),
+        ("none", ("global",), ()),
+        # a release, or a lab, that does not say
+        ("psk2+ccmp", None, ()),
+    ],
+)
+def test_an_encrypted_radio_that_joined_in_the_open_has_not_proven_itself(
+    encryption: str, supplicants: tuple[str, ...] | None, gaps: tuple[str, ...]
+) -> None:
+    expected = expectation(wanted(fleet(), "b01"), good(), [BASE])
+    assert expected.wireless is not None
+    text = re.sub("option encryption '.*'", f"option encryption '{encryption}'", dump(expected.wireless))
+    assert f"'{encryption}'" in text
+    sealed = replace(expected, wireless=parse(text, "wireless"))
+    assert missing(sealed, replace(good(), supplicants=supplicants)) == gaps

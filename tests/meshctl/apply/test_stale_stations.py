@@ -1,0 +1,317 @@
+"""Laws of who is asked to forget a radio, with which words, and when."""
+
+from __future__ import annotations
+
+import subprocess
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from meshctl.apply.stale_stations import (
+    FIRST_PAUSE_S,
+    LONGEST_PAUSE_S,
+    MOST_ASKED,
+    Entry,
+    behind,
+    booted_unforgotten_s,
+    by_holder,
+    entries_of,
+    flush_script,
+    neighbours_now,
+    next_ask_s,
+    own_entries,
+    silent_holders,
+    watch_script,
+)
+from meshctl.device.observation import Observation, Originator, Station, WirelessLink
+from meshctl.plan.radios import NO_RADIOS, Radios
+from tests.meshctl.plan.support import fleet, running
+
+MAC = "02:00:00:00:01:02"
+OTHER = "02:00:00:00:01:03"
+BASE = "02:00:00:00:01:00"
+
+
+def knows(name: str, *stations: tuple[str, str]) -> Observation:
+    return replace(running(fleet(), name), stations=tuple(Station(ifname, mac) for ifname, mac in stations))
+
+
+def itself(*macs: str) -> Observation:
+    links = tuple(WirelessLink(f"mesh{number}", "IBSS", mac) for number, mac in enumerate(macs))
+    return replace(running(fleet(), "b02"), links=links, mesh=None, macs={})
+
+
+def test_those_whose_radios_know_the_node_are_asked_on_the_interface_and_by_the_mac_they_told() -> None:
+    around = {
+        "b01": knows("b01", ("mesh0", OTHER), ("mesh1", MAC.upper())),
+        "b02": itself(MAC),
+        "b03": knows("b03", ("mesh0", OTHER)),
+        "base": knows("base", ("wlan0", MAC)),
+    }
+    assert entries_of("b02", around) == (Entry("b01", "mesh1", MAC.upper()), Entry("base", "wlan0", MAC))
+
+
+def test_every_radio_of_the_node_is_forgotten() -> None:
+    around = {"b01": knows("b01", ("mesh0", MAC), ("mesh0", OTHER)), "b02": itself(MAC, OTHER)}
+    assert by_holder(entries_of("b02", around)) == {"b01": (Entry("b01", "mesh0", MAC), Entry("b01", "mesh0", OTHER))}
+
+
+def test_of_a_node_that_told_nothing_and_of_one_without_a_radio_in_a_mesh_nobody_is_asked() -> None:
+    around = {"b01": knows("b01", ("mesh0", MAC))}
+    assert entries_of("b02", around) == ()
+    assert entries_of("b02", {**around, "b02": itself()}) == ()
+
+
+def test_a_station_table_of_any_length_has_few_asked() -> None:
+    entries = [Entry(f"n{number:03}", "mesh0", MAC) for number in range(200)]
+    assert list(by_holder(entries)) == [f"n{number:03}" for number in range(MOST_ASKED)]
+
+
+@given(st.lists(st.floats(0, 30), max_size=20))
+def test_a_silent_node_has_its_neighbours_asked_at_once_and_then_ever_more_seldom_until_once_a_minute(
+    lateness: list[float],
+) -> None:
+    asked: list[float] = []
+    for late_s in lateness:
+        due_s = next_ask_s(asked)
+        asked.append(due_s + late_s if asked else late_s)
+    pauses = [next_ask_s(asked[: count + 1]) - asked[count] for count in range(len(asked))]
+    assert next_ask_s([]) < 0
+    assert pauses == pytest.approx(sorted(pauses))
+    assert all(FIRST_PAUSE_S - 1e-6 <= pause <= LONGEST_PAUSE_S + 1e-6 for pause in pauses)
+
+
+def test_of_two_radios_only_those_who_know_the_one_that_starts_anew_are_asked() -> None:
+    around = {"b01": knows("b01", ("mesh0", MAC), ("mesh1", OTHER)), "b02": itself(MAC, OTHER)}
+    assert entries_of("b02", around, Radios(frozenset({"mesh1"}))) == (Entry("b01", "mesh1", OTHER),)
+    assert entries_of("b02", around, NO_RADIOS) == ()
+
+
+def hears(*macs: str) -> Observation:
+    return replace(itself(MAC), neighbours=(), stations=tuple(Station("mesh0", mac) for mac in macs))
+
+
+def test_whom_the_node_hears_and_who_told_nothing_may_know_it() -> None:
+    around = {
+        "b01": replace(knows("b01"), macs={}, links=(WirelessLink("mesh0", "IBSS", BASE),)),
+        "b02": hears(BASE, OTHER),
+    }
+    names = {OTHER: "b03", MAC: "b02"}
+    assert silent_holders("b02", around, names, ("b01", "b02", "b03", "b04")) == ("b03",)
+    assert neighbours_now(around["b02"], {**names, BASE: "b01"}) == ("b01", "b03")
+
+
+def test_who_answered_without_telling_of_its_stations_may_know_the_node() -> None:
+    around = {"b01": replace(knows("b01"), stations=None), "b02": hears(OTHER)}
+    assert silent_holders("b02", around, {OTHER: "b01"}, ()) == ("b01",)
+
+
+def test_a_stranger_may_be_any_fellow_whose_radios_nobody_has_seen() -> None:
+    around = {"b01": knows("b01"), "b02": hears("02:99:00:00:00:01")}
+    assert silent_holders("b02", around, {OTHER: "b03"}, ("b01", "b02", "b03", "b04")) == ("b04",)
+    assert silent_holders("b02", around, {"02:99:00:00:00:01": "b02"}, ("b04",)) == ()
+
+
+def hop(name: str, mac: str, next_hop: str, *, best: bool = True) -> Observation:
+    return replace(running(fleet(), name), originators=(Originator(mac, next_hop, "mesh0", 100, best, 200),))
+
+
+def at(seen: Observation, asked_at_s: float, *, uptime_s: float | None) -> Observation:
+    return replace(seen, asked_at_s=asked_at_s, answered_at_s=asked_at_s + 1.0, uptime_s=uptime_s)
+
+
+@pytest.mark.parametrize(
+    ("connected_s", "is_old"), [(150, True), (104, True), (102, False), (40, False), (None, False)]
+)
+def test_who_has_known_a_radio_from_before_its_node_booted_must_forget_it(
+    connected_s: int | None, is_old: bool
+) -> None:
+    # it is up since 900, give or take what an answer takes; the neighbour knows it since 1001 - connected_s
+    around = {
+        "b01": at(
+            replace(knows("b01"), stations=(Station("mesh0", MAC, connected_s=connected_s),)), 1000, uptime_s=9e9
+        ),
+        "b02": at(itself(MAC), 1000.0, uptime_s=100.0),
+    }
+    assert booted_unforgotten_s("b02", around) == (900.0 if is_old else None)
+    assert booted_unforgotten_s("b01", around) is None
+    assert booted_unforgotten_s("b02", {**around, "b02": at(itself(MAC), 1000.0, uptime_s=None)}) is None
+    assert booted_unforgotten_s("b03", around) is None
+
+
+def test_those_whose_best_way_to_the_base_begins_with_the_node_are_behind_it() -> None:
+    around = {
+        "b01": hop("b01", BASE, BASE),
+        "b02": itself(MAC),
+        "b03": hop("b03", BASE.upper(), MAC),
+        "b04": hop("b04", BASE, MAC, best=False),
+        "b05": hop("b05", OTHER, MAC),
+    }
+    assert behind("b02", around, (BASE,)) == {"b03"}
+    assert behind("b02", around, ()) == frozenset()
+
+
+def test_a_node_watches_its_own_entries_on_the_radios_that_may_restart() -> None:
+    seen = knows("b02", ("mesh0", OTHER), ("mesh1", BASE))
+    assert own_entries("b02", seen, Radios(frozenset({"mesh1"}))) == (Entry("b02", "mesh1", BASE),)
+    assert own_entries("b02", seen, NO_RADIOS) == ()
+
+
+@dataclass(frozen=True)
+class Second:
+    """What iw and batctl of a holder print about its neighbor within one second of its clock."""
+
+    inactive_ms: int
+    connected_s: int
+    echo: str
+
+
+ANSWERED = "20 bytes from 02:00:00:00:01:02 icmp_seq=1 ttl=50 time=1.10 ms"
+LOST = "Reply from host 02:00:00:00:01:02 timed out"
+UNREACHABLE = "From 02:00:00:00:01:02: Destination Host Unreachable (icmp_seq 1)"
+# Tools of a holder: line N of `seconds` is what they print at second N; the clock is what sleeps. `del` writes down
+# when it was called, and the entry is a new one from then on where `renews` is there.
+FAKES = {
+    "iw": """now=$(cat "$HERE/now")
+[ $# != 1 ] || printf 'phy#0\\n\\tInterface mesh0\\nphy#1\\n\\tInterface mesh1\\n'
+IFS='|' read -r inactive connected _ <<END
+$(sed -n "${now}p" "$HERE/seconds")
+END
+[ ! -f "$HERE/renewed" ] || connected=0
+case $4 in
+get)
+    [ -n "$inactive" ] || exit 0
+    printf 'Station %s\\n\\tinactive time:\\t%s ms\\n' "$5" "$inactive"
+    printf '\\tconnected time:\\t%s seconds\\n' "$connected"
+    ;;
+del) echo "$now $2 $5" >>"$HERE/deleted"; [ ! -f "$HERE/renews" ] || : >"$HERE/renewed"; [ "$5" != unknown ] ;;
+esac""",
+    "batctl": """echo "$@" >>"$HERE/asked"
+[ ! -f "$HERE/renewed" ] || { echo "20 bytes from x"; exit 0; }
+sed -n "$(cat "$HERE/now")s/.*|//p" "$HERE"/seconds
+""",
+    "sleep": 'now=$(($(cat "$HERE/now") + $1)); echo $now >"$HERE/now"; echo $((1000 + now)).00 1.00 >"$HERE/uptime"',
+    "start-stop-daemon": 'while [ "$1" != -- ]; do shift; done; shift; exec sh "$@"',
+    "mkdir": ":",
+}
+
+
+def deletions(place: Path, seconds: list[Second], text: str, *, bat: str = "bat0") -> tuple[str, list[str]]:
+    """What a script prints on a holder whose tools print this, second by second, and what it deletes when."""
+    for name, body in FAKES.items():
+        (place / name).write_text(f"#!/bin/sh\n{body}\n", encoding="ascii")
+        (place / name).chmod(0o755)
+    (place / "now").write_text("1")
+    (place / "uptime").write_text("1001.00 1.00")
+    (place / "seconds").write_text("".join(f"{one.inactive_ms}|{one.connected_s}|{one.echo}\n" for one in seconds))
+    if bat:
+        (place / "net" / "mesh0").mkdir(parents=True, exist_ok=True)
+        (place / "net" / bat).mkdir(exist_ok=True)
+        (place / "net" / "mesh0" / "master").unlink(missing_ok=True)
+        (place / "net" / "mesh0" / "master").symlink_to(f"../{bat}")
+    text = text.replace("/sys/class/net", str(place / "net")).replace("/proc/uptime", str(place / "uptime"))
+    environ = {"PATH": f"{place}:/usr/bin:/bin", "HERE": str(place)}
+    done = subprocess.run(
+        ("sh", "-c", text), env=environ, cwd=place, capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.stderr == ""
+    log = place / "deleted"
+    return done.stdout, log.read_text().splitlines() if log.exists() else []
+
+
+def flushed(place: Path, now: Second, *, bat: str = "bat0", has_restarted: bool = False) -> str:
+    """What a holder with such an entry prints when it is asked for entries of at least 11.2 s."""
+    text = flush_script([Entry("b01", "mesh0", MAC)], older_than_s=11.2, has_restarted=has_restarted)
+    printed, deleted = deletions(place, [now], text, bat=bat)
+    assert deleted == ([f"1 mesh0 {MAC}"] if printed == f"gone {MAC}\n" else [])
+    return printed
+
+
+@pytest.mark.parametrize(
+    ("now", "printed"),
+    [
+        (Second(100, 50, LOST), f"gone {MAC}\n"),
+        # it never restarted, or the neighbor has removed the stale entry already
+        (Second(100, 50, ANSWERED), f"answers {MAC}\n"),
+        # newer than the change
+        (Second(100, 11, LOST), ""),
+        # off the air: there is nothing to hear, so nothing is known to be dropped
+        (Second(5000, 50, LOST), ""),
+        # batman-adv has no path, which proves nothing about the link; nor does a tool without `ping`
+        (Second(100, 50, UNREACHABLE), f"unknown {MAC}\n"),
+        (Second(100, 50, "Error - unknown command: ping"), f"unknown {MAC}\n"),
+    ],
+)
+def test_an_entry_is_removed_only_where_its_neighbor_is_heard_and_does_not_answer(
+    tmp_path: Path, now: Second, printed: str
+) -> None:
+    assert flushed(tmp_path, now) == printed
+
+
+def test_one_lost_echo_request_is_not_enough(tmp_path: Path) -> None:
+    flushed(tmp_path, Second(100, 50, LOST))
+    assert (tmp_path / "asked").read_text() == f"meshif bat0 ping -c 3 -t 1 {MAC}\n"
+
+
+def test_the_batctl_of_19_07_is_asked_in_its_own_words(tmp_path: Path) -> None:
+    assert flushed(tmp_path, Second(100, 50, "Error - unknown command: meshif")) == f"unknown {MAC}\n"
+    asked = (tmp_path / "asked").read_text().splitlines()
+    assert asked == [f"{word} bat0 ping -c 3 -t 1 {MAC}" for word in ("meshif", "-m")]
+
+
+def test_where_there_is_no_batman_adv_only_a_restart_that_was_seen_counts(tmp_path: Path) -> None:
+    assert flushed(tmp_path, Second(100, 50, LOST), bat="") == f"unknown {MAC}\n"
+    assert flushed(tmp_path, Second(100, 50, ANSWERED), bat="", has_restarted=True) == f"gone {MAC}\n"
+
+
+def test_an_entry_that_cannot_be_removed_is_reported(tmp_path: Path) -> None:
+    text = flush_script([Entry("b01", "mesh0", "unknown")], older_than_s=1)
+    assert deletions(tmp_path, [Second(100, 50, LOST)], text)[0] == "kept unknown\n"
+
+
+def test_a_holder_that_did_not_answer_before_looks_on_all_of_its_interfaces(tmp_path: Path) -> None:
+    text = flush_script([Entry("b01", "", MAC)], older_than_s=11.2)
+    printed, deleted = deletions(tmp_path, [Second(100, 50, LOST)], text)
+    assert printed == f"gone {MAC}\n" * 2
+    assert deleted == [f"1 mesh0 {MAC}", f"1 mesh1 {MAC}"]
+
+
+def watched(place: Path, seconds: list[Second]) -> list[int]:
+    """When an entry like this is deleted by a holder that watches it."""
+    text = watch_script("b02", [Entry("b01", "mesh0", MAC)], for_s=len(seconds))
+    _, deleted = deletions(place, [*seconds, *seconds[-1:]], text)
+    assert all(line.endswith(f" mesh0 {MAC}") for line in deleted)
+    return [int(line.split()[0]) for line in deleted]
+
+
+def test_a_radio_that_keeps_answering_is_never_removed(tmp_path: Path) -> None:
+    assert watched(tmp_path, [Second(100, 500 + at, ANSWERED) for at in range(65)]) == []
+
+
+def test_a_radio_that_is_silent_and_then_heard_without_answering_is_removed_once(tmp_path: Path) -> None:
+    (tmp_path / "renews").touch()
+    away = [Second(1000 * at, 500 + at, LOST) for at in range(2, 20)]
+    back = [Second(100, 520 + at, LOST) for at in range(40)]
+    (when,) = watched(tmp_path, [Second(100, 500, ANSWERED), *away, *back])
+    assert len(away) < when <= len(away) + 5
+
+
+def test_a_radio_that_comes_back_as_a_new_station_is_left_alone(tmp_path: Path) -> None:
+    away = [Second(1000 * at, 500 + at, LOST) for at in range(2, 20)]
+    assert watched(tmp_path, [*away, *(Second(100, at, LOST) for at in range(40))]) == []
+
+
+def test_where_removing_it_does_not_help_it_is_not_repeated_for_ever(tmp_path: Path) -> None:
+    assert len(watched(tmp_path, [Second(100, 500 + at, LOST) for at in range(60)])) == 3
+
+
+def test_no_word_of_a_node_is_run(tmp_path: Path) -> None:
+    evil = [Entry("b01", "mesh0; touch x", "$(touch x)"), Entry("b01", "'; touch x; '", "`touch x`")]
+    for has_restarted in (False, True):
+        text = flush_script(evil, older_than_s=1, has_restarted=has_restarted) + watch_script("b02", evil, for_s=4)
+        deletions(tmp_path, [Second(100, 5000, LOST)] * 9, text)
+        assert (tmp_path / "deleted").exists()
+        assert not (tmp_path / "x").exists()

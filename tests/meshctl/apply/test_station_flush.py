@@ -1,0 +1,329 @@
+"""Laws of asking a radio's neighbours to forget it: on every way a radio starts anew, and on no other."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+from meshctl.apply.context import Job, Work
+from meshctl.apply.neighbor_query import REMEMBERED_S, neighbours_of
+from meshctl.apply.station_flush import Forgetting, ask_the_rest, make_up_for
+from meshctl.device.observation import Observation, Station, WirelessLink
+from meshctl.errors import NodeError
+from meshctl.fleet.journal import LastKnown
+from meshctl.model import Release
+from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, SLACK_S, Radios
+from meshlab.fleet import VirtualNode
+from tests import waiting
+from tests.meshctl.plan.support import fleet, running
+from tests.meshctl.proof.rig import Ended, Rig
+
+MAC = "02:00:00:00:01:02"
+MACS = {"b01": "02:00:00:00:01:01", "b02": MAC, "b03": "02:00:00:00:01:03", "b04": "02:00:00:00:01:04"}
+
+
+def node(name: str, *hears: str, connected_s: int = 500) -> Observation:
+    stations = tuple(Station("mesh0", MACS[other], connected_s=connected_s) for other in hears)
+    link = WirelessLink("mesh0", "IBSS", MACS[name])
+    return replace(
+        running(fleet(), name, neighbours=()), links=(link,), macs={}, ifindexes={"mesh0": 7}, stations=stations
+    )
+
+
+class Neighbours:
+    """A fleet whose neighbours answer or do not: what was asked of whom, and what the operator was told."""
+
+    def __init__(self, around: dict[str, Observation], *, silent: tuple[str, ...] = (), answer: str = f"gone {MAC}\n"):
+        self.silent = set(silent)
+        self.log_in: Callable[[], None] = lambda: None
+        self.answer = answer
+        self.asked: list[tuple[str, str]] = []
+        self.notes: list[str] = []
+        self.steps: list[str] = []
+        self.work = cast(
+            "Work",
+            SimpleNamespace(
+                fleet=fleet(),
+                around=around,
+                current_names=lambda: {mac: name for name, mac in MACS.items()},
+                bases=(),
+                later=[],
+                interrupt=SimpleNamespace(leaving=False),
+                access=SimpleNamespace(take=lambda name: None, open=self._open, keep=lambda name, kept: None),
+                note=lambda text, name: self.notes.append(f"{name}: {text}"),
+            ),
+        )
+        before = around.get("b02") or node("b02")
+        job = SimpleNamespace(name="b02", node=fleet().nodes["b02"], work=self.work, step=self._step, before=before)
+        self.job = cast("Job", job)
+
+    def _open(self, there: SimpleNamespace, **_: object) -> SimpleNamespace:
+        if there.name in self.silent:
+            raise NodeError("it does not answer")
+        self.log_in()
+
+        def run(script: str, *, timeout_s: float) -> SimpleNamespace:
+            self.asked.append((there.name, script))
+            return SimpleNamespace(stdout=self.answer)
+
+        return SimpleNamespace(run=run, close=lambda: None)
+
+    @contextmanager
+    def _step(self, name: str) -> Iterator[None]:
+        self.steps.append(name)
+        yield
+
+    @property
+    def names(self) -> list[str]:
+        return sorted(name for name, _ in self.asked)
+
+
+def test_a_node_that_is_silent_for_long_is_told_of_once_however_often_its_neighbours_are_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
+    monkeypatch.setattr("meshctl.apply.station_flush.next_ask_s", lambda asked_s: float("-inf"))
+    forgetting = Forgetting(near.job)
+    forgetting.begins()
+    for _ in range(5):
+        forgetting.while_silent()
+    forgetting.when_back()
+    assert near.names == ["b01"] * 6
+    assert near.steps == ["neighbours forget it"]
+    assert near.notes == ["b02: b01 removed a stale entry of its radio"]
+
+
+def test_of_a_node_whose_radios_stay_as_they_are_nobody_is_asked_unless_it_rebooted() -> None:
+    near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
+    forgetting = Forgetting(near.job, NO_RADIOS)
+    forgetting.begins()
+    forgetting.while_silent()
+    forgetting.when_back(node("b02"))
+    assert near.asked == []
+    forgetting.when_back(node("b02"), rebooted=True)
+    assert near.names == ["b01"]
+
+
+def test_who_did_not_tell_when_the_plan_was_made_is_asked_when_the_node_is_back() -> None:
+    near = Neighbours({"b02": node("b02", "b01", "b03"), "b01": node("b01", "b02")}, silent=("b03",))
+    forgetting = Forgetting(near.job)
+    forgetting.begins()
+    forgetting.while_silent()
+    assert near.names == ["b01"]
+    near.silent.clear()
+    forgetting.when_back(node("b02", "b04"))
+    # b03 was heard before, b04 is heard now: neither told, so each looks on whatever interfaces it has
+    assert near.names == ["b01", "b01", "b03", "b04"]
+    assert all("iw dev 2>/dev/null" in script for name, script in near.asked if name != "b01")
+    assert near.work.later == []
+
+
+def test_who_does_not_answer_then_either_is_asked_once_more_in_the_end_and_the_operator_is_told_of_the_rest() -> None:
+    near = Neighbours(
+        {"b02": node("b02", "b01", "b03", "b04"), "b01": node("b01", "b02")}, silent=("b01", "b03", "b04")
+    )
+    forgetting = Forgetting(near.job)
+    forgetting.begins()
+    forgetting.when_back(node("b02"))
+    assert near.asked == []
+    assert near.notes == []
+    near.silent = {"b03", "b04"}
+    assert ask_the_rest(near.work) == {"b02": ("b03", "b04")}
+    assert near.names == ["b01"]
+    assert near.notes == [
+        "b02: b01 removed a stale entry of its radio",
+        "b02: b03 and b04 did not answer and may hold a stale entry of its radio: "
+        "what it sends them may be lost for minutes",
+    ]
+
+
+def test_an_entry_is_no_older_for_the_time_that_a_login_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
+    now_s = [1000.0]
+    monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    forgetting = Forgetting(near.job)
+    forgetting.begins()
+    now_s[0] += 10.0
+    near.log_in = lambda: now_s.__setitem__(0, now_s[0] + 7.0)
+    forgetting.when_back(node("b02"))
+    assert f"flush_stale mesh0 {MAC} 17\n" in near.asked[0][1]
+
+
+def test_who_cannot_forget_is_told_to_the_operator() -> None:
+    near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")}, answer=f"kept {MAC}\n")
+    forgetting = Forgetting(near.job)
+    forgetting.begins()
+    forgetting.when_back(node("b02"))
+    assert near.notes == ["b02: b01 cannot remove its stale entry: what it sends them may be lost for minutes"]
+
+
+def test_who_cannot_find_out_removes_the_entry_only_of_a_radio_that_was_seen_to_restart() -> None:
+    for index, has_restarted in ((7, False), (8, True)):
+        near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")}, answer=f"unknown {MAC}\n")
+        forgetting = Forgetting(near.job)
+        forgetting.begins()
+        forgetting.when_back(replace(node("b02", "b01"), ifindexes={"mesh0": index}))
+        assert ["flush_restarted mesh0" in script for _, script in near.asked] == [False, True][: 1 + has_restarted]
+
+
+def test_a_change_whose_end_nobody_saw_is_made_up_for_if_the_radio_has_started_since() -> None:
+    same = Neighbours({"b02": node("b02", "b01", connected_s=500)})
+    make_up_for(same.job, ago_s=100.0)
+    assert same.asked == []
+    anew = Neighbours({"b02": node("b02", "b01", connected_s=50)})
+    make_up_for(anew.job, ago_s=100.0)
+    assert anew.names == ["b01"]
+    assert re.search(r"flush_stale .* 10[01]\n", anew.asked[0][1])
+
+
+def test_of_a_node_that_booted_since_what_was_known_before_its_boot_is_forgotten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: 0.0, time=lambda: 1003.0))
+    seen = replace(node("b02", "b01"), asked_at_s=1000.0, uptime_s=40.0)
+    booted = Neighbours({"b02": seen})
+    make_up_for(booted.job, ago_s=500.0)
+    assert re.search(r"flush_stale .* 43\n", booted.asked[0][1])
+
+
+def test_beside_whom_a_node_hears_those_are_looked_at_that_it_heard_lately() -> None:
+    seen = {"b02": node("b02", "b01")}
+    known = {
+        "b02": LastKnown("b02", 1000.0, {"macs": MAC, "neighbours": f"{MACS['b03'].upper()} {MACS['b01']}"}),
+        "b01": LastKnown("b01", 1.0, {"macs": MACS["b01"]}),
+        "b03": LastKnown("b03", 1.0, {"macs": MACS["b03"]}),
+    }
+    assert neighbours_of(fleet(), seen, known, now_s=1000.0 + REMEMBERED_S - 1) == ("b01", "b03")
+    assert neighbours_of(fleet(), seen, known, now_s=1000.0 + REMEMBERED_S + 1) == ("b01",)
+
+
+def test_radios_are_told_apart_by_name_unless_all_are_meant() -> None:
+    assert "mesh7" in EVERY_RADIO
+    assert "mesh1" not in Radios(frozenset({"mesh0"}))
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    # its radios keep their address when they restart
+    with Rig(tmp_path_factory.mktemp("rig"), count=1, window_s=60, release=Release.V22_03) as made:
+        made.take_in(made.current)
+        yield made
+
+
+def notes(ended: Ended) -> list[str]:
+    """What was told of the node, of its radio."""
+    told = [event for event in ended.events if event["event"] == "note" and event["node"] == "n001"]
+    return [event["text"] for event in told if "its radio" in event["text"]]
+
+
+def known_for_s(rig: Rig) -> list[int]:
+    """For how many seconds base has known each radio that it hears."""
+    told = rig.fleet.node("base").exec("iw dev mesh0 station dump").check("base: stations").stdout
+    return [int(age) for age in re.findall(r"connected time:\s*(\d+)", told)]
+
+
+def is_set_up(node: VirtualNode, *, distance: int) -> bool:
+    """Whether netifd has set the node's radio up with this distance."""
+    radio = json.loads(node.exec("ubus call network.wireless status").check("status").stdout)["radio0"]
+    return radio["up"] and not radio["pending"] and int(radio["config"]["distance"]) == distance
+
+
+FORGOT = ["base removed a stale entry of its radio"]
+
+
+@pytest.mark.lab
+@pytest.mark.xdist_group("lab")
+@pytest.mark.timeout(600)
+class TestOnAVirtualFleet:
+    """The same over real SSH; each test leaves the fleet on the rig's current inventory."""
+
+    def test_after_a_change_of_a_radio_its_neighbour_has_forgotten_it(self, rig: Rig) -> None:
+        _, new = rig.flip()
+        ended = rig.meshctl("provision", new, "n001", "--yes", "--json")
+        assert ended.results == {"n001": "done"}, ended.out + ended.err
+        assert notes(ended) == FORGOT
+
+    def test_a_change_beside_the_radio_has_nobody_forget_it(self, rig: Rig) -> None:
+        text = rig.inventory(rig.current).read_text(encoding="utf-8")
+        assert text.count("hop_penalty: 3") == 1
+        rig.inventory("penalty").write_text(text.replace("hop_penalty: 3", "hop_penalty: 4"), encoding="utf-8")
+        for variant in ("penalty", rig.current):
+            ended = rig.meshctl("provision", variant, "n001", "--yes", "--json")
+            assert ended.results == {"n001": "done"}, ended.out + ended.err
+            assert notes(ended) == []
+            assert not [event for event in ended.events if event.get("text") == "neighbours forget it"]
+
+    def test_a_node_that_is_put_back_from_a_backup_is_forgotten_by_its_neighbour(self, rig: Rig) -> None:
+        folder = rig.directory / "backups"
+        assert rig.meshctl("backup", rig.current, "n001", "--out", str(folder)).code == 0
+        (file,) = folder.iterdir()
+        node = rig.fleet.node("n001")
+        node.exec("uci set wireless.radio0.distance=777 && uci commit wireless && reload_config").check("edit by hand")
+        waiting.until(lambda: is_set_up(node, distance=777), "its radio to be set up with the edit")
+        restored = rig.meshctl("restore", rig.current, "n001", str(file), "--yes", "--json")
+        assert restored.code == 0, restored.out + restored.err
+        assert notes(restored) == FORGOT
+        assert rig.state_of("n001", "split", rig.current) == "new"
+
+    def test_of_a_neighbour_that_is_not_reached_the_operator_is_told_unless_it_can_be_later(self, rig: Rig) -> None:
+        # its host key is not the pinned one, so nothing is asked of it until somebody has looked after that
+        rig.fleet.break_("base", "host-key")
+        _, new = rig.flip()
+        ended = rig.meshctl("provision", new, "n001", "--yes", "--json")
+        assert ended.results == {"n001": "done"}, ended.out + ended.err
+        told = "base did not answer and may hold a stale entry of its radio: what it sends them may be lost for minutes"
+        assert notes(ended) == [told]
+        assert ended.events[-1]["outcomes"][0]["facts"] == {"not_asked": "base"}
+        _, new = rig.flip()
+        said: list[str] = []
+        with rig.start("provision", new, "n001", "--yes", "--json") as process:
+            assert process.stdout is not None
+            for line in process.stdout:
+                said.append(line)
+                if json.loads(line).get("text") == "stage":
+                    assert rig.meshctl("trust", new, "base", "--replace", "--yes").code == 0
+                    break
+            rest, err = process.communicate()
+        ended = Ended(process.returncode, "".join(said) + rest, err)
+        assert ended.results == {"n001": "done"}, ended.out + ended.err
+        assert notes(ended) == FORGOT
+
+    def test_after_a_reboot_the_next_run_has_the_neighbour_forget_the_radio_once(self, rig: Rig) -> None:
+        boot = rig.fleet.node("n001").boot_id
+        waiting.until(lambda: max(known_for_s(rig), default=0) > SLACK_S + 2, "base to know the radio for a while")
+        rig.meshctl("run", rig.current, "n001", command=["reboot"])
+        waiting.until(lambda: rig.fleet.node("n001").boot_id != boot, "the node to boot")
+        rig.fleet.node("n001").wait_up(wait_s=120.0)
+        waiting.until(lambda: bool(known_for_s(rig)), "its radio to be heard again")
+        for told in (FORGOT, []):
+            ended = rig.meshctl("provision", rig.current, "--yes", "--json")
+            assert ended.results["n001"] == "unchanged", ended.out + ended.err
+            assert notes(ended) == told
+
+    def test_a_radio_that_started_anew_while_nobody_looked_is_made_up_for(self, rig: Rig) -> None:
+        old, new = rig.current, {"a": "b", "b": "a"}[rig.current]
+        boot = rig.fleet.node("n001").boot_id
+        waiting.until(lambda: max(known_for_s(rig), default=0) > SLACK_S + 2, "base to know the radio for a while")
+        with rig.start("provision", new, "n001", "--yes", "--json") as process:
+            assert process.stdout is not None
+            for line in process.stdout:
+                if json.loads(line).get("text") == "prove":
+                    process.send_signal(signal.SIGKILL)
+                    break
+        rig.fleet.break_("n001", "power-cut")
+        waiting.until(lambda: rig.fleet.node("n001").boot_id != boot, "the node to boot")
+        rig.fleet.node("n001").wait_up(wait_s=120.0)
+        waiting.until(lambda: bool(known_for_s(rig)), "its radio to be heard again")
+        ended = rig.meshctl("provision", old, "n001", "--yes", "--json")
+        assert ended.results == {"n001": "unchanged"}, ended.out + ended.err
+        assert notes(ended) == FORGOT
+        again = rig.meshctl("provision", old, "n001", "--yes", "--json")
+        assert (again.results, notes(again)) == ({"n001": "unchanged"}, [])

@@ -1,0 +1,31 @@
+"""What a script is told of a run by its exit code."""
+
+from __future__ import annotations
+
+import pytest
+
+from meshctl.cli.context import exit_for
+from meshctl.errors import ExitCode
+from meshctl.fleet import Interrupt, Outcome, Result
+
+
+@pytest.mark.parametrize(
+    ("results", "code"),
+    [
+        ((), ExitCode.OK),
+        ((Result.DONE, Result.UNCHANGED), ExitCode.OK),
+        ((Result.DONE, Result.UNREACHABLE), ExitCode.UNREACHABLE),
+        ((Result.REFUSED,), ExitCode.FINDINGS),
+        ((Result.FAILED, Result.UNREACHABLE), ExitCode.FINDINGS),
+    ],
+)
+def test_only_silence_is_unreachable_and_everything_else_that_is_not_well_is_to_act_on(
+    results: tuple[Result, ...], code: ExitCode
+) -> None:
+    assert exit_for([Outcome("b03", result) for result in results], Interrupt()) is code
+
+
+def test_an_interrupted_run_says_so_whatever_came_of_it() -> None:
+    interrupt = Interrupt()
+    interrupt.request()
+    assert exit_for([Outcome("b03", Result.FAILED)], interrupt) is ExitCode.INTERRUPTED

@@ -1,0 +1,46 @@
+"""Connections that are kept are closed together, and what they lead through after them."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+from meshctl.device.ssh import SshConnection
+from meshctl.device.trust import TrustStore
+from meshctl.inventory import load_fleet
+from meshctl.nodes.connections import Access
+
+ROOT = Path(__file__).resolve().parents[3]
+PATIENCE_S = 60.0
+
+
+class Kept(SshConnection):
+    """One whose closing waits until others close, too."""
+
+    def __init__(self, name: str, others: threading.Barrier, closed: list[str]) -> None:
+        self._name = name
+        self._others = others
+        self._closed = closed
+
+    @property
+    def is_open(self) -> bool:
+        return self._name not in self._closed
+
+    def close(self) -> None:
+        self._others.wait(PATIENCE_S)
+        self._closed.append(self._name)
+
+
+def test_kept_connections_are_closed_side_by_side_before_those_they_go_through(tmp_path: Path) -> None:
+    closed: list[str] = []
+    access = Access(load_fleet(ROOT / "inventory/lab"), TrustStore(tmp_path / "known_hosts"))
+    together = threading.Barrier(8)
+    for number in range(8):
+        access.keep(f"b{number}", Kept(f"b{number}", together, closed))
+    access._jumps["base"] = Kept("base", threading.Barrier(1), closed)
+    access.close()
+    assert closed[-1] == "base"
+    assert sorted(closed[:-1]) == [f"b{number}" for number in range(8)]
+    assert access.take("b0") is None
+    access.close()
+    assert len(closed) == 9

@@ -1,0 +1,73 @@
+"""Laws of what is told of a node that does not answer: what was last seen, and who of the others hears it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from meshctl.device.observation import MeshNeighbour, Observation, Originator, Station
+from meshctl.fleet.journal import LastKnown
+from meshctl.nodes.last_seen import Whereabouts, whereabouts
+from tests.meshctl.plan.support import fleet, running
+
+LOST = "02:00:00:00:01:03"
+KNOWN = {
+    "b03": LastKnown(
+        "b03", 10_000.0, {"macs": LOST, "uptime_s": "7300", "version": "23.05.5", "revision": "r24106-10cc5fcd00"}
+    )
+}
+NOW_S = 10_095.0
+
+
+def hears(name: str, age_ms: int, **changes: Any) -> Observation:
+    seen = running(fleet(), name, neighbours=())
+    return replace(seen, neighbours=(MeshNeighbour(LOST.upper(), "mesh0", age_ms),), **changes)
+
+
+def of(**observations: Observation) -> Whereabouts:
+    return whereabouts(fleet(), ["b03"], observations, KNOWN)["b03"]
+
+
+def test_the_last_sighting_and_those_who_hear_it_are_told_the_latest_first() -> None:
+    stations = (Station("mesh0", LOST, signal_dbm=-61, inactive_ms=40),)
+    place = of(b01=hears("b01", 42_000), b02=hears("b02", 400, stations=stations), b04=running(fleet(), "b04"))
+    assert place.text(NOW_S) == (
+        "last seen 95 s ago (02:46:40 UTC), up 2 h then, 23.05.5, r24106-10cc5fcd00; "
+        "heard by b02 0.4 s ago (-61 dBm), b01 42 s ago"
+    )
+    assert place.facts == {"last_seen_s": "10000", "heard_by": "b02:400ms b01:42000ms", "asked": "3"}
+
+
+def test_where_no_neighbour_hears_it_a_way_that_somebody_knew_is_told() -> None:
+    far = replace(
+        running(fleet(), "base"), originators=(Originator(LOST, "02:00:00:00:01:00", "mesh0", 12_000, True, 90),)
+    )
+    assert (
+        of(base=far)
+        .text(NOW_S)
+        .endswith("; no neighbour that answers hears it; a way to it was known by base 12 s ago")
+    )
+
+
+def test_nobody_who_hears_it_is_told_with_the_number_of_those_asked() -> None:
+    assert (
+        of(b01=running(fleet(), "b01"), b02=running(fleet(), "b02"))
+        .text(NOW_S)
+        .endswith("; heard by none of the 2 nodes that answered")
+    )
+    assert of().text(NOW_S).endswith("; no other node could be asked")
+
+
+def test_what_batman_has_long_forgotten_does_not_count() -> None:
+    assert of(b01=hears("b01", 200_001)).heard == ()
+
+
+def test_a_node_never_seen_is_told_as_such_and_an_old_sighting_with_its_day() -> None:
+    assert whereabouts(fleet(), ["b04"], {}, {})["b04"].text(NOW_S) == (
+        "never seen before; no other node could be asked"
+    )
+    assert "last seen 3 d ago (1970-01-01 02:46 UTC)" in of().text(10_000.0 + 3 * 86400)
+
+
+def test_what_the_lost_node_itself_told_earlier_is_no_witness() -> None:
+    assert of(b03=hears("b03", 10)).asked == 0

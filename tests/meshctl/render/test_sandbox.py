@@ -1,0 +1,128 @@
+"""Templates that come with an inventory are bounded in time, memory, output and where they are read from."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from meshctl.diagnostics import InvalidInput
+from meshctl.inventory.file_access import VARIABLE, Boundary
+from meshctl.model import OperatorParts
+from meshctl.render import sandbox
+from meshctl.render.node import render_node
+from meshctl.render.rendered import Rendered
+from meshctl.render.templates import Templates
+from meshctl.resources import shipped
+from tests.meshctl.render import fleets
+
+NAME = "husky1-front"
+# which of both comes first depends on the machine
+MEMORY = "MemoryError|more than 1 s of processor time"
+GOOD = "config system\n\toption hostname {{ intent.hostname | uci }}\n"
+
+
+def write(folder: Path, text: str, path: str = "common/etc/config/system.j2") -> Path:
+    template = folder / "templates" / path
+    template.parent.mkdir(parents=True, exist_ok=True)
+    template.write_text(text, encoding="utf-8")
+    return template
+
+
+def render(folder: Path, templates: Templates | None = None) -> Rendered:
+    return render_node(fleets.fleet(base=str(folder)), NAME, fleets.secrets, templates)
+
+
+def quick(folder: Path) -> Templates:
+    templates = Templates((folder / "templates", shipped("templates")))
+    templates._bounded = sandbox.Renderer(cpu_s=1, memory_bytes=512 << 20, wait_s=60)
+    return templates
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("config x {{ ('A' * 10**10) | uci }}\n", MEMORY),
+        ("config x {{ ('%9999999999d' % 1) | uci }}\n", "Error"),
+        ("config x {{ 'a'.center(10**10) | uci }}\n", MEMORY),
+        ("{% set n = namespace(x='ab') %}{% for i in range(99) %}{% set n.x = n.x ~ n.x %}{% endfor %}", MEMORY),
+        (
+            "{% for a in range(99999) %}{% for b in range(99999) %}{% for c in range(99999) %}"
+            "{% endfor %}{% endfor %}{% endfor %}",
+            "it does not end: it takes more than 1 s of processor time",
+        ),
+        ("config x {{ (9**(9**9)) | uci }}\n", "it does not end: it takes more than 1 s of processor time"),
+        ("{% for i in range(99999) %}{{ ('A' * 99) | uci }}{% endfor %}", "it renders"),
+    ],
+)
+def test_a_template_that_does_not_end_is_refused_with_its_name(tmp_path: Path, text: str, words: str) -> None:
+    source = write(tmp_path, text)
+    templates = quick(tmp_path)
+    with pytest.raises(InvalidInput) as caught:
+        render(tmp_path, templates)
+    (finding,) = caught.value.diagnostics
+    assert finding.position.file == str(source)
+    assert re.search(words, str(finding))
+    # and the others are rendered as if nothing had been
+    write(tmp_path / "other", GOOD)
+    others = quick(tmp_path / "other")
+    others._bounded = templates._bounded
+    assert render(tmp_path / "other", others).package("system")
+
+
+def test_shipped_templates_start_no_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("subprocess.Popen", None)
+    assert render(tmp_path)
+
+
+def test_a_rendering_process_that_cannot_start_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path, GOOD)
+    monkeypatch.setattr("sys.executable", "/bin/false")
+    with pytest.raises(InvalidInput, match="the process that renders it ended with status 1"):
+        render(tmp_path)
+
+
+def test_links_out_of_the_tree_pipes_and_folders_elsewhere_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet = tmp_path / "fleet"
+    secret = tmp_path / "token"
+    secret.write_text("HUNTER2\n", encoding="utf-8")
+    place = write(fleet, GOOD)
+    place.unlink()
+    place.symlink_to(secret)
+    with pytest.raises(InvalidInput, match="outside the inventory's tree") as caught:
+        render(fleet)
+    assert "HUNTER2" not in str(caught.value)
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    with pytest.raises(InvalidInput, match="no UCI"):
+        render(fleet)
+    monkeypatch.delenv(VARIABLE)
+    place.unlink()
+    os.mkfifo(place)
+    with pytest.raises(InvalidInput, match="a pipe, a socket or a device"):
+        render(fleet)
+    place.unlink()
+    write(fleet, "{% include 'common/etc/config/_part.j2' %}")
+    (place.parent / "_part.j2").symlink_to(secret)
+    with pytest.raises(InvalidInput, match="outside the inventory's tree"):
+        render(fleet)
+    elsewhere = tmp_path / "parts"
+    elsewhere.mkdir()
+    mesh = fleets.mesh(operator_parts=replace(OperatorParts(), templates="../parts", base=str(fleet)))
+    with pytest.raises(InvalidInput, match="outside the inventory's tree"):
+        render_node(fleets.fleet(meshes=(mesh,), base=str(fleet)), NAME, fleets.secrets)
+
+
+def test_the_tree_is_the_git_work_tree_without_git_s_own_files(tmp_path: Path) -> None:
+    (tmp_path / "repository/.git").mkdir(parents=True)
+    (tmp_path / "repository/fleets/a").mkdir(parents=True)
+    boundary = Boundary.of(tmp_path / "repository/fleets/a", {})
+    assert boundary.objection(tmp_path / "repository/common.yaml") == ""
+    assert "git" in boundary.objection(tmp_path / "repository/.git/config")
+    assert "outside" in boundary.objection(tmp_path / "other.yaml")
+    assert "outside" in Boundary.of(tmp_path / "plain", {}).objection(tmp_path / "repository/common.yaml")
+    assert boundary.objection(Path("/dev/zero")).startswith("outside")

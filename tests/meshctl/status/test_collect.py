@@ -1,0 +1,72 @@
+"""Everybody is asked at once, and what one does changes nothing for the others."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from meshctl.cli.live_screen import page
+from meshctl.errors import NodeError, Unreachable
+from meshctl.status.collect import side_by_side
+
+
+def refuse() -> object:
+    raise NodeError("no")
+
+
+def vanish() -> object:
+    raise Unreachable("nobody there")
+
+
+def test_answers_come_in_the_order_asked_and_errors_beside_them() -> None:
+    told: list[tuple[int, int]] = []
+    jobs = {"a": lambda: 1, "b": refuse, "c": vanish, "d": lambda: None}
+    found = side_by_side(jobs, 2, lambda done, count: told.append((done, count)))
+    assert list(found) == ["a", "b", "c", "d"]
+    assert (found["a"], found["d"]) == (1, None)
+    assert isinstance(found["b"], NodeError)
+    assert isinstance(found["c"], Unreachable)
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def test_a_bug_is_raised_to_the_caller() -> None:
+    with pytest.raises(ZeroDivisionError):
+        side_by_side({"a": lambda: 1 // 0}, 1)
+
+
+def test_nobody_to_ask_is_no_wait() -> None:
+    assert side_by_side({}, 8) == {}
+
+
+def test_the_silent_do_not_keep_others_from_being_asked() -> None:
+    """With one at a time, and everyone waiting for the last: only those asked beside the silent can let it end."""
+    barrier = threading.Barrier(12)
+    found = side_by_side(dict.fromkeys(range(12), barrier.wait), 1, patience_s=0.001)
+    assert sorted(str(place) for place in found.values()) == sorted(str(place) for place in range(12))
+
+
+def test_those_asked_at_once_are_no_more_than_allowed_while_answers_come() -> None:
+    running, most, lock = 0, 0, threading.Lock()
+
+    def work() -> None:
+        nonlocal running, most
+        with lock:
+            running += 1
+            most = max(most, running)
+        with lock:
+            running -= 1
+
+    side_by_side(dict.fromkeys(range(200), work), 4, patience_s=3600)
+    assert most <= 4
+
+
+@pytest.mark.parametrize("height", [1, 2, 5, 24])
+def test_a_page_has_no_more_lines_than_the_window(height: int) -> None:
+    lines = [f"line {number}" for number in range(10)]
+    drawn = page(lines, height)
+    assert drawn.count("\n") + 1 == min(height, 10)
+    if height < 10:
+        assert f"{10 - height + 1} more lines" in drawn
+    assert drawn.startswith("\x1b[H")
+    assert drawn.endswith("\x1b[K\x1b[J")

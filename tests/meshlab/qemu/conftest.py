@@ -1,0 +1,306 @@
+"""One machine of real radios for the tests of this folder, taken from factory state to a working mesh once; those of
+`crew` have one of their own, which is gone before this one starts.
+
+Tests that change the fleet leave it as the inventory says, whatever that is by then. QEMU is installed by
+scripts/setup-lab when it is missing: nothing here is skipped.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import pytest
+
+from meshctl.topology import with_alternates
+from meshlab.fleet import VirtualNode
+from meshlab.from_inventory import spec_of
+from meshlab.inventory_copy import prepare
+from meshlab.qemu import control
+from meshlab.qemu.fleet import RealFleet
+from meshlab.spec import FleetSpec
+from tests import waiting
+from tests.conftest import TRIED_AGAIN
+from tests.meshlab.fleet_report import report
+
+INVENTORY = Path(__file__).with_name("inventory")
+SETUP = Path(__file__).parents[3] / "scripts" / "setup-lab"
+# packages are fetched, then a machine under emulation boots, on a host with much else to do; at worst twice
+START_S = 900.0
+# a run of meshctl over several hops, each login of which is emulated, that ends with a window of ten minutes
+COMMAND_S = 900.0
+_TRIES = 3
+# six emulated nodes that started at once took up to 200 s on two processors with twenty other programs at work
+WAIT_S = 600.0
+NODES = ("base", "b01", "b02", "husky-front", "husky-rear")
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """One finished run of meshctl."""
+
+    status: int
+    text: str
+    errors: str
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.text)
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.text.splitlines() if line.startswith("{")]
+
+
+@dataclass(frozen=True, slots=True)
+class Lab:
+    """The running fleet, and the copy of the inventory that belongs to it. `NODES`: those of its mesh, base first."""
+
+    NODES: ClassVar[tuple[str, ...]] = NODES
+
+    fleet: RealFleet
+    inventory: Path
+    state: Path
+
+    def meshctl(
+        self, *words: str, expect: int | None = 0, when_told: tuple[str, Callable[[], None]] | None = None
+    ) -> Done:
+        """Run meshctl as an operator does, in a process of its own; `expect` None: any exit code.
+
+        `when_told`: a text, and what is done as soon as meshctl has said it.
+        """
+        environment = {
+            **os.environ,
+            "MESHCTL_LAB": str(self.fleet.directory),
+            "MESHCTL_INVENTORY": str(self.inventory),
+            "XDG_STATE_HOME": str(self.state),
+            "COLUMNS": "200",
+        }
+        lines: list[str] = []
+        with (
+            tempfile.TemporaryFile("w+") as complaints,
+            subprocess.Popen(
+                (sys.executable, "-m", "meshctl", *words),
+                env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=complaints, text=True,
+            ) as process,
+        ):  # fmt: skip
+            patience = threading.Timer(COMMAND_S, process.kill)
+            patience.start()
+            try:
+                assert process.stdout is not None
+                for line in process.stdout:
+                    lines.append(line)
+                    if when_told is not None and when_told[0] in line:
+                        when_told[1]()
+                        when_told = None
+                status = process.wait()
+            finally:
+                patience.cancel()
+                process.kill()
+            complaints.seek(0)
+            done = Done(status, "".join(lines), complaints.read())
+        assert expect is None or status == expect, f"meshctl {' '.join(words)}: {done.text}{done.errors}"
+        return done
+
+    def take_in(self) -> None:
+        """Take the mesh's nodes in on the bench and carry them into the field, where only the mesh leads to them.
+
+        On a starved host a node may not answer in time, or not begin; then an operator does it again.
+        """
+        left = set(self.NODES)
+        for _ in range(_TRIES):
+            done = self.meshctl("bootstrap", "--yes", "--json", *sorted(left), expect=None)
+            finished = [event for event in done.events if event["event"] == "finished"]
+            left -= {event["node"] for event in finished if event["outcome"]["result"] in ("done", "unchanged")}
+            if not left:
+                break
+        else:
+            raise AssertionError(f"meshctl bootstrap did not take in {sorted(left)} in {_TRIES} tries: {done.errors}")
+        for name in self.NODES[1:]:
+            self.node(name).plug(False)
+        self.settle()
+
+    def provision(self, *nodes: str) -> list[list[dict[str, Any]]]:
+        """Provision until all is as the inventory says; the events of each run.
+
+        On a starved host a connection may be given up, and the change is undone: then an operator does it again.
+        """
+        runs = []
+        for _ in range(_TRIES):
+            done = self.meshctl("provision", "--yes", "--json", *nodes, expect=None)
+            runs.append(done.events)
+            if done.status == 0:
+                return runs
+            self.settle()
+        raise AssertionError(f"meshctl provision did not succeed {_TRIES} times: {runs[-1]}")
+
+    def edit(self, old: str, new: str) -> None:
+        """Replace a text that the inventory holds once."""
+        file = self.inventory / "fleet.yaml"
+        text = file.read_text(encoding="utf-8")
+        assert text.count(old) == 1, f"{old!r} stands {text.count(old)} times in {file}"
+        file.write_text(text.replace(old, new), encoding="utf-8")
+
+    def node(self, name: str) -> VirtualNode:
+        return self.fleet.node(name)
+
+    def on(self, node: str, command: str) -> str:
+        """What a command on a node's console prints."""
+        return self.node(node).exec(command).check(f"{node}: {command}").stdout
+
+    def computer(self, robot: str, command: str) -> str:
+        """What a command on a robot's computer prints."""
+        done = control.run(self.fleet.directory, f"ip netns exec pc.{robot} {command}", timeout_s=120.0)
+        return done.check(f"{robot}'s computer: {command}").stdout
+
+    def answers(self, robot: str, address: str) -> bool:
+        """Whether a ping from a robot's computer is answered."""
+        words = f"ip netns exec pc.{robot} ping -c 1 -W 2 {address}"
+        return control.run(self.fleet.directory, words).exit_status == 0
+
+    def originators(self, node: str) -> dict[str, str]:
+        """The node's own batman-adv: each node it has a route to -> the next hop towards it."""
+        names = self.names()
+        known = json.loads(self.on(node, "batctl meshif bat0 originators_json"))
+        return {names[one["orig_address"]]: names[one["neigh_address"]] for one in known if one.get("best")}
+
+    def neighbours(self, node: str) -> set[str]:
+        """Whom the node's own batman-adv has heard within the last seconds."""
+        names = self.names()
+        known = json.loads(self.on(node, "batctl meshif bat0 neighbors_json"))
+        return {names[one["neigh_address"]] for one in known if one["last_seen_msecs"] < 5000}
+
+    def hops(self) -> dict[str, int]:
+        """How many hops each node is from the base, along the next hops that the kernels would take now."""
+        others = self.NODES[1:]
+        towards = {name: self.originators(name).get("base", "") for name in others}
+        found = {"base": 0}
+        for name in others:
+            at, count = name, 0
+            while at != "base" and count <= len(others):
+                at, count = towards.get(at, "base"), count + 1
+            found[name] = count
+        return found
+
+    def names(self) -> dict[str, str]:
+        """The MAC addresses of each node's radio, the board's and its alternates -> its name."""
+        return with_alternates({radio.mac: node.name for node in self.fleet.spec.nodes for radio in node.radios})
+
+    def settle(self) -> None:
+        """Wait until every node is up and the base's batman-adv has a route to every other one."""
+        others = set(self.NODES[1:])
+        until(lambda: all(self.node(name).is_up() for name in self.NODES), "every node to boot")
+        until(lambda: self.originators("base").keys() >= others, "routes from the base to every node")
+        try:
+            until(lambda: self.answers("base-station", "10.42.0.10"), "the Husky's computer to answer")
+        except AssertionError as error:
+            raise AssertionError(f"{error}\n{self.tables()}") from error
+
+    def tables(self) -> str:
+        """What the kernel of each node knows of the others: for whoever has to find out why a mesh carries nothing."""
+        names = self.names()
+        told = []
+        for name in self.NODES:
+            text = self.node(name).exec(_TABLES).stdout
+            for mac, owner in names.items():
+                text = text.replace(mac, owner)
+            told.append(f"--- {name}\n{text}")
+        told.append("--- switches and computers\n" + control.run(self.fleet.directory, _LANS).stdout)
+        return "\n".join(told)
+
+
+L = TypeVar("L", bound=Lab)
+
+_TABLES = """
+batctl meshif bat0 originators -H
+batctl meshif bat0 transglobal -H
+batctl meshif bat0 gwl -H 2>/dev/null
+batctl meshif bat0 claimtable -H 2>/dev/null
+batctl meshif bat0 backbonetable -H 2>/dev/null
+for dev in $(iw dev | sed -n 's/^.*Interface //p'); do
+    iw dev $dev station dump | grep -E 'Station|time:|bytes|packets|failed'
+done
+ip neigh
+bridge fdb show br br-lan 2>/dev/null | grep -v permanent
+uptime
+"""
+
+
+_LANS = """
+bridge fdb show | grep -v permanent
+for space in $(ip netns list | cut -d ' ' -f 1); do
+    echo "$space"
+    ip -n "$space" neigh
+    ip -n "$space" -s link show dev eth0
+done
+"""
+
+
+def until(condition: Callable[[], bool], what: str) -> None:
+    """`waiting.until`, as long and as seldom as befits machines that QEMU emulates."""
+    waiting.until(condition, what, wait_s=WAIT_S, look_s=0.2)
+
+
+@contextmanager
+def fielded(kind: type[L], inventory: Path, place: Path, *, before: Callable[[L], None] | None = None) -> Iterator[L]:
+    """Nodes fresh from their boxes, taken into the fleet on the bench and carried into the field: only the mesh leads
+    there. A mesh that does not come about is made once more in a new machine, and the reason told at the end.
+    """
+    set_up_host()
+    for turn in ("lab", "again"):
+        copy = prepare(inventory, place / turn)
+        fleet = RealFleet(_quick(spec_of(copy.fleet, links=copy.links)), place / turn)
+        try:
+            fleet.up(wait_s=START_S)
+            made = kind(fleet, copy.inventory, place / f"state-{turn}")
+            if before is not None:
+                before(made)
+            try:
+                made.take_in()
+            except AssertionError as error:
+                # here, because the fleet is down when the fixture has failed
+                error.add_note(report(fleet, str(error)))
+                if turn == "again":
+                    raise
+                _tried_again.append("\n".join((str(error), *error.__notes__)))
+                continue
+            yield made
+            return
+        finally:
+            fleet.down()
+
+
+def _quick(spec: FleetSpec) -> FleetSpec:
+    """With one kind of host key: to make an RSA key takes an emulated node three to five seconds of a processor."""
+    return replace(spec, nodes=tuple(replace(node, host_key_types=("ed25519",)) for node in spec.nodes))
+
+
+# why a machine was made once more, until a test's report can carry it
+_tried_again: list[str] = []
+
+
+@pytest.fixture(autouse=True)
+def why_once_more(record_property: Callable[[str, object], None]) -> None:
+    while _tried_again:
+        record_property(TRIED_AGAIN, _tried_again.pop())
+
+
+@pytest.fixture(scope="package")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    """Five nodes of one mesh, three hops long."""
+    with fielded(Lab, INVENTORY, tmp_path_factory.mktemp("real")) as made:
+        yield made
+
+
+def set_up_host() -> None:
+    """QEMU and what apt needs; there already, as a rule."""
+    subprocess.run((SETUP,), check=True, timeout=START_S)

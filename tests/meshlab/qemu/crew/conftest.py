@@ -1,0 +1,47 @@
+"""A second machine of real radios: everything encrypted, a robot whose node has two radios, a spare in its box."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.meshlab.qemu.conftest import Lab, fielded
+
+INVENTORY = Path(__file__).with_name("inventory")
+FIELDED = ("base", "b01", "b02", "husky")
+KEYS = {"main": "a word that all of them know", "fast": "and another one for five gigahertz"}
+
+
+@dataclass(frozen=True, slots=True)
+class Crew(Lab):
+    """The running fleet; `spare` stays on its bench, fresh from the box."""
+
+    NODES = FIELDED
+
+    def write_keys(self, **keys: str) -> None:
+        """What the meshes' keys are from now on; a node has them once it is provisioned."""
+        lines = "".join(f"{mesh}: {key}\n" for mesh, key in {**KEYS, **keys}.items())
+        (self.inventory.parent / "keys.yaml").write_text(lines, encoding="utf-8")
+
+    def stations(self, name: str, interface: str) -> dict[str, bool]:
+        """Whom a radio of the node knows, and whether each has proven that it knows the key."""
+        names = self.names()
+        told: dict[str, bool] = {}
+        mac = ""
+        for line in self.on(name, f"iw dev {interface} station dump").splitlines():
+            words = line.split()
+            if line.startswith("Station"):
+                mac = words[1]
+            elif words[0] == "authorized:":
+                told[names[mac]] = words[1] == "yes"
+        return told
+
+
+@pytest.fixture(scope="package")
+def crew(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Crew]:
+    """The fielded nodes taken in on the bench and carried out: only the mesh leads to them."""
+    with fielded(Crew, INVENTORY, tmp_path_factory.mktemp("crew"), before=Crew.write_keys) as made:
+        yield made

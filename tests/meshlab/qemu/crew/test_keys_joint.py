@@ -1,0 +1,58 @@
+"""New keys over the very meshes they are for: of 802.11s with SAE alone, and of both meshes of a team at one moment."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+
+from tests.meshlab.qemu.conftest import until
+from tests.meshlab.qemu.crew.conftest import FIELDED, Crew
+from tests.meshlab.qemu.crew.test_encrypted import TWINS, all_are_let_in, heard_over, keys
+
+pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
+
+
+def results(events: Iterable[dict[str, Any]]) -> dict[str, str]:
+    return {event["node"]: event["outcome"]["result"] for event in events if event["event"] == "finished"}
+
+
+def works(crew: Crew) -> bool:
+    """Whether every radio is known to its neighbours with a proven key, and unicast passes each of them."""
+    both = all(heard_over(crew, name)["mesh1"] == {other} for name, other in zip(TWINS, TWINS[::-1], strict=True))
+    return both and all_are_let_in(crew) and crew.answers("base-station", "10.42.0.10")
+
+
+def switches(crew: Crew) -> list[list[str]]:
+    """The nodes of each switch that meshctl would make now."""
+    plan = crew.fleet.directory / "plan.json"
+    crew.meshctl("plan", "--out", str(plan), *FIELDED)
+    stages = json.loads(plan.read_text(encoding="utf-8"))["stages"]
+    return [sorted(stage["nodes"]) for stage in stages if stage["kind"] == "switch"]
+
+
+def test_the_key_of_a_mesh_with_sae_changes_alone_and_the_other_mesh_is_left_as_it_was(crew: Crew) -> None:
+    (main,) = keys(crew)["main"]
+    crew.write_keys(main=main, fast="a new word for five gigahertz")
+    assert switches(crew) == [sorted(TWINS)]
+    ended = results(crew.provision(*FIELDED)[-1])
+    assert {ended[name] for name in TWINS} <= {"done", "unchanged"}
+    assert {name: ended[name] for name in FIELDED if name not in TWINS} == {"base": "unchanged", "b01": "unchanged"}
+    assert keys(crew) == {"main": {main}, "fast": {"a new word for five gigahertz"}}
+    crew.settle()
+    until(lambda: works(crew), "both radios of both nodes to know each other with the new key")
+
+
+def test_both_meshes_take_new_keys_at_one_moment(crew: Crew) -> None:
+    crew.write_keys(main="new for all of them", fast="new for the fast ones, too")
+    # the two meshes share the nodes with two radios, whose files change at once: so there is one switch
+    assert switches(crew) == [sorted(FIELDED)]
+    ended = results(crew.provision(*FIELDED)[-1])
+    assert set(ended) == set(FIELDED)
+    assert set(ended.values()) <= {"done", "unchanged"}
+    assert keys(crew) == {"main": {"new for all of them"}, "fast": {"new for the fast ones, too"}}
+    crew.settle()
+    until(lambda: works(crew), "every neighbour to be authorized with the new keys")
+    until(lambda: crew.meshctl("provision", "--check", *FIELDED, expect=None).status == 0, "nothing left to change")

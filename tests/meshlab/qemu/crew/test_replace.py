@@ -1,0 +1,30 @@
+"""A beacon is dead, and a device fresh from its box takes its name and its place in the mesh."""
+
+from __future__ import annotations
+
+import pytest
+
+from meshctl.inventory import load_fleet
+from tests.meshlab.qemu.conftest import until
+from tests.meshlab.qemu.crew.conftest import Crew
+
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
+
+
+def test_a_factory_fresh_device_takes_over_a_dead_beacons_name_and_place(crew: Crew) -> None:
+    assert crew.originators("base")["husky"] == "b01"
+    place = crew.node("spare").bench
+    alive = crew.meshctl("replace", "b01", "spare", "--at", f"{place.host}:{place.port}", "--yes", expect=None)
+    assert "still answers" in alive.errors
+    crew.fleet.break_("b01", "off")
+    done = crew.meshctl("replace", "b01", "spare", "--at", f"{place.host}:{place.port}", "--yes", "--json")
+    assert {event["outcome"]["result"] for event in done.events if event["event"] == "finished"} == {"done"}
+    crew.node("spare").plug(False)
+    # the new device is where the old one was, with all that the mesh has to be told to let it in
+    until(lambda: crew.originators("base").get("husky") == "spare", "the way over the new device")
+    until(lambda: crew.answers("base-station", "10.42.0.10"), "the Husky's computer to answer")
+    assert crew.on("spare", "uci get system.@system[0].hostname").strip() == "b01"
+    assert crew.node("spare").address == "10.42.0.101"
+    fleet = load_fleet(crew.inventory)
+    assert (fleet.nodes["b01"].label, fleet.nodes["spare"].state.value) == ("S1", "retired")
+    until(lambda: crew.meshctl("provision", "b01", "--check", expect=None).status == 0, "nothing left to change")

@@ -1,0 +1,67 @@
+"""Where the machine's packages come from, on hosts of other distributions."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from meshlab.errors import LabError
+from meshlab.qemu import apt, debian_packages
+
+BOOKWORM = 'PRETTY_NAME="Debian GNU/Linux 12 (bookworm)"\nVERSION_CODENAME=bookworm\n'
+NOBLE = 'PRETTY_NAME="Ubuntu 24.04.1 LTS"\nVERSION_CODENAME=noble\nUBUNTU_CODENAME=noble\n'
+
+
+def release(tmp_path: Path, text: str) -> Path:
+    file = tmp_path / "os-release"
+    file.write_text(text)
+    return file
+
+
+def test_bookworm_has_the_machines_packages_in_its_own_sources(tmp_path: Path) -> None:
+    assert debian_packages.sources(tmp_path / "cache", {}, release(tmp_path, BOOKWORM)) == {}
+
+
+def test_another_distribution_gets_a_list_of_bookworms_packages_and_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(debian_packages, "KEYRING", release(tmp_path, NOBLE))
+    options = debian_packages.sources(tmp_path / "cache", {}, release(tmp_path, NOBLE))
+    listed = Path(options["Dir::Etc::sourcelist"]).read_text()
+    assert listed == f"deb [arch=amd64 signed-by={debian_packages.KEYRING}] {debian_packages.MIRROR} bookworm main\n"
+    assert options["Dir::Etc::sourceparts"] == "-"
+    # apt itself reads the options as they are meant
+    (tmp_path / "work").mkdir()
+    shown = apt.Apt(tmp_path / "work", options).get(tmp_path, "-qq", "indextargets", "--format", "$(METAKEY)")
+    assert {line.split("/")[0] for line in shown.splitlines()} <= {"main"}
+
+
+def test_another_mirror_is_taken_where_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(debian_packages, "KEYRING", release(tmp_path, NOBLE))
+    options = debian_packages.sources(
+        tmp_path / "cache",
+        {debian_packages.MIRROR_VARIABLE: "http://mirror.example/debian"},
+        release(tmp_path, BOOKWORM),
+    )
+    assert "http://mirror.example/debian bookworm main" in Path(options["Dir::Etc::sourcelist"]).read_text()
+
+
+def test_what_apt_cannot_verify_is_refused_with_the_way_to_mend_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(debian_packages, "KEYRING", tmp_path / "nothing")
+    with pytest.raises(LabError, match=r"Ubuntu 24\.04\.1 LTS has no .*nothing") as caught:
+        debian_packages.sources(tmp_path / "cache", {}, release(tmp_path, NOBLE))
+    assert "setup-lab" in caught.value.hint
+
+
+def test_setup_says_what_it_cannot_do_without_apt(tmp_path: Path) -> None:
+    script = Path(__file__).parents[3] / "scripts" / "setup-lab"
+    shell = shutil.which("sh")
+    assert shell is not None
+    done = subprocess.run((shell, script), env={"PATH": str(tmp_path)}, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "expected Debian or Ubuntu, found no apt-get" in done.stderr

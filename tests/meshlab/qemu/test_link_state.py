@@ -1,0 +1,42 @@
+"""The air of real radios, where it meets a node that is not ready for what is done to it."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+from meshlab.errors import LabError
+from meshlab.qemu import hwsim_devices
+from meshlab.qemu.link_state import RealEther
+from meshlab.spec import FleetSpec, NodeSpec
+from meshlab.state import NodeState, Power
+from meshlab.supervisor import Supervisor
+
+
+def test_a_cable_that_could_not_be_laid_is_laid_again_without_another_change(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = FleetSpec("x", (NodeSpec("b01"),))
+    state = NodeState(spec.nodes[0], 0, tmp_path_factory.mktemp("b01"), plugged=True, power=Power.UP, pid=7, boots=1)
+    tries: list[str] = []
+
+    async def run() -> None:
+        is_laid = asyncio.Event()
+
+        def lay_cable(place: hwsim_devices.Place, *_: object, on_bench: bool) -> None:
+            tries.append(place.name)
+            if len(tries) == 1:
+                raise LabError("ip link set cable0: Cannot find device")
+            is_laid.set()
+
+        monkeypatch.setattr(hwsim_devices, "lay_cable", lay_cable)
+        monkeypatch.setattr(hwsim_devices, "set_group", lambda *_: None)
+        fleet = SimpleNamespace(spec=spec, nodes={"b01": state}, doors=SimpleNamespace(refresh=lambda: None))
+        RealEther(cast(Supervisor, fleet), hwsim_devices.places(spec)).changed()
+        await asyncio.wait_for(is_laid.wait(), 60)
+
+    asyncio.run(run())
+    assert tries == ["b01", "b01"]

@@ -1,0 +1,142 @@
+"""From factory state to a working mesh of the kernel's own radios, and changes carried over that mesh itself."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from meshlab.qemu import control
+from tests.meshlab.qemu.conftest import NODES, Lab, until
+
+# the machine's start, its image's packages and the whole fleet's provisioning fall into the first test
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
+
+# numbers sent as broadcasts from the base's computer, and those that arrive at the Husky's, in the order of arrival
+_BROADCAST = """
+cat >/tmp/listen.py <<'END'
+import socket
+s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+s.bind(("", 9999))
+s.settimeout(4)
+try:
+    while True:
+        print(s.recv(100).decode())
+except TimeoutError:
+    pass
+END
+cat >/tmp/shout.py <<'END'
+import socket, time
+s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+s.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+for n in range(20):
+    s.sendto(str(n).encode(), ("10.42.0.255", 9999))
+    time.sleep(0.02)
+END
+ip netns exec pc.husky python3 /tmp/listen.py >/tmp/heard &
+until grep -q :270F /proc/$!/net/udp; do sleep 0.1; done
+ip netns exec pc.base-station python3 /tmp/shout.py
+wait
+cat /tmp/heard
+"""
+
+
+def test_what_was_provisioned_is_a_mesh_of_three_hops_with_lans_behind_it(lab: Lab) -> None:
+    # the kernel's own routes: each hop only hears the next
+    assert lab.originators("base") == {"b01": "b01", "b02": "b01", "husky-front": "b01", "husky-rear": "b01"}
+    assert lab.originators("b01")["husky-front"] == "b02"
+    assert lab.neighbours("b02") == {"b01", "husky-front", "husky-rear"}
+    # node to node over three hops, and computer to computer behind them
+    until(lambda: "2 packets received" in lab.on("base", "ping -c 2 -W 5 10.42.0.11 || true"), "three hops")
+    assert lab.answers("husky", "10.42.0.2")
+
+
+def test_the_rendered_files_are_what_configured_the_radios(lab: Lab) -> None:
+    for name in NODES:
+        info = lab.on(name, "iw dev mesh0 info; iw dev mesh0 link; cat /sys/class/net/mesh0/mtu")
+        channel = lab.on(name, "uci get wireless.radio0.channel").strip()
+        assert f"channel {channel} (" in info
+        assert f"ssid {lab.on(name, 'uci get wireless.mesh0.ssid').strip()}" in info
+        assert f"Joined IBSS {lab.on(name, 'uci get wireless.mesh0.bssid').strip()} (on mesh0)" in info
+        assert info.splitlines()[-1] == lab.on(name, "uci get network.mesh0.mtu").strip()
+        mesh = json.loads(lab.on(name, "batctl meshif bat0 mesh_json"))
+        assert mesh["orig_interval"] == int(lab.on(name, "uci get network.bat0.orig_interval"))
+        assert mesh["algo_name"] == lab.on(name, "uci get network.bat0.routing_algo").strip()
+        assert mesh["bridge_loop_avoidance_enabled"] is True
+
+
+def test_two_radios_on_one_switch_pass_a_broadcast_once_and_make_no_storm(lab: Lab) -> None:
+    def arrived_once() -> bool:
+        heard = control.run(lab.fleet.directory, _BROADCAST).check("broadcast").stdout
+        return heard.split() == [str(number) for number in range(20)]
+
+    # loop avoidance may hold broadcasts for half a minute
+    until(arrived_once, "20 broadcasts to come through once each")
+    frames = "cat /sys/class/net/eth0/statistics/rx_packets"
+    before = int(lab.computer("husky", frames))
+    lab.computer("husky", "sleep 5")
+    # what passes the switch while nobody speaks: the loop avoidance's claims, a few neighbour solicitations
+    assert int(lab.computer("husky", frames)) - before < 200
+
+
+def test_topology_says_what_the_kernels_tables_say(lab: Lab) -> None:
+    drawn = _topology_of_one_moment(lab)
+    linked: dict[str, set[str]] = {name: set() for name in NODES}
+    for link in drawn["links"]:
+        linked[link["a"]].add(link["b"])
+        linked[link["b"]].add(link["a"])
+    assert linked == {name: lab.neighbours(name) for name in NODES}
+    cuts_off = {node["name"]: set(node["cuts_off"]) for node in drawn["nodes"]}
+    assert cuts_off["b01"] == {"b02", "husky-front", "husky-rear"}
+    assert cuts_off["b02"] == {"husky-front", "husky-rear"}
+    assert cuts_off["husky-front"] == cuts_off["husky-rear"] == set()
+
+
+def _topology_of_one_moment(lab: Lab) -> Any:
+    """What meshctl draws; each node's hops are those of the kernels' routes just before or just after."""
+    drawn: Any = None
+
+    def agrees() -> bool:
+        nonlocal drawn
+        before = lab.hops()
+        drawn = lab.meshctl("topology", "--json").json
+        after = lab.hops()
+        told = {node["name"]: node["hops"] for node in drawn["nodes"]}
+        return all(told.get(name) in (before[name], after[name]) for name in NODES)
+
+    until(agrees, "the drawn hops to be those of the kernels' routes")
+    return drawn
+
+
+def test_status_says_what_the_radios_hear(lab: Lab) -> None:
+    names = lab.names()
+
+    def agrees() -> bool:
+        told = lab.meshctl("status", "--json", "--timeout", "30", expect=None).json["nodes"]
+        nodes = {node["name"]: node for node in told if node["answers"]}
+        return nodes.keys() == set(NODES) and all(
+            {neighbour["name"] for neighbour in node["neighbours"]} == heard(name) for name, node in nodes.items()
+        )
+
+    def heard(name: str) -> set[str]:
+        stations = lab.on(name, "iw dev mesh0 station dump")
+        return {names[line.split()[1]] for line in stations.splitlines() if line.startswith("Station")}
+
+    until(agrees, "the told neighbours to be the stations that the kernels know")
+
+
+def test_a_link_loses_what_it_is_told_to_lose_and_is_cut_at_once(lab: Lab) -> None:
+    def quality() -> int:
+        known = json.loads(lab.on("b01", "batctl meshif bat0 originators_json"))
+        names = lab.names()
+        return next((one["tq"] for one in known if one.get("best") and names[one["orig_address"]] == "base"), 0)
+
+    until(lambda: quality() > 230, "the link's full quality")
+    lab.meshctl("lab", "link", "base", "b01", "--loss", "0.4")
+    until(lambda: quality() < 190, "losses to show in batman-adv's quality")
+    lab.meshctl("lab", "link", "base", "b01", "--down")
+    until(lambda: "base" not in lab.neighbours("b01"), "the link to be gone")
+    lab.meshctl("lab", "mend", "base-b01")
+    lab.settle()
+    until(lambda: quality() > 230, "the link's full quality again")

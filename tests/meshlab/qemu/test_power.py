@@ -1,0 +1,36 @@
+"""Nodes of real radios that lose their power: radios and cables are theirs again, whatever else is left of them."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from meshlab.qemu import control
+from tests.meshlab.power_cycles import cycle
+from tests.meshlab.qemu.conftest import WAIT_S, Lab
+
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
+
+
+def test_a_node_comes_back_while_something_keeps_its_old_network(lab: Lab) -> None:
+    """A connection that waits for its next farewell keeps the network of a dead node for up to two minutes."""
+    (pid,) = (node["pid"] for node in lab.fleet.status()["nodes"] if node["name"] == "b02")
+    keep = f"sleep 1000 </proc/{pid}/ns/net >/dev/null 2>&1 & echo $!"
+    keeper = control.run(lab.fleet.directory, keep).check("keep the network").stdout.strip()
+    try:
+        # it is given up only when it has not booted in time
+        lab.node("b02").power_cut(wait_s=WAIT_S)
+        assert lab.node("b02").is_up()
+        kept = control.run(lab.fleet.directory, f"readlink /proc/{keeper}/fd/0").check("it is still kept").stdout
+        assert kept.startswith("net:")
+    finally:
+        control.run(lab.fleet.directory, f"kill {keeper}")
+    lab.settle()
+
+
+@pytest.mark.proof
+@pytest.mark.timeout(7200)
+def test_every_node_of_a_machine_comes_back_two_hundred_times(lab: Lab) -> None:
+    cycle(lab.fleet, lab.NODES, 200, random.Random(1), wait_s=WAIT_S)
+    lab.settle()

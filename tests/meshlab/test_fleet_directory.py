@@ -1,0 +1,204 @@
+"""`meshctl lab up` replaces what a lab left, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import threading
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from meshctl.cli.main import build
+from meshctl.errors import ExitCode, InputError
+from meshctl.fleet.lab_directory import INVENTORY, MARK, lab_of
+from meshctl.inventory import load_fleet
+from meshctl.resources import shipped
+from meshlab import fleet_directory
+from meshlab.control import address_of
+from meshlab.errors import LabError
+from meshlab.inventory_copy import prepare
+
+EXAMPLE = shipped("inventory") / "lab"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    """A project of the user's, with an inventory and folders that are called like the lab's."""
+    project = tmp_path / "project"
+    shutil.copytree(EXAMPLE, project / "inventory")
+    for name in ("rom", "nodes", "mnt", "log"):
+        (project / name).mkdir()
+        (project / name / "work.txt").write_text("weeks of work\n", encoding="utf-8")
+    return project
+
+
+def test_a_directory_with_other_files_is_refused_and_left_as_it_is(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = contents(mine)
+    monkeypatch.chdir(mine)
+    for arguments in (["inventory", "--dir", "."], [".", "--dir", "."], [str(EXAMPLE), "--dir", str(mine)]):
+        result = CliRunner().invoke(build("lab"), ["lab", "up", *arguments])
+        assert result.exit_code == ExitCode.COULD_NOT_RUN, result.output
+        assert contents(mine) == before
+    with pytest.raises(LabError, match="expected a directory that `meshctl lab up` made"):
+        prepare(mine / "inventory", mine)
+
+
+def test_the_inventory_s_own_directory_is_refused(tmp_path: Path) -> None:
+    project = tmp_path / "project"
+    shutil.copytree(EXAMPLE, project)
+    before = contents(project)
+    with pytest.raises(LabError, match="found other files"):
+        prepare(project, project)
+    (project / MARK).write_text("", encoding="utf-8")
+    with pytest.raises(InputError, match="expected an inventory outside --dir"):
+        prepare(project, project)
+    (project / MARK).unlink()
+    assert contents(project) == before
+
+
+def test_a_directory_in_which_a_fleet_runs_keeps_everything(tmp_path: Path) -> None:
+    prepare(EXAMPLE, tmp_path)
+    (tmp_path / "inventory" / "firmware.bin").write_bytes(b"image")
+    (tmp_path / "inventory" / "known_hosts").write_text("b01 ssh-ed25519 AAAA\n", encoding="utf-8")
+    before = contents(tmp_path)
+    folder = os.open(tmp_path, os.O_RDONLY | os.O_DIRECTORY)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as supervisor:
+        supervisor.bind(address_of(tmp_path, folder))
+        supervisor.listen(1)
+
+        def answer() -> None:
+            connection, _ = supervisor.accept()
+            with connection:
+                connection.recv(1000)
+                connection.send(json.dumps({"fleet": "x"}).encode())
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with pytest.raises(LabError, match=r"runs in .* already"):
+            prepare(EXAMPLE, tmp_path)
+        thread.join()
+    os.close(folder)
+    assert contents(tmp_path) == before
+
+
+def test_a_copy_that_was_edited_is_kept_beside_the_new_one(tmp_path: Path) -> None:
+    first = prepare(EXAMPLE, tmp_path)
+    assert first.kept is None
+    again = prepare(EXAMPLE, tmp_path)
+    assert again.kept is None, "nothing was edited"
+    edited = tmp_path / "inventory" / "fleet.yaml"
+    edited.write_text(edited.read_text(encoding="utf-8") + "# my notes\n", encoding="utf-8")
+    third = prepare(EXAMPLE, tmp_path)
+    assert third.kept is not None
+    assert (third.kept / "fleet.yaml").read_text(encoding="utf-8").endswith("# my notes\n")
+    assert "# my notes" not in edited.read_text(encoding="utf-8")
+
+
+def test_a_fleet_can_start_again_from_its_own_edited_copy(tmp_path: Path) -> None:
+    copy = prepare(EXAMPLE, tmp_path)
+    edited = copy.inventory / "fleet.yaml"
+    edited.write_text(edited.read_text(encoding="utf-8") + "# my notes\n", encoding="utf-8")
+    (copy.inventory / "known_hosts").write_text("of nodes that are gone\n", encoding="utf-8")
+    again = prepare(copy.inventory, tmp_path)
+    assert edited.read_text(encoding="utf-8").endswith("# my notes\n")
+    assert not (copy.inventory / "known_hosts").exists()
+    assert again.fleet.operators.ssh_keys == copy.fleet.operators.ssh_keys, "the lab's key is there once"
+
+
+def test_a_lab_may_lie_inside_its_inventory_s_directory(tmp_path: Path) -> None:
+    project = tmp_path / "project"
+    shutil.copytree(EXAMPLE, project)
+    for _ in range(2):
+        prepare(project, project / "lab")
+    assert not (project / "lab" / "inventory" / "lab").exists()
+    assert load_fleet(project / "lab" / "inventory", environ={}).name
+
+
+def test_the_copy_has_host_keys_of_its_own(tmp_path: Path) -> None:
+    project, real = tmp_path / "project", tmp_path / "real_known_hosts"
+    shutil.copytree(EXAMPLE, project)
+    real.write_text("base ssh-ed25519 AAAA\n", encoding="utf-8")
+    fleet = project / "fleet.yaml"
+    text = fleet.read_text(encoding="utf-8").replace("operators:\n", f"operators:\n  known_hosts: {real}\n", 1)
+    fleet.write_text(text, encoding="utf-8")
+    assert load_fleet(project, environ={}).operators.known_hosts == str(real)
+    assert prepare(project, tmp_path / "lab").fleet.operators.known_hosts == "known_hosts"
+
+
+def test_an_inventory_that_cannot_be_copied_leaves_the_earlier_copy(tmp_path: Path) -> None:
+    copy = prepare(EXAMPLE, tmp_path / "lab")
+    before = contents(copy.inventory)
+    project = tmp_path / "project"
+    shutil.copytree(EXAMPLE, project)
+    (project / "dangling").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="cannot be copied"):
+        prepare(project, tmp_path / "lab")
+    assert contents(copy.inventory) == before
+    assert not [path for path in (tmp_path / "lab").iterdir() if path.name.startswith(".inventory.")]
+
+
+def test_a_copy_that_cannot_be_put_in_place_leaves_the_earlier_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = prepare(EXAMPLE, tmp_path)
+    before = contents(copy.inventory)
+    rename = Path.rename
+
+    def failing(self: Path, target: Path) -> Path:
+        if self.name == INVENTORY and self.parent.name.startswith(".inventory."):
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    for source in (EXAMPLE, copy.inventory):
+        with pytest.raises(InputError, match="Input/output error"):
+            fleet_directory.replace_inventory(source, tmp_path)
+        assert contents(copy.inventory) == before
+
+
+def test_what_no_fleet_leaves_is_named_and_stays(tmp_path: Path) -> None:
+    fleet_directory.claim(tmp_path)
+    (tmp_path / "log").mkdir()
+    (tmp_path / "rom").mkdir()
+    with pytest.raises(LabError, match=r"log: expected a file that an earlier fleet left"):
+        fleet_directory.clear(tmp_path)
+    assert (tmp_path / "log").is_dir()
+    assert (tmp_path / "rom").is_dir()
+    (tmp_path / "log").rmdir()
+    fleet_directory.clear(tmp_path)
+    assert not (tmp_path / "rom").exists()
+
+
+def test_a_link_among_what_a_fleet_left_is_removed_and_not_followed(tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "work.txt").write_text("weeks of work\n", encoding="utf-8")
+    fleet_directory.claim(tmp_path / "lab")
+    (tmp_path / "lab" / "nodes").symlink_to(elsewhere)
+    fleet_directory.clear(tmp_path / "lab")
+    assert not (tmp_path / "lab" / "nodes").is_symlink()
+    assert (elsewhere / "work.txt").exists()
+
+
+def test_a_lab_of_a_version_that_did_not_mark_is_recognized(tmp_path: Path) -> None:
+    prepare(EXAMPLE, tmp_path)
+    (tmp_path / "spec.json").write_text('{"nodes": [], "links": []}', encoding="utf-8")
+    (tmp_path / MARK).unlink()
+    assert prepare(EXAMPLE, tmp_path).kept is None
+    assert (tmp_path / MARK).exists()
+
+
+def test_an_inventory_belongs_to_the_lab_whose_copy_it_is(tmp_path: Path) -> None:
+    copy = prepare(EXAMPLE, tmp_path / "lab")
+    assert lab_of(str(copy.inventory)) == str(tmp_path / "lab")
+    assert lab_of(str(copy.inventory / "fleet.yaml")) == str(tmp_path / "lab")
+    assert lab_of(str(EXAMPLE)) == ""
+    assert lab_of(str(tmp_path / "inventory")) == ""

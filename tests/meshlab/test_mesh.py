@@ -1,0 +1,141 @@
+"""A fleet as a mesh: who is reached when, and what links do to connections."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+
+import paramiko
+import pytest
+
+from meshlab.fleet import VirtualFleet
+from tests.meshlab.conftest import MESH, answers, connect, in_mesh, run
+from tests.waiting import until
+
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
+
+
+def test_a_node_behind_the_mesh_is_reached_at_its_address_and_knows_its_neighbours(mesh: VirtualFleet) -> None:
+    transport = connect(mesh.endpoint("10.42.0.3"))
+    neighbours = json.loads(run(transport, "batctl meshif bat0 neighbors_json"))
+    originators = json.loads(run(transport, "batctl meshif bat0 originators_json"))
+    stations = run(transport, "iw dev mesh0 station dump")
+    info = json.loads(run(transport, 'ubus call iwinfo info \'{"device":"mesh0"}\''))
+    transport.close()
+    assert len(neighbours) == 1
+    assert set(neighbours[0]) == {"hard_ifindex", "hard_ifname", "last_seen_msecs", "neigh_address"}
+    assert [path["best"] for path in originators] == [True, True]
+    assert {path["neigh_address"] for path in originators} == {neighbours[0]["neigh_address"]}
+    assert sorted(path["tq"] for path in originators) == [165, 200]
+    assert stations.startswith(f"Station {neighbours[0]['neigh_address']} (on mesh0)\n\tinactive time:\t")
+    assert (info["mode"], info["channel"], info["ssid"]) == ("Ad-Hoc", 6, "a team")
+
+
+def test_another_channel_cuts_a_node_and_what_lies_behind_it_off(mesh: VirtualFleet) -> None:
+    mesh.node("near").exec("uci set wireless.radio0.channel=11; uci commit; reload_config").check("change")
+    until(lambda: in_mesh(mesh) == set(), "the cut")
+    assert not answers(mesh.endpoint("10.42.0.3"))
+    until(lambda: mesh.node("far").exec("batctl meshif bat0 neighbors_json").stdout == "[]\n", "empty tables")
+    mesh.node("near").exec("uci set wireless.radio0.channel=6; uci commit; reload_config").check("change back")
+    until(lambda: answers(mesh.endpoint("10.42.0.3")), "the way back")
+
+
+def test_a_node_without_batman_has_no_mesh(mesh: VirtualFleet) -> None:
+    near = mesh.node("near")
+    near.exec("opkg remove kmod-batman-adv; wifi").check("remove")
+    until(lambda: in_mesh(mesh) == set(), "the cut")
+    dump = json.loads(near.exec("ubus call network.interface dump").stdout)["interface"]
+    bat0 = next(one for one in dump if one["interface"] == "bat0")
+    assert bat0["up"] is False
+    assert bat0["errors"][0]["code"] == "NO_PROTO_HANDLER"
+
+
+def test_a_cut_link_stops_a_connection_and_does_not_close_it(mesh: VirtualFleet) -> None:
+    transport = connect(mesh.endpoint("10.42.0.3"))
+    channel = transport.open_session(timeout=60)
+    channel.exec_command("cat")
+    channel.sendall(b"before\n")
+    channel.settimeout(60)
+    assert channel.recv(100) == b"before\n"
+    mesh.link("near", "far", up=False)
+    channel.sendall(b"during\n")
+    channel.settimeout(0.5)
+    with pytest.raises(TimeoutError):
+        channel.recv(100)
+    assert transport.is_active()
+    assert not answers(mesh.endpoint("10.42.0.3"))
+    mesh.link("near", "far", up=True)
+    channel.settimeout(60)
+    assert channel.recv(100) == b"during\n"
+    transport.close()
+
+
+def test_a_node_that_lost_power_is_silent_and_then_knows_nothing_of_the_connection(mesh: VirtualFleet) -> None:
+    far = mesh.node("far")
+    transport = connect(mesh.endpoint("10.42.0.3"))
+    far.power_cut(back=False)
+    transport.send_ignore()
+    assert transport.is_active()
+    far.power_on()
+    until(lambda: in_mesh(mesh) == {"near", "far"}, "the mesh of three")
+
+    def ended() -> bool:
+        with contextlib.suppress(EOFError, OSError, paramiko.SSHException):
+            transport.send_ignore()
+        return not transport.is_active()
+
+    until(ended, "the reset")
+    transport.close()
+
+
+def test_a_slow_link_slows_and_delivers(mesh: VirtualFleet) -> None:
+    mesh.link("base", "near", delay_ms=30, loss=0.02, rate_kbps=4000)
+    transport = connect(mesh.endpoint("10.42.0.3"))
+    sent = b"x" * 100_000
+    channel = transport.open_session(timeout=60)
+    channel.settimeout(60)
+    channel.exec_command("md5sum")
+    channel.sendall(sent)
+    channel.shutdown_write()
+    with channel.makefile("rb") as output:
+        assert output.read().split()[0] == hashlib.md5(sent).hexdigest().encode()
+    transport.close()
+
+
+def test_severing_at_a_step_leaves_the_node_working_alone(mesh: VirtualFleet) -> None:
+    far = mesh.node("far")
+    mesh.break_("far", "sever@sync")
+    far.exec("touch /etc/a; sync; touch /etc/b").check("work")
+    until(lambda: in_mesh(mesh) == {"near"}, "the cut")
+    assert far.exec("ls /etc/a /etc/b").exit_status == 0
+    mesh.mend("far")
+    far.plug(False)
+    until(lambda: in_mesh(mesh) == {"near", "far"}, "the link to come back")
+    until(lambda: answers(mesh.endpoint("10.42.0.3")), "the way back")
+
+
+def test_a_wrong_key_or_one_encrypted_side_separates(mesh: VirtualFleet) -> None:
+    for name, key in (("base", "first-secret"), ("near", "first-secret"), ("far", "other-secret")):
+        command = (
+            f"uci set wireless.mesh0.encryption=psk2+ccmp; uci set wireless.mesh0.key={key}; uci commit; reload_config"
+        )
+        mesh.node(name).exec(command).check("encrypt")
+    until(lambda: in_mesh(mesh) == {"near"}, "the two with the same key")
+
+
+def test_the_same_release_encrypts_only_with_a_full_supplicant(mesh: VirtualFleet) -> None:
+    near = mesh.node("near")
+    near.exec("opkg remove wpad-openssl").check("remove")
+    near.exec("uci set wireless.mesh0.encryption=psk2+ccmp; uci set wireless.mesh0.key=secret-123; uci commit; wifi")
+    until(lambda: near.exec("iw dev mesh0 link").stdout == "Not connected.\n", "the radio")
+
+
+def test_25_12_joins_open_when_asked_to_encrypt(fleet: VirtualFleet) -> None:
+    new = fleet.node("new")
+    new.exec(MESH.format(address="10.42.9.9", channel=6)).check("configure")
+    new.exec("uci set wireless.mesh0.encryption=psk2+ccmp; uci set wireless.mesh0.key=secret-123; uci commit; wifi")
+    asked = "grep -q 'key=secret-123' /tmp/run/netifd/radios && iw dev mesh0 link"
+    until(lambda: new.exec(asked).stdout.startswith("Joined IBSS"), "the cell")
+    info = json.loads(new.exec('ubus call iwinfo info \'{"device":"mesh0"}\'').stdout)
+    assert info["encryption"]["enabled"] is False

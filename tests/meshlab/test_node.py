@@ -1,0 +1,341 @@
+"""One virtual node: what it is fresh from the box, what survives what, and how it is flashed."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+
+import paramiko
+import pytest
+
+from meshctl.model import Release
+from meshlab.fleet import VirtualFleet, VirtualNode
+from meshlab.images import firmware_image, opkg_package
+from meshlab.state import Power
+from tests.meshlab.conftest import answers, connect, flash_text, run
+from tests.waiting import until
+
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
+
+
+def host_key(node: VirtualNode) -> str:
+    transport = connect(node.bench)
+    key = transport.get_remote_server_key().get_base64()
+    transport.close()
+    return key
+
+
+def test_a_factory_node_lets_root_in_without_a_password(fleet: VirtualFleet) -> None:
+    transport = connect(fleet.node("box").bench)
+    assert transport.remote_version.startswith("SSH-2.0-dropbear")
+    assert run(transport, "id -u; uci get network.lan.ipaddr; uci get wireless.radio0.disabled").split() == [
+        "0",
+        "192.168.1.1",
+        "1",
+    ]
+    transport.close()
+
+
+def test_dropbear_has_no_sftp(fleet: VirtualFleet) -> None:
+    transport = connect(fleet.node("box").bench)
+    with pytest.raises((paramiko.SSHException, EOFError, OSError)):
+        paramiko.SFTPClient.from_transport(transport)
+    transport.close()
+
+
+def test_every_node_has_processes_memory_clock_and_boot_id_of_its_own(fleet: VirtualFleet) -> None:
+    box, far = fleet.node("box"), fleet.node("far")
+    assert box.boot_id != far.boot_id
+    processes = box.exec("ps").stdout
+    assert "/rom/lab/init" in processes
+    assert "/usr/sbin/dropbear -F" in processes
+    assert box.exec("awk '/MemTotal/ { print $2 }' /proc/meminfo").stdout.strip() == str(128 * 1024)
+    before_s = time.monotonic()
+    box.power_cut()
+    uptime_s = float(box.exec("cat /proc/uptime").stdout.split()[0])
+    assert uptime_s <= time.monotonic() - before_s
+    assert uptime_s < float(far.exec("cat /proc/uptime").stdout.split()[0])
+
+
+def test_openwrts_busybox_has_not_what_openwrt_leaves_out(fleet: VirtualFleet) -> None:
+    missing = fleet.node("box").exec("for tool in stat timeout base64 nohup setsid; do command -v $tool; done; true")
+    assert missing.stdout == ""
+
+
+def test_what_is_not_synced_is_lost_at_a_power_cut(node: VirtualNode) -> None:
+    node.exec("echo kept >/etc/kept; sync; echo lost >/etc/lost; echo changed >/etc/kept").check("write")
+    boot_id = node.boot_id
+    assert flash_text(node, "/etc/kept") == "kept\n"
+    node.power_cut()
+    assert node.exec("cat /etc/kept; ls /etc/lost").stdout == "kept\n"
+    assert node.boot_id != boot_id
+
+
+def test_a_power_cut_may_also_keep_or_tear_what_was_not_synced(node: VirtualNode) -> None:
+    node.exec("echo old >/etc/file; sync; echo new >/etc/file").check("write")
+    node.power_cut(unsynced="kept")
+    assert node.exec("cat /etc/file").stdout == "new\n"
+    node.exec("echo newer >/etc/file").check("write")
+    node.power_cut(unsynced="torn")
+    assert node.exec("wc -c </etc/file").stdout.strip() == "0"
+
+
+def test_an_orderly_reboot_keeps_everything_but_ram(node: VirtualNode) -> None:
+    node.exec("echo here >/etc/file; echo gone >/tmp/file").check("write")
+    node.reboot()
+    assert node.exec("cat /etc/file; ls /tmp/file").stdout == "here\n"
+
+
+def test_a_radio_that_its_configuration_does_not_name_is_added_at_every_boot_and_switched_off(
+    node: VirtualNode,
+) -> None:
+    stock = node.exec("cat /etc/config/wireless").stdout
+    assert stock.count("config wifi-device") == stock.count("option disabled '1'") > 0
+    forget = "uci delete wireless.radio0; uci delete wireless.default_radio0; uci commit wireless; sync"
+    node.exec(forget).check("forget radio0")
+    assert "radio0" not in node.exec("cat /etc/config/wireless").stdout
+    node.reboot()
+    again = node.exec("cat /etc/config/wireless").stdout
+    assert again.count("config wifi-device") == stock.count("config wifi-device")
+    assert "option ssid 'OpenWrt'" in again
+    node.reboot()
+    assert node.exec("cat /etc/config/wireless").stdout == again
+
+
+def test_init_scripts_run_in_order_at_boot_when_enabled(node: VirtualNode) -> None:
+    script = "#!/bin/sh /etc/rc.common\\nSTART={start}\\nboot() {{ echo {name} >>/tmp/order; }}\\n"
+    for name, start in (("late", 97), ("early", 11), ("never", 50)):
+        node.exec(f"printf '{script.format(start=start, name=name)}' >/etc/init.d/{name}; chmod 755 /etc/init.d/{name}")
+    node.exec("/etc/init.d/late enable; /etc/init.d/early enable; sync").check("enable")
+    assert node.exec("/etc/init.d/early enabled").exit_status == 0
+    assert node.exec("/etc/init.d/never enabled").exit_status == 1
+    node.reboot()
+    assert node.exec("cat /tmp/order").stdout == "early\nlate\n"
+
+
+def test_reload_config_reloads_only_what_changed(node: VirtualNode) -> None:
+    node.exec("uci set system.@system[0].hostname=renamed; uci commit system").check("set")
+    before = node.exec("logread").stdout
+    assert node.exec("cat /proc/sys/kernel/hostname").stdout == "OpenWrt\n"
+    node.exec("reload_config").check("reload")
+    until(lambda: node.exec("cat /proc/sys/kernel/hostname").stdout == "renamed\n", "the new name")
+    assert "firewall" not in node.exec("logread").stdout.removeprefix(before)
+    assert "dnsmasq: reloaded" in node.exec("logread").stdout.removeprefix(before)
+    node.exec("uci set dhcp.lan.ignore=1; uci commit dhcp; reload_config").check("reload")
+    until(lambda: node.exec("logread").stdout.count("dnsmasq: reloaded") == 2, "dnsmasq")
+
+
+def test_an_address_change_moves_the_node(fleet: VirtualFleet, node: VirtualNode) -> None:
+    transport = connect(node.bench)
+    run(transport, "uci set network.lan.ipaddr=10.42.7.9; uci commit; (sleep 0; reload_config) >/dev/null 2>&1 &")
+    until(lambda: node.address == "10.42.7.9", "the new address")
+    assert not answers(node.bench)
+    until(lambda: answers(fleet.endpoint("10.42.7.9")), "an answer at the new address")
+    transport.close()
+
+
+def test_a_network_that_the_firewall_closes_is_not_reachable(fleet: VirtualFleet, node: VirtualNode) -> None:
+    node.exec("uci delete firewall.@zone[0]; uci commit; reload_config").check("close")
+    until(lambda: not answers(node.bench), "the firewall")
+
+
+@pytest.mark.parametrize("name", ["old", "new", "box"])
+def test_facts_have_the_shape_of_the_release(fleet: VirtualFleet, name: str) -> None:
+    node = fleet.node(name)
+    release = node.spec.release
+    board = json.loads(node.exec("ubus call system board").stdout)
+    assert board["board_name"] == "compex,wpj344-16m"
+    assert board["release"]["version"].startswith(release.value)
+    assert ("rootfs_type" in board) == (release > Release.V19_07)
+    assert f"DISTRIB_RELEASE='{release.value}" in node.exec("cat /etc/openwrt_release").stdout
+    info = json.loads(node.exec("ubus call system info").stdout)
+    assert info["memory"]["total"] == 128 * 1024 * 1024
+    network = json.loads(node.exec("cat /etc/board.json").stdout)["network"]["lan"]
+    assert network["ifname" if release is Release.V19_07 else "device"] == "eth0"
+    lan = node.exec("uci show network.lan").stdout
+    assert ("network.lan.type='bridge'" in lan) == (release is Release.V19_07)
+    tool = "apk" if release is Release.V25_12 else "opkg"
+    assert node.exec("command -v opkg || command -v apk").stdout.strip().endswith(tool)
+    installed = node.exec("apk list --installed" if tool == "apk" else "opkg list-installed").stdout
+    assert re.search(r"^kmod-batman-adv", installed, re.MULTILINE)
+    keys = node.exec("ls /etc/dropbear").stdout.split()
+    assert keys == (["dropbear_rsa_host_key"] if release is Release.V19_07 else ["dropbear_ed25519_host_key"])
+
+
+def test_a_full_flash_and_a_full_memory_are_really_full(fleet: VirtualFleet) -> None:
+    node = fleet.node("new")
+    fleet.break_("new", "full-flash")
+    assert node.exec("dd if=/dev/zero of=/etc/big bs=1k count=64 2>/dev/null").exit_status != 0
+    fleet.break_("new", "full-memory")
+    assert node.exec("echo x >/tmp/one && dd if=/dev/zero of=/tmp/two bs=1k count=64 2>/dev/null").exit_status != 0
+    assert int(node.exec("awk '/MemAvailable/ { print $2 }' /proc/meminfo").stdout) <= 2048
+    fleet.mend("new")
+    node.exec("rm -f /etc/big /tmp/one /tmp/two; echo x >/etc/small && echo y >/tmp/small").check("write again")
+
+
+def test_a_changed_host_key_is_another_key(fleet: VirtualFleet, node: VirtualNode) -> None:
+    before = host_key(node)
+    fleet.break_("box", "host-key")
+    until(lambda: answers(node.bench), "the restarted server")
+    assert host_key(node) != before
+
+
+def test_a_foreign_delta_is_seen_by_uci_changes(fleet: VirtualFleet, node: VirtualNode) -> None:
+    fleet.break_("box", "foreign-delta")
+    assert "description='left by hand'" in node.exec("uci changes").stdout
+
+
+def test_a_clock_off_by_years_moves_date_and_not_uptime(fleet: VirtualFleet, node: VirtualNode) -> None:
+    now = int(node.exec("date +%s").stdout)
+    fleet.break_("box", "clock")
+    assert now - int(node.exec("date +%s").stdout) > 9 * 365 * 86400
+    fleet.mend("box")
+    assert int(node.exec("date +%s").stdout) >= now
+
+
+def test_ssh_that_hangs_accepts_and_says_nothing(fleet: VirtualFleet, node: VirtualNode) -> None:
+    fleet.break_("box", "ssh-hang")
+    transport = paramiko.Transport((node.bench.host, node.bench.port))
+    transport.banner_timeout = 0.5
+    with pytest.raises(paramiko.SSHException):
+        transport.start_client(timeout=2)
+    transport.close()
+
+
+def test_a_wrong_board_says_so_before_and_after_a_boot(fleet: VirtualFleet, node: VirtualNode) -> None:
+    fleet.break_("box", "wrong-board")
+    for _ in range(2):
+        board = json.loads(node.exec("ubus call system board").stdout)
+        assert board["board_name"] == "virtual,other-board"
+        node.power_cut()
+    fleet.mend("box")
+    assert node.exec("cat /tmp/sysinfo/board_name").stdout.strip() == node.spec.board
+
+
+# -- flashing --
+
+
+def put_image(node: VirtualNode, image: bytes) -> None:
+    node.exec("cat >/tmp/firmware.bin", stdin=image).check("upload")
+
+
+def test_sysupgrade_refuses_what_is_not_for_this_board(node: VirtualNode) -> None:
+    put_image(node, firmware_image(Release.V24_10, board="other,board"))
+    done = node.exec("sysupgrade -T /tmp/firmware.bin")
+    assert done.exit_status == 1
+    assert "Device compex,wpj344-16m not supported by this image" in done.stdout
+    assert "Supported devices: other,board" in done.stdout
+    assert "Image check failed." in done.stderr
+    put_image(node, b"no image at all" * 100)
+    assert "Image metadata not present" in node.exec("sysupgrade -T /tmp/firmware.bin").stdout
+    verdict = json.loads(node.exec('ubus call system validate_firmware_image \'{"path":"/tmp/firmware.bin"}\'').stdout)
+    assert (verdict["valid"], verdict["tests"]["fwtool_device_match"]) == (False, False)
+
+
+def test_sysupgrade_refuses_an_image_cut_short_or_changed(node: VirtualNode) -> None:
+    image = firmware_image(Release.V24_10, board=node.spec.board)
+    put_image(node, image[:-1])
+    assert node.exec("sysupgrade -T /tmp/firmware.bin").exit_status == 1
+    put_image(node, image[:1000] + b"x" + image[1001:])
+    assert node.exec("sysupgrade -T /tmp/firmware.bin").exit_status == 1
+
+
+def test_flashing_brings_the_new_release_the_given_files_and_new_host_keys(node: VirtualNode) -> None:
+    put_image(node, firmware_image(Release.V25_12, board=node.spec.board))
+    key, boot_id = host_key(node), node.boot_id
+    node.exec(
+        "mkdir -p /tmp/new/etc/config && cp /etc/config/system /tmp/new/etc/config/ && "
+        "sed -i s/OpenWrt/flashed/ /tmp/new/etc/config/system && echo me >/tmp/new/etc/marker && "
+        "tar -czf /tmp/config.tgz -C /tmp/new . && echo old >/etc/old && sync"
+    ).check("make the tar")
+    assert node.exec("sysupgrade -T /tmp/firmware.bin").exit_status == 0
+    transport = connect(node.bench)
+    channel = transport.open_session(timeout=60)
+    channel.settimeout(60)
+    channel.exec_command("sysupgrade -n -f /tmp/config.tgz /tmp/firmware.bin 2>&1")
+    assert b"Commencing upgrade. Closing all shell sessions." in channel.recv(4096)
+    until(lambda: node.boot_id not in (None, boot_id), "the new firmware")
+    transport.close()
+    assert node.exec("cat /etc/marker; ls /etc/old").stdout == "me\n"
+    assert node.exec("cat /proc/sys/kernel/hostname").stdout == "flashed\n"
+    assert "25.12" in node.exec("cat /etc/openwrt_release").stdout
+    assert node.exec("command -v apk").exit_status == 0
+    assert host_key(node) != key
+    # back to what the other tests know
+    put_image(node, firmware_image(Release.V23_05, board=node.spec.board))
+    boots = node.boot_id
+    node.exec("start-stop-daemon -S -b -x /sbin/sysupgrade -- -n /tmp/firmware.bin")
+    until(lambda: node.boot_id not in (None, boots), "the old firmware")
+
+
+def test_a_power_cut_in_the_middle_of_a_flash_leaves_a_node_that_needs_the_bench(
+    fleet: VirtualFleet, node: VirtualNode
+) -> None:
+    put_image(node, firmware_image(Release.V24_10, board=node.spec.board))
+    fleet.break_("box", "power-cut@flash")
+    node.exec("start-stop-daemon -S -b -x /sbin/sysupgrade -- -n /tmp/firmware.bin")
+    until(lambda: node.power is Power.DEAD, "the dead firmware")
+    assert not answers(node.bench)
+    fleet.mend("box")
+    node.wait_up()
+    assert "23.05" in node.exec("cat /etc/openwrt_release").stdout
+
+
+# -- steps --
+
+
+def test_a_power_cut_strikes_before_the_step_it_names(fleet: VirtualFleet, node: VirtualNode) -> None:
+    work = "echo 1 >/etc/one; sync; cp /etc/one /etc/two; sync; rm /etc/one; sync"
+    node.record_steps()
+    node.exec(work).check("work")
+    steps = node.steps()
+    assert [step.split()[0] for step in steps] == ["sync", "cp", "sync", "rm", "sync"]
+    node.exec("rm -f /etc/one /etc/two; sync")
+    for number, left in ((2, "one"), (4, "one two"), (5, "one two")):
+        boot_id = node.boot_id
+        fleet.break_("box", f"power-cut@{number}")
+        node.exec(work)
+        until(lambda old=boot_id: node.boot_id not in (None, old), "the reboot")  # type: ignore[misc]
+        assert node.exec("cd /etc && ls one two 2>/dev/null").stdout.split() == left.split()
+        node.exec("rm -f /etc/one /etc/two; sync")
+
+
+def test_a_step_can_be_named_by_its_words(fleet: VirtualFleet, node: VirtualNode) -> None:
+    boot_id = node.boot_id
+    fleet.break_("box", "power-cut@uci commit system")
+    node.exec("uci set system.@system[0].hostname=a; uci commit network; uci commit system; uci commit")
+    until(lambda: node.boot_id not in (None, boot_id), "the reboot")
+    assert node.exec("uci get system.@system[0].hostname").stdout == "OpenWrt\n"
+
+
+def test_packages_are_installed_from_files_and_checked(fleet: VirtualFleet, node: VirtualNode) -> None:
+    from meshlab.images import apk_package, opkg_package
+
+    node.exec("cat >/tmp/p.ipk", stdin=opkg_package("tool", "1.2-3", {"/usr/bin/tool": "#!/bin/sh\necho works\n"}))
+    node.exec("opkg install /tmp/p.ipk").check("install")
+    assert node.exec("tool; opkg list-installed").stdout.startswith("works\n")
+    assert "tool - 1.2-3" in node.exec("opkg list-installed").stdout
+    node.exec("cat >/tmp/q.ipk", stdin=opkg_package("needy", "1", {}, depends=("absent",)))
+    assert node.exec("opkg install /tmp/q.ipk").exit_status == 255
+    node.exec("cat >/tmp/r.ipk", stdin=opkg_package("strange", "1", {}, arch="x86_64"))
+    assert node.exec("opkg install /tmp/r.ipk").exit_status == 255
+    new = fleet.node("new")
+    new.exec("cat >/tmp/p.apk", stdin=apk_package("tool", "1.2-r3", {"/usr/bin/tool": "#!/bin/sh\necho works\n"}))
+    new.exec("apk add --allow-untrusted /tmp/p.apk").check("install")
+    assert "tool-1.2-r3" in new.exec("apk list --installed").stdout
+    new.exec("apk del tool").check("remove")
+    assert "tool-1.2-r3" not in new.exec("apk list --installed").stdout
+
+
+def test_netifd_knows_the_protocols_that_were_there_when_it_started(fleet: VirtualFleet, node: VirtualNode) -> None:
+    known = json.loads(node.exec("ubus call network get_proto_handlers").stdout)
+    assert set(known) >= {"static", "batadv", "batadv_hardif"}
+    node.exec("opkg remove kmod-batman-adv && /etc/init.d/network restart").check("forget")
+    assert "batadv" not in json.loads(node.exec("ubus call network get_proto_handlers").stdout)
+    node.exec("cat >/tmp/k.ipk", stdin=opkg_package("kmod-batman-adv", "1", {})).check("put it there")
+    handlers = "ubus call network get_proto_handlers"
+    again = node.exec(f"opkg install /tmp/k.ipk >/dev/null; ubus call network reload; {handlers}")
+    assert "batadv" not in json.loads(again.stdout)
+    restarted = node.exec("ubus call network restart; ubus call network get_proto_handlers")
+    assert "batadv" in json.loads(restarted.stdout)

@@ -1,0 +1,135 @@
+"""Nodes that go down and come back: no signal, no word of the bell and no descriptor may keep one from starting."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from meshlab import rootfs
+from meshlab.errors import LabError
+from meshlab.fleet import VirtualFleet, VirtualNode
+from meshlab.spec import FleetSpec, NodeSpec
+from tests.meshlab.conftest import KEYS
+from tests.meshlab.fleet_report import fleets_of, report
+from tests.meshlab.power_cycles import cycle
+from tests.waiting import until
+
+# the kernel's number of write(2), as /proc/PID/syscall tells it
+_WRITE = {"x86_64": "1", "aarch64": "64"}[os.uname().machine]
+_PIPE_BYTES = 4096
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> Iterator[VirtualFleet]:
+    nodes = (NodeSpec("here", host_key_types=KEYS), NodeSpec("there", host_key_types=KEYS))
+    with VirtualFleet(FleetSpec("pair", nodes), tmp_path / "fleet") as running:
+        yield running
+
+
+def test_a_signal_that_comes_just_before_process_1_waits_is_not_lost(tmp_path: Path) -> None:
+    """The shell writes each command it runs into a pipe that holds one line: so it stands still before its read."""
+    script = (rootfs.STAND_INS / "lab" / "init").read_text(encoding="utf-8")
+    traps, loop = (
+        re.search(r"^trap 'ACTION=reboot; .*' TERM$", script, re.M),
+        re.search(r"^while .*?^done$", script, re.M | re.S),
+    )
+    assert traps is not None
+    assert loop is not None
+    fifo = tmp_path / "init"
+    before = f"ACTION= died=\nshut_down() {{ exit 0; }}\nmkfifo {fifo}\nexec 3<>{fifo}\n"
+    text = f"{before}{traps[0]}\nset -x\n{loop[0]}\n"
+    lines, lines_end = os.pipe2(os.O_DIRECT | os.O_CLOEXEC)
+    fcntl.fcntl(lines_end, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+    busybox = rootfs.find_program("busybox", "busybox-static")
+    with subprocess.Popen((busybox, "ash", "-c", text), stderr=lines_end, pass_fds=()) as shell:
+        os.close(lines_end)
+        try:
+            # the pipe holds what the loop asks first; what comes next is the read
+            until(lambda: _is_writing(shell.pid), "the shell to stand before its read")
+            shell.send_signal(signal.SIGTERM)
+            os.set_blocking(lines, False)
+            until(lambda: _has_ended(lines), "the shell to see the signal")
+            assert shell.wait() == 0
+        finally:
+            shell.kill()
+            os.close(lines)
+
+
+def _is_writing(pid: int) -> bool:
+    return Path(f"/proc/{pid}/syscall").read_text(encoding="ascii").split()[0] == _WRITE
+
+
+def test_a_shell_on_one_node_holds_nothing_of_another_one() -> None:
+    program = (
+        "import os, sys; from meshlab.node_runner import _close_all_but\n"
+        "kept, other = os.open('/dev/null', os.O_RDONLY), os.open('/proc/self/ns/net', os.O_RDONLY)\n"
+        "_close_all_but([kept])\n"
+        "os.fstat(kept)\n"
+        "try: os.fstat(other)\n"
+        "except OSError: sys.exit(0)\n"
+        "sys.exit('a descriptor of a network is still open')"
+    )
+    subprocess.run((sys.executable, "-c", program), check=True, timeout=60)
+
+
+def _has_ended(lines: int) -> bool:
+    """Read what is there; whether the other end is closed."""
+    try:
+        while os.read(lines, _PIPE_BYTES):
+            pass
+    except BlockingIOError:
+        return False
+    return True
+
+
+@pytest.mark.lab
+def test_a_word_that_the_fleet_cannot_read_does_not_take_the_next_one_along(pair: VirtualFleet) -> None:
+    air = pair.directory / "nodes" / "here" / "air" / "effective"
+    air.write_text("\t".join(("cell", "-", "mesh0", "adhoc", "no frequency", *"abcdefg")) + "\n", encoding="ascii")
+    (pair.directory / "nodes" / "there" / "air" / "effective").write_text("", encoding="ascii")
+    assert pair.node("there").address is not None
+    with (pair.directory / "bell").open("wb", buffering=0) as bell:
+        bell.write(b"changed here\nchanged there\n")
+    until(lambda: pair.node("there").address is None, "the second node's word to be heard")
+
+
+@pytest.mark.lab
+def test_a_node_that_cannot_be_started_is_not_waited_for(pair: VirtualFleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    node = pair.node("here")
+    state = {**pair.ask("node", node="here"), "power": "failed", "reason": "no memory"}
+    monkeypatch.setattr(VirtualNode, "_state", lambda _: state)
+    with pytest.raises(LabError, match="cannot start here: no memory"):
+        node.wait_up()
+
+
+@pytest.mark.lab
+def test_a_failure_s_report_holds_the_console_of_the_node_that_is_down(pair: VirtualFleet) -> None:
+    pair.node("here").power_cut(back=False)
+    (fleet,) = fleets_of([1, pair.node("there"), pair])
+    told = report(fleet, "waited 180 s for something")
+    console = told.partition("--- here: console\n")[2].partition("\n--- ")[0]
+    assert re.search(r"- boot [0-9a-f-]{36} -\n", console)
+    assert re.search(r"^\[[0-9.]+\] S20network$", console, re.M)
+    assert '"name": "here", "power": "off"' in told
+    # it is up, and nothing was said of it
+    assert "--- there" not in told
+    assert "--- there: log and processes" in report(fleet, "waited 180 s for there to boot")
+
+
+@pytest.mark.proof
+@pytest.mark.lab
+@pytest.mark.timeout(3600)
+def test_every_node_comes_back_a_thousand_times(tmp_path: Path) -> None:
+    names = [f"n{number}" for number in range(8)]
+    spec = FleetSpec("eight", tuple(NodeSpec(name, host_key_types=KEYS) for name in names))
+    with VirtualFleet(spec, tmp_path / "fleet") as fleet:
+        cycle(fleet, names, 1000, random.Random(1), wait_s=180.0)

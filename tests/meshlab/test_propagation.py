@@ -1,0 +1,196 @@
+"""Who hears whom on a ground: laws of the path-loss model, and the file format."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from meshctl.diagnostics import InvalidInput
+from meshctl.errors import InputError
+from meshlab import propagation_file
+from meshlab.propagation import DEAF_LOSS, Air, Ground, Place, Wall, frame_loss, links_of, received_dbm
+from meshlab.spec import LinkSpec
+from meshlab.yaml_entries import share_of
+
+FILE = "ground.yaml"
+EXAMPLES = Path(__file__).parents[3] / "inventory" / "lab"
+coordinates = st.integers(-400, 400).map(float)
+points = st.tuples(coordinates, coordinates)
+names = st.sampled_from([f"n{number}" for number in range(8)])
+powers = st.none() | st.integers(0, 33).map(float)
+links = st.builds(
+    LinkSpec,
+    st.sampled_from(["n0", "n1"]),
+    st.sampled_from(["n2", "n3", "n4"]),
+    loss=st.sampled_from([0.0, 0.25, 1.0]),
+    loss_back=st.sampled_from([None, 0.1, 1.0]),
+    up=st.booleans(),
+    rate_kbps=st.none() | st.integers(1, 1000),
+)
+grounds = st.builds(
+    Ground,
+    st.dictionaries(names, st.builds(Place, points, powers), max_size=8),
+    st.lists(st.builds(Wall, points, points, st.sampled_from([3.0, 40.0, 100.0])), max_size=3).map(tuple),
+    st.builds(Air, exponent=st.sampled_from([1.8, 3.5, 5.0]), fading_db=st.sampled_from([0.5, 2.0])),
+    st.lists(links, max_size=3, unique_by=lambda link: link.ends).map(tuple),
+)
+
+
+def loss_at(distance_m: float, air: Air = Air(), walls_db: float = 0.0) -> float:  # noqa: B008
+    return frame_loss(air, received_dbm(air, distance_m, air.tx_power_dbm, walls_db))
+
+
+def test_a_tenth_is_lost_at_the_sensitivity_and_free_space_holds_for_the_first_metre() -> None:
+    air = Air()
+    assert frame_loss(air, air.sensitivity_dbm) == 0.1
+    first_metre = received_dbm(replace(air, antenna_gain_dbi=0.0), 1.0, 0.0)
+    wavelength_m = 299_792_458 / 2.437e9
+    assert first_metre == pytest.approx(20 * math.log10(wavelength_m / (4 * math.pi)))
+    assert received_dbm(air, 100.0, 24.0) == pytest.approx(received_dbm(air, 10.0, 24.0) - 35.0)
+
+
+@given(st.floats(0.0, 1000.0), st.floats(0.0, 100.0), st.floats(0.0, 50.0))
+def test_farther_or_behind_more_rock_is_never_heard_better(near_m: float, more_m: float, rock_db: float) -> None:
+    assert loss_at(near_m + more_m) >= loss_at(near_m)
+    assert loss_at(near_m, walls_db=rock_db) >= loss_at(near_m)
+
+
+@given(grounds)
+def test_links_join_each_pair_once_and_the_deaf_not_at_all(ground: Ground) -> None:
+    found = links_of(ground)
+    assert len({link.ends for link in found}) == len(found)
+    by_hand = {link.ends for link in ground.links}
+    for link in found:
+        losses = (link.loss_to(link.a), link.loss_to(link.b))
+        if link.ends not in by_hand:
+            assert min(losses) < DEAF_LOSS
+            assert all(loss < DEAF_LOSS or loss == 1.0 for loss in losses)
+
+
+@given(grounds)
+def test_a_link_by_hand_holds_wherever_its_nodes_are(ground: Ground) -> None:
+    assert set(ground.links) <= set(links_of(ground))
+
+
+@given(grounds, points)
+def test_who_moves_changes_no_link_of_others(ground: Ground, to: tuple[float, float]) -> None:
+    if "n0" not in ground.places:
+        with pytest.raises(InputError, match="n0 has no place"):
+            ground.moved("n0", to)
+        return
+    before = [link for link in links_of(ground) if "n0" not in link.ends]
+    assert [link for link in links_of(ground.moved("n0", to)) if "n0" not in link.ends] == before
+
+
+def test_the_stronger_sender_is_heard_where_the_weaker_is_not() -> None:
+    ground = Ground({"strong": Place((0, 0), 33.0), "weak": Place((330, 0), 15.0)})
+    (link,) = links_of(ground)
+    assert link.loss_to("weak") < 0.5
+    assert link.loss_to("strong") == 1.0
+    assert link.signal_at("weak") - link.signal_at("strong") == 18
+    assert link.tq_to("weak") == link.tq_to("strong") == 0
+
+
+def test_a_wall_between_two_nodes_separates_them_and_one_beside_them_does_not() -> None:
+    ground = Ground({"a": Place((0, 0)), "b": Place((40, 0))})
+    assert len(links_of(replace(ground, walls=(Wall((20, -10), (20, 10)),)))) == 0
+    assert len(links_of(replace(ground, walls=(Wall((20, 5), (20, 10)),)))) == 1
+    assert len(links_of(replace(ground, walls=(Wall((20, -10), (20, 10), 6.0),)))) == 1
+
+
+# -- the file --
+
+
+def test_a_ground_is_read_as_it_is_written() -> None:
+    text = """
+nodes: {base: [0, 0], b01: {at: [80, 0.5], tx_power_dbm: 33}}
+walls: [{a: [40, 10], b: [200, 10], loss_db: 40}, {a: [0, 0], b: [1, 1]}]
+air: {exponent: 2, sensitivity_dbm: -90}
+links:
+  - {between: [base, b02], loss: 30%, loss_back: 0.05, delay_ms: 5, rate_kbps: 64}
+  - {between: [b01, b02], up: false}
+"""
+    assert propagation_file.parse(text, FILE) == Ground(
+        {"base": Place((0, 0)), "b01": Place((80, 0.5), 33.0)},
+        (Wall((40, 10), (200, 10), 40.0), Wall((0, 0), (1, 1))),
+        Air(exponent=2.0, sensitivity_dbm=-90.0),
+        (
+            LinkSpec("base", "b02", loss=0.3, loss_back=0.05, delay_ms=5.0, rate_kbps=64),
+            LinkSpec("b01", "b02", up=False),
+        ),
+    )
+
+
+def test_the_example_s_links_are_a_ground_without_places() -> None:
+    ground = propagation_file.load(EXAMPLES / "links.yaml")
+    assert ground.places == {}
+    assert links_of(ground)[0] == LinkSpec("base", "b01", tq=252, signal_dbm=-52)
+
+
+def test_the_example_s_places_make_a_line_with_a_robot_at_two_of_its_nodes() -> None:
+    pairs = {"-".join(sorted(link.ends)) for link in links_of(propagation_file.load(EXAMPLES / "ground.yaml"))}
+    assert pairs == {"b01-base", "b01-b02", "b02-b03", "b01-rover1", "b03-rover2"}
+
+
+@given(grounds)
+def test_a_ground_survives_its_file(ground: Ground) -> None:
+    assert propagation_file.parse(propagation_file.dump(ground), FILE) == ground
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("nodes: {a: [0]}", "ground.yaml:1:12: nodes.a: expected [x, y] in metres, found a list of 1 [INV021]"),
+        (
+            "nodes:\n  a: {at: [0, x]}",
+            "ground.yaml:2:15: nodes.a.at[1]: expected a number from -1e+06 to 1e+06, found 'x'",
+        ),
+        ("nodes:\n  a: {tx_power_dbm: 9}", "ground.yaml:2:6: nodes.a: expected the key at, found no such key [INV022]"),
+        ("walls:\n  - {a: [0, 0]}", "ground.yaml:2:5: walls[0]: expected the key b"),
+        ("walls: 7", "ground.yaml:1:8: walls: expected a list, found '7'"),
+        ("air: {exponent: 0}", "ground.yaml:1:17: air.exponent: expected a number from 1 to 10, found '0'"),
+        ("air: {colour: red}", "ground.yaml:1:7: air: expected one of tx_power_dbm,"),
+        ("links:\n- {between: [a, b]}\n- {between: [b, a]}", "ground.yaml:3:3: links[1]: expected each pair once"),
+        ("links: [{between: [a, a]}]", "ground.yaml:1:19: links[0].between: expected two different nodes"),
+        ("links: [{between: [a, b], loss: 130%}]", "expected a share from 0 to 1, or 0% to 100%, found '130%'"),
+        ("links: [{between: [a, b], up: maybe}]", "expected one of true, false, found 'maybe'"),
+        ("links: [{between: [a, b], tq: 2.5}]", "expected a whole number from 0 to 255, found '2.5'"),
+        ("place: {}", "ground.yaml:1:1: expected one of nodes, walls, air, links, found 'place'"),
+        ("[1, 2]", "ground.yaml:1:1: expected a mapping, found a list of 2"),
+        ("nodes: {a: [0, 0}", "ground.yaml:1:17: not valid YAML"),
+        ("nodes: {a: [0, 0], a: [1, 1]}", "ground.yaml:1:20: the key 'a' stands twice"),
+    ],
+)
+def test_a_problem_names_file_line_what_was_expected_and_found(text: str, said: str) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        propagation_file.parse(text, FILE)
+    assert said in str(caught.value)
+
+
+def test_all_problems_are_told_at_once() -> None:
+    with pytest.raises(InvalidInput) as caught:
+        propagation_file.parse("nodes: {a: 1, b: [0, y]}\nair: {exponent: x}\nmore: 1", FILE)
+    assert len(caught.value.diagnostics) == 4
+
+
+@given(st.text(max_size=200))
+def test_any_text_is_a_ground_or_a_list_of_problems(text: str) -> None:
+    try:
+        propagation_file.parse(text, FILE)
+    except InvalidInput as problems:
+        assert problems.diagnostics
+
+
+@pytest.mark.parametrize(("text", "share"), [("30%", 0.3), ("0.3", 0.3), ("100%", 1.0), ("0", 0.0)])
+def test_a_share_is_a_number_or_a_percentage(text: str, share: float) -> None:
+    assert share_of(text) == pytest.approx(share)
+
+
+@pytest.mark.parametrize("text", ["30", "-1%", "nan", "%", "", "1.01"])
+def test_what_is_no_share_is_none(text: str) -> None:
+    assert share_of(text) is None

@@ -1,0 +1,109 @@
+"""Specs, addresses, breaks, images and the ROM's surgery on busybox: values in, values out."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from meshctl.errors import InputError
+from meshctl.firmware.metadata import read_metadata
+from meshctl.model import Release
+from meshlab import addresses, faults, from_inventory, releases, rootfs
+from meshlab.errors import LabError
+from meshlab.faults import Break, Order
+from meshlab.images import firmware_image
+from meshlab.spec import FleetSpec, LinkSpec, Medium, NodeSpec, RadioSpec, dump, load
+
+
+def test_a_spec_survives_its_file() -> None:
+    spec = FleetSpec(
+        "x",
+        (
+            NodeSpec("a", medium=Medium.BASE, release=Release.V19_07, host_key_types=("rsa",)),
+            NodeSpec("b", radios=(RadioSpec("radio0"), RadioSpec("radio1", band="5g", mac="02:00:00:00:00:09"))),
+        ),
+        (LinkSpec("a", "b", loss=0.5, rate_kbps=64, up=False),),
+        port=20100,
+    )
+    assert load(dump(spec)) == spec
+
+
+def test_a_spec_names_what_is_wrong_with_it() -> None:
+    with pytest.raises(InputError, match="twice: a"):
+        FleetSpec("x", (NodeSpec("a"), NodeSpec("a")))
+    with pytest.raises(InputError, match="link a-c: no node named c"):
+        FleetSpec("x", (NodeSpec("a"),), (LinkSpec("a", "c"),))
+
+
+def test_every_address_has_one_place_on_this_machine() -> None:
+    assert addresses.loopback_of("10.42.0.11") == "127.42.0.11"
+    assert addresses.bench_of(0) == "127.255.0.1"
+    assert addresses.bench_of(299) == "127.255.1.44"
+    assert len({addresses.bench_of(number) for number in range(1000)}) == 1000
+
+
+def test_every_node_of_a_big_fleet_is_a_few_hops_away() -> None:
+    names = [f"n{number}" for number in range(200)]
+    parents = {link.b: link.a for link in from_inventory.default_links(names) if link.tq > 200}
+
+    def hops(name: str) -> int:
+        return 0 if name == "n0" else 1 + hops(parents[name])
+
+    assert max(map(hops, names)) <= 6
+
+
+def test_breaks_are_words_and_some_take_a_step() -> None:
+    assert faults.parse("power-cut@7") == Order(Break.CUT, "7")
+    assert faults.parse("full-flash") == Order(Break.FULL_FLASH)
+    assert faults.told(Order(Break.FULL_FLASH)) == "no space left in flash but 8 KiB"
+    assert faults.told(Order(Break.CUT, "7")).endswith(
+        "what was not synced is lost; at command 7 that it runs from now on"
+    )
+    assert faults.told(Order(Break.SEVER, "uci commit")).endswith(
+        "before the first command whose words hold 'uci commit'"
+    )
+    assert set(faults.BREAKS) == set(Break)
+    with pytest.raises(InputError, match="explode"):
+        faults.parse("explode")
+    with pytest.raises(InputError, match="takes no @STEP"):
+        faults.parse("clock@3")
+
+
+@pytest.mark.parametrize("release", list(Release))
+def test_an_image_passes_the_host_side_check_of_any_image(release: Release) -> None:
+    metadata = read_metadata(firmware_image(release, board="ubnt,rocket-m"))
+    assert metadata is not None
+    assert metadata.boards == ("ubnt,rocket-m",)
+    assert releases.facts(release).revision == metadata.revision
+
+
+def test_an_image_holds_one_supplicant() -> None:
+    with_full = releases.image_packages(Release.V23_05, ("wpad-openssl",))
+    assert [name for name in with_full if name.startswith("wpad")] == ["wpad-openssl"]
+    plain = releases.image_packages(Release.V23_05, ())
+    assert [name for name in plain if name.startswith("wpad")] == ["wpad-basic-mbedtls"]
+
+
+names_of_applets = st.lists(st.text("abcdefghs12[", min_size=2, max_size=6), min_size=4, max_size=30, unique=True).map(
+    lambda found: sorted({*found, "ash", "sh"})
+)
+
+
+@given(names_of_applets)
+def test_hiding_applets_keeps_the_order_that_lookups_rely_on(names: list[str]) -> None:
+    table = "\0".join(names).encode() + b"\0"
+    image = b"before" + table + b"after"
+    changed = rootfs.without_applets(image, names, set(names) - {"ash", "sh"}, keep=("ash", "sh"))
+    assert len(changed) == len(image)
+    found = changed[6:-5].split(b"\0")[:-1]
+    for kept in (b"ash", b"sh"):
+        place = names.index(kept.decode())
+        assert found[place] == kept
+        assert all(other < kept for other in found[:place])
+        assert all(other > kept for other in found[place + 1 :])
+
+
+def test_a_busybox_with_another_table_is_refused() -> None:
+    with pytest.raises(LabError, match="applet names"):
+        rootfs.without_applets(b"nothing here", ["ash", "cat"], {"cat"}, keep=("ash",))

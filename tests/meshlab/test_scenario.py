@@ -1,0 +1,169 @@
+"""Missions: where everybody is at which time, what happens when, and the file format."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from meshctl.diagnostics import InvalidInput
+from meshlab import scenario_file
+from meshlab.propagation import Ground, Place, links_of
+from meshlab.scenario import Course, Drop, Event, Happening, Incident, Mission, agenda, course, scene
+
+FILE = Path("mission.yaml")
+EXAMPLE = Path(__file__).parents[3] / "inventory" / "lab" / "mission.yaml"
+
+# a robot that drives away from the base at 2 m/s with a beacon, which it drops after 100 m
+AWAY = Mission(
+    "away",
+    "base",
+    Ground({"base": Place((0, 0), 27.0), "spare": Place((0, 5))}),
+    duration_s=200.0,
+    robots={"rover": Course((0.0, 200.0), ((0.0, 0.0), (400.0, 0.0)))},
+    beacons={"beacon": Drop("rover", 50.0)},
+)
+times = st.integers(0, 200).map(float)
+
+
+def happenings(mission: Mission, what: Happening) -> list[tuple[float, str, str]]:
+    return [(event.at_s, event.who, event.other) for event in agenda(mission) if event.what is what]
+
+
+@given(times)
+def test_a_beacon_rides_without_power_and_stays_with_power_where_it_was_dropped(t: float) -> None:
+    now = scene(AWAY, t)
+    rover, beacon = now.ground.places["rover"].at, now.ground.places["beacon"].at
+    assert rover == pytest.approx((2 * t, 0.0))
+    assert beacon == (rover if t < 50 else (100.0, 0.0))
+    assert ("beacon" in now.powered) == (t >= 50)
+    assert now.powered >= {"base", "rover", "spare"}
+
+
+@given(st.lists(st.tuples(times, st.tuples(times, times)), min_size=1, max_size=5, unique_by=lambda point: point[0]))
+def test_a_course_goes_through_its_points_and_stands_at_its_ends(
+    points: list[tuple[float, tuple[float, float]]],
+) -> None:
+    points.sort()
+    path = course(points)
+    assert all(path.at(at_s) == pytest.approx(place) for at_s, place in points)
+    assert path.at(-1.0) == points[0][1]
+    assert path.at(1000.0) == points[-1][1]
+
+
+@pytest.mark.parametrize("way_points", [[], [(1.0, (0.0, 0.0)), (1.0, (1.0, 0.0))]])
+def test_a_course_needs_rising_times(way_points: list[tuple[float, tuple[float, float]]]) -> None:
+    with pytest.raises(ValueError, match="rising times"):
+        course(way_points)
+
+
+def test_the_agenda_tells_what_was_planned_and_what_came_of_it() -> None:
+    assert happenings(AWAY, Happening.ARRIVES) == [(200.0, "rover", "")]
+    assert happenings(AWAY, Happening.DROPPED) == [(50.0, "beacon", "rover")]
+    # the beacon joins the mesh where it is dropped, and keeps the robot in it for a while
+    assert (50.0, "beacon", "") in happenings(AWAY, Happening.REACHED)
+    ((lost_s, *_),) = happenings(AWAY, Happening.CUT_OFF)
+    alone = replace(AWAY, beacons={}, ground=replace(AWAY.ground, places={"base": Place((0, 0), 27.0)}))
+    ((lost_alone_s, *_),) = happenings(alone, Happening.CUT_OFF)
+    assert lost_s > lost_alone_s + 40
+    assert agenda(AWAY)[-1] == Event(200.0, Happening.END, "base")
+
+
+@given(st.sampled_from([0.5, 1.0, 3.0, 7.0]))
+def test_events_come_in_order_and_links_as_the_ground_has_them(step_s: float) -> None:
+    mission = replace(AWAY, step_s=step_s)
+    events = agenda(mission)
+    assert [event.at_s for event in events] == sorted(event.at_s for event in events)
+    joined: set[frozenset[str]] = {link.ends for link in links_of(scene(mission, 0.0).ground)} - {
+        frozenset(("beacon", other)) for other in ("base", "rover", "spare")
+    }
+    for event in events:
+        if event.what is Happening.LINK_UP:
+            joined.add(frozenset((event.who, event.other)))
+        elif event.what is Happening.LINK_DOWN:
+            joined.remove(frozenset((event.who, event.other)))
+    end = {link.ends for link in links_of(scene(mission, 200.0).ground)}
+    assert joined == end
+
+
+def test_an_incident_takes_a_radio_off_and_back_and_never_wakes_a_carried_beacon() -> None:
+    mission = replace(
+        AWAY,
+        incidents=(Incident(10.0, "beacon", True), Incident(80.0, "beacon", False), Incident(90.0, "beacon", True)),
+    )
+    assert ["beacon" in scene(mission, t).powered for t in (9.0, 11.0, 50.0, 80.0, 89.0, 90.0)] == [
+        False, False, True, False, False, True,
+    ]  # fmt: skip
+    assert happenings(mission, Happening.OFF) == [(80.0, "beacon", "")]
+
+
+def test_the_order_of_incidents_in_the_file_does_not_matter() -> None:
+    late, early = Incident(90.0, "spare", True), Incident(80.0, "spare", False)
+    mission = replace(AWAY, incidents=(late, early))
+    assert "spare" not in scene(mission, 85.0).powered
+    assert "spare" in scene(mission, 95.0).powered
+
+
+# -- the file --
+
+
+def test_a_mission_is_read_as_it_is_written(tmp_path: Path) -> None:
+    (tmp_path / "ground.yaml").write_text(
+        "nodes: {base: [0, 0], spare: [9, 9]}\nair: {exponent: 2}\n", encoding="utf-8"
+    )
+    text = """
+ground: ground.yaml
+nodes: {spare: [0, 5]}
+duration_s: 200
+robots: {rover: {path: [[0, 0, 0], [200, 400, 0]]}}
+beacons: {beacon: {carried_by: rover, drop_s: 50}}
+incidents: [{at_s: 80, what: "off", who: spare}]
+"""
+    mission = scenario_file.parse(text, tmp_path / "away.yaml")
+    assert (mission.name, mission.base, mission.step_s) == ("away", "base", 1.0)
+    assert mission.ground.places == {"base": Place((0, 0)), "spare": Place((0, 5))}
+    assert mission.ground.air.exponent == 2
+    assert (mission.robots, mission.beacons) == (AWAY.robots, AWAY.beacons)
+    assert mission.incidents == (Incident(80.0, "spare", False),)
+    assert mission.names == ("base", "beacon", "rover", "spare")
+
+
+GOOD = "nodes: {base: [0, 0]}\nduration_s: 9\nrobots: {r: {path: [[0, 0, 0]]}}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("nodes: {base: [0, 0]}", "mission.yaml:1:1: expected the key duration_s, found no such key"),
+        (
+            GOOD + "beacons: {b: {carried_by: x, drop_s: 1}}",
+            "mission.yaml:4:27: beacons.b.carried_by: expected one of r,",
+        ),
+        (GOOD + "beacons: {b: {carried_by: r}}", "beacons.b: expected the key drop_s"),
+        (GOOD + "beacons: {r: {carried_by: base, drop_s: 1}}", "beacons: expected nodes that are not robots, found r"),
+        (GOOD + "incidents: [{at_s: 1, what: explode, who: r}]", "incidents[0].what: expected one of off, on, found"),
+        (GOOD + "incidents: [{at_s: 1, what: on, who: x}]", "incidents[0].who: expected one of base, r, found 'x'"),
+        (GOOD + "base: x", "mission.yaml:4:7: base: expected one of base, r, found 'x'"),
+        (GOOD + "ground: nowhere.yaml", "nowhere.yaml: cannot be read"),
+        (GOOD + "step_s: 0", "step_s: expected a number from 0.1"),
+        ("duration_s: 9\nnodes: {base: [0, 0]}\nrobots: {r: {path: [[1, 0, 0], [1, 2, 2]]}}", "with rising times"),
+        ("duration_s: 9\nnodes: {base: [0, 0]}\nrobots: {r: {path: [[1, 0]]}}", "path[0]: expected [seconds, x, y]"),
+    ],
+)
+def test_a_problem_names_file_line_what_was_expected_and_found(text: str, said: str) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        scenario_file.parse(text, FILE)
+    assert said in str(caught.value)
+
+
+def test_the_example_drops_every_beacon_in_reach_and_ends_with_everybody_at_the_base() -> None:
+    mission = scenario_file.load(EXAMPLE)
+    for name, drop in mission.beacons.items():
+        assert (drop.at_s, name, "") in happenings(mission, Happening.REACHED)
+    lost = {name for _, name, _ in happenings(mission, Happening.CUT_OFF)}
+    assert lost == {"rover1", "rover2", "b03"}
+    last = {event.who: event.what for event in agenda(mission) if event.what in (Happening.CUT_OFF, Happening.REACHED)}
+    assert set(last.values()) == {Happening.REACHED}

@@ -1,0 +1,142 @@
+"""Laws of station tables: who is half deaf to whom, and what ends it (docs/lab.md, What only real radios showed)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import pytest
+
+from meshlab import mesh_model
+from meshlab.mesh_model import Edge, Effective
+from meshlab.spec import LinkSpec
+from meshlab.station_tables import DEAF_S, EXPIRY_S, Stations
+from tests.meshlab.test_mesh_model import node
+
+BOOTS = {"a": 1, "b": 1}
+A, B = "02:00:00:00:00:01", "02:00:00:00:00:02"
+
+
+class Pair:
+    """Two nodes that hear each other, and a clock."""
+
+    def __init__(self) -> None:
+        self.stations = Stations()
+        self.nodes = {"a": node(1, index=21), "b": node(2, index=21)}
+        self.now_s = 1000.0
+        self.boots = dict(BOOTS)
+        self.hear()
+
+    def graph(self) -> Mapping[str, list[Edge]]:
+        return mesh_model.edges(self.nodes, [LinkSpec("a", "b")])
+
+    def hear(self, *, after_s: float = 1.0) -> None:
+        self.now_s += after_s
+        self.stations.update(self.graph(), self.boots, self.now_s)
+
+    def change(self, name: str, **changes: object) -> None:
+        cell = replace(self.nodes[name].cells[0], **changes)  # type: ignore[arg-type]
+        self.nodes[name] = Effective((cell,), self.nodes[name].addresses)
+
+    def restart(self, name: str, *, away_s: float = 1.0) -> None:
+        """The interface is made anew; nobody hears it meanwhile."""
+        cell = self.nodes[name].cells[0]
+        self.nodes[name] = Effective((), self.nodes[name].addresses)
+        self.hear()
+        self.nodes[name] = Effective((replace(cell, index=cell.index + 1),), self.nodes[name].addresses)
+        self.hear(after_s=away_s)
+
+    def passes(self) -> bool:
+        return self.stations.passes("a", self.boots, self.graph()["a"][0])
+
+    def connected_s(self, name: str) -> list[float]:
+        return [self.now_s - entry.since_s for entry in self.stations.of(name)]
+
+
+@pytest.fixture
+def pair() -> Pair:
+    return Pair()
+
+
+def test_two_that_just_met_hear_each_other(pair: Pair) -> None:
+    pair.hear(after_s=100)
+    assert pair.passes()
+    assert pair.connected_s("a") == pair.connected_s("b") == [100]
+
+
+def test_a_radio_made_anew_is_not_heard_by_who_knew_it_until_that_one_deletes_its_entry(pair: Pair) -> None:
+    pair.hear(after_s=100)
+    pair.restart("b")
+    assert not pair.passes()
+    assert pair.connected_s("a") == [102]
+    assert pair.connected_s("b") == [0]
+    pair.stations.delete("a", "mesh0", B, pair.now_s)
+    pair.hear()
+    assert pair.passes()
+    assert pair.connected_s("a") == [0]
+
+
+def test_a_radio_with_another_address_is_a_stranger_and_the_old_entry_falls_silent(pair: Pair) -> None:
+    pair.change("b", mac="42:00:00:00:00:02", index=22)
+    pair.hear(after_s=10)
+    assert pair.passes()
+    silent = {entry.mac: entry.silent_since_s for entry in pair.stations.of("a")}
+    assert silent == {B: pair.now_s, "42:00:00:00:00:02": None}
+    pair.hear(after_s=EXPIRY_S)
+    assert [entry.mac for entry in pair.stations.of("a")] == ["42:00:00:00:00:02"]
+
+
+def test_one_that_forgets_a_radio_that_did_not_restart_is_not_heard_until_that_one_forgets_it_too(pair: Pair) -> None:
+    pair.stations.delete("a", "mesh0", B, pair.now_s)
+    pair.hear()
+    assert not pair.passes()
+    pair.stations.delete("b", "mesh0", A, pair.now_s)
+    pair.hear()
+    assert pair.passes()
+
+
+def test_numbers_catch_up_after_minutes(pair: Pair) -> None:
+    pair.restart("b")
+    pair.hear(after_s=DEAF_S - 1)
+    assert not pair.passes()
+    pair.hear(after_s=2)
+    assert pair.passes()
+
+
+def test_one_that_was_away_for_longer_than_it_is_remembered_is_heard_at_once(pair: Pair) -> None:
+    cells = pair.nodes["b"].cells
+    pair.nodes["b"] = Effective()
+    pair.hear()
+    assert pair.stations.next_change_s() == pair.now_s + EXPIRY_S
+    pair.hear(after_s=EXPIRY_S + 1)
+    assert pair.stations.of("a") == []
+    pair.nodes["b"] = Effective((replace(cells[0], index=22),))
+    pair.hear()
+    assert pair.passes()
+
+
+def test_a_link_that_fails_for_a_moment_changes_nothing_about_it(pair: Pair) -> None:
+    pair.restart("b")
+    nodes, pair.nodes = pair.nodes, {}
+    pair.hear()
+    pair.nodes = nodes
+    pair.hear()
+    assert not pair.passes()
+
+
+def test_an_entry_that_is_deleted_while_its_radio_is_silent_costs_nothing(pair: Pair) -> None:
+    cells = pair.nodes["b"].cells
+    pair.nodes["b"] = Effective()
+    pair.hear()
+    pair.stations.delete("a", "mesh0", B, pair.now_s)
+    pair.nodes["b"] = Effective((replace(cells[0], index=22),))
+    pair.hear()
+    assert pair.passes()
+
+
+def test_a_reboot_forgets_ones_own_table(pair: Pair) -> None:
+    pair.boots["a"] = 2
+    pair.hear(after_s=50)
+    assert pair.connected_s("a") == [0]
+    assert pair.connected_s("b") == [50]
+    assert not pair.passes()

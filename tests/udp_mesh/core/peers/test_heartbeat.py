@@ -1,0 +1,123 @@
+"""Discovery costs a large team a bounded share of its channel, and a node no more than it uses."""
+
+import itertools
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.udp_mesh.core.pair import KEY, World, settings
+from udp_mesh.core import peer_lifecycle
+from udp_mesh.core.events import PeerOffline, PeerOnline
+from udp_mesh.core.peers.heartbeat import ANSWER_WITHIN_S, LEAST_GAP_S, MEETING_HASTE, Discovery
+from udp_mesh.core.peers.session import Session
+from udp_mesh.core.settings import Rates, Topic
+
+RATES = Rates()
+
+
+def _session(config_name: str = "b") -> Session:
+    return Session(config_name, bytes(range(16)), bytes(16), (KEY,), settings(config_name))
+
+
+@given(st.integers(0, 2000), st.lists(st.floats(0.0, 2.0), min_size=1, max_size=40), st.integers(0, 1 << 30))
+def test_whatever_asks_for_heartbeats_a_node_sends_no_more_than_its_share(
+    team: int, waits: list[float], seed: int
+) -> None:
+    discovery, now = Discovery(random.Random(seed), RATES, 0.0), 0.0
+    share_s = team / (MEETING_HASTE * RATES.heartbeats_heard_per_s)
+    sent: list[float] = []
+    for wait in waits:
+        now += wait
+        while discovery.next_at <= now:
+            sent.append(discovery.next_at)
+            discovery.compose(settings("a"), [], (), 0, 0.0, discovery.next_at)
+        discovery.answer(_session(), team, now)
+    gaps = [later - earlier for earlier, later in itertools.pairwise(sent)]
+    # a sparser heartbeat of its own may fall in between two answers
+    assert all(gap >= min(max(LEAST_GAP_S, share_s), 0.9 * RATES.heartbeat_s) - 1e-9 for gap in gaps)
+
+
+@given(st.integers(0, 1 << 30))
+def test_a_new_node_is_answered_at_once_in_a_small_team_and_not_by_all_at_once_in_a_large_one(seed: int) -> None:
+    rng = random.Random(seed)
+    small, large = (Discovery(rng, RATES, 0.0) for _ in range(2))
+    for discovery in (small, large):
+        discovery.compose(settings("a"), [], (), 0, 0.0, 0.0)
+    small.answer(_session(), 10, 0.9)
+    large.answer(_session(), 1000, 0.1)
+    assert small.next_at <= 0.9 + ANSWER_WITHIN_S
+    assert large.next_at >= 0.9
+
+
+def test_peers_to_whom_nothing_is_sent_have_no_sending_half() -> None:
+    world = World(seed=3)
+    for name in ("a", "b", "c"):
+        world.add(settings(name, Topic("map")))
+    assert world.run(5.0, until=lambda: all(len(world.told(name, PeerOnline)) == 2 for name in world.nodes))
+    world.run(3.0)
+    assert [peer.name for peer in world.nodes["a"]._state.roster.peers.values() if peer.engaged] == []
+    conditions = world.nodes["a"].conditions(world.now)
+    assert [(peer.name, peer.online, peer.round_trip_s) for peer in conditions.peers] == [
+        ("b", True, None),
+        ("c", True, None),
+    ]
+    world.send("a", "map", bytes(1000), "b")
+    assert [peer.name for peer in world.nodes["a"]._state.roster.peers.values() if peer.engaged] == ["b"]
+
+
+def test_settings_changed_before_anything_was_sent_hold_for_what_is_sent_later() -> None:
+    world = World(seed=3)
+    for name in ("a", "b"):
+        world.add(settings(name, Topic("map")))
+    world.run(3.0)
+    world.nodes["a"].apply(settings("a", Topic("map"), window=3), world.now)
+    world.send("a", "map", bytes(1000), "b")
+    assert world.nodes["a"].conditions(world.now).peers[0].window_packets == 3
+
+
+def test_every_silent_peer_goes_offline_although_a_round_looks_at_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peer_lifecycle, "LOOKED_AT_PER_ROUND", 1)
+    world = World(seed=4)
+    for name in "abcdef":
+        world.add(settings(name))
+    assert world.run(5.0, until=lambda: len(world.told("a", PeerOnline)) == 5)
+    for name in "bcdef":
+        del world.nodes[name]
+    assert world.run(20.0, until=lambda: len(world.told("a", PeerOffline)) == 5)
+
+
+def test_nodes_tell_each_other_what_they_send_and_what_arrives() -> None:
+    world = World(seed=5)
+    for name in ("a", "b", "c"):
+        world.add(settings(name, Topic("video", priority=9, reliable=False)))
+    world.run(3.0)
+    for _ in range(100):
+        world.send("a", "video", bytes(10_000), "b")
+        world.run(0.1)
+    sending = world.nodes["a"].conditions(world.now)
+    to_b = next(peer for peer in sending.peers if peer.name == "b")
+    # 10 kB ten times a second, with headers
+    assert 0.8e6 < sending.sent_bits_per_s < 1.0e6
+    assert to_b.arrived_bits_per_s is not None
+    assert 0.8e6 < to_b.arrived_bits_per_s < 1.0e6
+    heard = world.nodes["c"].conditions(world.now)
+    assert 0.8e6 < heard.heard_bits_per_s < 1.2e6
+    world.run(20.0)
+    later = world.nodes["a"].conditions(world.now)
+    assert next(peer for peer in later.peers if peer.name == "b").arrived_bits_per_s is None
+    assert world.nodes["c"].conditions(world.now).heard_bits_per_s < 20_000
+
+
+def test_new_nodes_that_one_heartbeat_cannot_list_are_listed_soon() -> None:
+    discovery = Discovery(random.Random(1), RATES, 0.0)
+    rng, listed, now = random.Random(2), set[bytes](), 0.0
+    strangers = [Session("b", rng.randbytes(16), bytes(16), (KEY,), settings("b")) for _ in range(300)]
+    for session in strangers:
+        discovery.answer(session, len(strangers), now)
+    while len(listed) < len(strangers):
+        now = discovery.next_at
+        listed.update(discovery.compose(settings("a"), strangers, (), 0, 0.0, now).heard)
+    # four heartbeats at the pace of a meeting, not of a regular round of ten seconds
+    assert now < 5 * len(strangers) / (MEETING_HASTE * RATES.heartbeats_heard_per_s)

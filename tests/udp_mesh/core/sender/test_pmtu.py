@@ -1,0 +1,450 @@
+"""A path that swallows large datagrams in silence is found out; loss of any other kind is not taken for one."""
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import pytest
+
+from tests.udp_mesh.core.pair import BROADCAST, IP_UDP_BYTES, Pipe, World, settings
+from udp_mesh.core.events import MessageDelivered, MessageId, MessageReceived, PathNarrowed, PeerOnline
+from udp_mesh.core.interfaces import Datagram
+from udp_mesh.core.sender.message import Accepted, Channel, Outgoing
+from udp_mesh.core.sender.pmtu import ASK_AT_MOST_EVERY_S, ASKED_TIMES, PathSize
+from udp_mesh.core.sender.sent_packets import Mark, Packet
+from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
+from udp_mesh.wire.frames import MessageFlag
+
+TOPICS = (Topic("status", priority=0), Topic("map"), Topic("seen", reliable=False))
+
+
+@dataclass
+class Narrow(Pipe):
+    """Loses every IP packet above `mtu` and says nothing."""
+
+    mtu: int = 1500
+
+    def carry(self, size_bytes: int, now: float, rng: random.Random) -> float | None:
+        if size_bytes + IP_UDP_BYTES > self.mtu:
+            self.dropped += 1
+            return None
+        return Pipe.carry(self, size_bytes, now, rng)
+
+
+def met(
+    mtu: int,
+    loss: float = 0.0,
+    *,
+    seed: int = 1,
+    link_mtu: int = 1500,
+    delay_s: float = 0.01,
+    fragment_bytes: int = 1400,
+) -> World:
+    world = World(seed=seed)
+    for name in ("a", "b"):
+        node = world.add(settings(name, *TOPICS, fragment_bytes=fragment_bytes))
+        node.link_up(LinkInfo("mesh", LinkKind.BROADCAST, world.addresses[name], BROADCAST, mtu=link_mtu), world.now)
+    for way in world.pipes:
+        world.pipes[way] = Narrow(mtu=mtu, loss=loss, delay_s=delay_s)
+    assert world.run(20.0, until=partial(knows, world))
+    return world
+
+
+def become(world: World, mtu: int) -> None:
+    """Every path carries so much from now on."""
+    for way in world.pipes.values():
+        assert isinstance(way, Narrow)
+        way.mtu = mtu
+
+
+def narrow(world: World) -> list[int]:
+    return [event.mtu for event in world.told("a", PathNarrowed) if isinstance(event, PathNarrowed)]
+
+
+def knows(world: World) -> bool:
+    return bool(world.told("a", PeerOnline) and world.told("b", PeerOnline))
+
+
+def found_narrow(world: World) -> bool:
+    return narrow(world) == [1280]
+
+
+def topics(world: World, name: str, kind: type[MessageDelivered] | type[MessageReceived]) -> list[str]:
+    return [event.topic for event in world.told(name, kind) if isinstance(event, MessageDelivered | MessageReceived)]
+
+
+@pytest.mark.parametrize(
+    ("mtu", "found"), [(1499, []), (1400, [1280]), (1280, [1280]), (900, [1280, 576]), (576, [1280, 576])]
+)
+@pytest.mark.parametrize("telemetry", [True, False])
+def test_a_large_message_crosses_a_path_that_is_narrower_than_its_link(
+    mtu: int, found: list[int], telemetry: bool
+) -> None:
+    world = met(mtu)
+
+    def publish() -> None:
+        world.send("a", "status", bytes(100), "b")
+
+    world.send("a", "map", bytes(100_000), "b")
+    if telemetry:
+        for tenth in range(200):
+            world.at(world.now + tenth / 10, publish)
+    assert world.run(20.0, until=lambda: "map" in topics(world, "a", MessageDelivered))
+    assert narrow(world) == found
+    world.run(5.0)
+    assert topics(world, "b", MessageReceived).count("map") == 1
+
+
+def largest_of(world: World) -> list[int]:
+    """The largest IP packet that leaves a from now on."""
+    largest = [0]
+
+    def look(name: str, datagram: Datagram, _: float) -> None:
+        if name == "a":
+            largest[0] = max(largest[0], len(datagram.data) + IP_UDP_BYTES)
+
+    world.tap = look
+    return largest
+
+
+@pytest.mark.parametrize("mtu", [1300, 1400])
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+@pytest.mark.parametrize("round_trip_s", [0.02, 0.2, 1.0])
+def test_a_narrow_path_is_found_soon_although_datagrams_of_any_size_are_lost(
+    mtu: int, loss: float, round_trip_s: float
+) -> None:
+    for seed in (1, 2, 3):
+        world = met(mtu, loss, seed=seed, delay_s=round_trip_s / 2)
+        world.send("a", "map", bytes(50_000), "b")
+        assert world.run(12.0, until=partial(found_narrow, world)), seed
+
+
+@pytest.mark.parametrize("size_bytes", [100, 400])
+def test_small_messages_that_share_datagrams_cross_a_narrow_path(size_bytes: int) -> None:
+    world = met(1300)
+    for _ in range(200):
+        world.send("a", "map", bytes(size_bytes), "b")
+    assert world.run(15.0, until=lambda: len(topics(world, "a", MessageDelivered)) == 200)
+
+
+def test_messages_that_share_datagrams_do_not_make_them_larger_than_a_full_fragment() -> None:
+    # The loopback, and some tunnels, say that they carry 64 KiB.
+    world = met(1500, 0.1, link_mtu=65_535)
+    largest = largest_of(world)
+    for _ in range(300):
+        world.send("a", "map", bytes(400), "b")
+    world.send("a", "map", bytes(200_000), "b")
+    assert world.run(10.0, until=lambda: len(topics(world, "a", MessageDelivered)) == 301)
+    assert (narrow(world), largest[0] <= 1500) == ([], True)
+
+
+@pytest.mark.parametrize(
+    ("link_mtu", "fragment_bytes", "mtu", "found"),
+    [
+        (9000, 8192, 1500, [1500]),
+        (65_535, 8192, 1500, [1500]),
+        (65_535, 8192, 1300, [1500, 1280]),
+        # Its fragments fit 1280 bytes anyhow.
+        (1500, 1000, 900, [576]),
+    ],
+)
+def test_a_path_is_narrowed_step_by_step_and_only_to_what_makes_fragments_smaller(
+    link_mtu: int, fragment_bytes: int, mtu: int, found: list[int]
+) -> None:
+    world = met(mtu, link_mtu=link_mtu, fragment_bytes=fragment_bytes)
+    world.send("a", "map", bytes(100_000), "b")
+    assert world.run(15.0, until=lambda: bool(topics(world, "a", MessageDelivered)))
+    assert narrow(world) == found
+
+
+def test_a_message_to_all_is_cut_for_a_path_known_to_be_narrow() -> None:
+    world = met(1300)
+    world.send("a", "map", bytes(50_000), "b")
+    assert world.run(60.0, until=lambda: found_narrow(world))
+    world.send("a", "seen", bytes(1380))
+    assert world.run(10.0, until=lambda: "seen" in topics(world, "b", MessageReceived))
+
+
+def test_a_message_to_all_is_no_larger_than_ethernet_s_packets_whatever_the_link_carries() -> None:
+    world = met(1500, link_mtu=65_535)
+    world.send("a", "seen", bytes(20_000))
+    assert world.run(1.0, until=lambda: "seen" in topics(world, "b", MessageReceived))
+
+
+def test_a_path_that_is_wide_again_carries_full_fragments_after_some_time() -> None:
+    world = met(1280)
+    world.send("a", "map", bytes(100_000), "b")
+    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    become(world, 1500)
+    world.run(12.0)
+    before = world.pipes[("a", "b")].carried
+    world.send("a", "map", bytes(100_000), "b")
+    assert world.run(20.0, until=lambda: len(world.told("a", MessageDelivered)) == 2)
+    # 72 full fragments; 84 would be the smaller ones
+    assert world.pipes[("a", "b")].carried - before < 80
+
+
+def test_a_path_that_is_less_narrow_than_it_was_carries_what_it_can() -> None:
+    world = met(900)
+    world.send("a", "map", bytes(100_000), "b")
+    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    become(world, 1400)
+    world.run(60.0)
+    world.pipes["a", "b"].dropped = 0
+    largest = largest_of(world)
+    world.send("a", "map", bytes(100_000), "b")
+    assert world.run(5.0, until=lambda: len(topics(world, "a", MessageDelivered)) == 2)
+    assert (narrow(world), world.pipes["a", "b"].dropped) == ([1280, 576], 0)
+    assert 1200 < largest[0] <= 1280
+
+
+def test_a_path_that_stays_narrow_is_asked_ever_more_seldom_and_loses_nothing_but_pings() -> None:
+    world = met(1400)
+    world.send("a", "map", bytes(100_000), "b")
+    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    start = world.now
+    large: list[float] = []
+
+    def look(name: str, datagram: Datagram, now: float) -> None:
+        if name == "a" and len(datagram.data) + IP_UDP_BYTES > 1280:
+            large.append(now - start)
+
+    world.tap = look
+
+    def publish() -> None:
+        world.send("a", "map", bytes(20_000), "b")
+        world.at(world.now + 20.0, publish)
+
+    publish()
+    world.run(2 * ASK_AT_MOST_EVERY_S + 50.0)
+    # 10, 20, 40 .. 320, 600 s after the one before
+    assert [round(at / 10) * 10 for at in large[::ASKED_TIMES]] == [10, 30, 70, 150, 310, 630, 1240]
+    assert len(large) == 7 * ASKED_TIMES
+    assert narrow(world) == [1280]
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3, 0.6])
+def test_a_path_taken_for_narrow_by_mistake_is_wide_again_within_minutes_however_much_is_lost(loss: float) -> None:
+    for seed in range(4):
+        world = met(1280, seed=seed)
+        world.send("a", "map", bytes(20_000), "b")
+        assert world.run(20.0, until=partial(found_narrow, world))
+        for way in world.pipes.values():
+            assert isinstance(way, Narrow)
+            way.mtu, way.loss = 1500, loss
+        largest = largest_of(world)
+        for _ in range(200):
+            world.send("a", "status", bytes(100), "b")
+            world.run(0.5)
+        largest[0] = 0
+        world.send("a", "map", bytes(20_000), "b")
+        world.run(1.0)
+        assert largest[0] > 1280, seed
+
+
+def test_a_path_that_carries_large_pings_and_nothing_else_is_asked_ever_more_seldom_too() -> None:
+    size = PathSize()
+    now = 0.0
+    asked: list[float] = []
+    while now < 1200.0:
+        if size.narrowed_at is None:
+            size.narrowed(now)
+        assert size.asking.carries == 0
+        while not size.asking.due(now, 0.0):
+            now += 0.5
+        asked.append(now)
+        size.asking.asked(1, 1500)
+        size.answered(1, now)
+        assert size.asking.carries == 1500
+        # Wide again, and narrow soon after.
+        now += 5.0
+        size.narrowed_at = None
+    assert asked == [10.0, 35.0, 80.0, 165.0, 330.0, 655.0, 1260.0]
+
+
+def packet(size_bytes: int, now: float) -> Packet:
+    body = bytes(size_bytes)
+    accepted = Accepted(MessageId(1), Channel(0, Topic("t"), "t", ""), body, body, MessageFlag.RELIABLE, now, None)
+    message = Outgoing(accepted, 8, reliable=True)
+    message.begin(1, 1400, 1400)
+    return Packet(Mark(now, 0, now, now, limited=False), message, 0)
+
+
+def narrowings(hours: float, arrives: Callable[[float], bool], *, large_arrive: bool = True) -> int:
+    """How often a silent peer, probed four times a second, is taken for behind a narrow path."""
+    size = PathSize()
+    large, small = packet(1350, 0.0), packet(100, 0.0)
+    count = 0
+    for step in range(int(hours * 3600 * 4)):
+        now = step / 4
+        if size.ask_small():
+            size.asked_small()
+            if arrives(now):
+                size.answered(0, now)
+        elif not (arrives(now) and large_arrive):
+            size.lost([large._replace(mark=small.mark._replace(sent_at=now))])
+        elif size.in_doubt:
+            size.arrived([large], 0, now)
+        if size.too_narrow(now):
+            count += 1
+            size.narrowed(now)
+    return count
+
+
+@pytest.mark.parametrize("loss", [0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95])
+def test_hours_of_even_loss_are_not_taken_for_a_narrow_path(loss: float) -> None:
+    rng = random.Random(7)
+    assert narrowings(10.0, lambda _: rng.random() >= loss) == 0
+
+
+@pytest.mark.parametrize("cut_s", [0.3, 1.0, 5.0, 60.0])
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+def test_hours_of_cuts_are_not_taken_for_a_narrow_path(cut_s: float, share: float) -> None:
+    rng = random.Random(8)
+    until, up = 0.0, False
+
+    def arrives(now: float) -> bool:
+        nonlocal until, up
+        while now >= until:
+            up = not up
+            until += rng.expovariate(1 / (cut_s * (1 - share) / share if up else cut_s))
+        return up
+
+    assert narrowings(5.0, arrives) == 0
+
+
+def test_no_mistake_comes_of_a_path_that_loses_much_from_one_moment_to_the_next() -> None:
+    rng = random.Random(9)
+    # A minute of each, again and again.
+    assert narrowings(10.0, lambda now: rng.random() >= (0.0 if now % 120 < 60 else 0.84)) == 0
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2, 0.36])
+def test_a_silent_peer_behind_a_narrow_path_is_known_for_one_within_seconds(loss: float) -> None:
+    rng = random.Random(10)
+    # Every narrowing begins a new doubt: on an average they are so far apart.
+    assert 3600 / narrowings(1.0, lambda _: rng.random() >= loss, large_arrive=False) < 10.0
+
+
+@pytest.mark.parametrize(("round_trip_s", "loss"), [(0.2, 0.7), (1.0, 0.6)])
+def test_a_long_path_that_loses_most_is_not_taken_for_narrow(round_trip_s: float, loss: float) -> None:
+    for seed in range(2):
+        world = World(seed=seed)
+        for name in ("a", "b"):
+            world.add(settings(name, *TOPICS))
+        assert world.run(20.0, until=partial(knows, world))
+        for way in world.pipes.values():
+            way.rate_bits_per_s, way.delay_s, way.loss = 1e6, round_trip_s / 2, loss
+        for tenth in range(300):
+            world.send("a", "status", bytes(100), "b")
+            world.send("b", "status", bytes(100), "a")
+            if not tenth % 10:
+                world.send("a", "map", bytes(world.rng.randrange(2_000, 20_000)), "b")
+            world.run(0.1)
+        assert narrow(world) == [], seed
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.5])
+def test_loss_and_cuts_of_any_size_are_not_taken_for_a_narrow_path(loss: float) -> None:
+    world = met(1500, loss)
+    rng = random.Random(2)
+
+    def cut_or_heal() -> None:
+        for way in world.pipes.values():
+            way.up = not way.up
+        world.at(world.now + rng.uniform(0.05, 1.5), cut_or_heal)
+
+    def publish() -> None:
+        world.send("a", "status", bytes(100), "b")
+        if rng.random() < 0.1:
+            world.send("a", "map", bytes(50_000), "b")
+        world.at(world.now + 0.1, publish)
+
+    world.at(world.now, cut_or_heal)
+    world.at(world.now, publish)
+    world.run(12.0)
+    assert narrow(world) == []
+
+
+def under_way(world: World) -> list[int]:
+    """Sizes of the datagrams that leave a from now on, as IP packets."""
+    sizes: list[int] = []
+    world.tap = lambda name, datagram, _: sizes.append(len(datagram.data) + IP_UDP_BYTES) if name == "a" else None
+    world.send("a", "map", bytes(500_000), "b")
+    world.run(0.1)
+    assert max(sizes) > 1300
+    sizes.clear()
+    return sizes
+
+
+def test_what_had_begun_fits_a_link_that_became_narrower() -> None:
+    world = met(1500)
+    sizes = under_way(world)
+    link = LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a"], BROADCAST, mtu=700)
+    world.nodes["a"].link_up(link, world.now)
+    assert world.run(20.0, until=lambda: bool(topics(world, "a", MessageDelivered)))
+    assert max(sizes) <= 700
+    assert topics(world, "b", MessageReceived) == ["map"]
+
+
+def test_what_had_left_whole_when_the_link_became_narrower_arrives_once() -> None:
+    world = met(1500)
+    for _ in range(20):
+        world.send("a", "map", bytes(3_000), "b")
+        # all of it is on its way, and nothing is acknowledged
+        world.run(0.012)
+        link = LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a"], BROADCAST, mtu=700)
+        world.nodes["a"].link_up(link, world.now)
+        world.run(0.5)
+        world.nodes["a"].link_up(replace(link, mtu=1500), world.now)
+    assert topics(world, "a", MessageDelivered) == ["map"] * 20
+    assert topics(world, "b", MessageReceived) == ["map"] * 20
+
+
+@pytest.mark.parametrize("change", ["link", "settings"])
+def test_what_the_path_was_found_to_carry_outlives_a_reload(change: str) -> None:
+    world = met(1280)
+    world.send("a", "map", bytes(100_000), "b")
+    assert world.run(30.0, until=lambda: bool(topics(world, "a", MessageDelivered)))
+    node = world.nodes["a"]
+    if change == "link":
+        node.link_up(LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a"], BROADCAST), world.now)
+    else:
+        node.apply(settings("a", *TOPICS, window=32), world.now)
+    world.pipes["a", "b"].dropped = 0
+    world.send("a", "map", bytes(100_000), "b")
+    assert world.run(5.0, until=lambda: len(topics(world, "a", MessageDelivered)) == 2)
+    assert world.pipes["a", "b"].dropped == 0
+    assert narrow(world) == [1280]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("loss", [0.05, 0.4])
+def test_a_path_that_becomes_long_and_lossy_is_not_taken_for_narrow_nor_does_anything_arrive_twice(
+    seed: int, loss: float
+) -> None:
+    world = World(seed=seed)
+    for name in ("a", "b"):
+        world.add(settings(name, *TOPICS))
+    assert world.run(20.0, until=partial(knows, world))
+    sent = 0
+
+    def publish() -> None:
+        nonlocal sent
+        sent += 1
+        world.send("a", "status", bytes(100), "b")
+        world.send("b", "status", bytes(100), "a")
+        if not sent % 10:
+            world.send("a", "map", bytes(world.rng.randrange(2_000, 20_000)), "b")
+        if sent < 100:
+            world.at(world.now + 0.1, publish)
+
+    publish()
+    world.run(3.0)
+    for way in world.pipes.values():
+        way.delay_s, way.loss = 1.0, loss
+    assert world.run(60.0, until=lambda: len(topics(world, "a", MessageDelivered)) == 110)
+    world.run(5.0)
+    assert narrow(world) == []
+    assert sorted(topics(world, "b", MessageReceived)) == ["map"] * 10 + ["status"] * 100

@@ -1,0 +1,133 @@
+"""Strict priority, decided per fragment when a datagram leaves."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.udp_mesh.core.pair import World, pair, settings
+from udp_mesh.core.events import MessageId, MessageReceived, TopicStarved
+from udp_mesh.core.interfaces import Datagram
+from udp_mesh.core.sender.message import Accepted, Channel, Outgoing
+from udp_mesh.core.sender.scheduler import Scheduler
+from udp_mesh.core.settings import Topic
+from udp_mesh.wire.frames import MessageFlag
+
+
+def outgoing(priority: int, fragments: int) -> Outgoing:
+    channel = Channel(0, Topic("t", priority=priority), "t", "")
+    body = bytes(10 * fragments)
+    message = Outgoing(
+        Accepted(MessageId(1), channel, body, body, MessageFlag.RELIABLE, 0.0, None), priority, reliable=True
+    )
+    message.begin(1, 10, 10)
+    return message
+
+
+steps = st.lists(
+    st.one_of(
+        st.tuples(st.just("push"), st.integers(0, 15), st.integers(1, 5)),
+        st.tuples(st.just("take"), st.integers(1, 3), st.just(0)),
+        st.tuples(st.just("lose"), st.integers(0, 50), st.just(0)),
+        st.tuples(st.just("aside"), st.integers(0, 15), st.just(0)),
+    ),
+    max_size=60,
+)
+
+
+@given(steps)
+def test_no_lower_priority_leaves_while_a_higher_one_waits_and_every_piece_leaves(
+    plan: list[tuple[str, int, int]],
+) -> None:
+    scheduler = Scheduler()
+    waiting: list[tuple[int, int]] = []
+    """(priority, serial of the message) of every piece that waits: the obvious slow version."""
+    messages: list[Outgoing] = []
+    left: list[tuple[Outgoing, int]] = []
+
+    def take(most: int) -> None:
+        if not scheduler.waiting:
+            return
+        priority = (scheduler.waiting & -scheduler.waiting).bit_length() - 1
+        run = scheduler.peek(priority)
+        if run is None:
+            return
+        count = min(most, run.length)
+        scheduler.take(run, count)
+        for position in range(run.position, run.position + count):
+            assert run.message.priority == min(level for level, _ in waiting)
+            waiting.remove((run.message.priority, messages.index(run.message)))
+            left.append((run.message, position))
+
+    for what, number, size in plan:
+        if what == "push":
+            message = outgoing(number, size)
+            messages.append(message)
+            scheduler.push(message)
+            waiting.extend([(number, len(messages) - 1)] * size)
+        elif what == "take":
+            take(number)
+        elif what == "lose" and left:
+            message, position = left.pop(number % len(left))
+            scheduler.push_again(message, position)
+            waiting.append((message.priority, messages.index(message)))
+        elif what == "aside":
+            scheduler.set_aside(number)
+    while scheduler.waiting:
+        take(3)
+    assert not waiting
+    assert len(left) == sum(message.fragments for message in messages)
+
+
+def test_fresh_urgent_messages_overtake_those_set_aside() -> None:
+    scheduler = Scheduler()
+    stale, fresh = outgoing(0, 1), outgoing(0, 1)
+    scheduler.push(stale)
+    scheduler.set_aside(3)
+    scheduler.push(fresh)
+    order = []
+    while (run := scheduler.peek(0)) is not None:
+        scheduler.take(run, 1)
+        order.append(run.message)
+    assert order == [fresh, stale]
+
+
+def test_an_urgent_message_leaves_next_in_the_middle_of_a_map() -> None:
+    both = pair(Topic("stop", priority=0), Topic("map", priority=9))
+    both.a.send("map", bytes(20_000_000), destination="b", now=both.now)
+    both.roundtrip(times=20)
+    both.a.send("stop", b"now", destination="b", now=both.now)
+    first = both.drop(both.a)[0]
+    assert isinstance(first, Datagram)
+    assert first.urgent
+    both.events(both.b)
+    both.b.receive(first.data, "mesh", ("10.0.0.1", 8700), both.now)
+    assert [event.topic for event in both.events(both.b) if isinstance(event, MessageReceived)] == ["stop"]
+
+
+def test_levels_leave_in_order_even_to_different_peers() -> None:
+    world = World()
+    topics = (Topic("high", priority=5), Topic("low", priority=12))
+    for name in ("a", "b", "c"):
+        world.add(settings(name, *topics))
+    world.run(2.0)
+    node = world.nodes["a"]
+    node.send("low", b"l" * 500, destination="c", now=world.now)
+    node.send("high", b"h" * 500, destination="b", now=world.now)
+    out = [datagram for datagram in node.datagrams_to_send(world.now) if len(datagram.data) > 500]
+    assert [datagram.destination for datagram in out] == [world.addresses["b"], world.addresses["c"]]
+
+
+def test_a_level_that_never_gets_its_turn_is_reported() -> None:
+    world = World()
+    topics = (Topic("hog", priority=5), Topic("starving", priority=12))
+    for name in ("a", "b"):
+        world.add(settings(name, *topics))
+    world.run(1.5)
+    for _ in range(20):
+        world.send("a", "hog", bytes(1_000_000), "b")
+    world.send("a", "starving", b"please", "b")
+    world.run(8.0)
+    told = world.told("a", TopicStarved)
+    assert [event.topic for event in told if isinstance(event, TopicStarved)] == ["starving"]
+    queues = {queue.priority: queue for queue in world.nodes["a"].conditions(world.now).peers[0].queues}
+    assert queues[12].starved_s > 5
+    assert queues[5].starved_s == 0

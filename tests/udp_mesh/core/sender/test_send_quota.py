@@ -1,0 +1,78 @@
+"""How many packets may leave: while acknowledgements are late the link is presumed to go on, for a bounded time."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.udp_mesh.core.test_links import Run
+from udp_mesh.core.sender.send_quota import PRESUMED_FOR_S, ack_spacing, permitted, window_room
+from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.settings import Settings
+
+
+def busy_outbound(**link: object) -> tuple[Outbound, float]:
+    """The sending half that has filled its link for a while, and the time of its last acknowledgement."""
+    run = Run(urgent=False)
+    run.link(**link)
+    run.start()
+    run.world.run(3.0)
+    outbound = run.world.nodes["a"]._state.roster.peers["b"].outbound
+    return outbound, outbound.last_progress
+
+
+def room(outbound: Outbound, now: float) -> int:
+    return permitted(outbound, window_room(outbound, now), now, None, urgent=True)
+
+
+def test_late_acknowledgements_do_not_stop_the_link() -> None:
+    outbound, heard = busy_outbound()
+    capacity = outbound.window.capacity()
+    assert capacity is not None
+    later = room(outbound, heard + 0.025) - room(outbound, heard)
+    assert 0.010 * capacity <= later <= 0.025 * capacity
+
+
+def test_what_is_presumed_is_bounded() -> None:
+    outbound, heard = busy_outbound()
+    capacity = outbound.window.capacity()
+    assert capacity is not None
+    assert room(outbound, heard + 10.0) - room(outbound, heard) <= PRESUMED_FOR_S * capacity + 1
+
+
+def test_nothing_is_presumed_of_a_link_whose_queue_is_not_ours() -> None:
+    outbound, heard = busy_outbound()
+    least = outbound.trip.least
+    assert least is not None
+    for step in range(40):
+        outbound.trip.sample(least + 0.1, heard + 0.005 * step)
+    assert room(outbound, heard + 0.06) == room(outbound, heard)
+
+
+def test_a_fixed_window_stays_what_it_is() -> None:
+    outbound = Outbound(Settings("a", unkeyed=True, window=3))
+    assert room(outbound, 100.0) == 3 + outbound.rates.urgent_excess_packets
+
+
+@pytest.mark.parametrize(("loss", "fewest", "most"), [(0.0, 4, 7), (0.2, 2, 3)])
+def test_a_lossy_way_back_is_asked_more_often(loss: float, fewest: int, most: int) -> None:
+    outbound, _ = busy_outbound(loss=loss)
+    assert fewest <= ack_spacing(outbound) <= most
+
+
+def test_bursts_that_swallow_whole_trains_of_acknowledgements_cost_little() -> None:
+    def lost_in_bursts(seed: int) -> float:
+        run = Run(urgent=False, seed=seed)
+        for pipe in run.world.pipes.values():
+            state = [False]
+
+            def lost(rng: object, _: float, state: list[bool] = state) -> bool:
+                # Gilbert and Elliott's chain per frame: bursts of ten frames, a fifth of all.
+                state[0] = rng.random() >= 0.1 if state[0] else rng.random() < 0.025  # type: ignore[attr-defined]
+                return state[0]
+
+            pipe.lost = lost
+        run.start()
+        run.world.run(2.0)
+        return run.measure(12.0).goodput_bits_per_s
+
+    assert sum(lost_in_bursts(seed) for seed in (1, 2, 3)) / 3 >= 0.90 * 0.8 * 10e6

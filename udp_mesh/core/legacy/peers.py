@@ -1,0 +1,288 @@
+"""Peers that speak the fielded format, each named by configuration: both directions, priorities kept.
+
+A datagram of that format is taken only from a configured address, and only under the configured name: what it claims
+about itself is not authenticated. Heartbeats, offline after silence, queues and outcomes are as for other peers.
+
+A robot that moves over is noticed: once a node of our own format has proved itself under the configured name, it is
+that peer, whatever the configuration still says, and the fielded format is not spoken with it any more. What waits for
+it begins anew (`presence`). Broadcasts stay covered for as long as the configuration names any fielded peer.
+"""
+
+from udp_mesh.core.events import MessageReceived, PeerOffline, PeerOnline
+from udp_mesh.core.interfaces import Datagram, RandomSource
+from udp_mesh.core.legacy.acks import LegacyAcks
+from udp_mesh.core.legacy.reassembly import LegacyReassembly
+from udp_mesh.core.legacy.sender import LegacySender
+from udp_mesh.core.peers.session import Meters, Peer
+from udp_mesh.core.publish import release_outbox, report_ended, shelve
+from udp_mesh.core.sender.packetizer import IP_UDP_BYTES
+from udp_mesh.core.sender.pending import Outcome
+from udp_mesh.core.settings import Address, LinkInfo, Neighbour, Settings
+from udp_mesh.core.state import ASLEEP_S, State
+from udp_mesh.wire.errors import DecodeError
+from udp_mesh.wire.legacy import (
+    Host,
+    LegacyAck,
+    LegacyPayload,
+    PriorityMeshData,
+    cover,
+    decode_legacy,
+    encode_legacy,
+    is_ros_name,
+    is_ros_type,
+)
+from udp_mesh.wire.limits import PRIORITY_LEVELS
+
+LEGACY_HEARTBEAT_S = 1.0
+"""The fielded period; its receivers report a peer offline after ten."""
+
+MISSED_S = 3.5
+"""Without a sign of life for this long a fielded program may have been restarted: it says a heartbeat a second."""
+
+SETTLE_S = 10.0
+"""After its first heartbeat then, before what an outbox keeps leaves: the program acknowledges from the start, but what
+arrives before its reader has subscribed is lost there (on a slow computer that takes long)."""
+
+MOST_TOPICS = 256
+"""Topics of one fielded peer: nothing it says is authenticated, and each may become a ROS topic here."""
+
+
+class LegacyPeer:
+    """One fielded peer."""
+
+    __slots__ = (
+        "_moved",
+        "acks",
+        "address",
+        "broadcasts",
+        "last_heard",
+        "link",
+        "meters",
+        "neighbour",
+        "peer",
+        "received_bytes",
+        "sender",
+        "settled_at",
+        "topics",
+        "unicasts",
+    )
+
+    def __init__(self, neighbour: Neighbour, peer: Peer, settings: Settings, rng: RandomSource) -> None:
+        self.neighbour = neighbour
+        self.peer = peer
+        self.address = neighbour.address
+        self.link = neighbour.link or ""
+        self.sender = LegacySender(peer.outbound, settings.name, rng.getrandbits(15))
+        self.unicasts = LegacyReassembly(settings.limits)
+        self.broadcasts = LegacyReassembly(settings.limits)
+        self.last_heard = float("-inf")
+        self.acks = LegacyAcks()
+        self.settled_at: float | None = None
+        """When what waits in outboxes may leave; None: it has."""
+        self.topics: set[str] = set()
+        self.received_bytes = 0
+        self.meters = peer.fielded_meters = Meters(0.0)
+        self._moved = False
+
+    def moved_over(self) -> bool:
+        """Whether a node of our own format speaks for it by now."""
+        if not self._moved and self.peer.session is not None:
+            self._moved = True
+            self.peer.legacy = self.peer.settling = False
+        return self._moved
+
+
+class LegacyPeers:
+    """All of them, by host address. `next_at` is when something is due."""
+
+    __slots__ = ("_by_host", "_heartbeat_at", "_state")
+
+    def __init__(self, state: State) -> None:
+        self._state = state
+        self._by_host: dict[str, LegacyPeer] = {}
+        self._heartbeat_at = float("-inf")
+        self.apply()
+
+    def apply(self) -> None:
+        """Follow the settings' neighbours; peers that stay keep everything."""
+        wanted = {neighbour.address[0]: neighbour for neighbour in self._state.settings.neighbours if neighbour.legacy}
+        for host in list(self._by_host):
+            if host not in wanted or self._by_host[host].neighbour != wanted[host]:
+                self._drop(self._by_host.pop(host))
+        for host, neighbour in wanted.items():
+            if host not in self._by_host and neighbour.name is not None:
+                peer = self._state.roster.peer(neighbour.name, self._state.settings)
+                if peer is not None:
+                    peer.legacy = True
+                    peer.lost = False
+                    self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings, self._state.rng)
+
+    def _drop(self, gone: LegacyPeer) -> None:
+        """It is not named any more; one that was never heard, and for which nothing waits, was never there."""
+        peer, state = gone.peer, self._state
+        peer.legacy = peer.settling = False
+        peer.fielded_meters = None
+        heard = peer.session is not None or peer.fielded_way is not None
+        if not heard and not peer.outbound.open and not state.outboxes.holds(peer.name):
+            state.ready.pop(peer, None)
+            del state.roster.peers[peer.name]
+
+    def __len__(self) -> int:
+        return len(self._by_host)
+
+    def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
+        """One datagram without our mark: the fielded format from a configured address, or nothing of ours."""
+        counters = self._state.ledger.counters
+        legacy = self._by_host.get(source[0])
+        if legacy is None or legacy.moved_over() or source != legacy.neighbour.address:
+            # Fielded programs send from the port they listen on; another one on that computer is not believed.
+            counters.dropped_unauthenticated += 1
+            return
+        try:
+            datagram = decode_legacy(data)
+            self._heard(legacy, link, source, now)
+            legacy.received_bytes += len(data) + IP_UDP_BYTES
+            match datagram:
+                case Host():
+                    self._acknowledge(legacy, legacy.acks.heartbeat())
+                case LegacyAck(sequence, position):
+                    legacy.sender.acknowledge(sequence, position, now)
+                    report_ended(self._state, legacy.peer, now)
+                case LegacyPayload():
+                    self._take(legacy, datagram, link, source, now)
+        except DecodeError:
+            counters.dropped_malformed += 1
+
+    def _heard(self, legacy: LegacyPeer, link: str, source: Address, now: float) -> None:
+        if now - legacy.last_heard > MISSED_S:
+            legacy.settled_at = now + SETTLE_S
+            legacy.peer.settling = True
+        legacy.last_heard = now
+        legacy.link = link
+        legacy.address = source
+        legacy.sender.heard()
+        peer = legacy.peer
+        peer.fielded_way = (source, link, now)
+        peer.lost = False
+        if not peer.online:
+            peer.online = True
+            peer.online_since = now
+            self._state.ledger.tell(PeerOnline(peer.name, source, link))
+
+    def _take(self, legacy: LegacyPeer, piece: LegacyPayload, link: str, source: Address, now: float) -> None:
+        reassembly = legacy.unicasts if piece.wants_ack else legacy.broadcasts
+        message: PriorityMeshData | None = None
+        keep = True
+        too_large = reassembly.over_limit
+        try:
+            keep, message = reassembly.add(piece, now)
+        finally:
+            self._state.ledger.counters.dropped_over_limit += reassembly.over_limit - too_large
+            if keep and piece.wants_ack:
+                more = legacy.acks.came(piece, now)
+                self._acknowledge(legacy, [LegacyAck(piece.sequence, piece.position), *more])
+        if message is not None:
+            if not self._may_name(legacy, message):
+                self._state.ledger.counters.dropped_over_limit += 1
+                return
+            self._state.ledger.counters.messages_received += 1
+            priority = min(message.priority, PRIORITY_LEVELS - 1)
+            self._state.ledger.tell(
+                MessageReceived(
+                    legacy.peer.name,
+                    message.topic,
+                    message.type_name,
+                    message.data,
+                    priority,
+                    not piece.wants_ack,
+                )
+            )
+
+    def _may_name(self, legacy: LegacyPeer, message: PriorityMeshData) -> bool:
+        """Whether a message's topic and type are names of ROS, and its topics not too many."""
+        if not is_ros_name(message.topic) or not is_ros_type(message.type_name):
+            return False
+        if message.topic not in legacy.topics:
+            if len(legacy.topics) >= MOST_TOPICS:
+                return False
+            legacy.topics.add(message.topic)
+        return True
+
+    def _acknowledge(self, legacy: LegacyPeer, acks: list[LegacyAck]) -> None:
+        for ack in acks:
+            self._state.outgoing.append(Datagram(legacy.link, legacy.address, encode_legacy(ack), True))
+
+    def covered(self, out: list[Datagram]) -> list[Datagram]:
+        """The datagrams, those to all in a cover that fielded programs take for one of theirs."""
+        to_all = {link.broadcast for link in self._state.links.values()} | {None}
+        return [
+            datagram._replace(data=cover(datagram.data)) if datagram.destination in to_all else datagram
+            for datagram in out
+        ]
+
+    def leave(self, now: float, out: list[Datagram]) -> None:
+        """Fragments that may leave now."""
+        for legacy in self._fielded():
+            if legacy.link and (legacy.peer.outbound.open or legacy.sender.timer() is not None):
+                legacy.sender.leave(legacy.link, legacy.address, now, out)
+                report_ended(self._state, legacy.peer, now)
+
+    def next_at(self) -> float:
+        """When `handle_timer` wants to be called."""
+        if not self._by_host:
+            return float("inf")
+        at = self._heartbeat_at
+        for legacy in self._fielded():
+            due = legacy.sender.timer()
+            if legacy.link:
+                at = min(at, legacy.acks.next_at(), at if due is None else due)
+        return at
+
+    def handle_timer(self, now: float) -> None:
+        """Acknowledgements that are due; heartbeats, silences and purges, once a second."""
+        for legacy in self._fielded():
+            if legacy.link:
+                self._acknowledge(legacy, legacy.acks.due(now))
+        if not self._by_host or now < self._heartbeat_at:
+            return
+        # This process did not run for so long: silence meanwhile was ours.
+        asleep_s = now - self._heartbeat_at if self._heartbeat_at != float("-inf") else 0.0
+        self._heartbeat_at = now + LEGACY_HEARTBEAT_S
+        state = self._state
+        rates = state.settings.rates
+        for legacy in self._fielded():
+            peer = legacy.peer
+            if asleep_s > ASLEEP_S:
+                legacy.last_heard = min(now, legacy.last_heard + asleep_s)
+            quiet_s = now - legacy.last_heard
+            if peer.online and quiet_s > rates.offline_s:
+                peer.online = False
+                peer.online_since = None
+                state.ledger.tell(PeerOffline(peer.name, left=False))
+                shelve(state, peer, now)
+            if not peer.online and not peer.lost and quiet_s > rates.peer_lost_s:
+                peer.lost = True
+                peer.outbound.finish_all(Outcome.PEER_LOST)
+                report_ended(state, peer, now)
+            legacy.unicasts.purge(now)
+            legacy.broadcasts.purge(now)
+            if peer.online and legacy.settled_at is not None and now >= legacy.settled_at:
+                legacy.settled_at = None
+                peer.settling = False
+            if peer.online and legacy.settled_at is None and state.outboxes.holds(peer.name):
+                release_outbox(state, peer, now)
+            legacy.meters.sent.feed(peer.outbound.sent_bytes, now)
+            legacy.meters.delivered.feed(peer.outbound.delivered_bytes, now)
+            legacy.meters.received.feed(legacy.received_bytes, now)
+            for link in self._links(legacy):
+                host = encode_legacy(Host(state.settings.name, link.address[0]))
+                state.outgoing.append(Datagram(link.name, legacy.neighbour.address, host, True))
+
+    def _fielded(self) -> list[LegacyPeer]:
+        return [legacy for legacy in self._by_host.values() if not legacy.moved_over()]
+
+    def _links(self, legacy: LegacyPeer) -> list[LinkInfo]:
+        # The fielded format has room for an IPv4 address only.
+        links = [link for link in self._state.links.values() if ":" not in link.address[0]]
+        named = [link for link in links if link.name == (legacy.neighbour.link or legacy.link)]
+        return named or links

@@ -1,0 +1,130 @@
+"""Fragments of one peer of the fielded format -> whole messages, each once, within a memory cap.
+
+Unlike the fielded receiver this one allocates nothing from the wire, remembers finished messages so that a repeated
+fragment opens no new one, and gives an old partial message up when its number comes around again. Numbers start at 1
+whenever the fielded program is started: what a fragment holds, not its number alone, tells a repetition from a new
+message.
+"""
+
+import zlib
+from collections import OrderedDict
+from dataclasses import dataclass
+
+from udp_mesh.core.receiver.reassembly import PIECE_OVERHEAD_BYTES
+from udp_mesh.core.settings import Limits
+from udp_mesh.wire.legacy import LegacyPayload, PriorityMeshData, decode_mesh_data
+from udp_mesh.wire.limits import MAX_LEGACY_FRAGMENT_BYTES
+
+PARTIAL_PATIENCE_S = 10.0
+"""A message whose fragments stop for this long is given up (the fielded system's timeout)."""
+
+FINISHED_REMEMBERED = 1024
+"""Finished messages of one peer: far fewer than its 32,767 numbers, far more than its window of three."""
+
+FINISHED_FOR_S = 30.0
+"""A number finished this long ago belongs to a new message."""
+
+REPEATED_WITHIN_S = 2.0
+"""The network repeats a fragment within this; the fielded sender never does, and takes longer to start again."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Finished:
+    """What tells a repeated fragment of a finished message from the first one of another with the same number."""
+
+    at: float
+    total: int
+    first_crc32: int
+
+    def repeats(self, piece: LegacyPayload, now: float) -> bool:
+        if piece.total != self.total or now - self.at >= FINISHED_FOR_S:
+            return False
+        if piece.position == 0:
+            return zlib.crc32(piece.data) == self.first_crc32
+        return now - self.at < REPEATED_WITHIN_S
+
+
+class _Partial:
+    __slots__ = ("bytes", "pieces", "total", "touched_at")
+
+    def __init__(self, total: int, now: float) -> None:
+        self.total = total
+        self.pieces: dict[int, bytes] = {}
+        self.bytes = 0
+        self.touched_at = now
+
+
+class LegacyReassembly:
+    """`bytes` never exceeds `Limits.partial_bytes_per_peer`."""
+
+    __slots__ = ("_finished", "_limits", "_partials", "bytes", "duplicates", "over_limit")
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._partials: dict[int, _Partial] = {}
+        self._finished: OrderedDict[int, _Finished] = OrderedDict()
+        self.bytes = 0
+        self.duplicates = 0
+        self.over_limit = 0
+        """Fragments of messages larger than the limit."""
+
+    def __len__(self) -> int:
+        return len(self._partials)
+
+    def add(self, piece: LegacyPayload, now: float) -> tuple[bool, PriorityMeshData | None]:
+        """(whether to acknowledge, the message if this completes one); raises DecodeError for a corrupt message."""
+        finished = self._finished.get(piece.sequence)
+        if finished is not None:
+            if finished.repeats(piece, now):
+                self.duplicates += 1
+                return True, None
+            del self._finished[piece.sequence]
+        partial = self._partials.get(piece.sequence)
+        if partial is not None and (
+            partial.total != piece.total
+            or now - partial.touched_at > PARTIAL_PATIENCE_S
+            or partial.pieces.get(piece.position, piece.data) != piece.data
+        ):
+            # The number came around, or the sender started anew: these are two messages, and the older one is over.
+            self._drop(piece.sequence)
+            partial = None
+        if (piece.total - 1) * MAX_LEGACY_FRAGMENT_BYTES > self._limits.message_bytes:
+            # Acknowledged all the same: the fielded sender takes a missing answer for a lost peer and drops everything.
+            self.over_limit += 1
+            return True, None
+        if partial is None:
+            if len(self._partials) >= self._limits.partials_per_peer:
+                return False, None
+            partial = self._partials[piece.sequence] = _Partial(piece.total, now)
+        if piece.position in partial.pieces:
+            self.duplicates += 1
+            return True, None
+        size = len(piece.data) + PIECE_OVERHEAD_BYTES
+        if self.bytes + size > self._limits.partial_bytes_per_peer:
+            if not partial.pieces:
+                del self._partials[piece.sequence]
+            return False, None
+        partial.pieces[piece.position] = piece.data
+        partial.bytes += len(piece.data)
+        partial.touched_at = now
+        self.bytes += size
+        if len(partial.pieces) < partial.total:
+            return True, None
+        body = b"".join([partial.pieces[position] for position in range(partial.total)])
+        self._finished[piece.sequence] = _Finished(now, partial.total, zlib.crc32(partial.pieces[0]))
+        self._finished.move_to_end(piece.sequence)
+        self._drop(piece.sequence)
+        if len(self._finished) > FINISHED_REMEMBERED:
+            self._finished.popitem(last=False)
+        return True, decode_mesh_data(body)
+
+    def purge(self, now: float) -> None:
+        """Give up each message, by its own age, whose fragments stopped."""
+        for sequence in [
+            sequence for sequence, partial in self._partials.items() if now - partial.touched_at > PARTIAL_PATIENCE_S
+        ]:
+            self._drop(sequence)
+
+    def _drop(self, sequence: int) -> None:
+        partial = self._partials.pop(sequence)
+        self.bytes -= partial.bytes + PIECE_OVERHEAD_BYTES * len(partial.pieces)

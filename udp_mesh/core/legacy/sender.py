@@ -1,0 +1,248 @@
+"""Messages to one peer of the fielded format: pieces in priority order, a window of three, resent until acknowledged.
+
+The fielded receiver acknowledges every fragment at once; the fielded sender never resent one. Here a fragment is sent
+again when its acknowledgement is overdue by the measured round trip, and a silent peer is probed with single
+fragments.
+"""
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+from udp_mesh.core.events import ExpiryReason
+from udp_mesh.core.interfaces import Datagram
+from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.pending import Outcome
+from udp_mesh.core.sender.sender import PROBE_S, Outbound
+from udp_mesh.core.settings import Address
+from udp_mesh.wire.legacy import (
+    LAST_SEQUENCE as LAST_SEQUENCE,
+)
+from udp_mesh.wire.legacy import (
+    LegacyPayload,
+    PriorityMeshData,
+    encode_legacy,
+    encode_mesh_data,
+    fragment_legacy,
+    is_ros_type,
+)
+from udp_mesh.wire.limits import MAX_LEGACY_FRAGMENT_BYTES, PRIORITY_LEVELS
+
+LEGACY_WINDOW = 3
+"""Fragments in flight to a fielded peer: its own choice, above which its radios were seen to interfere."""
+
+TRIES_BEFORE_SILENT = 3
+"""Tries of one fragment, with nothing acknowledged meanwhile, after which only single probes leave."""
+
+DOUBLINGS, DOUBLINGS_WHILE_ANSWERED = 3, 1
+"""How often the patience with one fragment doubles. Of a peer that acknowledges others some are lost, and with patience
+for that an urgent one would take most of a second; once it doubles all the same: the path may have become slower."""
+
+LEAST_PATIENCE_S = 0.025
+"""Before a fragment is sent again at the earliest: fielded programs answer when their interpreter gets to it."""
+
+MOST_PATIENCE_S = 0.2
+"""What that grows to where both tries of a fragment are answered: then the second was needless, and a message of one
+fragment arrived twice over there, where no finished message is remembered."""
+
+RESENT_REMEMBERED = 64
+"""Fragments answered after a resend of which another answer may come."""
+
+PATIENCE_WANES = 0.995
+"""Per answer at the first try, back towards `LEAST_PATIENCE_S`: some hundred answers after it was needed."""
+
+
+@dataclass(slots=True)
+class _Leg:
+    """One fragment on its way."""
+
+    message: Outgoing
+    position: int
+    sent_at: float
+    tries: int
+    answers: int
+    """Acknowledgements of any fragment that had come when it was sent last."""
+    unanswered: int
+    """Its tries since the last of them."""
+
+
+def carries(type_name: str) -> bool:
+    """Whether a fielded robot can publish a message of this type: `pkg/Type`, or one not said. Anything else (a
+    bridge's own messages, ROS 2, Zenoh) ends the callback of its reader with a traceback."""
+    name = type_name.partition(" ")[0]
+    return not name or is_ros_type(name)
+
+
+class LegacySender:
+    """The sending half for one fielded peer; queues and outcomes are those of its `Outbound`."""
+
+    __slots__ = (
+        "_answers",
+        "_fragments",
+        "_legs",
+        "_own_name",
+        "_patience_s",
+        "_resent",
+        "_sequence",
+        "_sequences",
+        "_stamp",
+        "outbound",
+        "silent",
+    )
+
+    def __init__(self, outbound: Outbound, own_name: str, first_sequence: int) -> None:
+        """`first_sequence` is drawn for each run: the peer may still hold pieces of our last one (its defect 8)."""
+        self.outbound = outbound
+        self.silent = False
+        self._answers = 0
+        self._patience_s = LEAST_PATIENCE_S
+        self._resent: OrderedDict[tuple[int, int], None] = OrderedDict()
+        self._own_name = own_name
+        self._sequence = first_sequence % LAST_SEQUENCE
+        self._stamp = 0
+        self._legs: dict[tuple[int, int], _Leg] = {}
+        self._sequences: dict[int, Outgoing] = {}
+        self._fragments: dict[Outgoing, tuple[int, list[bytes]]] = {}
+
+    def leave(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
+        """What may leave now: overdue fragments first by age, then new ones, most urgent first."""
+        self._forget_ended()
+        self._resend(link, address, now, out)
+        outbound = self.outbound
+        scheduler = outbound.scheduler
+        for priority in range(PRIORITY_LEVELS):
+            urgent = priority <= outbound.rates.urgent_priority
+            window = LEGACY_WINDOW + (outbound.rates.urgent_excess_packets if urgent else 0)
+            while scheduler.waiting >> priority & 1 and not self.silent and len(self._legs) < window:
+                run = scheduler.peek(priority)
+                if run is None:
+                    break
+                message = run.message
+                if not message.begun and not self._begin(message, now):
+                    outbound.finish(message, ExpiryReason.REFUSED)
+                    continue
+                run = scheduler.peek(priority)
+                assert run is not None
+                scheduler.take(run, 1)
+                self._send(message, run.position, 1, link, address, now, out)
+                if not message.reliable and run.position == message.fragments - 1 and message.missing == 0:
+                    outbound.finish(message, Outcome.SENT)
+
+    def acknowledge(self, sequence: int, position: int, now: float) -> None:
+        """The peer has this fragment; unknown ones are ignored."""
+        leg = self._legs.pop((sequence, position), None)
+        self.silent = False
+        self._answers += 1
+        if leg is None:
+            if (sequence, position) in self._resent:
+                del self._resent[sequence, position]
+                self._patience_s = min(MOST_PATIENCE_S, 2 * self._patience_s)
+            return
+        if leg.tries > 1:
+            self._resent[sequence, position] = None
+            if len(self._resent) > RESENT_REMEMBERED:
+                self._resent.popitem(last=False)
+        else:
+            self._patience_s = max(LEAST_PATIENCE_S, PATIENCE_WANES * self._patience_s)
+            # Karn: which try a later acknowledgement answers is unknown.
+            self.outbound.trip.sample(max(1e-5, now - leg.sent_at), now)
+        message = leg.message
+        if not message.ended and message.arrive(position):
+            self.outbound.delivered_bytes += len(self._fragments[message][1][position])
+            if not message.missing:
+                self.outbound.finish(message, Outcome.DELIVERED)
+        self.outbound.delivered_packets += 1
+        self.outbound.delivered_at = now
+
+    def heard(self) -> None:
+        """Anything from the peer ends its silence: everything on its way is due at once."""
+        if self.silent:
+            self.silent = False
+            for leg in self._legs.values():
+                leg.sent_at = float("-inf")
+                leg.tries = 1
+                leg.unanswered = 0
+
+    def timer(self) -> float | None:
+        """When the next fragment is overdue."""
+        if not self._legs:
+            return None
+        return min(leg.sent_at + self._patience(leg) for leg in self._legs.values())
+
+    def _patience(self, leg: _Leg) -> float:
+        timeout = max(self._patience_s, self.outbound.trip.timeout(0.0))
+        doublings = min(leg.tries - 1, DOUBLINGS_WHILE_ANSWERED)
+        if leg.answers == self._answers:
+            doublings = max(doublings, min(leg.unanswered - 1, DOUBLINGS))
+        return min(PROBE_S, timeout * (1 << doublings))
+
+    def _resend(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
+        due = [entry for entry in self._legs.values() if now >= entry.sent_at + self._patience(entry)]
+        due.sort(key=lambda leg: leg.message.priority)
+        for leg in due:
+            if leg.unanswered >= TRIES_BEFORE_SILENT and leg.answers == self._answers:
+                self.silent = True
+            self._send(leg.message, leg.position, leg.tries + 1, link, address, now, out)
+            self.outbound.retransmitted += 1
+            if self.silent:
+                # One probe; the others wait until it is answered.
+                for other in self._legs.values():
+                    if other is not leg:
+                        other.sent_at = now
+                break
+
+    def _begin(self, message: Outgoing, now: float) -> bool:
+        """Serialize, cut and number; False if the format cannot carry it (it then ends as refused)."""
+        accepted = message.accepted
+        if not carries(accepted.channel.type_name):
+            return False
+        self._stamp = (self._stamp + 1) & 0xFFFFFFFF
+        channel = accepted.channel
+        seconds = int(now)
+        data = PriorityMeshData(
+            self._own_name,
+            # what our bridges add behind the type's name (its md5sum), a fielded robot would take for the type
+            channel.type_name.partition(" ")[0],
+            message.priority,
+            channel.name,
+            accepted.payload,
+            self._stamp,
+            seconds & 0xFFFFFFFF,
+            int((now - seconds) * 1e9),
+        )
+        body = encode_mesh_data(data)
+        fragments = fragment_legacy(body)
+        sequence = self._next_sequence()
+        message.begin(sequence, MAX_LEGACY_FRAGMENT_BYTES, MAX_LEGACY_FRAGMENT_BYTES)
+        message.fragments = message.missing = len(fragments)
+        message.arrived = bytearray(len(fragments))
+        self._sequences[sequence] = message
+        self._fragments[message] = (sequence, fragments)
+        return True
+
+    def _next_sequence(self) -> int:
+        """The next number after the wrap not in use: a new message never meets an old one's pieces."""
+        while True:
+            self._sequence = self._sequence % LAST_SEQUENCE + 1
+            if self._sequence not in self._sequences:
+                return self._sequence
+
+    def _send(
+        self, message: Outgoing, position: int, tries: int, link: str, address: Address, now: float, out: list[Datagram]
+    ) -> None:
+        sequence, fragments = self._fragments[message]
+        before = self._legs.get((sequence, position))
+        unanswered = before.unanswered + 1 if before is not None and before.answers == self._answers else 1
+        self._legs[(sequence, position)] = _Leg(message, position, now, tries, self._answers, unanswered)
+        payload = LegacyPayload(sequence, position, len(fragments), fragments[position], wants_ack=True)
+        data = encode_legacy(payload)
+        urgent = message.priority <= self.outbound.rates.urgent_priority
+        out.append(Datagram(link, address, data, urgent))
+        self.outbound.sent_packets += 1
+        self.outbound.sent_bytes += len(data) + 28
+
+    def _forget_ended(self) -> None:
+        for message in [message for message in self._fragments if message.ended]:
+            sequence, fragments = self._fragments.pop(message)
+            del self._sequences[sequence]
+            for position in range(len(fragments)):
+                self._legs.pop((sequence, position), None)

@@ -1,0 +1,1 @@
+"""Who is there: heartbeats in, sessions and peers out."""

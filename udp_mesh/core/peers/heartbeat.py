@@ -1,0 +1,164 @@
+"""Heartbeats: when the next one leaves, what it says, and what one received means.
+
+A heartbeat leaves once per `heartbeat_s`, more seldom where traffic already proves every link, and more seldom the
+larger the team, so that what each node hears of discovery stays constant. A node heard for the first time is answered
+soon with a heartbeat that lists it: both then know that the link works both ways and that the other's heartbeats are
+no recordings.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from udp_mesh.core.interfaces import Datagram, RandomSource
+from udp_mesh.core.peers.session import Session
+from udp_mesh.core.receiver.datagram_age import clock_ms
+from udp_mesh.core.settings import LinkInfo, LinkKind, Neighbour, Rates, Settings
+from udp_mesh.crypto import SendChannel
+from udp_mesh.wire.codec import encode
+from udp_mesh.wire.frames import Feature, Heartbeat, Waiting
+from udp_mesh.wire.header import VERSION
+from udp_mesh.wire.limits import MAX_HEARD
+
+OWN_FEATURES = Feature.ZLIB | Feature.REPAIR | Feature.TIMED
+
+ANSWER_WITHIN_S = 0.1
+"""A new node is answered within this, after a random part of it, so that a team does not answer all at once."""
+
+LEAST_GAP_S = 0.2
+"""Between two heartbeats, whatever asks for one."""
+
+MEETING_HASTE = 5.0
+"""While a team meets, so many times more heartbeats are heard than later: 150 a second are 1 Mbit/s when full."""
+
+MOST_TO_ANSWER = 2048
+"""New nodes that wait to be listed: a team of a thousand meets twice over; a key holder invents more than that."""
+
+JITTER = 0.1
+"""Part of the interval by which heartbeats vary, so that two nodes never stay in step."""
+
+MISSED_HEARTBEATS = 3.5
+"""A peer is silent for at least so many of the intervals it announced before it counts as offline."""
+
+
+class Discovery:
+    """`next_at` is when the next heartbeat leaves."""
+
+    __slots__ = ("_heard_per_s", "_interval_s", "_last_at", "_listed_from", "_rng", "_to_answer", "next_at")
+
+    def __init__(self, rng: RandomSource, rates: Rates, now: float) -> None:
+        self._rng = rng
+        self._heard_per_s = rates.heartbeats_heard_per_s
+        self._interval_s = 1.0
+        self._last_at = float("-inf")
+        self._to_answer: dict[bytes, None] = {}
+        self._listed_from = 0
+        self.next_at = now
+
+    def answer(self, session: Session, team: int, now: float) -> None:
+        """A session heard for the first time (or still unproven): list it soon."""
+        self._to_answer[session.heard_tag] = None
+        if len(self._to_answer) > MOST_TO_ANSWER:
+            del self._to_answer[next(iter(self._to_answer))]
+        self.hurry(team, now)
+
+    def hurry(self, team: int, now: float) -> None:
+        """A heartbeat within `ANSWER_WITHIN_S`, if the last one is not too recent; later where `team` nodes do so."""
+        share_s = team / (MEETING_HASTE * self._heard_per_s)
+        soon = now + max(ANSWER_WITHIN_S, share_s) * (0.2 + 0.8 * self._rng.random())
+        self.next_at = min(self.next_at, max(self._last_at + max(LEAST_GAP_S, share_s), soon))
+
+    def interval_s(self, settings: Settings, sessions: list[Session], now: float) -> float:
+        """Until the next heartbeat: sparse if every peer acknowledged something lately, and by the size of the team."""
+        rates = settings.rates
+        online = [session for session in sessions if session.peer is not None and session.peer.online]
+        proven = bool(online) and all(
+            session.peer is not None
+            and session.peer.engaged
+            and now - session.peer.outbound.delivered_at < rates.heartbeat_s
+            and session.peer.outbound.delivered_packets
+            for session in online
+        )
+        base = rates.heartbeat_sparse_s if proven else rates.heartbeat_s
+        return max(base, len(online) / rates.heartbeats_heard_per_s)
+
+    def compose(
+        self,
+        settings: Settings,
+        sessions: list[Session],
+        waiting: tuple[Waiting, ...],
+        next_cast: int,
+        sent_bytes_per_s: float,
+        now: float,
+    ) -> Heartbeat:
+        """The heartbeat to send now; the next one is due after its interval. `broadcast_number` is filled by `seal`."""
+        self._heard_per_s = settings.rates.heartbeats_heard_per_s
+        self._interval_s = self.interval_s(settings, sessions, now)
+        self._last_at = now
+        self.next_at = now + self._interval_s * (1 - JITTER * self._rng.random())
+        heard = self._heard(sessions, settings.name, now)
+        if self._to_answer:
+            # More new nodes than one heartbeat can list: the others are not kept waiting for the next regular one.
+            self.hurry(len(sessions), now)
+        return Heartbeat(
+            settings.name,
+            VERSION,
+            VERSION,
+            int(OWN_FEATURES),
+            min(65_535, int(self._interval_s * 1000)),
+            min(65_535, sum(1 for session in sessions if session.peer is not None and session.peer.online)),
+            min(0xFFFFFFFF, int(sent_bytes_per_s)),
+            0,
+            next_cast,
+            heard,
+            waiting,
+            clock_ms(now),
+        )
+
+    def _heard(self, sessions: list[Session], own_name: str, now: float) -> tuple[bytes, ...]:
+        """Tags of those to be answered first, then of the others in turn."""
+        tags = list(self._to_answer)[:MAX_HEARD]
+        for tag in tags:
+            del self._to_answer[tag]
+        # Who lost its name to another run is not listed: nothing it sends is taken, and it must know that.
+        taken = [one for one in sessions if one.current or not one.proven or one.name == own_name]
+        alive = [session for session in taken if now - session.last_heard < MISSED_HEARTBEATS * session.interval_s]
+        if alive:
+            start = self._listed_from % len(alive)
+            for session in alive[start:] + alive[:start]:
+                if len(tags) >= MAX_HEARD:
+                    break
+                if session.heard_tag not in tags:
+                    tags.append(session.heard_tag)
+                self._listed_from += 1
+        return tuple(tags)
+
+
+def numbered(beat: Heartbeat, channel: SendChannel) -> bytes:
+    """The encoded heartbeat with the number of the packet that will carry it."""
+    return encode([replace(beat, broadcast_number=channel.next_number)])
+
+
+def announce(
+    beat: Heartbeat, channel: SendChannel, links: Iterable[LinkInfo], neighbours: tuple[Neighbour, ...]
+) -> list[Datagram]:
+    """The heartbeat on every link: one datagram to all where there is broadcast, one per neighbour where not."""
+    out: list[Datagram] = []
+    links = list(links)
+    for link in links:
+        near = [neighbour for neighbour in neighbours if not neighbour.legacy and leads(neighbour, link, links)]
+        if link.kind is LinkKind.NEIGHBOURS and not near:
+            continue
+        _, data = channel.seal_long(numbered(beat, channel))
+        if link.kind is LinkKind.BROADCAST:
+            out.append(Datagram(link.name, link.broadcast, data, True))
+        out.extend(Datagram(link.name, neighbour.address, data, True) for neighbour in near)
+    return out
+
+
+def leads(neighbour: Neighbour, link: LinkInfo, links: list[LinkInfo]) -> bool:
+    """Whether the neighbour is reached over this link."""
+    if neighbour.link is not None:
+        return neighbour.link == link.name
+    if any(other.kind is LinkKind.NEIGHBOURS for other in links):
+        return link.kind is LinkKind.NEIGHBOURS
+    return link is links[0]

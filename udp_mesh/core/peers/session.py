@@ -1,0 +1,331 @@
+"""One run of one peer, told from others by its boot id: channels, the way to it, what is owed to it.
+
+heard (a heartbeat, perhaps replayed) -> *proven* (it showed that it hears this run of ours) -> replaced by the peer's
+next run, or gone. Nothing but its heartbeat is believed before it is proven.
+"""
+
+from typing import NamedTuple
+
+from udp_mesh.core.meter import Meter
+from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, Freshness
+from udp_mesh.core.receiver.memory_limit import Memory
+from udp_mesh.core.receiver.receiver import Inbound
+from udp_mesh.core.sender.packetizer import Way
+from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.settings import Address, Settings
+from udp_mesh.crypto import TO_ALL, Key, ReceiveChannel, SendChannel
+from udp_mesh.wire.frames import Ack, Feature, Frame, Heartbeat, Waiting
+from udp_mesh.wire.limits import HEARD_TAG_BYTES, MAX_HEARD
+
+
+class Challenge(NamedTuple):
+    """A ping that proves a path once its pong comes from where it went."""
+
+    link: str
+    address: Address
+    asked_at: float
+    in_use: bool
+    """It went to the address in use."""
+
+
+ANSWER_WITHIN_S = 60.0
+"""Pongs are waited for this long: a path may be as slow as that."""
+
+STALE_PATH_S = 2.0
+"""A path not heard for this long is left for one that is: two heartbeats."""
+
+FLOORS_REMEMBERED = 64
+"""Keys taken away of which a session remembers how far their numbers had come: years of rotations."""
+
+OWED_FRAMES = 64
+"""Small frames (pongs, repairs asked for, refusals) waiting to leave to one peer; more is a flood of questions."""
+
+
+class Meters:
+    """Bytes per second of one session."""
+
+    __slots__ = ("delivered", "received", "sent")
+
+    def __init__(self, now: float) -> None:
+        self.sent = Meter(now)
+        self.delivered = Meter(now)
+        self.received = Meter(now)
+
+
+class Peer:
+    """A name: what is on its way to it, whichever run of it listens.
+
+    `outbound` is made when first asked for, and `engaged` is True from then on: in a large team most nodes send to few.
+    """
+
+    __slots__ = (
+        "_settings",
+        "conflict_reported_at",
+        "engaged",
+        "fielded_meters",
+        "fielded_way",
+        "held_until",
+        "left",
+        "legacy",
+        "lost",
+        "name",
+        "online",
+        "online_since",
+        "outbound",
+        "retired",
+        "session",
+        "settling",
+        "timer_at",
+        "wants_at",
+    )
+
+    outbound: Outbound
+
+    def __init__(self, name: str, settings: Settings) -> None:
+        self.name = name
+        self._settings = settings
+        self.engaged = False
+        self.session: Session | None = None
+        self.online = False
+        self.left = False
+        self.legacy = False
+        self.fielded_way: tuple[Address, str, float] | None = None
+        """Address and link from which a fielded program was heard last, and when."""
+        self.fielded_meters: Meters | None = None
+        """Where it speaks the fielded format: no session of it has any."""
+        self.settling = False
+        """A fielded program that has just started: what outboxes keep for it does not leave yet."""
+        self.lost = True
+        """Silent for `peer_lost_s`, or never heard: nothing waits for it but in an outbox."""
+        self.online_since: float | None = None
+        self.conflict_reported_at = float("-inf")
+        self.retired: dict[bytes, None] = {}
+        """Earlier boot ids: never believed again."""
+        self.timer_at = float("inf")
+        """Where this peer stands in the node's timer queue: at `wants_at`, or earlier until it comes to the front."""
+        self.wants_at = float("inf")
+        """When this peer wants attention."""
+        self.held_until: dict[int, float] = {}
+        """Priority -> until when the time it is held back for other robots is booked."""
+
+    def __getattr__(self, name: str) -> Outbound:
+        # Only called for a slot not yet set: nothing is paid for this once the sending half is there.
+        if name != "outbound":
+            raise AttributeError(name)
+        self.engaged = True
+        self.outbound = Outbound(self._settings)
+        return self.outbound
+
+    def book_held(self, levels: int, now: float, until: float) -> None:
+        """Levels of the mask wait here and are held back for other robots' urgent messages until then."""
+        for priority, book in enumerate(self.outbound.levels):
+            if levels >> priority & 1:
+                book.held_s += max(0.0, until - max(now, self.held_until.get(priority, now)))
+                self.held_until[priority] = until
+
+    def apply(self, settings: Settings) -> None:
+        """New settings; nothing on its way is touched."""
+        self._settings = settings
+        if self.engaged:
+            self.outbound.apply(settings)
+
+
+class Session:
+    """A boot id heard under a name."""
+
+    __slots__ = (
+        "_forgotten_floor",
+        "_key_floors",
+        "boot_id",
+        "broadcast_channels",
+        "challenged_at",
+        "challenges",
+        "contested",
+        "data_channels",
+        "features",
+        "freshness",
+        "inbound",
+        "interval_s",
+        "introduced_at",
+        "knows_us",
+        "last_heard",
+        "lists_us",
+        "met_at",
+        "meters",
+        "name",
+        "next_wire_id",
+        "owed",
+        "peer",
+        "peer_receives",
+        "peer_sends",
+        "proven",
+        "received_bytes",
+        "replaced",
+        "restored",
+        "timed",
+        "unheard_since",
+        "versions",
+        "way",
+    )
+
+    def __init__(
+        self,
+        name: str,
+        boot_id: bytes,
+        own_boot: bytes,
+        keys: tuple[Key, ...],
+        settings: Settings,
+        memory: Memory | None = None,
+    ) -> None:
+        """`memory` is that of all peers (None: only this session's own limits hold)."""
+        self.name = name
+        self.boot_id = boot_id
+        self.peer: Peer | None = None
+        self.proven = False
+        self.knows_us = False
+        """It listed us as heard, or answered us: introductions need no name any more."""
+        self.met_at: float | None = None
+        """When its first heartbeat was heard."""
+        self.lists_us = False
+        """Its heartbeats to all have listed us: from one that no longer does something follows."""
+        self.unheard_since: float | None = None
+        """Since when they list us no more and it acknowledges nothing: only its way to us works."""
+        self.contested = False
+        """It went on speaking after another run took its name: two nodes share that."""
+        self.next_wire_id = 0
+        """Of the messages to it, when another run took its name."""
+        self.introduced_at = float("-inf")
+        self.last_heard = float("-inf")
+        self.meters = Meters(0.0)
+        self.received_bytes = 0
+        self.peer_sends = (0, float("-inf"))
+        """Bytes per second that the peer says it sends to everybody, and when it said so."""
+        self.peer_receives = (0, float("-inf"))
+        """Bytes per second from here that the peer says arrive, and when it said so."""
+        self.interval_s = settings.rates.heartbeat_s
+        self.versions = (1, 1)
+        self.features = 0
+        self.inbound = Inbound(settings.rates, settings.limits, memory or Memory(1 << 62))
+        self.way = Way(SendChannel(keys[0], own_boot, boot_id))
+        self.owed: list[Frame] = []
+        self.freshness = Freshness()
+        self.timed = False
+        """It dates what it sends."""
+        self.challenges: dict[int, Challenge] = {}
+        """Pings whose pongs prove a path, by token (`paths`)."""
+        self.challenged_at = float("-inf")
+        self.replaced = False
+        """Another run has had its name since."""
+        self.restored = False
+        """An earlier session for the same boot was forgotten meanwhile."""
+        self._key_floors: dict[tuple[bytes, bytes], int] = {}
+        """(key id, receiver) of keys taken away -> the number from which on datagrams are new."""
+        self._forgotten_floor = 0
+        self.data_channels: list[ReceiveChannel] = []
+        self.broadcast_channels: list[ReceiveChannel] = []
+        self.set_keys(own_boot, keys)
+
+    @property
+    def heard_tag(self) -> bytes:
+        return self.boot_id[:HEARD_TAG_BYTES]
+
+    def set_keys(self, own_boot: bytes, keys: tuple[Key, ...]) -> None:
+        """The live keys: channels of keys that stay keep their replay windows; packet numbers go on across keys."""
+        self.data_channels = self._receive_channels(self.data_channels, own_boot, keys)
+        self.broadcast_channels = self._receive_channels(self.broadcast_channels, TO_ALL, keys)
+        channel = self.way.channel
+        if channel.key != keys[0]:
+            self.way.channel = SendChannel(keys[0], own_boot, self.boot_id)
+            self.way.channel.next_number = channel.next_number
+
+    def _receive_channels(
+        self, before: list[ReceiveChannel], receiver: bytes, keys: tuple[Key, ...]
+    ) -> list[ReceiveChannel]:
+        """A key that comes back finds its numbers where they were: what was sealed with it before is a recording."""
+        known = {channel.key: channel for channel in before}
+        floors = self._key_floors
+        for channel in before:
+            if channel.key not in keys:
+                floors[channel.key.key_id, channel.receiver_boot] = channel.window.next_new
+        while len(floors) > FLOORS_REMEMBERED:
+            self._forgotten_floor = max(self._forgotten_floor, floors.pop(next(iter(floors))))
+        channels = []
+        for key in keys:
+            kept = known.get(key)
+            if kept is None:
+                kept = ReceiveChannel(key, self.boot_id, receiver)
+                kept.window.raise_floor(floors.get((key.key_id, receiver), self._forgotten_floor))
+            channels.append(kept)
+        return channels
+
+    def floors(self) -> dict[tuple[bytes, bytes], int]:
+        """(key id, receiver) -> the number from which on datagrams are new, of every key there ever was."""
+        found = dict(self._key_floors)
+        for channels in (self.data_channels, self.broadcast_channels):
+            for channel in channels:
+                found[channel.key.key_id, channel.receiver_boot] = channel.window.next_new
+        return found
+
+    def restore_floors(self, floors: dict[tuple[bytes, bytes], int]) -> None:
+        """What `floors` said of this boot's earlier session."""
+        self._key_floors = dict(floors)
+        for channels in (self.data_channels, self.broadcast_channels):
+            for channel in channels:
+                channel.window.raise_floor(floors.get((channel.key.key_id, channel.receiver_boot), 0))
+
+    def is_fresh(self, now: float) -> bool:
+        """Whether something came lately that was no recording."""
+        return now - self.freshness.fresh_at <= ACCEPT_AGE_S
+
+    def age_windows(self, now: float) -> None:
+        """What was not received for long counts as seen; questions not answered for long are forgotten."""
+        for token, question in list(self.challenges.items()):
+            if now - question.asked_at > ANSWER_WITHIN_S:
+                del self.challenges[token]
+        for channel in self.data_channels:
+            channel.window.age(now)
+        for channel in self.broadcast_channels:
+            channel.window.age(now)
+
+    @property
+    def current(self) -> bool:
+        """Whether it is the one that its name means."""
+        return self.peer is not None and self.peer.session is self
+
+    def hears_us(self) -> None:
+        """It lists us, or acknowledged what left lately."""
+        self.knows_us = True
+        self.unheard_since = None
+
+    def take_list(self, heard: tuple[bytes, ...], own_tag: bytes, now: float) -> None:
+        """What a heartbeat to all says of whether we are heard; a full list may have had no room for us."""
+        if own_tag in heard:
+            self.lists_us = True
+            self.hears_us()
+        elif self.lists_us and self.unheard_since is None and len(heard) < MAX_HEARD:
+            self.unheard_since = now
+
+    def owe(self, frame: Frame) -> None:
+        """A small frame leaves with the next datagrams."""
+        if len(self.owed) < OWED_FRAMES:
+            self.owed.append(frame)
+
+    def take_ack(self, now: float, waiting: tuple[Waiting, ...]) -> Ack | None:
+        """The acknowledgement to send now, if there is anything to acknowledge; it then counts as sent."""
+        acks = self.inbound.acks
+        if acks.largest < 0:
+            return None
+        delay_us = min((1 << 24) - 1, int(max(0.0, now - acks.arrived_at) * 1e6))
+        acks.sent()
+        arriving = min(0xFFFFFFFF, int(self.meters.received.per_s(now)))
+        return Ack(acks.largest, acks.received >> 1, delay_us, arriving, waiting)
+
+    def learn(self, beat: Heartbeat, now: float) -> None:
+        """What a heartbeat says about its sender."""
+        if self.met_at is None:
+            self.met_at = now
+        self.peer_sends = (beat.send_rate, now)
+        self.interval_s = beat.interval_ms / 1000
+        self.versions = (beat.min_version, beat.max_version)
+        self.features = beat.features
+        self.timed = self.way.timed = bool(beat.features & Feature.TIMED)

@@ -1,0 +1,81 @@
+"""No robot drowns another's urgent traffic: levels waiting elsewhere -> less urgent levels hold back here, for a while.
+
+Each node says in heartbeats and acknowledgements which urgent levels wait at it, and how long. Who hears it holds
+back its own less urgent levels for `yield_hold_s`, but never for more than `yield_share` of the time, so that none
+starves.
+"""
+
+from collections.abc import Iterable
+
+from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.settings import Rates
+from udp_mesh.wire.frames import Waiting
+
+ALL_LEVELS = 0xFFFF
+
+BUDGET_S = 1.0
+"""Holding back is budgeted over this much time."""
+
+LOOK_EVERY_S = 0.02
+"""What waits here is looked up no more often than this."""
+
+
+class Yielding:
+    """`allowed(now)` is the bit mask of levels that may leave."""
+
+    __slots__ = ("_allowed", "_budget_at", "_budget_s", "_looked_at", "_rates", "_until", "_waiting", "held_total_s")
+
+    def __init__(self, rates: Rates, now: float) -> None:
+        self._rates = rates
+        self._allowed = ALL_LEVELS
+        self._until = float("-inf")
+        self._budget_s = BUDGET_S * rates.yield_share
+        self._budget_at = now
+        self._looked_at = float("-inf")
+        self._waiting: tuple[Waiting, ...] = ()
+        self.held_total_s = 0.0
+
+    def apply(self, rates: Rates) -> None:
+        self._rates = rates
+
+    def waiting_here(self, outbounds: Iterable[Outbound], now: float) -> tuple[Waiting, ...]:
+        """The urgent levels at which something has waited too long, most urgent first."""
+        if now < self._looked_at + LOOK_EVERY_S:
+            return self._waiting
+        self._looked_at = now
+        oldest: dict[int, float] = {}
+        for outbound in outbounds:
+            if outbound.silent_since is not None:
+                # What waits for a peer out of reach waits for no one else's airtime.
+                continue
+            patience = self._rates.yield_after_s + 3 * (outbound.trip.least or 0.0)
+            for priority, age_s in outbound.levels.oldest_ages(self._rates.urgent_priority, now):
+                if age_s > patience:
+                    oldest[priority] = max(age_s, oldest.get(priority, 0.0))
+        self._waiting = tuple(
+            Waiting(priority, min(65_535, int(age_s * 1000))) for priority, age_s in sorted(oldest.items())
+        )
+        return self._waiting
+
+    def heard(self, waiting: tuple[Waiting, ...], now: float) -> None:
+        """Another node's waiting levels."""
+        level = min(entry.priority for entry in waiting)
+        if level > self._rates.urgent_priority or self._rates.yield_share <= 0:
+            return
+        share = self._rates.yield_share
+        self._budget_s = min(BUDGET_S * share, self._budget_s + (now - self._budget_at) * share)
+        self._budget_at = now
+        extension = now + self._rates.yield_hold_s - max(now, self._until)
+        if extension <= 0 or self._budget_s < extension:
+            return
+        allowed = (1 << (level + 1)) - 1
+        self._allowed = allowed if now >= self._until else min(self._allowed, allowed)
+        self._budget_s -= extension
+        self.held_total_s += extension
+        self._until = now + self._rates.yield_hold_s
+
+    def allowed(self, now: float) -> int:
+        return self._allowed if now < self._until else ALL_LEVELS
+
+    def holds_until(self, now: float) -> float | None:
+        return self._until if now < self._until else None

@@ -1,0 +1,252 @@
+"""The receiving half of a session: opened datagrams in -> whole messages and what is owed to the sender out.
+
+1. `take` reads a datagram's fragments; a plain full fragment takes the fast path without building a frame.
+2. Pieces go to the reassembly of the channel they are numbered in (the sender's unicast or its broadcasts).
+3. A datagram all of whose pieces were kept is acknowledged; one with a refused piece is not, so that it comes again.
+"""
+
+import struct
+from collections import deque
+from typing import NamedTuple
+
+from udp_mesh.core.compression import Unpacking
+from udp_mesh.core.receiver.acks import MOST_PENDING, AckState
+from udp_mesh.core.receiver.memory_limit import TOPIC_BYTES, Account, Memory
+from udp_mesh.core.receiver.reassembly import Reassembly, Verdict, Whole
+from udp_mesh.core.sender.sent_packets import REORDER_PACKETS
+from udp_mesh.core.settings import Limits, Rates
+from udp_mesh.wire.codec import FRAGMENT, FRAGMENT_ACK_NOW, FRAGMENT_BYTES, FRAGMENT_WIDE, FRAGMENT_WIDE_BYTES
+from udp_mesh.wire.frames import Fragment, MessageFlag, Refused, RefuseReason, TopicAnnounce
+
+_NARROW = struct.Struct(">BIH")
+_WIDE = struct.Struct(">BII")
+_PLAIN_MASK = 0xFF & ~FRAGMENT_ACK_NOW
+
+REFUSED_REMEMBERED = 256
+"""Messages of one peer refused for good, remembered so that each of their pieces is refused again."""
+
+
+class Arrived(NamedTuple):
+    """A whole message, ready for the application."""
+
+    topic: str
+    type_name: str
+    payload: bytes
+    priority: int
+    to_all: bool
+    from_broadcast: int | None
+    """Its broadcast number, where it is numbered so."""
+
+
+def _topic_bytes(names: tuple[str, str]) -> int:
+    return TOPIC_BYTES + sum(len(name) for name in names)
+
+
+class Inbound:
+    """`arrived` and `refusals` are fetched and cleared by the session."""
+
+    __slots__ = (
+        "_account",
+        "_gap_ends",
+        "_limits",
+        "_rates",
+        "_refused",
+        "acks",
+        "arrived",
+        "broadcasts",
+        "duplicates",
+        "expired",
+        "fragments",
+        "over_limit",
+        "refusals",
+        "topics",
+        "unicasts",
+        "unpacking",
+    )
+
+    def __init__(self, rates: Rates, limits: Limits, memory: Memory) -> None:
+        self._rates = rates
+        self._limits = limits
+        self.acks = AckState()
+        self._account = Account(memory)
+        self.unicasts = Reassembly(limits, self._account)
+        self.broadcasts = Reassembly(limits, self._account)
+        self.topics: dict[int, tuple[str, str]] = {}
+        self.arrived: list[Arrived] = []
+        self.refusals: list[Refused] = []
+        self.unpacking: deque[tuple[Unpacking, Arrived]] = deque()
+        """Whole messages still being inflated, with what is told of them but for the payload."""
+        self.duplicates = 0
+        self.expired = 0
+        """Pieces of messages whose senders have given them up by now."""
+        self.fragments = 0
+        self.over_limit = 0
+        self._refused: dict[tuple[bool, int], RefuseReason] = {}
+        self._gap_ends: int | None = None
+
+    @property
+    def partial_bytes(self) -> int:
+        return self.unicasts.bytes + self.broadcasts.bytes
+
+    @property
+    def unpacking_bytes(self) -> int:
+        return sum([unpacking.held_bytes for unpacking, _ in self.unpacking])
+
+    def apply(self, rates: Rates, limits: Limits) -> None:
+        self._rates, self._limits = rates, limits
+        self.unicasts.set_limits(limits)
+        self.broadcasts.set_limits(limits)
+
+    def take_plain(self, frames: bytes, number: int, now: float) -> bool:
+        """The fast path: one fragment without a head that fills its datagram. False if this is something else."""
+        first = frames[0]
+        kind = first & _PLAIN_MASK
+        if kind == FRAGMENT and len(frames) > FRAGMENT_BYTES:
+            _, message_id, position = _NARROW.unpack_from(frames)
+            payload = frames[FRAGMENT_BYTES:]
+        elif kind == FRAGMENT | FRAGMENT_WIDE and len(frames) > FRAGMENT_WIDE_BYTES:
+            _, message_id, position = _WIDE.unpack_from(frames)
+            payload = frames[FRAGMENT_WIDE_BYTES:]
+        else:
+            return False
+        if not position or self._refused:
+            return False
+        if not self.unicasts.add_plain(message_id, position, payload):
+            return False
+        self.fragments += 1
+        self.accepted(number, now, ack_now=first != kind)
+        return True
+
+    def announce(self, frame: TopicAnnounce) -> None:
+        """Learn a topic's number; bounded, since only a faulty peer announces without end."""
+        names = (frame.name, frame.type_name)
+        known = self.topics.get(frame.topic_id)
+        if known == names:
+            return
+        size = _topic_bytes(names)
+        if (known is None and len(self.topics) >= self._limits.topics_per_peer) or not self._account.has_room(size):
+            self.over_limit += 1
+            return
+        self._account.take(size - (0 if known is None else _topic_bytes(known)))
+        self.topics[frame.topic_id] = names
+
+    def close(self) -> None:
+        """The peer is forgotten: what is kept for it no longer counts."""
+        self._account.close()
+
+    def take(self, fragment: Fragment, now: float, *, broadcast: bool, late_s: float = 0.0) -> bool:
+        """Take in one piece, `late_s` longer on its way than others; False if it was refused, so that its datagram must
+        not be acknowledged."""
+        by_broadcast = broadcast or fragment.broadcast_id
+        self.fragments += 1
+        key = (by_broadcast, fragment.message_id)
+        if self._refused and key in self._refused:
+            self._refuse(key, self._refused[key])
+            return False
+        reassembly = self.broadcasts if by_broadcast else self.unicasts
+        result = reassembly.add(fragment, now, late_s)
+        if isinstance(result, Whole):
+            return self._hand_over(result, by_broadcast)
+        match result:
+            case Verdict.KEPT:
+                return True
+            case Verdict.DUPLICATE:
+                self.duplicates += 1
+                return True
+            case Verdict.FULL:
+                self.over_limit += 1
+                return False
+            case Verdict.EXPIRED:
+                self.expired += 1
+                return False
+            case Verdict.FORGOTTEN:
+                self._refuse(key, RefuseReason.FORGOTTEN)
+                return False
+            case Verdict.TOO_LARGE:
+                self.over_limit += 1
+                self._refuse_for_good(key, RefuseReason.TOO_LARGE)
+                return False
+            case Verdict.CORRUPT:
+                self._refuse_for_good(key, RefuseReason.CORRUPT)
+                return False
+
+    def accepted(self, number: int, now: float, *, ack_now: bool) -> None:
+        """A datagram that wants an acknowledgement was taken in whole."""
+        acks = self.acks
+        if number > acks.largest + 1:
+            # A gap: the sender can call it a loss once it knows of three later packets, so tell it then.
+            if self._gap_ends is None:
+                self._gap_ends = number + REORDER_PACKETS - 1
+            ack_now = ack_now or acks.largest < 0
+        acks.saw(number, now)
+        acks.pending += 1
+        if self._gap_ends is not None and number >= self._gap_ends:
+            ack_now = True
+        if ack_now or acks.pending >= self._rates.ack_every_packets:
+            acks.now_wanted = True
+            self._gap_ends = None
+        elif acks.due_at is None:
+            acks.due_at = now + self._rates.ack_delay_s
+
+    def overdue(self) -> bool:
+        """So many packets are pending that an acknowledgement must be cut before more arrive."""
+        return self.acks.pending >= MOST_PENDING
+
+    def _hand_over(self, whole: Whole, by_broadcast: bool) -> bool:
+        head = whole.head
+        key = (by_broadcast, whole.message_id)
+        topic = self.topics.get(head.topic_id)
+        if topic is None:
+            self._refuse(key, RefuseReason.FORGOTTEN)
+            return False
+        number = whole.message_id if by_broadcast else None
+        to_all = by_broadcast or bool(head.flags & MessageFlag.TO_ALL)
+        arrived = Arrived(*topic, whole.body, head.priority, to_all, number)
+        if not head.flags & MessageFlag.COMPRESSED:
+            self.arrived.append(arrived)
+            return True
+        unpacking = Unpacking(whole.body, self._limits.message_bytes)
+        if not unpacking.step():
+            size = len(whole.body)
+            if (
+                self.unpacking_bytes + unpacking.held_bytes > self._limits.partial_bytes_per_peer
+                or not self._account.has_room(size)
+            ):
+                self.over_limit += 1
+                self._refuse_for_good(key, RefuseReason.TOO_LARGE)
+                return False
+            self._account.take(size)
+            self.unpacking.append((unpacking, arrived))
+            return True
+        if unpacking.payload is None:
+            self._refuse_for_good(key, RefuseReason.CORRUPT)
+            return False
+        self.arrived.append(arrived._replace(payload=unpacking.payload))
+        return True
+
+    def unpack(self) -> bool:
+        """Inflate some more of the first message that waits for it; False where it turned out to be corrupt.
+
+        Its pieces were acknowledged already: only a faulty peer compresses what cannot be inflated.
+        """
+        unpacking, arrived = self.unpacking[0]
+        if not unpacking.step():
+            return True
+        self.unpacking.popleft()
+        self._account.give_back(len(arrived.payload))
+        if unpacking.payload is None:
+            return False
+        self.arrived.append(arrived._replace(payload=unpacking.payload))
+        return True
+
+    def _refuse(self, key: tuple[bool, int], reason: RefuseReason) -> None:
+        broadcast, message_id = key
+        refusal = Refused(message_id, reason, broadcast)
+        if refusal not in self.refusals:
+            self.refusals.append(refusal)
+
+    def _refuse_for_good(self, key: tuple[bool, int], reason: RefuseReason) -> None:
+        if len(self._refused) >= REFUSED_REMEMBERED:
+            del self._refused[next(iter(self._refused))]
+        self._refused[key] = reason
+        self._refuse(key, reason)

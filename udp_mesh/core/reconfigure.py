@@ -1,0 +1,204 @@
+"""Changes of a running node: links come and go, settings are replaced, outboxes are restored, the node closes.
+
+Nothing here drops an accepted message: a topic's new settings reach the messages already waiting on it.
+"""
+
+from dataclasses import fields, replace
+from enum import Enum
+
+from udp_mesh.core.events import ExpiryReason, MessageId
+from udp_mesh.core.interfaces import Datagram
+from udp_mesh.core.peer_lifecycle import refit
+from udp_mesh.core.peers.heartbeat import leads
+from udp_mesh.core.publish import channel_of, enqueue, report_ended, stop_packing, tell_expired
+from udp_mesh.core.sender.message import Accepted
+from udp_mesh.core.sender.rate_limit import Gate
+from udp_mesh.core.settings import LinkInfo, LinkKind, Neighbour, Settings, Topic
+from udp_mesh.core.state import State, live_keys
+from udp_mesh.crypto import SendChannel
+from udp_mesh.wire.codec import encode
+from udp_mesh.wire.frames import Bye, MessageFlag
+
+
+def restore_outboxes(state: State, now: float) -> None:
+    """What the last run left on disk waits again."""
+    for stored in state.outboxes.load():
+        topic = state.topics.get(stored.topic)
+        if topic is None and state.settings.undeclared is not None:
+            topic = replace(state.settings.undeclared, name=stored.topic)
+        channel = channel_of(state, topic, stored.type_name) if topic is not None else None
+        if channel is None:
+            # Its topic is no longer declared: it stays on disk for a run that declares it.
+            continue
+        message_id = MessageId(state.next_message_id)
+        state.next_message_id += 1
+        flags = MessageFlag.RELIABLE if channel.topic.reliable else MessageFlag(0)
+        deadline = None if stored.remaining_s is None else now + stored.remaining_s
+        accepted = Accepted(message_id, channel, stored.payload, stored.payload, flags, now, deadline)
+        enqueue(state, stored.peer, accepted, now, stored.key)
+
+
+def link_up(state: State, link: LinkInfo, now: float) -> None:
+    """A new or changed link; heartbeats introduce it soon."""
+    state.links[link.name] = link
+    for session in state.roster.sessions.values():
+        if session.way.link == link.name:
+            refit(state, session, link.mtu)
+    state.discovery.hurry(len(state.roster.sessions), now)
+
+
+def link_down(state: State, name: str) -> None:
+    """Peers keep their last way until they are heard on another."""
+    state.links.pop(name, None)
+
+
+def apply(state: State, settings: Settings, now: float) -> list[str]:
+    """See `Node.apply`."""
+    old = state.settings
+    if (settings.name, settings.port) != (old.name, old.port):
+        raise ValueError("name and port need a new run of the node")
+    changes = _changes(old, settings)
+    state.settings = settings
+    state.topics = {topic.name: topic for topic in settings.topics}
+    state.ledger.set_limit(settings.limits.events)
+    state.roster.apply(settings)
+    state.yielding.apply(settings.rates)
+    _retopic(state, now)
+    keys = live_keys(settings)
+    if keys != state.keys:
+        state.keys = keys
+        number = state.to_all.next_number
+        state.to_all = SendChannel(keys[0], state.boot_id)
+        state.to_all.next_number = number
+        state.roster.set_keys(keys)
+    for session in state.roster.sessions.values():
+        session.inbound.apply(settings.rates, settings.limits)
+    for peer in state.roster.peers.values():
+        peer.apply(settings)
+        if peer.engaged:
+            state.ready[peer] = None
+        state.arm(peer)
+    for session in state.roster.sessions.values():
+        info = state.links.get(session.way.link)
+        if info is not None:
+            refit(state, session, info.mtu)
+    state.discovery.hurry(len(state.roster.sessions), now)
+    return changes
+
+
+def _changes(old: Settings, new: Settings) -> list[str]:
+    """One line per change, for the operator."""
+    lines = []
+    before = {topic.name: topic for topic in old.topics}
+    after = {topic.name: topic for topic in new.topics}
+    lines += [f"topic {name}: added" for name in after if name not in before]
+    lines += [f"topic {name}: removed" for name in before if name not in after]
+    for name in sorted(before.keys() & after.keys()):
+        lines += [f"topic {name}: {text}" for text in _differences(before[name], after[name])]
+    if old.keys != new.keys:
+        lines.append("keys: changed")
+    for what in ("rates", "limits"):
+        lines += [f"{what}: {text}" for text in _differences(getattr(old, what), getattr(new, what))]
+    lines += _topic_without_name(old.undeclared, new.undeclared)
+    lines += _neighbours(old.neighbours, new.neighbours)
+    for what in ("window", "fragment_bytes"):
+        if getattr(old, what) != getattr(new, what):
+            lines.append(f"{what}: {getattr(old, what)} -> {getattr(new, what)}")
+    return lines
+
+
+def _topic_without_name(old: Topic | None, new: Topic | None) -> list[str]:
+    if old is None or new is None:
+        return [] if old is new else ["undeclared: removed" if new is None else "undeclared: added"]
+    return [f"undeclared: {text}" for text in _differences(old, new)]
+
+
+def _neighbours(old: tuple[Neighbour, ...], new: tuple[Neighbour, ...]) -> list[str]:
+    before = {neighbour.address: neighbour for neighbour in old}
+    after = {neighbour.address: neighbour for neighbour in new}
+    return [
+        *(f"neighbour {address[0]}: added" for address in after if address not in before),
+        *(f"neighbour {address[0]}: removed" for address in before if address not in after),
+        *(
+            f"neighbour {address[0]}: {text}"
+            for address in before.keys() & after.keys()
+            for text in _differences(before[address], after[address])
+        ),
+    ]
+
+
+def _differences(old: object, new: object) -> list[str]:
+    texts = []
+    for field in fields(old):  # type: ignore[arg-type]
+        before, after = getattr(old, field.name), getattr(new, field.name)
+        if before != after:
+            texts.append(f"{field.name} {_shown(before)} -> {_shown(after)}")
+    return texts
+
+
+def _shown(value: object) -> str:
+    """As it stands in a configuration."""
+    match value:
+        case None:
+            return "none"
+        case bool():
+            return str(value).lower()
+        case Enum():
+            return str(value.value)
+        case tuple():
+            return f"[{', '.join(map(str, value))}]"
+        case _:
+            return str(value)
+
+
+def _retopic(state: State, now: float) -> None:
+    """Give every topic its new settings; messages already waiting follow a new priority."""
+    for channel in state.channels.values():
+        topic: Topic | None = state.topics.get(channel.name)
+        if topic is None and state.settings.undeclared is not None:
+            topic = replace(state.settings.undeclared, name=channel.name)
+        if topic is not None:
+            channel.topic = topic
+    for name in list(state.gates):
+        rate = state.topics[name].rate_limit_bytes_per_s if name in state.topics else None
+        gate = state.gates[name]
+        gate.release()
+        if rate is None:
+            del state.gates[name]
+        else:
+            gate.bytes_per_s = rate
+    for topic in state.topics.values():
+        if topic.rate_limit_bytes_per_s is not None and topic.name not in state.gates:
+            state.gates[topic.name] = Gate(topic.rate_limit_bytes_per_s, now)
+    for peer in state.roster.peers.values():
+        if peer.engaged:
+            peer.outbound.reprioritize()
+    state.casts.reprioritize()
+
+
+def close(state: State, now: float) -> None:
+    """See `Node.close`."""
+    if state.closed:
+        return
+    stop_packing(state, now)
+    for peer in state.roster.peers.values():
+        if not peer.engaged:
+            continue
+        for message in list(peer.outbound.open):
+            if state.outboxes.on_disk(message.store_key):
+                peer.outbound.withdraw(message)
+            else:
+                peer.outbound.finish(message, ExpiryReason.CLOSED)
+        report_ended(state, peer, now)
+    for name, held in state.outboxes.drop_all():
+        tell_expired(state, name, held.accepted, ExpiryReason.CLOSED)
+    links = list(state.links.values())
+    for link in links:
+        _, data = state.to_all.seal_long(encode([Bye("closed")]))
+        if link.kind is LinkKind.BROADCAST:
+            state.outgoing.append(Datagram(link.name, link.broadcast, data, True))
+        for neighbour in state.settings.neighbours:
+            if not neighbour.legacy and leads(neighbour, link, links):
+                state.outgoing.append(Datagram(link.name, neighbour.address, data, True))
+    state.ready.clear()
+    state.closed = True

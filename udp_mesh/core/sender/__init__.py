@@ -1,0 +1,1 @@
+"""The sending half of a session: messages in, packets out, outcomes back."""

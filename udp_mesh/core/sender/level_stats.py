@@ -1,0 +1,113 @@
+"""What is open on each priority level towards one peer, and how the levels fare.
+
+A message enters its level when accepted, may move when its topic's priority changes, and leaves when it ends.
+`book_served` tells the levels which of them just sent: less urgent ones that wait meanwhile starve, and for how long
+is part of the statistics.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+
+from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.wire.limits import PRIORITY_LEVELS
+
+
+class LevelBook:
+    """What is open on one priority level, and how the level fares."""
+
+    __slots__ = ("bytes", "held_s", "messages", "order", "starved_reported", "starved_s", "starved_since")
+
+    def __init__(self) -> None:
+        self.order: deque[Outgoing] = deque()
+        """Messages in the order accepted; ended ones are dropped from its front when somebody looks."""
+        self.messages = 0
+        self.bytes = 0
+        self.starved_s = 0.0
+        self.starved_since: float | None = None
+        self.starved_reported = False
+        self.held_s = 0.0
+
+    def oldest(self) -> Outgoing | None:
+        order = self.order
+        while order and order[0].ended:
+            order.popleft()
+        return order[0] if order else None
+
+
+class Levels:
+    """One `LevelBook` per priority; `queued_bytes` is the sum of what is open on all of them."""
+
+    __slots__ = ("_books", "queued_bytes")
+
+    def __init__(self) -> None:
+        self._books = [LevelBook() for _ in range(PRIORITY_LEVELS)]
+        self.queued_bytes = 0
+
+    def __getitem__(self, priority: int) -> LevelBook:
+        return self._books[priority]
+
+    def __iter__(self) -> Iterator[LevelBook]:
+        return iter(self._books)
+
+    def enter(self, message: Outgoing) -> None:
+        """A message was accepted."""
+        self._count(message, 1)
+        self.stand_last(message)
+
+    def stand_last(self, message: Outgoing) -> None:
+        """The message is the youngest of its level (again: it begins anew under another object)."""
+        book = self._books[message.priority]
+        book.order.append(message)
+        if len(book.order) > 64 + 2 * book.messages:
+            book.order = deque(waiting for waiting in book.order if not waiting.ended)
+
+    def leave(self, message: Outgoing) -> None:
+        """A message ended."""
+        self._count(message, -1)
+
+    def _count(self, message: Outgoing, sign: int) -> None:
+        book = self._books[message.priority]
+        book.messages += sign
+        book.bytes += sign * len(message.body)
+        self.queued_bytes += sign * len(message.body)
+
+    def rearrange(self, messages: Iterable[Outgoing]) -> bool:
+        """Give each open message (all of them, in the order accepted) its topic's present priority; False: all had."""
+        everything = list(messages)
+        if all(message.priority == message.accepted.channel.topic.priority for message in everything):
+            return False
+        for message in everything:
+            priority = message.accepted.channel.topic.priority
+            if priority != message.priority:
+                self._count(message, -1)
+                message.priority = priority
+                self._count(message, 1)
+        for priority, book in enumerate(self._books):
+            book.order = deque(message for message in everything if message.priority == priority)
+        return True
+
+    def book_served(self, served: int, waiting: int, now: float) -> None:
+        """Levels of the mask `served` sent something; less urgent ones of the mask `waiting` did not."""
+        lowest = served & -served
+        mask = waiting & ~(lowest - 1) | served
+        while mask:
+            bit = mask & -mask
+            mask ^= bit
+            book = self._books[bit.bit_length() - 1]
+            if bit & served:
+                if book.starved_since is not None:
+                    book.starved_s += now - book.starved_since
+                    book.starved_since = None
+                    book.starved_reported = False
+            elif book.starved_since is None:
+                book.starved_since = now
+
+    def oldest_ages(self, last_priority: int, now: float) -> list[tuple[int, float]]:
+        """(priority, age of its oldest open message in s) of levels up to `last_priority`."""
+        ages = []
+        for priority in range(last_priority + 1):
+            book = self._books[priority]
+            oldest = book.oldest() if book.messages else None
+            if oldest is not None:
+                ages.append((priority, now - oldest.queued_at))
+        return ages

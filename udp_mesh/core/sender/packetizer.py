@@ -1,0 +1,382 @@
+"""What leaves for one peer, decided at the last moment: level -> pieces -> frames -> sealed datagrams.
+
+`leave_level` sends from one priority level until it is empty, or the window, the pacing or the room ends. A run of full
+fragments of one message takes the fast path: one pack, one seal and one record per fragment. Everything else (first and
+last fragments, small messages, pieces sent again) is built frame by frame, small pieces together in one datagram.
+"""
+
+import struct
+
+from udp_mesh.core.events import ExpiryReason
+from udp_mesh.core.interfaces import Datagram
+from udp_mesh.core.receiver.datagram_age import clock_ms
+from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.pending import Outcome
+from udp_mesh.core.sender.rate_limit import Gate
+from udp_mesh.core.sender.scheduler import Run
+from udp_mesh.core.sender.send_quota import ack_spacing, look_again, permitted, urgent_may_wait_until, window_room
+from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.sender.sent_packets import Mark, Packet
+from udp_mesh.core.settings import Address
+from udp_mesh.crypto import LONG_OVERHEAD_BYTES, SHORT_OVERHEAD_BYTES, SendChannel
+from udp_mesh.wire.codec import (
+    FRAGMENT,
+    FRAGMENT_ACK_NOW,
+    FRAGMENT_BYTES,
+    FRAGMENT_WIDE,
+    FRAGMENT_WIDE_BYTES,
+    HEAD_BYTES,
+    LENGTH_BYTES,
+    LIFE_BYTES,
+    encode,
+)
+from udp_mesh.wire.frames import Delivered, Fragment, Frame, MessageHead, Ping, Sent, TopicAnnounce
+from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
+
+IP_UDP_BYTES = 28
+"""IPv4 and UDP headers."""
+
+IP6_EXTRA_BYTES = 20
+"""IPv6 headers are larger by this."""
+
+LEAST_ROOM_BYTES = 64
+"""Less room than this in a datagram is not worth looking for another small message."""
+
+PING_BYTES = 9
+IDS_BYTES = 4
+ID_BYTES = 4
+"""Of a PING; of a DELIVERED without its message ids, and of each of these."""
+
+NO_MESSAGE_ID = 0xFFFF_FFFF
+"""Messages are numbered from 0 on: none comes to this one in the life of a boot."""
+
+_NARROW = struct.Struct(">BIH")
+_WIDE = struct.Struct(">BII")
+_NARROW_POSITIONS = 65_536
+
+
+def header_bytes(address: Address) -> int:
+    """IP and UDP headers of a datagram to or from this address."""
+    return IP_UDP_BYTES + (IP6_EXTRA_BYTES if ":" in address[0] else 0)
+
+
+def datagram_room(address: Address, mtu: int, fragment_bytes: int) -> int:
+    """Bytes of frames in a datagram that an IP packet of `mtu` bytes carries, and with it a full fragment."""
+    return min(mtu - header_bytes(address) - LONG_OVERHEAD_BYTES, fragment_bytes + FRAGMENT_WIDE_BYTES)
+
+
+class Way:
+    """How datagrams reach the peer now: link, address, sealing, sizes."""
+
+    __slots__ = ("address", "channel", "confirmed", "fragment_bytes", "heard_at", "link", "mtu", "room_bytes", "timed")
+
+    def __init__(self, channel: SendChannel) -> None:
+        self.channel = channel
+        self.confirmed = False
+        """The peer has answered in this channel: the short header does."""
+        self.link = ""
+        self.address: Address = ("", 0)
+        self.heard_at = float("-inf")
+        """When the peer was last heard from this address."""
+        self.mtu = 0
+        """Bytes of the largest IP packet."""
+        self.room_bytes = 0
+        """Frames of one datagram at most: small pieces that share one make it no larger than a full fragment does."""
+        self.fragment_bytes = 0
+        """Payload of a full fragment."""
+        self.timed = False
+        """The peer takes dated datagrams and heads that say how long their message may live."""
+
+    def lead(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
+        """Datagrams go this way from now on; messages already begun keep their fragments where these still fit."""
+        self.link, self.address, self.mtu = link, address, mtu
+        self.room_bytes = datagram_room(address, mtu, fragment_bytes)
+        self.fragment_bytes = self.room_bytes - FRAGMENT_WIDE_BYTES
+
+    def dated(self, frames: list[Frame], now: float) -> list[Frame]:
+        """The frames, behind the time where the peer takes that.
+
+        It is no part of `room_bytes`: the long header, for which that leaves room, is larger than the short one by more
+        than the date and a remaining life. In a datagram with a long header both are left out where they do not fit.
+        """
+        return [Sent(clock_ms(now)), *frames] if self.timed else frames
+
+    def encode(self, frames: list[Frame], now: float) -> bytes:
+        """As `dated`, in bytes that fit the way."""
+        encoded = encode(self.dated(frames, now))
+        return encoded if self.confirmed or len(encoded) <= self.room_bytes else encode(frames)
+
+    def seal(self, frames: bytes) -> tuple[int, bytes]:
+        return self.channel.seal(frames) if self.confirmed else self.channel.seal_long(frames)
+
+    def seal_run(self, run: list[bytes]) -> list[bytes]:
+        """Datagrams with the channel's next numbers."""
+        if self.confirmed:
+            return self.channel.seal_run(run)
+        return [self.channel.seal_long(frames)[1] for frames in run]
+
+    @property
+    def overhead_bytes(self) -> int:
+        return SHORT_OVERHEAD_BYTES if self.confirmed else LONG_OVERHEAD_BYTES
+
+
+def leave_level(
+    outbound: Outbound,
+    way: Way,
+    priority: int,
+    now: float,
+    out: list[Datagram],
+    room_bytes: int,
+    gates: dict[str, Gate],
+) -> int:
+    """Let what waits on one level leave, at most about `room_bytes`; returns the bytes that left."""
+    urgent_level = priority <= outbound.rates.urgent_priority
+    level_pace = outbound.window.packets_per_s()
+    used = 0
+    mark = outbound.mark(now, urgent=urgent_level)
+    while used < room_bytes:
+        run = outbound.scheduler.peek(priority)
+        if run is None:
+            break
+        urgent = urgent_level and not run.stale
+        pace = None if urgent else level_pace
+        room = window_room(outbound, now)
+        most = permitted(outbound, room, now, pace, urgent=urgent)
+        if most <= 0:
+            outbound.limited = False
+            if urgent:
+                if outbound.silent_since is None:
+                    outbound.wake_at = min(outbound.wake_at, urgent_may_wait_until(outbound))
+            elif (again := look_again(outbound, room, now, pace)) is not None:
+                outbound.wake_at = min(outbound.wake_at, again)
+            break
+        message = run.message
+        if message.superseded and run.again:
+            outbound.finish(message, ExpiryReason.SUPERSEDED)
+            continue
+        gate = gates.get(message.accepted.channel.name) if gates else None
+        if gate is not None and not gate.open(now):
+            outbound.scheduler.drop_head(run)
+            gate.parked.append((outbound, run))
+            continue
+        if not message.begun:
+            _begin(outbound, way, message)
+            run = Run(message, 0, message.fragments, again=False)
+        before = used
+        is_plain = gate is None and message.accepted.broadcast_number is None
+        if run.position and run.length > 2 and most > 1 and is_plain:
+            count = min(run.length - 1, most, 1 + (room_bytes - used) // message.fragment_bytes)
+            used += _leave_run(outbound, way, run, count, mark, out)
+        else:
+            count = 1
+            used += _leave_one(outbound, way, run, urgent, mark, out)
+        if gate is not None:
+            gate.spend(used - before)
+        if outbound.probe_credit:
+            outbound.probe_credit = max(0, outbound.probe_credit - count)
+        if urgent:
+            outbound.urgent_left_at = now
+        else:
+            outbound.pacer.spend(count, now, pace)
+    return used
+
+
+def leave_copies(outbound: Outbound, way: Way, now: float, out: list[Datagram]) -> None:
+    """Second copies of small urgent messages whose time has come and that were not acknowledged meanwhile."""
+    for message, position in outbound.copies.due(now, outbound.overdue_s()):
+        if outbound.silent_since is not None:
+            continue
+        run = Run(message, position, 1, again=True)
+        _leave(
+            outbound,
+            way,
+            [(message, position)],
+            [*_frames(outbound, way, run, now, ack_now=True)],
+            outbound.mark(now, urgent=True),
+            out,
+        )
+
+
+def leave_large_ping(outbound: Outbound, way: Way, token: int, frames_bytes: int) -> Datagram:
+    """A ping in a datagram that is no smaller than one with `frames_bytes` of frames, and larger by 7 B at most.
+
+    What fills it are words of a message that no peer ever sends: that we have it whole.
+    """
+    frames: list[Frame] = [Ping(token)]
+    missing = frames_bytes - PING_BYTES
+    while missing > 0:
+        ids = min(MAX_IDS, max(1, -(-(missing - IDS_BYTES) // ID_BYTES)))
+        frames.append(Delivered((NO_MESSAGE_ID,) * ids))
+        missing -= IDS_BYTES + ID_BYTES * ids
+    number, data = way.seal(encode(frames))
+    outbound.flight.add(number, None)
+    return Datagram(way.link, way.address, data, True)
+
+
+def _begin(outbound: Outbound, way: Way, message: Outgoing) -> None:
+    channel = message.accepted.channel
+    first = way.fragment_bytes - HEAD_BYTES
+    if channel.number not in outbound.announced:
+        first -= 5 + len(channel.name.encode()) + len(channel.type_name.encode())
+        first -= LENGTH_BYTES
+    cast_number = message.accepted.broadcast_number
+    if cast_number is not None:
+        # the copy of a lost cast keeps its number, or the receiver would take it for another message
+        message.begin(cast_number, way.fragment_bytes, max(1, first))
+        return
+    message.begin(outbound.next_wire_id, way.fragment_bytes, max(1, first))
+    outbound.next_wire_id += 1
+
+
+def _leave_run(outbound: Outbound, way: Way, run: Run, count: int, mark: Mark, out: list[Datagram]) -> int:
+    """The fast path: `count` full fragments in a row, none of them its message's first or last."""
+    message, position = run.message, run.position
+    wire_id = message.wire_id
+    assert wire_id is not None
+    size = message.fragment_bytes
+    offset = message.first_bytes + (position - 1) * size
+    body = memoryview(message.body)
+    frames = []
+    spacing = ack_spacing(outbound)
+    since = outbound.since_ack_wanted
+    wide = position + count > _NARROW_POSITIONS
+    pack = _WIDE.pack if wide else _NARROW.pack
+    plain = FRAGMENT | FRAGMENT_WIDE if wide else FRAGMENT
+    if wide and position < _NARROW_POSITIONS:
+        count = _NARROW_POSITIONS - position
+        pack, plain = _NARROW.pack, FRAGMENT
+    for place in range(position, position + count):
+        since += 1
+        first = plain
+        if since >= spacing:
+            since = 0
+            first |= FRAGMENT_ACK_NOW
+        frames.append(pack(first, wire_id, place) + body[offset : offset + size])
+        offset += size
+    out.extend(Datagram.run(way.link, way.address, way.seal_run(frames)))
+    outbound.flight.add_run(mark, message, range(position, position + count))
+    outbound.since_ack_wanted = since
+    sent_bytes = count * (size + FRAGMENT_BYTES + way.overhead_bytes)
+    outbound.sent_packets += count
+    outbound.sent_bytes += sent_bytes + IP_UDP_BYTES * count
+    outbound.scheduler.take(run, count)
+    return sent_bytes
+
+
+def _leave_one(outbound: Outbound, way: Way, run: Run, urgent: bool, mark: Mark, out: list[Datagram]) -> int:
+    """One datagram with the piece of `run` and, if there is room, small pieces behind it on the same level."""
+    now = mark.sent_at
+    message = run.message
+    pieces: list[tuple[Outgoing, int]] = []
+    frames: list[Frame] = []
+    room = way.room_bytes
+    priority = message.priority
+    scheduler = outbound.scheduler
+    again = 0
+    spacing = ack_spacing(outbound)
+    outbound.since_ack_wanted += 1
+    next_run: Run | None = run
+    while next_run is not None:
+        message = next_run.message
+        if next_run.again and (message, next_run.position) in pieces:
+            # Several copies of it were lost: one datagram needs no more than one.
+            scheduler.take(next_run, 1)
+            next_run = _next_small(outbound, way, priority, room)
+            continue
+        size = _piece_bytes(outbound, way, next_run)
+        if frames and (size > room or len(frames) >= MAX_FRAMES_PER_DATAGRAM - 3):
+            break
+        again += next_run.again
+        pieces.append((message, next_run.position))
+        scheduler.take(next_run, 1)
+        last = next_run.position == message.fragments - 1
+        ack_now = urgent or outbound.since_ack_wanted >= spacing or (last and scheduler.nothing_waits(priority))
+        frames.extend(_frames(outbound, way, next_run, now, ack_now=ack_now))
+        if ack_now:
+            outbound.since_ack_wanted = 0
+        room -= size
+        if urgent and message.small and not next_run.again:
+            outbound.copy_later(message, next_run.position, now)
+        if not message.reliable and last:
+            outbound.finish(message, Outcome.SENT)
+        if room < LEAST_ROOM_BYTES:
+            break
+        next_run = _next_small(outbound, way, priority, room)
+    outbound.retransmitted += again
+    return _leave(outbound, way, pieces, frames, mark, out, urgent=urgent)
+
+
+def _leave(
+    outbound: Outbound,
+    way: Way,
+    pieces: list[tuple[Outgoing, int]],
+    frames: list[Frame],
+    mark: Mark,
+    out: list[Datagram],
+    *,
+    urgent: bool = True,
+) -> int:
+    number, data = way.seal(way.encode(frames, mark.sent_at))
+    (message, position), *more = pieces
+    outbound.flight.add(number, Packet(mark, message, position, tuple(more)))
+    out.append(Datagram(way.link, way.address, data, urgent))
+    outbound.sent_packets += 1
+    outbound.sent_bytes += len(data) + IP_UDP_BYTES
+    return len(data)
+
+
+def _next_small(outbound: Outbound, way: Way, priority: int, room: int) -> Run | None:
+    """The next piece of the level if it is small enough to ride along (ruling out what only the main loop decides)."""
+    run = outbound.scheduler.peek(priority)
+    if run is None or run.message.superseded or run.message.accepted.channel.topic.rate_limit_bytes_per_s is not None:
+        return None
+    if not run.message.begun:
+        if len(run.message.body) > room:
+            return None
+        _begin(outbound, way, run.message)
+        run = Run(run.message, 0, run.message.fragments, again=False)
+    return run if _piece_bytes(outbound, way, run) <= room else None
+
+
+def _piece_bytes(outbound: Outbound, way: Way, run: Run) -> int:
+    """Bytes of the frames that carry one piece."""
+    message = run.message
+    start, end = message.span(run.position)
+    size = end - start + FRAGMENT_WIDE_BYTES + LENGTH_BYTES
+    if run.position == 0:
+        size += HEAD_BYTES + (LIFE_BYTES if _says_life(way, message) else 0)
+        channel = message.accepted.channel
+        if channel.number not in outbound.announced:
+            size += 5 + len(channel.name.encode()) + len(channel.type_name.encode())
+    return size
+
+
+def _says_life(way: Way, message: Outgoing) -> bool:
+    return way.timed and way.confirmed and message.accepted.deadline is not None
+
+
+def _frames(outbound: Outbound, way: Way, run: Run, now: float, *, ack_now: bool) -> list[Frame]:
+    """The piece as a fragment, with head and, until the peer knows it, the topic's name in front of the first."""
+    message, position = run.message, run.position
+    accepted = message.accepted
+    wire_id = message.wire_id
+    assert wire_id is not None
+    is_cast = accepted.broadcast_number is not None
+    start, end = message.span(position)
+    payload = memoryview(message.body)[start:end]
+    if position:
+        return [Fragment(wire_id, position, payload, None, ack_now, is_cast)]
+    head = MessageHead(
+        len(message.body),
+        message.fragments,
+        accepted.channel.number,
+        message.priority,
+        accepted.flags,
+        max(0, int((now - accepted.accepted_at) * 1000)),
+        accepted.life_ms(now) if _says_life(way, message) else None,
+    )
+    fragment = Fragment(wire_id, 0, payload, head, ack_now, is_cast)
+    channel = accepted.channel
+    if channel.number in outbound.announced:
+        return [fragment]
+    return [TopicAnnounce(channel.number, channel.name, channel.type_name), fragment]

@@ -1,0 +1,137 @@
+"""The messages of one peer that have no outcome yet: taken on -> replaced, expired, begun anew -> ended, once each.
+
+What becomes of their pieces on the way is `outbound`'s part.
+"""
+
+from collections.abc import Iterable
+from enum import Enum
+from heapq import heapify, heappop, heappush
+from typing import NamedTuple
+
+from udp_mesh.core.events import ExpiryReason
+from udp_mesh.core.sender.level_stats import Levels
+from udp_mesh.core.sender.message import Outgoing
+
+
+class Outcome(Enum):
+    """How a message ended, besides expiring."""
+
+    DELIVERED = 1
+    SENT = 2
+    """Best effort: it left, no outcome is reported."""
+    PEER_LOST = 3
+
+
+class Ended(NamedTuple):
+    message: Outgoing
+    outcome: Outcome | ExpiryReason
+
+
+class OpenMessages:
+    """`ended` and `cancelled` are fetched and cleared by the session."""
+
+    def __init__(self) -> None:
+        self.open: dict[Outgoing, None] = {}
+        """Messages without an outcome, in the order accepted."""
+        self.levels = Levels()
+        self.ended: list[Ended] = []
+        self.cancelled: list[int] = []
+        """Wire ids given up after they had begun: the peer may forget them."""
+        self._deadlines: list[tuple[float, int, Outgoing]] = []
+        self._deadline_serial = 0
+        self._kept: dict[str, list[Outgoing]] = {}
+        """Open messages of topics that keep only the last few."""
+
+    def take_on(self, message: Outgoing) -> None:
+        """One more; older ones that its topic does not keep end, or end as what becomes of their pieces."""
+        self.open[message] = None
+        self.levels.enter(message)
+        self._note_deadline(message)
+        keep_last = message.accepted.channel.topic.keep_last
+        if keep_last is not None:
+            self._replace_older(message, keep_last)
+
+    def _note_deadline(self, message: Outgoing) -> None:
+        if message.accepted.deadline is not None:
+            self._deadline_serial += 1
+            heappush(self._deadlines, (message.accepted.deadline, self._deadline_serial, message))
+            if len(self._deadlines) > 64 + 2 * len(self.open):
+                # What ended long before its deadline must not stay in memory until then.
+                self._deadlines = [entry for entry in self._deadlines if not entry[2].ended]
+                heapify(self._deadlines)
+
+    def _replace_older(self, message: Outgoing, keep_last: int) -> None:
+        kept = self._kept.get(message.accepted.channel.topic.name, [])
+        alive = [older for older in kept if not older.ended and not older.superseded]
+        alive.append(message)
+        self._kept[message.accepted.channel.topic.name] = alive
+        for older in alive[: max(0, len(alive) - keep_last)]:
+            if not older.begun:
+                self.finish(older, ExpiryReason.SUPERSEDED)
+            elif older.small:
+                # Its pieces may be arriving right now: it ends as what becomes of them.
+                older.superseded = True
+
+    def next_deadline(self) -> float | None:
+        """When the next message expires (it may have ended meanwhile)."""
+        return self._deadlines[0][0] if self._deadlines else None
+
+    def expire(self, now: float) -> None:
+        """Deadlines that have come."""
+        while self._deadlines and self._deadlines[0][0] <= now:
+            self.finish(heappop(self._deadlines)[2], ExpiryReason.DEADLINE)
+
+    def begin_anew(self, message: Outgoing) -> Outgoing:
+        """The message under another object, nothing of which has left; it is the youngest of its level."""
+        message.ended = True
+        self.open.pop(message, None)
+        copy = message.anew()
+        self.open[copy] = None
+        self.levels.stand_last(copy)
+        self._note_deadline(copy)
+        kept = self._kept.get(copy.accepted.channel.topic.name)
+        if kept is not None:
+            kept.append(copy)
+        return copy
+
+    def finish(self, message: Outgoing, outcome: Outcome | ExpiryReason) -> None:
+        """The one outcome of a message; later ones are ignored."""
+        if message.ended:
+            return
+        self._remove(message)
+        if message.begun and outcome is not Outcome.DELIVERED and outcome is not Outcome.SENT:
+            self.cancel(message)
+        self.ended.append(Ended(message, outcome))
+
+    def finish_all(self, outcome: Outcome | ExpiryReason) -> None:
+        for message in list(self.open):
+            self.finish(message, outcome)
+
+    def withdraw(self, message: Outgoing, *, to_resume: bool = False) -> None:
+        """The message leaves without an outcome: an outbox keeps it, `to_resume` it under its number."""
+        if not message.ended:
+            self._remove(message)
+            if message.begun and not to_resume:
+                self.cancel(message)
+
+    def _remove(self, message: Outgoing) -> None:
+        message.ended = True
+        del self.open[message]
+        self.levels.leave(message)
+
+    def cancel(self, message: Outgoing) -> None:
+        """The peer is told to forget what it has of this one."""
+        if message.wire_id is not None and message.accepted.broadcast_number is None:
+            self.cancelled.append(message.wire_id)
+
+    def by_wire_id(self, wire_id: int) -> Outgoing | None:
+        """The open message of this number (copies of casts are numbered apart); a search, for rare answers."""
+        own = (message for message in self.open if message.accepted.broadcast_number is None)
+        return next((message for message in own if message.wire_id == wire_id), None)
+
+    def told_delivered(self, wire_ids: Iterable[int]) -> None:
+        """The peer says it has these whole, whatever it acknowledged; a search, for peers of another make."""
+        known = set(wire_ids)
+        for message in list(self.open):
+            if message.wire_id in known and message.accepted.broadcast_number is None:
+                self.finish(message, Outcome.DELIVERED)

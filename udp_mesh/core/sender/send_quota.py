@@ -1,0 +1,98 @@
+"""How many packets may leave for one peer now, and when to look again.
+
+1. `window_room`: what the window leaves room for, plus what the link should have delivered while acknowledgements are
+   late.
+2. `permitted`: that, plus the excess of urgent pieces; for the rest no more than the pacing allows. A silent peer gets
+   probes alone.
+3. `look_again`: when nothing may leave, the time at which the pacing, or a still missing acknowledgement, changes that.
+4. `ack_spacing`: how often packets ask for an acknowledgement, which is what makes one late.
+
+Acknowledgements go missing in bursts and come late from a process that was not scheduled; a window that waits for them
+leaves the link idle. For some tens of milliseconds the link is presumed to go on as it did.
+"""
+
+from udp_mesh.core.sender.sender import Outbound
+
+MOST_ACK_SPACING = 10
+"""Packets between two that ask for an acknowledgement at once."""
+
+ACK_SPACING = 0.2
+"""Part of the window between two packets that ask for an acknowledgement at once."""
+
+LOSSY_ACK_SPACING = 0.5
+LOSS_WEIGHT = 5.0
+"""Acknowledgements are lost too: with each percent of loss they are asked for 5 % more often, up to twice as often."""
+
+LATE_AFTER_S = 0.006
+"""Acknowledgements are late when they stay away for longer than their spacing takes, and at least this long."""
+
+URGENT_WAIT_S = 0.1
+"""Longest an urgent piece waits for what is on its way: that may stand in a queue of seconds, or be lost unnoticed. One
+datagram, with all that is small and waits, delays bulk by a hundredth."""
+
+PRESUMED_FOR_S = 0.03
+"""So long the link is presumed to go on delivering; what its packets then wait is bounded by it."""
+
+
+def window_room(outbound: Outbound, now: float) -> int:
+    """Packets for which the window has room; below 0 where more are on their way."""
+    window = outbound.window
+    packets = window.packets
+    if outbound.struggling:
+        # Packets leave the window by their age only: more of them are young enough than within a round trip.
+        smoothed = outbound.trip.smoothed
+        if smoothed is not None and window.presumable():
+            packets *= max(1.0, outbound.timeout() / smoothed)
+    else:
+        late_s = now - _late_at(outbound)
+        if late_s > 0 and window.presumable():
+            packets += (window.capacity() or 0.0) * min(late_s, PRESUMED_FOR_S)
+    room = int(packets) - outbound.flight.outstanding
+    if room <= 0 and window.draining(now):
+        # A drain ends with the round trip of a piece that is not urgent: one may leave whatever else is on its way.
+        room = max(room, 1 - outbound.flight.others_outstanding())
+    return room
+
+
+def permitted(outbound: Outbound, room: int, now: float, packets_per_s: float | None, *, urgent: bool) -> int:
+    """Packets that may leave now; `packets_per_s` is the pacing, which urgent pieces do not wait for."""
+    if outbound.silent_since is not None:
+        return outbound.probe_credit
+    packets = room
+    if urgent:
+        packets += outbound.rates.urgent_excess_packets
+        if packets <= 0 and now >= urgent_may_wait_until(outbound):
+            packets = 1
+    else:
+        packets = min(packets, outbound.pacer.allowance(now, packets_per_s))
+    return max(packets, outbound.probe_credit)
+
+
+def urgent_may_wait_until(outbound: Outbound) -> float:
+    """When an urgent piece leaves whatever is on its way (to a silent peer it is a probe)."""
+    return outbound.urgent_left_at + URGENT_WAIT_S
+
+
+def look_again(outbound: Outbound, room: int, now: float, packets_per_s: float | None) -> float | None:
+    """When more may leave although nothing arrives until then; None: only an acknowledgement changes anything."""
+    if outbound.silent_since is not None:
+        return None
+    if room > 0:
+        return outbound.pacer.wake_at(packets_per_s)
+    late_at = _late_at(outbound)
+    if outbound.struggling or now >= late_at + PRESUMED_FOR_S or not outbound.window.presumable():
+        return None
+    return max(now, late_at) + outbound.rates.pace_quantum_s
+
+
+def ack_spacing(outbound: Outbound) -> int:
+    """Packets between two that ask for an acknowledgement at once."""
+    often = max(LOSSY_ACK_SPACING, 1.0 - LOSS_WEIGHT * outbound.loss)
+    return max(2, min(MOST_ACK_SPACING, int(outbound.window.packets * ACK_SPACING * often)))
+
+
+def _late_at(outbound: Outbound) -> float:
+    """When the next acknowledgement should have come."""
+    capacity = outbound.window.capacity()
+    spacing_s = ack_spacing(outbound) / capacity if capacity else 0.0
+    return outbound.last_progress + max(LATE_AFTER_S, spacing_s)

@@ -1,0 +1,428 @@
+"""Everything on its way to one peer: accepted -> scheduled -> in flight -> delivered, expired or peer lost.
+
+1. `accept` takes a message on; `departure` pulls pieces when datagrams leave and books them here.
+2. `acknowledge` books what arrived, measures round trip, rate and loss, and puts lost pieces back by priority.
+3. `handle_timer` probes when acknowledgements stay away: first one packet; then the peer is *silent*, everything
+   on its way is waiting again, and single probes leave: window and rate model stay as they were.
+4. `heard` ends the silence; `restart` begins anew with a peer that forgot everything.
+Which messages are open, and the one outcome of each, is the book of `open_messages`.
+"""
+
+from collections.abc import Iterable
+
+from udp_mesh.core.congestion.controller import FixedWindow, Window
+from udp_mesh.core.congestion.delay_based import AdaptiveWindow
+from udp_mesh.core.congestion.pacer import Pacer
+from udp_mesh.core.congestion.rtt import INITIAL_TIMEOUT_S, RoundTrip
+from udp_mesh.core.events import ExpiryReason
+from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.pending import OpenMessages, Outcome
+from udp_mesh.core.sender.pmtu import PathSize
+from udp_mesh.core.sender.redundancy import OVERDUE_ROUND_TRIPS, Copies
+from udp_mesh.core.sender.resume_backoff import RETURN_BURST_PACKETS, Bursts
+from udp_mesh.core.sender.scheduler import Scheduler
+from udp_mesh.core.sender.sent_packets import Flight, Mark, Packet
+from udp_mesh.core.settings import Rates, Settings
+from udp_mesh.wire.frames import Ack
+
+PROBE_SOON_S = 0.025
+"""Between probes in the first second of a silence: most cuts of a moving robot are that short."""
+
+PROBE_S = 0.25
+"""Between probes later on: at most this much is lost when the link returns; four packets a second to a dead peer."""
+
+PROBE_SOON_FOR_S = 1.0
+
+SILENT_AFTER_TIMEOUTS = 3
+SILENT_AFTER_S = 0.25
+"""Without any acknowledgement for both of these the peer is silent. Until then packets are replaced as they time out,
+at the pace of the window: a burst of losses then costs little more than its own length."""
+
+QUIET_S = 0.02
+"""Acknowledgements must stay away at least this long before packets time out: twice what they are held back."""
+
+EXPIRE_EVERY_S = 0.005
+"""Between two looks for packets that timed out."""
+
+LOSS_MEMORY_PACKETS = 256
+"""Packets over which loss is smoothed."""
+
+
+OTHERS_TELL_S = 1.0
+"""So long the round trip of packets that are not urgent is the one that counts."""
+
+
+class Outbound(OpenMessages):
+    """The sending half of a session. Times in seconds."""
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__()
+        self.trip = RoundTrip()
+        self.urgent_trip = RoundTrip()
+        """Of urgent packets alone: in a radio's queues they pass others (wifi's access categories)."""
+        self._other_sampled_at = float("-inf")
+        self.window: Window = AdaptiveWindow(self.trip)
+        self.pacer = Pacer(settings.rates.pace_quantum_s)
+        self.flight = Flight()
+        self.scheduler = Scheduler()
+        self.rates: Rates = settings.rates
+        self.announced: set[int] = set()
+        """Numbers of topics that the peer knows by name."""
+        self.next_wire_id = 0
+        self.epoch = 0
+        """Counts the runs of the peer: wire ids of earlier ones mean nothing to this one."""
+        self.copies = Copies()
+        self.served = 0
+        """Mask of levels from which something left in this round."""
+        self.wake_at = float("inf")
+        """When pacing lets the next quantum leave."""
+        self.silent_since: float | None = None
+        self.struggling = False
+        """Acknowledgements stay away: packets are taken for lost by their age."""
+        self.overdue: list[Packet] = []
+        """Packets that timed out and are neither known to have arrived nor sent again."""
+        self.expired_at = float("-inf")
+        self.urgent_left_at = float("-inf")
+        self.probe_credit = 0
+        self.probed_at = float("-inf")
+        self._bursts = Bursts()
+        self.path_size = PathSize()
+        self.last_progress = 0.0
+        self.other_progress = 0.0
+        """When the last packet that was not urgent arrived."""
+        self.limited = True
+        """The application, not window or pacing, decides how much leaves."""
+        self.since_ack_wanted = 0
+        """Packets sent since the last one that asked for an acknowledgement at once."""
+        self.loss = 0.0
+        self.send_twice = False
+        """Loss was seen and has not been gone for long: small urgent messages leave twice."""
+        self.delivered_packets = 0
+        self.delivered_at = 0.0
+        self.delivered_sent_at = 0.0
+        self.delivered_bytes = 0
+        self.retransmitted = 0
+        self.sent_packets = 0
+        self.sent_bytes = 0
+        self.apply(settings)
+
+    def apply(self, settings: Settings) -> None:
+        """New settings; nothing on its way is touched."""
+        self.rates = settings.rates
+        self.pacer = Pacer(settings.rates.pace_quantum_s)
+        if isinstance(settings.window, int):
+            self.window = FixedWindow(settings.window)
+        elif not isinstance(self.window, AdaptiveWindow):
+            self.window = AdaptiveWindow(self.trip)
+
+    # Accepting
+
+    def accept(self, message: Outgoing, now: float) -> None:
+        """Take a message on: it waits on its level."""
+        self.take_on(message)
+        if not self.flight.outstanding and self.silent_since is None:
+            self.last_progress = now
+        if self.silent_since is not None and message.priority <= self.rates.urgent_priority:
+            # A fresh urgent message is itself the best probe: what waited until now stands behind it.
+            self.allow_probe(now)
+        self.scheduler.push(message)
+
+    # Acknowledgements
+
+    def acknowledge(self, ack: Ack, now: float) -> None:
+        """Book an acknowledgement of the peer."""
+        flight = self.flight
+        received = ack.received << 1 | 1
+        # Sparse traffic has too few successors to lose packets otherwise.
+        timed_out = flight.confirm_timed_out(ack.largest, received) if ack.largest < flight.next_number else 0
+        spurious = flight.spurious
+        acknowledged, lost, newest = flight.acknowledge(ack.largest, received)
+        if acknowledged:
+            # What was acknowledged late, all at once, says nothing about the rate of the link.
+            after_silence = self.struggling or self.silent_since is not None
+            self.last_progress = now
+            if not all(packet.mark.urgent for packet in acknowledged):
+                self.other_progress = now
+            self.struggling = False
+            if self.silent_since is not None:
+                self._end_silence()
+            if self.path_size.in_doubt:
+                self.path_size.arrived(acknowledged, flight.spurious - spurious, now)
+            self._book_arrivals(acknowledged)
+            if self.overdue:
+                self._settle_overdue()
+            rate: float | None = None
+            largest = -1
+            ahead = 0
+            count = len(acknowledged)
+            self.delivered_packets += count
+            if newest is not None:
+                mark = newest.mark
+                if self._sample(max(1e-5, now - mark.sent_at - ack.delay_us * 1e-6), now, urgent=mark.urgent):
+                    largest = ack.largest
+                elapsed = max(now - mark.delivered_at, mark.sent_at - mark.delivered_sent_at)
+                if elapsed > 0 and not after_silence:
+                    rate = (self.delivered_packets - mark.delivered) / elapsed
+                self.delivered_sent_at = mark.sent_at
+                ahead = mark.ahead_of(ack.largest)
+            self.delivered_at = now
+            limited = newest is None or newest.mark.limited
+            in_flight = flight.outstanding
+            if self.window.draining(now) and not flight.others_outstanding():
+                # The few urgent ones that leave during a drain are no queue.
+                in_flight = 0
+            self.window.acknowledged(
+                count,
+                largest,
+                flight.next_number,
+                in_flight,
+                rate,
+                limited=limited,
+                ahead=ahead,
+                loss=self.loss,
+                now=now,
+            )
+        if lost:
+            self.path_size.lost(lost)
+            self._put_back(lost)
+        lost_packets = len(lost) + timed_out
+        total = len(acknowledged) + lost_packets
+        if total:
+            if self.loss >= self.rates.twice_loss:
+                self.send_twice = True
+            elif self.loss < self.rates.twice_loss / 4:
+                self.send_twice = False
+            self.loss += (lost_packets - self.loss * total) / max(total, LOSS_MEMORY_PACKETS)
+
+    def _sample(self, round_trip_s: float, now: float, *, urgent: bool) -> bool:
+        """Whether this round trip tells of the queue by which the window goes."""
+        if urgent:
+            self.urgent_trip.sample(round_trip_s, now)
+            if now < self._other_sampled_at + OTHERS_TELL_S:
+                return False
+        else:
+            self._other_sampled_at = now
+        self.trip.sample(round_trip_s, now)
+        return True
+
+    def _book_arrivals(self, packets: Iterable[Packet]) -> None:
+        for packet in packets:
+            _, message, position, more = packet
+            if not position:
+                self.announced.add(message.accepted.channel.number)
+            if not message.ended and not message.arrived[position]:
+                message.arrived[position] = 1
+                message.missing -= 1
+                self.delivered_bytes += message.fragment_bytes if position else message.first_bytes
+                if not message.missing:
+                    self.finish(message, Outcome.DELIVERED)
+            for message, position in more:
+                if not position:
+                    self.announced.add(message.accepted.channel.number)
+                if not message.ended and message.arrive(position):
+                    self.delivered_bytes += len(message.body)
+                    if not message.missing:
+                        self.finish(message, Outcome.DELIVERED)
+
+    def _put_back(self, packets: Iterable[Packet]) -> None:
+        """Lost pieces of reliable messages wait again on their level."""
+        for packet in packets:
+            self._put_back_piece(packet.message, packet.position)
+            for message, position in packet.more:
+                self._put_back_piece(message, position)
+
+    def _put_back_piece(self, message: Outgoing, position: int) -> None:
+        if message.ended or not message.reliable or message.arrived[position]:
+            return
+        if message.superseded:
+            self.finish(message, ExpiryReason.SUPERSEDED)
+        else:
+            self.scheduler.push_again(message, position)
+
+    def copy_later(self, message: Outgoing, position: int, now: float) -> None:
+        """A small urgent piece left for the first time."""
+        self.copies.later(
+            message,
+            position,
+            now,
+            gap_s=self.rates.twice_gap_s,
+            twice=self.send_twice,
+            loss=self.loss,
+            overdue_s=self.overdue_s(),
+        )
+
+    def overdue_s(self) -> float:
+        """How long the answer to an urgent piece may take."""
+        smoothed = self.urgent_trip.smoothed or self.trip.smoothed
+        return INITIAL_TIMEOUT_S if smoothed is None else OVERDUE_ROUND_TRIPS * smoothed + self.rates.twice_gap_s
+
+    # Silence
+
+    def timer(self) -> float | None:
+        """When `handle_timer` wants to be called for probes, deadlines or second copies. Late answers do no harm."""
+        at: float | None = None
+        if self.silent_since is not None:
+            if self.open or self.flight.outstanding:
+                at = self.probed_at + self._probe_every(self.silent_since)
+        elif self.flight.outstanding:
+            at = self._expiry_at()
+        deadline = self.next_deadline()
+        if deadline is not None and (at is None or deadline < at):
+            at = deadline
+        if self.wake_at != float("inf") and (at is None or self.wake_at < at):
+            at = self.wake_at
+        if self.copies and (at is None or self.copies.next_at() < at):
+            at = self.copies.next_at()
+        return at
+
+    def timeout(self) -> float:
+        """Silence after which the oldest packet counts as lost."""
+        return self.trip.timeout(self.rates.ack_delay_s, PROBE_S)
+
+    def handle_timer(self, now: float) -> None:
+        self.expire(now)
+        if self.wake_at <= now:
+            self.wake_at = float("inf")
+        if self.silent_since is not None:
+            if now >= self.probed_at + self._probe_every(self.silent_since) and (self.open or self.flight.outstanding):
+                self.allow_probe(now)
+        elif self.flight.outstanding:
+            timeout = self.timeout()
+            if now >= self.last_progress + max(SILENT_AFTER_TIMEOUTS * timeout, SILENT_AFTER_S):
+                self.silent_since = now
+                self.allow_probe(now)
+            elif now >= self._expiry_at():
+                self.expired_at = now
+                self._expire(now - timeout)
+
+    def _expiry_at(self) -> float:
+        """When to look for packets whose acknowledgement is overdue."""
+        oldest = self.flight.oldest()
+        if oldest is None:
+            return float("inf")
+        timeout = self.timeout()
+        # Urgent packets overtake others in radios: that they arrive says nothing about one that all others follow.
+        progress = self.last_progress if oldest.urgent else self.other_progress
+        quiet = progress + max(QUIET_S, timeout / 2)
+        return max(quiet, oldest.sent_at + timeout, self.expired_at + EXPIRE_EVERY_S)
+
+    def _expire(self, sent_before: float) -> None:
+        """Packets sent until then are no longer counted as on their way, so that others may leave.
+
+        Whether they, or only their acknowledgements, were lost the next acknowledgement will tell: until then urgent
+        pieces are sent again, others only if nothing else waits.
+        """
+        self.struggling = True
+        for packet in self.flight.lose_before(sent_before):
+            if packet.message.priority <= self.rates.urgent_priority:
+                self._put_back((packet,))
+            else:
+                self.overdue.append(packet)
+            self.path_size.lost((packet,))
+        if self.overdue and not self.scheduler.waiting:
+            self._settle_overdue()
+
+    def _settle_overdue(self) -> None:
+        overdue, self.overdue = self.overdue, []
+        self._put_back(overdue)
+
+    def _probe_every(self, silent_since: float) -> float:
+        return PROBE_SOON_S if self.probed_at - silent_since < PROBE_SOON_FOR_S else PROBE_S
+
+    def allow_probe(self, now: float) -> None:
+        """The most urgent waiting piece may leave although the peer is silent; not more often than `PROBE_SOON_S`."""
+        if now < self.probed_at + PROBE_SOON_S * 0.99:
+            return
+        self.probed_at = now
+        self.probe_credit = 1
+        self._set_aside()
+
+    def probes_small(self, now: float) -> bool:
+        """Whether the probe just allowed shall be a ping: nothing waits, or full pieces may be too large for the path
+        (then one probe in a few, once the silence is no short cut)."""
+        if self.silent_since is None or not self.probe_credit:
+            return False
+        if self.scheduler.waiting:
+            long_since = now - self.silent_since > PROBE_SOON_FOR_S
+            if not (long_since and self.path_size.ask_small()):
+                return False
+            self.probe_credit = 0
+        self.path_size.asked_small()
+        return True
+
+    def _set_aside(self) -> None:
+        """Everything on its way waits again, urgent messages behind those still to come."""
+        self._settle_overdue()
+        given_up = self.flight.give_up()
+        self.path_size.lost(given_up)
+        self._put_back(given_up)
+        self.scheduler.set_aside(self.rates.urgent_priority)
+
+    def heard(self, now: float) -> None:
+        """Something authentic came from the peer. After a silence a first burst leaves, the rest when it is
+        acknowledged."""
+        if self.silent_since is None or now < self.probed_at + PROBE_SOON_S * 0.99:
+            return
+        if self._bursts.due(now):
+            self.allow_probe(now)
+            self.probe_credit = min(RETURN_BURST_PACKETS, int(self.window.packets))
+
+    def _end_silence(self) -> None:
+        self.silent_since = None
+        self._bursts.reset()
+        self.probe_credit = 0
+        self.scheduler.set_aside(self.rates.urgent_priority)
+
+    def reprioritize(self) -> None:
+        """Topics changed their priorities: what waits moves to its new level."""
+        if self.levels.rearrange(self.open):
+            self.scheduler.rebuild(list(self.open), pieces=True)
+
+    # Anew
+
+    def restart(self, now: float) -> None:
+        """The peer runs anew (or must be told anew): every open message begins again under new numbers."""
+        self.flight.restart(0)
+        self.overdue.clear()
+        self.announced.clear()
+        self.copies.clear()
+        self.cancelled.clear()
+        self.next_wire_id = 0
+        self.epoch += 1
+        self.silent_since = None
+        self.struggling = False
+        self.probe_credit = 0
+        self.last_progress = now
+        messages = list(self.open)
+        self.open.clear()
+        for message in messages:
+            self.begin_anew(message)
+        self.scheduler.rebuild(list(self.open), pieces=False)
+
+    def send_anew(self, message: Outgoing) -> None:
+        """The peer forgot the pieces it had of this one."""
+        self.announced.discard(message.accepted.channel.number)
+        self.scheduler.push(self.begin_anew(message))
+
+    def resume(self, message: Outgoing, now: float) -> None:
+        """Take a withdrawn message on again where it stopped."""
+        copy = message.resumed()
+        self.accept(copy, now)
+        for position in range(copy.next_position):
+            if not copy.arrived[position]:
+                self.scheduler.push_again(copy, position)
+
+    def mark(self, now: float, *, urgent: bool = False) -> Mark:
+        """The state in which the packets of one burst leave."""
+        if not self.flight.outstanding and not self.struggling and self.silent_since is None:
+            self.delivered_at = self.delivered_sent_at = self.last_progress = now
+        return Mark(
+            now,
+            self.delivered_packets,
+            self.delivered_at,
+            self.delivered_sent_at,
+            self.limited,
+            urgent,
+            self.flight.next_number,
+            self.flight.outstanding,
+        )
