@@ -18,7 +18,7 @@ from meshlab.spec import LinkSpec
 from meshlab.yaml_entries import share_of
 
 FILE = "ground.yaml"
-EXAMPLES = Path(__file__).parents[3] / "inventory" / "lab"
+EXAMPLES = Path(__file__).parents[2] / "inventory" / "lab"
 coordinates = st.integers(-400, 400).map(float)
 points = st.tuples(coordinates, coordinates)
 names = st.sampled_from([f"n{number}" for number in range(8)])

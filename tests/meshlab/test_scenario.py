@@ -15,7 +15,7 @@ from meshlab.propagation import Ground, Place, links_of
 from meshlab.scenario import Course, Drop, Event, Happening, Incident, Mission, agenda, course, scene
 
 FILE = Path("mission.yaml")
-EXAMPLE = Path(__file__).parents[3] / "inventory" / "lab" / "mission.yaml"
+EXAMPLE = Path(__file__).parents[2] / "inventory" / "lab" / "mission.yaml"
 
 # a robot that drives away from the base at 2 m/s with a beacon, which it drops after 100 m
 AWAY = Mission(
