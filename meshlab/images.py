@@ -7,10 +7,9 @@ An image is the text that a virtual flash chip holds, padded, and fwtool's metad
 from __future__ import annotations
 
 import gzip
-import io
-import tarfile
 from collections.abc import Mapping
 
+from meshctl.archive import TarMember, tar_of
 from meshctl.firmware.trailer import append_metadata
 from meshctl.model import Release
 from meshlab.releases import ARCH, facts, firmware_text
@@ -69,11 +68,4 @@ def apk_package(name: str, version: str, files: Mapping[str, str], *, depends: t
 
 
 def _tar(members: Mapping[str, bytes]) -> bytes:
-    packed = io.BytesIO()
-    with tarfile.open(fileobj=packed, mode="w", format=tarfile.USTAR_FORMAT) as archive:
-        for path, content in members.items():
-            entry = tarfile.TarInfo(path)
-            entry.size = len(content)
-            entry.mode = 0o755
-            archive.addfile(entry, io.BytesIO(content))
-    return gzip.compress(packed.getvalue(), mtime=0)
+    return gzip.compress(tar_of(TarMember(path, content, 0o755) for path, content in members.items()), mtime=0)

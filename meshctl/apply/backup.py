@@ -22,6 +22,7 @@ from meshctl.apply.change_in_progress import Attempt
 from meshctl.apply.change_set import new_change_id, new_nonce, reload_script
 from meshctl.apply.commit_confirm import carry
 from meshctl.apply.context import Job
+from meshctl.archive import TarMember
 from meshctl.device import openwrt
 from meshctl.device.connection import OwnKey
 from meshctl.device.deadman import Change, NewFile
@@ -90,21 +91,16 @@ def with_info(archive: bytes, info: Mapping[str, object], extra: Mapping[str, by
     """
     out = io.BytesIO()
     with tarfile.open(fileobj=out, mode="w", format=tarfile.GNU_FORMAT) as new:
-        _add(new, INFO_NAME, json.dumps(info, indent=1).encode(), 0o600)
-        for path, content in extra.items():
-            _add(new, path.lstrip("/"), content, 0o644)
+        added = [TarMember(INFO_NAME, json.dumps(info, indent=1).encode(), 0o600)]
+        added += [TarMember(path.lstrip("/"), content) for path, content in extra.items()]
+        for own in added:
+            new.addfile(own.info, io.BytesIO(own.content))
         for member, content in _members(archive, "the archive"):
             if member.isreg():
                 new.addfile(member, io.BytesIO(content))
             elif member.issym():
                 new.addfile(member)
     return gzip.compress(out.getvalue(), mtime=0)
-
-
-def _add(tar: tarfile.TarFile, name: str, content: bytes, mode: int) -> None:
-    entry = tarfile.TarInfo(name)
-    entry.size, entry.mode = len(content), mode
-    tar.addfile(entry, io.BytesIO(content))
 
 
 def read_backup(data: bytes, file: str) -> Backup:

@@ -8,16 +8,15 @@ marker in the archive (`archive`, pure). Proof of success is a new boot id, the 
 from __future__ import annotations
 
 import gzip
-import io
 import secrets
-import tarfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
 from meshctl.apply.change_in_progress import LOCK_SLACK_S, install_switch
 from meshctl.apply.context import Job
 from meshctl.apply.station_flush import Forgetting
+from meshctl.archive import TarMember, tar_of
 from meshctl.device import deadman, openwrt
 from meshctl.device.observation import Observation
 from meshctl.device.observe import observe
@@ -121,21 +120,9 @@ def archive(wanted: Wanted, host_keys: Mapping[str, FetchedFile], marker: str) -
     files += [(path, content, mode) for path, (mode, content) in deadman.installed_files().items()]
     files.append((MARKER_PATH, f"{marker}\n".encode(), 0o644))
     link = f"../init.d/{deadman.INIT_SCRIPT.rpartition('/')[2]}"
-    return gzip.compress(_tar(sorted(files), [(deadman.INIT_LINK, link)]), mtime=0)
-
-
-def _tar(files: Iterable[tuple[str, bytes, int]], links: Iterable[tuple[str, str]]) -> bytes:
-    out = io.BytesIO()
-    with tarfile.open(fileobj=out, mode="w", format=tarfile.USTAR_FORMAT) as tar:
-        for path, content, mode in files:
-            info = tarfile.TarInfo(path.lstrip("/"))
-            info.size, info.mode = len(content), mode
-            tar.addfile(info, io.BytesIO(content))
-        for path, target in links:
-            info = tarfile.TarInfo(path.lstrip("/"))
-            info.type, info.linkname, info.mode = tarfile.SYMTYPE, target, 0o777
-            tar.addfile(info)
-    return out.getvalue()
+    members = [TarMember(path.lstrip("/"), content, mode) for path, content, mode in sorted(files)]
+    members.append(TarMember(deadman.INIT_LINK.lstrip("/"), link_to=link))
+    return gzip.compress(tar_of(members), mtime=0)
 
 
 def _await_return(job: Job, marker: str, forgetting: Forgetting) -> Outcome:

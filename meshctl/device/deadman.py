@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import gzip
 import hashlib
-import io
 import re
 import shlex
-import tarfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
+from meshctl.archive import TarMember, tar_of
 from meshctl.device.connection import Completed, Connection
 from meshctl.device.errors import CommandFailed, NodeRefused
 from meshctl.device.observation import ChangeStatus
@@ -118,31 +117,6 @@ def _expected(change: Change, path: str) -> str:
     if path not in change.expected:
         return "-"
     return change.expected[path] or "absent"
-
-
-@dataclass(frozen=True, slots=True)
-class TarMember:
-    """A file, or a symbolic link when `link_to` is given."""
-
-    name: str
-    content: bytes = field(default=b"", repr=False)
-    mode: int = 0o644
-    link_to: str = ""
-
-
-def tar_of(members: Iterable[TarMember]) -> bytes:
-    """An uncompressed tar owned by root, without times, in the order given: the same members give the same bytes."""
-    out = io.BytesIO()
-    with tarfile.open(fileobj=out, mode="w", format=tarfile.USTAR_FORMAT) as tar:
-        for member in members:
-            info = tarfile.TarInfo(member.name)
-            info.mode = member.mode
-            if member.link_to:
-                info.type, info.linkname, info.mode = tarfile.SYMTYPE, member.link_to, 0o777
-            else:
-                info.size = len(member.content)
-            tar.addfile(info, io.BytesIO(member.content))
-    return out.getvalue()
 
 
 def install(connection: Connection) -> None:

@@ -7,11 +7,10 @@ travel by themselves and are shared between releases; a change of topics or keys
 from __future__ import annotations
 
 import hashlib
-import io
-import tarfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from meshctl.archive import TarMember, tar_of
 from meshctl.errors import InputError
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Secret, SecretRef
@@ -79,22 +78,14 @@ class Bundle:
 
     def archive(self) -> bytes:
         """The release's own files as a tar, with its manifest and the link to its tree."""
-        out = io.BytesIO()
-        with tarfile.open(fileobj=out, mode="w", format=tarfile.USTAR_FORMAT) as archive:
-            for directory in ("bin", "etc", "ros1"):
-                entry = tarfile.TarInfo(directory)
-                entry.type, entry.mode = tarfile.DIRTYPE, 0o755
-                archive.addfile(entry)
-            # ROS's Python finds our package in ros1/, and none of the wheels that are built for another one
-            for name, target in (("lib", f"../../trees/{self.tree}"), ("ros1/udp_mesh", "../lib/udp_mesh")):
-                link = tarfile.TarInfo(name)
-                link.type, link.linkname = tarfile.SYMTYPE, target
-                archive.addfile(link)
-            for file in (*self.files, File("manifest", self.manifest)):
-                entry = tarfile.TarInfo(file.path)
-                entry.size, entry.mode = len(file.content), file.mode
-                archive.addfile(entry, io.BytesIO(file.content))
-        return out.getvalue()
+        directories = [TarMember(name, mode=0o755, is_directory=True) for name in ("bin", "etc", "ros1")]
+        # ROS's Python finds our package in ros1/, and none of the wheels that are built for another one
+        links = [
+            TarMember("lib", link_to=f"../../trees/{self.tree}"),
+            TarMember("ros1/udp_mesh", link_to="../lib/udp_mesh"),
+        ]
+        files = (*self.files, File("manifest", self.manifest))
+        return tar_of([*directories, *links, *(TarMember(file.path, file.content, file.mode) for file in files)])
 
 
 def bundle(

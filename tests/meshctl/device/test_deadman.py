@@ -8,7 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from meshctl.device.deadman import Change, NewFile, TarMember, bundle, tar_of
+from meshctl.archive import TarMember, tar_of
+from meshctl.device.deadman import Change, NewFile, bundle
 from meshctl.device.parse.deadman import parse_status
 from meshctl.device.scripts import script
 from tests.meshctl.device.changes import (
