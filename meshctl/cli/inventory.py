@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from meshctl.cli.export import export
 from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import InputError
@@ -22,6 +23,7 @@ from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Node, NodeState, Role
 
 app = typer.Typer(help="Show what the inventory says and why.", no_args_is_help=True)
+app.command("export")(export)
 
 # Where ssh-keygen puts public keys, the kind that every release but 19.07 knows first.
 _PUBLIC_KEYS = ("id_ed25519.pub", "id_ecdsa.pub", "id_rsa.pub")

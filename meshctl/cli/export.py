@@ -1,0 +1,45 @@
+"""`meshctl inventory export`: the fleet's hosts for ssh and Ansible."""
+
+from __future__ import annotations
+
+import os
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from meshctl.cli.options import InventoryPath
+from meshctl.cli.output import echo
+from meshctl.errors import InputError
+from meshctl.inventory.load import load_fleet
+from meshctl.render.host_lists import ansible_inventory, host_entries, ssh_config
+
+
+class ExportFormat(Enum):
+    SSH_CONFIG = "ssh-config"
+    ANSIBLE = "ansible"
+
+
+def export(
+    inventory: InventoryPath = Path(),
+    format: Annotated[ExportFormat, typer.Option("--format", "-f", help="What to write.")] = ExportFormat.SSH_CONFIG,
+    out: Annotated[Path | None, typer.Option("--out", help="Write to this file instead of standard output.")] = None,
+) -> None:
+    """Export managed nodes and robot computers as an OpenSSH configuration or an Ansible inventory.
+
+    Example: meshctl inventory export --out fleet.ssh_config && ssh -F fleet.ssh_config b03
+    """
+    fleet = load_fleet(inventory, environ=os.environ)
+    base = Path(fleet.base).resolve()
+    known_hosts = base / Path(fleet.operators.known_hosts).expanduser()
+    entries = host_entries(fleet, fleet.managed())
+    write = ssh_config if format is ExportFormat.SSH_CONFIG else ansible_inventory
+    text = write(entries, known_hosts, lambda name: base / Path(name).expanduser())
+    if out is None:
+        echo(text, nl=False)
+        return
+    try:
+        out.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{out}: cannot write: {error.strerror}") from error

@@ -1,0 +1,109 @@
+"""The fleet's hosts for other tools: an OpenSSH client configuration and an Ansible inventory. Pure.
+
+Both name nodes as the inventory does and pin the same host keys: `HostKeyAlias` is the name that `meshctl trust` writes
+into known_hosts (`robot.NAME` for a robot's computer).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from meshctl.model import Fleet, Node, Release, SshSettings
+
+
+@dataclass(frozen=True, slots=True)
+class HostEntry:
+    """One SSH server: `alias` names its host key, `groups` are Ansible's, `is_openwrt` tells radios from computers."""
+
+    name: str
+    alias: str
+    address: str
+    ssh: SshSettings
+    groups: tuple[str, ...]
+    is_openwrt: bool
+    has_sha1_rsa_only: bool = False
+
+
+def host_entries(fleet: Fleet, nodes: Iterable[Node]) -> tuple[HostEntry, ...]:
+    """The nodes, then the computers of all robots."""
+    radios = [
+        HostEntry(
+            node.name,
+            node.name,
+            node.ssh.host or str(node.address.ip),
+            node.ssh,
+            tuple(dict.fromkeys((f"role_{node.role.value}", f"state_{node.state.value}", *node.groups))),
+            is_openwrt=True,
+            has_sha1_rsa_only=node.release is Release.V19_07,
+        )
+        for node in nodes
+    ]
+    computers = [
+        HostEntry(
+            f"robot.{name}",
+            f"robot.{name}",
+            robot.computer.ssh.host or str(robot.computer.address.ip),
+            robot.computer.ssh,
+            ("robots",),
+            is_openwrt=False,
+        )
+        for name, robot in fleet.robots.items()
+        if robot.computer is not None
+    ]
+    return (*radios, *computers)
+
+
+def ssh_config(entries: Iterable[HostEntry], known_hosts: Path, key_path: Callable[[str], Path]) -> str:
+    """Host blocks for `ssh -F FILE NAME` or an `Include` in ~/.ssh/config; see ssh_config(5)."""
+    return "\n".join(line for entry in entries for line in (*_block(entry, known_hosts, key_path), ""))
+
+
+def _block(entry: HostEntry, known_hosts: Path, key_path: Callable[[str], Path]) -> Iterator[str]:
+    yield f"Host {entry.name}"
+    yield f"    HostName {entry.address}"
+    if entry.ssh.port != 22:
+        yield f"    Port {entry.ssh.port}"
+    if entry.ssh.user:
+        yield f"    User {entry.ssh.user}"
+    yield f"    HostKeyAlias {entry.alias}"
+    yield f"    UserKnownHostsFile {_quoted(known_hosts)}"
+    yield from (f"    IdentityFile {_quoted(key_path(text))}" for text in entry.ssh.key_files)
+    if entry.ssh.jump:
+        yield f"    ProxyJump {entry.ssh.jump}"
+    if entry.has_sha1_rsa_only:
+        # dropbear 2019.78 signs and accepts RSA with SHA-1 only
+        yield "    HostKeyAlgorithms +ssh-rsa"
+        yield "    PubkeyAcceptedAlgorithms +ssh-rsa"
+
+
+def ansible_inventory(entries: Iterable[HostEntry], known_hosts: Path, key_path: Callable[[str], Path]) -> str:
+    """A static YAML inventory (JSON is YAML). OpenWrt has no Python: the module `raw` works there, others do not."""
+    groups: dict[str, dict[str, dict[str, object]]] = {}
+    for entry in entries:
+        options = [f"-o HostKeyAlias={entry.alias}", f"-o UserKnownHostsFile={_quoted(known_hosts)}"]
+        options += [f"-o ProxyJump={entry.ssh.jump}"] if entry.ssh.jump else []
+        variables: dict[str, object] = {
+            "ansible_host": entry.address,
+            "ansible_port": entry.ssh.port,
+            **({"ansible_user": entry.ssh.user} if entry.ssh.user else {}),
+            **({"ansible_ssh_private_key_file": str(key_path(entry.ssh.key_files[0]))} if entry.ssh.key_files else {}),
+            "ansible_ssh_common_args": " ".join(options),
+        }
+        own = ("openwrt" if entry.is_openwrt else "computers", *entry.groups)
+        for index, group in enumerate(dict.fromkeys(_group_name(name) for name in own)):
+            # variables once: Ansible merges a host that several groups list
+            groups.setdefault(group, {})[entry.name] = {} if index else variables
+    children = {group: {"hosts": hosts} for group, hosts in groups.items()}
+    return json.dumps({"all": {"children": children}}, indent=2) + "\n"
+
+
+def _group_name(name: str) -> str:
+    """Ansible's group names are identifiers."""
+    return "".join(letter if letter.isalnum() else "_" for letter in name)
+
+
+def _quoted(path: Path) -> str:
+    return f'"{path}"' if " " in str(path) else str(path)

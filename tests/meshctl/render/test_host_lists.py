@@ -1,0 +1,72 @@
+"""What other tools get is read by these tools."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[3]
+EXAMPLE = ROOT / "inventory" / "subt-final"
+
+
+def export(*words: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "meshctl", "inventory", "export", "-i", str(EXAMPLE), *words],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout
+
+
+def parsed(name: str, file: Path) -> dict[str, str]:
+    """What OpenSSH makes of it."""
+    done = subprocess.run(["ssh", "-F", str(file), "-G", name], capture_output=True, text=True, check=True)
+    return dict(line.split(" ", 1) for line in done.stdout.splitlines() if " " in line)
+
+
+def test_openssh_reads_the_configuration(tmp_path: Path) -> None:
+    file = tmp_path / "ssh_config"
+    export("--out", str(file))
+    names = [line.split()[1] for line in file.read_text().splitlines() if line.startswith("Host ")]
+    listed = json.loads(
+        subprocess.run(
+            [sys.executable, "-m", "meshctl", "inventory", "list", "-i", str(EXAMPLE), "--json"],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+    )["nodes"]
+    for node in listed:
+        if node["state"] not in ("lost", "retired"):
+            seen = parsed(node["name"], file)
+            assert (seen["hostname"], seen["user"]) == (node["address"].partition("/")[0], "root")
+            assert seen["hostkeyalias"] == node["name"]
+            assert seen["userknownhostsfile"] == str(EXAMPLE / "known_hosts")
+    robots = [name for name in names if name.startswith("robot.")]
+    assert robots
+    assert parsed(robots[0], file)["hostkeyalias"] == robots[0]
+
+
+def test_the_ansible_inventory_lists_every_host_with_its_address_once() -> None:
+    children = json.loads(export("--format", "ansible"))["all"]["children"]
+    assert {"openwrt", "computers", "role_base", "role_beacon", "role_robot"} <= set(children)
+    for name, host in children["openwrt"]["hosts"].items():
+        assert host["ansible_host"]
+        assert f"HostKeyAlias={name}" in host["ansible_ssh_common_args"]
+    assert all(host == {} for host in children["role_beacon"]["hosts"].values())
+
+
+@pytest.mark.parametrize("kind", ["ssh-config", "ansible"])
+def test_a_file_that_cannot_be_written_is_an_error(kind: str, tmp_path: Path) -> None:
+    with pytest.raises(subprocess.CalledProcessError) as caught:
+        export("--format", kind, "--out", str(tmp_path / "absent" / "file"))
+    assert caught.value.returncode == 2
+    assert "cannot write: No such file or directory" in caught.value.stderr
