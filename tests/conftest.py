@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from tests.udp_mesh.bridges.interpreters import NEEDS_ROS, ROS_PYTHON, expects_ros
+from tests.udp_mesh.bridges.ros2_processes import NEEDS_ROS2, PYTHON, expects_ros2
 
 settings.register_profile(
     "fast", derandomize=True, deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow]
@@ -47,8 +48,14 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.section("tried again")
         for reason in reasons:
             terminalreporter.line(reason)
-    if not expects_ros():
+    if not expects_ros() or not expects_ros2():
         terminalreporter.section("not tested here")
+    if not expects_ros2():
+        terminalreporter.line(
+            f"ROS 2: there is no {PYTHON}, so tests/udp_mesh/bridges/test_ros2.py was not collected. scripts/setup-ros2"
+            f" makes it (Python 3.11, x86_64); {NEEDS_ROS2}=1 makes it fail instead."
+        )
+    if not expects_ros():
         terminalreporter.line(
             f"ROS 1: {ROS_PYTHON} has no rospy and rosmaster, so tests/udp_mesh/bridges/test_ros1_quick.py was not"
             f" collected. scripts/setup-ros installs them (Debian, Ubuntu); {NEEDS_ROS}=1 makes it fail instead."

@@ -8,9 +8,11 @@ from collections.abc import Generator
 import pytest
 
 from tests.udp_mesh.bridges.interpreters import expects_ros
+from tests.udp_mesh.bridges.ros2_processes import expects_ros2
 from tests.udp_mesh.bridges.ros_processes import FOLDERS
 
 collect_ignore = [] if expects_ros() else ["test_ros1_quick.py"]
+collect_ignore += [] if expects_ros2() else ["test_ros2.py"]
 
 LAST_WORDS = 3000
 

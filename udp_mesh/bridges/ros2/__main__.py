@@ -9,8 +9,10 @@ subscriptions from their classes only.
 from __future__ import annotations
 
 import argparse
+import importlib
 import logging
 import os
+import re
 import sys
 import threading
 import time
@@ -30,7 +32,6 @@ try:
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.node import Node
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-    from rosidl_runtime_py.utilities import get_message
 except ModuleNotFoundError as error:
     raise SystemExit("udp_mesh.bridges.ros2: {} (source /opt/ros/RELEASE/setup.bash first)".format(error)) from error
 
@@ -38,6 +39,8 @@ log = logging.getLogger(__name__)
 
 EXCHANGE_TOPIC = "bridge/ros2"
 LOOK_S = 1.0
+# https://docs.ros.org/en/rolling/Concepts/Basic/About-Interfaces.html: package and message names
+_TYPE_NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
 MAX_ARRIVED = 1000
 """Messages of the mesh that wait for the executor: the oldest are dropped."""
 
@@ -64,6 +67,18 @@ def quality_of(info: Any) -> Quality:
         1 if latched else 10,
         type_hash if type_hash.startswith("RIHS") else "",
     )
+
+
+def message_class(name: str) -> Any:
+    """`std_msgs/msg/String` -> its class. A peer chooses the name, so nothing but a package's messages is imported.
+
+    rosidl_runtime_py has such a function, and is not part of every distribution of rclpy. Raises ValueError,
+    ModuleNotFoundError or AttributeError.
+    """
+    found = _TYPE_NAME.fullmatch(name)
+    if found is None:
+        raise ValueError("expected PACKAGE/msg/TYPE")
+    return getattr(importlib.import_module("{}.msg".format(found[1])), found[2])
 
 
 class Bridge:
@@ -170,7 +185,7 @@ class Bridge:
 
     def _class(self, name: str) -> Any:
         try:
-            return get_message(name)
+            return message_class(name)
         except (AttributeError, ModuleNotFoundError, ValueError) as error:
             self._tell_once(name, "type-unknown type={} {}".format(name, error))
             return None
