@@ -46,7 +46,9 @@ def greet(
     """An authentic heartbeat of a session (to all, or to us alone), perhaps a recording until the session is
     proven."""
     session.learn(beat, now)
-    state.crowd.told(session.boot_id, beat.send_rate, now, holds_s=MISSED_HEARTBEATS * session.interval_s)
+    state.channel_share.on_send_rate(
+        session.boot_id, beat.send_rate, now, valid_s=MISSED_HEARTBEATS * session.interval_s
+    )
     session.last_heard = now
     if not beat.min_version <= VERSION <= beat.max_version:
         if now - state.incompatible_reported.get(session.boot_id, float("-inf")) > REPORT_AGAIN_S:
@@ -341,13 +343,13 @@ def housekeep(state: State, now: float) -> None:
     if mismatch is not None:
         state.ledger.tell(mismatch)
     state.sent.feed(state.ledger.counters.bytes_sent, now)
-    queue_share = state.crowd.queue_share(state.sent.per_s(now), now)
+    queue_share = state.channel_share.queue_share(state.sent.per_s(now), now)
     peers = list(state.roster.peers.values())
     start = state.look_from if state.look_from < len(peers) else 0
     state.look_from = start + LOOKED_AT_PER_ROUND
     engaged = [peer for peer in peers if peer.engaged]
     for peer in engaged:
-        peer.outbound.window.queue_share = queue_share
+        peer.outbound.congestion.queue_share = queue_share
         _look_at(state, peer, now)
     for peer in peers[start : state.look_from]:
         if not peer.engaged:

@@ -48,7 +48,7 @@ class Yielding:
             if outbound.silent_since is not None:
                 # What waits for a peer out of reach waits for no one else's airtime.
                 continue
-            patience = self._rates.yield_after_s + 3 * (outbound.trip.least or 0.0)
+            patience = self._rates.yield_after_s + 3 * (outbound.rtt.min_rtt or 0.0)
             for priority, age_s in outbound.levels.oldest_ages(self._rates.urgent_priority, now):
                 if age_s > patience:
                     oldest[priority] = max(age_s, oldest.get(priority, 0.0))

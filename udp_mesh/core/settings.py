@@ -159,7 +159,7 @@ class Rates:
     ack_every_packets: int = 10
     """Packets per acknowledgement under bulk: at 8 to 16 acknowledgements cost under 5 % of a half-duplex channel."""
     ack_delay_s: float = 0.008
-    """Longest an acknowledgement waits; under bulk the sender asks for most of them at once (see `allowance`)."""
+    """Longest an acknowledgement waits; under bulk the sender asks for most of them at once (see `packets_allowed`)."""
     pace_quantum_s: float = 0.003
     """Packets of this much time leave together; less costs CPU per wake-up, more costs latency."""
     broadcast_packets_per_s: float = 400.0

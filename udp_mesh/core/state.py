@@ -10,7 +10,7 @@ from heapq import heappop, heappush
 
 from udp_mesh.core.broadcast import CastQueue, Repairs
 from udp_mesh.core.compression import PackingQueue
-from udp_mesh.core.congestion.channel_share import Crowd
+from udp_mesh.core.congestion.channel_share import ChannelShare
 from udp_mesh.core.event_queue import Ledger
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
 from udp_mesh.core.meter import Meter
@@ -52,7 +52,7 @@ class State:
         self.roster = Roster(settings, boot_id)
         self.sent = Meter(now)
         """Wire bytes of this node, to everybody."""
-        self.crowd = Crowd()
+        self.channel_share = ChannelShare()
         self.ledger = Ledger(settings.limits.events)
         self.outboxes = Outboxes(store)
         self.discovery = Discovery(rng, settings.rates, now)

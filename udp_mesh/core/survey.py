@@ -66,7 +66,7 @@ def _alive(session: Session, now: float) -> bool:
 def _peer(state: State, peer: Peer, outbound: Outbound, now: float) -> PeerConditions:
     session = peer.session
     held_messages, held_bytes = state.outboxes.count(peer.name)
-    capacity = outbound.window.capacity()
+    capacity = outbound.congestion.capacity_packets_per_s()
     fragment_bytes = session.way.fragment_bytes if session is not None else state.settings.fragment_bytes
     meters = session.meters if session is not None else peer.fielded_meters
     address, link, last_heard = _way(peer)
@@ -78,8 +78,8 @@ def _peer(state: State, peer: Peer, outbound: Outbound, now: float) -> PeerCondi
         link,
         peer.online_since,
         last_heard,
-        outbound.trip.smoothed,
-        outbound.trip.least,
+        outbound.rtt.smoothed_rtt,
+        outbound.rtt.min_rtt,
         outbound.loss,
         _bits(meters.sent, now) if meters is not None else 0.0,
         _bits(meters.delivered, now) if meters is not None else 0.0,
@@ -87,7 +87,7 @@ def _peer(state: State, peer: Peer, outbound: Outbound, now: float) -> PeerCondi
         _told(session.peer_receives, TOLD_FOR_S, now) if session is not None else None,
         _told(session.peer_sends, MISSED_HEARTBEATS * session.interval_s, now) if session is not None else None,
         None if capacity is None else capacity * fragment_bytes * 8,
-        outbound.window.packets,
+        outbound.congestion.cwnd,
         outbound.flight.outstanding,
         outbound.retransmitted,
         _queues(outbound, now),

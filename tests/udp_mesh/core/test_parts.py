@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from tests.udp_mesh.core.sender.test_scheduler import outgoing
 from udp_mesh.core.compression import compress, decompress
-from udp_mesh.core.congestion.pacer import MOST_DEBT_S, Pacer
+from udp_mesh.core.congestion.pacer import MAX_DEBT_S, Pacer
 from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.receiver.acks import AckState
 from udp_mesh.core.receiver.reassembly import PIECE_OVERHEAD_BYTES, Reassembly, Verdict, Whole
@@ -212,12 +212,12 @@ def test_what_left_at_the_pace_of_a_slow_path_holds_nothing_up_on_a_fast_one() -
     pacer, now = Pacer(0.003), 10.0
     # ten bursts to a peer that was silent, when a packet took ten seconds
     for _ in range(10):
-        pacer.spend(10, now, 0.1)
-    assert pacer.allowance(now, 0.1) == 0
+        pacer.on_sent(10, now, 0.1)
+    assert pacer.packets_allowed(now, 0.1) == 0
     assert pacer.wake_at(0.1) <= now + 10.0
-    assert pacer.allowance(now, 100.0) == 0
-    assert pacer.wake_at(100.0) <= now + MOST_DEBT_S
-    assert pacer.allowance(now + MOST_DEBT_S, 100.0) == 1
+    assert pacer.packets_allowed(now, 100.0) == 0
+    assert pacer.wake_at(100.0) <= now + MAX_DEBT_S
+    assert pacer.packets_allowed(now + MAX_DEBT_S, 100.0) == 1
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 0.5), st.integers(1, 3000)), max_size=50))
@@ -234,8 +234,8 @@ def test_a_bucket_lets_no_more_through_than_its_rate_and_burst(visits: list[tupl
 def test_pacing_spreads_packets_over_time_at_its_rate() -> None:
     pacer, now, left = Pacer(0.003), 0.0, 0
     while now < 1.0:
-        count = pacer.allowance(now, 850.0)
-        pacer.spend(count, now, 850.0)
+        count = pacer.packets_allowed(now, 850.0)
+        pacer.on_sent(count, now, 850.0)
         left += count
         now = max(now + 1e-9, pacer.wake_at(850.0))
     assert 845 <= left <= 856

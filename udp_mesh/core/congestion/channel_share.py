@@ -1,6 +1,6 @@
 """Several nodes send on one channel: what each says in heartbeats that it sends -> how much queue is ours to keep.
 
-1. `told` takes in what another node says it sends; those that send next to nothing are left out.
+1. `on_send_rate` takes in what another node says it sends; those that send next to nothing are left out.
 2. `queue_share` counts the senders, each by its share: (sum of rates)^2 / sum of squares. Four nodes that send alike
    are 4, one with three that only acknowledge is little more than 1, and all who hear each other come to one number.
 
@@ -11,23 +11,23 @@ throughput. Who sends less than the others keeps more, who sends more keeps less
 
 import math
 
-LEAST_BYTES_PER_S = 10_000.0
+MIN_BYTES_PER_S = 10_000.0
 """Who sends less takes hardly any of the slowest channel (1 Mbit/s); and bounds what is remembered in a large team."""
 
-LEAST_SENDERS = 1.5
+MIN_SENDERS = 1.5
 """Fewer are one sender and those who answer it."""
 
-MOST_CORRECTION = 2.0
+MAX_CORRECTION = 2.0
 """By so much at most unequal shares are corrected: rates of the last second scatter."""
 
-MOST_SHARE = 0.9
+MAX_SHARE = 0.9
 """Among others, whatever the correction."""
 
-HOLDS_S = 10.5
+RATE_VALID_S = 10.5
 """What a heartbeat says holds at least so long: until some of the most sparse ones of a small team have been missed."""
 
 
-class Crowd:
+class ChannelShare:
     """The nodes heard to send much, by boot id."""
 
     __slots__ = ("_others",)
@@ -36,10 +36,10 @@ class Crowd:
         self._others: dict[bytes, tuple[float, float]] = {}
         """Bytes per second, and until when that holds."""
 
-    def told(self, boot_id: bytes, bytes_per_s: float, now: float, *, holds_s: float = HOLDS_S) -> None:
-        """A heartbeat says how much its sender sends to everybody; the next one is missed after `holds_s`."""
-        if bytes_per_s >= LEAST_BYTES_PER_S:
-            self._others[boot_id] = (bytes_per_s, now + max(HOLDS_S, holds_s))
+    def on_send_rate(self, boot_id: bytes, bytes_per_s: float, now: float, *, valid_s: float = RATE_VALID_S) -> None:
+        """A heartbeat says how much its sender sends to everybody; the next one is missed after `valid_s`."""
+        if bytes_per_s >= MIN_BYTES_PER_S:
+            self._others[boot_id] = (bytes_per_s, now + max(RATE_VALID_S, valid_s))
         elif self._others:
             self._others.pop(boot_id, None)
 
@@ -50,10 +50,10 @@ class Crowd:
             return 1.0
         for boot_id in [boot_id for boot_id, (_, until) in others.items() if now > until]:
             del others[boot_id]
-        rates = [max(own_bytes_per_s, LEAST_BYTES_PER_S), *(rate for rate, _ in others.values())]
+        rates = [max(own_bytes_per_s, MIN_BYTES_PER_S), *(rate for rate, _ in others.values())]
         total = sum(rates)
         senders = total * total / sum(rate * rate for rate in rates)
-        if senders < LEAST_SENDERS:
+        if senders < MIN_SENDERS:
             return 1.0
         correction = total / senders / rates[0]
-        return min(MOST_SHARE, min(MOST_CORRECTION, max(1 / MOST_CORRECTION, correction)) / math.sqrt(senders))
+        return min(MAX_SHARE, min(MAX_CORRECTION, max(1 / MAX_CORRECTION, correction)) / math.sqrt(senders))

@@ -6,26 +6,26 @@ The law that follows the link is in `adaptive`.
 from typing import Protocol
 
 
-class Window(Protocol):
+class CongestionController(Protocol):
     """Decides how much may be in flight and how fast it leaves."""
 
     queue_share: float
-    """The part of a single sender's queue that is ours to keep (see `crowd`)."""
+    """The part of a single sender's queue that is ours to keep (see `channel_share`)."""
 
     @property
-    def packets(self) -> float:
+    def cwnd(self) -> float:
         """How many packets may be on their way."""
         ...
 
-    def draining(self, now: float) -> bool:
+    def drain_overdue(self, now: float) -> bool:
         """Whether a drain takes longer than what was on its way before it."""
         ...
 
-    def packets_per_s(self) -> float | None:
+    def pacing_packets_per_s(self) -> float | None:
         """Pacing (None: as fast as the window allows)."""
         ...
 
-    def acknowledged(
+    def on_ack(
         self,
         count: int,
         largest: int,
@@ -42,11 +42,11 @@ class Window(Protocol):
         When the newest of them left, `ahead` others were on their way; its burst was `limited` by the application."""
         ...
 
-    def capacity(self) -> float | None:
+    def capacity_packets_per_s(self) -> float | None:
         """Estimated packets/s of the path."""
         ...
 
-    def presumable(self) -> bool:
+    def assume_delivery(self) -> bool:
         """Whether the link can be presumed to go on delivering as it did while acknowledgements are late."""
         ...
 
@@ -54,19 +54,19 @@ class Window(Protocol):
 class FixedWindow:
     """A number of packets, whatever happens: the paper's scheme."""
 
-    __slots__ = ("packets", "queue_share")
+    __slots__ = ("cwnd", "queue_share")
 
     def __init__(self, packets: int) -> None:
-        self.packets = float(packets)
+        self.cwnd = float(packets)
         self.queue_share = 1.0
 
-    def draining(self, now: float) -> bool:
+    def drain_overdue(self, now: float) -> bool:
         return False
 
-    def packets_per_s(self) -> float | None:
+    def pacing_packets_per_s(self) -> float | None:
         return None
 
-    def acknowledged(
+    def on_ack(
         self,
         count: int,
         largest: int,
@@ -81,8 +81,8 @@ class FixedWindow:
     ) -> None:
         return
 
-    def capacity(self) -> float | None:
+    def capacity_packets_per_s(self) -> float | None:
         return None
 
-    def presumable(self) -> bool:
+    def assume_delivery(self) -> bool:
         return False

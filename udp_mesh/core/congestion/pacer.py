@@ -4,7 +4,7 @@ A quantum of packets leaves together, then a timer waits for the next: fewer wak
 segments that offload can batch.
 """
 
-MOST_DEBT_S = 0.25
+MAX_DEBT_S = 0.25
 """What left beyond the pace (bursts to a peer that was silent), or at the pace of a path that was slow then, holds up
 what follows for no longer than this, or than a packet takes now: the window limits what is on its way, pacing only
 spreads it."""
@@ -19,17 +19,17 @@ class Pacer:
         self._quantum_s = quantum_s
         self.free_at = 0.0
 
-    def allowance(self, now: float, packets_per_s: float | None) -> int:
+    def packets_allowed(self, now: float, packets_per_s: float | None) -> int:
         """How many packets may leave now."""
         if packets_per_s is None:
             return 1 << 30
-        start = self.free_at = min(self.free_at, now + max(MOST_DEBT_S, 1.0 / packets_per_s))
+        start = self.free_at = min(self.free_at, now + max(MAX_DEBT_S, 1.0 / packets_per_s))
         if start > now:
             return 0
         start = max(start, now - self._quantum_s)
         return int((now - start) * packets_per_s) + 1
 
-    def spend(self, count: int, now: float, packets_per_s: float | None) -> None:
+    def on_sent(self, count: int, now: float, packets_per_s: float | None) -> None:
         """`count` packets left."""
         if packets_per_s is not None:
             self.free_at = max(self.free_at, now - self._quantum_s) + count / packets_per_s

@@ -144,7 +144,7 @@ class LegacySender:
         else:
             self._patience_s = max(LEAST_PATIENCE_S, PATIENCE_WANES * self._patience_s)
             # Karn: which try a later acknowledgement answers is unknown.
-            self.outbound.trip.sample(max(1e-5, now - leg.sent_at), now)
+            self.outbound.rtt.sample(max(1e-5, now - leg.sent_at), now)
         message = leg.message
         if not message.ended and message.arrive(position):
             self.outbound.delivered_bytes += len(self._fragments[message][1][position])
@@ -169,7 +169,7 @@ class LegacySender:
         return min(leg.sent_at + self._patience(leg) for leg in self._legs.values())
 
     def _patience(self, leg: _Leg) -> float:
-        timeout = max(self._patience_s, self.outbound.trip.timeout(0.0))
+        timeout = max(self._patience_s, self.outbound.rtt.timeout(0.0))
         doublings = min(leg.tries - 1, DOUBLINGS_WHILE_ANSWERED)
         if leg.answers == self._answers:
             doublings = max(doublings, min(leg.unanswered - 1, DOUBLINGS))

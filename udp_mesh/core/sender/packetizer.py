@@ -131,7 +131,7 @@ def leave_level(
 ) -> int:
     """Let what waits on one level leave, at most about `room_bytes`; returns the bytes that left."""
     urgent_level = priority <= outbound.rates.urgent_priority
-    level_pace = outbound.window.packets_per_s()
+    level_pace = outbound.congestion.pacing_packets_per_s()
     used = 0
     mark = outbound.mark(now, urgent=urgent_level)
     while used < room_bytes:
@@ -177,7 +177,7 @@ def leave_level(
         if urgent:
             outbound.urgent_left_at = now
         else:
-            outbound.pacer.spend(count, now, pace)
+            outbound.pacer.on_sent(count, now, pace)
     return used
 
 

@@ -36,19 +36,19 @@ PRESUMED_FOR_S = 0.03
 
 def window_room(outbound: Outbound, now: float) -> int:
     """Packets for which the window has room; below 0 where more are on their way."""
-    window = outbound.window
-    packets = window.packets
+    congestion = outbound.congestion
+    packets = congestion.cwnd
     if outbound.struggling:
         # Packets leave the window by their age only: more of them are young enough than within a round trip.
-        smoothed = outbound.trip.smoothed
-        if smoothed is not None and window.presumable():
-            packets *= max(1.0, outbound.timeout() / smoothed)
+        smoothed_rtt = outbound.rtt.smoothed_rtt
+        if smoothed_rtt is not None and congestion.assume_delivery():
+            packets *= max(1.0, outbound.timeout() / smoothed_rtt)
     else:
         late_s = now - _late_at(outbound)
-        if late_s > 0 and window.presumable():
-            packets += (window.capacity() or 0.0) * min(late_s, PRESUMED_FOR_S)
+        if late_s > 0 and congestion.assume_delivery():
+            packets += (congestion.capacity_packets_per_s() or 0.0) * min(late_s, PRESUMED_FOR_S)
     room = int(packets) - outbound.flight.outstanding
-    if room <= 0 and window.draining(now):
+    if room <= 0 and congestion.drain_overdue(now):
         # A drain ends with the round trip of a piece that is not urgent: one may leave whatever else is on its way.
         room = max(room, 1 - outbound.flight.others_outstanding())
     return room
@@ -64,7 +64,7 @@ def permitted(outbound: Outbound, room: int, now: float, packets_per_s: float | 
         if packets <= 0 and now >= urgent_may_wait_until(outbound):
             packets = 1
     else:
-        packets = min(packets, outbound.pacer.allowance(now, packets_per_s))
+        packets = min(packets, outbound.pacer.packets_allowed(now, packets_per_s))
     return max(packets, outbound.probe_credit)
 
 
@@ -80,7 +80,7 @@ def look_again(outbound: Outbound, room: int, now: float, packets_per_s: float |
     if room > 0:
         return outbound.pacer.wake_at(packets_per_s)
     late_at = _late_at(outbound)
-    if outbound.struggling or now >= late_at + PRESUMED_FOR_S or not outbound.window.presumable():
+    if outbound.struggling or now >= late_at + PRESUMED_FOR_S or not outbound.congestion.assume_delivery():
         return None
     return max(now, late_at) + outbound.rates.pace_quantum_s
 
@@ -88,11 +88,11 @@ def look_again(outbound: Outbound, room: int, now: float, packets_per_s: float |
 def ack_spacing(outbound: Outbound) -> int:
     """Packets between two that ask for an acknowledgement at once."""
     often = max(LOSSY_ACK_SPACING, 1.0 - LOSS_WEIGHT * outbound.loss)
-    return max(2, min(MOST_ACK_SPACING, int(outbound.window.packets * ACK_SPACING * often)))
+    return max(2, min(MOST_ACK_SPACING, int(outbound.congestion.cwnd * ACK_SPACING * often)))
 
 
 def _late_at(outbound: Outbound) -> float:
     """When the next acknowledgement should have come."""
-    capacity = outbound.window.capacity()
+    capacity = outbound.congestion.capacity_packets_per_s()
     spacing_s = ack_spacing(outbound) / capacity if capacity else 0.0
     return outbound.last_progress + max(LATE_AFTER_S, spacing_s)

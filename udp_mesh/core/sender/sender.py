@@ -10,10 +10,10 @@ Which messages are open, and the one outcome of each, is the book of `open_messa
 
 from collections.abc import Iterable
 
-from udp_mesh.core.congestion.controller import FixedWindow, Window
-from udp_mesh.core.congestion.delay_based import AdaptiveWindow
+from udp_mesh.core.congestion.controller import CongestionController, FixedWindow
+from udp_mesh.core.congestion.delay_based import DelayBasedController
 from udp_mesh.core.congestion.pacer import Pacer
-from udp_mesh.core.congestion.rtt import INITIAL_TIMEOUT_S, RoundTrip
+from udp_mesh.core.congestion.rtt import INITIAL_PTO_S, RttEstimator
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.sender.message import Outgoing
 from udp_mesh.core.sender.pending import OpenMessages, Outcome
@@ -57,11 +57,11 @@ class Outbound(OpenMessages):
 
     def __init__(self, settings: Settings) -> None:
         super().__init__()
-        self.trip = RoundTrip()
-        self.urgent_trip = RoundTrip()
+        self.rtt = RttEstimator()
+        self.urgent_rtt = RttEstimator()
         """Of urgent packets alone: in a radio's queues they pass others (wifi's access categories)."""
         self._other_sampled_at = float("-inf")
-        self.window: Window = AdaptiveWindow(self.trip)
+        self.congestion: CongestionController = DelayBasedController(self.rtt)
         self.pacer = Pacer(settings.rates.pace_quantum_s)
         self.flight = Flight()
         self.scheduler = Scheduler()
@@ -111,9 +111,9 @@ class Outbound(OpenMessages):
         self.rates = settings.rates
         self.pacer = Pacer(settings.rates.pace_quantum_s)
         if isinstance(settings.window, int):
-            self.window = FixedWindow(settings.window)
-        elif not isinstance(self.window, AdaptiveWindow):
-            self.window = AdaptiveWindow(self.trip)
+            self.congestion = FixedWindow(settings.window)
+        elif not isinstance(self.congestion, DelayBasedController):
+            self.congestion = DelayBasedController(self.rtt)
 
     # Accepting
 
@@ -167,15 +167,15 @@ class Outbound(OpenMessages):
                 ahead = mark.ahead_of(ack.largest)
             self.delivered_at = now
             limited = newest is None or newest.mark.limited
-            in_flight = flight.outstanding
-            if self.window.draining(now) and not flight.others_outstanding():
+            outstanding = flight.outstanding
+            if self.congestion.drain_overdue(now) and not flight.others_outstanding():
                 # The few urgent ones that leave during a drain are no queue.
-                in_flight = 0
-            self.window.acknowledged(
+                outstanding = 0
+            self.congestion.on_ack(
                 count,
                 largest,
                 flight.next_number,
-                in_flight,
+                outstanding,
                 rate,
                 limited=limited,
                 ahead=ahead,
@@ -197,12 +197,12 @@ class Outbound(OpenMessages):
     def _sample(self, round_trip_s: float, now: float, *, urgent: bool) -> bool:
         """Whether this round trip tells of the queue by which the window goes."""
         if urgent:
-            self.urgent_trip.sample(round_trip_s, now)
+            self.urgent_rtt.sample(round_trip_s, now)
             if now < self._other_sampled_at + OTHERS_TELL_S:
                 return False
         else:
             self._other_sampled_at = now
-        self.trip.sample(round_trip_s, now)
+        self.rtt.sample(round_trip_s, now)
         return True
 
     def _book_arrivals(self, packets: Iterable[Packet]) -> None:
@@ -253,8 +253,8 @@ class Outbound(OpenMessages):
 
     def overdue_s(self) -> float:
         """How long the answer to an urgent piece may take."""
-        smoothed = self.urgent_trip.smoothed or self.trip.smoothed
-        return INITIAL_TIMEOUT_S if smoothed is None else OVERDUE_ROUND_TRIPS * smoothed + self.rates.twice_gap_s
+        smoothed_rtt = self.urgent_rtt.smoothed_rtt or self.rtt.smoothed_rtt
+        return INITIAL_PTO_S if smoothed_rtt is None else OVERDUE_ROUND_TRIPS * smoothed_rtt + self.rates.twice_gap_s
 
     # Silence
 
@@ -277,7 +277,7 @@ class Outbound(OpenMessages):
 
     def timeout(self) -> float:
         """Silence after which the oldest packet counts as lost."""
-        return self.trip.timeout(self.rates.ack_delay_s, PROBE_S)
+        return self.rtt.timeout(self.rates.ack_delay_s, PROBE_S)
 
     def handle_timer(self, now: float) -> None:
         self.expire(now)
@@ -365,7 +365,7 @@ class Outbound(OpenMessages):
             return
         if self._bursts.due(now):
             self.allow_probe(now)
-            self.probe_credit = min(RETURN_BURST_PACKETS, int(self.window.packets))
+            self.probe_credit = min(RETURN_BURST_PACKETS, int(self.congestion.cwnd))
 
     def _end_silence(self) -> None:
         self.silent_since = None

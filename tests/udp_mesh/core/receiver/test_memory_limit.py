@@ -100,8 +100,8 @@ def test_past_the_half_a_peer_gets_an_equal_part_and_past_the_whole_nobody_gets_
         late.take(10)
     assert late.bytes == 250
     assert not greedy.has_room(1)
-    crowd = [Account(memory) for _ in range(100)]
-    for one in crowd:
+    channel_share = [Account(memory) for _ in range(100)]
+    for one in channel_share:
         while one.has_room(1):
             one.take(1)
     assert memory.bytes <= 1000

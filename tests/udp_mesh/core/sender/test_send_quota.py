@@ -26,7 +26,7 @@ def room(outbound: Outbound, now: float) -> int:
 
 def test_late_acknowledgements_do_not_stop_the_link() -> None:
     outbound, heard = busy_outbound()
-    capacity = outbound.window.capacity()
+    capacity = outbound.congestion.capacity_packets_per_s()
     assert capacity is not None
     later = room(outbound, heard + 0.025) - room(outbound, heard)
     assert 0.010 * capacity <= later <= 0.025 * capacity
@@ -34,17 +34,17 @@ def test_late_acknowledgements_do_not_stop_the_link() -> None:
 
 def test_what_is_presumed_is_bounded() -> None:
     outbound, heard = busy_outbound()
-    capacity = outbound.window.capacity()
+    capacity = outbound.congestion.capacity_packets_per_s()
     assert capacity is not None
     assert room(outbound, heard + 10.0) - room(outbound, heard) <= PRESUMED_FOR_S * capacity + 1
 
 
 def test_nothing_is_presumed_of_a_link_whose_queue_is_not_ours() -> None:
     outbound, heard = busy_outbound()
-    least = outbound.trip.least
-    assert least is not None
+    min_rtt = outbound.rtt.min_rtt
+    assert min_rtt is not None
     for step in range(40):
-        outbound.trip.sample(least + 0.1, heard + 0.005 * step)
+        outbound.rtt.sample(min_rtt + 0.1, heard + 0.005 * step)
     assert room(outbound, heard + 0.06) == room(outbound, heard)
 
 
