@@ -36,7 +36,7 @@ MOST_MISSING = 256
 """Casts asked for at a time per peer: a sender that jumps ahead must not make us ask for millions."""
 
 
-class CastQueue:
+class BroadcastQueue:
     """Casts waiting to leave, by level; `waiting` as in `Scheduler`."""
 
     __slots__ = ("_copies", "_kept", "_kept_bytes", "_levels", "_number", "_unrepaired", "free_at", "waiting")
@@ -88,7 +88,7 @@ class CastQueue:
         self,
         priority: int,
         channel: SendChannel,
-        ways: Iterable[tuple[str, Address | None]],
+        paths: Iterable[tuple[str, Address | None]],
         now: float,
         out: list[Datagram],
         *,
@@ -97,11 +97,11 @@ class CastQueue:
         kept_limit_bytes: int,
         dated_bytes: int,
     ) -> None:
-        """Let the casts of a level leave on all `ways` (link, address); `copy_after_s` sends them a second time
+        """Let the casts of a level leave on all `paths` (link, address); `copy_after_s` sends them a second time
         then. Those of at
         most `dated_bytes` say when they left."""
         level = self._levels[priority]
-        ways = list(ways)
+        paths = list(paths)
         while level:
             if packets_per_s is not None:
                 if self.free_at > now:
@@ -116,7 +116,7 @@ class CastQueue:
                 encoded = encode(frames)
             _, data = channel.seal(encoded)
             urgent = packets_per_s is None
-            datagrams = [Datagram(link, address, data, urgent) for link, address in ways]
+            datagrams = [Datagram(link, address, data, urgent) for link, address in paths]
             out.extend(datagrams)
             if copy_after_s is not None:
                 # The same packet number: whoever has it drops the copy before deciphering it.
@@ -166,7 +166,7 @@ def _dated(frames: tuple[TopicAnnounce, Fragment], accepted: Accepted, now: floa
     return [Sent(clock_ms(now)), announce, fragment._replace(head=head)]
 
 
-class Repairs:
+class NackRepair:
     """Which casts of one peer are missing here, and when to ask for them."""
 
     __slots__ = ("_expected", "_missing", "_rng", "next_at")

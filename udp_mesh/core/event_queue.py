@@ -6,7 +6,7 @@ from udp_mesh.core.conditions import Counters
 from udp_mesh.core.events import Event, MessageReceived
 
 
-class Ledger:
+class EventQueue:
     """Events not yet fetched and totals. A driver that stops reading loses the oldest received messages, never
     outcomes."""
 
@@ -20,14 +20,14 @@ class Ledger:
     def set_limit(self, limit: int) -> None:
         self._limit = limit
 
-    def tell(self, event: Event) -> None:
+    def emit(self, event: Event) -> None:
         """Queue an event for the driver."""
         if len(self._events) >= self._limit:
             self._drop_one()
         self._events.append(event)
 
     @property
-    def waits(self) -> bool:
+    def has_events(self) -> bool:
         """Whether an event is to be fetched."""
         return bool(self._events)
 

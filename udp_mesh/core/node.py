@@ -87,7 +87,7 @@ class Node:
 
     def next_event(self) -> Event | None:
         """The oldest event not yet fetched."""
-        return self._state.ledger.next_event()
+        return self._state.event_queue.next_event()
 
     def send(
         self, topic: str, payload: bytes, *, destination: str | None = None, now: float, type_name: str = ""

@@ -29,7 +29,7 @@ class Held:
     begun: Outgoing | None = None
     """What has left of it, where the peer may have it."""
     epoch: int = 0
-    """`Outbound.epoch` in which it began."""
+    """`Sender.epoch` in which it began."""
     gone: bool = False
     """Expired or replaced: it stands in its shelf until somebody looks."""
 

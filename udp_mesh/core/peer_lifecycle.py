@@ -6,7 +6,7 @@
 4. `housekeep` finds the silent and the deaf ones: offline, then lost; their messages go to the outbox or end.
 """
 
-from udp_mesh.core.broadcast import Repairs
+from udp_mesh.core.broadcast import NackRepair
 from udp_mesh.core.events import (
     Incompatible,
     NameConflict,
@@ -23,10 +23,10 @@ from udp_mesh.core.peers.peer_table import Arrival
 from udp_mesh.core.peers.session import STALE_PATH_S, Challenge, Peer, Session
 from udp_mesh.core.publish import release_outbox, report_ended, shelve
 from udp_mesh.core.sender.message import Outgoing
-from udp_mesh.core.sender.packetizer import Way, datagram_room, leave_large_ping
+from udp_mesh.core.sender.packetizer import Path, datagram_room, leave_large_ping
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.pmtu import NARROWER_MTUS
-from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import ASLEEP_S, HOUSEKEEPING_S, State
 from udp_mesh.wire.frames import Heartbeat
@@ -55,7 +55,7 @@ def greet(
             state.incompatible_reported[session.boot_id] = now
             if len(state.incompatible_reported) > state.settings.limits.strangers:
                 del state.incompatible_reported[next(iter(state.incompatible_reported))]
-            state.ledger.tell(Incompatible(session.name, source, session.versions))
+            state.event_queue.emit(Incompatible(session.name, source, session.versions))
         return
     lists_us = state.boot_id[:HEARD_TAG_BYTES] in beat.heard
     if to_all:
@@ -63,8 +63,8 @@ def greet(
     elif lists_us:
         session.hears_us()
     if not session.proven:
-        if (link, source) == (session.way.link, session.way.address):
-            session.way.heard_at = now
+        if (link, source) == (session.path.link, session.path.address):
+            session.path.heard_at = now
         else:
             follow(state, session, link, source, now)
         if lists_us:
@@ -75,27 +75,27 @@ def greet(
             _own_name(state, session, now)
     if not (session.proven and session.knows_us):
         # It does not hear us, or we cannot know yet that it does.
-        state.discovery.answer(session, len(state.roster.sessions), now)
+        state.heartbeats.answer(session, len(state.peer_table.sessions), now)
     if session.proven and session.peer is not None:
         repairs = state.repairs.get(session.boot_id)
         if repairs is None:
-            repairs = state.repairs[session.boot_id] = Repairs(state.rng)
+            repairs = state.repairs[session.boot_id] = NackRepair(state.rng)
             for channel in session.broadcast_channels:
                 channel.window.raise_floor(beat.broadcast_number)
-        repairs.counted(beat.broadcast_messages, now, session.inbound.broadcasts.finished)
+        repairs.counted(beat.broadcast_messages, now, session.receiver.broadcasts.finished)
         state.ask_by(session.boot_id, repairs)
         if beat.waiting:
-            state.yielding.heard(beat.waiting, now)
+            state.priority_backoff.heard(beat.waiting, now)
 
 
 def prove(state: State, session: Session, now: float) -> None:
     """The session has shown that it hears this run of ours."""
-    arrival, peer = state.roster.prove(session, state.settings)
+    arrival, peer = state.peer_table.prove(session, state.settings)
     if arrival is Arrival.OWN_NAME:
         _own_name(state, session, now)
         return
     if peer is None:
-        state.ledger.counters.dropped_over_limit += 1
+        state.event_queue.counters.dropped_over_limit += 1
         return
     if arrival is Arrival.RETIRED:
         # Served again when it is heard and the later run is gone (`heard`).
@@ -103,7 +103,7 @@ def prove(state: State, session: Session, now: float) -> None:
     session.freshness.prove(now)
     _replace(state, peer, session, now)
     if arrival is Arrival.RESTARTED and peer.online:
-        state.ledger.tell(PeerRestarted(peer.name))
+        state.event_queue.emit(PeerRestarted(peer.name))
         peer.online_since = now
     come_online(state, peer, session, now)
     state.arm(peer)
@@ -115,25 +115,25 @@ def _own_name(state: State, session: Session, now: float) -> None:
         return
     state.own_name_reported_at = now
     own = next(iter(state.links.values())).address if state.links else ("", state.settings.port)
-    state.ledger.tell(NameConflict(session.name, own, session.way.address, own=True))
+    state.event_queue.emit(NameConflict(session.name, own, session.path.address, own=True))
 
 
 def _replace(state: State, peer: Peer, session: Session, now: float) -> None:
     """The session is what the name means from now on; what waits for the name begins anew with it."""
     old = peer.session
-    state.roster.replace(peer, session)
+    state.peer_table.replace(peer, session)
     if old is not None:
         state.repairs.pop(old.boot_id, None)
         state.owing.pop(old, None)
-        if peer.engaged:
-            old.next_wire_id = peer.outbound.next_wire_id
-    if peer.engaged:
-        peer.outbound.restart(now)
+        if peer.has_sender:
+            old.next_wire_id = peer.sender.next_wire_id
+    if peer.has_sender:
+        peer.sender.restart(now)
         # Of a run that is taken back the numbers go on: it remembers what it had.
-        peer.outbound.flight.restart(session.way.channel.next_number)
-        peer.outbound.next_wire_id = session.next_wire_id
+        peer.sender.in_flight.restart(session.path.channel.next_number)
+        peer.sender.next_wire_id = session.next_wire_id
         state.ready[peer] = None
-    state.discovery.answer(session, len(state.roster.sessions), now)
+    state.heartbeats.answer(session, len(state.peer_table.sessions), now)
 
 
 def come_online(state: State, peer: Peer, session: Session, now: float) -> None:
@@ -144,16 +144,16 @@ def come_online(state: State, peer: Peer, session: Session, now: float) -> None:
         return
     peer.online = True
     peer.online_since = now
-    state.ledger.tell(PeerOnline(peer.name, session.way.address, session.way.link))
+    state.event_queue.emit(PeerOnline(peer.name, session.path.address, session.path.link))
     release_outbox(state, peer, now)
 
 
 def heard(state: State, session: Session, link: str, source: Address, now: float) -> None:
     """Something authentic came from a proven session."""
     session.last_heard = now
-    way = session.way
-    if source == way.address and link == way.link:
-        way.heard_at = now
+    path = session.path
+    if source == path.address and link == path.link:
+        path.heard_at = now
     else:
         follow(state, session, link, source, now)
     peer = session.peer
@@ -174,14 +174,14 @@ def heard(state: State, session: Session, link: str, source: Address, now: float
             challenge(state, session, link, source, now)
             return
         come_online(state, peer, session, now)
-    if peer.engaged and peer.outbound.silent_since is not None:
-        peer.outbound.heard(now)
+    if peer.has_sender and peer.sender.unresponsive_since is not None:
+        peer.sender.heard(now)
         state.ready[peer] = None
 
 
 def conflict(state: State, session: Session, source: Address, now: float) -> None:
     """A run that was replaced by a later one still speaks: two nodes use one name."""
-    peer = session.peer or state.roster.peers.get(session.name)
+    peer = session.peer or state.peer_table.peers.get(session.name)
     if peer is None or peer.session is None:
         return
     if peer.online_since is not None and now - peer.online_since < STALE_PATH_S:
@@ -191,7 +191,7 @@ def conflict(state: State, session: Session, source: Address, now: float) -> Non
     if now - peer.conflict_reported_at < REPORT_AGAIN_S:
         return
     peer.conflict_reported_at = now
-    state.ledger.tell(NameConflict(session.name, source, peer.session.way.address, own=False))
+    state.event_queue.emit(NameConflict(session.name, source, peer.session.path.address, own=False))
 
 
 def follow(state: State, session: Session, link: str, source: Address, now: float) -> None:
@@ -203,12 +203,12 @@ def follow(state: State, session: Session, link: str, source: Address, now: floa
     """
     if link not in state.links:
         return
-    way = session.way
-    outbound = session.peer.outbound if session.peer is not None and session.peer.engaged else None
-    struggling = outbound is not None and (outbound.struggling or outbound.silent_since is not None)
-    first = not way.link
-    quiet = now - way.heard_at >= STALE_PATH_S or way.link not in state.links
-    if not first and not quiet and not struggling:
+    path = session.path
+    sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
+    timing_out = sender is not None and (sender.timing_out or sender.unresponsive_since is not None)
+    first = not path.link
+    quiet = now - path.heard_at >= STALE_PATH_S or path.link not in state.links
+    if not first and not quiet and not timing_out:
         return
     peer = session.peer
     if not first and session.proven and peer is not None and (session.timed or not quiet or not peer.online):
@@ -220,11 +220,11 @@ def follow(state: State, session: Session, link: str, source: Address, now: floa
 def path_proven(state: State, session: Session, question: Challenge, now: float) -> None:
     """The peer answered a ping of ours from where that went: it is alive, and there."""
     session.freshness.prove(now)
-    way = session.way
+    path = session.path
     if question.in_use:
         # The way in use works: whatever came from elsewhere was no move. If it has been left since, it is gone back to.
         session.challenges.clear()
-    if (way.link, way.address) != (question.link, question.address):
+    if (path.link, path.address) != (question.link, question.address):
         _move(state, session, question.link, question.address, now)
     heard(state, session, question.link, question.address, now)
 
@@ -234,47 +234,47 @@ def _move(state: State, session: Session, link: str, source: Address, now: float
     info = state.links.get(link)
     if info is None:
         return
-    way = session.way
-    outbound = session.peer.outbound if session.peer is not None and session.peer.engaged else None
-    first = not way.link
-    old = way.address
-    before = way.fragment_bytes
-    way.lead(link, source, info.mtu, state.settings.fragment_bytes)
-    way.heard_at = now
+    path = session.path
+    sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
+    first = not path.link
+    old = path.address
+    before = path.fragment_bytes
+    path.lead(link, source, info.mtu, state.settings.fragment_bytes)
+    path.heard_at = now
     if not first and session.proven and session.peer is not None:
-        state.ledger.tell(PeerAddressChanged(session.name, old, source, link))
-    if outbound is not None and way.fragment_bytes < before:
-        _fit(outbound, way, all_of_it=False)
+        state.event_queue.emit(PeerAddressChanged(session.name, old, source, link))
+    if sender is not None and path.fragment_bytes < before:
+        _fit(sender, path, all_of_it=False)
 
 
 def refit(state: State, session: Session, mtu: int) -> None:
     """The link, or the settings, changed under a session's way: what leaves from now on fits both, and what the path
     was found to carry."""
-    way = session.way
-    outbound = session.peer.outbound if session.peer is not None and session.peer.engaged else None
-    if outbound is not None and outbound.path_size.narrowed_at is not None:
-        mtu = min(mtu, way.mtu)
-    before = way.mtu
-    way.lead(way.link, way.address, mtu, state.settings.fragment_bytes)
-    if outbound is not None and mtu < before:
-        _fit(outbound, way, all_of_it=False)
+    path = session.path
+    sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
+    if sender is not None and sender.pmtu.narrowed_at is not None:
+        mtu = min(mtu, path.mtu)
+    before = path.mtu
+    path.lead(path.link, path.address, mtu, state.settings.fragment_bytes)
+    if sender is not None and mtu < before:
+        _fit(sender, path, all_of_it=False)
 
 
-def _fit(outbound: Outbound, way: Way, *, all_of_it: bool) -> None:
+def _fit(sender: Sender, path: Path, *, all_of_it: bool) -> None:
     """What was cut into larger fragments than the way carries now begins anew.
 
     One that has left whole may have arrived whole, and under a new number it would arrive twice: it only does so with
     `all_of_it`, where none of its large pieces get through anyhow. Our own kernel cuts what is too large for our link.
     """
-    for message in list(outbound.open):
+    for message in list(sender.pending):
         if not all_of_it and message.begun and message.next_position >= message.fragments:
             continue
         if message.begun and any(
-            not there and _size(message, position) > way.fragment_bytes
+            not there and _size(message, position) > path.fragment_bytes
             for position, there in enumerate(message.arrived)
         ):
-            outbound.cancel(message)
-            outbound.send_anew(message)
+            sender.cancel(message)
+            sender.send_anew(message)
 
 
 def _size(message: Outgoing, position: int) -> int:
@@ -284,33 +284,33 @@ def _size(message: Outgoing, position: int) -> int:
 
 def _measure_path(state: State, peer: Peer, session: Session, now: float) -> None:
     """Smaller fragments where full ones do not get through; larger ones again where a ping of that size does."""
-    outbound, way = peer.outbound, session.way
-    size, info = outbound.path_size, state.links.get(way.link)
+    sender, path = peer.sender, session.path
+    size, info = sender.pmtu, state.links.get(path.link)
     fragment_bytes = state.settings.fragment_bytes
-    rooms = {mtu: datagram_room(way.address, mtu, fragment_bytes) for mtu in NARROWER_MTUS}
-    narrower = [mtu for mtu, room in rooms.items() if room < way.room_bytes]
+    rooms = {mtu: datagram_room(path.address, mtu, fragment_bytes) for mtu in NARROWER_MTUS}
+    narrower = [mtu for mtu, room in rooms.items() if room < path.room_bytes]
     if size.too_narrow(now) and narrower:
-        way.lead(way.link, way.address, narrower.pop(0), fragment_bytes)
+        path.lead(path.link, path.address, narrower.pop(0), fragment_bytes)
         size.narrowed(now)
-        state.ledger.tell(PathNarrowed(peer.name, way.mtu, way.fragment_bytes))
-        _fit(outbound, way, all_of_it=True)
+        state.event_queue.emit(PathNarrowed(peer.name, path.mtu, path.fragment_bytes))
+        _fit(sender, path, all_of_it=True)
         state.ready[peer] = None
     size.large_bytes = rooms[narrower[0]] if narrower else float("inf")
     if size.narrowed_at is None or info is None:
         return
-    if size.asking.carries > way.mtu:
-        way.lead(way.link, way.address, min(size.asking.carries, info.mtu), fragment_bytes)
+    if size.probe.carries > path.mtu:
+        path.lead(path.link, path.address, min(size.probe.carries, info.mtu), fragment_bytes)
         size.reset()
     rooms = {mtu: room for mtu, room in rooms.items() if mtu < info.mtu}
-    rooms[info.mtu] = datagram_room(way.address, info.mtu, fragment_bytes)
-    larger = {room: mtu for mtu, room in rooms.items() if room > way.room_bytes}
+    rooms[info.mtu] = datagram_room(path.address, info.mtu, fragment_bytes)
+    larger = {room: mtu for mtu, room in rooms.items() if room > path.room_bytes}
     if not larger:
         size.narrowed_at = None
-    elif peer.online and way.confirmed and outbound.silent_since is None and size.asking.due(now, outbound.loss):
+    elif peer.online and path.confirmed and sender.unresponsive_since is None and size.probe.due(now, sender.loss):
         for room, mtu in larger.items():
             token = state.rng.getrandbits(64)
-            size.asking.asked(token, mtu)
-            state.outgoing.append(leave_large_ping(outbound, way, token, room))
+            size.probe.asked(token, mtu)
+            state.outgoing.append(leave_large_ping(sender, path, token, room))
 
 
 def leave(state: State, session: Session, now: float) -> None:
@@ -326,10 +326,10 @@ def go_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
     peer.online = False
     peer.left = left
     peer.online_since = None
-    state.ledger.tell(PeerOffline(peer.name, left))
-    if peer.engaged and peer.outbound.silent_since is None and peer.outbound.flight.outstanding:
-        peer.outbound.silent_since = now
-        peer.outbound.allow_probe(now)
+    state.event_queue.emit(PeerOffline(peer.name, left))
+    if peer.has_sender and peer.sender.unresponsive_since is None and peer.sender.in_flight.outstanding:
+        peer.sender.unresponsive_since = now
+        peer.sender.allow_probe(now)
     shelve(state, peer, now)
 
 
@@ -339,40 +339,40 @@ def housekeep(state: State, now: float) -> None:
     state.housekept_at = now
     if asleep_s > ASLEEP_S:
         _excuse(state, asleep_s, now)
-    mismatch = state.mismatches.rest(now)
+    mismatch = state.key_mismatches.rest(now)
     if mismatch is not None:
-        state.ledger.tell(mismatch)
-    state.sent.feed(state.ledger.counters.bytes_sent, now)
+        state.event_queue.emit(mismatch)
+    state.sent.feed(state.event_queue.counters.bytes_sent, now)
     queue_share = state.channel_share.queue_share(state.sent.per_s(now), now)
-    peers = list(state.roster.peers.values())
+    peers = list(state.peer_table.peers.values())
     start = state.look_from if state.look_from < len(peers) else 0
     state.look_from = start + LOOKED_AT_PER_ROUND
-    engaged = [peer for peer in peers if peer.engaged]
-    for peer in engaged:
-        peer.outbound.congestion.queue_share = queue_share
+    has_sender = [peer for peer in peers if peer.has_sender]
+    for peer in has_sender:
+        peer.sender.congestion.queue_share = queue_share
         _look_at(state, peer, now)
     for peer in peers[start : state.look_from]:
-        if not peer.engaged:
+        if not peer.has_sender:
             _look_at(state, peer, now)
     for name in state.outboxes.peers():
-        holding = state.roster.peers.get(name)
+        holding = state.peer_table.peers.get(name)
         if holding is not None and holding.online and not holding.settling:
             release_outbox(state, holding, now)
-    for session in state.roster.not_current():
+    for session in state.peer_table.not_current():
         session.age_windows(now)
         if session.contested and session.peer is not None:
             # It may be taken back for as long as its name is remembered.
-            session.inbound.unicasts.purge(now)
-            session.inbound.broadcasts.purge(now)
+            session.receiver.unicasts.purge(now)
+            session.receiver.broadcasts.purge(now)
         elif now - session.last_heard > state.settings.rates.offline_s:
-            state.roster.forget(session)
+            state.peer_table.forget(session)
             state.repairs.pop(session.boot_id, None)
             state.incompatible_reported.pop(session.boot_id, None)
 
 
 def _excuse(state: State, asleep_s: float, now: float) -> None:
     """This process did not run for so long (it was stopped, its machine stood still): silence meanwhile was ours."""
-    for session in state.roster.sessions.values():
+    for session in state.peer_table.sessions.values():
         session.last_heard = min(now, session.last_heard + asleep_s)
         if session.unheard_since is not None:
             session.unheard_since = min(now, session.unheard_since + asleep_s)
@@ -391,27 +391,27 @@ def _look_at(state: State, peer: Peer, now: float) -> None:
         go_offline(state, peer, now, left=False)
     if not peer.online and not peer.lost and max(quiet_s, deaf_s) > rates.peer_lost_s:
         peer.lost = True
-        if peer.engaged:
-            peer.outbound.finish_all(Outcome.PEER_LOST)
+        if peer.has_sender:
+            peer.sender.finish_all(Outcome.PEER_LOST)
             report_ended(state, peer, now)
-    if session.inbound.fragments:
-        session.inbound.unicasts.purge(now)
-        session.inbound.broadcasts.purge(now)
+    if session.receiver.fragments:
+        session.receiver.unicasts.purge(now)
+        session.receiver.broadcasts.purge(now)
     if session.received_bytes:
         session.meters.received.feed(session.received_bytes, now)
-    if peer.engaged:
+    if peer.has_sender:
         _report_starved(state, peer, now)
         _measure_path(state, peer, session, now)
-        session.meters.sent.feed(peer.outbound.sent_bytes, now)
-        session.meters.delivered.feed(peer.outbound.delivered_bytes, now)
+        session.meters.sent.feed(peer.sender.sent_bytes, now)
+        session.meters.delivered.feed(peer.sender.delivered_bytes, now)
 
 
 def _report_starved(state: State, peer: Peer, now: float) -> None:
-    for book in peer.outbound.levels:
+    for book in peer.sender.levels:
         since = book.starved_since
         if since is None or book.starved_reported or now - since < state.settings.rates.starved_s:
             continue
         oldest = book.oldest()
         if oldest is not None:
             book.starved_reported = True
-            state.ledger.tell(TopicStarved(peer.name, oldest.accepted.channel.name, now - since))
+            state.event_queue.emit(TopicStarved(peer.name, oldest.accepted.channel.name, now - since))

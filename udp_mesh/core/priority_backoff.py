@@ -7,7 +7,7 @@ starves.
 
 from collections.abc import Iterable
 
-from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Rates
 from udp_mesh.wire.frames import Waiting
 
@@ -20,7 +20,7 @@ LOOK_EVERY_S = 0.02
 """What waits here is looked up no more often than this."""
 
 
-class Yielding:
+class PriorityBackoff:
     """`allowed(now)` is the bit mask of levels that may leave."""
 
     __slots__ = ("_allowed", "_budget_at", "_budget_s", "_looked_at", "_rates", "_until", "_waiting", "held_total_s")
@@ -38,18 +38,18 @@ class Yielding:
     def apply(self, rates: Rates) -> None:
         self._rates = rates
 
-    def waiting_here(self, outbounds: Iterable[Outbound], now: float) -> tuple[Waiting, ...]:
+    def waiting_here(self, senders: Iterable[Sender], now: float) -> tuple[Waiting, ...]:
         """The urgent levels at which something has waited too long, most urgent first."""
         if now < self._looked_at + LOOK_EVERY_S:
             return self._waiting
         self._looked_at = now
         oldest: dict[int, float] = {}
-        for outbound in outbounds:
-            if outbound.silent_since is not None:
+        for sender in senders:
+            if sender.unresponsive_since is not None:
                 # What waits for a peer out of reach waits for no one else's airtime.
                 continue
-            patience = self._rates.yield_after_s + 3 * (outbound.rtt.min_rtt or 0.0)
-            for priority, age_s in outbound.levels.oldest_ages(self._rates.urgent_priority, now):
+            patience = self._rates.yield_after_s + 3 * (sender.rtt.min_rtt or 0.0)
+            for priority, age_s in sender.levels.oldest_ages(self._rates.urgent_priority, now):
                 if age_s > patience:
                     oldest[priority] = max(age_s, oldest.get(priority, 0.0))
         self._waiting = tuple(

@@ -26,7 +26,7 @@ from udp_mesh.core.sender.message import Accepted, Channel, Outgoing
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, header_bytes
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.pmtu import ETHERNET_MTU
-from udp_mesh.core.sender.rate_limit import Gate
+from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.settings import Outbox, Topic, is_type_name
 from udp_mesh.core.state import State
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
@@ -79,7 +79,7 @@ def send(
         return rejected
     message_id = MessageId(state.next_message_id)
     state.next_message_id += 1
-    state.ledger.counters.messages_sent += 1
+    state.event_queue.counters.messages_sent += 1
     if topic.compression and (len(payload) > STEP_BYTES or state.packing.holds(topic.name)):
         plain = _accept(message_id, channel, payload, None, now)
         keys = tuple(state.outboxes.keep(name, plain, now) for name in names) if topic.reliable else ()
@@ -118,25 +118,25 @@ def _enqueue_all(
 
 def _room_for(state: State, topic: Topic, names: list[str], size_bytes: int) -> Rejected | None:
     limits = state.settings.limits
-    for name in names or [peer.name for peer in state.roster.online()]:
-        peer = state.roster.peers.get(name)
+    for name in names or [peer.name for peer in state.peer_table.online()]:
+        peer = state.peer_table.peers.get(name)
         if peer is None:
             if topic.outbox is Outbox.NONE and name not in topic.destinations:
                 return Rejected(RejectReason.UNKNOWN_PEER, f"{name} was never heard of")
-            if len(state.roster.peers) >= limits.peers:
+            if len(state.peer_table.peers) >= limits.peers:
                 return Rejected(RejectReason.QUEUE_FULL, f"already {limits.peers} peers")
             continue
-        if not peer.engaged:
+        if not peer.has_sender:
             continue
-        outbound = peer.outbound
+        sender = peer.sender
         if (
-            outbound.levels.queued_bytes + size_bytes > limits.queue_bytes_per_peer
-            or len(outbound.open) >= limits.queue_messages_per_peer
+            sender.levels.queued_bytes + size_bytes > limits.queue_bytes_per_peer
+            or len(sender.pending) >= limits.queue_messages_per_peer
         ):
             return Rejected(RejectReason.QUEUE_FULL, f"too much waits for {name}")
     if topic.compression and state.packing.bytes + size_bytes > limits.queue_bytes_per_peer:
         return Rejected(RejectReason.QUEUE_FULL, "too much waits to be compressed")
-    if not names and state.casts.queued() >= limits.queue_messages_per_peer:
+    if not names and state.broadcasts.queued() >= limits.queue_messages_per_peer:
         return Rejected(RejectReason.QUEUE_FULL, "too many broadcasts wait")
     return None
 
@@ -168,7 +168,7 @@ def _accept(
 def enqueue(state: State, name: str, accepted: Accepted, now: float, store_key: int | None = None) -> None:
     """One destination's copy: into the queue of a peer in reach, else where the topic's outbox says."""
     topic = accepted.channel.topic
-    peer = state.roster.peer(name, state.settings)
+    peer = state.peer_table.peer(name, state.settings)
     if peer is None or ((not peer.online) and topic.outbox is not Outbox.NONE):
         _hold(state, name, Held(accepted, store_key), now)
         return
@@ -189,12 +189,12 @@ def _queue(state: State, peer: Peer, accepted: Accepted, now: float, store_key: 
     topic = accepted.channel.topic
     message = Outgoing(accepted, topic.priority, reliable=topic.reliable)
     message.store_key = store_key
-    outbound = peer.outbound
-    outbound.accept(message, now)
+    sender = peer.sender
+    sender.accept(message, now)
     if peer.lost:
-        outbound.finish(message, Outcome.PEER_LOST)
-    if topic.rate_limit_bytes_per_s is not None and topic.name not in state.gates:
-        state.gates[topic.name] = Gate(topic.rate_limit_bytes_per_s, now)
+        sender.finish(message, Outcome.PEER_LOST)
+    if topic.rate_limit_bytes_per_s is not None and topic.name not in state.rate_limits:
+        state.rate_limits[topic.name] = TokenBucket(topic.rate_limit_bytes_per_s, now)
     report_ended(state, peer, now)
     state.ready[peer] = None
     state.arm(peer)
@@ -215,13 +215,13 @@ def unpacked(accepted: Accepted) -> Accepted:
 def _to_all(state: State, accepted: Accepted, now: float) -> None:
     topic = accepted.channel.topic
     accepted = replace(accepted, flags=accepted.flags | MessageFlag.TO_ALL)
-    sessions = [peer.session for peer in state.roster.online() if peer.session is not None]
+    sessions = [peer.session for peer in state.peer_table.online() if peer.session is not None]
     if not all(map(inflates, sessions)):
         accepted = unpacked(accepted)
-    fits = state.broadcasts() and _broadcast_bytes(accepted) <= broadcast_room(state, sessions)
+    fits = state.can_broadcast() and _broadcast_bytes(accepted) <= broadcast_room(state, sessions)
     if fits:
-        state.casts.push(accepted)
-    for peer in list(state.roster.peers.values()):
+        state.broadcasts.push(accepted)
+    for peer in list(state.peer_table.peers.values()):
         if peer.legacy and not carries(accepted.channel.type_name):
             continue
         if (peer.online and (not fits or peer.legacy)) or (not peer.online and topic.outbox is not Outbox.NONE):
@@ -232,7 +232,7 @@ def broadcast_room(state: State, sessions: Iterable[Session]) -> int:
     """Bytes of a datagram that everybody's path carries, as far as that is known. On links that take larger packets
     than Ethernet's it is Ethernet's all the same: nobody would notice that a mesh behind them does not."""
     links = [link.mtu - header_bytes(link.address) for link in state.links.values()]
-    paths = [way.mtu - header_bytes(way.address) for way in (session.way for session in sessions) if way.link]
+    paths = [path.mtu - header_bytes(path.address) for path in (session.path for session in sessions) if path.link]
     room = min([*links, *paths, max(ETHERNET_MTU, state.settings.fragment_bytes) - IP_UDP_BYTES], default=0)
     if any(neighbour.legacy for neighbour in state.settings.neighbours):
         room -= LEGACY_OVERHEAD_BYTES
@@ -249,7 +249,7 @@ def _broadcast_bytes(accepted: Accepted) -> int:
 
 def shelve(state: State, peer: Peer, now: float) -> None:
     """The peer went out of reach: move what its outboxes keep out of the queue."""
-    everything = list(peer.outbound.open) if peer.engaged else []
+    everything = list(peer.sender.pending) if peer.has_sender else []
     # The newest first: each then stands in front of those already there.
     everything.sort(key=lambda message: message.accepted.message_id, reverse=True)
     for message in everything:
@@ -257,9 +257,9 @@ def shelve(state: State, peer: Peer, now: float) -> None:
             continue
         # best effort is not remembered for long over there, and fielded programs know no numbers of ours
         resumable = message.begun and message.reliable and not peer.legacy
-        peer.outbound.withdraw(message, to_resume=resumable)
+        peer.sender.withdraw(message, to_resume=resumable)
         begun = message if resumable else None
-        _hold(state, peer.name, Held(message.accepted, message.store_key, begun, peer.outbound.epoch), now)
+        _hold(state, peer.name, Held(message.accepted, message.store_key, begun, peer.sender.epoch), now)
 
 
 def _hold(state: State, name: str, new: Held, now: float) -> None:
@@ -269,26 +269,26 @@ def _hold(state: State, name: str, new: Held, now: float) -> None:
 
 def _give_up_held(state: State, name: str, held: Held, reason: ExpiryReason) -> None:
     """An outbox no longer keeps this one; what the peer has of it, it may forget."""
-    peer = state.roster.peers.get(name)
-    if held.begun is not None and peer is not None and held.epoch == peer.outbound.epoch:
-        peer.outbound.cancel(held.begun)
-    tell_expired(state, name, held.accepted, reason)
+    peer = state.peer_table.peers.get(name)
+    if held.begun is not None and peer is not None and held.epoch == peer.sender.epoch:
+        peer.sender.cancel(held.begun)
+    report_expired(state, name, held.accepted, reason)
 
 
 def release_outbox(state: State, peer: Peer, now: float) -> None:
     """The peer is in reach: some of what waited for it is queued, the most urgent and oldest first; more of it soon."""
     for held in state.outboxes.release(peer.name, RELEASED_AT_ONCE):
         begun, session = held.begun, peer.session
-        if begun is not None and held.epoch == peer.outbound.epoch:
+        if begun is not None and held.epoch == peer.sender.epoch:
             # One that has left whole may have arrived whole: under a new number it would arrive twice.
             whole = begun.next_position >= begun.fragments
-            if session is not None and (whole or begun.fragment_bytes <= session.way.fragment_bytes):
+            if session is not None and (whole or begun.fragment_bytes <= session.path.fragment_bytes):
                 begun.store_key = held.store_key
-                peer.outbound.resume(begun, now)
+                peer.sender.resume(begun, now)
                 state.ready[peer] = None
                 state.arm(peer)
                 continue
-            peer.outbound.cancel(begun)
+            peer.sender.cancel(begun)
         accepted = held.accepted if session is None or inflates(session) else unpacked(held.accepted)
         _queue(state, peer, accepted, now, held.store_key)
     if state.outboxes.holds(peer.name):
@@ -297,11 +297,11 @@ def release_outbox(state: State, peer: Peer, now: float) -> None:
 
 def report_ended(state: State, peer: Peer, now: float) -> None:
     """Turn the ends of messages to one peer into events."""
-    ended = peer.outbound.ended
+    ended = peer.sender.ended
     if not ended:
         return
-    peer.outbound.ended = []
-    counters = state.ledger.counters
+    peer.sender.ended = []
+    counters = state.event_queue.counters
     for message, outcome in ended:
         accepted = message.accepted
         if message.store_key is not None:
@@ -315,20 +315,20 @@ def report_ended(state: State, peer: Peer, now: float) -> None:
             counters.messages_delivered += 1
             if message.reliable:
                 latency_s = now - accepted.accepted_at
-                state.ledger.tell(MessageDelivered(accepted.message_id, peer.name, topic, latency_s))
+                state.event_queue.emit(MessageDelivered(accepted.message_id, peer.name, topic, latency_s))
         elif outcome is Outcome.PEER_LOST:
             counters.messages_peer_lost += 1
             if message.reliable:
-                state.ledger.tell(MessagePeerLost(accepted.message_id, peer.name, topic))
+                state.event_queue.emit(MessagePeerLost(accepted.message_id, peer.name, topic))
         elif isinstance(outcome, ExpiryReason):
-            tell_expired(state, peer.name, accepted, outcome)
+            report_expired(state, peer.name, accepted, outcome)
 
 
-def tell_expired(state: State, peer: str, accepted: Accepted, reason: ExpiryReason) -> None:
+def report_expired(state: State, peer: str, accepted: Accepted, reason: ExpiryReason) -> None:
     """An accepted message was given up."""
-    state.ledger.counters.messages_expired += 1
+    state.event_queue.counters.messages_expired += 1
     if accepted.flags & MessageFlag.RELIABLE:
-        state.ledger.tell(MessageExpired(accepted.message_id, peer, accepted.channel.name, reason))
+        state.event_queue.emit(MessageExpired(accepted.message_id, peer, accepted.channel.name, reason))
 
 
 def expire_held(state: State, now: float) -> None:

@@ -50,7 +50,7 @@ _LEAST_BYTES = SHORT_HEADER_BYTES + SEAL_TAG_BYTES
 
 def take_datagram(state: State, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
     """See `Node.receive`."""
-    counters = state.ledger.counters
+    counters = state.event_queue.counters
     size = len(data)
     counters.datagrams_received += 1
     counters.bytes_received += size + 28
@@ -61,7 +61,7 @@ def take_datagram(state: State, data: bytes | memoryview, link: str, source: Add
     if first == DATA_BYTE:
         replayed = False
         _, tag, low = SHORT_HEADER.unpack_from(data)
-        for channel, session in state.roster.data_tags.get(tag, ()):
+        for channel, session in state.peer_table.data_tags.get(tag, ()):
             try:
                 number, frames = channel.open(data, low)
             except ReplayError:
@@ -76,7 +76,7 @@ def take_datagram(state: State, data: bytes | memoryview, link: str, source: Add
     elif first == BROADCAST_BYTE:
         replayed = False
         _, tag, low = SHORT_HEADER.unpack_from(data)
-        for channel, session in state.roster.broadcast_tags.get(tag, ()):
+        for channel, session in state.peer_table.broadcast_tags.get(tag, ()):
             try:
                 _, frames = channel.open(data, low)
             except ReplayError:
@@ -94,9 +94,9 @@ def take_datagram(state: State, data: bytes | memoryview, link: str, source: Add
                 _take_long(state, data, header, link, source, now)
         except UnknownKeyError:
             counters.dropped_unauthenticated += 1
-            mismatch = state.mismatches.seen(source, link, now)
+            mismatch = state.key_mismatches.seen(source, link, now)
             if mismatch is not None:
-                state.ledger.tell(mismatch)
+                state.event_queue.emit(mismatch)
         except ReplayError:
             counters.dropped_replayed += 1
         except OpenError:
@@ -118,11 +118,11 @@ def _take_data(
     state: State, session: Session, number: int, frames: bytes, link: str, source: Address, now: float
 ) -> None:
     """An opened datagram bound to this run of ours: its sender is alive, or was when it was recorded."""
-    way = session.way
+    path = session.path
     peer = session.peer
     session.received_bytes += len(frames) + 51
     if not frames:
-        state.ledger.counters.dropped_malformed += 1
+        state.event_queue.counters.dropped_malformed += 1
         return
     late_s: float | None = 0.0
     if frames[0] < FRAGMENT or now > session.freshness.trusted_until:
@@ -133,11 +133,11 @@ def _take_data(
         peer is not None
         and peer.online
         and peer.session is session
-        and source == way.address
-        and link == way.link
-        and peer.outbound.silent_since is None
+        and source == path.address
+        and link == path.link
+        and peer.sender.unresponsive_since is None
     ):
-        session.last_heard = way.heard_at = now
+        session.last_heard = path.heard_at = now
     else:
         if not session.proven:
             prove(state, session, now)
@@ -145,12 +145,12 @@ def _take_data(
         peer = session.peer
         if peer is None or peer.session is not session:
             return
-    inbound = session.inbound
-    if inbound.take_plain(frames, number, now):
-        acks = inbound.acks
+    receiver = session.receiver
+    if receiver.take_plain(frames, number, now):
+        acks = receiver.acks
         if acks.now_wanted:
             state.owing[session] = None
-            if inbound.overdue():
+            if receiver.overdue():
                 _cut_ack(state, session, now)
         elif acks.due_at is not None and acks.due_at < peer.wants_at:
             state.set_timer(peer, acks.due_at)
@@ -158,7 +158,7 @@ def _take_data(
     try:
         decoded = decode(frames)
     except DecodeError:
-        state.ledger.counters.dropped_malformed += 1
+        state.event_queue.counters.dropped_malformed += 1
         return
     if session.timed and date_of(frames) is None:
         # Its sender dates every message that begins: one without a date would have none when it is late.
@@ -177,10 +177,10 @@ def _take_frames(
     late_s: float = 0.0,
 ) -> None:
     """The frames of a unicast datagram of a peer's session, in order."""
-    inbound = session.inbound
+    receiver = session.receiver
     peer = session.peer
     assert peer is not None
-    outbound = peer.outbound
+    sender = peer.sender
     wants_ack = ack_now = False
     kept = True
     for frame in frames:
@@ -188,21 +188,21 @@ def _take_frames(
             case Fragment():
                 wants_ack = True
                 ack_now = ack_now or frame.ack_now
-                kept = inbound.take(frame, now, broadcast=False, late_s=late_s) and kept
+                kept = receiver.take(frame, now, broadcast=False, late_s=late_s) and kept
             case Ack():
-                if frame.largest < session.way.channel.next_number:
-                    session.way.confirmed = session.knows_us = True
+                if frame.largest < session.path.channel.next_number:
+                    session.path.confirmed = session.knows_us = True
                     session.peer_receives = (frame.receive_rate, now)
-                    arrived_before = outbound.delivered_packets
-                    outbound.acknowledge(frame, now)
-                    if outbound.delivered_packets > arrived_before:
+                    arrived_before = sender.delivered_packets
+                    sender.acknowledge(frame, now)
+                    if sender.delivered_packets > arrived_before:
                         session.hears_us()
                     report_ended(state, peer, now)
                     state.ready[peer] = None
                 if frame.waiting:
-                    state.yielding.heard(frame.waiting, now)
+                    state.priority_backoff.heard(frame.waiting, now)
             case TopicAnnounce():
-                inbound.announce(frame)
+                receiver.announce(frame)
             case Cancel(message_ids, broadcast_ids):
                 _take_cancel(state, session, message_ids, broadcast_ids=broadcast_ids)
             case Refused():
@@ -212,19 +212,19 @@ def _take_frames(
                     state.ready[peer] = None
             case Delivered(message_ids, broadcast_ids):
                 if not broadcast_ids:
-                    outbound.told_delivered(message_ids)
+                    sender.told_delivered(message_ids)
                     report_ended(state, peer, now)
             case Nack(message_id):
                 _repair(state, session, message_id, now)
             case Ping(token):
-                if (link, source) == (session.way.link, session.way.address):
+                if (link, source) == (session.path.link, session.path.address):
                     session.owe(Pong(token, 0))
                     state.owe(session)
                 else:
                     # It asks whether we are there, not whether we know another way.
                     send_on_path(state, session, Pong(token, 0), link, source, now)
             case Pong(token):
-                outbound.path_size.answered(token, now)
+                sender.pmtu.answered(token, now)
             case Bye():
                 leave(state, session, now)
             case _:
@@ -232,15 +232,15 @@ def _take_frames(
                 pass
     _hand_over(state, session, now)
     if not wants_ack:
-        inbound.acks.saw(number, now)
+        receiver.acks.saw(number, now)
     elif kept:
-        inbound.accepted(number, now, ack_now=ack_now)
-        if inbound.acks.now_wanted:
+        receiver.accepted(number, now, ack_now=ack_now)
+        if receiver.acks.now_wanted:
             state.owe(session)
-    if inbound.refusals:
-        for refusal in inbound.refusals:
+    if receiver.refusals:
+        for refusal in receiver.refusals:
             session.owe(refusal)
-        inbound.refusals.clear()
+        receiver.refusals.clear()
         state.owe(session)
     state.arm(peer)
 
@@ -260,38 +260,38 @@ def _take_cancel(state: State, session: Session, message_ids: tuple[int, ...], *
                 repairs.give_up(message_id)
         return
     for message_id in message_ids:
-        session.inbound.unicasts.end(message_id)
+        session.receiver.unicasts.end(message_id)
 
 
 def _take_refusal(state: State, session: Session, refused: Refused) -> None:
     peer = session.peer
     assert peer is not None
-    outbound = peer.outbound
-    message = outbound.by_wire_id(refused.message_id)
+    sender = peer.sender
+    message = sender.by_wire_id(refused.message_id)
     if message is None:
         return
     match refused.reason:
         case RefuseReason.FORGOTTEN:
-            outbound.send_anew(message)
+            sender.send_anew(message)
         case RefuseReason.NO_MEMORY:
             # Its packets stay unacknowledged and come again by themselves.
             return
         case RefuseReason.TOO_LARGE | RefuseReason.CORRUPT:
-            outbound.finish(message, ExpiryReason.REFUSED)
+            sender.finish(message, ExpiryReason.REFUSED)
 
 
 def _repair(state: State, session: Session, number: int, now: float) -> None:
     """A peer misses a cast: send it for itself, or say that it is gone."""
     peer = session.peer
     assert peer is not None
-    accepted = state.casts.repair(number)
+    accepted = state.broadcasts.repair(number)
     if accepted is None:
         session.owe(Cancel((number,), broadcast_ids=True))
         state.owe(session)
         return
-    if any(message.accepted.broadcast_number == number for message in peer.outbound.open):
+    if any(message.accepted.broadcast_number == number for message in peer.sender.pending):
         return
-    state.ledger.counters.repairs_sent += 1
+    state.event_queue.counters.repairs_sent += 1
     copy = Accepted(
         accepted.message_id,
         accepted.channel,
@@ -302,26 +302,26 @@ def _repair(state: State, session: Session, number: int, now: float) -> None:
         accepted.deadline,
         number,
     )
-    peer.outbound.accept(Outgoing(copy, accepted.channel.topic.priority, reliable=True), now)
+    peer.sender.accept(Outgoing(copy, accepted.channel.topic.priority, reliable=True), now)
     state.ready[peer] = None
 
 
 def _hand_over(state: State, session: Session, now: float) -> None:
     """Whole messages become events."""
-    inbound = session.inbound
-    if inbound.unpacking:
+    receiver = session.receiver
+    if receiver.unpacking:
         state.unpacking[session] = None
-    if not inbound.arrived:
+    if not receiver.arrived:
         return
-    arrived, inbound.arrived = inbound.arrived, []
+    arrived, receiver.arrived = receiver.arrived, []
     repairs = state.repairs.get(session.boot_id)
     for message in arrived:
         number = message.from_broadcast
         if number is not None and number < UNREPAIRED_FROM and repairs is not None:
-            repairs.received(number, now, inbound.broadcasts.finished)
+            repairs.received(number, now, receiver.broadcasts.finished)
             state.ask_by(session.boot_id, repairs)
-        state.ledger.counters.messages_received += 1
-        state.ledger.tell(
+        state.event_queue.counters.messages_received += 1
+        state.event_queue.emit(
             MessageReceived(
                 session.name, message.topic, message.type_name, message.payload, message.priority, message.to_all
             )
@@ -331,10 +331,10 @@ def _hand_over(state: State, session: Session, now: float) -> None:
 def unpack(state: State, now: float) -> None:
     """Inflate some more of a message that is whole, of each session in turn."""
     session = next(iter(state.unpacking))
-    held = sum(one.inbound.unpacking_bytes for one in state.unpacking)
-    if not session.inbound.unpack():
-        state.ledger.counters.dropped_malformed += 1
-    if held <= 2 * state.settings.limits.message_bytes or not session.inbound.unpacking:
+    held = sum(one.receiver.unpacking_bytes for one in state.unpacking)
+    if not session.receiver.unpack():
+        state.event_queue.counters.dropped_malformed += 1
+    if held <= 2 * state.settings.limits.message_bytes or not session.receiver.unpacking:
         # In turn, but where much is held already: then what was begun ends before more grows.
         del state.unpacking[session]
     _hand_over(state, session, now)
@@ -344,10 +344,10 @@ def _take_broadcast(state: State, session: Session, frames: bytes, link: str, so
     """An opened datagram to all. Until the sender is proven and its floor known, it may be a recording."""
     peer = session.peer
     if peer is None or peer.session is not session or session.boot_id not in state.repairs:
-        state.ledger.counters.dropped_unproven += 1
+        state.event_queue.counters.dropped_unproven += 1
         return
     if not frames:
-        state.ledger.counters.dropped_malformed += 1
+        state.event_queue.counters.dropped_malformed += 1
         return
     late_s = broadcast_lateness_s(state, session, frames, link, source, now)
     if late_s is None:
@@ -356,19 +356,19 @@ def _take_broadcast(state: State, session: Session, frames: bytes, link: str, so
     try:
         decoded = decode(frames)
     except DecodeError:
-        state.ledger.counters.dropped_malformed += 1
+        state.event_queue.counters.dropped_malformed += 1
         return
     for frame in decoded:
         match frame:
             case Fragment():
-                session.inbound.take(frame, now, broadcast=True, late_s=late_s)
+                session.receiver.take(frame, now, broadcast=True, late_s=late_s)
             case TopicAnnounce():
-                session.inbound.announce(frame)
+                session.receiver.announce(frame)
             case Bye():
                 leave(state, session, now)
             case _:
                 pass
-    session.inbound.refusals.clear()
+    session.receiver.refusals.clear()
     _hand_over(state, session, now)
 
 
@@ -380,7 +380,7 @@ def _take_long(
         return
     key = _key(state, header.key_id)
     check_long(key, data, header)
-    session = state.roster.sessions.get(header.boot_id)
+    session = state.peer_table.sessions.get(header.boot_id)
     introduced = header.kind is Kind.INTRODUCTION
     if session is not None:
         channel = _channel(session.data_channels if introduced else session.broadcast_channels, key)
@@ -394,16 +394,16 @@ def _take_long(
         beat = _beat(decoded)
         if beat is None:
             # An introduction without a name: its sender believes that we know it. Its heartbeats will tell.
-            state.ledger.counters.dropped_unproven += 1
+            state.event_queue.counters.dropped_unproven += 1
             return
-        session = state.roster.stranger(beat.name, header.boot_id, state.keys, state.settings)
+        session = state.peer_table.stranger(beat.name, header.boot_id, state.keys, state.settings)
         channel = _channel(session.data_channels if introduced else session.broadcast_channels, key)
         if not channel.window.accept(number):
             # Of a boot that was forgotten, and whose numbers were not.
-            state.roster.forget(session)
+            state.peer_table.forget(session)
             raise ReplayError(f"packet {number} was already seen or is too old")
     if beat is not None and beat.name != session.name:
-        state.ledger.counters.dropped_malformed += 1
+        state.event_queue.counters.dropped_malformed += 1
         return
     late_s = long_lateness_s(state, session, decoded, link, source, now)
     if late_s is None:
@@ -428,7 +428,7 @@ def _take_long(
         return
     _take_frames(state, session, decoded, number, link, source, now, late_s)
     # The sender writes long headers until it is answered.
-    session.inbound.acks.now_wanted = True
+    session.receiver.acks.now_wanted = True
     state.owe(session)
 
 

@@ -10,9 +10,9 @@ from udp_mesh.core.events import ExpiryReason, MessageId
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peer_lifecycle import refit
 from udp_mesh.core.peers.heartbeat import leads
-from udp_mesh.core.publish import channel_of, enqueue, report_ended, stop_packing, tell_expired
+from udp_mesh.core.publish import channel_of, enqueue, report_ended, report_expired, stop_packing
 from udp_mesh.core.sender.message import Accepted
-from udp_mesh.core.sender.rate_limit import Gate
+from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.settings import LinkInfo, LinkKind, Neighbour, Settings, Topic
 from udp_mesh.core.state import State, live_keys
 from udp_mesh.crypto import SendChannel
@@ -41,10 +41,10 @@ def restore_outboxes(state: State, now: float) -> None:
 def link_up(state: State, link: LinkInfo, now: float) -> None:
     """A new or changed link; heartbeats introduce it soon."""
     state.links[link.name] = link
-    for session in state.roster.sessions.values():
-        if session.way.link == link.name:
+    for session in state.peer_table.sessions.values():
+        if session.path.link == link.name:
             refit(state, session, link.mtu)
-    state.discovery.hurry(len(state.roster.sessions), now)
+    state.heartbeats.schedule_now(len(state.peer_table.sessions), now)
 
 
 def link_down(state: State, name: str) -> None:
@@ -60,9 +60,9 @@ def apply(state: State, settings: Settings, now: float) -> list[str]:
     changes = _changes(old, settings)
     state.settings = settings
     state.topics = {topic.name: topic for topic in settings.topics}
-    state.ledger.set_limit(settings.limits.events)
-    state.roster.apply(settings)
-    state.yielding.apply(settings.rates)
+    state.event_queue.set_limit(settings.limits.events)
+    state.peer_table.apply(settings)
+    state.priority_backoff.apply(settings.rates)
     _retopic(state, now)
     keys = live_keys(settings)
     if keys != state.keys:
@@ -70,19 +70,19 @@ def apply(state: State, settings: Settings, now: float) -> list[str]:
         number = state.to_all.next_number
         state.to_all = SendChannel(keys[0], state.boot_id)
         state.to_all.next_number = number
-        state.roster.set_keys(keys)
-    for session in state.roster.sessions.values():
-        session.inbound.apply(settings.rates, settings.limits)
-    for peer in state.roster.peers.values():
+        state.peer_table.set_keys(keys)
+    for session in state.peer_table.sessions.values():
+        session.receiver.apply(settings.rates, settings.limits)
+    for peer in state.peer_table.peers.values():
         peer.apply(settings)
-        if peer.engaged:
+        if peer.has_sender:
             state.ready[peer] = None
         state.arm(peer)
-    for session in state.roster.sessions.values():
-        info = state.links.get(session.way.link)
+    for session in state.peer_table.sessions.values():
+        info = state.links.get(session.path.link)
         if info is not None:
             refit(state, session, info.mtu)
-    state.discovery.hurry(len(state.roster.sessions), now)
+    state.heartbeats.schedule_now(len(state.peer_table.sessions), now)
     return changes
 
 
@@ -159,21 +159,21 @@ def _retopic(state: State, now: float) -> None:
             topic = replace(state.settings.undeclared, name=channel.name)
         if topic is not None:
             channel.topic = topic
-    for name in list(state.gates):
+    for name in list(state.rate_limits):
         rate = state.topics[name].rate_limit_bytes_per_s if name in state.topics else None
-        gate = state.gates[name]
-        gate.release()
+        bucket = state.rate_limits[name]
+        bucket.release()
         if rate is None:
-            del state.gates[name]
+            del state.rate_limits[name]
         else:
-            gate.bytes_per_s = rate
+            bucket.bytes_per_s = rate
     for topic in state.topics.values():
-        if topic.rate_limit_bytes_per_s is not None and topic.name not in state.gates:
-            state.gates[topic.name] = Gate(topic.rate_limit_bytes_per_s, now)
-    for peer in state.roster.peers.values():
-        if peer.engaged:
-            peer.outbound.reprioritize()
-    state.casts.reprioritize()
+        if topic.rate_limit_bytes_per_s is not None and topic.name not in state.rate_limits:
+            state.rate_limits[topic.name] = TokenBucket(topic.rate_limit_bytes_per_s, now)
+    for peer in state.peer_table.peers.values():
+        if peer.has_sender:
+            peer.sender.reprioritize()
+    state.broadcasts.reprioritize()
 
 
 def close(state: State, now: float) -> None:
@@ -181,17 +181,17 @@ def close(state: State, now: float) -> None:
     if state.closed:
         return
     stop_packing(state, now)
-    for peer in state.roster.peers.values():
-        if not peer.engaged:
+    for peer in state.peer_table.peers.values():
+        if not peer.has_sender:
             continue
-        for message in list(peer.outbound.open):
+        for message in list(peer.sender.pending):
             if state.outboxes.on_disk(message.store_key):
-                peer.outbound.withdraw(message)
+                peer.sender.withdraw(message)
             else:
-                peer.outbound.finish(message, ExpiryReason.CLOSED)
+                peer.sender.finish(message, ExpiryReason.CLOSED)
         report_ended(state, peer, now)
     for name, held in state.outboxes.drop_all():
-        tell_expired(state, name, held.accepted, ExpiryReason.CLOSED)
+        report_expired(state, name, held.accepted, ExpiryReason.CLOSED)
     links = list(state.links.values())
     for link in links:
         _, data = state.to_all.seal_long(encode([Bye("closed")]))

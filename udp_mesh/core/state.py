@@ -8,21 +8,21 @@ state and of `now`.
 from collections.abc import Iterator
 from heapq import heappop, heappush
 
-from udp_mesh.core.broadcast import CastQueue, Repairs
+from udp_mesh.core.broadcast import BroadcastQueue, NackRepair
 from udp_mesh.core.compression import PackingQueue
 from udp_mesh.core.congestion.channel_share import ChannelShare
-from udp_mesh.core.event_queue import Ledger
+from udp_mesh.core.event_queue import EventQueue
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.outbox import Outboxes
-from udp_mesh.core.peers.heartbeat import Discovery
-from udp_mesh.core.peers.key_mismatch import Mismatches
-from udp_mesh.core.peers.peer_table import Roster
+from udp_mesh.core.peers.heartbeat import HeartbeatScheduler
+from udp_mesh.core.peers.key_mismatch import KeyMismatchLimiter
+from udp_mesh.core.peers.peer_table import PeerTable
 from udp_mesh.core.peers.session import Peer, Session
-from udp_mesh.core.priority_backoff import Yielding
+from udp_mesh.core.priority_backoff import PriorityBackoff
 from udp_mesh.core.sender.message import Channel
-from udp_mesh.core.sender.rate_limit import Gate
-from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.sender.rate_limit import TokenBucket
+from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
 from udp_mesh.crypto import Key, Keyring, SendChannel
 
@@ -49,20 +49,20 @@ class State:
         self.rng = rng
         self.keys = live_keys(settings)
         self.links: dict[str, LinkInfo] = {}
-        self.roster = Roster(settings, boot_id)
+        self.peer_table = PeerTable(settings, boot_id)
         self.sent = Meter(now)
         """Wire bytes of this node, to everybody."""
         self.channel_share = ChannelShare()
-        self.ledger = Ledger(settings.limits.events)
+        self.event_queue = EventQueue(settings.limits.events)
         self.outboxes = Outboxes(store)
-        self.discovery = Discovery(rng, settings.rates, now)
-        self.casts = CastQueue()
+        self.heartbeats = HeartbeatScheduler(rng, settings.rates, now)
+        self.broadcasts = BroadcastQueue()
         self.packing = PackingQueue()
         self.unpacking: dict[Session, None] = {}
         """Sessions of which a message is being inflated."""
         self.to_all = SendChannel(self.keys[0], boot_id)
-        self.yielding = Yielding(settings.rates, now)
-        self.repairs: dict[bytes, Repairs] = {}
+        self.priority_backoff = PriorityBackoff(settings.rates, now)
+        self.repairs: dict[bytes, NackRepair] = {}
         """By the sender's boot id."""
         self.asking: dict[bytes, None] = {}
         """Those of `repairs` in which something is missing."""
@@ -70,7 +70,7 @@ class State:
         """Where the next round of housekeeping begins."""
         self.topics: dict[str, Topic] = {topic.name: topic for topic in settings.topics}
         self.channels: dict[tuple[str, str], Channel] = {}
-        self.gates: dict[str, Gate] = {}
+        self.rate_limits: dict[str, TokenBucket] = {}
         self.next_message_id = 1
         self.ready: dict[Peer, None] = {}
         """Peers to which something may be able to leave."""
@@ -82,7 +82,7 @@ class State:
         self.timer_serial = 0
         self.housekeeping_at = now
         self.housekept_at = now
-        self.mismatches = Mismatches()
+        self.key_mismatches = KeyMismatchLimiter()
         self.incompatible_reported: dict[bytes, float] = {}
         self.own_name_reported_at = float("-inf")
         self.closed = False
@@ -95,10 +95,10 @@ class State:
 
     def arm(self, peer: Peer) -> None:
         """Bring the peer's timer up to what its halves want now, be it later than before."""
-        at = peer.outbound.timer() if peer.engaged else None
+        at = peer.sender.timer() if peer.has_sender else None
         session = peer.session
         if session is not None:
-            due = session.inbound.acks.due_at
+            due = session.receiver.acks.due_at
             if due is not None and (at is None or due < at):
                 at = due
         peer.wants_at = _NEVER if at is None else at
@@ -126,7 +126,7 @@ class State:
                 return at
         return _NEVER
 
-    def ask_by(self, boot_id: bytes, repairs: Repairs) -> None:
+    def ask_by(self, boot_id: bytes, repairs: NackRepair) -> None:
         """Ask this sender for what is missing, when it is time."""
         if repairs.next_at != float("inf"):
             self.asking[boot_id] = None
@@ -136,12 +136,12 @@ class State:
         """The session has small frames or an acknowledgement to send now."""
         self.owing[session] = None
 
-    def waiting_outbounds(self) -> Iterator[Outbound]:
+    def waiting_senders(self) -> Iterator[Sender]:
         """Of peers in reach with open messages."""
-        for peer in self.roster.peers.values():
-            if peer.engaged and peer.online and peer.outbound.open:
-                yield peer.outbound
+        for peer in self.peer_table.peers.values():
+            if peer.has_sender and peer.online and peer.sender.pending:
+                yield peer.sender
 
-    def broadcasts(self) -> bool:
+    def can_broadcast(self) -> bool:
         """Whether some link reaches everyone with one datagram."""
         return any(link.kind is LinkKind.BROADCAST for link in self.links.values())

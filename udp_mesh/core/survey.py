@@ -7,7 +7,7 @@ from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
 from udp_mesh.core.peers.session import Peer, Session
-from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
 
@@ -20,55 +20,55 @@ STRANGE_AFTER_S = 3.0
 
 def conditions(state: State, now: float) -> Conditions:
     """See `Node.conditions`."""
-    idle = Outbound(state.settings)
+    idle = Sender(state.settings)
     peers = tuple(
-        _peer(state, peer, peer.outbound if peer.engaged else idle, now)
-        for _, peer in sorted(state.roster.peers.items())
+        _peer(state, peer, peer.sender if peer.has_sender else idle, now)
+        for _, peer in sorted(state.peer_table.peers.items())
     )
-    outbounds = [peer.outbound for peer in state.roster.peers.values() if peer.engaged]
-    counters = state.ledger.counters
+    senders = [peer.sender for peer in state.peer_table.peers.values() if peer.has_sender]
+    counters = state.event_queue.counters
     sent_bits_per_s = _bits(state.sent, now)
-    inbounds = [session.inbound for session in state.roster.sessions.values()]
+    receivers = [session.receiver for session in state.peer_table.sessions.values()]
     return Conditions(
         now,
         state.settings.name,
         peers,
         replace(
             counters,
-            fragments_received=sum(inbound.fragments for inbound in inbounds),
-            duplicates_received=sum(inbound.duplicates for inbound in inbounds),
-            fragments_retransmitted=sum(outbound.retransmitted for outbound in outbounds),
-            fragments_sent=sum(outbound.sent_packets for outbound in outbounds),
-            dropped_stale=counters.dropped_stale + sum(inbound.expired for inbound in inbounds),
-            dropped_over_limit=counters.dropped_over_limit + sum(inbound.over_limit for inbound in inbounds),
+            fragments_received=sum(receiver.fragments for receiver in receivers),
+            duplicates_received=sum(receiver.duplicates for receiver in receivers),
+            fragments_retransmitted=sum(sender.retransmitted for sender in senders),
+            fragments_sent=sum(sender.sent_packets for sender in senders),
+            dropped_stale=counters.dropped_stale + sum(receiver.expired for receiver in receivers),
+            dropped_over_limit=counters.dropped_over_limit + sum(receiver.over_limit for receiver in receivers),
         ),
         sent_bits_per_s,
         sent_bits_per_s + sum(peer.peer_sends_bits_per_s or 0.0 for peer in peers if peer.online),
-        sum(inbound.partial_bytes + inbound.unpacking_bytes for inbound in inbounds),
-        sum(outbound.levels.queued_bytes for outbound in outbounds) + state.packing.bytes,
-        state.casts.kept_bytes,
+        sum(receiver.partial_bytes + receiver.unpacking_bytes for receiver in receivers),
+        sum(sender.levels.queued_bytes for sender in senders) + state.packing.bytes,
+        state.broadcasts.kept_bytes,
         tuple(_strangers(state, now)),
     )
 
 
 def _strangers(state: State, now: float) -> Iterator[Stranger]:
-    for session in sorted(state.roster.not_current(), key=lambda session: session.name):
-        met_at, way = session.met_at, session.way
+    for session in sorted(state.peer_table.not_current(), key=lambda session: session.name):
+        met_at, path = session.met_at, session.path
         if session.proven or met_at is None or now - met_at < STRANGE_AFTER_S or not _alive(session, now):
             continue
-        yield Stranger(session.name, way.address, way.link, met_at, session.last_heard)
+        yield Stranger(session.name, path.address, path.link, met_at, session.last_heard)
 
 
 def _alive(session: Session, now: float) -> bool:
     return now - session.last_heard < MISSED_HEARTBEATS * session.interval_s
 
 
-def _peer(state: State, peer: Peer, outbound: Outbound, now: float) -> PeerConditions:
+def _peer(state: State, peer: Peer, sender: Sender, now: float) -> PeerConditions:
     session = peer.session
     held_messages, held_bytes = state.outboxes.count(peer.name)
-    capacity = outbound.congestion.capacity_packets_per_s()
-    fragment_bytes = session.way.fragment_bytes if session is not None else state.settings.fragment_bytes
-    meters = session.meters if session is not None else peer.fielded_meters
+    capacity = sender.congestion.capacity_packets_per_s()
+    fragment_bytes = session.path.fragment_bytes if session is not None else state.settings.fragment_bytes
+    meters = session.meters if session is not None else peer.legacy_meters
     address, link, last_heard = _way(peer)
     return PeerConditions(
         peer.name,
@@ -78,23 +78,23 @@ def _peer(state: State, peer: Peer, outbound: Outbound, now: float) -> PeerCondi
         link,
         peer.online_since,
         last_heard,
-        outbound.rtt.smoothed_rtt,
-        outbound.rtt.min_rtt,
-        outbound.loss,
+        sender.rtt.smoothed_rtt,
+        sender.rtt.min_rtt,
+        sender.loss,
         _bits(meters.sent, now) if meters is not None else 0.0,
         _bits(meters.delivered, now) if meters is not None else 0.0,
         _bits(meters.received, now) if meters is not None else 0.0,
         _told(session.peer_receives, TOLD_FOR_S, now) if session is not None else None,
         _told(session.peer_sends, MISSED_HEARTBEATS * session.interval_s, now) if session is not None else None,
         None if capacity is None else capacity * fragment_bytes * 8,
-        outbound.congestion.cwnd,
-        outbound.flight.outstanding,
-        outbound.retransmitted,
-        _queues(outbound, now),
+        sender.congestion.cwnd,
+        sender.in_flight.outstanding,
+        sender.retransmitted,
+        _queues(sender, now),
         held_messages,
         held_bytes,
         session is not None and session.unheard_since is not None and _alive(session, now),
-        now - outbound.last_progress if outbound.silent_since is not None and outbound.open else None,
+        now - sender.last_progress if sender.unresponsive_since is not None and sender.pending else None,
     )
 
 
@@ -102,14 +102,14 @@ def _way(peer: Peer) -> tuple[Address | None, str | None, float | None]:
     """Address, link and when something last came from there."""
     session = peer.session
     if session is not None:
-        way = session.way
-        return (way.address, way.link, session.last_heard) if way.link else (None, None, session.last_heard)
-    return peer.fielded_way or (None, None, None)
+        path = session.path
+        return (path.address, path.link, session.last_heard) if path.link else (None, None, session.last_heard)
+    return peer.legacy_path or (None, None, None)
 
 
-def _queues(outbound: Outbound, now: float) -> tuple[QueueConditions, ...]:
+def _queues(sender: Sender, now: float) -> tuple[QueueConditions, ...]:
     queues = []
-    for priority, book in enumerate(outbound.levels):
+    for priority, book in enumerate(sender.levels):
         oldest = book.oldest()
         starved_s = book.starved_s + (now - book.starved_since if book.starved_since is not None else 0.0)
         if not book.messages and not starved_s and not book.held_s:

@@ -92,11 +92,11 @@ def test_broadcasts_without_repair_ask_for_nothing() -> None:
 
 def test_a_repair_no_longer_kept_is_called_off() -> None:
     world = team(Topic("t", repair=True))
-    world.nodes["a"]._state.casts._kept.clear()
+    world.nodes["a"]._state.broadcasts._kept.clear()
     world.pipes[("a", "b")].up = False
     world.send("a", "t", b"gone")
     world.run(0.001)
-    world.nodes["a"]._state.casts._kept.clear()
+    world.nodes["a"]._state.broadcasts._kept.clear()
     world.pipes[("a", "b")].up = True
     world.run(5.0)
     asked = world.nodes["b"].conditions(world.now).counters.repairs_asked

@@ -55,7 +55,7 @@ class Fuzzer:
         for node, other in ((both.a, "b"), (both.b, "a")):
             node.send("any", b"hello", destination=other, now=both.now)
         both.roundtrip(times=30)
-        self.insider = both.a._state.roster.peers["b"].session
+        self.insider = both.a._state.peer_table.peers["b"].session
         self.stranger = SendChannel(both.a._state.keys[0], self.dice.randbytes(16), TO_ALL)
         return both
 
@@ -99,8 +99,8 @@ class Fuzzer:
                     pass
         if self.inputs % FRESH_PAIR_EVERY == 0:
             state = self.both.b._state
-            assert state.roster.memory.bytes <= 2_000_000
-            assert len(state.roster.peers) <= 64 + 1
+            assert state.peer_table.memory.bytes <= 2_000_000
+            assert len(state.peer_table.peers) <= 64 + 1
             self.both = self.new_pair()
 
 
@@ -119,10 +119,10 @@ def decoder(fuzzer: Fuzzer) -> None:
 def sealed_data(fuzzer: Fuzzer) -> None:
     """To one boot, short and long headers."""
     assert fuzzer.insider is not None
-    way = fuzzer.insider.way
-    seal = way.channel.seal if fuzzer.dice.random() < 0.7 else way.channel.seal_long
+    path = fuzzer.insider.path
+    seal = path.channel.seal if fuzzer.dice.random() < 0.7 else path.channel.seal_long
     number, data = seal(fuzzer.frames())
-    fuzzer.both.a._state.roster.peers["b"].outbound.flight.add(number, None)
+    fuzzer.both.a._state.peer_table.peers["b"].sender.in_flight.add(number, None)
     fuzzer.receive(data)
 
 
@@ -135,8 +135,8 @@ def sealed_to_all(fuzzer: Fuzzer) -> None:
 def mutated_datagrams(fuzzer: Fuzzer) -> None:
     """What was sealed, changed on its way: it opens nowhere."""
     assert fuzzer.insider is not None
-    number, data = fuzzer.insider.way.channel.seal(fuzzer.dice.choice(fuzzer.seeds))
-    fuzzer.both.a._state.roster.peers["b"].outbound.flight.add(number, None)
+    number, data = fuzzer.insider.path.channel.seal(fuzzer.dice.choice(fuzzer.seeds))
+    fuzzer.both.a._state.peer_table.peers["b"].sender.in_flight.add(number, None)
     fuzzer.receive(fuzzer.mutated(data))
 
 

@@ -80,7 +80,7 @@ def test_a_flood_of_invented_senders_holds_bounded_state() -> None:
         beat = Heartbeat(f"ghost{number}", 1, 1, 0, 1000, 0, 0, 0, 0)
         _, data = channel.seal_long(encode([beat]))
         both.b.receive(data, "mesh", FORGER, both.now)
-    assert len(both.b._state.roster.sessions) <= 1 + 8
+    assert len(both.b._state.peer_table.sessions) <= 1 + 8
     assert [peer.name for peer in both.b.conditions(both.now).peers] == ["a"]
     assert still_works(both)
 
@@ -97,10 +97,10 @@ def test_a_flood_of_boots_that_a_key_holder_invents_holds_bounded_state(name: st
         beat = Heartbeat(name.format(number), *versions, 0, 1000, 0, 0, 0, 0, (state.boot_id[:HEARD_TAG_BYTES],))
         _, data = SendChannel(KEY, boot_id, TO_ALL).seal_long(encode([beat]))
         both.b.receive(data, "mesh", FORGER, both.now)
-    assert len(state.roster.sessions) <= 1 + 8 + 16 + RETIRED_REMEMBERED
+    assert len(state.peer_table.sessions) <= 1 + 8 + 16 + RETIRED_REMEMBERED
     assert len(state.repairs) <= 1 + 8 + 16 + RETIRED_REMEMBERED
     assert len(state.incompatible_reported) <= 8
-    assert len(state.discovery._to_answer) <= MOST_TO_ANSWER
+    assert len(state.heartbeats._to_answer) <= MOST_TO_ANSWER
     both.events(both.b)
     both.now += 60.0
     assert still_works(both)
@@ -108,10 +108,10 @@ def test_a_flood_of_boots_that_a_key_holder_invents_holds_bounded_state(name: st
 
 def insider(both: Pair, frames: list[Frame]) -> None:
     """A datagram from a's session with frames of the test's choice: a key holder gone bad."""
-    peer = both.a._state.roster.peers["b"]
+    peer = both.a._state.peer_table.peers["b"]
     assert peer.session is not None
-    number, data = peer.session.way.seal(encode(frames))
-    peer.outbound.flight.add(number, None)
+    number, data = peer.session.path.seal(encode(frames))
+    peer.sender.in_flight.add(number, None)
     both.b.receive(data, "mesh", A, both.now)
 
 
@@ -129,9 +129,9 @@ def test_an_insider_who_announces_topics_without_end_meets_the_cap() -> None:
     both = pair(limits=Limits(topics_per_peer=10))
     for number in range(200):
         insider(both, [TopicAnnounce(number, f"t{number}")])
-    session = both.b._state.roster.peers["a"].session
+    session = both.b._state.peer_table.peers["a"].session
     assert session is not None
-    assert len(session.inbound.topics) <= 10
+    assert len(session.receiver.topics) <= 10
 
 
 frames = st.lists(
@@ -170,7 +170,7 @@ def test_whatever_an_insider_says_nothing_crashes_and_little_is_owed(datagrams: 
             for ack in datagram
         ]
         insider(both, mended)
-    session = both.b._state.roster.peers["a"].session
+    session = both.b._state.peer_table.peers["a"].session
     assert session is not None
     assert len(session.owed) <= OWED_FRAMES
     both.roundtrip(times=10)
@@ -219,7 +219,7 @@ def test_waiting_levels_claimed_without_end_hold_nobody_back_for_good() -> None:
     world.run(1.5)
 
     def claim() -> None:
-        world.nodes["a"]._state.yielding.heard((Waiting(0, 60_000),), world.now)
+        world.nodes["a"]._state.priority_backoff.heard((Waiting(0, 60_000),), world.now)
         world.at(world.now + 0.01, claim)
 
     claim()

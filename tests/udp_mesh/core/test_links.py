@@ -76,11 +76,11 @@ class Run:
     def measure(self, seconds: float) -> Figures:
         """Let it run on and look."""
         world = self.world
-        outbound = world.nodes["a"]._state.roster.peers["b"].outbound
+        sender = world.nodes["a"]._state.peer_table.peers["b"].sender
         pipe = world.pipes[("a", "b")]
-        start, delivered, carried = world.now, outbound.delivered_bytes, pipe.carried_bytes
+        start, delivered, carried = world.now, sender.delivered_bytes, pipe.carried_bytes
         world.run(seconds)
-        payload = outbound.delivered_bytes - delivered
+        payload = sender.delivered_bytes - delivered
         return Figures(
             8 * payload / (world.now - start),
             [arrived - sent for sent, arrived in self.arrived if sent >= start],

@@ -101,8 +101,8 @@ def test_a_node_that_never_heard_us_is_no_peer_and_is_told_of_as_a_stranger() ->
 
 def test_losses_of_half_of_all_datagrams_call_nobody_offline() -> None:
     world = met(4)
-    for way in world.pipes.values():
-        way.loss = 0.5
+    for path in world.pipes.values():
+        path.loss = 0.5
     world.run(300.0)
     assert not world.told("a", PeerOffline)
     assert not world.told("b", PeerOffline)

@@ -12,8 +12,8 @@ from udp_mesh.core.congestion.pacer import MAX_DEBT_S, Pacer
 from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.receiver.acks import AckState
 from udp_mesh.core.receiver.reassembly import PIECE_OVERHEAD_BYTES, Reassembly, Verdict, Whole
-from udp_mesh.core.sender.rate_limit import Gate
-from udp_mesh.core.sender.sent_packets import Flight, Mark, Packet
+from udp_mesh.core.sender.rate_limit import TokenBucket
+from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot, SentPackets
 from udp_mesh.core.settings import Limits
 from udp_mesh.wire.frames import Fragment, MessageFlag, MessageHead
 
@@ -96,7 +96,7 @@ def test_a_best_effort_message_that_stops_is_purged_by_its_own_age() -> None:
     assert reassembly.missing(2) == [(1, 1)]
 
 
-MARK = Mark(0.0, 0, 0.0, 0.0, False)
+MARK = SendSnapshot(0.0, 0, 0.0, 0.0, False)
 
 
 @given(
@@ -105,7 +105,7 @@ MARK = Mark(0.0, 0, 0.0, 0.0, False)
     )
 )
 def test_every_packet_is_acknowledged_or_lost_as_a_plain_model_says(plan: list[tuple[str, int]]) -> None:
-    flight, state = Flight(), AckState()
+    in_flight, state = SentPackets(), AckState()
     sent: dict[int, Packet] = {}
     ended: dict[int, str] = {}
     number = 0
@@ -120,61 +120,61 @@ def test_every_packet_is_acknowledged_or_lost_as_a_plain_model_says(plan: list[t
     for what, choice in plan:
         if what == "send":
             sent[number] = Packet(MARK, outgoing(1, 1), number)
-            flight.add(number, sent[number])
+            in_flight.add(number, sent[number])
             number += 1
         elif what == "skip":
-            flight.add(number, None)
+            in_flight.add(number, None)
             number += 1
         elif what == "arrive" and number:
             state.saw(number - 1 - choice % min(number, 12), 0.0) if not received(
                 state, number - 1 - choice % min(number, 12)
             ) else None
         elif what == "ack" and state.largest >= 0:
-            acknowledged, lost, _ = flight.acknowledge(state.largest, state.received)
+            acknowledged, lost, _ = in_flight.acknowledge(state.largest, state.received)
             book(acknowledged, "acknowledged")
             book(lost, "lost")
         elif what == "give up":
-            book(flight.give_up(), "lost")
-        assert flight.outstanding == sum(1 for index in sent if index not in ended)
+            book(in_flight.give_up(), "lost")
+        assert in_flight.outstanding == sum(1 for index in sent if index not in ended)
     for index, how in ended.items():
         if how == "acknowledged":
             assert received(state, index)
 
 
-URGENT = Mark(0.0, 0, 0.0, 0.0, False, urgent=True)
+URGENT = SendSnapshot(0.0, 0, 0.0, 0.0, False, urgent=True)
 
 
 def test_urgent_packets_that_overtake_others_in_the_radio_are_no_sign_of_loss() -> None:
-    flight = Flight()
+    in_flight = SentPackets()
     bulk = [Packet(MARK, outgoing(1, 1), 0), Packet(MARK, outgoing(1, 1), 1)]
     for number in range(2):
-        flight.add(number, bulk[number])
+        in_flight.add(number, bulk[number])
     for number in range(2, 8):
-        flight.add(number, Packet(URGENT, outgoing(1, 1), number))
-    acknowledged, lost, _ = flight.acknowledge(7, 0b111111)
+        in_flight.add(number, Packet(URGENT, outgoing(1, 1), number))
+    acknowledged, lost, _ = in_flight.acknowledge(7, 0b111111)
     assert len(acknowledged) == 6
     assert lost == []
     # Three later ones of its own kind are.
     for number in range(8, 12):
-        flight.add(number, Packet(MARK, outgoing(1, 1), number))
-    assert flight.acknowledge(11, 0b1111111111)[1] == bulk
+        in_flight.add(number, Packet(MARK, outgoing(1, 1), number))
+    assert in_flight.acknowledge(11, 0b1111111111)[1] == bulk
 
 
 def test_a_lost_urgent_packet_is_noticed_by_the_urgent_ones_behind_it() -> None:
-    flight = Flight()
+    in_flight = SentPackets()
     for number in range(5):
-        flight.add(number, Packet(URGENT, outgoing(1, 1), number))
-    assert [packet.position for packet in flight.acknowledge(4, 0b1111)[1]] == [0]
+        in_flight.add(number, Packet(URGENT, outgoing(1, 1), number))
+    assert [packet.position for packet in in_flight.acknowledge(4, 0b1111)[1]] == [0]
 
 
 def test_urgent_packets_that_timed_out_count_as_lost_once_an_acknowledgement_says_so() -> None:
-    flight = Flight()
+    in_flight = SentPackets()
     for number in range(8):
-        flight.add(number, Packet(URGENT, outgoing(1, 1), number))
-        flight.lose_before(1.0)
+        in_flight.add(number, Packet(URGENT, outgoing(1, 1), number))
+        in_flight.lose_before(1.0)
     # 0, 2, 4 and 6 arrived; of 5 and 7 it is too early to tell.
-    assert flight.confirm_timed_out(7, 0b10101010) == 2
-    assert flight.confirm_timed_out(7, 0b10101010) == 0
+    assert in_flight.confirm_timed_out(7, 0b10101010) == 2
+    assert in_flight.confirm_timed_out(7, 0b10101010) == 0
 
 
 def received(state: AckState, number: int) -> bool:
@@ -183,10 +183,10 @@ def received(state: AckState, number: int) -> bool:
 
 
 def test_an_acknowledgement_of_what_was_never_sent_says_nothing() -> None:
-    flight = Flight()
-    flight.add(0, Packet(MARK, outgoing(1, 1), 0))
-    assert flight.acknowledge(7, 0xFF) == ([], [], None)
-    assert flight.outstanding == 1
+    in_flight = SentPackets()
+    in_flight.add(0, Packet(MARK, outgoing(1, 1), 0))
+    assert in_flight.acknowledge(7, 0xFF) == ([], [], None)
+    assert in_flight.outstanding == 1
 
 
 @given(st.binary(max_size=2000))
@@ -222,11 +222,11 @@ def test_what_left_at_the_pace_of_a_slow_path_holds_nothing_up_on_a_fast_one() -
 
 @given(st.lists(st.tuples(st.floats(0.0, 0.5), st.integers(1, 3000)), max_size=50))
 def test_a_bucket_lets_no_more_through_than_its_rate_and_burst(visits: list[tuple[float, int]]) -> None:
-    gate, now, spent = Gate(10_000, 0.0), 0.0, 0
+    bucket, now, spent = TokenBucket(10_000, 0.0), 0.0, 0
     for wait, size in visits:
         now += wait
-        if gate.open(now):
-            gate.spend(size)
+        if bucket.open(now):
+            bucket.spend(size)
             spent += size
     assert spent <= 10_000 * now + 1000 + 3000
 

@@ -72,7 +72,7 @@ def test_a_lost_command_is_not_delivered_late(topic: Topic) -> None:
     both = acquainted(topic)
     recorded = overheard(both, topic.name, b"stop")
     # The peers go on hearing each other; what was lost is never sent again by hand of the test.
-    both.a._state.roster.peers["b"].outbound.finish_all(ExpiryReason.DEADLINE)
+    both.a._state.peer_table.peers["b"].sender.finish_all(ExpiryReason.DEADLINE)
     both.roundtrip(times=900, step_s=0.1)
     before = both.b.conditions(both.now).counters
     replay(both, recorded)
@@ -193,7 +193,7 @@ def test_a_peer_whose_computer_slept_is_believed_again_within_a_second() -> None
     for name in "ab":
         world.add(settings(name))
     world.run(3.0)
-    session = world.nodes["b"]._state.roster.peers["a"].session
+    session = world.nodes["b"]._state.peer_table.peers["a"].session
     assert session is not None
     assert session.freshness._offset_ms is not None
     session.freshness._offset_ms = (session.freshness._offset_ms - 3_600_000) & 0xFFFFFFFF
@@ -207,8 +207,8 @@ def roaming(seed: int, loss: float) -> World:
     for name in "ab":
         world.add(settings(name, Topic("map", priority=8)))
     world.run(3.0)
-    for way in world.pipes.values():
-        way.loss = loss
+    for path in world.pipes.values():
+        path.loss = loss
     return world
 
 
@@ -400,9 +400,9 @@ def test_a_clock_that_wraps_or_drifts_makes_nothing_old() -> None:
 
 def test_an_empty_datagram_of_a_key_holder_is_malformed() -> None:
     both = acquainted()
-    session = both.a._state.roster.peers["b"].session
+    session = both.a._state.peer_table.peers["b"].session
     assert session is not None
-    both.b.receive(session.way.channel.seal(b"")[1], "mesh", A, both.now)
+    both.b.receive(session.path.channel.seal(b"")[1], "mesh", A, both.now)
     both.b.receive(both.a._state.to_all.seal(b"")[1], "mesh", A, both.now)
     assert both.b.conditions(both.now).counters.dropped_malformed == 2
 
@@ -412,7 +412,7 @@ def test_a_ping_is_answered_where_it_came_from() -> None:
     both = acquainted()
     for node, own in ((both.a, "172.16.0.1"), (both.b, "172.16.0.2")):
         node.link_up(LinkInfo("cable", LinkKind.BROADCAST, (own, 8700), ("172.16.0.255", 8700)), both.now)
-    session = both.a._state.roster.peers["b"].session
+    session = both.a._state.peer_table.peers["b"].session
     assert session is not None
     challenge(both.a._state, session, "cable", ("172.16.0.2", 8700), both.now)
     asked = [datagram for datagram in both.drop(both.a) if datagram.link == "cable" and datagram.data[0] == DATA_BYTE]

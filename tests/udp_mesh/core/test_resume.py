@@ -19,14 +19,14 @@ def met(*topics: Topic, **changes: object) -> World:
     return world
 
 
-def cut(world: World, *ways: tuple[str, str]) -> None:
-    for way in ways:
-        world.pipes[way].up = False
+def cut(world: World, *paths: tuple[str, str]) -> None:
+    for path in paths:
+        world.pipes[path].up = False
 
 
 def heal(world: World) -> None:
-    for way in world.pipes.values():
-        way.up = True
+    for path in world.pipes.values():
+        path.up = True
     assert world.run(20.0, until=lambda: all(peer.online for peer in world.nodes["a"].conditions(world.now).peers))
 
 

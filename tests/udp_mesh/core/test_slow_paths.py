@@ -27,8 +27,8 @@ def test_urgent_messages_stay_urgent_on_a_path_that_became_slow(
     for name in "ab":
         world.add(settings(name, *TOPICS))
     world.run(3.0)
-    for way in world.pipes.values():
-        way.rate_bits_per_s = 20e6
+    for path in world.pipes.values():
+        path.rate_bits_per_s = 20e6
     sent: dict[bytes, float] = {}
 
     def publish() -> None:
@@ -44,8 +44,8 @@ def test_urgent_messages_stay_urgent_on_a_path_that_became_slow(
 
     world.at(world.now, publish)
     world.run(3.0)
-    for way in world.pipes.values():
-        way.rate_bits_per_s, way.delay_s = rate_bits_per_s, delay_s
+    for path in world.pipes.values():
+        path.rate_bits_per_s, path.delay_s = rate_bits_per_s, delay_s
     slow_since = world.now
     world.run(30.0)
     took = {
@@ -68,19 +68,19 @@ def test_what_is_on_its_way_on_a_path_that_became_slow_holds_no_urgent_message_b
     for name in "ab":
         world.add(settings(name, *TOPICS))
     world.run(3.0)
-    for way in world.pipes.values():
-        way.rate_bits_per_s, way.loss = 20e6, loss
+    for path in world.pipes.values():
+        path.rate_bits_per_s, path.loss = 20e6, loss
     world.send("a", "map", bytes(20_000_000), "b")
     world.run(2.0)
-    for way in world.pipes.values():
-        way.rate_bits_per_s = 200e3
-    outbound = world.nodes["a"]._state.roster.peers["b"].outbound
+    for path in world.pipes.values():
+        path.rate_bits_per_s = 200e3
+    sender = world.nodes["a"]._state.peer_table.peers["b"].sender
     for number in range(200):
         world.send("a", "status", b"%d" % number, "b")
         world.run(URGENT_WAIT_S + 0.001)
-        waiting = [message for message in outbound.open if message.priority == 0 and not message.begun]
+        waiting = [message for message in sender.pending if message.priority == 0 and not message.begun]
         # a silent peer gets probes instead
-        assert not waiting or outbound.silent_since is not None
+        assert not waiting or sender.unresponsive_since is not None
 
 
 def test_what_a_silent_and_then_slow_peer_was_sent_holds_nothing_up_when_its_path_is_well_again() -> None:
@@ -91,6 +91,6 @@ def test_what_a_silent_and_then_slow_peer_was_sent_holds_nothing_up_when_its_pat
     world.run(3.0)
     world.send("a", "map", bytes(50_000), "b")
     world.run(3.0)
-    world.nodes["a"]._state.roster.peers["b"].outbound.pacer.on_sent(100, world.now, 1.0)
+    world.nodes["a"]._state.peer_table.peers["b"].sender.pacer.on_sent(100, world.now, 1.0)
     world.send("a", "map", bytes(50_000), "b")
     assert world.run(2.0, until=lambda: len(world.told("a", MessageDelivered)) == 2)

@@ -72,7 +72,7 @@ class LegacyPeer:
         self.peer = peer
         self.address = neighbour.address
         self.link = neighbour.link or ""
-        self.sender = LegacySender(peer.outbound, settings.name, rng.getrandbits(15))
+        self.sender = LegacySender(peer.sender, settings.name, rng.getrandbits(15))
         self.unicasts = LegacyReassembly(settings.limits)
         self.broadcasts = LegacyReassembly(settings.limits)
         self.last_heard = float("-inf")
@@ -81,7 +81,7 @@ class LegacyPeer:
         """When what waits in outboxes may leave; None: it has."""
         self.topics: set[str] = set()
         self.received_bytes = 0
-        self.meters = peer.fielded_meters = Meters(0.0)
+        self.meters = peer.legacy_meters = Meters(0.0)
         self._moved = False
 
     def moved_over(self) -> bool:
@@ -111,7 +111,7 @@ class LegacyPeers:
                 self._drop(self._by_host.pop(host))
         for host, neighbour in wanted.items():
             if host not in self._by_host and neighbour.name is not None:
-                peer = self._state.roster.peer(neighbour.name, self._state.settings)
+                peer = self._state.peer_table.peer(neighbour.name, self._state.settings)
                 if peer is not None:
                     peer.legacy = True
                     peer.lost = False
@@ -121,18 +121,18 @@ class LegacyPeers:
         """It is not named any more; one that was never heard, and for which nothing waits, was never there."""
         peer, state = gone.peer, self._state
         peer.legacy = peer.settling = False
-        peer.fielded_meters = None
-        heard = peer.session is not None or peer.fielded_way is not None
-        if not heard and not peer.outbound.open and not state.outboxes.holds(peer.name):
+        peer.legacy_meters = None
+        heard = peer.session is not None or peer.legacy_path is not None
+        if not heard and not peer.sender.pending and not state.outboxes.holds(peer.name):
             state.ready.pop(peer, None)
-            del state.roster.peers[peer.name]
+            del state.peer_table.peers[peer.name]
 
     def __len__(self) -> int:
         return len(self._by_host)
 
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
         """One datagram without our mark: the fielded format from a configured address, or nothing of ours."""
-        counters = self._state.ledger.counters
+        counters = self._state.event_queue.counters
         legacy = self._by_host.get(source[0])
         if legacy is None or legacy.moved_over() or source != legacy.neighbour.address:
             # Fielded programs send from the port they listen on; another one on that computer is not believed.
@@ -162,12 +162,12 @@ class LegacyPeers:
         legacy.address = source
         legacy.sender.heard()
         peer = legacy.peer
-        peer.fielded_way = (source, link, now)
+        peer.legacy_path = (source, link, now)
         peer.lost = False
         if not peer.online:
             peer.online = True
             peer.online_since = now
-            self._state.ledger.tell(PeerOnline(peer.name, source, link))
+            self._state.event_queue.emit(PeerOnline(peer.name, source, link))
 
     def _take(self, legacy: LegacyPeer, piece: LegacyPayload, link: str, source: Address, now: float) -> None:
         reassembly = legacy.unicasts if piece.wants_ack else legacy.broadcasts
@@ -177,17 +177,17 @@ class LegacyPeers:
         try:
             keep, message = reassembly.add(piece, now)
         finally:
-            self._state.ledger.counters.dropped_over_limit += reassembly.over_limit - too_large
+            self._state.event_queue.counters.dropped_over_limit += reassembly.over_limit - too_large
             if keep and piece.wants_ack:
                 more = legacy.acks.came(piece, now)
                 self._acknowledge(legacy, [LegacyAck(piece.sequence, piece.position), *more])
         if message is not None:
             if not self._may_name(legacy, message):
-                self._state.ledger.counters.dropped_over_limit += 1
+                self._state.event_queue.counters.dropped_over_limit += 1
                 return
-            self._state.ledger.counters.messages_received += 1
+            self._state.event_queue.counters.messages_received += 1
             priority = min(message.priority, PRIORITY_LEVELS - 1)
-            self._state.ledger.tell(
+            self._state.event_queue.emit(
                 MessageReceived(
                     legacy.peer.name,
                     message.topic,
@@ -222,8 +222,8 @@ class LegacyPeers:
 
     def leave(self, now: float, out: list[Datagram]) -> None:
         """Fragments that may leave now."""
-        for legacy in self._fielded():
-            if legacy.link and (legacy.peer.outbound.open or legacy.sender.timer() is not None):
+        for legacy in self._active():
+            if legacy.link and (legacy.peer.sender.pending or legacy.sender.timer() is not None):
                 legacy.sender.leave(legacy.link, legacy.address, now, out)
                 report_ended(self._state, legacy.peer, now)
 
@@ -232,7 +232,7 @@ class LegacyPeers:
         if not self._by_host:
             return float("inf")
         at = self._heartbeat_at
-        for legacy in self._fielded():
+        for legacy in self._active():
             due = legacy.sender.timer()
             if legacy.link:
                 at = min(at, legacy.acks.next_at(), at if due is None else due)
@@ -240,7 +240,7 @@ class LegacyPeers:
 
     def handle_timer(self, now: float) -> None:
         """Acknowledgements that are due; heartbeats, silences and purges, once a second."""
-        for legacy in self._fielded():
+        for legacy in self._active():
             if legacy.link:
                 self._acknowledge(legacy, legacy.acks.due(now))
         if not self._by_host or now < self._heartbeat_at:
@@ -250,7 +250,7 @@ class LegacyPeers:
         self._heartbeat_at = now + LEGACY_HEARTBEAT_S
         state = self._state
         rates = state.settings.rates
-        for legacy in self._fielded():
+        for legacy in self._active():
             peer = legacy.peer
             if asleep_s > ASLEEP_S:
                 legacy.last_heard = min(now, legacy.last_heard + asleep_s)
@@ -258,11 +258,11 @@ class LegacyPeers:
             if peer.online and quiet_s > rates.offline_s:
                 peer.online = False
                 peer.online_since = None
-                state.ledger.tell(PeerOffline(peer.name, left=False))
+                state.event_queue.emit(PeerOffline(peer.name, left=False))
                 shelve(state, peer, now)
             if not peer.online and not peer.lost and quiet_s > rates.peer_lost_s:
                 peer.lost = True
-                peer.outbound.finish_all(Outcome.PEER_LOST)
+                peer.sender.finish_all(Outcome.PEER_LOST)
                 report_ended(state, peer, now)
             legacy.unicasts.purge(now)
             legacy.broadcasts.purge(now)
@@ -271,14 +271,14 @@ class LegacyPeers:
                 peer.settling = False
             if peer.online and legacy.settled_at is None and state.outboxes.holds(peer.name):
                 release_outbox(state, peer, now)
-            legacy.meters.sent.feed(peer.outbound.sent_bytes, now)
-            legacy.meters.delivered.feed(peer.outbound.delivered_bytes, now)
+            legacy.meters.sent.feed(peer.sender.sent_bytes, now)
+            legacy.meters.delivered.feed(peer.sender.delivered_bytes, now)
             legacy.meters.received.feed(legacy.received_bytes, now)
             for link in self._links(legacy):
                 host = encode_legacy(Host(state.settings.name, link.address[0]))
                 state.outgoing.append(Datagram(link.name, legacy.neighbour.address, host, True))
 
-    def _fielded(self) -> list[LegacyPeer]:
+    def _active(self) -> list[LegacyPeer]:
         return [legacy for legacy in self._by_host.values() if not legacy.moved_over()]
 
     def _links(self, legacy: LegacyPeer) -> list[LinkInfo]:

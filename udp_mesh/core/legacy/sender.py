@@ -12,7 +12,7 @@ from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.sender.message import Outgoing
 from udp_mesh.core.sender.pending import Outcome
-from udp_mesh.core.sender.sender import PROBE_S, Outbound
+from udp_mesh.core.sender.sender import PROBE_S, Sender
 from udp_mesh.core.settings import Address
 from udp_mesh.wire.legacy import (
     LAST_SEQUENCE as LAST_SEQUENCE,
@@ -73,7 +73,7 @@ def carries(type_name: str) -> bool:
 
 
 class LegacySender:
-    """The sending half for one fielded peer; queues and outcomes are those of its `Outbound`."""
+    """The sending half for one fielded peer; queues and outcomes are those of its `Sender`."""
 
     __slots__ = (
         "_answers",
@@ -85,13 +85,13 @@ class LegacySender:
         "_sequence",
         "_sequences",
         "_stamp",
-        "outbound",
+        "sender",
         "silent",
     )
 
-    def __init__(self, outbound: Outbound, own_name: str, first_sequence: int) -> None:
+    def __init__(self, sender: Sender, own_name: str, first_sequence: int) -> None:
         """`first_sequence` is drawn for each run: the peer may still hold pieces of our last one (its defect 8)."""
-        self.outbound = outbound
+        self.sender = sender
         self.silent = False
         self._answers = 0
         self._patience_s = LEAST_PATIENCE_S
@@ -107,25 +107,25 @@ class LegacySender:
         """What may leave now: overdue fragments first by age, then new ones, most urgent first."""
         self._forget_ended()
         self._resend(link, address, now, out)
-        outbound = self.outbound
-        scheduler = outbound.scheduler
+        sender = self.sender
+        scheduler = sender.scheduler
         for priority in range(PRIORITY_LEVELS):
-            urgent = priority <= outbound.rates.urgent_priority
-            window = LEGACY_WINDOW + (outbound.rates.urgent_excess_packets if urgent else 0)
+            urgent = priority <= sender.rates.urgent_priority
+            window = LEGACY_WINDOW + (sender.rates.urgent_excess_packets if urgent else 0)
             while scheduler.waiting >> priority & 1 and not self.silent and len(self._legs) < window:
                 run = scheduler.peek(priority)
                 if run is None:
                     break
                 message = run.message
                 if not message.begun and not self._begin(message, now):
-                    outbound.finish(message, ExpiryReason.REFUSED)
+                    sender.finish(message, ExpiryReason.REFUSED)
                     continue
                 run = scheduler.peek(priority)
                 assert run is not None
                 scheduler.take(run, 1)
                 self._send(message, run.position, 1, link, address, now, out)
                 if not message.reliable and run.position == message.fragments - 1 and message.missing == 0:
-                    outbound.finish(message, Outcome.SENT)
+                    sender.finish(message, Outcome.SENT)
 
     def acknowledge(self, sequence: int, position: int, now: float) -> None:
         """The peer has this fragment; unknown ones are ignored."""
@@ -144,14 +144,14 @@ class LegacySender:
         else:
             self._patience_s = max(LEAST_PATIENCE_S, PATIENCE_WANES * self._patience_s)
             # Karn: which try a later acknowledgement answers is unknown.
-            self.outbound.rtt.sample(max(1e-5, now - leg.sent_at), now)
+            self.sender.rtt.sample(max(1e-5, now - leg.sent_at), now)
         message = leg.message
         if not message.ended and message.arrive(position):
-            self.outbound.delivered_bytes += len(self._fragments[message][1][position])
+            self.sender.delivered_bytes += len(self._fragments[message][1][position])
             if not message.missing:
-                self.outbound.finish(message, Outcome.DELIVERED)
-        self.outbound.delivered_packets += 1
-        self.outbound.delivered_at = now
+                self.sender.finish(message, Outcome.DELIVERED)
+        self.sender.delivered_packets += 1
+        self.sender.delivered_at = now
 
     def heard(self) -> None:
         """Anything from the peer ends its silence: everything on its way is due at once."""
@@ -169,7 +169,7 @@ class LegacySender:
         return min(leg.sent_at + self._patience(leg) for leg in self._legs.values())
 
     def _patience(self, leg: _Leg) -> float:
-        timeout = max(self._patience_s, self.outbound.rtt.timeout(0.0))
+        timeout = max(self._patience_s, self.sender.rtt.timeout(0.0))
         doublings = min(leg.tries - 1, DOUBLINGS_WHILE_ANSWERED)
         if leg.answers == self._answers:
             doublings = max(doublings, min(leg.unanswered - 1, DOUBLINGS))
@@ -182,7 +182,7 @@ class LegacySender:
             if leg.unanswered >= TRIES_BEFORE_SILENT and leg.answers == self._answers:
                 self.silent = True
             self._send(leg.message, leg.position, leg.tries + 1, link, address, now, out)
-            self.outbound.retransmitted += 1
+            self.sender.retransmitted += 1
             if self.silent:
                 # One probe; the others wait until it is answered.
                 for other in self._legs.values():
@@ -235,10 +235,10 @@ class LegacySender:
         self._legs[(sequence, position)] = _Leg(message, position, now, tries, self._answers, unanswered)
         payload = LegacyPayload(sequence, position, len(fragments), fragments[position], wants_ack=True)
         data = encode_legacy(payload)
-        urgent = message.priority <= self.outbound.rates.urgent_priority
+        urgent = message.priority <= self.sender.rates.urgent_priority
         out.append(Datagram(link, address, data, urgent))
-        self.outbound.sent_packets += 1
-        self.outbound.sent_bytes += len(data) + 28
+        self.sender.sent_packets += 1
+        self.sender.sent_bytes += len(data) + 28
 
     def _forget_ended(self) -> None:
         for message in [message for message in self._fragments if message.ended]:

@@ -42,17 +42,17 @@ class BootMemory:
 
     def keep(self, session: Session) -> None:
         """The session goes. One that was never proven, and to which nothing was sent, leaves nothing behind."""
-        number = session.way.channel.next_number
+        number = session.path.channel.next_number
         if not (session.proven or session.restored or number):
             return
-        inbound = session.inbound
+        receiver = session.receiver
         self._records.pop(session.boot_id, None)
         self._records[session.boot_id] = _Record(
             session.name,
             number,
             session.next_wire_id,
             session.floors(),
-            (inbound.unicasts.finished, inbound.broadcasts.finished),
+            (receiver.unicasts.finished, receiver.broadcasts.finished),
             session.freshness,
         )
         while len(self._records) > MOST_BOOTS:
@@ -62,14 +62,14 @@ class BootMemory:
     def restore(self, session: Session) -> None:
         """A session made for a boot: it goes on where an earlier one for the same boot stopped."""
         record = self._records.pop(session.boot_id, None)
-        channel = session.way.channel
+        channel = session.path.channel
         if record is None:
             channel.next_number = max(channel.next_number, self._send_floor)
             return
         channel.next_number = max(record.next_number, self._send_floor)
         session.next_wire_id = record.next_wire_id
         session.restore_floors(record.floors)
-        session.inbound.unicasts.finished, session.inbound.broadcasts.finished = record.finished
+        session.receiver.unicasts.finished, session.receiver.broadcasts.finished = record.finished
         session.freshness = record.freshness
         session.restored = True
         session.replaced = record.name == session.name

@@ -40,7 +40,7 @@ MISSED_HEARTBEATS = 3.5
 """A peer is silent for at least so many of the intervals it announced before it counts as offline."""
 
 
-class Discovery:
+class HeartbeatScheduler:
     """`next_at` is when the next heartbeat leaves."""
 
     __slots__ = ("_heard_per_s", "_interval_s", "_last_at", "_listed_from", "_rng", "_to_answer", "next_at")
@@ -59,9 +59,9 @@ class Discovery:
         self._to_answer[session.heard_tag] = None
         if len(self._to_answer) > MOST_TO_ANSWER:
             del self._to_answer[next(iter(self._to_answer))]
-        self.hurry(team, now)
+        self.schedule_now(team, now)
 
-    def hurry(self, team: int, now: float) -> None:
+    def schedule_now(self, team: int, now: float) -> None:
         """A heartbeat within `ANSWER_WITHIN_S`, if the last one is not too recent; later where `team` nodes do so."""
         share_s = team / (MEETING_HASTE * self._heard_per_s)
         soon = now + max(ANSWER_WITHIN_S, share_s) * (0.2 + 0.8 * self._rng.random())
@@ -73,9 +73,9 @@ class Discovery:
         online = [session for session in sessions if session.peer is not None and session.peer.online]
         proven = bool(online) and all(
             session.peer is not None
-            and session.peer.engaged
-            and now - session.peer.outbound.delivered_at < rates.heartbeat_s
-            and session.peer.outbound.delivered_packets
+            and session.peer.has_sender
+            and now - session.peer.sender.delivered_at < rates.heartbeat_s
+            and session.peer.sender.delivered_packets
             for session in online
         )
         base = rates.heartbeat_sparse_s if proven else rates.heartbeat_s
@@ -98,7 +98,7 @@ class Discovery:
         heard = self._heard(sessions, settings.name, now)
         if self._to_answer:
             # More new nodes than one heartbeat can list: the others are not kept waiting for the next regular one.
-            self.hurry(len(sessions), now)
+            self.schedule_now(len(sessions), now)
         return Heartbeat(
             settings.name,
             VERSION,

@@ -22,7 +22,7 @@ REMEMBERED = 256
 """Addresses whose unknown key was reported: a flood of them must not grow memory."""
 
 
-class Mismatches:
+class KeyMismatchLimiter:
     """What of unknown keys is reported; `None` where nothing is to be said now."""
 
     __slots__ = ("_at", "_last", "_left", "_reported", "more")

@@ -26,10 +26,10 @@ def challenge(state: State, session: Session, link: str, source: Address, now: f
     if session.peer is None or now < session.challenged_at + ASK_AGAIN_S:
         return
     session.challenged_at = now
-    way = session.way
-    elsewhere = way.link in state.links and (way.link, way.address) != (link, source)
+    path = session.path
+    elsewhere = path.link in state.links and (path.link, path.address) != (link, source)
     if elsewhere:
-        _ask(state, session, Challenge(way.link, way.address, now, in_use=True))
+        _ask(state, session, Challenge(path.link, path.address, now, in_use=True))
     _ask(state, session, Challenge(link, source, now, in_use=not elsewhere))
 
 
@@ -43,9 +43,9 @@ def _ask(state: State, session: Session, question: Challenge) -> None:
 
 def send_on_path(state: State, session: Session, frame: Frame, link: str, address: Address, now: float) -> None:
     """One small frame to this address, whatever the way in use."""
-    number, data = session.way.seal(encode(session.way.dated([frame], now)))
+    number, data = session.path.seal(encode(session.path.dated([frame], now)))
     if session.current and session.peer is not None:
-        session.peer.outbound.flight.add(number, None)
+        session.peer.sender.in_flight.add(number, None)
     state.outgoing.append(Datagram(link, address, data, True))
 
 

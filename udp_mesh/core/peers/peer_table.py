@@ -27,7 +27,7 @@ class Arrival(Enum):
     FULL = 5
 
 
-class Roster:
+class PeerTable:
     """`tags` maps a short header's tag to the channels it may mean, unicast and broadcast apart."""
 
     __slots__ = (
@@ -118,7 +118,7 @@ class Roster:
     def forget(self, session: Session) -> None:
         """Drop a session and its channels; what these counted is kept."""
         self._boots.keep(session)
-        session.inbound.close()
+        session.receiver.close()
         self.sessions.pop(session.boot_id, None)
         self._strangers.pop(session.boot_id, None)
         self._aside.pop(session.boot_id, None)

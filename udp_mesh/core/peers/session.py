@@ -9,9 +9,9 @@ from typing import NamedTuple
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, Freshness
 from udp_mesh.core.receiver.memory_limit import Memory
-from udp_mesh.core.receiver.receiver import Inbound
-from udp_mesh.core.sender.packetizer import Way
-from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.receiver.receiver import Receiver
+from udp_mesh.core.sender.packetizer import Path
+from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address, Settings
 from udp_mesh.crypto import TO_ALL, Key, ReceiveChannel, SendChannel
 from udp_mesh.wire.frames import Ack, Feature, Frame, Heartbeat, Waiting
@@ -53,45 +53,45 @@ class Meters:
 
 
 class Peer:
-    """A name: what is on its way to it, whichever run of it listens.
+    """A name: what is being sent to it, whichever of its boots receives.
 
-    `outbound` is made when first asked for, and `engaged` is True from then on: in a large team most nodes send to few.
+    `sender` is created on first access, and `has_sender` is True from then on: in a large team most nodes send to few.
     """
 
     __slots__ = (
         "_settings",
         "conflict_reported_at",
-        "engaged",
-        "fielded_meters",
-        "fielded_way",
+        "has_sender",
         "held_until",
         "left",
         "legacy",
+        "legacy_meters",
+        "legacy_path",
         "lost",
         "name",
         "online",
         "online_since",
         "retired",
-        "outbound",
+        "sender",
         "session",
         "settling",
         "timer_at",
         "wants_at",
     )
 
-    outbound: Outbound
+    sender: Sender
 
     def __init__(self, name: str, settings: Settings) -> None:
         self.name = name
         self._settings = settings
-        self.engaged = False
+        self.has_sender = False
         self.session: Session | None = None
         self.online = False
         self.left = False
         self.legacy = False
-        self.fielded_way: tuple[Address, str, float] | None = None
+        self.legacy_path: tuple[Address, str, float] | None = None
         """Address and link from which a fielded program was heard last, and when."""
-        self.fielded_meters: Meters | None = None
+        self.legacy_meters: Meters | None = None
         """Where it speaks the fielded format: no session of it has any."""
         self.settling = False
         """A fielded program that has just started: what outboxes keep for it does not leave yet."""
@@ -108,17 +108,17 @@ class Peer:
         self.held_until: dict[int, float] = {}
         """Priority -> until when the time it is held back for other robots is booked."""
 
-    def __getattr__(self, name: str) -> Outbound:
+    def __getattr__(self, name: str) -> Sender:
         # Only called for a slot not yet set: nothing is paid for this once the sending half is there.
-        if name != "outbound":
+        if name != "sender":
             raise AttributeError(name)
-        self.engaged = True
-        self.outbound = Outbound(self._settings)
-        return self.outbound
+        self.has_sender = True
+        self.sender = Sender(self._settings)
+        return self.sender
 
     def book_held(self, levels: int, now: float, until: float) -> None:
         """Levels of the mask wait here and are held back for other robots' urgent messages until then."""
-        for priority, book in enumerate(self.outbound.levels):
+        for priority, book in enumerate(self.sender.levels):
             if levels >> priority & 1:
                 book.held_s += max(0.0, until - max(now, self.held_until.get(priority, now)))
                 self.held_until[priority] = until
@@ -126,8 +126,8 @@ class Peer:
     def apply(self, settings: Settings) -> None:
         """New settings; nothing on its way is touched."""
         self._settings = settings
-        if self.engaged:
-            self.outbound.apply(settings)
+        if self.has_sender:
+            self.sender.apply(settings)
 
 
 class Session:
@@ -144,7 +144,6 @@ class Session:
         "data_channels",
         "features",
         "freshness",
-        "inbound",
         "interval_s",
         "introduced_at",
         "knows_us",
@@ -155,17 +154,18 @@ class Session:
         "name",
         "next_wire_id",
         "owed",
+        "path",
         "peer",
         "peer_receives",
         "peer_sends",
         "proven",
         "received_bytes",
+        "receiver",
         "replaced",
         "restored",
         "timed",
         "unheard_since",
         "versions",
-        "way",
     )
 
     def __init__(
@@ -205,8 +205,8 @@ class Session:
         self.interval_s = settings.rates.heartbeat_s
         self.versions = (1, 1)
         self.features = 0
-        self.inbound = Inbound(settings.rates, settings.limits, memory or Memory(1 << 62))
-        self.way = Way(SendChannel(keys[0], own_boot, boot_id))
+        self.receiver = Receiver(settings.rates, settings.limits, memory or Memory(1 << 62))
+        self.path = Path(SendChannel(keys[0], own_boot, boot_id))
         self.owed: list[Frame] = []
         self.freshness = Freshness()
         self.timed = False
@@ -233,10 +233,10 @@ class Session:
         """The live keys: channels of keys that stay keep their replay windows; packet numbers go on across keys."""
         self.data_channels = self._receive_channels(self.data_channels, own_boot, keys)
         self.broadcast_channels = self._receive_channels(self.broadcast_channels, TO_ALL, keys)
-        channel = self.way.channel
+        channel = self.path.channel
         if channel.key != keys[0]:
-            self.way.channel = SendChannel(keys[0], own_boot, self.boot_id)
-            self.way.channel.next_number = channel.next_number
+            self.path.channel = SendChannel(keys[0], own_boot, self.boot_id)
+            self.path.channel.next_number = channel.next_number
 
     def _receive_channels(
         self, before: list[ReceiveChannel], receiver: bytes, keys: tuple[Key, ...]
@@ -312,7 +312,7 @@ class Session:
 
     def take_ack(self, now: float, waiting: tuple[Waiting, ...]) -> Ack | None:
         """The acknowledgement to send now, if there is anything to acknowledge; it then counts as sent."""
-        acks = self.inbound.acks
+        acks = self.receiver.acks
         if acks.largest < 0:
             return None
         delay_us = min((1 << 24) - 1, int(max(0.0, now - acks.arrived_at) * 1e6))
@@ -328,4 +328,4 @@ class Session:
         self.interval_s = beat.interval_ms / 1000
         self.versions = (beat.min_version, beat.max_version)
         self.features = beat.features
-        self.timed = self.way.timed = bool(beat.features & Feature.TIMED)
+        self.timed = self.path.timed = bool(beat.features & Feature.TIMED)

@@ -42,7 +42,7 @@ def _topic_bytes(names: tuple[str, str]) -> int:
     return TOPIC_BYTES + sum(len(name) for name in names)
 
 
-class Inbound:
+class Receiver:
     """`arrived` and `refusals` are fetched and cleared by the session."""
 
     __slots__ = (

@@ -92,7 +92,7 @@ def date_of(frames: bytes) -> int | None:
 
 def stale(state: State, session: Session, frames: Sequence[Frame], link: str, source: Address, now: float) -> None:
     """A recording; or its sender's clock stood still (its computer slept), and then its answer says so."""
-    state.ledger.counters.dropped_stale += 1
+    state.event_queue.counters.dropped_stale += 1
     for frame in frames:
         if isinstance(frame, Ping) and session.peer is not None:
             send_on_path(state, session, Pong(frame.token, 0), link, source, now)

@@ -12,7 +12,7 @@ from udp_mesh.core.sender.message import Outgoing
 from udp_mesh.wire.limits import PRIORITY_LEVELS
 
 
-class LevelBook:
+class LevelStats:
     """What is open on one priority level, and how the level fares."""
 
     __slots__ = ("bytes", "held_s", "messages", "order", "starved_reported", "starved_s", "starved_since")
@@ -34,19 +34,19 @@ class LevelBook:
         return order[0] if order else None
 
 
-class Levels:
-    """One `LevelBook` per priority; `queued_bytes` is the sum of what is open on all of them."""
+class PriorityLevels:
+    """One `LevelStats` per priority; `queued_bytes` is the sum of what is open on all of them."""
 
     __slots__ = ("_books", "queued_bytes")
 
     def __init__(self) -> None:
-        self._books = [LevelBook() for _ in range(PRIORITY_LEVELS)]
+        self._books = [LevelStats() for _ in range(PRIORITY_LEVELS)]
         self.queued_bytes = 0
 
-    def __getitem__(self, priority: int) -> LevelBook:
+    def __getitem__(self, priority: int) -> LevelStats:
         return self._books[priority]
 
-    def __iter__(self) -> Iterator[LevelBook]:
+    def __iter__(self) -> Iterator[LevelStats]:
         return iter(self._books)
 
     def enter(self, message: Outgoing) -> None:

@@ -12,11 +12,11 @@ from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.receiver.datagram_age import clock_ms
 from udp_mesh.core.sender.message import Outgoing
 from udp_mesh.core.sender.pending import Outcome
-from udp_mesh.core.sender.rate_limit import Gate
+from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.scheduler import Run
 from udp_mesh.core.sender.send_quota import ack_spacing, look_again, permitted, urgent_may_wait_until, window_room
-from udp_mesh.core.sender.sender import Outbound
-from udp_mesh.core.sender.sent_packets import Mark, Packet
+from udp_mesh.core.sender.sender import Sender
+from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot
 from udp_mesh.core.settings import Address
 from udp_mesh.crypto import LONG_OVERHEAD_BYTES, SHORT_OVERHEAD_BYTES, SendChannel
 from udp_mesh.wire.codec import (
@@ -65,7 +65,7 @@ def datagram_room(address: Address, mtu: int, fragment_bytes: int) -> int:
     return min(mtu - header_bytes(address) - LONG_OVERHEAD_BYTES, fragment_bytes + FRAGMENT_WIDE_BYTES)
 
 
-class Way:
+class Path:
     """How datagrams reach the peer now: link, address, sealing, sizes."""
 
     __slots__ = ("address", "channel", "confirmed", "fragment_bytes", "heard_at", "link", "mtu", "room_bytes", "timed")
@@ -121,83 +121,83 @@ class Way:
 
 
 def leave_level(
-    outbound: Outbound,
-    way: Way,
+    sender: Sender,
+    path: Path,
     priority: int,
     now: float,
     out: list[Datagram],
     room_bytes: int,
-    gates: dict[str, Gate],
+    rate_limits: dict[str, TokenBucket],
 ) -> int:
     """Let what waits on one level leave, at most about `room_bytes`; returns the bytes that left."""
-    urgent_level = priority <= outbound.rates.urgent_priority
-    level_pace = outbound.congestion.pacing_packets_per_s()
+    urgent_level = priority <= sender.rates.urgent_priority
+    level_pace = sender.congestion.pacing_packets_per_s()
     used = 0
-    mark = outbound.mark(now, urgent=urgent_level)
+    snapshot = sender.snapshot(now, urgent=urgent_level)
     while used < room_bytes:
-        run = outbound.scheduler.peek(priority)
+        run = sender.scheduler.peek(priority)
         if run is None:
             break
         urgent = urgent_level and not run.stale
         pace = None if urgent else level_pace
-        room = window_room(outbound, now)
-        most = permitted(outbound, room, now, pace, urgent=urgent)
+        room = window_room(sender, now)
+        most = permitted(sender, room, now, pace, urgent=urgent)
         if most <= 0:
-            outbound.limited = False
+            sender.limited = False
             if urgent:
-                if outbound.silent_since is None:
-                    outbound.wake_at = min(outbound.wake_at, urgent_may_wait_until(outbound))
-            elif (again := look_again(outbound, room, now, pace)) is not None:
-                outbound.wake_at = min(outbound.wake_at, again)
+                if sender.unresponsive_since is None:
+                    sender.wake_at = min(sender.wake_at, urgent_may_wait_until(sender))
+            elif (again := look_again(sender, room, now, pace)) is not None:
+                sender.wake_at = min(sender.wake_at, again)
             break
         message = run.message
         if message.superseded and run.again:
-            outbound.finish(message, ExpiryReason.SUPERSEDED)
+            sender.finish(message, ExpiryReason.SUPERSEDED)
             continue
-        gate = gates.get(message.accepted.channel.name) if gates else None
-        if gate is not None and not gate.open(now):
-            outbound.scheduler.drop_head(run)
-            gate.parked.append((outbound, run))
+        bucket = rate_limits.get(message.accepted.channel.name) if rate_limits else None
+        if bucket is not None and not bucket.open(now):
+            sender.scheduler.drop_head(run)
+            bucket.parked.append((sender, run))
             continue
         if not message.begun:
-            _begin(outbound, way, message)
+            _begin(sender, path, message)
             run = Run(message, 0, message.fragments, again=False)
         before = used
-        is_plain = gate is None and message.accepted.broadcast_number is None
+        is_plain = bucket is None and message.accepted.broadcast_number is None
         if run.position and run.length > 2 and most > 1 and is_plain:
             count = min(run.length - 1, most, 1 + (room_bytes - used) // message.fragment_bytes)
-            used += _leave_run(outbound, way, run, count, mark, out)
+            used += _leave_run(sender, path, run, count, snapshot, out)
         else:
             count = 1
-            used += _leave_one(outbound, way, run, urgent, mark, out)
-        if gate is not None:
-            gate.spend(used - before)
-        if outbound.probe_credit:
-            outbound.probe_credit = max(0, outbound.probe_credit - count)
+            used += _leave_one(sender, path, run, urgent, snapshot, out)
+        if bucket is not None:
+            bucket.spend(used - before)
+        if sender.probe_credit:
+            sender.probe_credit = max(0, sender.probe_credit - count)
         if urgent:
-            outbound.urgent_left_at = now
+            sender.urgent_left_at = now
         else:
-            outbound.pacer.on_sent(count, now, pace)
+            sender.pacer.on_sent(count, now, pace)
     return used
 
 
-def leave_copies(outbound: Outbound, way: Way, now: float, out: list[Datagram]) -> None:
+def leave_copies(sender: Sender, path: Path, now: float, out: list[Datagram]) -> None:
     """Second copies of small urgent messages whose time has come and that were not acknowledged meanwhile."""
-    for message, position in outbound.copies.due(now, outbound.overdue_s()):
-        if outbound.silent_since is not None:
+    for message, position in sender.copies.due(now, sender.overdue_s()):
+        if sender.unresponsive_since is not None:
             continue
         run = Run(message, position, 1, again=True)
         _leave(
-            outbound,
-            way,
+            sender,
+            path,
             [(message, position)],
-            [*_frames(outbound, way, run, now, ack_now=True)],
-            outbound.mark(now, urgent=True),
+            [*_frames(sender, path, run, now, ack_now=True)],
+            sender.snapshot(now, urgent=True),
             out,
         )
 
 
-def leave_large_ping(outbound: Outbound, way: Way, token: int, frames_bytes: int) -> Datagram:
+def leave_large_ping(sender: Sender, path: Path, token: int, frames_bytes: int) -> Datagram:
     """A ping in a datagram that is no smaller than one with `frames_bytes` of frames, and larger by 7 B at most.
 
     What fills it are words of a message that no peer ever sends: that we have it whole.
@@ -208,27 +208,27 @@ def leave_large_ping(outbound: Outbound, way: Way, token: int, frames_bytes: int
         ids = min(MAX_IDS, max(1, -(-(missing - IDS_BYTES) // ID_BYTES)))
         frames.append(Delivered((NO_MESSAGE_ID,) * ids))
         missing -= IDS_BYTES + ID_BYTES * ids
-    number, data = way.seal(encode(frames))
-    outbound.flight.add(number, None)
-    return Datagram(way.link, way.address, data, True)
+    number, data = path.seal(encode(frames))
+    sender.in_flight.add(number, None)
+    return Datagram(path.link, path.address, data, True)
 
 
-def _begin(outbound: Outbound, way: Way, message: Outgoing) -> None:
+def _begin(sender: Sender, path: Path, message: Outgoing) -> None:
     channel = message.accepted.channel
-    first = way.fragment_bytes - HEAD_BYTES
-    if channel.number not in outbound.announced:
+    first = path.fragment_bytes - HEAD_BYTES
+    if channel.number not in sender.announced:
         first -= 5 + len(channel.name.encode()) + len(channel.type_name.encode())
         first -= LENGTH_BYTES
     cast_number = message.accepted.broadcast_number
     if cast_number is not None:
         # the copy of a lost cast keeps its number, or the receiver would take it for another message
-        message.begin(cast_number, way.fragment_bytes, max(1, first))
+        message.begin(cast_number, path.fragment_bytes, max(1, first))
         return
-    message.begin(outbound.next_wire_id, way.fragment_bytes, max(1, first))
-    outbound.next_wire_id += 1
+    message.begin(sender.next_wire_id, path.fragment_bytes, max(1, first))
+    sender.next_wire_id += 1
 
 
-def _leave_run(outbound: Outbound, way: Way, run: Run, count: int, mark: Mark, out: list[Datagram]) -> int:
+def _leave_run(sender: Sender, path: Path, run: Run, count: int, snapshot: SendSnapshot, out: list[Datagram]) -> int:
     """The fast path: `count` full fragments in a row, none of them its message's first or last."""
     message, position = run.message, run.position
     wire_id = message.wire_id
@@ -237,8 +237,8 @@ def _leave_run(outbound: Outbound, way: Way, run: Run, count: int, mark: Mark, o
     offset = message.first_bytes + (position - 1) * size
     body = memoryview(message.body)
     frames = []
-    spacing = ack_spacing(outbound)
-    since = outbound.since_ack_wanted
+    spacing = ack_spacing(sender)
+    since = sender.since_ack_wanted
     wide = position + count > _NARROW_POSITIONS
     pack = _WIDE.pack if wide else _NARROW.pack
     plain = FRAGMENT | FRAGMENT_WIDE if wide else FRAGMENT
@@ -253,109 +253,109 @@ def _leave_run(outbound: Outbound, way: Way, run: Run, count: int, mark: Mark, o
             first |= FRAGMENT_ACK_NOW
         frames.append(pack(first, wire_id, place) + body[offset : offset + size])
         offset += size
-    out.extend(Datagram.run(way.link, way.address, way.seal_run(frames)))
-    outbound.flight.add_run(mark, message, range(position, position + count))
-    outbound.since_ack_wanted = since
-    sent_bytes = count * (size + FRAGMENT_BYTES + way.overhead_bytes)
-    outbound.sent_packets += count
-    outbound.sent_bytes += sent_bytes + IP_UDP_BYTES * count
-    outbound.scheduler.take(run, count)
+    out.extend(Datagram.run(path.link, path.address, path.seal_run(frames)))
+    sender.in_flight.add_run(snapshot, message, range(position, position + count))
+    sender.since_ack_wanted = since
+    sent_bytes = count * (size + FRAGMENT_BYTES + path.overhead_bytes)
+    sender.sent_packets += count
+    sender.sent_bytes += sent_bytes + IP_UDP_BYTES * count
+    sender.scheduler.take(run, count)
     return sent_bytes
 
 
-def _leave_one(outbound: Outbound, way: Way, run: Run, urgent: bool, mark: Mark, out: list[Datagram]) -> int:
+def _leave_one(sender: Sender, path: Path, run: Run, urgent: bool, snapshot: SendSnapshot, out: list[Datagram]) -> int:
     """One datagram with the piece of `run` and, if there is room, small pieces behind it on the same level."""
-    now = mark.sent_at
+    now = snapshot.sent_at
     message = run.message
     pieces: list[tuple[Outgoing, int]] = []
     frames: list[Frame] = []
-    room = way.room_bytes
+    room = path.room_bytes
     priority = message.priority
-    scheduler = outbound.scheduler
+    scheduler = sender.scheduler
     again = 0
-    spacing = ack_spacing(outbound)
-    outbound.since_ack_wanted += 1
+    spacing = ack_spacing(sender)
+    sender.since_ack_wanted += 1
     next_run: Run | None = run
     while next_run is not None:
         message = next_run.message
         if next_run.again and (message, next_run.position) in pieces:
             # Several copies of it were lost: one datagram needs no more than one.
             scheduler.take(next_run, 1)
-            next_run = _next_small(outbound, way, priority, room)
+            next_run = _next_small(sender, path, priority, room)
             continue
-        size = _piece_bytes(outbound, way, next_run)
+        size = _piece_bytes(sender, path, next_run)
         if frames and (size > room or len(frames) >= MAX_FRAMES_PER_DATAGRAM - 3):
             break
         again += next_run.again
         pieces.append((message, next_run.position))
         scheduler.take(next_run, 1)
         last = next_run.position == message.fragments - 1
-        ack_now = urgent or outbound.since_ack_wanted >= spacing or (last and scheduler.nothing_waits(priority))
-        frames.extend(_frames(outbound, way, next_run, now, ack_now=ack_now))
+        ack_now = urgent or sender.since_ack_wanted >= spacing or (last and scheduler.nothing_waits(priority))
+        frames.extend(_frames(sender, path, next_run, now, ack_now=ack_now))
         if ack_now:
-            outbound.since_ack_wanted = 0
+            sender.since_ack_wanted = 0
         room -= size
         if urgent and message.small and not next_run.again:
-            outbound.copy_later(message, next_run.position, now)
+            sender.copy_later(message, next_run.position, now)
         if not message.reliable and last:
-            outbound.finish(message, Outcome.SENT)
+            sender.finish(message, Outcome.SENT)
         if room < LEAST_ROOM_BYTES:
             break
-        next_run = _next_small(outbound, way, priority, room)
-    outbound.retransmitted += again
-    return _leave(outbound, way, pieces, frames, mark, out, urgent=urgent)
+        next_run = _next_small(sender, path, priority, room)
+    sender.retransmitted += again
+    return _leave(sender, path, pieces, frames, snapshot, out, urgent=urgent)
 
 
 def _leave(
-    outbound: Outbound,
-    way: Way,
+    sender: Sender,
+    path: Path,
     pieces: list[tuple[Outgoing, int]],
     frames: list[Frame],
-    mark: Mark,
+    snapshot: SendSnapshot,
     out: list[Datagram],
     *,
     urgent: bool = True,
 ) -> int:
-    number, data = way.seal(way.encode(frames, mark.sent_at))
+    number, data = path.seal(path.encode(frames, snapshot.sent_at))
     (message, position), *more = pieces
-    outbound.flight.add(number, Packet(mark, message, position, tuple(more)))
-    out.append(Datagram(way.link, way.address, data, urgent))
-    outbound.sent_packets += 1
-    outbound.sent_bytes += len(data) + IP_UDP_BYTES
+    sender.in_flight.add(number, Packet(snapshot, message, position, tuple(more)))
+    out.append(Datagram(path.link, path.address, data, urgent))
+    sender.sent_packets += 1
+    sender.sent_bytes += len(data) + IP_UDP_BYTES
     return len(data)
 
 
-def _next_small(outbound: Outbound, way: Way, priority: int, room: int) -> Run | None:
+def _next_small(sender: Sender, path: Path, priority: int, room: int) -> Run | None:
     """The next piece of the level if it is small enough to ride along (ruling out what only the main loop decides)."""
-    run = outbound.scheduler.peek(priority)
+    run = sender.scheduler.peek(priority)
     if run is None or run.message.superseded or run.message.accepted.channel.topic.rate_limit_bytes_per_s is not None:
         return None
     if not run.message.begun:
         if len(run.message.body) > room:
             return None
-        _begin(outbound, way, run.message)
+        _begin(sender, path, run.message)
         run = Run(run.message, 0, run.message.fragments, again=False)
-    return run if _piece_bytes(outbound, way, run) <= room else None
+    return run if _piece_bytes(sender, path, run) <= room else None
 
 
-def _piece_bytes(outbound: Outbound, way: Way, run: Run) -> int:
+def _piece_bytes(sender: Sender, path: Path, run: Run) -> int:
     """Bytes of the frames that carry one piece."""
     message = run.message
     start, end = message.span(run.position)
     size = end - start + FRAGMENT_WIDE_BYTES + LENGTH_BYTES
     if run.position == 0:
-        size += HEAD_BYTES + (LIFE_BYTES if _says_life(way, message) else 0)
+        size += HEAD_BYTES + (LIFE_BYTES if _says_life(path, message) else 0)
         channel = message.accepted.channel
-        if channel.number not in outbound.announced:
+        if channel.number not in sender.announced:
             size += 5 + len(channel.name.encode()) + len(channel.type_name.encode())
     return size
 
 
-def _says_life(way: Way, message: Outgoing) -> bool:
-    return way.timed and way.confirmed and message.accepted.deadline is not None
+def _says_life(path: Path, message: Outgoing) -> bool:
+    return path.timed and path.confirmed and message.accepted.deadline is not None
 
 
-def _frames(outbound: Outbound, way: Way, run: Run, now: float, *, ack_now: bool) -> list[Frame]:
+def _frames(sender: Sender, path: Path, run: Run, now: float, *, ack_now: bool) -> list[Frame]:
     """The piece as a fragment, with head and, until the peer knows it, the topic's name in front of the first."""
     message, position = run.message, run.position
     accepted = message.accepted
@@ -373,10 +373,10 @@ def _frames(outbound: Outbound, way: Way, run: Run, now: float, *, ack_now: bool
         message.priority,
         accepted.flags,
         max(0, int((now - accepted.accepted_at) * 1000)),
-        accepted.life_ms(now) if _says_life(way, message) else None,
+        accepted.life_ms(now) if _says_life(path, message) else None,
     )
     fragment = Fragment(wire_id, 0, payload, head, ack_now, is_cast)
     channel = accepted.channel
-    if channel.number in outbound.announced:
+    if channel.number in sender.announced:
         return [fragment]
     return [TopicAnnounce(channel.number, channel.name, channel.type_name), fragment]

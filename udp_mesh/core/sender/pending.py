@@ -1,6 +1,6 @@
 """The messages of one peer that have no outcome yet: taken on -> replaced, expired, begun anew -> ended, once each.
 
-What becomes of their pieces on the way is `outbound`'s part.
+What becomes of their pieces on the way is `sender`'s part.
 """
 
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
 from udp_mesh.core.events import ExpiryReason
-from udp_mesh.core.sender.level_stats import Levels
+from udp_mesh.core.sender.level_stats import PriorityLevels
 from udp_mesh.core.sender.message import Outgoing
 
 
@@ -27,13 +27,13 @@ class Ended(NamedTuple):
     outcome: Outcome | ExpiryReason
 
 
-class OpenMessages:
+class PendingMessages:
     """`ended` and `cancelled` are fetched and cleared by the session."""
 
     def __init__(self) -> None:
-        self.open: dict[Outgoing, None] = {}
+        self.pending: dict[Outgoing, None] = {}
         """Messages without an outcome, in the order accepted."""
-        self.levels = Levels()
+        self.levels = PriorityLevels()
         self.ended: list[Ended] = []
         self.cancelled: list[int] = []
         """Wire ids given up after they had begun: the peer may forget them."""
@@ -44,7 +44,7 @@ class OpenMessages:
 
     def take_on(self, message: Outgoing) -> None:
         """One more; older ones that its topic does not keep end, or end as what becomes of their pieces."""
-        self.open[message] = None
+        self.pending[message] = None
         self.levels.enter(message)
         self._note_deadline(message)
         keep_last = message.accepted.channel.topic.keep_last
@@ -55,7 +55,7 @@ class OpenMessages:
         if message.accepted.deadline is not None:
             self._deadline_serial += 1
             heappush(self._deadlines, (message.accepted.deadline, self._deadline_serial, message))
-            if len(self._deadlines) > 64 + 2 * len(self.open):
+            if len(self._deadlines) > 64 + 2 * len(self.pending):
                 # What ended long before its deadline must not stay in memory until then.
                 self._deadlines = [entry for entry in self._deadlines if not entry[2].ended]
                 heapify(self._deadlines)
@@ -84,9 +84,9 @@ class OpenMessages:
     def begin_anew(self, message: Outgoing) -> Outgoing:
         """The message under another object, nothing of which has left; it is the youngest of its level."""
         message.ended = True
-        self.open.pop(message, None)
+        self.pending.pop(message, None)
         copy = message.anew()
-        self.open[copy] = None
+        self.pending[copy] = None
         self.levels.stand_last(copy)
         self._note_deadline(copy)
         kept = self._kept.get(copy.accepted.channel.topic.name)
@@ -104,7 +104,7 @@ class OpenMessages:
         self.ended.append(Ended(message, outcome))
 
     def finish_all(self, outcome: Outcome | ExpiryReason) -> None:
-        for message in list(self.open):
+        for message in list(self.pending):
             self.finish(message, outcome)
 
     def withdraw(self, message: Outgoing, *, to_resume: bool = False) -> None:
@@ -116,7 +116,7 @@ class OpenMessages:
 
     def _remove(self, message: Outgoing) -> None:
         message.ended = True
-        del self.open[message]
+        del self.pending[message]
         self.levels.leave(message)
 
     def cancel(self, message: Outgoing) -> None:
@@ -126,12 +126,12 @@ class OpenMessages:
 
     def by_wire_id(self, wire_id: int) -> Outgoing | None:
         """The open message of this number (copies of casts are numbered apart); a search, for rare answers."""
-        own = (message for message in self.open if message.accepted.broadcast_number is None)
+        own = (message for message in self.pending if message.accepted.broadcast_number is None)
         return next((message for message in own if message.wire_id == wire_id), None)
 
     def told_delivered(self, wire_ids: Iterable[int]) -> None:
         """The peer says it has these whole, whatever it acknowledged; a search, for peers of another make."""
         known = set(wire_ids)
-        for message in list(self.open):
+        for message in list(self.pending):
             if message.wire_id in known and message.accepted.broadcast_number is None:
                 self.finish(message, Outcome.DELIVERED)

@@ -67,7 +67,7 @@ LARGE_AT_FIRST_BYTES = 1200
 _INFINITY = float("inf")
 
 
-class PathSize:
+class PathMtu:
     """What is known about one peer's path. `narrowed_at` is when it was last taken for narrower."""
 
     __slots__ = (
@@ -85,9 +85,9 @@ class PathSize:
         "_rounds",
         "_small",
         "_small_lost",
-        "asking",
         "large_bytes",
         "narrowed_at",
+        "probe",
     )
 
     def __init__(self) -> None:
@@ -112,7 +112,7 @@ class PathSize:
         """Small datagrams of earlier doubts."""
         self._probes = 0
         self.narrowed_at: float | None = None
-        self.asking = Asking()
+        self.probe = PmtuProbe()
 
     @property
     def in_doubt(self) -> bool:
@@ -127,7 +127,7 @@ class PathSize:
             if size > self.large_bytes:
                 self._lost += 1
                 self._least_lost = min(self._least_lost, size)
-                left_at = packet.mark.sent_at
+                left_at = packet.snapshot.sent_at
                 most = MOST_AT_A_STRETCH + LOST_PER_ROUND * self._between_small
                 if left_at >= self._counted_at + APART_S and self._between < most:
                     self._counted_at = left_at
@@ -156,7 +156,7 @@ class PathSize:
 
     def answered(self, token: int, now: float) -> None:
         """A ping was answered."""
-        if not self.asking.answered(token) and self.in_doubt:
+        if not self.probe.answered(token) and self.in_doubt:
             self._small_arrived(1, 1, now)
 
     def _small_is_lost(self) -> None:
@@ -203,11 +203,11 @@ class PathSize:
     def narrowed(self, now: float) -> None:
         """The path is taken for narrower from now on."""
         self.reset()
-        self.asking.begin(now)
+        self.probe.begin(now)
         self.narrowed_at = now
 
 
-class Asking:
+class PmtuProbe:
     """When to ask whether a path carries more than it is given, and what was answered."""
 
     __slots__ = ("_at", "_begun_at", "_pause_s", "_times", "_tokens", "carries")

@@ -1,14 +1,14 @@
 """A topic's rate limit: bytes leave when the bucket holds them; until then the topic's messages are parked."""
 
 from udp_mesh.core.sender.scheduler import Run
-from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.sender.sender import Sender
 
 BURST_S = 0.1
 """The bucket holds this much time: short enough that a limit of one second's mean is kept, long enough for a
 message."""
 
 
-class Gate:
+class TokenBucket:
     """One topic's bucket, shared by all destinations. It may go into debt by one datagram."""
 
     __slots__ = ("_at", "_bytes", "bytes_per_s", "parked")
@@ -17,7 +17,7 @@ class Gate:
         self.bytes_per_s = bytes_per_s
         self._bytes = bytes_per_s * BURST_S
         self._at = now
-        self.parked: list[tuple[Outbound, Run]] = []
+        self.parked: list[tuple[Sender, Run]] = []
         """What waits for the bucket: messages, or single pieces to be sent again."""
 
     def open(self, now: float) -> bool:
@@ -37,10 +37,10 @@ class Gate:
     def release(self) -> None:
         """Put everything parked back in front of its level, in its order."""
         parked, self.parked = self.parked, []
-        for outbound, run in reversed(parked):
+        for sender, run in reversed(parked):
             if run.message.ended:
                 continue
             if run.again:
-                outbound.scheduler.push_again(run.message, run.position)
+                sender.scheduler.push_again(run.message, run.position)
             else:
-                outbound.scheduler.push(run.message, first=True)
+                sender.scheduler.push(run.message, first=True)

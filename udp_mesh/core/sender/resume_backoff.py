@@ -11,7 +11,7 @@ BURST_AGAIN_S = 0.1
 MOST_BURST_AGAIN_S = 3.2
 
 
-class Bursts:
+class ResumeBackoff:
     """Those of one silence after another."""
 
     __slots__ = ("_again_s", "_at")

@@ -11,7 +11,7 @@ Acknowledgements go missing in bursts and come late from a process that was not 
 leaves the link idle. For some tens of milliseconds the link is presumed to go on as it did.
 """
 
-from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.sender.sender import Sender
 
 MOST_ACK_SPACING = 10
 """Packets between two that ask for an acknowledgement at once."""
@@ -34,65 +34,65 @@ PRESUMED_FOR_S = 0.03
 """So long the link is presumed to go on delivering; what its packets then wait is bounded by it."""
 
 
-def window_room(outbound: Outbound, now: float) -> int:
+def window_room(sender: Sender, now: float) -> int:
     """Packets for which the window has room; below 0 where more are on their way."""
-    congestion = outbound.congestion
+    congestion = sender.congestion
     packets = congestion.cwnd
-    if outbound.struggling:
+    if sender.timing_out:
         # Packets leave the window by their age only: more of them are young enough than within a round trip.
-        smoothed_rtt = outbound.rtt.smoothed_rtt
+        smoothed_rtt = sender.rtt.smoothed_rtt
         if smoothed_rtt is not None and congestion.assume_delivery():
-            packets *= max(1.0, outbound.timeout() / smoothed_rtt)
+            packets *= max(1.0, sender.timeout() / smoothed_rtt)
     else:
-        late_s = now - _late_at(outbound)
+        late_s = now - _late_at(sender)
         if late_s > 0 and congestion.assume_delivery():
             packets += (congestion.capacity_packets_per_s() or 0.0) * min(late_s, PRESUMED_FOR_S)
-    room = int(packets) - outbound.flight.outstanding
+    room = int(packets) - sender.in_flight.outstanding
     if room <= 0 and congestion.drain_overdue(now):
         # A drain ends with the round trip of a piece that is not urgent: one may leave whatever else is on its way.
-        room = max(room, 1 - outbound.flight.others_outstanding())
+        room = max(room, 1 - sender.in_flight.others_outstanding())
     return room
 
 
-def permitted(outbound: Outbound, room: int, now: float, packets_per_s: float | None, *, urgent: bool) -> int:
+def permitted(sender: Sender, room: int, now: float, packets_per_s: float | None, *, urgent: bool) -> int:
     """Packets that may leave now; `packets_per_s` is the pacing, which urgent pieces do not wait for."""
-    if outbound.silent_since is not None:
-        return outbound.probe_credit
+    if sender.unresponsive_since is not None:
+        return sender.probe_credit
     packets = room
     if urgent:
-        packets += outbound.rates.urgent_excess_packets
-        if packets <= 0 and now >= urgent_may_wait_until(outbound):
+        packets += sender.rates.urgent_excess_packets
+        if packets <= 0 and now >= urgent_may_wait_until(sender):
             packets = 1
     else:
-        packets = min(packets, outbound.pacer.packets_allowed(now, packets_per_s))
-    return max(packets, outbound.probe_credit)
+        packets = min(packets, sender.pacer.packets_allowed(now, packets_per_s))
+    return max(packets, sender.probe_credit)
 
 
-def urgent_may_wait_until(outbound: Outbound) -> float:
+def urgent_may_wait_until(sender: Sender) -> float:
     """When an urgent piece leaves whatever is on its way (to a silent peer it is a probe)."""
-    return outbound.urgent_left_at + URGENT_WAIT_S
+    return sender.urgent_left_at + URGENT_WAIT_S
 
 
-def look_again(outbound: Outbound, room: int, now: float, packets_per_s: float | None) -> float | None:
+def look_again(sender: Sender, room: int, now: float, packets_per_s: float | None) -> float | None:
     """When more may leave although nothing arrives until then; None: only an acknowledgement changes anything."""
-    if outbound.silent_since is not None:
+    if sender.unresponsive_since is not None:
         return None
     if room > 0:
-        return outbound.pacer.wake_at(packets_per_s)
-    late_at = _late_at(outbound)
-    if outbound.struggling or now >= late_at + PRESUMED_FOR_S or not outbound.congestion.assume_delivery():
+        return sender.pacer.wake_at(packets_per_s)
+    late_at = _late_at(sender)
+    if sender.timing_out or now >= late_at + PRESUMED_FOR_S or not sender.congestion.assume_delivery():
         return None
-    return max(now, late_at) + outbound.rates.pace_quantum_s
+    return max(now, late_at) + sender.rates.pace_quantum_s
 
 
-def ack_spacing(outbound: Outbound) -> int:
+def ack_spacing(sender: Sender) -> int:
     """Packets between two that ask for an acknowledgement at once."""
-    often = max(LOSSY_ACK_SPACING, 1.0 - LOSS_WEIGHT * outbound.loss)
-    return max(2, min(MOST_ACK_SPACING, int(outbound.congestion.cwnd * ACK_SPACING * often)))
+    often = max(LOSSY_ACK_SPACING, 1.0 - LOSS_WEIGHT * sender.loss)
+    return max(2, min(MOST_ACK_SPACING, int(sender.congestion.cwnd * ACK_SPACING * often)))
 
 
-def _late_at(outbound: Outbound) -> float:
+def _late_at(sender: Sender) -> float:
     """When the next acknowledgement should have come."""
-    capacity = outbound.congestion.capacity_packets_per_s()
-    spacing_s = ack_spacing(outbound) / capacity if capacity else 0.0
-    return outbound.last_progress + max(LATE_AFTER_S, spacing_s)
+    capacity = sender.congestion.capacity_packets_per_s()
+    spacing_s = ack_spacing(sender) / capacity if capacity else 0.0
+    return sender.last_progress + max(LATE_AFTER_S, spacing_s)

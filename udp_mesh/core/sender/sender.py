@@ -16,12 +16,12 @@ from udp_mesh.core.congestion.pacer import Pacer
 from udp_mesh.core.congestion.rtt import INITIAL_PTO_S, RttEstimator
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.sender.message import Outgoing
-from udp_mesh.core.sender.pending import OpenMessages, Outcome
-from udp_mesh.core.sender.pmtu import PathSize
+from udp_mesh.core.sender.pending import Outcome, PendingMessages
+from udp_mesh.core.sender.pmtu import PathMtu
 from udp_mesh.core.sender.redundancy import OVERDUE_ROUND_TRIPS, Copies
-from udp_mesh.core.sender.resume_backoff import RETURN_BURST_PACKETS, Bursts
+from udp_mesh.core.sender.resume_backoff import RETURN_BURST_PACKETS, ResumeBackoff
 from udp_mesh.core.sender.scheduler import Scheduler
-from udp_mesh.core.sender.sent_packets import Flight, Mark, Packet
+from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot, SentPackets
 from udp_mesh.core.settings import Rates, Settings
 from udp_mesh.wire.frames import Ack
 
@@ -52,7 +52,7 @@ OTHERS_TELL_S = 1.0
 """So long the round trip of packets that are not urgent is the one that counts."""
 
 
-class Outbound(OpenMessages):
+class Sender(PendingMessages):
     """The sending half of a session. Times in seconds."""
 
     def __init__(self, settings: Settings) -> None:
@@ -63,7 +63,7 @@ class Outbound(OpenMessages):
         self._other_sampled_at = float("-inf")
         self.congestion: CongestionController = DelayBasedController(self.rtt)
         self.pacer = Pacer(settings.rates.pace_quantum_s)
-        self.flight = Flight()
+        self.in_flight = SentPackets()
         self.scheduler = Scheduler()
         self.rates: Rates = settings.rates
         self.announced: set[int] = set()
@@ -76,8 +76,8 @@ class Outbound(OpenMessages):
         """Mask of levels from which something left in this round."""
         self.wake_at = float("inf")
         """When pacing lets the next quantum leave."""
-        self.silent_since: float | None = None
-        self.struggling = False
+        self.unresponsive_since: float | None = None
+        self.timing_out = False
         """Acknowledgements stay away: packets are taken for lost by their age."""
         self.overdue: list[Packet] = []
         """Packets that timed out and are neither known to have arrived nor sent again."""
@@ -85,8 +85,8 @@ class Outbound(OpenMessages):
         self.urgent_left_at = float("-inf")
         self.probe_credit = 0
         self.probed_at = float("-inf")
-        self._bursts = Bursts()
-        self.path_size = PathSize()
+        self._resume_backoff = ResumeBackoff()
+        self.pmtu = PathMtu()
         self.last_progress = 0.0
         self.other_progress = 0.0
         """When the last packet that was not urgent arrived."""
@@ -120,9 +120,9 @@ class Outbound(OpenMessages):
     def accept(self, message: Outgoing, now: float) -> None:
         """Take a message on: it waits on its level."""
         self.take_on(message)
-        if not self.flight.outstanding and self.silent_since is None:
+        if not self.in_flight.outstanding and self.unresponsive_since is None:
             self.last_progress = now
-        if self.silent_since is not None and message.priority <= self.rates.urgent_priority:
+        if self.unresponsive_since is not None and message.priority <= self.rates.urgent_priority:
             # A fresh urgent message is itself the best probe: what waited until now stands behind it.
             self.allow_probe(now)
         self.scheduler.push(message)
@@ -131,23 +131,23 @@ class Outbound(OpenMessages):
 
     def acknowledge(self, ack: Ack, now: float) -> None:
         """Book an acknowledgement of the peer."""
-        flight = self.flight
+        in_flight = self.in_flight
         received = ack.received << 1 | 1
         # Sparse traffic has too few successors to lose packets otherwise.
-        timed_out = flight.confirm_timed_out(ack.largest, received) if ack.largest < flight.next_number else 0
-        spurious = flight.spurious
-        acknowledged, lost, newest = flight.acknowledge(ack.largest, received)
+        timed_out = in_flight.confirm_timed_out(ack.largest, received) if ack.largest < in_flight.next_number else 0
+        spurious = in_flight.spurious
+        acknowledged, lost, newest = in_flight.acknowledge(ack.largest, received)
         if acknowledged:
             # What was acknowledged late, all at once, says nothing about the rate of the link.
-            after_silence = self.struggling or self.silent_since is not None
+            after_silence = self.timing_out or self.unresponsive_since is not None
             self.last_progress = now
-            if not all(packet.mark.urgent for packet in acknowledged):
+            if not all(packet.snapshot.urgent for packet in acknowledged):
                 self.other_progress = now
-            self.struggling = False
-            if self.silent_since is not None:
+            self.timing_out = False
+            if self.unresponsive_since is not None:
                 self._end_silence()
-            if self.path_size.in_doubt:
-                self.path_size.arrived(acknowledged, flight.spurious - spurious, now)
+            if self.pmtu.in_doubt:
+                self.pmtu.arrived(acknowledged, in_flight.spurious - spurious, now)
             self._book_arrivals(acknowledged)
             if self.overdue:
                 self._settle_overdue()
@@ -157,24 +157,24 @@ class Outbound(OpenMessages):
             count = len(acknowledged)
             self.delivered_packets += count
             if newest is not None:
-                mark = newest.mark
-                if self._sample(max(1e-5, now - mark.sent_at - ack.delay_us * 1e-6), now, urgent=mark.urgent):
+                snapshot = newest.snapshot
+                if self._sample(max(1e-5, now - snapshot.sent_at - ack.delay_us * 1e-6), now, urgent=snapshot.urgent):
                     largest = ack.largest
-                elapsed = max(now - mark.delivered_at, mark.sent_at - mark.delivered_sent_at)
+                elapsed = max(now - snapshot.delivered_at, snapshot.sent_at - snapshot.delivered_sent_at)
                 if elapsed > 0 and not after_silence:
-                    rate = (self.delivered_packets - mark.delivered) / elapsed
-                self.delivered_sent_at = mark.sent_at
-                ahead = mark.ahead_of(ack.largest)
+                    rate = (self.delivered_packets - snapshot.delivered) / elapsed
+                self.delivered_sent_at = snapshot.sent_at
+                ahead = snapshot.ahead_of(ack.largest)
             self.delivered_at = now
-            limited = newest is None or newest.mark.limited
-            outstanding = flight.outstanding
-            if self.congestion.drain_overdue(now) and not flight.others_outstanding():
+            limited = newest is None or newest.snapshot.limited
+            outstanding = in_flight.outstanding
+            if self.congestion.drain_overdue(now) and not in_flight.others_outstanding():
                 # The few urgent ones that leave during a drain are no queue.
                 outstanding = 0
             self.congestion.on_ack(
                 count,
                 largest,
-                flight.next_number,
+                in_flight.next_number,
                 outstanding,
                 rate,
                 limited=limited,
@@ -183,7 +183,7 @@ class Outbound(OpenMessages):
                 now=now,
             )
         if lost:
-            self.path_size.lost(lost)
+            self.pmtu.lost(lost)
             self._put_back(lost)
         lost_packets = len(lost) + timed_out
         total = len(acknowledged) + lost_packets
@@ -261,10 +261,10 @@ class Outbound(OpenMessages):
     def timer(self) -> float | None:
         """When `handle_timer` wants to be called for probes, deadlines or second copies. Late answers do no harm."""
         at: float | None = None
-        if self.silent_since is not None:
-            if self.open or self.flight.outstanding:
-                at = self.probed_at + self._probe_every(self.silent_since)
-        elif self.flight.outstanding:
+        if self.unresponsive_since is not None:
+            if self.pending or self.in_flight.outstanding:
+                at = self.probed_at + self._probe_interval_s(self.unresponsive_since)
+        elif self.in_flight.outstanding:
             at = self._expiry_at()
         deadline = self.next_deadline()
         if deadline is not None and (at is None or deadline < at):
@@ -283,13 +283,14 @@ class Outbound(OpenMessages):
         self.expire(now)
         if self.wake_at <= now:
             self.wake_at = float("inf")
-        if self.silent_since is not None:
-            if now >= self.probed_at + self._probe_every(self.silent_since) and (self.open or self.flight.outstanding):
+        if self.unresponsive_since is not None:
+            awaited = self.pending or self.in_flight.outstanding
+            if awaited and now >= self.probed_at + self._probe_interval_s(self.unresponsive_since):
                 self.allow_probe(now)
-        elif self.flight.outstanding:
+        elif self.in_flight.outstanding:
             timeout = self.timeout()
             if now >= self.last_progress + max(SILENT_AFTER_TIMEOUTS * timeout, SILENT_AFTER_S):
-                self.silent_since = now
+                self.unresponsive_since = now
                 self.allow_probe(now)
             elif now >= self._expiry_at():
                 self.expired_at = now
@@ -297,7 +298,7 @@ class Outbound(OpenMessages):
 
     def _expiry_at(self) -> float:
         """When to look for packets whose acknowledgement is overdue."""
-        oldest = self.flight.oldest()
+        oldest = self.in_flight.oldest()
         if oldest is None:
             return float("inf")
         timeout = self.timeout()
@@ -312,13 +313,13 @@ class Outbound(OpenMessages):
         Whether they, or only their acknowledgements, were lost the next acknowledgement will tell: until then urgent
         pieces are sent again, others only if nothing else waits.
         """
-        self.struggling = True
-        for packet in self.flight.lose_before(sent_before):
+        self.timing_out = True
+        for packet in self.in_flight.lose_before(sent_before):
             if packet.message.priority <= self.rates.urgent_priority:
                 self._put_back((packet,))
             else:
                 self.overdue.append(packet)
-            self.path_size.lost((packet,))
+            self.pmtu.lost((packet,))
         if self.overdue and not self.scheduler.waiting:
             self._settle_overdue()
 
@@ -326,8 +327,8 @@ class Outbound(OpenMessages):
         overdue, self.overdue = self.overdue, []
         self._put_back(overdue)
 
-    def _probe_every(self, silent_since: float) -> float:
-        return PROBE_SOON_S if self.probed_at - silent_since < PROBE_SOON_FOR_S else PROBE_S
+    def _probe_interval_s(self, unresponsive_since: float) -> float:
+        return PROBE_SOON_S if self.probed_at - unresponsive_since < PROBE_SOON_FOR_S else PROBE_S
 
     def allow_probe(self, now: float) -> None:
         """The most urgent waiting piece may leave although the peer is silent; not more often than `PROBE_SOON_S`."""
@@ -340,64 +341,64 @@ class Outbound(OpenMessages):
     def probes_small(self, now: float) -> bool:
         """Whether the probe just allowed shall be a ping: nothing waits, or full pieces may be too large for the path
         (then one probe in a few, once the silence is no short cut)."""
-        if self.silent_since is None or not self.probe_credit:
+        if self.unresponsive_since is None or not self.probe_credit:
             return False
         if self.scheduler.waiting:
-            long_since = now - self.silent_since > PROBE_SOON_FOR_S
-            if not (long_since and self.path_size.ask_small()):
+            long_since = now - self.unresponsive_since > PROBE_SOON_FOR_S
+            if not (long_since and self.pmtu.ask_small()):
                 return False
             self.probe_credit = 0
-        self.path_size.asked_small()
+        self.pmtu.asked_small()
         return True
 
     def _set_aside(self) -> None:
         """Everything on its way waits again, urgent messages behind those still to come."""
         self._settle_overdue()
-        given_up = self.flight.give_up()
-        self.path_size.lost(given_up)
+        given_up = self.in_flight.give_up()
+        self.pmtu.lost(given_up)
         self._put_back(given_up)
         self.scheduler.set_aside(self.rates.urgent_priority)
 
     def heard(self, now: float) -> None:
         """Something authentic came from the peer. After a silence a first burst leaves, the rest when it is
         acknowledged."""
-        if self.silent_since is None or now < self.probed_at + PROBE_SOON_S * 0.99:
+        if self.unresponsive_since is None or now < self.probed_at + PROBE_SOON_S * 0.99:
             return
-        if self._bursts.due(now):
+        if self._resume_backoff.due(now):
             self.allow_probe(now)
             self.probe_credit = min(RETURN_BURST_PACKETS, int(self.congestion.cwnd))
 
     def _end_silence(self) -> None:
-        self.silent_since = None
-        self._bursts.reset()
+        self.unresponsive_since = None
+        self._resume_backoff.reset()
         self.probe_credit = 0
         self.scheduler.set_aside(self.rates.urgent_priority)
 
     def reprioritize(self) -> None:
         """Topics changed their priorities: what waits moves to its new level."""
-        if self.levels.rearrange(self.open):
-            self.scheduler.rebuild(list(self.open), pieces=True)
+        if self.levels.rearrange(self.pending):
+            self.scheduler.rebuild(list(self.pending), pieces=True)
 
     # Anew
 
     def restart(self, now: float) -> None:
         """The peer runs anew (or must be told anew): every open message begins again under new numbers."""
-        self.flight.restart(0)
+        self.in_flight.restart(0)
         self.overdue.clear()
         self.announced.clear()
         self.copies.clear()
         self.cancelled.clear()
         self.next_wire_id = 0
         self.epoch += 1
-        self.silent_since = None
-        self.struggling = False
+        self.unresponsive_since = None
+        self.timing_out = False
         self.probe_credit = 0
         self.last_progress = now
-        messages = list(self.open)
-        self.open.clear()
+        messages = list(self.pending)
+        self.pending.clear()
         for message in messages:
             self.begin_anew(message)
-        self.scheduler.rebuild(list(self.open), pieces=False)
+        self.scheduler.rebuild(list(self.pending), pieces=False)
 
     def send_anew(self, message: Outgoing) -> None:
         """The peer forgot the pieces it had of this one."""
@@ -412,17 +413,17 @@ class Outbound(OpenMessages):
             if not copy.arrived[position]:
                 self.scheduler.push_again(copy, position)
 
-    def mark(self, now: float, *, urgent: bool = False) -> Mark:
+    def snapshot(self, now: float, *, urgent: bool = False) -> SendSnapshot:
         """The state in which the packets of one burst leave."""
-        if not self.flight.outstanding and not self.struggling and self.silent_since is None:
+        if not self.in_flight.outstanding and not self.timing_out and self.unresponsive_since is None:
             self.delivered_at = self.delivered_sent_at = self.last_progress = now
-        return Mark(
+        return SendSnapshot(
             now,
             self.delivered_packets,
             self.delivered_at,
             self.delivered_sent_at,
             self.limited,
             urgent,
-            self.flight.next_number,
-            self.flight.outstanding,
+            self.in_flight.next_number,
+            self.in_flight.outstanding,
         )

@@ -23,7 +23,7 @@ REMEMBERED_LOST = 256
 """Packets called lost that an acknowledgement may still correct: those its bitmap covers."""
 
 
-class Mark(NamedTuple):
+class SendSnapshot(NamedTuple):
     """The state in which a burst of packets was sent, shared by all of them; for round trip and rate samples."""
 
     sent_at: float
@@ -49,13 +49,13 @@ class Mark(NamedTuple):
 class Packet(NamedTuple):
     """One packet on its way, and the pieces of messages in it."""
 
-    mark: Mark
+    snapshot: SendSnapshot
     message: Outgoing
     position: int
     more: tuple[tuple[Outgoing, int], ...] = ()
 
 
-class Flight:
+class SentPackets:
     """`outstanding` counts the packets neither acknowledged nor lost."""
 
     __slots__ = (
@@ -88,7 +88,7 @@ class Flight:
 
     def others_outstanding(self) -> int:
         """How many of `outstanding` are not urgent. Walks the queue."""
-        return sum(packet is not None and not packet.mark.urgent for packet in self._packets)
+        return sum(packet is not None and not packet.snapshot.urgent for packet in self._packets)
 
     def add(self, number: int, packet: Packet | None) -> None:
         """A packet left; None for one that asks for no acknowledgement. Every number of the channel comes, in order."""
@@ -100,11 +100,11 @@ class Flight:
             return
         packets.append(packet)
 
-    def add_run(self, mark: Mark, message: Outgoing, positions: range) -> None:
+    def add_run(self, snapshot: SendSnapshot, message: Outgoing, positions: range) -> None:
         """As `add` for a packet of each piece, which have the next numbers; without a call in Python for each."""
         self.outstanding += len(positions)
         self._packets.extend(
-            map(partial(tuple.__new__, Packet), zip(repeat(mark), repeat(message), positions, repeat(())))
+            map(partial(tuple.__new__, Packet), zip(repeat(snapshot), repeat(message), positions, repeat(())))
         )
 
     def acknowledge(self, largest: int, received: int) -> tuple[list[Packet], list[Packet], Packet | None]:
@@ -139,7 +139,7 @@ class Flight:
         reorder = self.reorder_packets
         for behind in range(count):
             packet = packets[count - 1 - behind]
-            if packet is not None and received >> behind & 1 and not packet.mark.urgent:
+            if packet is not None and received >> behind & 1 and not packet.snapshot.urgent:
                 self._largest_other = max(self._largest_other, largest - behind)
                 break
         ahead = largest - self._largest_other
@@ -149,7 +149,7 @@ class Flight:
             if packet is not None:
                 if received >> behind & 1:
                     acknowledged.append(packet)
-                elif behind >= (reorder if packet.mark.urgent else reorder + ahead):
+                elif behind >= (reorder if packet.snapshot.urgent else reorder + ahead):
                     lost.append(packet)
                     self._remember(largest - behind, packet, overtaken=True)
                 else:
@@ -198,14 +198,14 @@ class Flight:
         self.outstanding = 0
         return lost
 
-    def oldest(self) -> Mark | None:
+    def oldest(self) -> SendSnapshot | None:
         """The mark of the first packet still on its way."""
         packets = self._packets
         while packets and packets[0] is None:
             packets.popleft()
             self.base += 1
         front = packets[0] if packets else None
-        return front.mark if front is not None else None
+        return front.snapshot if front is not None else None
 
     def lose_before(self, sent_before: float) -> list[Packet]:
         """Packets sent before that time count as lost."""
@@ -214,11 +214,11 @@ class Flight:
         while packets:
             packet = packets[0]
             if packet is not None:
-                if packet.mark.sent_at > sent_before + 1e-9:
+                if packet.snapshot.sent_at > sent_before + 1e-9:
                     break
                 lost.append(packet)
                 self._remember(self.base, packet, overtaken=False)
-                if packet.mark.urgent:
+                if packet.snapshot.urgent:
                     self._timed_out.append(self.base)
             packets.popleft()
             self.base += 1

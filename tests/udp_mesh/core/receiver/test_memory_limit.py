@@ -43,7 +43,7 @@ def test_many_names_together_hold_no_more_than_one_bound_and_leave_room_for_a_pe
             insider.say(channel, Fragment(number % 40, 1 + number, bytes(1300)))
     held = both.b.conditions(both.now).partial_bytes
     assert TOTAL // 3 < held <= TOTAL
-    assert both.b._state.roster.memory.bytes <= TOTAL
+    assert both.b._state.peer_table.memory.bytes <= TOTAL
     for node, other in ((both.a, "b"), (both.b, "a")):
         node.send("any", bytes(30_000), destination=other, now=both.now)
     both.roundtrip(times=60)
@@ -60,9 +60,9 @@ def test_topic_names_and_tiny_messages_count_too() -> None:
                 TopicAnnounce(number, "t" * 250 + str(number)),
                 Fragment(number, 0, b"x", MessageHead(9, 5, 1, 0, 1)),
             )
-    memory = both.b._state.roster.memory
+    memory = both.b._state.peer_table.memory
     assert TOTAL // 3 < memory.bytes <= TOTAL
-    kept = sum(len(session.inbound.topics) for session in both.b._state.roster.sessions.values())
+    kept = sum(len(session.receiver.topics) for session in both.b._state.peer_table.sessions.values())
     assert kept < 8 * 1000
 
 
@@ -72,12 +72,12 @@ def test_what_a_forgotten_peer_held_is_free_again() -> None:
     for number in range(200):
         for channel in insider.channels:
             insider.say(channel, Fragment(number % 40, 1 + number, bytes(1300)))
-    roster = both.b._state.roster
-    for session in list(roster.sessions.values()):
+    peer_table = both.b._state.peer_table
+    for session in list(peer_table.sessions.values()):
         if session.name.startswith("ghost"):
-            roster.forget(session)
-    assert roster.memory.bytes < 10_000
-    assert roster.memory.holders <= 1
+            peer_table.forget(session)
+    assert peer_table.memory.bytes < 10_000
+    assert peer_table.memory.holders <= 1
 
 
 def test_whole_messages_give_back_what_their_pieces_took() -> None:
@@ -86,7 +86,7 @@ def test_whole_messages_give_back_what_their_pieces_took() -> None:
         both.a.send("any", bytes(300_000), destination="b", now=both.now)
         both.roundtrip(times=200, step_s=0.005)
     assert len([event for event in both.events(both.b) if isinstance(event, MessageReceived)]) == 5
-    assert both.b._state.roster.memory.bytes < 2000
+    assert both.b._state.peer_table.memory.bytes < 2000
 
 
 def test_past_the_half_a_peer_gets_an_equal_part_and_past_the_whole_nobody_gets_any() -> None:

@@ -11,8 +11,8 @@ from tests.udp_mesh.core.pair import BROADCAST, IP_UDP_BYTES, Pipe, World, setti
 from udp_mesh.core.events import MessageDelivered, MessageId, MessageReceived, PathNarrowed, PeerOnline
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.sender.message import Accepted, Channel, Outgoing
-from udp_mesh.core.sender.pmtu import ASK_AT_MOST_EVERY_S, ASKED_TIMES, PathSize
-from udp_mesh.core.sender.sent_packets import Mark, Packet
+from udp_mesh.core.sender.pmtu import ASK_AT_MOST_EVERY_S, ASKED_TIMES, PathMtu
+from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot
 from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
 from udp_mesh.wire.frames import MessageFlag
 
@@ -45,17 +45,17 @@ def met(
     for name in ("a", "b"):
         node = world.add(settings(name, *TOPICS, fragment_bytes=fragment_bytes))
         node.link_up(LinkInfo("mesh", LinkKind.BROADCAST, world.addresses[name], BROADCAST, mtu=link_mtu), world.now)
-    for way in world.pipes:
-        world.pipes[way] = Narrow(mtu=mtu, loss=loss, delay_s=delay_s)
+    for path in world.pipes:
+        world.pipes[path] = Narrow(mtu=mtu, loss=loss, delay_s=delay_s)
     assert world.run(20.0, until=partial(knows, world))
     return world
 
 
 def become(world: World, mtu: int) -> None:
     """Every path carries so much from now on."""
-    for way in world.pipes.values():
-        assert isinstance(way, Narrow)
-        way.mtu = mtu
+    for path in world.pipes.values():
+        assert isinstance(path, Narrow)
+        path.mtu = mtu
 
 
 def narrow(world: World) -> list[int]:
@@ -230,9 +230,9 @@ def test_a_path_taken_for_narrow_by_mistake_is_wide_again_within_minutes_however
         world = met(1280, seed=seed)
         world.send("a", "map", bytes(20_000), "b")
         assert world.run(20.0, until=partial(found_narrow, world))
-        for way in world.pipes.values():
-            assert isinstance(way, Narrow)
-            way.mtu, way.loss = 1500, loss
+        for path in world.pipes.values():
+            assert isinstance(path, Narrow)
+            path.mtu, path.loss = 1500, loss
         largest = largest_of(world)
         for _ in range(200):
             world.send("a", "status", bytes(100), "b")
@@ -244,19 +244,19 @@ def test_a_path_taken_for_narrow_by_mistake_is_wide_again_within_minutes_however
 
 
 def test_a_path_that_carries_large_pings_and_nothing_else_is_asked_ever_more_seldom_too() -> None:
-    size = PathSize()
+    size = PathMtu()
     now = 0.0
     asked: list[float] = []
     while now < 1200.0:
         if size.narrowed_at is None:
             size.narrowed(now)
-        assert size.asking.carries == 0
-        while not size.asking.due(now, 0.0):
+        assert size.probe.carries == 0
+        while not size.probe.due(now, 0.0):
             now += 0.5
         asked.append(now)
-        size.asking.asked(1, 1500)
+        size.probe.asked(1, 1500)
         size.answered(1, now)
-        assert size.asking.carries == 1500
+        assert size.probe.carries == 1500
         # Wide again, and narrow soon after.
         now += 5.0
         size.narrowed_at = None
@@ -268,12 +268,12 @@ def packet(size_bytes: int, now: float) -> Packet:
     accepted = Accepted(MessageId(1), Channel(0, Topic("t"), "t", ""), body, body, MessageFlag.RELIABLE, now, None)
     message = Outgoing(accepted, 8, reliable=True)
     message.begin(1, 1400, 1400)
-    return Packet(Mark(now, 0, now, now, limited=False), message, 0)
+    return Packet(SendSnapshot(now, 0, now, now, limited=False), message, 0)
 
 
 def narrowings(hours: float, arrives: Callable[[float], bool], *, large_arrive: bool = True) -> int:
     """How often a silent peer, probed four times a second, is taken for behind a narrow path."""
-    size = PathSize()
+    size = PathMtu()
     large, small = packet(1350, 0.0), packet(100, 0.0)
     count = 0
     for step in range(int(hours * 3600 * 4)):
@@ -283,7 +283,7 @@ def narrowings(hours: float, arrives: Callable[[float], bool], *, large_arrive: 
             if arrives(now):
                 size.answered(0, now)
         elif not (arrives(now) and large_arrive):
-            size.lost([large._replace(mark=small.mark._replace(sent_at=now))])
+            size.lost([large._replace(snapshot=small.snapshot._replace(sent_at=now))])
         elif size.in_doubt:
             size.arrived([large], 0, now)
         if size.too_narrow(now):
@@ -334,8 +334,8 @@ def test_a_long_path_that_loses_most_is_not_taken_for_narrow(round_trip_s: float
         for name in ("a", "b"):
             world.add(settings(name, *TOPICS))
         assert world.run(20.0, until=partial(knows, world))
-        for way in world.pipes.values():
-            way.rate_bits_per_s, way.delay_s, way.loss = 1e6, round_trip_s / 2, loss
+        for path in world.pipes.values():
+            path.rate_bits_per_s, path.delay_s, path.loss = 1e6, round_trip_s / 2, loss
         for tenth in range(300):
             world.send("a", "status", bytes(100), "b")
             world.send("b", "status", bytes(100), "a")
@@ -351,8 +351,8 @@ def test_loss_and_cuts_of_any_size_are_not_taken_for_a_narrow_path(loss: float) 
     rng = random.Random(2)
 
     def cut_or_heal() -> None:
-        for way in world.pipes.values():
-            way.up = not way.up
+        for path in world.pipes.values():
+            path.up = not path.up
         world.at(world.now + rng.uniform(0.05, 1.5), cut_or_heal)
 
     def publish() -> None:
@@ -442,8 +442,8 @@ def test_a_path_that_becomes_long_and_lossy_is_not_taken_for_narrow_nor_does_any
 
     publish()
     world.run(3.0)
-    for way in world.pipes.values():
-        way.delay_s, way.loss = 1.0, loss
+    for path in world.pipes.values():
+        path.delay_s, path.loss = 1.0, loss
     assert world.run(60.0, until=lambda: len(topics(world, "a", MessageDelivered)) == 110)
     world.run(5.0)
     assert narrow(world) == []

@@ -65,10 +65,10 @@ def test_the_window_does_not_go_by_urgent_packets_that_pass_the_others() -> None
     run = Run(urgent=True)
     run.start()
     run.world.run(3.0)
-    outbound = run.world.nodes["a"]._state.roster.peers["b"].outbound
-    smoothed = outbound.rtt.smoothed_rtt
-    assert not outbound._sample(0.001, run.world.now, urgent=True)
-    assert outbound.rtt.smoothed_rtt == smoothed
-    assert outbound._sample(0.030, run.world.now, urgent=False)
+    sender = run.world.nodes["a"]._state.peer_table.peers["b"].sender
+    smoothed = sender.rtt.smoothed_rtt
+    assert not sender._sample(0.001, run.world.now, urgent=True)
+    assert sender.rtt.smoothed_rtt == smoothed
+    assert sender._sample(0.030, run.world.now, urgent=False)
     # where nothing else is sent urgent packets are all there is to measure
-    assert outbound._sample(0.001, run.world.now + 10.0, urgent=True)
+    assert sender._sample(0.001, run.world.now + 10.0, urgent=True)
