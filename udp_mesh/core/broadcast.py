@@ -14,7 +14,7 @@ from dataclasses import replace
 from udp_mesh.core.interfaces import Datagram, RandomSource
 from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.receiver.datagram_age import clock_ms
-from udp_mesh.core.sender.message import Accepted
+from udp_mesh.core.sender.message import AcceptedMessage
 from udp_mesh.core.settings import Address
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES, SendChannel
 from udp_mesh.wire.codec import encode
@@ -42,9 +42,9 @@ class BroadcastQueue:
     __slots__ = ("_copies", "_kept", "_kept_bytes", "_levels", "_number", "_unrepaired", "free_at", "waiting")
 
     def __init__(self) -> None:
-        self._levels: list[deque[Accepted]] = [deque() for _ in range(PRIORITY_LEVELS)]
+        self._levels: list[deque[AcceptedMessage]] = [deque() for _ in range(PRIORITY_LEVELS)]
         self._copies: deque[tuple[float, list[Datagram]]] = deque()
-        self._kept: OrderedDict[int, Accepted] = OrderedDict()
+        self._kept: OrderedDict[int, AcceptedMessage] = OrderedDict()
         self._kept_bytes = 0
         self._number = 0
         self._unrepaired = 0
@@ -60,7 +60,7 @@ class BroadcastQueue:
     def kept_bytes(self) -> int:
         return self._kept_bytes
 
-    def push(self, accepted: Accepted) -> None:
+    def push(self, accepted: AcceptedMessage) -> None:
         topic = accepted.channel.topic
         level = self._levels[topic.priority]
         if topic.keep_last is not None:
@@ -95,11 +95,11 @@ class BroadcastQueue:
         packets_per_s: float | None,
         copy_after_s: float | None,
         kept_limit_bytes: int,
-        dated_bytes: int,
+        max_timestamped_bytes: int,
     ) -> None:
         """Let the casts of a level leave on all `paths` (link, address); `copy_after_s` sends them a second time
         then. Those of at
-        most `dated_bytes` say when they left."""
+        most `max_timestamped_bytes` say when they left."""
         level = self._levels[priority]
         paths = list(paths)
         while level:
@@ -111,8 +111,8 @@ class BroadcastQueue:
             if accepted.deadline is not None and accepted.deadline <= now:
                 continue
             frames = self._frames(accepted, now, kept_limit_bytes)
-            encoded = encode(_dated(frames, accepted, now))
-            if len(encoded) + SHORT_OVERHEAD_BYTES > dated_bytes:
+            encoded = encode(_with_timestamp(frames, accepted, now))
+            if len(encoded) + SHORT_OVERHEAD_BYTES > max_timestamped_bytes:
                 encoded = encode(frames)
             _, data = channel.seal(encoded)
             urgent = packets_per_s is None
@@ -123,7 +123,7 @@ class BroadcastQueue:
                 self._copies.append((now + copy_after_s, datagrams))
         self.waiting &= ~(1 << priority)
 
-    def leave_copies(self, now: float, out: list[Datagram]) -> None:
+    def send_copies(self, now: float, out: list[Datagram]) -> None:
         while self._copies and self._copies[0][0] <= now:
             out.extend(self._copies.popleft()[1])
 
@@ -132,11 +132,11 @@ class BroadcastQueue:
         at = self._copies[0][0] if self._copies else float("inf")
         return min(at, self.free_at) if self.waiting else at
 
-    def repair(self, number: int) -> Accepted | None:
+    def repair(self, number: int) -> AcceptedMessage | None:
         """The cast of this number, if still kept."""
         return self._kept.get(number)
 
-    def _frames(self, accepted: Accepted, now: float, limit_bytes: int) -> tuple[TopicAnnounce, Fragment]:
+    def _frames(self, accepted: AcceptedMessage, now: float, limit_bytes: int) -> tuple[TopicAnnounce, Fragment]:
         channel = accepted.channel
         flags = accepted.flags | MessageFlag.TO_ALL
         if channel.topic.repair:
@@ -158,7 +158,7 @@ class BroadcastQueue:
         )
 
 
-def _dated(frames: tuple[TopicAnnounce, Fragment], accepted: Accepted, now: float) -> list[Frame]:
+def _with_timestamp(frames: tuple[TopicAnnounce, Fragment], accepted: AcceptedMessage, now: float) -> list[Frame]:
     """The same, with the time and what remains of the message's life."""
     announce, fragment = frames
     assert fragment.head is not None

@@ -9,7 +9,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from udp_mesh.core.events import MessageId
-from udp_mesh.core.sender.message import Channel
+from udp_mesh.core.sender.message import TopicChannel
 
 LEVEL = 1
 """zlib's fastest: an embedded core compresses several times faster than a mesh carries."""
@@ -124,7 +124,7 @@ class Unpacked:
     their copies is on disk."""
 
     message_id: MessageId
-    channel: Channel
+    channel: TopicChannel
     payload: bytes
     names: tuple[str, ...]
     accepted_at: float

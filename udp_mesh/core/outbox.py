@@ -16,7 +16,7 @@ from heapq import heapify, heappop, heappush
 
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.interfaces import Store, StoredMessage
-from udp_mesh.core.sender.message import Accepted, Outgoing
+from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage
 from udp_mesh.core.settings import Outbox
 
 
@@ -24,9 +24,9 @@ from udp_mesh.core.settings import Outbox
 class Held:
     """One message held for one peer; `store_key` where it is on disk."""
 
-    accepted: Accepted
+    accepted: AcceptedMessage
     store_key: int | None
-    begun: Outgoing | None = None
+    begun: OutgoingMessage | None = None
     """What has left of it, where the peer may have it."""
     epoch: int = 0
     """`Sender.epoch` in which it began."""
@@ -95,7 +95,7 @@ class Outboxes:
         self._next_key = max((message.key for message in stored), default=-1) + 1
         return stored
 
-    def keep(self, peer: str, accepted: Accepted, now: float) -> int | None:
+    def keep(self, peer: str, accepted: AcceptedMessage, now: float) -> int | None:
         """Put a message on disk, where its topic wants that; its key there, None where it is held in memory alone."""
         topic = accepted.channel.topic
         if self._store is None or not topic.outbox_on_disk or topic.outbox is Outbox.NONE:

@@ -22,8 +22,8 @@ from udp_mesh.core.peers.path_validation import challenge
 from udp_mesh.core.peers.peer_table import Arrival
 from udp_mesh.core.peers.session import STALE_PATH_S, Challenge, Peer, Session
 from udp_mesh.core.publish import release_outbox, report_ended, shelve
-from udp_mesh.core.sender.message import Outgoing
-from udp_mesh.core.sender.packetizer import Path, datagram_room, leave_large_ping
+from udp_mesh.core.sender.message import OutgoingMessage
+from udp_mesh.core.sender.packetizer import Path, build_mtu_probe, datagram_room
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.pmtu import NARROWER_MTUS
 from udp_mesh.core.sender.sender import Sender
@@ -175,7 +175,7 @@ def heard(state: State, session: Session, link: str, source: Address, now: float
             return
         come_online(state, peer, session, now)
     if peer.has_sender and peer.sender.unresponsive_since is not None:
-        peer.sender.heard(now)
+        peer.sender.on_activity(now)
         state.ready[peer] = None
 
 
@@ -239,7 +239,7 @@ def _move(state: State, session: Session, link: str, source: Address, now: float
     first = not path.link
     old = path.address
     before = path.fragment_bytes
-    path.lead(link, source, info.mtu, state.settings.fragment_bytes)
+    path.switch_to(link, source, info.mtu, state.settings.fragment_bytes)
     path.heard_at = now
     if not first and session.proven and session.peer is not None:
         state.event_queue.emit(PeerAddressChanged(session.name, old, source, link))
@@ -255,7 +255,7 @@ def refit(state: State, session: Session, mtu: int) -> None:
     if sender is not None and sender.pmtu.narrowed_at is not None:
         mtu = min(mtu, path.mtu)
     before = path.mtu
-    path.lead(path.link, path.address, mtu, state.settings.fragment_bytes)
+    path.switch_to(path.link, path.address, mtu, state.settings.fragment_bytes)
     if sender is not None and mtu < before:
         _fit(sender, path, all_of_it=False)
 
@@ -274,10 +274,10 @@ def _fit(sender: Sender, path: Path, *, all_of_it: bool) -> None:
             for position, there in enumerate(message.arrived)
         ):
             sender.cancel(message)
-            sender.send_anew(message)
+            sender.resend_from_start(message)
 
 
-def _size(message: Outgoing, position: int) -> int:
+def _size(message: OutgoingMessage, position: int) -> int:
     start, end = message.span(position)
     return end - start
 
@@ -289,17 +289,17 @@ def _measure_path(state: State, peer: Peer, session: Session, now: float) -> Non
     fragment_bytes = state.settings.fragment_bytes
     rooms = {mtu: datagram_room(path.address, mtu, fragment_bytes) for mtu in NARROWER_MTUS}
     narrower = [mtu for mtu, room in rooms.items() if room < path.room_bytes]
-    if size.too_narrow(now) and narrower:
-        path.lead(path.link, path.address, narrower.pop(0), fragment_bytes)
-        size.narrowed(now)
+    if size.is_black_hole(now) and narrower:
+        path.switch_to(path.link, path.address, narrower.pop(0), fragment_bytes)
+        size.on_narrowed(now)
         state.event_queue.emit(PathNarrowed(peer.name, path.mtu, path.fragment_bytes))
         _fit(sender, path, all_of_it=True)
         state.ready[peer] = None
     size.large_bytes = rooms[narrower[0]] if narrower else float("inf")
     if size.narrowed_at is None or info is None:
         return
-    if size.probe.carries > path.mtu:
-        path.lead(path.link, path.address, min(size.probe.carries, info.mtu), fragment_bytes)
+    if size.probe.confirmed_mtu > path.mtu:
+        path.switch_to(path.link, path.address, min(size.probe.confirmed_mtu, info.mtu), fragment_bytes)
         size.reset()
     rooms = {mtu: room for mtu, room in rooms.items() if mtu < info.mtu}
     rooms[info.mtu] = datagram_room(path.address, info.mtu, fragment_bytes)
@@ -309,8 +309,8 @@ def _measure_path(state: State, peer: Peer, session: Session, now: float) -> Non
     elif peer.online and path.confirmed and sender.unresponsive_since is None and size.probe.due(now, sender.loss):
         for room, mtu in larger.items():
             token = state.rng.getrandbits(64)
-            size.probe.asked(token, mtu)
-            state.outgoing.append(leave_large_ping(sender, path, token, room))
+            size.probe.on_probe_sent(token, mtu)
+            state.outgoing.append(build_mtu_probe(sender, path, token, room))
 
 
 def leave(state: State, session: Session, now: float) -> None:

@@ -22,7 +22,7 @@ from udp_mesh.core.events import (
 from udp_mesh.core.legacy.sender import carries
 from udp_mesh.core.outbox import Held
 from udp_mesh.core.peers.session import Peer, Session
-from udp_mesh.core.sender.message import Accepted, Channel, Outgoing
+from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, header_bytes
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.pmtu import ETHERNET_MTU
@@ -107,7 +107,7 @@ def stop_packing(state: State, now: float) -> None:
 
 
 def _enqueue_all(
-    state: State, accepted: Accepted, names: Sequence[str], now: float, store_keys: Sequence[int | None] = ()
+    state: State, accepted: AcceptedMessage, names: Sequence[str], now: float, store_keys: Sequence[int | None] = ()
 ) -> None:
     if names:
         for name, store_key in zip_longest(names, store_keys):
@@ -141,31 +141,31 @@ def _room_for(state: State, topic: Topic, names: list[str], size_bytes: int) -> 
     return None
 
 
-def channel_of(state: State, topic: Topic, type_name: str) -> Channel | None:
+def channel_of(state: State, topic: Topic, type_name: str) -> TopicChannel | None:
     """The topic's number on the air with this type; None when there are too many, or where no receiver takes the type's
     name: it would refuse every datagram that announces it, with all that is packed beside it."""
     channel = state.channels.get((topic.name, type_name))
     if channel is None:
         if len(state.channels) >= MOST_CHANNELS or not is_type_name(type_name):
             return None
-        channel = Channel(len(state.channels), topic, topic.name, type_name)
+        channel = TopicChannel(len(state.channels), topic, topic.name, type_name)
         state.channels[(topic.name, type_name)] = channel
     return channel
 
 
 def _accept(
-    message_id: MessageId, channel: Channel, payload: bytes, packed: bytes | None, accepted_at: float
-) -> Accepted:
+    message_id: MessageId, channel: TopicChannel, payload: bytes, packed: bytes | None, accepted_at: float
+) -> AcceptedMessage:
     topic = channel.topic
     flags = MessageFlag.RELIABLE if topic.reliable else MessageFlag(0)
     if packed is not None:
         flags |= MessageFlag.COMPRESSED
     deadline = None if topic.deadline_s is None else accepted_at + topic.deadline_s
     body = payload if packed is None else packed
-    return Accepted(message_id, channel, payload, body, flags, accepted_at, deadline)
+    return AcceptedMessage(message_id, channel, payload, body, flags, accepted_at, deadline)
 
 
-def enqueue(state: State, name: str, accepted: Accepted, now: float, store_key: int | None = None) -> None:
+def enqueue(state: State, name: str, accepted: AcceptedMessage, now: float, store_key: int | None = None) -> None:
     """One destination's copy: into the queue of a peer in reach, else where the topic's outbox says."""
     topic = accepted.channel.topic
     peer = state.peer_table.peer(name, state.settings)
@@ -184,10 +184,10 @@ def enqueue(state: State, name: str, accepted: Accepted, now: float, store_key: 
     _queue(state, peer, accepted, now, store_key)
 
 
-def _queue(state: State, peer: Peer, accepted: Accepted, now: float, store_key: int | None) -> None:
+def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, store_key: int | None) -> None:
     """On its way to a peer, in reach or not."""
     topic = accepted.channel.topic
-    message = Outgoing(accepted, topic.priority, reliable=topic.reliable)
+    message = OutgoingMessage(accepted, topic.priority, reliable=topic.reliable)
     message.store_key = store_key
     sender = peer.sender
     sender.accept(message, now)
@@ -205,14 +205,14 @@ def inflates(session: Session) -> bool:
     return bool(session.features & Feature.ZLIB)
 
 
-def unpacked(accepted: Accepted) -> Accepted:
+def unpacked(accepted: AcceptedMessage) -> AcceptedMessage:
     """The message as it was accepted."""
     if not accepted.flags & MessageFlag.COMPRESSED:
         return accepted
     return replace(accepted, body=accepted.payload, flags=accepted.flags & ~MessageFlag.COMPRESSED)
 
 
-def _to_all(state: State, accepted: Accepted, now: float) -> None:
+def _to_all(state: State, accepted: AcceptedMessage, now: float) -> None:
     topic = accepted.channel.topic
     accepted = replace(accepted, flags=accepted.flags | MessageFlag.TO_ALL)
     sessions = [peer.session for peer in state.peer_table.online() if peer.session is not None]
@@ -239,7 +239,7 @@ def broadcast_room(state: State, sessions: Iterable[Session]) -> int:
     return room
 
 
-def _broadcast_bytes(accepted: Accepted) -> int:
+def _broadcast_bytes(accepted: AcceptedMessage) -> int:
     """The datagram of a broadcast of this message."""
     channel = accepted.channel
     names = ANNOUNCE_BYTES + len(channel.name.encode()) + len(channel.type_name.encode())
@@ -324,7 +324,7 @@ def report_ended(state: State, peer: Peer, now: float) -> None:
             report_expired(state, peer.name, accepted, outcome)
 
 
-def report_expired(state: State, peer: str, accepted: Accepted, reason: ExpiryReason) -> None:
+def report_expired(state: State, peer: str, accepted: AcceptedMessage, reason: ExpiryReason) -> None:
     """An accepted message was given up."""
     state.event_queue.counters.messages_expired += 1
     if accepted.flags & MessageFlag.RELIABLE:

@@ -13,7 +13,7 @@ from udp_mesh.core.peers.path_validation import send_on_path
 from udp_mesh.core.peers.session import Session
 from udp_mesh.core.publish import report_ended
 from udp_mesh.core.receiver.replay_check import broadcast_lateness_s, data_lateness_s, date_of, long_lateness_s
-from udp_mesh.core.sender.message import Accepted, Outgoing
+from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
 from udp_mesh.crypto import TO_ALL, Key, OpenError, ReceiveChannel, ReplayError, UnknownKeyError, check_long
@@ -212,7 +212,7 @@ def _take_frames(
                     state.ready[peer] = None
             case Delivered(message_ids, broadcast_ids):
                 if not broadcast_ids:
-                    sender.told_delivered(message_ids)
+                    sender.on_delivered(message_ids)
                     report_ended(state, peer, now)
             case Nack(message_id):
                 _repair(state, session, message_id, now)
@@ -224,7 +224,7 @@ def _take_frames(
                     # It asks whether we are there, not whether we know another way.
                     send_on_path(state, session, Pong(token, 0), link, source, now)
             case Pong(token):
-                sender.pmtu.answered(token, now)
+                sender.pmtu.on_pong(token, now)
             case Bye():
                 leave(state, session, now)
             case _:
@@ -272,7 +272,7 @@ def _take_refusal(state: State, session: Session, refused: Refused) -> None:
         return
     match refused.reason:
         case RefuseReason.FORGOTTEN:
-            sender.send_anew(message)
+            sender.resend_from_start(message)
         case RefuseReason.NO_MEMORY:
             # Its packets stay unacknowledged and come again by themselves.
             return
@@ -292,7 +292,7 @@ def _repair(state: State, session: Session, number: int, now: float) -> None:
     if any(message.accepted.broadcast_number == number for message in peer.sender.pending):
         return
     state.event_queue.counters.repairs_sent += 1
-    copy = Accepted(
+    copy = AcceptedMessage(
         accepted.message_id,
         accepted.channel,
         accepted.payload,
@@ -302,7 +302,7 @@ def _repair(state: State, session: Session, number: int, now: float) -> None:
         accepted.deadline,
         number,
     )
-    peer.sender.accept(Outgoing(copy, accepted.channel.topic.priority, reliable=True), now)
+    peer.sender.accept(OutgoingMessage(copy, accepted.channel.topic.priority, reliable=True), now)
     state.ready[peer] = None
 
 

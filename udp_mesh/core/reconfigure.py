@@ -11,7 +11,7 @@ from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peer_lifecycle import refit
 from udp_mesh.core.peers.heartbeat import leads
 from udp_mesh.core.publish import channel_of, enqueue, report_ended, report_expired, stop_packing
-from udp_mesh.core.sender.message import Accepted
+from udp_mesh.core.sender.message import AcceptedMessage
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.settings import LinkInfo, LinkKind, Neighbour, Settings, Topic
 from udp_mesh.core.state import State, live_keys
@@ -34,7 +34,7 @@ def restore_outboxes(state: State, now: float) -> None:
         state.next_message_id += 1
         flags = MessageFlag.RELIABLE if channel.topic.reliable else MessageFlag(0)
         deadline = None if stored.remaining_s is None else now + stored.remaining_s
-        accepted = Accepted(message_id, channel, stored.payload, stored.payload, flags, now, deadline)
+        accepted = AcceptedMessage(message_id, channel, stored.payload, stored.payload, flags, now, deadline)
         enqueue(state, stored.peer, accepted, now, stored.key)
 
 
@@ -162,7 +162,7 @@ def _retopic(state: State, now: float) -> None:
     for name in list(state.rate_limits):
         rate = state.topics[name].rate_limit_bytes_per_s if name in state.topics else None
         bucket = state.rate_limits[name]
-        bucket.release()
+        bucket.unpark()
         if rate is None:
             del state.rate_limits[name]
         else:

@@ -20,7 +20,7 @@ from udp_mesh.core.peers.key_mismatch import KeyMismatchLimiter
 from udp_mesh.core.peers.peer_table import PeerTable
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.priority_backoff import PriorityBackoff
-from udp_mesh.core.sender.message import Channel
+from udp_mesh.core.sender.message import TopicChannel
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
@@ -69,7 +69,7 @@ class State:
         self.look_from = 0
         """Where the next round of housekeeping begins."""
         self.topics: dict[str, Topic] = {topic.name: topic for topic in settings.topics}
-        self.channels: dict[tuple[str, str], Channel] = {}
+        self.channels: dict[tuple[str, str], TopicChannel] = {}
         self.rate_limits: dict[str, TokenBucket] = {}
         self.next_message_id = 1
         self.ready: dict[Peer, None] = {}

@@ -14,7 +14,7 @@ from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.publish import broadcast_room, expire_held, pack, report_ended
 from udp_mesh.core.receive import unpack
 from udp_mesh.core.receiver.datagram_age import clock_ms
-from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, leave_copies, leave_level
+from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, send_copies, send_level
 from udp_mesh.core.settings import Address, LinkKind
 from udp_mesh.core.state import HOUSEKEEPING_S, State
 from udp_mesh.wire.codec import encode
@@ -125,7 +125,7 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
         if sender.cancelled and not sender.scheduler.waiting:
             state.owe(session)
         if sender.copies:
-            leave_copies(sender, session.path, now, out)
+            send_copies(sender, session.path, now, out)
         if sender.scheduler.waiting:
             if not session.path.confirmed and not session.knows_us and now >= session.introduced_at + INTRODUCE_AGAIN_S:
                 session.introduced_at = now
@@ -137,7 +137,7 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
             mask |= sender.scheduler.waiting
         else:
             del state.ready[peer]
-            sender.limited = True
+            sender.app_limited = True
             state.arm(peer)
     held = mask & ~allowed
     mask &= allowed
@@ -155,7 +155,7 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
                 continue
             session = peer.session
             assert session is not None
-            used = leave_level(sender, session.path, priority, now, out, room, state.rate_limits)
+            used = send_level(sender, session.path, priority, now, out, room, state.rate_limits)
             if used:
                 sender.served |= bit
             room -= used
@@ -166,13 +166,13 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
     for peer in peers:
         sender = peer.sender
         if sender.served:
-            sender.levels.book_served(sender.served, sender.scheduler.waiting, now)
+            sender.levels.record_served(sender.served, sender.scheduler.waiting, now)
             sender.served = 0
         if sender.ended:
             report_ended(state, peer, now)
         if room > 0:
             state.ready.pop(peer, None)
-            sender.limited = not sender.scheduler.waiting
+            sender.app_limited = not sender.scheduler.waiting
         if held & sender.scheduler.waiting:
             until = state.priority_backoff.holds_until(now)
             if until is not None:
@@ -204,11 +204,11 @@ def _leave_casts(state: State, priority: int, now: float, out: list[Datagram]) -
         packets_per_s=None if urgent else rates.broadcast_packets_per_s,
         copy_after_s=rates.twice_gap_s if twice else None,
         kept_limit_bytes=state.settings.limits.repair_bytes,
-        dated_bytes=_dated_bytes(state),
+        max_timestamped_bytes=_max_timestamped_bytes(state),
     )
 
 
-def _dated_bytes(state: State) -> int:
+def _max_timestamped_bytes(state: State) -> int:
     """The largest broadcast that may say when it left: none, where some peer takes no dates."""
     sessions = [peer.session for peer in state.peer_table.online() if peer.session is not None]
     return broadcast_room(state, sessions) if all(session.timed for session in sessions) else 0
@@ -229,7 +229,7 @@ def next_timer(state: State) -> float | None:
     at = min(state.housekeeping_at, state.heartbeats.next_at, state.broadcasts.next_at(), state.next_peer_at())
     for bucket in state.rate_limits.values():
         if bucket.parked:
-            at = min(at, bucket.opens_at())
+            at = min(at, bucket.ready_at())
     if (state.packing or state.unpacking) and not state.closed:
         # At once, again and again; whatever else is due is done in between.
         return _ALWAYS
@@ -256,7 +256,7 @@ def handle_timer(state: State, now: float) -> None:
                 session.receiver.acks.now_wanted = True
                 session.receiver.acks.due_at = None
                 state.owe(session)
-            if sender.probes_small(now):
+            if sender.consume_small_probe(now):
                 session.owe(Ping(state.rng.getrandbits(64)))
                 state.owe(session)
         state.ready[peer] = None
@@ -264,14 +264,14 @@ def handle_timer(state: State, now: float) -> None:
     if state.heartbeats.next_at <= now:
         _send_heartbeats(state, now)
     for bucket in state.rate_limits.values():
-        if bucket.parked and bucket.open(now):
+        if bucket.parked and bucket.has_tokens(now):
             waiting = {sender for sender, _ in bucket.parked}
-            bucket.release()
+            bucket.unpark()
             for peer in state.peer_table.peers.values():
                 if peer.has_sender and peer.sender in waiting:
                     state.ready[peer] = None
     broadcasts: list[Datagram] = []
-    state.broadcasts.leave_copies(now, broadcasts)
+    state.broadcasts.send_copies(now, broadcasts)
     state.outgoing.extend(broadcasts)
     if state.packing:
         pack(state, now)

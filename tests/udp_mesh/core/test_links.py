@@ -47,9 +47,9 @@ class Run:
         self.urgent = urgent
         self.arrived: list[tuple[float, float]] = []
         """(sent, arrived) of urgent messages."""
-        self.world.on_event = self._note
+        self.world.on_event = self._push
 
-    def _note(self, name: str, event: Event, now: float) -> None:
+    def _push(self, name: str, event: Event, now: float) -> None:
         if isinstance(event, MessageReceived) and event.topic == "stop":
             self.arrived.append((float(event.payload[:20]), now))
 

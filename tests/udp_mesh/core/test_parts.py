@@ -134,7 +134,7 @@ def test_every_packet_is_acknowledged_or_lost_as_a_plain_model_says(plan: list[t
             book(acknowledged, "acknowledged")
             book(lost, "lost")
         elif what == "give up":
-            book(in_flight.give_up(), "lost")
+            book(in_flight.abandon_all(), "lost")
         assert in_flight.outstanding == sum(1 for index in sent if index not in ended)
     for index, how in ended.items():
         if how == "acknowledged":
@@ -171,7 +171,7 @@ def test_urgent_packets_that_timed_out_count_as_lost_once_an_acknowledgement_say
     in_flight = SentPackets()
     for number in range(8):
         in_flight.add(number, Packet(URGENT, outgoing(1, 1), number))
-        in_flight.lose_before(1.0)
+        in_flight.declare_lost_before(1.0)
     # 0, 2, 4 and 6 arrived; of 5 and 7 it is too early to tell.
     assert in_flight.confirm_timed_out(7, 0b10101010) == 2
     assert in_flight.confirm_timed_out(7, 0b10101010) == 0
@@ -225,8 +225,8 @@ def test_a_bucket_lets_no_more_through_than_its_rate_and_burst(visits: list[tupl
     bucket, now, spent = TokenBucket(10_000, 0.0), 0.0, 0
     for wait, size in visits:
         now += wait
-        if bucket.open(now):
-            bucket.spend(size)
+        if bucket.has_tokens(now):
+            bucket.consume(size)
             spent += size
     assert spent <= 10_000 * now + 1000 + 3000
 

@@ -154,8 +154,8 @@ def silent_world() -> tuple[World, list[Datagram]]:
 
 
 @pytest.mark.parametrize("dated", [True, False])
-def test_an_old_hello_raises_no_peer(dated: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not dated:
+def test_an_old_hello_raises_no_peer(with_timestamp: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not with_timestamp:
         without_dates(monkeypatch)
     world, recorded = silent_world()
     online = len(world.told("b", PeerOnline))
@@ -169,9 +169,9 @@ def test_an_old_hello_raises_no_peer(dated: bool, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("dated", [True, False])
 def test_a_peer_that_was_away_comes_back_within_a_round_trip_of_its_hello(
-    dated: bool, monkeypatch: pytest.MonkeyPatch
+    with_timestamp: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if not dated:
+    if not with_timestamp:
         without_dates(monkeypatch)
     world = World(seed=2)
     for name in "ab":
@@ -214,9 +214,9 @@ def roaming(seed: int, loss: float) -> World:
 
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("dated", [True, False])
-def test_resent_datagrams_move_no_path(seed: int, dated: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resent_datagrams_move_no_path(seed: int, with_timestamp: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """An attacker that repeats overheard datagrams from its own address wins the race where the original is lost."""
-    if not dated:
+    if not with_timestamp:
         without_dates(monkeypatch)
     world = roaming(seed, 0.2)
 
@@ -331,9 +331,9 @@ def test_no_number_is_used_twice_for_a_pair_of_boots_however_many_runs_took_the_
 @pytest.mark.parametrize("away_s", [15.0, 200.0])
 @pytest.mark.parametrize("dated", [True, False])
 def test_a_robot_replaced_for_a_while_is_believed_again(
-    away_s: float, dated: bool, monkeypatch: pytest.MonkeyPatch
+    away_s: float, with_timestamp: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if not dated:
+    if not with_timestamp:
         without_dates(monkeypatch)
     world = World(seed=7)
     world.add(settings("base", Topic("map", priority=7)))

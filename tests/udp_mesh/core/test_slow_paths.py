@@ -4,7 +4,7 @@ import pytest
 
 from tests.udp_mesh.core.pair import World, settings
 from udp_mesh.core.events import MessageDelivered, MessageReceived
-from udp_mesh.core.sender.send_quota import URGENT_WAIT_S
+from udp_mesh.core.sender.send_quota import MAX_URGENT_WAIT_S
 from udp_mesh.core.settings import Topic
 
 TOPICS = (Topic("status", priority=0), Topic("map", priority=7), Topic("video", priority=9, reliable=False))
@@ -77,7 +77,7 @@ def test_what_is_on_its_way_on_a_path_that_became_slow_holds_no_urgent_message_b
     sender = world.nodes["a"]._state.peer_table.peers["b"].sender
     for number in range(200):
         world.send("a", "status", b"%d" % number, "b")
-        world.run(URGENT_WAIT_S + 0.001)
+        world.run(MAX_URGENT_WAIT_S + 0.001)
         waiting = [message for message in sender.pending if message.priority == 0 and not message.begun]
         # a silent peer gets probes instead
         assert not waiting or sender.unresponsive_since is not None

@@ -33,13 +33,13 @@ class CongestionController(Protocol):
         in_flight: int,
         rate: float | None,
         *,
-        limited: bool,
+        app_limited: bool,
         ahead: int,
         loss: float,
         now: float,
     ) -> None:
         """`count` packets were newly acknowledged, up to number `largest`; `rate` is a delivery rate sample.
-        When the newest of them left, `ahead` others were on their way; its burst was `limited` by the application."""
+        When the newest of them was sent, `ahead` others were in flight; `app_limited`: there was no more to send."""
         ...
 
     def capacity_packets_per_s(self) -> float | None:
@@ -74,7 +74,7 @@ class FixedWindow:
         in_flight: int,
         rate: float | None,
         *,
-        limited: bool,
+        app_limited: bool,
         ahead: int,
         loss: float,
         now: float,

@@ -225,7 +225,7 @@ class DelayBasedController:
         in_flight: int,
         rate: float | None,
         *,
-        limited: bool,
+        app_limited: bool,
         ahead: int,
         loss: float,
         now: float,
@@ -235,10 +235,10 @@ class DelayBasedController:
             return
         self._loss = loss
         if rate is not None:
-            self._add_rate_sample(rate, limited=limited, now=now)
+            self._add_rate_sample(rate, app_limited=app_limited, now=now)
         self._last_rtts.append(rtt.latest_rtt)
         self._uncontended_acks = self._uncontended_acks + 1 if ahead < MIN_CWND - 1 else 0
-        if limited and self._uncontended_acks >= 4 and min(self._last_rtts) > 1.15 * rtt.min_rtt + STARTUP_QUEUE_S:
+        if app_limited and self._uncontended_acks >= 4 and min(self._last_rtts) > 1.15 * rtt.min_rtt + STARTUP_QUEUE_S:
             # None of the four found more of ours on its way than a drain leaves: the path itself is longer now. (An
             # application that pauses says nothing of that: a link that became slow still holds what it sent before.)
             rtt.reset_min_rtt(min(self._last_rtts), now)
@@ -258,7 +258,7 @@ class DelayBasedController:
                 self._end_drain(now)
                 self._round_ends_at = next_number
             return
-        if self.phase is Phase.STARTUP and not limited and min(self._last_rtts) - rtt.min_rtt > STARTUP_QUEUE_S:
+        if self.phase is Phase.STARTUP and not app_limited and min(self._last_rtts) - rtt.min_rtt > STARTUP_QUEUE_S:
             self.phase = Phase.CRUISE
             self._drained_at = now
             self.cwnd = max(MIN_CWND, self.cwnd * rtt.min_rtt / rtt.windowed_rtt)
@@ -269,7 +269,7 @@ class DelayBasedController:
         if rtt.latest_rtt <= rtt.min_rtt * 1.02 + 0.0005 and self._min_rtt_is_verified():
             # The empty path was seen just now: no drain is needed to see it.
             self._drained_at = now
-        self._update(limited=limited, now=now)
+        self._update(app_limited=app_limited, now=now)
 
     def _min_update_s(self) -> float:
         return MIN_STARTUP_UPDATE_S if self.phase is Phase.STARTUP else MIN_UPDATE_S
@@ -295,14 +295,14 @@ class DelayBasedController:
         """What the packets that a drain leaves on their way may take, and a radio's scatter."""
         return STARTUP_QUEUE_S / 3 + (MIN_CWND - 1) / (self.capacity_packets_per_s() or float("inf"))
 
-    def _update(self, *, limited: bool, now: float) -> None:
+    def _update(self, *, app_limited: bool, now: float) -> None:
         min_rtt, windowed_rtt = self._rtt.min_rtt, self._rtt.windowed_rtt
         assert min_rtt is not None
         assert windowed_rtt is not None
         if self.phase is Phase.STARTUP:
             # It begins with little on its way.
             self._verified_min_rtt = min_rtt
-            if not limited:
+            if not app_limited:
                 self._grow_startup(min_rtt, windowed_rtt, now)
             return
         since_drain = now - self._drained_at
@@ -315,13 +315,13 @@ class DelayBasedController:
             if (
                 not self._suspect_rounds
                 and self._min_rtt_is_verified()
-                and (limited or windowed_rtt - min_rtt < QUEUE_S / 4)
+                and (app_limited or windowed_rtt - min_rtt < QUEUE_S / 4)
             ):
                 self._drained_at = now
             else:
                 self._begin_drain(now, suspicion=self._suspect_rounds > 0)
                 return
-        empty = windowed_rtt - min_rtt < QUEUE_S / 4 and not limited and now >= self._grow_after
+        empty = windowed_rtt - min_rtt < QUEUE_S / 4 and not app_limited and now >= self._grow_after
         self._empty_rounds = self._empty_rounds + 1 if empty else 0
         if self._empty_rounds >= GROWTH_AFTER_ROUNDS:
             capacity = self.capacity_packets_per_s() or 0.0
@@ -339,7 +339,7 @@ class DelayBasedController:
             return
         self._growing = False
         target = 0.5 * self.cwnd + 0.5 * (self.cwnd * min_rtt / windowed_rtt + self._queue_packets(windowed_rtt))
-        if target < self.cwnd or not limited:
+        if target < self.cwnd or not app_limited:
             self.cwnd = self._bounded(min(target, 2 * self.cwnd), min_rtt, windowed_rtt)
 
     def _restart(self, packets: float) -> None:
@@ -444,12 +444,12 @@ class DelayBasedController:
         max_cwnd = min(MAX_CWND, STARTUP_RATE_BOUND * max(INITIAL_CWND, self._cwnd_before_drain))
         self.cwnd = min(max_cwnd, max(MIN_CWND, throughput * base + queue))
 
-    def _add_rate_sample(self, rate: float, *, limited: bool, now: float) -> None:
+    def _add_rate_sample(self, rate: float, *, app_limited: bool, now: float) -> None:
         """Windowed maximum; a rate the application limited says nothing unless it is larger."""
         rates = self._rates
-        while rates and rates[0][0] < now - RATE_WINDOW_S and not (limited and len(rates) == 1):
+        while rates and rates[0][0] < now - RATE_WINDOW_S and not (app_limited and len(rates) == 1):
             rates.popleft()
-        if limited and (not rates or rate < rates[0][1]):
+        if app_limited and (not rates or rate < rates[0][1]):
             return
         while rates and rates[-1][1] <= rate:
             rates.pop()

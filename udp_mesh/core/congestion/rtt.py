@@ -66,7 +66,7 @@ class RttEstimator:
         self._min_samples.append((now, round_trip_s))
         self.min_rtt = round_trip_s
 
-    def timeout(self, ack_delay_s: float, max_s: float = float("inf")) -> float:
+    def pto_s(self, ack_delay_s: float, max_s: float = float("inf")) -> float:
         """How long after the last progress the oldest packet or its acknowledgement must be lost; at most `max_s` on
         a path that is not slow itself."""
         if self.smoothed_rtt is None:

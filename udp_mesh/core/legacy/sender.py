@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.pending import Outcome
-from udp_mesh.core.sender.sender import PROBE_S, Sender
+from udp_mesh.core.sender.sender import PROBE_INTERVAL_S, Sender
 from udp_mesh.core.settings import Address
 from udp_mesh.wire.legacy import (
     LAST_SEQUENCE as LAST_SEQUENCE,
@@ -55,7 +55,7 @@ PATIENCE_WANES = 0.995
 class _Leg:
     """One fragment on its way."""
 
-    message: Outgoing
+    message: OutgoingMessage
     position: int
     sent_at: float
     tries: int
@@ -100,8 +100,8 @@ class LegacySender:
         self._sequence = first_sequence % LAST_SEQUENCE
         self._stamp = 0
         self._legs: dict[tuple[int, int], _Leg] = {}
-        self._sequences: dict[int, Outgoing] = {}
-        self._fragments: dict[Outgoing, tuple[int, list[bytes]]] = {}
+        self._sequences: dict[int, OutgoingMessage] = {}
+        self._fragments: dict[OutgoingMessage, tuple[int, list[bytes]]] = {}
 
     def leave(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
         """What may leave now: overdue fragments first by age, then new ones, most urgent first."""
@@ -122,7 +122,7 @@ class LegacySender:
                     continue
                 run = scheduler.peek(priority)
                 assert run is not None
-                scheduler.take(run, 1)
+                scheduler.consume(run, 1)
                 self._send(message, run.position, 1, link, address, now, out)
                 if not message.reliable and run.position == message.fragments - 1 and message.missing == 0:
                     sender.finish(message, Outcome.SENT)
@@ -146,7 +146,7 @@ class LegacySender:
             # Karn: which try a later acknowledgement answers is unknown.
             self.sender.rtt.sample(max(1e-5, now - leg.sent_at), now)
         message = leg.message
-        if not message.ended and message.arrive(position):
+        if not message.ended and message.mark_arrived(position):
             self.sender.delivered_bytes += len(self._fragments[message][1][position])
             if not message.missing:
                 self.sender.finish(message, Outcome.DELIVERED)
@@ -169,11 +169,11 @@ class LegacySender:
         return min(leg.sent_at + self._patience(leg) for leg in self._legs.values())
 
     def _patience(self, leg: _Leg) -> float:
-        timeout = max(self._patience_s, self.sender.rtt.timeout(0.0))
+        timeout = max(self._patience_s, self.sender.rtt.pto_s(0.0))
         doublings = min(leg.tries - 1, DOUBLINGS_WHILE_ANSWERED)
         if leg.answers == self._answers:
             doublings = max(doublings, min(leg.unanswered - 1, DOUBLINGS))
-        return min(PROBE_S, timeout * (1 << doublings))
+        return min(PROBE_INTERVAL_S, timeout * (1 << doublings))
 
     def _resend(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
         due = [entry for entry in self._legs.values() if now >= entry.sent_at + self._patience(entry)]
@@ -190,7 +190,7 @@ class LegacySender:
                         other.sent_at = now
                 break
 
-    def _begin(self, message: Outgoing, now: float) -> bool:
+    def _begin(self, message: OutgoingMessage, now: float) -> bool:
         """Serialize, cut and number; False if the format cannot carry it (it then ends as refused)."""
         accepted = message.accepted
         if not carries(accepted.channel.type_name):
@@ -227,7 +227,14 @@ class LegacySender:
                 return self._sequence
 
     def _send(
-        self, message: Outgoing, position: int, tries: int, link: str, address: Address, now: float, out: list[Datagram]
+        self,
+        message: OutgoingMessage,
+        position: int,
+        tries: int,
+        link: str,
+        address: Address,
+        now: float,
+        out: list[Datagram],
     ) -> None:
         sequence, fragments = self._fragments[message]
         before = self._legs.get((sequence, position))

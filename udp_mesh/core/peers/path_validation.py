@@ -43,7 +43,7 @@ def _ask(state: State, session: Session, question: Challenge) -> None:
 
 def send_on_path(state: State, session: Session, frame: Frame, link: str, address: Address, now: float) -> None:
     """One small frame to this address, whatever the way in use."""
-    number, data = session.path.seal(encode(session.path.dated([frame], now)))
+    number, data = session.path.seal(encode(session.path.with_timestamp([frame], now)))
     if session.current and session.peer is not None:
         session.peer.sender.in_flight.add(number, None)
     state.outgoing.append(Datagram(link, address, data, True))

@@ -1,14 +1,14 @@
 """What is open on each priority level towards one peer, and how the levels fare.
 
 A message enters its level when accepted, may move when its topic's priority changes, and leaves when it ends.
-`book_served` tells the levels which of them just sent: less urgent ones that wait meanwhile starve, and for how long
+`record_served` tells the levels which of them just sent: less urgent ones that wait meanwhile starve, and for how long
 is part of the statistics.
 """
 
 from collections import deque
 from collections.abc import Iterable, Iterator
 
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.wire.limits import PRIORITY_LEVELS
 
 
@@ -18,7 +18,7 @@ class LevelStats:
     __slots__ = ("bytes", "held_s", "messages", "order", "starved_reported", "starved_s", "starved_since")
 
     def __init__(self) -> None:
-        self.order: deque[Outgoing] = deque()
+        self.order: deque[OutgoingMessage] = deque()
         """Messages in the order accepted; ended ones are dropped from its front when somebody looks."""
         self.messages = 0
         self.bytes = 0
@@ -27,7 +27,7 @@ class LevelStats:
         self.starved_reported = False
         self.held_s = 0.0
 
-    def oldest(self) -> Outgoing | None:
+    def oldest(self) -> OutgoingMessage | None:
         order = self.order
         while order and order[0].ended:
             order.popleft()
@@ -49,29 +49,29 @@ class PriorityLevels:
     def __iter__(self) -> Iterator[LevelStats]:
         return iter(self._books)
 
-    def enter(self, message: Outgoing) -> None:
+    def add(self, message: OutgoingMessage) -> None:
         """A message was accepted."""
         self._count(message, 1)
-        self.stand_last(message)
+        self.append(message)
 
-    def stand_last(self, message: Outgoing) -> None:
+    def append(self, message: OutgoingMessage) -> None:
         """The message is the youngest of its level (again: it begins anew under another object)."""
         book = self._books[message.priority]
         book.order.append(message)
         if len(book.order) > 64 + 2 * book.messages:
             book.order = deque(waiting for waiting in book.order if not waiting.ended)
 
-    def leave(self, message: Outgoing) -> None:
+    def remove(self, message: OutgoingMessage) -> None:
         """A message ended."""
         self._count(message, -1)
 
-    def _count(self, message: Outgoing, sign: int) -> None:
+    def _count(self, message: OutgoingMessage, sign: int) -> None:
         book = self._books[message.priority]
         book.messages += sign
         book.bytes += sign * len(message.body)
         self.queued_bytes += sign * len(message.body)
 
-    def rearrange(self, messages: Iterable[Outgoing]) -> bool:
+    def reprioritize(self, messages: Iterable[OutgoingMessage]) -> bool:
         """Give each open message (all of them, in the order accepted) its topic's present priority; False: all had."""
         everything = list(messages)
         if all(message.priority == message.accepted.channel.topic.priority for message in everything):
@@ -86,7 +86,7 @@ class PriorityLevels:
             book.order = deque(message for message in everything if message.priority == priority)
         return True
 
-    def book_served(self, served: int, waiting: int, now: float) -> None:
+    def record_served(self, served: int, waiting: int, now: float) -> None:
         """Levels of the mask `served` sent something; less urgent ones of the mask `waiting` did not."""
         lowest = served & -served
         mask = waiting & ~(lowest - 1) | served

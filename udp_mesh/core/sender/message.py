@@ -6,12 +6,12 @@ from udp_mesh.core.events import MessageId
 from udp_mesh.core.settings import Topic
 from udp_mesh.wire.frames import MessageFlag
 
-SMALL_FRAGMENTS = 3
+MAX_SMALL_FRAGMENTS = 3
 """Up to this many fragments an urgent message is worth sending twice, and a newer one may replace it even when
 begun."""
 
 
-class Channel:
+class TopicChannel:
     """A topic as this node announces it: its number on the air, its type, and its settings of the moment.
 
     Replacing `topic` is how a run-time change reaches messages already accepted.
@@ -27,11 +27,11 @@ class Channel:
 
 
 @dataclass(frozen=True, slots=True)
-class Accepted:
+class AcceptedMessage:
     """What `Node.send` took on, shared by the copies to every destination."""
 
     message_id: MessageId
-    channel: Channel
+    channel: TopicChannel
     payload: bytes
     """The bytes given to `send`."""
     body: bytes
@@ -47,7 +47,7 @@ class Accepted:
         return None if self.deadline is None else max(1, int((self.deadline - now) * 1000))
 
 
-class Outgoing:
+class OutgoingMessage:
     """The copy for one peer. `wire_id` is None until its first fragment leaves."""
 
     __slots__ = (
@@ -65,11 +65,10 @@ class Outgoing:
         "reliable",
         "store_key",
         "superseded",
-        "twice",
         "wire_id",
     )
 
-    def __init__(self, accepted: Accepted, priority: int, *, reliable: bool) -> None:
+    def __init__(self, accepted: AcceptedMessage, priority: int, *, reliable: bool) -> None:
         self.accepted = accepted
         self.body = accepted.body
         self.priority = priority
@@ -79,7 +78,6 @@ class Outgoing:
         self.ended = False
         self.superseded = False
         """A newer one replaced it: what is lost of it is not sent again."""
-        self.twice = False
         self.wire_id: int | None = None
         self.fragment_bytes = 0
         self.first_bytes = 0
@@ -106,16 +104,16 @@ class Outgoing:
         start = self.first_bytes + (position - 1) * self.fragment_bytes
         return start, min(start + self.fragment_bytes, len(self.body))
 
-    def anew(self) -> "Outgoing":
+    def restarted(self) -> "OutgoingMessage":
         """The same message with nothing of it sent: the peer lost what it had. This one must be marked ended."""
-        copy = Outgoing(self.accepted, self.priority, reliable=self.reliable)
+        copy = OutgoingMessage(self.accepted, self.priority, reliable=self.reliable)
         copy.store_key = self.store_key
         return copy
 
-    def resumed(self) -> "Outgoing":
+    def resumed(self) -> "OutgoingMessage":
         """The same message under its number, with what of it is known to have arrived. This one must be marked
         ended."""
-        copy = Outgoing(self.accepted, self.accepted.channel.topic.priority, reliable=self.reliable)
+        copy = OutgoingMessage(self.accepted, self.accepted.channel.topic.priority, reliable=self.reliable)
         copy.store_key = self.store_key
         assert self.wire_id is not None
         copy.begin(self.wire_id, self.fragment_bytes, self.first_bytes)
@@ -129,18 +127,12 @@ class Outgoing:
     @property
     def small(self) -> bool:
         """Few fragments; known once it has begun."""
-        return self.fragments <= SMALL_FRAGMENTS
+        return self.fragments <= MAX_SMALL_FRAGMENTS
 
-    def arrive(self, position: int) -> bool:
+    def mark_arrived(self, position: int) -> bool:
         """A fragment arrived; True if that was news."""
         if self.arrived[position]:
             return False
         self.arrived[position] = 1
         self.missing -= 1
         return True
-
-    def unacknowledged_bytes(self) -> int:
-        """Payload still to arrive, about."""
-        if not self.begun:
-            return len(self.body)
-        return min(len(self.body), self.missing * self.fragment_bytes)

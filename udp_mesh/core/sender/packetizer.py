@@ -1,6 +1,6 @@
 """What leaves for one peer, decided at the last moment: level -> pieces -> frames -> sealed datagrams.
 
-`leave_level` sends from one priority level until it is empty, or the window, the pacing or the room ends. A run of full
+`send_level` sends from one priority level until it is empty, or the window, the pacing or the room ends. A run of full
 fragments of one message takes the fast path: one pack, one seal and one record per fragment. Everything else (first and
 last fragments, small messages, pieces sent again) is built frame by frame, small pieces together in one datagram.
 """
@@ -10,11 +10,11 @@ import struct
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.receiver.datagram_age import clock_ms
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.scheduler import Run
-from udp_mesh.core.sender.send_quota import ack_spacing, look_again, permitted, urgent_may_wait_until, window_room
+from udp_mesh.core.sender.send_quota import ack_spacing, cwnd_room, next_send_at, send_quota, urgent_wait_until
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot
 from udp_mesh.core.settings import Address
@@ -39,11 +39,11 @@ IP_UDP_BYTES = 28
 IP6_EXTRA_BYTES = 20
 """IPv6 headers are larger by this."""
 
-LEAST_ROOM_BYTES = 64
+MIN_ROOM_BYTES = 64
 """Less room than this in a datagram is not worth looking for another small message."""
 
 PING_BYTES = 9
-IDS_BYTES = 4
+DELIVERED_BYTES = 4
 ID_BYTES = 4
 """Of a PING; of a DELIVERED without its message ids, and of each of these."""
 
@@ -87,13 +87,13 @@ class Path:
         self.timed = False
         """The peer takes dated datagrams and heads that say how long their message may live."""
 
-    def lead(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
+    def switch_to(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
         """Datagrams go this way from now on; messages already begun keep their fragments where these still fit."""
         self.link, self.address, self.mtu = link, address, mtu
         self.room_bytes = datagram_room(address, mtu, fragment_bytes)
         self.fragment_bytes = self.room_bytes - FRAGMENT_WIDE_BYTES
 
-    def dated(self, frames: list[Frame], now: float) -> list[Frame]:
+    def with_timestamp(self, frames: list[Frame], now: float) -> list[Frame]:
         """The frames, behind the time where the peer takes that.
 
         It is no part of `room_bytes`: the long header, for which that leaves room, is larger than the short one by more
@@ -102,8 +102,8 @@ class Path:
         return [Sent(clock_ms(now)), *frames] if self.timed else frames
 
     def encode(self, frames: list[Frame], now: float) -> bytes:
-        """As `dated`, in bytes that fit the way."""
-        encoded = encode(self.dated(frames, now))
+        """As `with_timestamp`, in bytes that fit the way."""
+        encoded = encode(self.with_timestamp(frames, now))
         return encoded if self.confirmed or len(encoded) <= self.room_bytes else encode(frames)
 
     def seal(self, frames: bytes) -> tuple[int, bytes]:
@@ -120,7 +120,7 @@ class Path:
         return SHORT_OVERHEAD_BYTES if self.confirmed else LONG_OVERHEAD_BYTES
 
 
-def leave_level(
+def send_level(
     sender: Sender,
     path: Path,
     priority: int,
@@ -140,14 +140,14 @@ def leave_level(
             break
         urgent = urgent_level and not run.stale
         pace = None if urgent else level_pace
-        room = window_room(sender, now)
-        most = permitted(sender, room, now, pace, urgent=urgent)
-        if most <= 0:
-            sender.limited = False
+        room = cwnd_room(sender, now)
+        quota = send_quota(sender, room, now, pace, urgent=urgent)
+        if quota <= 0:
+            sender.app_limited = False
             if urgent:
                 if sender.unresponsive_since is None:
-                    sender.wake_at = min(sender.wake_at, urgent_may_wait_until(sender))
-            elif (again := look_again(sender, room, now, pace)) is not None:
+                    sender.wake_at = min(sender.wake_at, urgent_wait_until(sender))
+            elif (again := next_send_at(sender, room, now, pace)) is not None:
                 sender.wake_at = min(sender.wake_at, again)
             break
         message = run.message
@@ -155,8 +155,8 @@ def leave_level(
             sender.finish(message, ExpiryReason.SUPERSEDED)
             continue
         bucket = rate_limits.get(message.accepted.channel.name) if rate_limits else None
-        if bucket is not None and not bucket.open(now):
-            sender.scheduler.drop_head(run)
+        if bucket is not None and not bucket.has_tokens(now):
+            sender.scheduler.park_head(run)
             bucket.parked.append((sender, run))
             continue
         if not message.begun:
@@ -164,30 +164,30 @@ def leave_level(
             run = Run(message, 0, message.fragments, again=False)
         before = used
         is_plain = bucket is None and message.accepted.broadcast_number is None
-        if run.position and run.length > 2 and most > 1 and is_plain:
-            count = min(run.length - 1, most, 1 + (room_bytes - used) // message.fragment_bytes)
-            used += _leave_run(sender, path, run, count, snapshot, out)
+        if run.position and run.length > 2 and quota > 1 and is_plain:
+            count = min(run.length - 1, quota, 1 + (room_bytes - used) // message.fragment_bytes)
+            used += _send_run(sender, path, run, count, snapshot, out)
         else:
             count = 1
-            used += _leave_one(sender, path, run, urgent, snapshot, out)
+            used += _send_datagram(sender, path, run, urgent, snapshot, out)
         if bucket is not None:
-            bucket.spend(used - before)
+            bucket.consume(used - before)
         if sender.probe_credit:
             sender.probe_credit = max(0, sender.probe_credit - count)
         if urgent:
-            sender.urgent_left_at = now
+            sender.urgent_sent_at = now
         else:
             sender.pacer.on_sent(count, now, pace)
     return used
 
 
-def leave_copies(sender: Sender, path: Path, now: float, out: list[Datagram]) -> None:
+def send_copies(sender: Sender, path: Path, now: float, out: list[Datagram]) -> None:
     """Second copies of small urgent messages whose time has come and that were not acknowledged meanwhile."""
-    for message, position in sender.copies.due(now, sender.overdue_s()):
+    for message, position in sender.copies.pop_due(now, sender.urgent_timeout_s()):
         if sender.unresponsive_since is not None:
             continue
         run = Run(message, position, 1, again=True)
-        _leave(
+        _seal_datagram(
             sender,
             path,
             [(message, position)],
@@ -197,7 +197,7 @@ def leave_copies(sender: Sender, path: Path, now: float, out: list[Datagram]) ->
         )
 
 
-def leave_large_ping(sender: Sender, path: Path, token: int, frames_bytes: int) -> Datagram:
+def build_mtu_probe(sender: Sender, path: Path, token: int, frames_bytes: int) -> Datagram:
     """A ping in a datagram that is no smaller than one with `frames_bytes` of frames, and larger by 7 B at most.
 
     What fills it are words of a message that no peer ever sends: that we have it whole.
@@ -205,30 +205,30 @@ def leave_large_ping(sender: Sender, path: Path, token: int, frames_bytes: int) 
     frames: list[Frame] = [Ping(token)]
     missing = frames_bytes - PING_BYTES
     while missing > 0:
-        ids = min(MAX_IDS, max(1, -(-(missing - IDS_BYTES) // ID_BYTES)))
+        ids = min(MAX_IDS, max(1, -(-(missing - DELIVERED_BYTES) // ID_BYTES)))
         frames.append(Delivered((NO_MESSAGE_ID,) * ids))
-        missing -= IDS_BYTES + ID_BYTES * ids
+        missing -= DELIVERED_BYTES + ID_BYTES * ids
     number, data = path.seal(encode(frames))
     sender.in_flight.add(number, None)
     return Datagram(path.link, path.address, data, True)
 
 
-def _begin(sender: Sender, path: Path, message: Outgoing) -> None:
+def _begin(sender: Sender, path: Path, message: OutgoingMessage) -> None:
     channel = message.accepted.channel
     first = path.fragment_bytes - HEAD_BYTES
     if channel.number not in sender.announced:
         first -= 5 + len(channel.name.encode()) + len(channel.type_name.encode())
         first -= LENGTH_BYTES
-    cast_number = message.accepted.broadcast_number
-    if cast_number is not None:
+    broadcast_number = message.accepted.broadcast_number
+    if broadcast_number is not None:
         # the copy of a lost cast keeps its number, or the receiver would take it for another message
-        message.begin(cast_number, path.fragment_bytes, max(1, first))
+        message.begin(broadcast_number, path.fragment_bytes, max(1, first))
         return
     message.begin(sender.next_wire_id, path.fragment_bytes, max(1, first))
     sender.next_wire_id += 1
 
 
-def _leave_run(sender: Sender, path: Path, run: Run, count: int, snapshot: SendSnapshot, out: list[Datagram]) -> int:
+def _send_run(sender: Sender, path: Path, run: Run, count: int, snapshot: SendSnapshot, out: list[Datagram]) -> int:
     """The fast path: `count` full fragments in a row, none of them its message's first or last."""
     message, position = run.message, run.position
     wire_id = message.wire_id
@@ -238,7 +238,7 @@ def _leave_run(sender: Sender, path: Path, run: Run, count: int, snapshot: SendS
     body = memoryview(message.body)
     frames = []
     spacing = ack_spacing(sender)
-    since = sender.since_ack_wanted
+    since = sender.since_ack_requested
     wide = position + count > _NARROW_POSITIONS
     pack = _WIDE.pack if wide else _NARROW.pack
     plain = FRAGMENT | FRAGMENT_WIDE if wide else FRAGMENT
@@ -255,61 +255,63 @@ def _leave_run(sender: Sender, path: Path, run: Run, count: int, snapshot: SendS
         offset += size
     out.extend(Datagram.run(path.link, path.address, path.seal_run(frames)))
     sender.in_flight.add_run(snapshot, message, range(position, position + count))
-    sender.since_ack_wanted = since
+    sender.since_ack_requested = since
     sent_bytes = count * (size + FRAGMENT_BYTES + path.overhead_bytes)
     sender.sent_packets += count
     sender.sent_bytes += sent_bytes + IP_UDP_BYTES * count
-    sender.scheduler.take(run, count)
+    sender.scheduler.consume(run, count)
     return sent_bytes
 
 
-def _leave_one(sender: Sender, path: Path, run: Run, urgent: bool, snapshot: SendSnapshot, out: list[Datagram]) -> int:
+def _send_datagram(
+    sender: Sender, path: Path, run: Run, urgent: bool, snapshot: SendSnapshot, out: list[Datagram]
+) -> int:
     """One datagram with the piece of `run` and, if there is room, small pieces behind it on the same level."""
     now = snapshot.sent_at
     message = run.message
-    pieces: list[tuple[Outgoing, int]] = []
+    fragments: list[tuple[OutgoingMessage, int]] = []
     frames: list[Frame] = []
     room = path.room_bytes
     priority = message.priority
     scheduler = sender.scheduler
     again = 0
     spacing = ack_spacing(sender)
-    sender.since_ack_wanted += 1
+    sender.since_ack_requested += 1
     next_run: Run | None = run
     while next_run is not None:
         message = next_run.message
-        if next_run.again and (message, next_run.position) in pieces:
+        if next_run.again and (message, next_run.position) in fragments:
             # Several copies of it were lost: one datagram needs no more than one.
-            scheduler.take(next_run, 1)
+            scheduler.consume(next_run, 1)
             next_run = _next_small(sender, path, priority, room)
             continue
-        size = _piece_bytes(sender, path, next_run)
+        size = _fragment_frame_bytes(sender, path, next_run)
         if frames and (size > room or len(frames) >= MAX_FRAMES_PER_DATAGRAM - 3):
             break
         again += next_run.again
-        pieces.append((message, next_run.position))
-        scheduler.take(next_run, 1)
+        fragments.append((message, next_run.position))
+        scheduler.consume(next_run, 1)
         last = next_run.position == message.fragments - 1
-        ack_now = urgent or sender.since_ack_wanted >= spacing or (last and scheduler.nothing_waits(priority))
+        ack_now = urgent or sender.since_ack_requested >= spacing or (last and scheduler.is_idle(priority))
         frames.extend(_frames(sender, path, next_run, now, ack_now=ack_now))
         if ack_now:
-            sender.since_ack_wanted = 0
+            sender.since_ack_requested = 0
         room -= size
         if urgent and message.small and not next_run.again:
-            sender.copy_later(message, next_run.position, now)
+            sender.schedule_copies(message, next_run.position, now)
         if not message.reliable and last:
             sender.finish(message, Outcome.SENT)
-        if room < LEAST_ROOM_BYTES:
+        if room < MIN_ROOM_BYTES:
             break
         next_run = _next_small(sender, path, priority, room)
     sender.retransmitted += again
-    return _leave(sender, path, pieces, frames, snapshot, out, urgent=urgent)
+    return _seal_datagram(sender, path, fragments, frames, snapshot, out, urgent=urgent)
 
 
-def _leave(
+def _seal_datagram(
     sender: Sender,
     path: Path,
-    pieces: list[tuple[Outgoing, int]],
+    fragments: list[tuple[OutgoingMessage, int]],
     frames: list[Frame],
     snapshot: SendSnapshot,
     out: list[Datagram],
@@ -317,7 +319,7 @@ def _leave(
     urgent: bool = True,
 ) -> int:
     number, data = path.seal(path.encode(frames, snapshot.sent_at))
-    (message, position), *more = pieces
+    (message, position), *more = fragments
     sender.in_flight.add(number, Packet(snapshot, message, position, tuple(more)))
     out.append(Datagram(path.link, path.address, data, urgent))
     sender.sent_packets += 1
@@ -335,23 +337,23 @@ def _next_small(sender: Sender, path: Path, priority: int, room: int) -> Run | N
             return None
         _begin(sender, path, run.message)
         run = Run(run.message, 0, run.message.fragments, again=False)
-    return run if _piece_bytes(sender, path, run) <= room else None
+    return run if _fragment_frame_bytes(sender, path, run) <= room else None
 
 
-def _piece_bytes(sender: Sender, path: Path, run: Run) -> int:
+def _fragment_frame_bytes(sender: Sender, path: Path, run: Run) -> int:
     """Bytes of the frames that carry one piece."""
     message = run.message
     start, end = message.span(run.position)
     size = end - start + FRAGMENT_WIDE_BYTES + LENGTH_BYTES
     if run.position == 0:
-        size += HEAD_BYTES + (LIFE_BYTES if _says_life(path, message) else 0)
+        size += HEAD_BYTES + (LIFE_BYTES if _sends_life(path, message) else 0)
         channel = message.accepted.channel
         if channel.number not in sender.announced:
             size += 5 + len(channel.name.encode()) + len(channel.type_name.encode())
     return size
 
 
-def _says_life(path: Path, message: Outgoing) -> bool:
+def _sends_life(path: Path, message: OutgoingMessage) -> bool:
     return path.timed and path.confirmed and message.accepted.deadline is not None
 
 
@@ -361,11 +363,11 @@ def _frames(sender: Sender, path: Path, run: Run, now: float, *, ack_now: bool) 
     accepted = message.accepted
     wire_id = message.wire_id
     assert wire_id is not None
-    is_cast = accepted.broadcast_number is not None
+    is_broadcast = accepted.broadcast_number is not None
     start, end = message.span(position)
     payload = memoryview(message.body)[start:end]
     if position:
-        return [Fragment(wire_id, position, payload, None, ack_now, is_cast)]
+        return [Fragment(wire_id, position, payload, None, ack_now, is_broadcast)]
     head = MessageHead(
         len(message.body),
         message.fragments,
@@ -373,9 +375,9 @@ def _frames(sender: Sender, path: Path, run: Run, now: float, *, ack_now: bool) 
         message.priority,
         accepted.flags,
         max(0, int((now - accepted.accepted_at) * 1000)),
-        accepted.life_ms(now) if _says_life(path, message) else None,
+        accepted.life_ms(now) if _sends_life(path, message) else None,
     )
-    fragment = Fragment(wire_id, 0, payload, head, ack_now, is_cast)
+    fragment = Fragment(wire_id, 0, payload, head, ack_now, is_broadcast)
     channel = accepted.channel
     if channel.number in sender.announced:
         return [fragment]

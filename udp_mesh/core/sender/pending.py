@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.sender.level_stats import PriorityLevels
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.message import OutgoingMessage
 
 
 class Outcome(Enum):
@@ -23,7 +23,7 @@ class Outcome(Enum):
 
 
 class Ended(NamedTuple):
-    message: Outgoing
+    message: OutgoingMessage
     outcome: Outcome | ExpiryReason
 
 
@@ -31,27 +31,27 @@ class PendingMessages:
     """`ended` and `cancelled` are fetched and cleared by the session."""
 
     def __init__(self) -> None:
-        self.pending: dict[Outgoing, None] = {}
+        self.pending: dict[OutgoingMessage, None] = {}
         """Messages without an outcome, in the order accepted."""
         self.levels = PriorityLevels()
         self.ended: list[Ended] = []
         self.cancelled: list[int] = []
         """Wire ids given up after they had begun: the peer may forget them."""
-        self._deadlines: list[tuple[float, int, Outgoing]] = []
+        self._deadlines: list[tuple[float, int, OutgoingMessage]] = []
         self._deadline_serial = 0
-        self._kept: dict[str, list[Outgoing]] = {}
+        self._kept: dict[str, list[OutgoingMessage]] = {}
         """Open messages of topics that keep only the last few."""
 
-    def take_on(self, message: Outgoing) -> None:
+    def add(self, message: OutgoingMessage) -> None:
         """One more; older ones that its topic does not keep end, or end as what becomes of their pieces."""
         self.pending[message] = None
-        self.levels.enter(message)
+        self.levels.add(message)
         self._note_deadline(message)
         keep_last = message.accepted.channel.topic.keep_last
         if keep_last is not None:
             self._replace_older(message, keep_last)
 
-    def _note_deadline(self, message: Outgoing) -> None:
+    def _note_deadline(self, message: OutgoingMessage) -> None:
         if message.accepted.deadline is not None:
             self._deadline_serial += 1
             heappush(self._deadlines, (message.accepted.deadline, self._deadline_serial, message))
@@ -60,7 +60,7 @@ class PendingMessages:
                 self._deadlines = [entry for entry in self._deadlines if not entry[2].ended]
                 heapify(self._deadlines)
 
-    def _replace_older(self, message: Outgoing, keep_last: int) -> None:
+    def _replace_older(self, message: OutgoingMessage, keep_last: int) -> None:
         kept = self._kept.get(message.accepted.channel.topic.name, [])
         alive = [older for older in kept if not older.ended and not older.superseded]
         alive.append(message)
@@ -81,20 +81,20 @@ class PendingMessages:
         while self._deadlines and self._deadlines[0][0] <= now:
             self.finish(heappop(self._deadlines)[2], ExpiryReason.DEADLINE)
 
-    def begin_anew(self, message: Outgoing) -> Outgoing:
+    def restart_message(self, message: OutgoingMessage) -> OutgoingMessage:
         """The message under another object, nothing of which has left; it is the youngest of its level."""
         message.ended = True
         self.pending.pop(message, None)
-        copy = message.anew()
+        copy = message.restarted()
         self.pending[copy] = None
-        self.levels.stand_last(copy)
+        self.levels.append(copy)
         self._note_deadline(copy)
         kept = self._kept.get(copy.accepted.channel.topic.name)
         if kept is not None:
             kept.append(copy)
         return copy
 
-    def finish(self, message: Outgoing, outcome: Outcome | ExpiryReason) -> None:
+    def finish(self, message: OutgoingMessage, outcome: Outcome | ExpiryReason) -> None:
         """The one outcome of a message; later ones are ignored."""
         if message.ended:
             return
@@ -107,29 +107,29 @@ class PendingMessages:
         for message in list(self.pending):
             self.finish(message, outcome)
 
-    def withdraw(self, message: Outgoing, *, to_resume: bool = False) -> None:
+    def withdraw(self, message: OutgoingMessage, *, to_resume: bool = False) -> None:
         """The message leaves without an outcome: an outbox keeps it, `to_resume` it under its number."""
         if not message.ended:
             self._remove(message)
             if message.begun and not to_resume:
                 self.cancel(message)
 
-    def _remove(self, message: Outgoing) -> None:
+    def _remove(self, message: OutgoingMessage) -> None:
         message.ended = True
         del self.pending[message]
-        self.levels.leave(message)
+        self.levels.remove(message)
 
-    def cancel(self, message: Outgoing) -> None:
+    def cancel(self, message: OutgoingMessage) -> None:
         """The peer is told to forget what it has of this one."""
         if message.wire_id is not None and message.accepted.broadcast_number is None:
             self.cancelled.append(message.wire_id)
 
-    def by_wire_id(self, wire_id: int) -> Outgoing | None:
+    def by_wire_id(self, wire_id: int) -> OutgoingMessage | None:
         """The open message of this number (copies of casts are numbered apart); a search, for rare answers."""
         own = (message for message in self.pending if message.accepted.broadcast_number is None)
         return next((message for message in own if message.wire_id == wire_id), None)
 
-    def told_delivered(self, wire_ids: Iterable[int]) -> None:
+    def on_delivered(self, wire_ids: Iterable[int]) -> None:
         """The peer says it has these whole, whatever it acknowledged; a search, for peers of another make."""
         known = set(wire_ids)
         for message in list(self.pending):

@@ -26,42 +26,42 @@ ROUND_S = 0.3
 LOST_PER_ROUND = 2
 """At least eight large datagrams in more than a second."""
 
-CHANCE = 1e-6
+MAX_CHANCE = 1e-6
 """Less likely than this, at the loss of small ones, so many large ones in a row are not lost by chance."""
 
-APART_S = 0.1
+LOSS_SPACING_S = 0.1
 """Large datagrams that left closer together count as one: what loses one of them often loses the others as well."""
 
-MOST_AT_A_STRETCH = 8
+MAX_LARGE_LOST_BETWEEN = 8
 """And no more of them between two small ones that arrived, but for two with each small one lost: a cut loses both."""
 
-MOST_SMALL_AT_A_STRETCH = 32
+MAX_SMALL_LOST_BETWEEN = 32
 """Small ones lost between two that arrived: a cut says nothing more however long it lasts."""
 
-MEMORY = 64
+LOSS_MEMORY_PACKETS = 64
 """Small datagrams over which their loss is remembered from one doubt to the next: of a few all may arrive by chance."""
 
-DOUBT_S = 2.5
+SUSPECT_S = 2.5
 """And no large datagram acknowledged for so long since the first round: on a path whose round trip has just become a
 second or two their acknowledgements are still to come, and what is cut anew although it arrived arrives twice."""
 
 PROBES_PER_SMALL = LOST_PER_ROUND + 1
 """Of the probes of a silent peer one in so many is small: a round takes the others."""
 
-ASK_AFTER_S = 10.0
-ASK_AT_MOST_EVERY_S = 600.0
+PROBE_AFTER_S = 10.0
+MAX_PROBE_INTERVAL_S = 600.0
 """The larger size is asked for after the first, then after twice as long each time, at last with RFC 8899's
 PMTU_RAISE_TIMER. A mistake costs a tenth of the rate until then; a path that is narrow, three pings each
 time."""
 
-ASKED_TIMES = 3
+MAX_PROBES = 3
 """Pings of a size per time that would be answered (RFC 8899's MAX_PROBES) if as many got through as the loss says: one
 alone proves little."""
 
-LEAST_ARRIVING = 0.3
+MIN_ARRIVING = 0.3
 """Of pings and answers each, whatever the loss: 33 per time at most."""
 
-LARGE_AT_FIRST_BYTES = 1200
+INITIAL_LARGE_BYTES = 1200
 """Until the first look at the way, some half second: about what frames take on the narrowest of IPv6 links."""
 
 _INFINITY = float("inf")
@@ -71,193 +71,193 @@ class PathMtu:
     """What is known about one peer's path. `narrowed_at` is when it was last taken for narrower."""
 
     __slots__ = (
-        "_between",
-        "_between_small",
         "_counted_at",
-        "_doubted_at",
-        "_in_a_row",
-        "_least_lost",
-        "_lost",
+        "_large_lost",
+        "_large_lost_between",
+        "_large_lost_in_a_row",
+        "_past_small",
+        "_past_small_lost",
         "_probes",
-        "_remembered",
-        "_remembered_lost",
         "_round_at",
         "_rounds",
         "_small",
         "_small_lost",
+        "_small_lost_between",
+        "_smallest_lost",
+        "_suspect_since",
         "large_bytes",
         "narrowed_at",
         "probe",
     )
 
     def __init__(self) -> None:
-        self.large_bytes: float = LARGE_AT_FIRST_BYTES
+        self.large_bytes: float = INITIAL_LARGE_BYTES
         """Frames of a datagram that is not large, at most; where nothing narrower is to be tried all are small."""
-        self._lost = 0
+        self._large_lost = 0
         """Large datagrams lost in this round."""
-        self._least_lost = _INFINITY
+        self._smallest_lost = _INFINITY
         """Frames of the smallest of them since the doubt began."""
         self._rounds = 0
         self._round_at = 0.0
-        self._doubted_at = 0.0
-        self._in_a_row = 0
+        self._suspect_since = 0.0
+        self._large_lost_in_a_row = 0
         """Large datagrams lost since the doubt began, apart from each other."""
         self._counted_at = float("-inf")
         """When the last of those left."""
         self._small = self._small_lost = 0
         """Small datagrams since the doubt began."""
-        self._between = self._between_small = 0
+        self._large_lost_between = self._small_lost_between = 0
         """Of both, the lost ones since a small one arrived."""
-        self._remembered = self._remembered_lost = 0.0
+        self._past_small = self._past_small_lost = 0.0
         """Small datagrams of earlier doubts."""
         self._probes = 0
         self.narrowed_at: float | None = None
         self.probe = PmtuProbe()
 
     @property
-    def in_doubt(self) -> bool:
+    def suspect(self) -> bool:
         """Large datagrams were lost and none arrived since."""
-        return self._lost > 0 or self._rounds > 0
+        return self._large_lost > 0 or self._rounds > 0
 
     # Doubt
 
-    def lost(self, packets: Iterable[Packet]) -> None:
+    def on_lost(self, packets: Iterable[Packet]) -> None:
         for packet in packets:
             size = _frames_bytes(packet)
             if size > self.large_bytes:
-                self._lost += 1
-                self._least_lost = min(self._least_lost, size)
+                self._large_lost += 1
+                self._smallest_lost = min(self._smallest_lost, size)
                 left_at = packet.snapshot.sent_at
-                most = MOST_AT_A_STRETCH + LOST_PER_ROUND * self._between_small
-                if left_at >= self._counted_at + APART_S and self._between < most:
+                most = MAX_LARGE_LOST_BETWEEN + LOST_PER_ROUND * self._small_lost_between
+                if left_at >= self._counted_at + LOSS_SPACING_S and self._large_lost_between < most:
                     self._counted_at = left_at
-                    self._between += 1
-                    self._in_a_row += 1
-            elif self.in_doubt:
-                self._small_is_lost()
+                    self._large_lost_between += 1
+                    self._large_lost_in_a_row += 1
+            elif self.suspect:
+                self._on_small_lost()
 
-    def arrived(self, packets: Sequence[Packet], called_lost: int, now: float) -> None:
-        """Only to be told while `in_doubt`; so many of them were called lost before."""
-        least = self._least_lost
+    def on_acked(self, packets: Sequence[Packet], called_lost: int, now: float) -> None:
+        """Only to be told while `suspect`; so many of them were called lost before."""
+        least = self._smallest_lost
         if any(_frames_bytes(packet) >= least for packet in packets):
             self.reset()
         else:
-            self._small_arrived(len(packets), called_lost, now)
+            self._on_small_acked(len(packets), called_lost, now)
 
-    def ask_small(self) -> bool:
+    def next_probe_is_small(self) -> bool:
         """Whether the next probe of a silent peer shall be small."""
         self._probes += 1
-        return self.in_doubt and not self._probes % PROBES_PER_SMALL
+        return self.suspect and not self._probes % PROBES_PER_SMALL
 
-    def asked_small(self) -> None:
+    def on_small_probe_sent(self) -> None:
         """A small ping left: lost, unless it is answered."""
-        if self.in_doubt:
-            self._small_is_lost()
+        if self.suspect:
+            self._on_small_lost()
 
-    def answered(self, token: int, now: float) -> None:
+    def on_pong(self, token: int, now: float) -> None:
         """A ping was answered."""
-        if not self.probe.answered(token) and self.in_doubt:
-            self._small_arrived(1, 1, now)
+        if not self.probe.on_pong(token) and self.suspect:
+            self._on_small_acked(1, 1, now)
 
-    def _small_is_lost(self) -> None:
-        if self._between_small < MOST_SMALL_AT_A_STRETCH:
-            self._between_small += 1
+    def _on_small_lost(self) -> None:
+        if self._small_lost_between < MAX_SMALL_LOST_BETWEEN:
+            self._small_lost_between += 1
             self._small += 1
             self._small_lost += 1
 
-    def _small_arrived(self, count: int, called_lost: int, now: float) -> None:
+    def _on_small_acked(self, count: int, called_lost: int, now: float) -> None:
         called_lost = min(called_lost, self._small_lost)
         self._small_lost -= called_lost
         self._small += count - called_lost
-        self._between = self._between_small = 0
-        if self._lost >= LOST_PER_ROUND and now - self._round_at >= ROUND_S:
+        self._large_lost_between = self._small_lost_between = 0
+        if self._large_lost >= LOST_PER_ROUND and now - self._round_at >= ROUND_S:
             if not self._rounds:
-                self._doubted_at = now
+                self._suspect_since = now
             self._rounds += 1
-            self._lost = 0
+            self._large_lost = 0
             self._round_at = now
 
-    def too_narrow(self, now: float) -> bool:
+    def is_black_hole(self, now: float) -> bool:
         """Large datagrams do not get through."""
-        if self._rounds < ROUNDS or now - self._doubted_at < DOUBT_S:
+        if self._rounds < ROUNDS or now - self._suspect_since < SUSPECT_S:
             return False
         small_loss = max(
             (self._small_lost + 1) / (self._small + 2),
-            (self._remembered_lost + self._small_lost + 1) / (self._remembered + self._small + 2),
+            (self._past_small_lost + self._small_lost + 1) / (self._past_small + self._small + 2),
         )
-        return bool(small_loss**self._in_a_row < CHANCE)
+        return bool(small_loss**self._large_lost_in_a_row < MAX_CHANCE)
 
     def reset(self) -> None:
         """A large datagram arrived, or their size is another from now on."""
-        self._remembered += self._small
-        self._remembered_lost += self._small_lost
-        if self._remembered > MEMORY:
-            self._remembered_lost *= MEMORY / self._remembered
-            self._remembered = MEMORY
-        self._lost = self._rounds = self._in_a_row = self._small = self._small_lost = 0
-        self._between = self._between_small = 0
-        self._least_lost = _INFINITY
+        self._past_small += self._small
+        self._past_small_lost += self._small_lost
+        if self._past_small > LOSS_MEMORY_PACKETS:
+            self._past_small_lost *= LOSS_MEMORY_PACKETS / self._past_small
+            self._past_small = LOSS_MEMORY_PACKETS
+        self._large_lost = self._rounds = self._large_lost_in_a_row = self._small = self._small_lost = 0
+        self._large_lost_between = self._small_lost_between = 0
+        self._smallest_lost = _INFINITY
 
     # Narrowed
 
-    def narrowed(self, now: float) -> None:
+    def on_narrowed(self, now: float) -> None:
         """The path is taken for narrower from now on."""
         self.reset()
-        self.probe.begin(now)
+        self.probe.start(now)
         self.narrowed_at = now
 
 
 class PmtuProbe:
     """When to ask whether a path carries more than it is given, and what was answered."""
 
-    __slots__ = ("_at", "_begun_at", "_pause_s", "_times", "_tokens", "carries")
+    __slots__ = ("_interval_s", "_next_at", "_sent_probes", "_started_at", "_tokens", "confirmed_mtu")
 
     def __init__(self) -> None:
-        self._begun_at = float("-inf")
-        self._at = float("inf")
-        self._pause_s = ASK_AFTER_S
-        self._times = 0
+        self._started_at = float("-inf")
+        self._next_at = float("inf")
+        self._interval_s = PROBE_AFTER_S
+        self._sent_probes = 0
         self._tokens: dict[int, int] = {}
         """Of pings that may still be answered -> the MTU they fill."""
-        self.carries = 0
+        self.confirmed_mtu = 0
         """The largest MTU for which one was answered."""
 
-    def begin(self, now: float) -> None:
+    def start(self, now: float) -> None:
         """The path is taken for narrow from now on. Where a ping was answered not long ago that proved little."""
-        if now - self._begun_at > 2 * ASK_AT_MOST_EVERY_S:
-            self._pause_s = ASK_AFTER_S
-        elif self.carries:
-            self._pause_s = min(2 * self._pause_s, ASK_AT_MOST_EVERY_S)
-        self._begun_at = now
-        self.carries = 0
+        if now - self._started_at > 2 * MAX_PROBE_INTERVAL_S:
+            self._interval_s = PROBE_AFTER_S
+        elif self.confirmed_mtu:
+            self._interval_s = min(2 * self._interval_s, MAX_PROBE_INTERVAL_S)
+        self._started_at = now
+        self.confirmed_mtu = 0
         self._tokens.clear()
-        self._wait(now)
+        self._schedule(now)
 
-    def _wait(self, now: float) -> None:
-        self._at = now + self._pause_s
-        self._times = 0
+    def _schedule(self, now: float) -> None:
+        self._next_at = now + self._interval_s
+        self._sent_probes = 0
 
     def due(self, now: float, loss: float) -> bool:
         """Whether to ask now; to be called some times a second at most, and only while the peer answers. `loss` is that
         of datagrams to the peer."""
-        if now < self._at:
+        if now < self._next_at:
             return False
-        if not self._times:
+        if not self._sent_probes:
             self._tokens.clear()
-        self._times += 1
-        if self._times >= ASKED_TIMES / max(LEAST_ARRIVING, 1 - loss) ** 2:
-            self._pause_s = min(2 * self._pause_s, ASK_AT_MOST_EVERY_S)
-            self._wait(now)
+        self._sent_probes += 1
+        if self._sent_probes >= MAX_PROBES / max(MIN_ARRIVING, 1 - loss) ** 2:
+            self._interval_s = min(2 * self._interval_s, MAX_PROBE_INTERVAL_S)
+            self._schedule(now)
         return True
 
-    def asked(self, token: int, mtu: int) -> None:
+    def on_probe_sent(self, token: int, mtu: int) -> None:
         self._tokens[token] = mtu
 
-    def answered(self, token: int) -> bool:
+    def on_pong(self, token: int) -> bool:
         """Whether it was one of these pings."""
         mtu = self._tokens.pop(token, None)
         if mtu is not None:
-            self.carries = max(self.carries, mtu)
+            self.confirmed_mtu = max(self.confirmed_mtu, mtu)
         return mtu is not None
 
 

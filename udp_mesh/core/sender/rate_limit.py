@@ -20,21 +20,21 @@ class TokenBucket:
         self.parked: list[tuple[Sender, Run]] = []
         """What waits for the bucket: messages, or single pieces to be sent again."""
 
-    def open(self, now: float) -> bool:
+    def has_tokens(self, now: float) -> bool:
         """Whether a datagram may leave now."""
         self._bytes = min(self.bytes_per_s * BURST_S, self._bytes + (now - self._at) * self.bytes_per_s)
         self._at = now
         return self._bytes > 0
 
-    def spend(self, count: int) -> None:
+    def consume(self, count: int) -> None:
         """`count` bytes left."""
         self._bytes -= count
 
-    def opens_at(self) -> float:
+    def ready_at(self) -> float:
         """When the bucket is out of debt."""
         return self._at + max(0.0, 1.0 - self._bytes) / self.bytes_per_s
 
-    def release(self) -> None:
+    def unpark(self) -> None:
         """Put everything parked back in front of its level, in its order."""
         parked, self.parked = self.parked, []
         for sender, run in reversed(parked):

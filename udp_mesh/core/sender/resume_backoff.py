@@ -4,17 +4,17 @@ The first sign of life is answered at once. While nothing is acknowledged the ne
 the one before: the way there may be cut, or be one whose queue takes seconds, and more of the same would keep it full.
 """
 
-RETURN_BURST_PACKETS = 10
+RESUME_BURST_PACKETS = 10
 """What leaves at once when a silent peer is heard without acknowledging (the way to it may still be cut)."""
 
-BURST_AGAIN_S = 0.1
-MOST_BURST_AGAIN_S = 3.2
+MIN_RESUME_INTERVAL_S = 0.1
+MAX_RESUME_INTERVAL_S = 3.2
 
 
 class ResumeBackoff:
     """Those of one silence after another."""
 
-    __slots__ = ("_again_s", "_at")
+    __slots__ = ("_at", "_interval_s")
 
     def __init__(self) -> None:
         self.reset()
@@ -22,12 +22,12 @@ class ResumeBackoff:
     def reset(self) -> None:
         """The silence is over."""
         self._at = float("-inf")
-        self._again_s = BURST_AGAIN_S
+        self._interval_s = MIN_RESUME_INTERVAL_S
 
     def due(self, now: float) -> bool:
         """Whether one may leave now; it then counts as left."""
         if now < self._at:
             return False
-        self._at = now + self._again_s
-        self._again_s = min(MOST_BURST_AGAIN_S, 2 * self._again_s)
+        self._at = now + self._interval_s
+        self._interval_s = min(MAX_RESUME_INTERVAL_S, 2 * self._interval_s)
         return True

@@ -1,13 +1,13 @@
 """Strict priority to one peer: messages wait by level, and the most urgent piece is chosen when a datagram leaves.
 
 Within a level pieces to be sent again go first, then messages in the order accepted. After a silence of the peer the
-urgent levels put what waited then behind what comes fresh (`set_aside`): nothing stale stands ahead of fresh.
+urgent levels put what waited then behind what comes fresh (`demote_stale`): nothing stale stands ahead of fresh.
 """
 
 from collections import deque
 from typing import NamedTuple
 
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.message import OutgoingMessage
 
 
 class Run(NamedTuple):
@@ -16,7 +16,7 @@ class Run(NamedTuple):
     `again`: it left before. `stale`: it was set aside and has no claim to be urgent any more.
     """
 
-    message: Outgoing
+    message: OutgoingMessage
     position: int
     length: int
     again: bool
@@ -27,10 +27,10 @@ class _Level:
     __slots__ = ("again", "fresh", "stale_again", "stale_fresh")
 
     def __init__(self) -> None:
-        self.again: deque[tuple[Outgoing, int]] = deque()
-        self.fresh: deque[Outgoing] = deque()
-        self.stale_again: deque[tuple[Outgoing, int]] = deque()
-        self.stale_fresh: deque[Outgoing] = deque()
+        self.again: deque[tuple[OutgoingMessage, int]] = deque()
+        self.fresh: deque[OutgoingMessage] = deque()
+        self.stale_again: deque[tuple[OutgoingMessage, int]] = deque()
+        self.stale_fresh: deque[OutgoingMessage] = deque()
 
     def empty(self) -> bool:
         return not (self.again or self.fresh or self.stale_again or self.stale_fresh)
@@ -53,7 +53,7 @@ class Scheduler:
         self._levels = _Levels()
         self.waiting = 0
 
-    def push(self, message: Outgoing, *, first: bool = False) -> None:
+    def push(self, message: OutgoingMessage, *, first: bool = False) -> None:
         """All of the message (what of it has not left) waits; `first` puts it ahead of its level."""
         fresh = self._levels[message.priority].fresh
         if first:
@@ -62,12 +62,12 @@ class Scheduler:
             fresh.append(message)
         self.waiting |= 1 << message.priority
 
-    def push_again(self, message: Outgoing, position: int) -> None:
+    def push_again(self, message: OutgoingMessage, position: int) -> None:
         """One piece of the message was lost and waits anew."""
         self._levels[message.priority].again.append((message, position))
         self.waiting |= 1 << message.priority
 
-    def nothing_waits(self, priority: int) -> bool:
+    def is_idle(self, priority: int) -> bool:
         """Whether every level is empty; `priority` is the one just taken from, whose bit may not show it yet."""
         return not self.waiting & ~(1 << priority) and self._levels[priority].empty()
 
@@ -91,7 +91,7 @@ class Scheduler:
         self.waiting &= ~(1 << priority)
         return None
 
-    def take(self, run: Run, count: int) -> None:
+    def consume(self, run: Run, count: int) -> None:
         """The first `count` pieces of the run just peeked leave."""
         level = self._levels[run.message.priority]
         if run.again:
@@ -102,7 +102,7 @@ class Scheduler:
         if message.next_position >= message.fragments:
             (level.fresh if level.fresh and level.fresh[0] is message else level.stale_fresh).popleft()
 
-    def drop_head(self, run: Run) -> None:
+    def park_head(self, run: Run) -> None:
         """The message of the run just peeked leaves this scheduler whole (a rate limit parks it)."""
         level = self._levels[run.message.priority]
         if run.again:
@@ -112,7 +112,7 @@ class Scheduler:
         else:
             level.stale_fresh.popleft()
 
-    def set_aside(self, last_priority: int) -> None:
+    def demote_stale(self, last_priority: int) -> None:
         """What waits on levels up to `last_priority` is stale from now on: fresh messages overtake it."""
         for priority, level in self._levels.items():
             if priority > last_priority:
@@ -124,11 +124,11 @@ class Scheduler:
                 level.stale_fresh.extend(level.fresh)
                 level.fresh.clear()
 
-    def rebuild(self, messages: list[Outgoing], *, pieces: bool) -> None:
-        """Start anew with these messages in this order; with `pieces`, pieces that wait to be sent again keep
+    def rebuild(self, messages: list[OutgoingMessage], *, keep_fragments: bool) -> None:
+        """Start anew with these messages in this order; with `keep_fragments`, pieces that wait to be sent again keep
         waiting."""
         kept = []
-        if pieces:
+        if keep_fragments:
             for _, level in sorted(self._levels.items()):
                 kept.extend([*level.again, *level.stale_again])
         self._levels = _Levels()

@@ -4,7 +4,7 @@
 2. `acknowledge` books what arrived, measures round trip, rate and loss, and puts lost pieces back by priority.
 3. `handle_timer` probes when acknowledgements stay away: first one packet; then the peer is *silent*, everything
    on its way is waiting again, and single probes leave: window and rate model stay as they were.
-4. `heard` ends the silence; `restart` begins anew with a peer that forgot everything.
+4. `on_activity` ends the silence; `restart` begins anew with a peer that forgot everything.
 Which messages are open, and the one outcome of each, is the book of `open_messages`.
 """
 
@@ -15,40 +15,40 @@ from udp_mesh.core.congestion.delay_based import DelayBasedController
 from udp_mesh.core.congestion.pacer import Pacer
 from udp_mesh.core.congestion.rtt import INITIAL_PTO_S, RttEstimator
 from udp_mesh.core.events import ExpiryReason
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.pending import Outcome, PendingMessages
 from udp_mesh.core.sender.pmtu import PathMtu
-from udp_mesh.core.sender.redundancy import OVERDUE_ROUND_TRIPS, Copies
-from udp_mesh.core.sender.resume_backoff import RETURN_BURST_PACKETS, ResumeBackoff
+from udp_mesh.core.sender.redundancy import OVERDUE_ROUND_TRIPS, RedundantCopies
+from udp_mesh.core.sender.resume_backoff import RESUME_BURST_PACKETS, ResumeBackoff
 from udp_mesh.core.sender.scheduler import Scheduler
 from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot, SentPackets
 from udp_mesh.core.settings import Rates, Settings
 from udp_mesh.wire.frames import Ack
 
-PROBE_SOON_S = 0.025
+FAST_PROBE_INTERVAL_S = 0.025
 """Between probes in the first second of a silence: most cuts of a moving robot are that short."""
 
-PROBE_S = 0.25
+PROBE_INTERVAL_S = 0.25
 """Between probes later on: at most this much is lost when the link returns; four packets a second to a dead peer."""
 
-PROBE_SOON_FOR_S = 1.0
+FAST_PROBE_FOR_S = 1.0
 
-SILENT_AFTER_TIMEOUTS = 3
-SILENT_AFTER_S = 0.25
+UNRESPONSIVE_AFTER_PTOS = 3
+UNRESPONSIVE_AFTER_S = 0.25
 """Without any acknowledgement for both of these the peer is silent. Until then packets are replaced as they time out,
 at the pace of the window: a burst of losses then costs little more than its own length."""
 
-QUIET_S = 0.02
+MIN_ACK_GAP_S = 0.02
 """Acknowledgements must stay away at least this long before packets time out: twice what they are held back."""
 
-EXPIRE_EVERY_S = 0.005
+EXPIRE_INTERVAL_S = 0.005
 """Between two looks for packets that timed out."""
 
 LOSS_MEMORY_PACKETS = 256
 """Packets over which loss is smoothed."""
 
 
-OTHERS_TELL_S = 1.0
+NON_URGENT_RTT_VALID_S = 1.0
 """So long the round trip of packets that are not urgent is the one that counts."""
 
 
@@ -60,7 +60,7 @@ class Sender(PendingMessages):
         self.rtt = RttEstimator()
         self.urgent_rtt = RttEstimator()
         """Of urgent packets alone: in a radio's queues they pass others (wifi's access categories)."""
-        self._other_sampled_at = float("-inf")
+        self._non_urgent_sampled_at = float("-inf")
         self.congestion: CongestionController = DelayBasedController(self.rtt)
         self.pacer = Pacer(settings.rates.pace_quantum_s)
         self.in_flight = SentPackets()
@@ -71,7 +71,7 @@ class Sender(PendingMessages):
         self.next_wire_id = 0
         self.epoch = 0
         """Counts the runs of the peer: wire ids of earlier ones mean nothing to this one."""
-        self.copies = Copies()
+        self.copies = RedundantCopies()
         self.served = 0
         """Mask of levels from which something left in this round."""
         self.wake_at = float("inf")
@@ -79,20 +79,20 @@ class Sender(PendingMessages):
         self.unresponsive_since: float | None = None
         self.timing_out = False
         """Acknowledgements stay away: packets are taken for lost by their age."""
-        self.overdue: list[Packet] = []
+        self.timed_out: list[Packet] = []
         """Packets that timed out and are neither known to have arrived nor sent again."""
         self.expired_at = float("-inf")
-        self.urgent_left_at = float("-inf")
+        self.urgent_sent_at = float("-inf")
         self.probe_credit = 0
         self.probed_at = float("-inf")
         self._resume_backoff = ResumeBackoff()
         self.pmtu = PathMtu()
         self.last_progress = 0.0
-        self.other_progress = 0.0
+        self.non_urgent_progress = 0.0
         """When the last packet that was not urgent arrived."""
-        self.limited = True
+        self.app_limited = True
         """The application, not window or pacing, decides how much leaves."""
-        self.since_ack_wanted = 0
+        self.since_ack_requested = 0
         """Packets sent since the last one that asked for an acknowledgement at once."""
         self.loss = 0.0
         self.send_twice = False
@@ -117,9 +117,9 @@ class Sender(PendingMessages):
 
     # Accepting
 
-    def accept(self, message: Outgoing, now: float) -> None:
+    def accept(self, message: OutgoingMessage, now: float) -> None:
         """Take a message on: it waits on its level."""
-        self.take_on(message)
+        self.add(message)
         if not self.in_flight.outstanding and self.unresponsive_since is None:
             self.last_progress = now
         if self.unresponsive_since is not None and message.priority <= self.rates.urgent_priority:
@@ -142,15 +142,15 @@ class Sender(PendingMessages):
             after_silence = self.timing_out or self.unresponsive_since is not None
             self.last_progress = now
             if not all(packet.snapshot.urgent for packet in acknowledged):
-                self.other_progress = now
+                self.non_urgent_progress = now
             self.timing_out = False
             if self.unresponsive_since is not None:
-                self._end_silence()
-            if self.pmtu.in_doubt:
-                self.pmtu.arrived(acknowledged, in_flight.spurious - spurious, now)
-            self._book_arrivals(acknowledged)
-            if self.overdue:
-                self._settle_overdue()
+                self._on_responsive()
+            if self.pmtu.suspect:
+                self.pmtu.on_acked(acknowledged, in_flight.spurious - spurious, now)
+            self._record_arrivals(acknowledged)
+            if self.timed_out:
+                self._requeue_timed_out()
             rate: float | None = None
             largest = -1
             ahead = 0
@@ -164,11 +164,11 @@ class Sender(PendingMessages):
                 if elapsed > 0 and not after_silence:
                     rate = (self.delivered_packets - snapshot.delivered) / elapsed
                 self.delivered_sent_at = snapshot.sent_at
-                ahead = snapshot.ahead_of(ack.largest)
+                ahead = snapshot.packets_ahead_of(ack.largest)
             self.delivered_at = now
-            limited = newest is None or newest.snapshot.limited
+            app_limited = newest is None or newest.snapshot.app_limited
             outstanding = in_flight.outstanding
-            if self.congestion.drain_overdue(now) and not in_flight.others_outstanding():
+            if self.congestion.drain_overdue(now) and not in_flight.non_urgent_outstanding():
                 # The few urgent ones that leave during a drain are no queue.
                 outstanding = 0
             self.congestion.on_ack(
@@ -177,14 +177,14 @@ class Sender(PendingMessages):
                 in_flight.next_number,
                 outstanding,
                 rate,
-                limited=limited,
+                app_limited=app_limited,
                 ahead=ahead,
                 loss=self.loss,
                 now=now,
             )
         if lost:
-            self.pmtu.lost(lost)
-            self._put_back(lost)
+            self.pmtu.on_lost(lost)
+            self._requeue(lost)
         lost_packets = len(lost) + timed_out
         total = len(acknowledged) + lost_packets
         if total:
@@ -198,14 +198,14 @@ class Sender(PendingMessages):
         """Whether this round trip tells of the queue by which the window goes."""
         if urgent:
             self.urgent_rtt.sample(round_trip_s, now)
-            if now < self._other_sampled_at + OTHERS_TELL_S:
+            if now < self._non_urgent_sampled_at + NON_URGENT_RTT_VALID_S:
                 return False
         else:
-            self._other_sampled_at = now
+            self._non_urgent_sampled_at = now
         self.rtt.sample(round_trip_s, now)
         return True
 
-    def _book_arrivals(self, packets: Iterable[Packet]) -> None:
+    def _record_arrivals(self, packets: Iterable[Packet]) -> None:
         for packet in packets:
             _, message, position, more = packet
             if not position:
@@ -219,19 +219,19 @@ class Sender(PendingMessages):
             for message, position in more:
                 if not position:
                     self.announced.add(message.accepted.channel.number)
-                if not message.ended and message.arrive(position):
+                if not message.ended and message.mark_arrived(position):
                     self.delivered_bytes += len(message.body)
                     if not message.missing:
                         self.finish(message, Outcome.DELIVERED)
 
-    def _put_back(self, packets: Iterable[Packet]) -> None:
+    def _requeue(self, packets: Iterable[Packet]) -> None:
         """Lost pieces of reliable messages wait again on their level."""
         for packet in packets:
-            self._put_back_piece(packet.message, packet.position)
+            self._requeue_fragment(packet.message, packet.position)
             for message, position in packet.more:
-                self._put_back_piece(message, position)
+                self._requeue_fragment(message, position)
 
-    def _put_back_piece(self, message: Outgoing, position: int) -> None:
+    def _requeue_fragment(self, message: OutgoingMessage, position: int) -> None:
         if message.ended or not message.reliable or message.arrived[position]:
             return
         if message.superseded:
@@ -239,19 +239,19 @@ class Sender(PendingMessages):
         else:
             self.scheduler.push_again(message, position)
 
-    def copy_later(self, message: Outgoing, position: int, now: float) -> None:
+    def schedule_copies(self, message: OutgoingMessage, position: int, now: float) -> None:
         """A small urgent piece left for the first time."""
-        self.copies.later(
+        self.copies.schedule(
             message,
             position,
             now,
             gap_s=self.rates.twice_gap_s,
             twice=self.send_twice,
             loss=self.loss,
-            overdue_s=self.overdue_s(),
+            urgent_timeout_s=self.urgent_timeout_s(),
         )
 
-    def overdue_s(self) -> float:
+    def urgent_timeout_s(self) -> float:
         """How long the answer to an urgent piece may take."""
         smoothed_rtt = self.urgent_rtt.smoothed_rtt or self.rtt.smoothed_rtt
         return INITIAL_PTO_S if smoothed_rtt is None else OVERDUE_ROUND_TRIPS * smoothed_rtt + self.rates.twice_gap_s
@@ -275,9 +275,9 @@ class Sender(PendingMessages):
             at = self.copies.next_at()
         return at
 
-    def timeout(self) -> float:
+    def pto_s(self) -> float:
         """Silence after which the oldest packet counts as lost."""
-        return self.rtt.timeout(self.rates.ack_delay_s, PROBE_S)
+        return self.rtt.pto_s(self.rates.ack_delay_s, PROBE_INTERVAL_S)
 
     def handle_timer(self, now: float) -> None:
         self.expire(now)
@@ -288,103 +288,103 @@ class Sender(PendingMessages):
             if awaited and now >= self.probed_at + self._probe_interval_s(self.unresponsive_since):
                 self.allow_probe(now)
         elif self.in_flight.outstanding:
-            timeout = self.timeout()
-            if now >= self.last_progress + max(SILENT_AFTER_TIMEOUTS * timeout, SILENT_AFTER_S):
+            timeout = self.pto_s()
+            if now >= self.last_progress + max(UNRESPONSIVE_AFTER_PTOS * timeout, UNRESPONSIVE_AFTER_S):
                 self.unresponsive_since = now
                 self.allow_probe(now)
             elif now >= self._expiry_at():
                 self.expired_at = now
-                self._expire(now - timeout)
+                self._declare_timed_out(now - timeout)
 
     def _expiry_at(self) -> float:
         """When to look for packets whose acknowledgement is overdue."""
         oldest = self.in_flight.oldest()
         if oldest is None:
             return float("inf")
-        timeout = self.timeout()
+        timeout = self.pto_s()
         # Urgent packets overtake others in radios: that they arrive says nothing about one that all others follow.
-        progress = self.last_progress if oldest.urgent else self.other_progress
-        quiet = progress + max(QUIET_S, timeout / 2)
-        return max(quiet, oldest.sent_at + timeout, self.expired_at + EXPIRE_EVERY_S)
+        progress = self.last_progress if oldest.urgent else self.non_urgent_progress
+        quiet = progress + max(MIN_ACK_GAP_S, timeout / 2)
+        return max(quiet, oldest.sent_at + timeout, self.expired_at + EXPIRE_INTERVAL_S)
 
-    def _expire(self, sent_before: float) -> None:
+    def _declare_timed_out(self, sent_before: float) -> None:
         """Packets sent until then are no longer counted as on their way, so that others may leave.
 
         Whether they, or only their acknowledgements, were lost the next acknowledgement will tell: until then urgent
         pieces are sent again, others only if nothing else waits.
         """
         self.timing_out = True
-        for packet in self.in_flight.lose_before(sent_before):
+        for packet in self.in_flight.declare_lost_before(sent_before):
             if packet.message.priority <= self.rates.urgent_priority:
-                self._put_back((packet,))
+                self._requeue((packet,))
             else:
-                self.overdue.append(packet)
-            self.pmtu.lost((packet,))
-        if self.overdue and not self.scheduler.waiting:
-            self._settle_overdue()
+                self.timed_out.append(packet)
+            self.pmtu.on_lost((packet,))
+        if self.timed_out and not self.scheduler.waiting:
+            self._requeue_timed_out()
 
-    def _settle_overdue(self) -> None:
-        overdue, self.overdue = self.overdue, []
-        self._put_back(overdue)
+    def _requeue_timed_out(self) -> None:
+        timed_out, self.timed_out = self.timed_out, []
+        self._requeue(timed_out)
 
     def _probe_interval_s(self, unresponsive_since: float) -> float:
-        return PROBE_SOON_S if self.probed_at - unresponsive_since < PROBE_SOON_FOR_S else PROBE_S
+        return FAST_PROBE_INTERVAL_S if self.probed_at - unresponsive_since < FAST_PROBE_FOR_S else PROBE_INTERVAL_S
 
     def allow_probe(self, now: float) -> None:
-        """The most urgent waiting piece may leave although the peer is silent; not more often than `PROBE_SOON_S`."""
-        if now < self.probed_at + PROBE_SOON_S * 0.99:
+        """Let the most urgent fragment probe an unresponsive peer, at most once per `FAST_PROBE_INTERVAL_S`."""
+        if now < self.probed_at + FAST_PROBE_INTERVAL_S * 0.99:
             return
         self.probed_at = now
         self.probe_credit = 1
-        self._set_aside()
+        self._demote_in_flight()
 
-    def probes_small(self, now: float) -> bool:
+    def consume_small_probe(self, now: float) -> bool:
         """Whether the probe just allowed shall be a ping: nothing waits, or full pieces may be too large for the path
         (then one probe in a few, once the silence is no short cut)."""
         if self.unresponsive_since is None or not self.probe_credit:
             return False
         if self.scheduler.waiting:
-            long_since = now - self.unresponsive_since > PROBE_SOON_FOR_S
-            if not (long_since and self.pmtu.ask_small()):
+            long_since = now - self.unresponsive_since > FAST_PROBE_FOR_S
+            if not (long_since and self.pmtu.next_probe_is_small()):
                 return False
             self.probe_credit = 0
-        self.pmtu.asked_small()
+        self.pmtu.on_small_probe_sent()
         return True
 
-    def _set_aside(self) -> None:
+    def _demote_in_flight(self) -> None:
         """Everything on its way waits again, urgent messages behind those still to come."""
-        self._settle_overdue()
-        given_up = self.in_flight.give_up()
-        self.pmtu.lost(given_up)
-        self._put_back(given_up)
-        self.scheduler.set_aside(self.rates.urgent_priority)
+        self._requeue_timed_out()
+        given_up = self.in_flight.abandon_all()
+        self.pmtu.on_lost(given_up)
+        self._requeue(given_up)
+        self.scheduler.demote_stale(self.rates.urgent_priority)
 
-    def heard(self, now: float) -> None:
+    def on_activity(self, now: float) -> None:
         """Something authentic came from the peer. After a silence a first burst leaves, the rest when it is
         acknowledged."""
-        if self.unresponsive_since is None or now < self.probed_at + PROBE_SOON_S * 0.99:
+        if self.unresponsive_since is None or now < self.probed_at + FAST_PROBE_INTERVAL_S * 0.99:
             return
         if self._resume_backoff.due(now):
             self.allow_probe(now)
-            self.probe_credit = min(RETURN_BURST_PACKETS, int(self.congestion.cwnd))
+            self.probe_credit = min(RESUME_BURST_PACKETS, int(self.congestion.cwnd))
 
-    def _end_silence(self) -> None:
+    def _on_responsive(self) -> None:
         self.unresponsive_since = None
         self._resume_backoff.reset()
         self.probe_credit = 0
-        self.scheduler.set_aside(self.rates.urgent_priority)
+        self.scheduler.demote_stale(self.rates.urgent_priority)
 
     def reprioritize(self) -> None:
         """Topics changed their priorities: what waits moves to its new level."""
-        if self.levels.rearrange(self.pending):
-            self.scheduler.rebuild(list(self.pending), pieces=True)
+        if self.levels.reprioritize(self.pending):
+            self.scheduler.rebuild(list(self.pending), keep_fragments=True)
 
     # Anew
 
     def restart(self, now: float) -> None:
         """The peer runs anew (or must be told anew): every open message begins again under new numbers."""
         self.in_flight.restart(0)
-        self.overdue.clear()
+        self.timed_out.clear()
         self.announced.clear()
         self.copies.clear()
         self.cancelled.clear()
@@ -397,15 +397,15 @@ class Sender(PendingMessages):
         messages = list(self.pending)
         self.pending.clear()
         for message in messages:
-            self.begin_anew(message)
-        self.scheduler.rebuild(list(self.pending), pieces=False)
+            self.restart_message(message)
+        self.scheduler.rebuild(list(self.pending), keep_fragments=False)
 
-    def send_anew(self, message: Outgoing) -> None:
+    def resend_from_start(self, message: OutgoingMessage) -> None:
         """The peer forgot the pieces it had of this one."""
         self.announced.discard(message.accepted.channel.number)
-        self.scheduler.push(self.begin_anew(message))
+        self.scheduler.push(self.restart_message(message))
 
-    def resume(self, message: Outgoing, now: float) -> None:
+    def resume(self, message: OutgoingMessage, now: float) -> None:
         """Take a withdrawn message on again where it stopped."""
         copy = message.resumed()
         self.accept(copy, now)
@@ -422,7 +422,7 @@ class Sender(PendingMessages):
             self.delivered_packets,
             self.delivered_at,
             self.delivered_sent_at,
-            self.limited,
+            self.app_limited,
             urgent,
             self.in_flight.next_number,
             self.in_flight.outstanding,

@@ -11,15 +11,15 @@ from functools import partial
 from itertools import repeat
 from typing import NamedTuple
 
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.message import OutgoingMessage
 
 REORDER_PACKETS = 3
 """RFC 9002, 6.1.1: fewer calls reordering a loss, more waits longer."""
 
-MOST_REORDER_PACKETS = 64
+MAX_REORDER_PACKETS = 64
 """What learned reordering may reach."""
 
-REMEMBERED_LOST = 256
+MAX_REMEMBERED_LOST = 256
 """Packets called lost that an acknowledgement may still correct: those its bitmap covers."""
 
 
@@ -33,7 +33,7 @@ class SendSnapshot(NamedTuple):
     """When the last of those was acknowledged."""
     delivered_sent_at: float
     """When the last of those had been sent."""
-    limited: bool
+    app_limited: bool
     """The application, not the window, decided how much was sent."""
     urgent: bool = False
     first: int = 0
@@ -41,7 +41,7 @@ class SendSnapshot(NamedTuple):
     outstanding: int = 0
     """Packets that were on their way when it left."""
 
-    def ahead_of(self, number: int) -> int:
+    def packets_ahead_of(self, number: int) -> int:
         """Packets of ours that were on their way when packet `number` of the burst left."""
         return self.outstanding + number - self.first
 
@@ -50,9 +50,9 @@ class Packet(NamedTuple):
     """One packet on its way, and the pieces of messages in it."""
 
     snapshot: SendSnapshot
-    message: Outgoing
+    message: OutgoingMessage
     position: int
-    more: tuple[tuple[Outgoing, int], ...] = ()
+    more: tuple[tuple[OutgoingMessage, int], ...] = ()
 
 
 class SentPackets:
@@ -86,7 +86,7 @@ class SentPackets:
     def next_number(self) -> int:
         return self.base + len(self._packets)
 
-    def others_outstanding(self) -> int:
+    def non_urgent_outstanding(self) -> int:
         """How many of `outstanding` are not urgent. Walks the queue."""
         return sum(packet is not None and not packet.snapshot.urgent for packet in self._packets)
 
@@ -100,7 +100,7 @@ class SentPackets:
             return
         packets.append(packet)
 
-    def add_run(self, snapshot: SendSnapshot, message: Outgoing, positions: range) -> None:
+    def add_run(self, snapshot: SendSnapshot, message: OutgoingMessage, positions: range) -> None:
         """As `add` for a packet of each piece, which have the next numbers; without a call in Python for each."""
         self.outstanding += len(positions)
         self._packets.extend(
@@ -121,7 +121,7 @@ class SentPackets:
         late: Packet | None = None
         if self._lost and largest < self.next_number:
             late = self._lost[largest][0] if largest in self._lost else None
-            self._correct(largest, received, acknowledged)
+            self._undo_loss(largest, received, acknowledged)
         if count <= 0 or count > len(packets):
             return acknowledged, lost, late
         newest = packets[count - 1]
@@ -168,13 +168,13 @@ class SentPackets:
 
     def confirm_timed_out(self, largest: int, received: int) -> int:
         """How many urgent packets that timed out were lost indeed, as this acknowledgement tells."""
-        told = largest - self.reorder_packets
+        conclusive = largest - self.reorder_packets
         lost = 0
-        while self._timed_out and self._timed_out[0] <= told:
+        while self._timed_out and self._timed_out[0] <= conclusive:
             lost += not received >> (largest - self._timed_out.pop(0)) & 1
         return lost
 
-    def give_up(self) -> list[Packet]:
+    def abandon_all(self) -> list[Packet]:
         """Everything on its way counts as lost (the peer is silent); an acknowledgement may still correct that."""
         lost = [packet for packet in self._packets if packet is not None]
         for number, packet in enumerate(self._packets, self.base):
@@ -207,7 +207,7 @@ class SentPackets:
         front = packets[0] if packets else None
         return front.snapshot if front is not None else None
 
-    def lose_before(self, sent_before: float) -> list[Packet]:
+    def declare_lost_before(self, sent_before: float) -> list[Packet]:
         """Packets sent before that time count as lost."""
         packets = self._packets
         lost = []
@@ -227,14 +227,14 @@ class SentPackets:
 
     def _remember(self, number: int, packet: Packet, *, overtaken: bool) -> None:
         self._lost[number] = (packet, overtaken)
-        if len(self._lost) > REMEMBERED_LOST:
+        if len(self._lost) > MAX_REMEMBERED_LOST:
             self._lost.popitem(last=False)
 
-    def _correct(self, largest: int, received: int, acknowledged: list[Packet]) -> None:
+    def _undo_loss(self, largest: int, received: int, acknowledged: list[Packet]) -> None:
         late = [number for number in self._lost if number <= largest and received >> (largest - number) & 1]
         for number in late:
             packet, overtaken = self._lost.pop(number)
             acknowledged.append(packet)
             self.spurious += 1
             if overtaken:
-                self.reorder_packets = min(MOST_REORDER_PACKETS, self.reorder_packets + 1)
+                self.reorder_packets = min(MAX_REORDER_PACKETS, self.reorder_packets + 1)

@@ -10,8 +10,8 @@ import pytest
 from tests.udp_mesh.core.pair import BROADCAST, IP_UDP_BYTES, Pipe, World, settings
 from udp_mesh.core.events import MessageDelivered, MessageId, MessageReceived, PathNarrowed, PeerOnline
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.sender.message import Accepted, Channel, Outgoing
-from udp_mesh.core.sender.pmtu import ASK_AT_MOST_EVERY_S, ASKED_TIMES, PathMtu
+from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
+from udp_mesh.core.sender.pmtu import MAX_PROBE_INTERVAL_S, MAX_PROBES, PathMtu
 from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot
 from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
 from udp_mesh.wire.frames import MessageFlag
@@ -217,10 +217,10 @@ def test_a_path_that_stays_narrow_is_asked_ever_more_seldom_and_loses_nothing_bu
         world.at(world.now + 20.0, publish)
 
     publish()
-    world.run(2 * ASK_AT_MOST_EVERY_S + 50.0)
+    world.run(2 * MAX_PROBE_INTERVAL_S + 50.0)
     # 10, 20, 40 .. 320, 600 s after the one before
-    assert [round(at / 10) * 10 for at in large[::ASKED_TIMES]] == [10, 30, 70, 150, 310, 630, 1240]
-    assert len(large) == 7 * ASKED_TIMES
+    assert [round(at / 10) * 10 for at in large[::MAX_PROBES]] == [10, 30, 70, 150, 310, 630, 1240]
+    assert len(large) == 7 * MAX_PROBES
     assert narrow(world) == [1280]
 
 
@@ -249,14 +249,14 @@ def test_a_path_that_carries_large_pings_and_nothing_else_is_asked_ever_more_sel
     asked: list[float] = []
     while now < 1200.0:
         if size.narrowed_at is None:
-            size.narrowed(now)
-        assert size.probe.carries == 0
+            size.on_narrowed(now)
+        assert size.probe.confirmed_mtu == 0
         while not size.probe.due(now, 0.0):
             now += 0.5
         asked.append(now)
-        size.probe.asked(1, 1500)
-        size.answered(1, now)
-        assert size.probe.carries == 1500
+        size.probe.on_probe_sent(1, 1500)
+        size.on_pong(1, now)
+        assert size.probe.confirmed_mtu == 1500
         # Wide again, and narrow soon after.
         now += 5.0
         size.narrowed_at = None
@@ -265,10 +265,12 @@ def test_a_path_that_carries_large_pings_and_nothing_else_is_asked_ever_more_sel
 
 def packet(size_bytes: int, now: float) -> Packet:
     body = bytes(size_bytes)
-    accepted = Accepted(MessageId(1), Channel(0, Topic("t"), "t", ""), body, body, MessageFlag.RELIABLE, now, None)
-    message = Outgoing(accepted, 8, reliable=True)
+    accepted = AcceptedMessage(
+        MessageId(1), TopicChannel(0, Topic("t"), "t", ""), body, body, MessageFlag.RELIABLE, now, None
+    )
+    message = OutgoingMessage(accepted, 8, reliable=True)
     message.begin(1, 1400, 1400)
-    return Packet(SendSnapshot(now, 0, now, now, limited=False), message, 0)
+    return Packet(SendSnapshot(now, 0, now, now, app_limited=False), message, 0)
 
 
 def narrowings(hours: float, arrives: Callable[[float], bool], *, large_arrive: bool = True) -> int:
@@ -278,17 +280,17 @@ def narrowings(hours: float, arrives: Callable[[float], bool], *, large_arrive: 
     count = 0
     for step in range(int(hours * 3600 * 4)):
         now = step / 4
-        if size.ask_small():
-            size.asked_small()
+        if size.next_probe_is_small():
+            size.on_small_probe_sent()
             if arrives(now):
-                size.answered(0, now)
+                size.on_pong(0, now)
         elif not (arrives(now) and large_arrive):
-            size.lost([large._replace(snapshot=small.snapshot._replace(sent_at=now))])
-        elif size.in_doubt:
-            size.arrived([large], 0, now)
-        if size.too_narrow(now):
+            size.on_lost([large._replace(snapshot=small.snapshot._replace(sent_at=now))])
+        elif size.suspect:
+            size.on_acked([large], 0, now)
+        if size.is_black_hole(now):
             count += 1
-            size.narrowed(now)
+            size.on_narrowed(now)
     return count
 
 

@@ -6,33 +6,35 @@ import pytest
 
 from tests.udp_mesh.core.test_links import Run
 from udp_mesh.core.events import MessageId
-from udp_mesh.core.sender.message import Accepted, Channel, Outgoing
-from udp_mesh.core.sender.redundancy import EARLY, OVERDUE_TIMES, Copies
+from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
+from udp_mesh.core.sender.redundancy import EARLY_COPIES, MAX_OVERDUE_COPIES, RedundantCopies
 from udp_mesh.core.settings import Topic
 from udp_mesh.wire.frames import MessageFlag
 
 GAP_S, OVERDUE_S = 0.003, 0.025
-EARLY_S = [GAP_S, *(gaps * GAP_S for _, gaps in EARLY)]
+EARLY_S = [GAP_S, *(gaps * GAP_S for _, gaps in EARLY_COPIES)]
 
 
-def piece(*, reliable: bool = True) -> Outgoing:
+def piece(*, reliable: bool = True) -> OutgoingMessage:
     topic = Topic("stop", priority=0, reliable=reliable)
-    accepted = Accepted(MessageId(1), Channel(0, topic, topic.name, ""), b"x", b"x", MessageFlag(0), 0.0, None)
-    message = Outgoing(accepted, 0, reliable=reliable)
+    accepted = AcceptedMessage(
+        MessageId(1), TopicChannel(0, topic, topic.name, ""), b"x", b"x", MessageFlag(0), 0.0, None
+    )
+    message = OutgoingMessage(accepted, 0, reliable=reliable)
     message.begin(0, 1400, 1400)
     return message
 
 
-def sendings(message: Outgoing, *, twice: bool, loss: float, answered_at: float = float("inf")) -> list[float]:
+def sendings(message: OutgoingMessage, *, twice: bool, loss: float, answered_at: float = float("inf")) -> list[float]:
     """When copies of a piece leave that was sent at 0."""
-    copies = Copies()
-    copies.later(message, 0, 0.0, gap_s=GAP_S, twice=twice, loss=loss, overdue_s=OVERDUE_S)
+    copies = RedundantCopies()
+    copies.schedule(message, 0, 0.0, gap_s=GAP_S, twice=twice, loss=loss, urgent_timeout_s=OVERDUE_S)
     times = []
     while copies:
         at = copies.next_at()
         if at >= answered_at:
             message.arrived[0] = 1
-        times += [at for _ in copies.due(at, OVERDUE_S)]
+        times += [at for _ in copies.pop_due(at, OVERDUE_S)]
     return times
 
 
@@ -48,7 +50,7 @@ def test_the_more_is_lost_the_more_copies_leave_before_an_answer_can_come() -> N
 
 def test_an_overdue_answer_brings_another_copy_a_bounded_number_of_times() -> None:
     later = [at for at in sendings(piece(), twice=True, loss=0.05) if at > GAP_S]
-    assert later == pytest.approx([n * OVERDUE_S for n in range(1, OVERDUE_TIMES + 1)])
+    assert later == pytest.approx([n * OVERDUE_S for n in range(1, MAX_OVERDUE_COPIES + 1)])
 
 
 def test_an_answer_ends_it() -> None:

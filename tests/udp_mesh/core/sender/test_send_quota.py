@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.udp_mesh.core.test_links import Run
-from udp_mesh.core.sender.send_quota import PRESUMED_FOR_S, ack_spacing, permitted, window_room
+from udp_mesh.core.sender.send_quota import ASSUMED_DELIVERY_S, ack_spacing, cwnd_room, send_quota
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Settings
 
@@ -21,7 +21,7 @@ def busy_outbound(**link: object) -> tuple[Sender, float]:
 
 
 def room(sender: Sender, now: float) -> int:
-    return permitted(sender, window_room(sender, now), now, None, urgent=True)
+    return send_quota(sender, cwnd_room(sender, now), now, None, urgent=True)
 
 
 def test_late_acknowledgements_do_not_stop_the_link() -> None:
@@ -36,7 +36,7 @@ def test_what_is_presumed_is_bounded() -> None:
     sender, heard = busy_outbound()
     capacity = sender.congestion.capacity_packets_per_s()
     assert capacity is not None
-    assert room(sender, heard + 10.0) - room(sender, heard) <= PRESUMED_FOR_S * capacity + 1
+    assert room(sender, heard + 10.0) - room(sender, heard) <= ASSUMED_DELIVERY_S * capacity + 1
 
 
 def test_nothing_is_presumed_of_a_link_whose_queue_is_not_ours() -> None:
