@@ -21,31 +21,40 @@ from udp_mesh.wire.codec import encode
 from udp_mesh.wire.frames import Fragment, Frame, MessageFlag, MessageHead, Nack, Sent, TopicAnnounce
 from udp_mesh.wire.limits import PRIORITY_LEVELS
 
-UNREPAIRED_FROM = 1 << 31
+FIRST_UNREPAIRED_NUMBER = 1 << 31
 """Numbers of casts without repair start here, so that a lost one leaves no gap among those with repair."""
 
-ASK_AFTER_S = 0.02
+NACK_DELAY_S = 0.02
 """Between noticing a gap and asking: a reordered cast still comes, and not everyone asks at once."""
 
-ASK_AGAIN_S = 0.25
+NACK_INTERVAL_S = 0.25
 """Between two requests for one cast: a round trip and a resend, generously."""
 
-ASK_TIMES = 8
+MAX_NACKS = 8
 
-MOST_MISSING = 256
+MAX_MISSING = 256
 """Casts asked for at a time per peer: a sender that jumps ahead must not make us ask for millions."""
 
 
 class BroadcastQueue:
     """Casts waiting to leave, by level; `waiting` as in `Scheduler`."""
 
-    __slots__ = ("_copies", "_kept", "_kept_bytes", "_levels", "_number", "_unrepaired", "free_at", "waiting")
+    __slots__ = (
+        "_copies",
+        "_levels",
+        "_number",
+        "_repairable",
+        "_repairable_bytes",
+        "_unrepaired",
+        "free_at",
+        "waiting",
+    )
 
     def __init__(self) -> None:
         self._levels: list[deque[AcceptedMessage]] = [deque() for _ in range(PRIORITY_LEVELS)]
         self._copies: deque[tuple[float, list[Datagram]]] = deque()
-        self._kept: OrderedDict[int, AcceptedMessage] = OrderedDict()
-        self._kept_bytes = 0
+        self._repairable: OrderedDict[int, AcceptedMessage] = OrderedDict()
+        self._repairable_bytes = 0
         self._number = 0
         self._unrepaired = 0
         self.waiting = 0
@@ -58,7 +67,7 @@ class BroadcastQueue:
 
     @property
     def kept_bytes(self) -> int:
-        return self._kept_bytes
+        return self._repairable_bytes
 
     def push(self, accepted: AcceptedMessage) -> None:
         topic = accepted.channel.topic
@@ -84,7 +93,7 @@ class BroadcastQueue:
         """Casts that have not left."""
         return sum(len(level) for level in self._levels)
 
-    def leave(
+    def send_level(
         self,
         priority: int,
         channel: SendChannel,
@@ -94,7 +103,7 @@ class BroadcastQueue:
         *,
         packets_per_s: float | None,
         copy_after_s: float | None,
-        kept_limit_bytes: int,
+        repairable_limit_bytes: int,
         max_timestamped_bytes: int,
     ) -> None:
         """Let the casts of a level leave on all `paths` (link, address); `copy_after_s` sends them a second time
@@ -110,7 +119,7 @@ class BroadcastQueue:
             accepted = level.popleft()
             if accepted.deadline is not None and accepted.deadline <= now:
                 continue
-            frames = self._frames(accepted, now, kept_limit_bytes)
+            frames = self._frames(accepted, now, repairable_limit_bytes)
             encoded = encode(_with_timestamp(frames, accepted, now))
             if len(encoded) + SHORT_OVERHEAD_BYTES > max_timestamped_bytes:
                 encoded = encode(frames)
@@ -134,7 +143,7 @@ class BroadcastQueue:
 
     def repair(self, number: int) -> AcceptedMessage | None:
         """The cast of this number, if still kept."""
-        return self._kept.get(number)
+        return self._repairable.get(number)
 
     def _frames(self, accepted: AcceptedMessage, now: float, limit_bytes: int) -> tuple[TopicAnnounce, Fragment]:
         channel = accepted.channel
@@ -143,12 +152,12 @@ class BroadcastQueue:
             number = self._number
             self._number += 1
             flags |= MessageFlag.REPAIR
-            self._kept[number] = accepted
-            self._kept_bytes += len(accepted.body)
-            while self._kept_bytes > limit_bytes:
-                self._kept_bytes -= len(self._kept.popitem(last=False)[1].body)
+            self._repairable[number] = accepted
+            self._repairable_bytes += len(accepted.body)
+            while self._repairable_bytes > limit_bytes:
+                self._repairable_bytes -= len(self._repairable.popitem(last=False)[1].body)
         else:
-            number = UNREPAIRED_FROM + self._unrepaired % UNREPAIRED_FROM
+            number = FIRST_UNREPAIRED_NUMBER + self._unrepaired % FIRST_UNREPAIRED_NUMBER
             self._unrepaired += 1
         age_ms = max(0, int((now - accepted.accepted_at) * 1000))
         head = MessageHead(len(accepted.body), 1, channel.number, channel.topic.priority, flags, age_ms)
@@ -179,7 +188,7 @@ class NackRepair:
         """Number -> (when to ask, how often asked)."""
         self.next_at = float("inf")
 
-    def counted(self, next_number: int, now: float, received: RangeSet) -> None:
+    def on_counter(self, next_number: int, now: float, received: RangeSet) -> None:
         """A heartbeat counts casts up to `next_number`: those not here are missing."""
         if self._expected is None:
             # Casts from before we met are not for us.
@@ -187,36 +196,36 @@ class NackRepair:
             return
         if next_number <= self._expected:
             return
-        for number in range(max(self._expected, next_number - MOST_MISSING), next_number):
+        for number in range(max(self._expected, next_number - MAX_MISSING), next_number):
             if number not in received:
-                at = now + ASK_AFTER_S * (0.5 + self._rng.random())
+                at = now + NACK_DELAY_S * (0.5 + self._rng.random())
                 self._missing[number] = (at, 0)
                 self.next_at = min(self.next_at, at)
         self._expected = next_number
 
-    def received(self, number: int, now: float, received: RangeSet) -> None:
+    def on_received(self, number: int, now: float, received: RangeSet) -> None:
         """A cast with repair arrived."""
         self._missing.pop(number, None)
         if self._expected is None:
             self._expected = number
         if number >= self._expected:
-            self.counted(number, now, received)
+            self.on_counter(number, now, received)
             self._expected = number + 1
 
-    def give_up(self, number: int) -> None:
+    def abandon(self, number: int) -> None:
         """The sender no longer has it."""
         self._missing.pop(number, None)
 
-    def ask(self, now: float) -> list[Nack]:
+    def due_nacks(self, now: float) -> list[Nack]:
         """What to ask for now."""
-        asks = []
+        nacks = []
         for number, (at, times) in list(self._missing.items()):
             if at > now:
                 continue
-            if times >= ASK_TIMES:
+            if times >= MAX_NACKS:
                 del self._missing[number]
                 continue
-            asks.append(Nack(number))
-            self._missing[number] = (now + ASK_AGAIN_S, times + 1)
+            nacks.append(Nack(number))
+            self._missing[number] = (now + NACK_INTERVAL_S, times + 1)
         self.next_at = min((at for at, _ in self._missing.values()), default=float("inf"))
-        return asks
+        return nacks

@@ -1,7 +1,7 @@
 """Message bodies, compressed on request of their topic and never inflated past the receiver's limit.
 
 Both ways go step by step, a millisecond each: whoever carries a map of 20 MB goes on with everything else in between.
-`Packing` and `Unpacking` are one body under way; `PackingQueue` is what a node still has to compress.
+`Compression` and `Decompression` are one body under way; `CompressionQueue` is what a node still has to compress.
 """
 
 import zlib
@@ -14,7 +14,7 @@ from udp_mesh.core.sender.message import TopicChannel
 LEVEL = 1
 """zlib's fastest: an embedded core compresses several times faster than a mesh carries."""
 
-LEAST_BYTES = 128
+MIN_BYTES = 128
 """Shorter messages gain nothing over zlib's own header."""
 
 STEP_BYTES = 1 << 16
@@ -24,7 +24,7 @@ INFLATE_STEP_BYTES = 1 << 18
 """Inflated in one step, which is faster."""
 
 
-class Packing:
+class Compression:
     """A payload being compressed (zlib, RFC 1950). When done, `body` is None where that is not shorter."""
 
     __slots__ = ("_at", "_compressor", "_packed", "_payload", "_size", "body")
@@ -40,7 +40,7 @@ class Packing:
     def step(self) -> bool:
         """Compress some more; True when done."""
         size = len(self._payload)
-        if size < LEAST_BYTES:
+        if size < MIN_BYTES:
             return True
         self._add(self._compressor.compress(self._payload[self._at : self._at + STEP_BYTES]))
         self._at += STEP_BYTES
@@ -58,7 +58,7 @@ class Packing:
         self._size += len(packed)
 
 
-class Unpacking:
+class Decompression:
     """A body being inflated. When done, `payload` is None for what is not zlib, is cut short, carries a tail, or grows
     past the limit."""
 
@@ -104,22 +104,22 @@ class Unpacking:
 
 def compress(payload: bytes) -> bytes | None:
     """The payload as zlib, or None where that is not shorter."""
-    packing = Packing(payload)
-    while not packing.step():
+    compression = Compression(payload)
+    while not compression.step():
         pass
-    return packing.body
+    return compression.body
 
 
 def decompress(body: bytes, limit_bytes: int) -> bytes | None:
-    """The inverse of `compress`; None as `Unpacking.payload`."""
-    unpacking = Unpacking(body, limit_bytes)
-    while not unpacking.step():
+    """The inverse of `compress`; None as `Decompression.payload`."""
+    decompression = Decompression(body, limit_bytes)
+    while not decompression.step():
         pass
-    return unpacking.payload
+    return decompression.payload
 
 
 @dataclass(frozen=True, slots=True)
-class Unpacked:
+class Uncompressed:
     """A message accepted but not yet compressed; `names` are its destinations, none for all, `store_keys` where each of
     their copies is on disk."""
 
@@ -131,44 +131,44 @@ class Unpacked:
     store_keys: tuple[int | None, ...] = ()
 
 
-class PackingQueue:
+class CompressionQueue:
     """What waits to be compressed: of one topic in the order accepted, of several topics the most urgent first."""
 
-    __slots__ = ("_topics", "_under_way", "bytes")
+    __slots__ = ("_in_progress", "_topics", "bytes")
 
     def __init__(self) -> None:
-        self._topics: dict[str, deque[Unpacked]] = {}
-        self._under_way: dict[str, Packing] = {}
+        self._topics: dict[str, deque[Uncompressed]] = {}
+        self._in_progress: dict[str, Compression] = {}
         self.bytes = 0
 
     def __len__(self) -> int:
         return len(self._topics)
 
-    def holds(self, topic: str) -> bool:
+    def has_topic(self, topic: str) -> bool:
         """Whether something of this topic waits, so that what comes later must wait behind it."""
         return topic in self._topics
 
-    def add(self, message: Unpacked) -> None:
+    def add(self, message: Uncompressed) -> None:
         self._topics.setdefault(message.channel.name, deque()).append(message)
         self.bytes += len(message.payload)
 
-    def step(self) -> tuple[Unpacked, bytes | None] | None:
+    def step(self) -> tuple[Uncompressed, bytes | None] | None:
         """Compress some more; a message and its compressed body (None: send it as it is) when one is done."""
         name = min(self._topics, key=lambda topic: self._topics[topic][0].channel.topic.priority)
-        packing = self._under_way.get(name)
-        if packing is None:
-            packing = self._under_way[name] = Packing(self._topics[name][0].payload)
-        if not packing.step():
+        compression = self._in_progress.get(name)
+        if compression is None:
+            compression = self._in_progress[name] = Compression(self._topics[name][0].payload)
+        if not compression.step():
             return None
-        del self._under_way[name]
-        return self._take(name), packing.body
+        del self._in_progress[name]
+        return self._take(name), compression.body
 
-    def take_all(self) -> list[Unpacked]:
+    def drain(self) -> list[Uncompressed]:
         """Everything, as it is: the node closes."""
-        self._under_way.clear()
+        self._in_progress.clear()
         return [self._take(name) for name in list(self._topics) for _ in range(len(self._topics[name]))]
 
-    def _take(self, name: str) -> Unpacked:
+    def _take(self, name: str) -> Uncompressed:
         waiting = self._topics[name]
         message = waiting.popleft()
         if not waiting:

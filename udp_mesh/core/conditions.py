@@ -21,7 +21,7 @@ class QueueConditions:
 
 
 @dataclass(frozen=True, slots=True)
-class Stranger:
+class UnverifiedNode:
     """A node that is heard and does not hear us: no peer, since nothing would reach it."""
 
     name: str
@@ -116,4 +116,4 @@ class Conditions:
     partial_bytes: int
     queued_bytes: int
     repair_bytes: int
-    strangers: tuple[Stranger, ...]
+    strangers: tuple[UnverifiedNode, ...]

@@ -9,11 +9,11 @@ from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.events import Event, MessageId, Rejected
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
 from udp_mesh.core.legacy.peers import LegacyPeers
-from udp_mesh.core.receive import take_datagram
+from udp_mesh.core.receive import receive_datagram
 from udp_mesh.core.settings import Address, LinkInfo, Settings
 from udp_mesh.core.state import State
 from udp_mesh.wire.header import MARK
-from udp_mesh.wire.legacy import uncover
+from udp_mesh.wire.legacy import decapsulate
 from udp_mesh.wire.limits import BOOT_ID_BYTES
 
 
@@ -38,13 +38,13 @@ class Node:
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
         """Take in one datagram. Bad bytes are counted and dropped; this never raises because of what was received."""
         if len(data) and data[0] < MARK:
-            covered = uncover(data)
+            covered = decapsulate(data)
             if covered is not None:
                 data = covered
         if len(data) and data[0] < MARK and self._legacy:
             self._legacy.receive(data, link, source, now)
         else:
-            take_datagram(self._state, data, link, source, now)
+            receive_datagram(self._state, data, link, source, now)
 
     def datagrams_to_send(self, now: float, *, max_bytes: int | None = None) -> list[Datagram]:
         """The datagrams that leave now, most urgent first, about 64 KiB at most per call (`max_bytes`, if given).
@@ -53,8 +53,8 @@ class Node:
         """
         out = transmit.collect(self._state, now, max_bytes)
         if self._legacy:
-            out = self._legacy.covered(out)
-            self._legacy.leave(now, out)
+            out = self._legacy.encapsulate_broadcasts(out)
+            self._legacy.send(now, out)
         if out:
             transmit.count_sent(self._state, out)
         return out

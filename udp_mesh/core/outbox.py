@@ -1,13 +1,13 @@
 """Messages held for peers that are offline, as their topic's outbox says: none, the last, or all within a bound.
 
-1. `keep` puts a message on disk as soon as it is accepted, where its topic says so: it stays there until its outcome is
-   known, not only until it is sent. A crash in between sends it again.
-2. `hold` keeps it while its peer is away, in the order accepted, and says which older ones had to go for it.
-3. `release` gives back the most urgent and oldest ones, some at a time: a long absence leaves a hundred thousand.
-4. `settle` forgets it on disk: its outcome is known.
+1. `persist` writes a message to disk when it is accepted, if its topic requires that. It stays there until its outcome
+   is known, so a crash in between sends it again.
+2. `hold` queues it while its peer is offline, in the order accepted, and returns the older ones dropped for it.
+3. `release` returns the most urgent and oldest messages in batches: a long absence accumulates a hundred thousand.
+4. `forget` removes it from disk once its outcome is known.
 
-A message that had begun to leave keeps its number, so that a peer which had all of it before the cut does not take it
-twice.
+A partly sent message keeps its number, so that a peer that received all of it before the link was lost does not deliver
+it twice.
 """
 
 from collections import deque
@@ -21,7 +21,7 @@ from udp_mesh.core.settings import Outbox
 
 
 @dataclass(slots=True, eq=False)
-class Held:
+class HeldMessage:
     """One message held for one peer; `store_key` where it is on disk."""
 
     accepted: AcceptedMessage
@@ -39,22 +39,22 @@ class Held:
 
 
 @dataclass(slots=True)
-class _Shelf:
+class _TopicQueue:
     """What is held of one topic for one peer, in the order accepted."""
 
-    held: deque[Held] = field(default_factory=deque)
+    held: deque[HeldMessage] = field(default_factory=deque)
     messages: int = 0
     bytes: int = 0
 
-    def front(self) -> Held:
+    def front(self) -> HeldMessage:
         """The oldest. Only of a shelf that holds something."""
         while self.held[0].gone:
             self.held.popleft()
         return self.held[0]
 
-    def put(self, new: Held) -> None:
+    def put(self, new: HeldMessage) -> None:
         """In its place: the newest, or one taken back, which then is older than all that came meanwhile."""
-        later: list[Held] = []
+        later: list[HeldMessage] = []
         if self.messages and new.accepted.message_id < self.front().accepted.message_id:
             self.held.appendleft(new)
         else:
@@ -65,7 +65,7 @@ class _Shelf:
         self.messages += 1
         self.bytes += new.size
 
-    def drop(self, held: Held) -> None:
+    def drop(self, held: HeldMessage) -> None:
         held.gone = True
         self.messages -= 1
         self.bytes -= held.size
@@ -79,8 +79,8 @@ class Outboxes:
     __slots__ = ("_deadlines", "_held", "_messages", "_next_key", "_serial", "_store", "bytes")
 
     def __init__(self, store: Store | None) -> None:
-        self._held: dict[str, dict[str, _Shelf]] = {}
-        self._deadlines: list[tuple[float, int, str, Held]] = []
+        self._held: dict[str, dict[str, _TopicQueue]] = {}
+        self._deadlines: list[tuple[float, int, str, HeldMessage]] = []
         self._messages = 0
         self._serial = 0
         self._store = store
@@ -95,7 +95,7 @@ class Outboxes:
         self._next_key = max((message.key for message in stored), default=-1) + 1
         return stored
 
-    def keep(self, peer: str, accepted: AcceptedMessage, now: float) -> int | None:
+    def persist(self, peer: str, accepted: AcceptedMessage, now: float) -> int | None:
         """Put a message on disk, where its topic wants that; its key there, None where it is held in memory alone."""
         topic = accepted.channel.topic
         if self._store is None or not topic.outbox_on_disk or topic.outbox is Outbox.NONE:
@@ -111,71 +111,71 @@ class Outboxes:
         """Whether a message will be there in the next run."""
         return store_key is not None and self._store is not None and self._store.holds(store_key)
 
-    def hold(self, peer: str, new: Held, now: float) -> list[tuple[Held, ExpiryReason]]:
+    def hold(self, peer: str, new: HeldMessage, now: float) -> list[tuple[HeldMessage, ExpiryReason]]:
         """Keep a message; returns those that had to go for it (perhaps this one)."""
         accepted = new.accepted
         topic = accepted.channel.topic
         if new.size > topic.outbox_bytes:
-            self.settle(new.store_key)
+            self.forget(new.store_key)
             return [(new, ExpiryReason.OUTBOX_FULL)]
-        shelf = self._held.setdefault(peer, {}).setdefault(topic.name, _Shelf())
-        shelf.put(new)
+        queue = self._held.setdefault(peer, {}).setdefault(topic.name, _TopicQueue())
+        queue.put(new)
         self.bytes += new.size
         self._messages += 1
-        gone: list[tuple[Held, ExpiryReason]] = []
+        gone: list[tuple[HeldMessage, ExpiryReason]] = []
         last = topic.outbox is Outbox.LAST
-        while shelf.messages > 1 if last else shelf.bytes > topic.outbox_bytes:
-            oldest = shelf.front()
-            self._drop(shelf, oldest)
+        while queue.messages > 1 if last else queue.bytes > topic.outbox_bytes:
+            oldest = queue.front()
+            self._drop(queue, oldest)
             gone.append((oldest, ExpiryReason.SUPERSEDED if last else ExpiryReason.OUTBOX_FULL))
         if not new.gone:
             if not self.on_disk(new.store_key):
-                new.store_key = self.keep(peer, accepted, now)
+                new.store_key = self.persist(peer, accepted, now)
             self._note_deadline(peer, new)
         return gone
 
-    def release(self, peer: str, most: int) -> list[Held]:
+    def release(self, peer: str, most: int) -> list[HeldMessage]:
         """The peer is online: up to `most` of what is held for it leaves the outbox (but not yet the disk), the most
         urgent first, of those the oldest."""
-        shelves = self._held.get(peer, {})
-        released: list[Held] = []
-        by_urgency: dict[int, list[_Shelf]] = {}
-        for shelf in shelves.values():
-            if shelf.messages:
-                by_urgency.setdefault(shelf.front().accepted.channel.topic.priority, []).append(shelf)
+        queues = self._held.get(peer, {})
+        released: list[HeldMessage] = []
+        by_urgency: dict[int, list[_TopicQueue]] = {}
+        for queue in queues.values():
+            if queue.messages:
+                by_urgency.setdefault(queue.front().accepted.channel.topic.priority, []).append(queue)
         for _, level in sorted(by_urgency.items()):
-            heads = [(shelf.front().accepted.message_id, place) for place, shelf in enumerate(level)]
+            heads = [(queue.front().accepted.message_id, place) for place, queue in enumerate(level)]
             heads.sort()
             while heads and len(released) < most:
                 _, place = heappop(heads)
-                shelf = level[place]
-                held = shelf.front()
-                shelf.held.popleft()
-                self._take(shelf, held)
+                queue = level[place]
+                held = queue.front()
+                queue.held.popleft()
+                self._take(queue, held)
                 released.append(held)
-                if shelf.messages:
-                    heappush(heads, (shelf.front().accepted.message_id, place))
+                if queue.messages:
+                    heappush(heads, (queue.front().accepted.message_id, place))
         if not self.holds(peer):
             self._held.pop(peer, None)
         return released
 
     def holds(self, peer: str, topic: str | None = None) -> bool:
         """Whether something (of this topic) is held for a peer."""
-        shelves = self._held.get(peer)
-        if not shelves:
+        queues = self._held.get(peer)
+        if not queues:
             return False
         if topic is None:
-            return any(shelf.messages for shelf in shelves.values())
-        return topic in shelves and shelves[topic].messages > 0
+            return any(queue.messages for queue in queues.values())
+        return topic in queues and queues[topic].messages > 0
 
-    def settle(self, store_key: int | None) -> None:
+    def forget(self, store_key: int | None) -> None:
         """The outcome is known: the disk may forget it."""
         if store_key is not None and self._store is not None:
             self._store.remove(store_key)
 
-    def expire(self, now: float) -> list[tuple[str, Held]]:
+    def expire(self, now: float) -> list[tuple[str, HeldMessage]]:
         """(peer, message) of everything past its deadline, removed."""
-        late: list[tuple[str, Held]] = []
+        late: list[tuple[str, HeldMessage]] = []
         while self._deadlines and (self._deadlines[0][0] <= now or self._deadlines[0][3].gone):
             _, _, peer, held = heappop(self._deadlines)
             if not held.gone:
@@ -183,13 +183,13 @@ class Outboxes:
                 late.append((peer, held))
         return late
 
-    def drop_all(self) -> list[tuple[str, Held]]:
+    def drop_all(self) -> list[tuple[str, HeldMessage]]:
         """At the end of the node: what is only in memory is lost with it; what is on disk stays there."""
         everything = [
             (peer, held)
-            for peer, shelves in self._held.items()
-            for shelf in shelves.values()
-            for held in shelf.held
+            for peer, queues in self._held.items()
+            for queue in queues.values()
+            for held in queue.held
             if not held.gone and not self.on_disk(held.store_key)
         ]
         self._held.clear()
@@ -202,19 +202,19 @@ class Outboxes:
 
     def count(self, peer: str) -> tuple[int, int]:
         """(messages, bytes) held for a peer."""
-        shelves = self._held.get(peer, {}).values()
-        return sum(shelf.messages for shelf in shelves), sum(shelf.bytes for shelf in shelves)
+        queues = self._held.get(peer, {}).values()
+        return sum(queue.messages for queue in queues), sum(queue.bytes for queue in queues)
 
-    def _drop(self, shelf: _Shelf, held: Held) -> None:
-        self._take(shelf, held)
-        self.settle(held.store_key)
+    def _drop(self, queue: _TopicQueue, held: HeldMessage) -> None:
+        self._take(queue, held)
+        self.forget(held.store_key)
 
-    def _take(self, shelf: _Shelf, held: Held) -> None:
-        shelf.drop(held)
+    def _take(self, queue: _TopicQueue, held: HeldMessage) -> None:
+        queue.drop(held)
         self.bytes -= held.size
         self._messages -= 1
 
-    def _note_deadline(self, peer: str, held: Held) -> None:
+    def _note_deadline(self, peer: str, held: HeldMessage) -> None:
         deadline = held.accepted.deadline
         if deadline is None:
             return

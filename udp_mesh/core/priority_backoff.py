@@ -16,14 +16,14 @@ ALL_LEVELS = 0xFFFF
 BUDGET_S = 1.0
 """Holding back is budgeted over this much time."""
 
-LOOK_EVERY_S = 0.02
+CHECK_INTERVAL_S = 0.02
 """What waits here is looked up no more often than this."""
 
 
 class PriorityBackoff:
     """`allowed(now)` is the bit mask of levels that may leave."""
 
-    __slots__ = ("_allowed", "_budget_at", "_budget_s", "_looked_at", "_rates", "_until", "_waiting", "held_total_s")
+    __slots__ = ("_allowed", "_budget_at", "_budget_s", "_checked_at", "_rates", "_until", "_waiting", "held_total_s")
 
     def __init__(self, rates: Rates, now: float) -> None:
         self._rates = rates
@@ -31,18 +31,18 @@ class PriorityBackoff:
         self._until = float("-inf")
         self._budget_s = BUDGET_S * rates.yield_share
         self._budget_at = now
-        self._looked_at = float("-inf")
+        self._checked_at = float("-inf")
         self._waiting: tuple[Waiting, ...] = ()
         self.held_total_s = 0.0
 
     def apply(self, rates: Rates) -> None:
         self._rates = rates
 
-    def waiting_here(self, senders: Iterable[Sender], now: float) -> tuple[Waiting, ...]:
+    def local_waiting(self, senders: Iterable[Sender], now: float) -> tuple[Waiting, ...]:
         """The urgent levels at which something has waited too long, most urgent first."""
-        if now < self._looked_at + LOOK_EVERY_S:
+        if now < self._checked_at + CHECK_INTERVAL_S:
             return self._waiting
-        self._looked_at = now
+        self._checked_at = now
         oldest: dict[int, float] = {}
         for sender in senders:
             if sender.unresponsive_since is not None:
@@ -57,7 +57,7 @@ class PriorityBackoff:
         )
         return self._waiting
 
-    def heard(self, waiting: tuple[Waiting, ...], now: float) -> None:
+    def on_waiting(self, waiting: tuple[Waiting, ...], now: float) -> None:
         """Another node's waiting levels."""
         level = min(entry.priority for entry in waiting)
         if level > self._rates.urgent_priority or self._rates.yield_share <= 0:
@@ -74,8 +74,8 @@ class PriorityBackoff:
         self.held_total_s += extension
         self._until = now + self._rates.yield_hold_s
 
-    def allowed(self, now: float) -> int:
+    def allowed_levels(self, now: float) -> int:
         return self._allowed if now < self._until else ALL_LEVELS
 
-    def holds_until(self, now: float) -> float | None:
+    def held_until(self, now: float) -> float | None:
         return self._until if now < self._until else None

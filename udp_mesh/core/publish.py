@@ -1,15 +1,15 @@
-"""Messages in: topic -> destinations -> queues, the broadcast, or an outbox; and their outcomes out.
+"""Messages in: topic -> destinations -> a peer's queue, the broadcast queue or an outbox; outcomes out as events.
 
-`send` decides where a message goes (a large one first waits until `pack` has compressed it, step by step); `shelve`
-and `release_outbox` move messages between a peer's queue and its outbox as it goes and comes; `report_ended` turns
-ends into events.
+`send` chooses where a message goes; a large one is first compressed in steps by `compress_step`. `store_in_outbox` and
+`release_outbox` move messages between a peer's queue and its outbox as the peer goes offline and returns.
+`report_ended` turns outcomes into events.
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 
-from udp_mesh.core.compression import STEP_BYTES, Unpacked, compress
+from udp_mesh.core.compression import STEP_BYTES, Uncompressed, compress
 from udp_mesh.core.events import (
     ExpiryReason,
     MessageDelivered,
@@ -19,8 +19,8 @@ from udp_mesh.core.events import (
     Rejected,
     RejectReason,
 )
-from udp_mesh.core.legacy.sender import carries
-from udp_mesh.core.outbox import Held
+from udp_mesh.core.legacy.sender import can_publish
+from udp_mesh.core.outbox import HeldMessage
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, header_bytes
@@ -38,13 +38,13 @@ from udp_mesh.wire.limits import MAX_TYPE_BYTES
 ANNOUNCE_BYTES = 5
 """Of a topic's announcement besides its two names."""
 
-RELEASED_AT_ONCE = 400
+RELEASE_BATCH = 400
 """Messages of an outbox queued in one go: some milliseconds, in which no urgent one can leave."""
 
-RELEASE_AGAIN_S = 0.02
+RELEASE_INTERVAL_S = 0.02
 """Until the next: 20,000 messages a second, more than a robot's link carries."""
 
-MOST_CHANNELS = 65_536
+MAX_CHANNELS = 65_536
 """Topic numbers are 16 bits."""
 
 
@@ -62,7 +62,7 @@ def send(
     limits = state.settings.limits
     if len(payload) > limits.message_bytes:
         return Rejected(RejectReason.TOO_LARGE, f"expected at most {limits.message_bytes} bytes, found {len(payload)}")
-    channel = channel_of(state, topic, type_name)
+    channel = topic_channel(state, topic, type_name)
     if channel is None:
         return Rejected(
             RejectReason.UNKNOWN_TOPIC,
@@ -74,34 +74,34 @@ def send(
         names = [name for name in topic.destinations if name != state.settings.name]
     else:
         names = []
-    rejected = _room_for(state, topic, names, len(payload))
+    rejected = _check_capacity(state, topic, names, len(payload))
     if rejected is not None:
         return rejected
     message_id = MessageId(state.next_message_id)
     state.next_message_id += 1
     state.event_queue.counters.messages_sent += 1
-    if topic.compression and (len(payload) > STEP_BYTES or state.packing.holds(topic.name)):
+    if topic.compression and (len(payload) > STEP_BYTES or state.compression_queue.has_topic(topic.name)):
         plain = _accept(message_id, channel, payload, None, now)
-        keys = tuple(state.outboxes.keep(name, plain, now) for name in names) if topic.reliable else ()
-        state.packing.add(Unpacked(message_id, channel, payload, tuple(names), now, keys))
+        keys = tuple(state.outboxes.persist(name, plain, now) for name in names) if topic.reliable else ()
+        state.compression_queue.add(Uncompressed(message_id, channel, payload, tuple(names), now, keys))
     else:
         packed = compress(payload) if topic.compression else None
         _enqueue_all(state, _accept(message_id, channel, payload, packed, now), names, now)
     return message_id
 
 
-def pack(state: State, now: float) -> None:
+def compress_step(state: State, now: float) -> None:
     """Compress some more of what waits for that; what is done goes on its way."""
-    done = state.packing.step()
+    done = state.compression_queue.step()
     if done is not None:
         message, packed = done
         accepted = _accept(message.message_id, message.channel, message.payload, packed, message.accepted_at)
         _enqueue_all(state, accepted, message.names, now, message.store_keys)
 
 
-def stop_packing(state: State, now: float) -> None:
+def flush_compression(state: State, now: float) -> None:
     """Everything goes on its way as it is."""
-    for message in state.packing.take_all():
+    for message in state.compression_queue.drain():
         accepted = _accept(message.message_id, message.channel, message.payload, None, message.accepted_at)
         _enqueue_all(state, accepted, message.names, now, message.store_keys)
 
@@ -113,10 +113,10 @@ def _enqueue_all(
         for name, store_key in zip_longest(names, store_keys):
             enqueue(state, name, accepted, now, store_key)
     else:
-        _to_all(state, accepted, now)
+        _broadcast(state, accepted, now)
 
 
-def _room_for(state: State, topic: Topic, names: list[str], size_bytes: int) -> Rejected | None:
+def _check_capacity(state: State, topic: Topic, names: list[str], size_bytes: int) -> Rejected | None:
     limits = state.settings.limits
     for name in names or [peer.name for peer in state.peer_table.online()]:
         peer = state.peer_table.peers.get(name)
@@ -134,19 +134,19 @@ def _room_for(state: State, topic: Topic, names: list[str], size_bytes: int) -> 
             or len(sender.pending) >= limits.queue_messages_per_peer
         ):
             return Rejected(RejectReason.QUEUE_FULL, f"too much waits for {name}")
-    if topic.compression and state.packing.bytes + size_bytes > limits.queue_bytes_per_peer:
+    if topic.compression and state.compression_queue.bytes + size_bytes > limits.queue_bytes_per_peer:
         return Rejected(RejectReason.QUEUE_FULL, "too much waits to be compressed")
     if not names and state.broadcasts.queued() >= limits.queue_messages_per_peer:
         return Rejected(RejectReason.QUEUE_FULL, "too many broadcasts wait")
     return None
 
 
-def channel_of(state: State, topic: Topic, type_name: str) -> TopicChannel | None:
+def topic_channel(state: State, topic: Topic, type_name: str) -> TopicChannel | None:
     """The topic's number on the air with this type; None when there are too many, or where no receiver takes the type's
     name: it would refuse every datagram that announces it, with all that is packed beside it."""
     channel = state.channels.get((topic.name, type_name))
     if channel is None:
-        if len(state.channels) >= MOST_CHANNELS or not is_type_name(type_name):
+        if len(state.channels) >= MAX_CHANNELS or not is_type_name(type_name):
             return None
         channel = TopicChannel(len(state.channels), topic, topic.name, type_name)
         state.channels[(topic.name, type_name)] = channel
@@ -168,19 +168,19 @@ def _accept(
 def enqueue(state: State, name: str, accepted: AcceptedMessage, now: float, store_key: int | None = None) -> None:
     """One destination's copy: into the queue of a peer in reach, else where the topic's outbox says."""
     topic = accepted.channel.topic
-    peer = state.peer_table.peer(name, state.settings)
+    peer = state.peer_table.get_or_create(name, state.settings)
     if peer is None or ((not peer.online) and topic.outbox is not Outbox.NONE):
-        _hold(state, name, Held(accepted, store_key), now)
+        _hold(state, name, HeldMessage(accepted, store_key), now)
         return
-    if peer.session is not None and not inflates(peer.session):
-        accepted = unpacked(accepted)
+    if peer.session is not None and not accepts_compressed(peer.session):
+        accepted = uncompressed(accepted)
     keeps = topic.outbox is not Outbox.NONE and peer.settling
     if (keeps or state.outboxes.holds(name, topic.name)) and topic.priority > state.settings.rates.urgent_priority:
         # Older ones of the topic are still to come; only what is urgent goes ahead of what is stale.
-        _hold(state, name, Held(accepted, store_key), now)
+        _hold(state, name, HeldMessage(accepted, store_key), now)
         return
     if store_key is None and topic.reliable:
-        store_key = state.outboxes.keep(name, accepted, now)
+        store_key = state.outboxes.persist(name, accepted, now)
     _queue(state, peer, accepted, now, store_key)
 
 
@@ -200,29 +200,29 @@ def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, stor
     state.arm(peer)
 
 
-def inflates(session: Session) -> bool:
+def accepts_compressed(session: Session) -> bool:
     """Whether the peer takes compressed messages."""
     return bool(session.features & Feature.ZLIB)
 
 
-def unpacked(accepted: AcceptedMessage) -> AcceptedMessage:
+def uncompressed(accepted: AcceptedMessage) -> AcceptedMessage:
     """The message as it was accepted."""
     if not accepted.flags & MessageFlag.COMPRESSED:
         return accepted
     return replace(accepted, body=accepted.payload, flags=accepted.flags & ~MessageFlag.COMPRESSED)
 
 
-def _to_all(state: State, accepted: AcceptedMessage, now: float) -> None:
+def _broadcast(state: State, accepted: AcceptedMessage, now: float) -> None:
     topic = accepted.channel.topic
     accepted = replace(accepted, flags=accepted.flags | MessageFlag.TO_ALL)
     sessions = [peer.session for peer in state.peer_table.online() if peer.session is not None]
-    if not all(map(inflates, sessions)):
-        accepted = unpacked(accepted)
+    if not all(map(accepts_compressed, sessions)):
+        accepted = uncompressed(accepted)
     fits = state.can_broadcast() and _broadcast_bytes(accepted) <= broadcast_room(state, sessions)
     if fits:
         state.broadcasts.push(accepted)
     for peer in list(state.peer_table.peers.values()):
-        if peer.legacy and not carries(accepted.channel.type_name):
+        if peer.legacy and not can_publish(accepted.channel.type_name):
             continue
         if (peer.online and (not fits or peer.legacy)) or (not peer.online and topic.outbox is not Outbox.NONE):
             enqueue(state, peer.name, accepted, now)
@@ -247,7 +247,7 @@ def _broadcast_bytes(accepted: AcceptedMessage) -> int:
     return SHORT_OVERHEAD_BYTES + names + fragment
 
 
-def shelve(state: State, peer: Peer, now: float) -> None:
+def store_in_outbox(state: State, peer: Peer, now: float) -> None:
     """The peer went out of reach: move what its outboxes keep out of the queue."""
     everything = list(peer.sender.pending) if peer.has_sender else []
     # The newest first: each then stands in front of those already there.
@@ -259,15 +259,15 @@ def shelve(state: State, peer: Peer, now: float) -> None:
         resumable = message.begun and message.reliable and not peer.legacy
         peer.sender.withdraw(message, to_resume=resumable)
         begun = message if resumable else None
-        _hold(state, peer.name, Held(message.accepted, message.store_key, begun, peer.sender.epoch), now)
+        _hold(state, peer.name, HeldMessage(message.accepted, message.store_key, begun, peer.sender.epoch), now)
 
 
-def _hold(state: State, name: str, new: Held, now: float) -> None:
+def _hold(state: State, name: str, new: HeldMessage, now: float) -> None:
     for held, reason in state.outboxes.hold(name, new, now):
-        _give_up_held(state, name, held, reason)
+        _drop_held(state, name, held, reason)
 
 
-def _give_up_held(state: State, name: str, held: Held, reason: ExpiryReason) -> None:
+def _drop_held(state: State, name: str, held: HeldMessage, reason: ExpiryReason) -> None:
     """An outbox no longer keeps this one; what the peer has of it, it may forget."""
     peer = state.peer_table.peers.get(name)
     if held.begun is not None and peer is not None and held.epoch == peer.sender.epoch:
@@ -277,7 +277,7 @@ def _give_up_held(state: State, name: str, held: Held, reason: ExpiryReason) -> 
 
 def release_outbox(state: State, peer: Peer, now: float) -> None:
     """The peer is in reach: some of what waited for it is queued, the most urgent and oldest first; more of it soon."""
-    for held in state.outboxes.release(peer.name, RELEASED_AT_ONCE):
+    for held in state.outboxes.release(peer.name, RELEASE_BATCH):
         begun, session = held.begun, peer.session
         if begun is not None and held.epoch == peer.sender.epoch:
             # One that has left whole may have arrived whole: under a new number it would arrive twice.
@@ -289,10 +289,10 @@ def release_outbox(state: State, peer: Peer, now: float) -> None:
                 state.arm(peer)
                 continue
             peer.sender.cancel(begun)
-        accepted = held.accepted if session is None or inflates(session) else unpacked(held.accepted)
+        accepted = held.accepted if session is None or accepts_compressed(session) else uncompressed(held.accepted)
         _queue(state, peer, accepted, now, held.store_key)
     if state.outboxes.holds(peer.name):
-        state.housekeeping_at = min(state.housekeeping_at, now + RELEASE_AGAIN_S)
+        state.maintenance_at = min(state.maintenance_at, now + RELEASE_INTERVAL_S)
 
 
 def report_ended(state: State, peer: Peer, now: float) -> None:
@@ -305,7 +305,7 @@ def report_ended(state: State, peer: Peer, now: float) -> None:
     for message, outcome in ended:
         accepted = message.accepted
         if message.store_key is not None:
-            state.outboxes.settle(message.store_key)
+            state.outboxes.forget(message.store_key)
         if accepted.broadcast_number is not None:
             continue
         topic = accepted.channel.name
@@ -334,4 +334,4 @@ def report_expired(state: State, peer: str, accepted: AcceptedMessage, reason: E
 def expire_held(state: State, now: float) -> None:
     """Messages in outboxes whose deadline passed."""
     for peer, held in state.outboxes.expire(now):
-        _give_up_held(state, peer, held, ExpiryReason.DEADLINE)
+        _drop_held(state, peer, held, ExpiryReason.DEADLINE)

@@ -8,9 +8,9 @@ from enum import Enum
 
 from udp_mesh.core.events import ExpiryReason, MessageId
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.peer_lifecycle import refit
-from udp_mesh.core.peers.heartbeat import leads
-from udp_mesh.core.publish import channel_of, enqueue, report_ended, report_expired, stop_packing
+from udp_mesh.core.peer_lifecycle import update_mtu
+from udp_mesh.core.peers.heartbeat import uses_link
+from udp_mesh.core.publish import enqueue, flush_compression, report_ended, report_expired, topic_channel
 from udp_mesh.core.sender.message import AcceptedMessage
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.settings import LinkInfo, LinkKind, Neighbour, Settings, Topic
@@ -26,7 +26,7 @@ def restore_outboxes(state: State, now: float) -> None:
         topic = state.topics.get(stored.topic)
         if topic is None and state.settings.undeclared is not None:
             topic = replace(state.settings.undeclared, name=stored.topic)
-        channel = channel_of(state, topic, stored.type_name) if topic is not None else None
+        channel = topic_channel(state, topic, stored.type_name) if topic is not None else None
         if channel is None:
             # Its topic is no longer declared: it stays on disk for a run that declares it.
             continue
@@ -43,7 +43,7 @@ def link_up(state: State, link: LinkInfo, now: float) -> None:
     state.links[link.name] = link
     for session in state.peer_table.sessions.values():
         if session.path.link == link.name:
-            refit(state, session, link.mtu)
+            update_mtu(state, session, link.mtu)
     state.heartbeats.schedule_now(len(state.peer_table.sessions), now)
 
 
@@ -67,9 +67,9 @@ def apply(state: State, settings: Settings, now: float) -> list[str]:
     keys = live_keys(settings)
     if keys != state.keys:
         state.keys = keys
-        number = state.to_all.next_number
-        state.to_all = SendChannel(keys[0], state.boot_id)
-        state.to_all.next_number = number
+        number = state.broadcast_channel.next_number
+        state.broadcast_channel = SendChannel(keys[0], state.boot_id)
+        state.broadcast_channel.next_number = number
         state.peer_table.set_keys(keys)
     for session in state.peer_table.sessions.values():
         session.receiver.apply(settings.rates, settings.limits)
@@ -81,7 +81,7 @@ def apply(state: State, settings: Settings, now: float) -> list[str]:
     for session in state.peer_table.sessions.values():
         info = state.links.get(session.path.link)
         if info is not None:
-            refit(state, session, info.mtu)
+            update_mtu(state, session, info.mtu)
     state.heartbeats.schedule_now(len(state.peer_table.sessions), now)
     return changes
 
@@ -180,7 +180,7 @@ def close(state: State, now: float) -> None:
     """See `Node.close`."""
     if state.closed:
         return
-    stop_packing(state, now)
+    flush_compression(state, now)
     for peer in state.peer_table.peers.values():
         if not peer.has_sender:
             continue
@@ -194,11 +194,11 @@ def close(state: State, now: float) -> None:
         report_expired(state, name, held.accepted, ExpiryReason.CLOSED)
     links = list(state.links.values())
     for link in links:
-        _, data = state.to_all.seal_long(encode([Bye("closed")]))
+        _, data = state.broadcast_channel.seal_long(encode([Bye("closed")]))
         if link.kind is LinkKind.BROADCAST:
             state.outgoing.append(Datagram(link.name, link.broadcast, data, True))
         for neighbour in state.settings.neighbours:
-            if not neighbour.legacy and leads(neighbour, link, links):
+            if not neighbour.legacy and uses_link(neighbour, link, links):
                 state.outgoing.append(Datagram(link.name, neighbour.address, data, True))
     state.ready.clear()
     state.closed = True

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from heapq import heappop, heappush
 
 from udp_mesh.core.broadcast import BroadcastQueue, NackRepair
-from udp_mesh.core.compression import PackingQueue
+from udp_mesh.core.compression import CompressionQueue
 from udp_mesh.core.congestion.channel_share import ChannelShare
 from udp_mesh.core.event_queue import EventQueue
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
@@ -28,10 +28,10 @@ from udp_mesh.crypto import Key, Keyring, SendChannel
 
 _NEVER = float("inf")
 
-HOUSEKEEPING_S = 0.5
+MAINTENANCE_INTERVAL_S = 0.5
 """Between two rounds through all peers: offline, purges, starvation."""
 
-ASLEEP_S = 1.0
+SUSPENDED_S = 1.0
 """A round so much later than it should be: this process did not run. A busy machine is late by less."""
 
 
@@ -57,16 +57,16 @@ class State:
         self.outboxes = Outboxes(store)
         self.heartbeats = HeartbeatScheduler(rng, settings.rates, now)
         self.broadcasts = BroadcastQueue()
-        self.packing = PackingQueue()
-        self.unpacking: dict[Session, None] = {}
+        self.compression_queue = CompressionQueue()
+        self.inflating: dict[Session, None] = {}
         """Sessions of which a message is being inflated."""
-        self.to_all = SendChannel(self.keys[0], boot_id)
+        self.broadcast_channel = SendChannel(self.keys[0], boot_id)
         self.priority_backoff = PriorityBackoff(settings.rates, now)
         self.repairs: dict[bytes, NackRepair] = {}
         """By the sender's boot id."""
-        self.asking: dict[bytes, None] = {}
+        self.repairs_due: dict[bytes, None] = {}
         """Those of `repairs` in which something is missing."""
-        self.look_from = 0
+        self.maintain_from = 0
         """Where the next round of housekeeping begins."""
         self.topics: dict[str, Topic] = {topic.name: topic for topic in settings.topics}
         self.channels: dict[tuple[str, str], TopicChannel] = {}
@@ -74,14 +74,14 @@ class State:
         self.next_message_id = 1
         self.ready: dict[Peer, None] = {}
         """Peers to which something may be able to leave."""
-        self.owing: dict[Session, None] = {}
+        self.control_ready: dict[Session, None] = {}
         """Sessions that are owed an acknowledgement or small frames now."""
         self.outgoing: list[Datagram] = []
         """Datagrams already built: heartbeats, second copies."""
         self.timers: list[tuple[float, int, Peer]] = []
         self.timer_serial = 0
-        self.housekeeping_at = now
-        self.housekept_at = now
+        self.maintenance_at = now
+        self.maintained_at = now
         self.key_mismatches = KeyMismatchLimiter()
         self.incompatible_reported: dict[bytes, float] = {}
         self.own_name_reported_at = float("-inf")
@@ -89,8 +89,8 @@ class State:
 
     def set_timer(self, peer: Peer, at: float) -> None:
         """The peer wants attention at `at` too; an earlier wish stands."""
-        if at < peer.wants_at:
-            peer.wants_at = at
+        if at < peer.due_at:
+            peer.due_at = at
             self._queue(peer)
 
     def arm(self, peer: Peer) -> None:
@@ -101,12 +101,12 @@ class State:
             due = session.receiver.acks.due_at
             if due is not None and (at is None or due < at):
                 at = due
-        peer.wants_at = _NEVER if at is None else at
+        peer.due_at = _NEVER if at is None else at
         self._queue(peer)
 
     def _queue(self, peer: Peer) -> None:
-        if peer.wants_at < peer.timer_at:
-            peer.timer_at = peer.wants_at
+        if peer.due_at < peer.timer_at:
+            peer.timer_at = peer.due_at
             self.timer_serial += 1
             heappush(self.timers, (peer.timer_at, self.timer_serial, peer))
 
@@ -118,7 +118,7 @@ class State:
             at, _, peer = timers[0]
             if peer.timer_at != at:
                 heappop(timers)
-            elif peer.wants_at > at:
+            elif peer.due_at > at:
                 peer.timer_at = _NEVER
                 heappop(timers)
                 self._queue(peer)
@@ -126,15 +126,15 @@ class State:
                 return at
         return _NEVER
 
-    def ask_by(self, boot_id: bytes, repairs: NackRepair) -> None:
+    def schedule_repair(self, boot_id: bytes, repairs: NackRepair) -> None:
         """Ask this sender for what is missing, when it is time."""
         if repairs.next_at != float("inf"):
-            self.asking[boot_id] = None
-            self.housekeeping_at = min(self.housekeeping_at, repairs.next_at)
+            self.repairs_due[boot_id] = None
+            self.maintenance_at = min(self.maintenance_at, repairs.next_at)
 
-    def owe(self, session: Session) -> None:
+    def schedule_control(self, session: Session) -> None:
         """The session has small frames or an acknowledgement to send now."""
-        self.owing[session] = None
+        self.control_ready[session] = None
 
     def waiting_senders(self) -> Iterator[Sender]:
         """Of peers in reach with open messages."""

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
-from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions, Stranger
+from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions, UnverifiedNode
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
 from udp_mesh.core.peers.session import Peer, Session
@@ -11,10 +11,10 @@ from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
 
-TOLD_FOR_S = 2.0
+REPORTED_RATE_VALID_S = 2.0
 """What an acknowledgement says about rates holds for the second it averages, and one more."""
 
-STRANGE_AFTER_S = 3.0
+UNVERIFIED_AFTER_S = 3.0
 """A node heard for so long without hearing us is told of; meeting takes a fraction of that."""
 
 
@@ -22,12 +22,12 @@ def conditions(state: State, now: float) -> Conditions:
     """See `Node.conditions`."""
     idle = Sender(state.settings)
     peers = tuple(
-        _peer(state, peer, peer.sender if peer.has_sender else idle, now)
+        _peer_conditions(state, peer, peer.sender if peer.has_sender else idle, now)
         for _, peer in sorted(state.peer_table.peers.items())
     )
     senders = [peer.sender for peer in state.peer_table.peers.values() if peer.has_sender]
     counters = state.event_queue.counters
-    sent_bits_per_s = _bits(state.sent, now)
+    sent_bits_per_s = _bits_per_s(state.sent, now)
     receivers = [session.receiver for session in state.peer_table.sessions.values()]
     return Conditions(
         now,
@@ -44,32 +44,32 @@ def conditions(state: State, now: float) -> Conditions:
         ),
         sent_bits_per_s,
         sent_bits_per_s + sum(peer.peer_sends_bits_per_s or 0.0 for peer in peers if peer.online),
-        sum(receiver.partial_bytes + receiver.unpacking_bytes for receiver in receivers),
-        sum(sender.levels.queued_bytes for sender in senders) + state.packing.bytes,
+        sum(receiver.partial_bytes + receiver.inflating_bytes for receiver in receivers),
+        sum(sender.levels.queued_bytes for sender in senders) + state.compression_queue.bytes,
         state.broadcasts.kept_bytes,
-        tuple(_strangers(state, now)),
+        tuple(_unverified_nodes(state, now)),
     )
 
 
-def _strangers(state: State, now: float) -> Iterator[Stranger]:
+def _unverified_nodes(state: State, now: float) -> Iterator[UnverifiedNode]:
     for session in sorted(state.peer_table.not_current(), key=lambda session: session.name):
         met_at, path = session.met_at, session.path
-        if session.proven or met_at is None or now - met_at < STRANGE_AFTER_S or not _alive(session, now):
+        if session.verified or met_at is None or now - met_at < UNVERIFIED_AFTER_S or not _recently_heard(session, now):
             continue
-        yield Stranger(session.name, path.address, path.link, met_at, session.last_heard)
+        yield UnverifiedNode(session.name, path.address, path.link, met_at, session.last_heard)
 
 
-def _alive(session: Session, now: float) -> bool:
+def _recently_heard(session: Session, now: float) -> bool:
     return now - session.last_heard < MISSED_HEARTBEATS * session.interval_s
 
 
-def _peer(state: State, peer: Peer, sender: Sender, now: float) -> PeerConditions:
+def _peer_conditions(state: State, peer: Peer, sender: Sender, now: float) -> PeerConditions:
     session = peer.session
     held_messages, held_bytes = state.outboxes.count(peer.name)
     capacity = sender.congestion.capacity_packets_per_s()
     fragment_bytes = session.path.fragment_bytes if session is not None else state.settings.fragment_bytes
     meters = session.meters if session is not None else peer.legacy_meters
-    address, link, last_heard = _way(peer)
+    address, link, last_heard = _current_path(peer)
     return PeerConditions(
         peer.name,
         peer.online,
@@ -81,24 +81,26 @@ def _peer(state: State, peer: Peer, sender: Sender, now: float) -> PeerCondition
         sender.rtt.smoothed_rtt,
         sender.rtt.min_rtt,
         sender.loss,
-        _bits(meters.sent, now) if meters is not None else 0.0,
-        _bits(meters.delivered, now) if meters is not None else 0.0,
-        _bits(meters.received, now) if meters is not None else 0.0,
-        _told(session.peer_receives, TOLD_FOR_S, now) if session is not None else None,
-        _told(session.peer_sends, MISSED_HEARTBEATS * session.interval_s, now) if session is not None else None,
+        _bits_per_s(meters.sent, now) if meters is not None else 0.0,
+        _bits_per_s(meters.delivered, now) if meters is not None else 0.0,
+        _bits_per_s(meters.received, now) if meters is not None else 0.0,
+        _reported_bits_per_s(session.peer_receives, REPORTED_RATE_VALID_S, now) if session is not None else None,
+        _reported_bits_per_s(session.peer_sends, MISSED_HEARTBEATS * session.interval_s, now)
+        if session is not None
+        else None,
         None if capacity is None else capacity * fragment_bytes * 8,
         sender.congestion.cwnd,
         sender.in_flight.outstanding,
         sender.retransmitted,
-        _queues(sender, now),
+        _queue_conditions(sender, now),
         held_messages,
         held_bytes,
-        session is not None and session.unheard_since is not None and _alive(session, now),
+        session is not None and session.one_way_since is not None and _recently_heard(session, now),
         now - sender.last_progress if sender.unresponsive_since is not None and sender.pending else None,
     )
 
 
-def _way(peer: Peer) -> tuple[Address | None, str | None, float | None]:
+def _current_path(peer: Peer) -> tuple[Address | None, str | None, float | None]:
     """Address, link and when something last came from there."""
     session = peer.session
     if session is not None:
@@ -107,31 +109,31 @@ def _way(peer: Peer) -> tuple[Address | None, str | None, float | None]:
     return peer.legacy_path or (None, None, None)
 
 
-def _queues(sender: Sender, now: float) -> tuple[QueueConditions, ...]:
+def _queue_conditions(sender: Sender, now: float) -> tuple[QueueConditions, ...]:
     queues = []
-    for priority, book in enumerate(sender.levels):
-        oldest = book.oldest()
-        starved_s = book.starved_s + (now - book.starved_since if book.starved_since is not None else 0.0)
-        if not book.messages and not starved_s and not book.held_s:
+    for priority, level in enumerate(sender.levels):
+        oldest = level.oldest()
+        starved_s = level.starved_s + (now - level.starved_since if level.starved_since is not None else 0.0)
+        if not level.messages and not starved_s and not level.held_s:
             continue
         queues.append(
             QueueConditions(
                 priority,
-                book.messages,
-                book.bytes,
+                level.messages,
+                level.bytes,
                 now - oldest.queued_at if oldest is not None else 0.0,
                 starved_s,
-                book.held_s,
+                level.held_s,
             )
         )
     return tuple(queues)
 
 
-def _told(rate: tuple[int, float], for_s: float, now: float) -> float | None:
+def _reported_bits_per_s(rate: tuple[int, float], for_s: float, now: float) -> float | None:
     """Bits per second of what a peer said, unless that was too long ago."""
-    bytes_per_s, told_at = rate
-    return 8.0 * bytes_per_s if now - told_at <= for_s else None
+    bytes_per_s, reported_at = rate
+    return 8.0 * bytes_per_s if now - reported_at <= for_s else None
 
 
-def _bits(meter: Meter, now: float) -> float:
+def _bits_per_s(meter: Meter, now: float) -> float:
     return 8 * meter.per_s(now)

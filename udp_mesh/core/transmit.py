@@ -8,15 +8,15 @@ acknowledgement, a timer or a new message brings it back.
 from heapq import heappop
 
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.peer_lifecycle import housekeep
-from udp_mesh.core.peers.heartbeat import OWN_FEATURES, announce
+from udp_mesh.core.peer_lifecycle import maintain
+from udp_mesh.core.peers.heartbeat import OWN_FEATURES, heartbeat_datagrams
 from udp_mesh.core.peers.session import Peer, Session
-from udp_mesh.core.publish import broadcast_room, expire_held, pack, report_ended
-from udp_mesh.core.receive import unpack
+from udp_mesh.core.publish import broadcast_room, compress_step, expire_held, report_ended
+from udp_mesh.core.receive import inflate_step
 from udp_mesh.core.receiver.datagram_age import clock_ms
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, send_copies, send_level
 from udp_mesh.core.settings import Address, LinkKind
-from udp_mesh.core.state import HOUSEKEEPING_S, State
+from udp_mesh.core.state import MAINTENANCE_INTERVAL_S, State
 from udp_mesh.wire.codec import encode
 from udp_mesh.wire.frames import Cancel, Frame, Heartbeat, Ping
 from udp_mesh.wire.header import VERSION
@@ -25,7 +25,7 @@ from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
 BATCH_BYTES = 65_536
 """What one call returns at most, about: one system call with segmentation offload."""
 
-INTRODUCE_AGAIN_S = 0.25
+INTRODUCTION_INTERVAL_S = 0.25
 """Between two introductions to a peer that has not answered one."""
 
 _INFINITY = float("inf")
@@ -41,13 +41,13 @@ def collect(state: State, now: float, max_bytes: int | None) -> list[Datagram]:
     if state.outgoing:
         out.extend(state.outgoing)
         state.outgoing.clear()
-    if state.owing:
-        sessions = list(state.owing)
-        state.owing.clear()
+    if state.control_ready:
+        sessions = list(state.control_ready)
+        state.control_ready.clear()
         for session in sessions:
-            _leave_owed(state, session, now, out)
+            _send_control(state, session, now, out)
     if state.ready or state.broadcasts.waiting:
-        _leave_levels(state, now, out, room)
+        _send_levels(state, now, out, room)
     return out
 
 
@@ -58,21 +58,21 @@ def count_sent(state: State, out: list[Datagram]) -> None:
     counters.bytes_sent += sum([len(datagram[2]) for datagram in out]) + IP_UDP_BYTES * len(out)
 
 
-def _leave_owed(state: State, session: Session, now: float, out: list[Datagram]) -> None:
+def _send_control(state: State, session: Session, now: float, out: list[Datagram]) -> None:
     """Acknowledgement and small frames of one session, together in as few datagrams as they fit."""
     path = session.path
     peer = session.peer
     if not path.link or peer is None:
         return
     frames: list[Frame] = []
-    if session.receiver.acks.pending or session.receiver.acks.now_wanted:
-        waiting = state.priority_backoff.waiting_here(state.waiting_senders(), now)
-        ack = session.take_ack(now, waiting[:1])
+    if session.receiver.acks.pending or session.receiver.acks.send_now:
+        waiting = state.priority_backoff.local_waiting(state.waiting_senders(), now)
+        ack = session.build_ack(now, waiting[:1])
         if ack is not None:
             frames.append(ack)
             state.event_queue.counters.acknowledgements_sent += 1
-    frames.extend(session.owed)
-    session.owed.clear()
+    frames.extend(session.pending_control)
+    session.pending_control.clear()
     cancelled = peer.sender.cancelled
     while cancelled:
         frames.append(Cancel(tuple(cancelled[:MAX_IDS])))
@@ -103,7 +103,7 @@ def _introduction(state: State, session: Session, now: float) -> Heartbeat:
         min(65_535, int(settings.rates.heartbeat_sparse_s * 1000)),
         0,
         0,
-        state.to_all.next_number,
+        state.broadcast_channel.next_number,
         state.broadcasts.next_number,
         (session.heard_tag,),
         (),
@@ -111,8 +111,8 @@ def _introduction(state: State, session: Session, now: float) -> Heartbeat:
     )
 
 
-def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> None:
-    allowed = state.priority_backoff.allowed(now)
+def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> None:
+    allowed = state.priority_backoff.allowed_levels(now)
     broadcasts = state.broadcasts
     peers: list[Peer] = []
     mask = broadcasts.waiting
@@ -123,11 +123,15 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
             del state.ready[peer]
             continue
         if sender.cancelled and not sender.scheduler.waiting:
-            state.owe(session)
+            state.schedule_control(session)
         if sender.copies:
             send_copies(sender, session.path, now, out)
         if sender.scheduler.waiting:
-            if not session.path.confirmed and not session.knows_us and now >= session.introduced_at + INTRODUCE_AGAIN_S:
+            if (
+                not session.path.confirmed
+                and not session.knows_us
+                and now >= session.introduced_at + INTRODUCTION_INTERVAL_S
+            ):
                 session.introduced_at = now
                 number, data = session.path.seal(encode([_introduction(state, session, now)]))
                 sender.in_flight.add(number, None)
@@ -147,7 +151,7 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
         priority = bit.bit_length() - 1
         if broadcasts.waiting & bit:
             before = len(out)
-            _leave_casts(state, priority, now, out)
+            _send_broadcasts(state, priority, now, out)
             room -= sum(len(datagram.data) for datagram in out[before:])
         for peer in peers:
             sender = peer.sender
@@ -174,14 +178,14 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
             state.ready.pop(peer, None)
             sender.app_limited = not sender.scheduler.waiting
         if held & sender.scheduler.waiting:
-            until = state.priority_backoff.holds_until(now)
+            until = state.priority_backoff.held_until(now)
             if until is not None:
-                peer.book_held(held & sender.scheduler.waiting, now, until)
+                peer.record_held(held & sender.scheduler.waiting, now, until)
                 sender.wake_at = min(sender.wake_at, until)
         state.arm(peer)
 
 
-def _leave_casts(state: State, priority: int, now: float, out: list[Datagram]) -> None:
+def _send_broadcasts(state: State, priority: int, now: float, out: list[Datagram]) -> None:
     rates = state.settings.rates
     urgent = priority <= rates.urgent_priority
     twice = urgent and any(peer.has_sender and peer.sender.send_twice for peer in state.peer_table.online())
@@ -195,15 +199,15 @@ def _leave_casts(state: State, priority: int, now: float, out: list[Datagram]) -
         link = state.links.get(session.path.link)
         if link is not None and link.kind is LinkKind.NEIGHBOURS:
             paths.append((link.name, session.path.address))
-    state.broadcasts.leave(
+    state.broadcasts.send_level(
         priority,
-        state.to_all,
+        state.broadcast_channel,
         paths,
         now,
         out,
         packets_per_s=None if urgent else rates.broadcast_packets_per_s,
         copy_after_s=rates.twice_gap_s if twice else None,
-        kept_limit_bytes=state.settings.limits.repair_bytes,
+        repairable_limit_bytes=state.settings.limits.repair_bytes,
         max_timestamped_bytes=_max_timestamped_bytes(state),
     )
 
@@ -216,7 +220,7 @@ def _max_timestamped_bytes(state: State) -> int:
 
 def has_datagrams(state: State) -> bool:
     """See `Node.has_datagrams`."""
-    return bool(state.owing or state.ready or state.outgoing or state.broadcasts.waiting)
+    return bool(state.control_ready or state.ready or state.outgoing or state.broadcasts.waiting)
 
 
 def is_quiet(state: State) -> bool:
@@ -226,11 +230,11 @@ def is_quiet(state: State) -> bool:
 
 def next_timer(state: State) -> float | None:
     """See `Node.next_timer`."""
-    at = min(state.housekeeping_at, state.heartbeats.next_at, state.broadcasts.next_at(), state.next_peer_at())
+    at = min(state.maintenance_at, state.heartbeats.next_at, state.broadcasts.next_at(), state.next_peer_at())
     for bucket in state.rate_limits.values():
         if bucket.parked:
             at = min(at, bucket.ready_at())
-    if (state.packing or state.unpacking) and not state.closed:
+    if (state.compression_queue or state.inflating) and not state.closed:
         # At once, again and again; whatever else is due is done in between.
         return _ALWAYS
     return None if at == _INFINITY or state.closed else at
@@ -243,7 +247,7 @@ def handle_timer(state: State, now: float) -> None:
     due_peers: list[Peer] = []
     while state.next_peer_at() <= now:
         _, _, peer = heappop(state.timers)
-        peer.timer_at = peer.wants_at = _INFINITY
+        peer.timer_at = peer.due_at = _INFINITY
         due_peers.append(peer)
     for peer in due_peers:
         sender = peer.sender
@@ -253,12 +257,12 @@ def handle_timer(state: State, now: float) -> None:
         if session is not None:
             due = session.receiver.acks.due_at
             if due is not None and due <= now:
-                session.receiver.acks.now_wanted = True
+                session.receiver.acks.send_now = True
                 session.receiver.acks.due_at = None
-                state.owe(session)
+                state.schedule_control(session)
             if sender.consume_small_probe(now):
-                session.owe(Ping(state.rng.getrandbits(64)))
-                state.owe(session)
+                session.queue_control(Ping(state.rng.getrandbits(64)))
+                state.schedule_control(session)
         state.ready[peer] = None
         state.arm(peer)
     if state.heartbeats.next_at <= now:
@@ -273,40 +277,40 @@ def handle_timer(state: State, now: float) -> None:
     broadcasts: list[Datagram] = []
     state.broadcasts.send_copies(now, broadcasts)
     state.outgoing.extend(broadcasts)
-    if state.packing:
-        pack(state, now)
-    if state.unpacking:
-        unpack(state, now)
-    if state.housekeeping_at <= now:
-        state.housekeeping_at = now + HOUSEKEEPING_S
-        housekeep(state, now)
+    if state.compression_queue:
+        compress_step(state, now)
+    if state.inflating:
+        inflate_step(state, now)
+    if state.maintenance_at <= now:
+        state.maintenance_at = now + MAINTENANCE_INTERVAL_S
+        maintain(state, now)
         expire_held(state, now)
-        _ask_for_repairs(state, now)
+        _send_nacks(state, now)
 
 
 def _send_heartbeats(state: State, now: float) -> None:
     sessions = list(state.peer_table.sessions.values())
-    waiting = state.priority_backoff.waiting_here(state.waiting_senders(), now)
+    waiting = state.priority_backoff.local_waiting(state.waiting_senders(), now)
     sent = state.sent.per_s(now)
-    beat = state.heartbeats.compose(state.settings, sessions, waiting, state.broadcasts.next_number, sent, now)
-    datagrams = announce(beat, state.to_all, state.links.values(), state.settings.neighbours)
+    beat = state.heartbeats.build(state.settings, sessions, waiting, state.broadcasts.next_number, sent, now)
+    datagrams = heartbeat_datagrams(beat, state.broadcast_channel, state.links.values(), state.settings.neighbours)
     state.event_queue.counters.heartbeats_sent += len(datagrams)
     state.outgoing.extend(datagrams)
 
 
-def _ask_for_repairs(state: State, now: float) -> None:
-    asking = list(state.asking)
-    state.asking.clear()
-    for boot_id in asking:
+def _send_nacks(state: State, now: float) -> None:
+    repairs_due = list(state.repairs_due)
+    state.repairs_due.clear()
+    for boot_id in repairs_due:
         repairs = state.repairs.get(boot_id)
         session = state.peer_table.sessions.get(boot_id)
         if repairs is None or session is None:
             continue
-        asks = repairs.ask(now) if repairs.next_at <= now else []
-        state.ask_by(boot_id, repairs)
-        if not asks:
+        nacks = repairs.due_nacks(now) if repairs.next_at <= now else []
+        state.schedule_repair(boot_id, repairs)
+        if not nacks:
             continue
-        state.event_queue.counters.repairs_asked += len(asks)
-        for ask in asks:
-            session.owe(ask)
-        state.owe(session)
+        state.event_queue.counters.repairs_asked += len(nacks)
+        for ask in nacks:
+            session.queue_control(ask)
+        state.schedule_control(session)

@@ -28,8 +28,6 @@ from udp_mesh.wire.limits import (
 _HEADER = struct.Struct("<BHIIH")
 LEGACY_OVERHEAD_BYTES = _HEADER.size + 1
 """Header and the trailing byte of a disabled checksum."""
-BROADCAST_SEQUENCE = 0x8000
-"""High bit of a sequence number: counts messages to all; unicast numbers run 1 to 0x7fff per peer and wrap to 1."""
 LAST_SEQUENCE = 0x7FFF
 """Unicast sequence numbers run from 1 to this, then from 1 again."""
 _HOST = struct.Struct("<64p16p")
@@ -104,22 +102,22 @@ class PriorityMeshData:
     frame_id: str = ""
 
 
-_COVER = _HEADER.pack(LegacyType.ACK, 0xFFFF, 0xFFFFFFFF, 0, 0)[:-2]
+_ENCAPSULATION = _HEADER.pack(LegacyType.ACK, 0xFFFF, 0xFFFFFFFF, 0, 0)[:-2]
 """An acknowledgement of a message that nobody sends: unicast numbers end at 0x7fff, and broadcasts are never
 acknowledged."""
 
 
-def cover(data: bytes) -> bytes:
+def encapsulate(data: bytes) -> bytes:
     """A datagram of ours that may reach fielded programs: in the payload of an acknowledgement they ignore.
 
     A datagram of another type than theirs, which a broadcast would bring them, ends them.
     """
-    return _COVER + struct.pack("<H", len(data)) + data + b"\x00"
+    return _ENCAPSULATION + struct.pack("<H", len(data)) + data + b"\x00"
 
 
-def uncover(data: bytes | memoryview) -> bytes | memoryview | None:
-    """What `cover` was given; None where this is something else."""
-    if len(data) < LEGACY_OVERHEAD_BYTES or bytes(data[: len(_COVER)]) != _COVER:
+def decapsulate(data: bytes | memoryview) -> bytes | memoryview | None:
+    """What `encapsulate` was given; None where this is something else."""
+    if len(data) < LEGACY_OVERHEAD_BYTES or bytes(data[: len(_ENCAPSULATION)]) != _ENCAPSULATION:
         return None
     return data[_HEADER.size : -1]
 

@@ -136,7 +136,7 @@ class World:
         self._pump(source)
         return result
 
-    def told(self, name: str, kind: type) -> list[Event]:
+    def events_of(self, name: str, kind: type) -> list[Event]:
         """Events of one kind that a node told so far."""
         self._fetch(name)
         return [event for _, event in self.events[name] if isinstance(event, kind)]
@@ -204,10 +204,10 @@ class Pair:
 
     def events(self, node: Node) -> list[Event]:
         """Everything a node told since the last look."""
-        told = []
+        events = []
         while (event := node.next_event()) is not None:
-            told.append(event)
-        return told
+            events.append(event)
+        return events
 
 
 def pair(*topics: Topic, **changes: object) -> Pair:

@@ -14,7 +14,7 @@ from tests.udp_mesh.core.test_legacy import OLD, OldRobot, pieces
 from udp_mesh.core.events import MessageDelivered, MessageExpired, MessageReceived
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.legacy.acks import LegacyAcks
-from udp_mesh.core.legacy.peers import MOST_TOPICS, SETTLE_S
+from udp_mesh.core.legacy.peers import MAX_TOPICS, SETTLE_S
 from udp_mesh.core.settings import Neighbour, Outbox, Topic
 from udp_mesh.wire.legacy import (
     Host,
@@ -128,7 +128,7 @@ def test_acknowledgements_besides_stay_few_without_loss() -> None:
     acks, now, more = LegacyAcks(), 0.0, 0
     for sequence in range(1, 1001):
         piece = LegacyPayload(sequence, 0, 1, b"x", wants_ack=True)
-        more += len(acks.came(piece, now))
+        more += len(acks.on_fragment(piece, now))
         now += 0.005
         more += len(acks.due(now))
     assert more <= 1000 + 6 * 5.0 / 0.05 + 24
@@ -183,10 +183,10 @@ def test_only_names_of_ros_are_taken_from_fielded_robots(topic: str, kind: str) 
 
 def test_a_fielded_robot_names_so_many_topics_and_no_more() -> None:
     old = OldRobot()
-    for number in range(MOST_TOPICS + 50):
+    for number in range(MAX_TOPICS + 50):
         body = encode_mesh_data(PriorityMeshData("old", "a/B", 1, f"t{number}", b"x"))
         old.say(LegacyPayload(number + 1, 0, 1, body, wants_ack=True))
-    assert len(old.received()) == MOST_TOPICS
+    assert len(old.received()) == MAX_TOPICS
     old.say(pieces(2000, b"x")[0])
     assert old.node.conditions(old.now).counters.dropped_over_limit == 51
 

@@ -127,7 +127,7 @@ def sealed_data(fuzzer: Fuzzer) -> None:
 
 
 def sealed_to_all(fuzzer: Fuzzer) -> None:
-    channel = fuzzer.both.a._state.to_all if fuzzer.dice.random() < 0.7 else fuzzer.stranger
+    channel = fuzzer.both.a._state.broadcast_channel if fuzzer.dice.random() < 0.7 else fuzzer.stranger
     seal = channel.seal if fuzzer.dice.random() < 0.5 else channel.seal_long
     fuzzer.receive(seal(fuzzer.frames())[1])
 

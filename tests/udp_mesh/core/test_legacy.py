@@ -215,7 +215,7 @@ def test_defect_4_nothing_that_is_sent_to_all_ends_a_fielded_program() -> None:
             to_all.append(datagram)
 
     world.tap = tap
-    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    assert world.run(5.0, until=lambda: bool(world.events_of("a", PeerOnline) and world.events_of("b", PeerOnline)))
     for size in (0, 100, 1300, 1380, 1400, 3000):
         world.send("a", "cast", bytes(size))
         world.run(0.5)
@@ -225,7 +225,9 @@ def test_defect_4_nothing_that_is_sent_to_all_ends_a_fielded_program() -> None:
     for datagram in to_all:
         assert decode_legacy(datagram.data) == LegacyAck(0xFFFF, 0xFFFFFFFF)
         assert len(datagram.data) <= 1500 - 28
-    assert [len(event.payload) for event in world.told("b", MessageReceived) if isinstance(event, MessageReceived)] == [
+    assert [
+        len(event.payload) for event in world.events_of("b", MessageReceived) if isinstance(event, MessageReceived)
+    ] == [
         0,
         100,
         1300,
@@ -233,7 +235,7 @@ def test_defect_4_nothing_that_is_sent_to_all_ends_a_fielded_program() -> None:
         1400,
         3000,
     ]
-    assert world.told("b", PeerOffline)
+    assert world.events_of("b", PeerOffline)
 
 
 def test_defect_5_a_name_is_not_believed_as_announced() -> None:
@@ -264,10 +266,10 @@ def test_defect_5_among_our_own_nodes_a_taken_name_is_reported() -> None:
     for other in ("a", "b"):
         world.pipes[("b2", other)] = world.pipes[("a", "b")]
         world.pipes[(other, "b2")] = world.pipes[("a", "b")]
-    assert world.run(20.0, until=lambda: bool(world.told("a", NameConflict)))
-    assert [event.name for event in world.told("a", NameConflict) if isinstance(event, NameConflict)] == ["b"]
-    assert world.run(5.0, until=lambda: bool(world.told("b", NameConflict)))
-    assert any(event.own for event in world.told("b", NameConflict) if isinstance(event, NameConflict))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", NameConflict)))
+    assert [event.name for event in world.events_of("a", NameConflict) if isinstance(event, NameConflict)] == ["b"]
+    assert world.run(5.0, until=lambda: bool(world.events_of("b", NameConflict)))
+    assert any(event.own for event in world.events_of("b", NameConflict) if isinstance(event, NameConflict))
 
 
 @pytest.mark.parametrize("broadcast", ["10.0.15.255", "10.0.0.15", "192.168.255.255"])

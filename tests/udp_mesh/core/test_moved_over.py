@@ -27,7 +27,7 @@ class Move:
         world.tap = lambda name, datagram, now: self._take(name, datagram.destination, bytes(datagram.data))
         for turn in range(8):
             world.at(world.now + turn, self._announce)
-        assert world.run(3.0, until=lambda: len(world.told("a", PeerOnline)) == 2)
+        assert world.run(3.0, until=lambda: len(world.events_of("a", PeerOnline)) == 2)
 
     def _announce(self) -> None:
         for node in self.world.nodes.values() if self.answers else ():
@@ -51,14 +51,16 @@ class Move:
         self.world.add(settings("b", Topic("map", priority=7)), address=OLD[0])
 
     def received(self, name: str) -> list[bytes]:
-        return [event.payload for event in self.world.told(name, MessageReceived) if isinstance(event, MessageReceived)]
+        return [
+            event.payload for event in self.world.events_of(name, MessageReceived) if isinstance(event, MessageReceived)
+        ]
 
 
 def test_messages_go_on_after_a_fielded_robot_has_moved_over_although_nobody_was_told() -> None:
     move = Move()
     world = move.world
     world.send("a", "map", MAP, "b")
-    assert world.run(5.0, until=lambda: len(world.told("a", MessageDelivered)) == 1)
+    assert world.run(5.0, until=lambda: len(world.events_of("a", MessageDelivered)) == 1)
     assert move.payloads
     move.answers = False
     # These begin in the old format and find nobody there.
@@ -66,7 +68,7 @@ def test_messages_go_on_after_a_fielded_robot_has_moved_over_although_nobody_was
     world.send("a", "status", b"waits", "b")
     world.run(0.5)
     move.move()
-    assert world.run(10.0, until=lambda: len(world.told("a", MessageDelivered)) == 3)
+    assert world.run(10.0, until=lambda: len(world.events_of("a", MessageDelivered)) == 3)
     world.send("b", "map", MAP, "a")
     world.send("a", "map", MAP)
     assert world.run(10.0, until=lambda: len(move.received("a")) == 1 and len(move.received("b")) == 3)
@@ -79,7 +81,7 @@ def test_a_robot_that_has_moved_over_stays_online() -> None:
     move.move()
     move.world.run(60.0)
     for name in ("a", "c"):
-        assert move.world.told(name, PeerOffline) == []
+        assert move.world.events_of(name, PeerOffline) == []
     with_b = [peer for peer in move.world.nodes["a"].conditions(move.world.now).peers if peer.name == "b"]
     assert [(peer.online, peer.legacy) for peer in with_b] == [(True, False)]
 

@@ -18,7 +18,7 @@ def met(seed: int) -> World:
     world = World(seed=seed)
     for name in ("a", "b"):
         world.add(settings(name, *TOPICS))
-    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    assert world.run(5.0, until=lambda: bool(world.events_of("a", PeerOnline) and world.events_of("b", PeerOnline)))
     world.run(3.0)
     return world
 
@@ -35,18 +35,18 @@ def test_a_peer_that_is_heard_and_does_not_hear_us_goes_offline_and_returns() ->
     world.send("a", "map", bytes(5000), "b")
     world.send("a", "art", b"found", "b")
     assert world.run(20.0, until=lambda: peer(world, "a") == (True, True))
-    assert world.run(20.0, until=lambda: bool(world.told("a", PeerOffline)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", PeerOffline)))
     assert peer(world, "a") == (False, True)
-    assert world.told("b", PeerOffline)
+    assert world.events_of("b", PeerOffline)
     world.run(10.0)
-    assert len(world.told("a", PeerOnline)) == 1
+    assert len(world.events_of("a", PeerOnline)) == 1
     # while it waits what b sends is taken: that way works
     world.send("b", "map", b"one way", "a")
     world.pipes[("a", "b")].up = True
-    assert world.run(10.0, until=lambda: len(world.told("a", PeerOnline)) == 2)
-    assert world.run(5.0, until=lambda: len(world.told("a", MessageDelivered)) == 2)
+    assert world.run(10.0, until=lambda: len(world.events_of("a", PeerOnline)) == 2)
+    assert world.run(5.0, until=lambda: len(world.events_of("a", MessageDelivered)) == 2)
     assert peer(world, "a") == (True, False)
-    assert len(world.told("b", MessageReceived)) == 2
+    assert len(world.events_of("b", MessageReceived)) == 2
 
 
 def carry_broadcasts_alone(world: World, source: str, target: str) -> None:
@@ -79,9 +79,9 @@ def test_what_no_outbox_keeps_for_a_peer_that_never_hears_us_again_is_told_as_lo
     world = met(2)
     world.pipes[("a", "b")].up = False
     world.send("a", "map", bytes(5000), "b")
-    assert world.run(120.0, until=lambda: bool(world.told("a", MessagePeerLost)))
-    assert len(world.told("a", MessagePeerLost)) == 1
-    assert not world.told("a", MessageDelivered)
+    assert world.run(120.0, until=lambda: bool(world.events_of("a", MessagePeerLost)))
+    assert len(world.events_of("a", MessagePeerLost)) == 1
+    assert not world.events_of("a", MessageDelivered)
 
 
 def test_a_node_that_never_heard_us_is_no_peer_and_is_told_of_as_a_stranger() -> None:
@@ -95,7 +95,7 @@ def test_a_node_that_never_heard_us_is_no_peer_and_is_told_of_as_a_stranger() ->
     assert [(stranger.name, stranger.address) for stranger in conditions.strangers] == [("b", ("10.0.0.2", 8700))]
     assert not world.nodes["b"].conditions(world.now).strangers
     world.pipes[("a", "b")].up = True
-    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    assert world.run(5.0, until=lambda: bool(world.events_of("a", PeerOnline) and world.events_of("b", PeerOnline)))
     assert not world.nodes["a"].conditions(world.now).strangers
 
 
@@ -104,5 +104,5 @@ def test_losses_of_half_of_all_datagrams_call_nobody_offline() -> None:
     for path in world.pipes.values():
         path.loss = 0.5
     world.run(300.0)
-    assert not world.told("a", PeerOffline)
-    assert not world.told("b", PeerOffline)
+    assert not world.events_of("a", PeerOffline)
+    assert not world.events_of("b", PeerOffline)

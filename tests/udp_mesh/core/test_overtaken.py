@@ -33,7 +33,7 @@ def test_bulk_that_was_lost_all_at_once_is_sent_again_while_urgent_messages_keep
         world.add(settings(name, *TOPICS))
     walls = [Wall(delay_s=0.05) for _ in world.pipes]
     world.pipes.update(zip(world.pipes, walls, strict=True))
-    assert world.run(20.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", PeerOnline) and world.events_of("b", PeerOnline)))
 
     def report() -> None:
         world.send("a", "telemetry", bytes(100), "b")
@@ -50,7 +50,7 @@ def test_bulk_that_was_lost_all_at_once_is_sent_again_while_urgent_messages_keep
     world.at(world.now + 0.08, fall)
 
     def maps() -> list[str]:
-        events = [event for event in world.told("a", MessageDelivered) if isinstance(event, MessageDelivered)]
+        events = [event for event in world.events_of("a", MessageDelivered) if isinstance(event, MessageDelivered)]
         return [event.topic for event in events if event.topic == "map"]
 
     assert world.run(5.0, until=lambda: bool(maps()))

@@ -11,7 +11,7 @@ from udp_mesh.core.compression import compress, decompress
 from udp_mesh.core.congestion.pacer import MAX_DEBT_S, Pacer
 from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.receiver.acks import AckState
-from udp_mesh.core.receiver.reassembly import PIECE_OVERHEAD_BYTES, Reassembly, Verdict, Whole
+from udp_mesh.core.receiver.reassembly import FRAGMENT_OVERHEAD_BYTES, CompleteMessage, FragmentStatus, Reassembly
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot, SentPackets
 from udp_mesh.core.settings import Limits
@@ -46,9 +46,9 @@ def test_reassembly_does_not_depend_on_order_or_repetition(body: bytes, size: in
     order = data.draw(st.permutations(pieces + pieces[: len(pieces) // 2]))
     reassembly = Reassembly(Limits())
     results = [reassembly.add(piece, 0.0) for piece in order]
-    wholes = [result for result in results if isinstance(result, Whole)]
+    wholes = [result for result in results if isinstance(result, CompleteMessage)]
     assert [whole.body for whole in wholes] == [body]
-    assert set(results) - set(wholes) <= {Verdict.KEPT, Verdict.DUPLICATE}
+    assert set(results) - set(wholes) <= {FragmentStatus.KEPT, FragmentStatus.DUPLICATE}
     assert reassembly.bytes == 0
 
 
@@ -74,15 +74,15 @@ def test_reassembly_never_holds_more_than_its_cap_whatever_fragments_claim(claim
 
 
 def test_a_refused_piece_leaves_nothing_behind_and_is_taken_when_there_is_room() -> None:
-    reassembly = Reassembly(Limits(partial_bytes_per_peer=PIECE_OVERHEAD_BYTES + 50))
+    reassembly = Reassembly(Limits(partial_bytes_per_peer=FRAGMENT_OVERHEAD_BYTES + 50))
     first, second = pieces_of(bytes(60), 30)
-    assert reassembly.add(first, 0.0) is Verdict.KEPT
+    assert reassembly.add(first, 0.0) is FragmentStatus.KEPT
     other = Fragment(2, 1, bytes(30))
-    assert reassembly.add(other, 0.0) is Verdict.FULL
+    assert reassembly.add(other, 0.0) is FragmentStatus.FULL
     assert len(reassembly) == 1
-    assert reassembly.add(second, 0.0) is Verdict.FULL
+    assert reassembly.add(second, 0.0) is FragmentStatus.FULL
     reassembly.forget(1)
-    assert reassembly.add(other, 0.0) is Verdict.KEPT
+    assert reassembly.add(other, 0.0) is FragmentStatus.KEPT
 
 
 def test_a_best_effort_message_that_stops_is_purged_by_its_own_age() -> None:
@@ -126,7 +126,7 @@ def test_every_packet_is_acknowledged_or_lost_as_a_plain_model_says(plan: list[t
             in_flight.add(number, None)
             number += 1
         elif what == "arrive" and number:
-            state.saw(number - 1 - choice % min(number, 12), 0.0) if not received(
+            state.on_packet(number - 1 - choice % min(number, 12), 0.0) if not received(
                 state, number - 1 - choice % min(number, 12)
             ) else None
         elif what == "ack" and state.largest >= 0:

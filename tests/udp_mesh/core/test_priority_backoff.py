@@ -12,15 +12,15 @@ from udp_mesh.wire.frames import Waiting
 
 def test_levels_less_urgent_than_the_one_waiting_elsewhere_hold_back_for_a_while() -> None:
     priority_backoff = PriorityBackoff(Rates(), 0.0)
-    priority_backoff.heard((Waiting(2, 50),), 1.0)
-    assert priority_backoff.allowed(1.05) == 0b111
-    assert priority_backoff.allowed(1.2) == ALL_LEVELS
+    priority_backoff.on_waiting((Waiting(2, 50),), 1.0)
+    assert priority_backoff.allowed_levels(1.05) == 0b111
+    assert priority_backoff.allowed_levels(1.2) == ALL_LEVELS
 
 
 def test_bulk_waiting_elsewhere_holds_nobody_back() -> None:
     priority_backoff = PriorityBackoff(Rates(), 0.0)
-    priority_backoff.heard((Waiting(9, 60_000),), 1.0)
-    assert priority_backoff.allowed(1.0) == ALL_LEVELS
+    priority_backoff.on_waiting((Waiting(9, 60_000),), 1.0)
+    assert priority_backoff.allowed_levels(1.0) == ALL_LEVELS
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 0.3), st.integers(0, 3)), max_size=80))
@@ -29,7 +29,7 @@ def test_no_level_is_held_back_for_more_than_its_share_of_the_time(reports: list
     priority_backoff, now = PriorityBackoff(rates, 0.0), 0.0
     for wait, level in reports:
         now += wait
-        priority_backoff.heard((Waiting(level, 100),), now)
+        priority_backoff.on_waiting((Waiting(level, 100),), now)
     assert priority_backoff.held_total_s <= rates.yield_share * (now + BUDGET_S) + 1e-6
 
 
@@ -50,4 +50,4 @@ def test_a_node_whose_urgent_messages_wait_is_given_way_by_another_ones_bulk() -
     queues = {queue.priority: queue for queue in world.nodes["a"].conditions(world.now).peers[0].queues}
     # what the level waited for others is told, and is no more than the node held back at all
     assert 0 < queues[9].held_s <= held_s + 1e-9
-    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))

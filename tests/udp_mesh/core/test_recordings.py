@@ -20,7 +20,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peers import heartbeat
-from udp_mesh.core.peers.path_validation import challenge
+from udp_mesh.core.peers.path_validation import validate_path
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, Freshness, clock_ms
 from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
 from udp_mesh.crypto import Key, ReceiveChannel, SendChannel
@@ -131,9 +131,9 @@ def test_messages_outlive_cuts_of_several_seconds_and_routes_that_become_slow() 
         world.run(cut_s)
         for pipe in world.pipes.values():
             pipe.up, pipe.delay_s = True, 0.8
-        before = len(world.told("a", MessageDelivered))
-        assert world.run(15.0, until=lambda before=before: len(world.told("a", MessageDelivered)) > before)  # type: ignore[misc]
-    assert len(world.told("b", MessageReceived)) == 2
+        before = len(world.events_of("a", MessageDelivered))
+        assert world.run(15.0, until=lambda before=before: len(world.events_of("a", MessageDelivered)) > before)  # type: ignore[misc]
+    assert len(world.events_of("b", MessageReceived)) == 2
 
 
 def silent_world() -> tuple[World, list[Datagram]]:
@@ -148,7 +148,7 @@ def silent_world() -> tuple[World, list[Datagram]]:
     world.run(4.0)
     world.tap = None
     del world.nodes["a"]
-    assert world.run(30.0, until=lambda: bool(world.told("b", PeerOffline)))
+    assert world.run(30.0, until=lambda: bool(world.events_of("b", PeerOffline)))
     world.run(ACCEPT_AGE_S)
     return world, recorded
 
@@ -158,13 +158,13 @@ def test_an_old_hello_raises_no_peer(with_timestamp: bool, monkeypatch: pytest.M
     if not with_timestamp:
         without_dates(monkeypatch)
     world, recorded = silent_world()
-    online = len(world.told("b", PeerOnline))
+    online = len(world.events_of("b", PeerOnline))
     assert recorded
     for datagram in recorded:
         world.nodes["b"].receive(datagram.data, "mesh", ATTACKER, world.now)
         world.run(0.3)
-    assert len(world.told("b", PeerOnline)) == online
-    assert not world.told("b", PeerAddressChanged)
+    assert len(world.events_of("b", PeerOnline)) == online
+    assert not world.events_of("b", PeerAddressChanged)
 
 
 @pytest.mark.parametrize("dated", [True, False])
@@ -178,12 +178,12 @@ def test_a_peer_that_was_away_comes_back_within_a_round_trip_of_its_hello(
         world.add(settings(name))
     world.run(3.0)
     world.pipes["a", "b"].up = False
-    assert world.run(30.0, until=lambda: bool(world.told("b", PeerOffline)))
+    assert world.run(30.0, until=lambda: bool(world.events_of("b", PeerOffline)))
     world.pipes["a", "b"].up = True
     heard: list[float] = []
     world.tap = lambda name, datagram, now: heard.append(now) if name == "a" else None
-    online = len(world.told("b", PeerOnline))
-    assert world.run(5.0, until=lambda: len(world.told("b", PeerOnline)) > online)
+    online = len(world.events_of("b", PeerOnline))
+    assert world.run(5.0, until=lambda: len(world.events_of("b", PeerOnline)) > online)
     assert world.now - heard[0] < 0.010 + 0.020 + 0.005
 
 
@@ -197,9 +197,9 @@ def test_a_peer_whose_computer_slept_is_believed_again_within_a_second() -> None
     assert session is not None
     assert session.freshness._offset_ms is not None
     session.freshness._offset_ms = (session.freshness._offset_ms - 3_600_000) & 0xFFFFFFFF
-    session.freshness.prove(world.now)
+    session.freshness.confirm(world.now)
     world.send("a", "any", b"awake", "b")
-    assert world.run(1.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(1.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
 
 
 def roaming(seed: int, loss: float) -> World:
@@ -234,8 +234,8 @@ def test_resent_datagrams_move_no_path(seed: int, with_timestamp: bool, monkeypa
 
     both_ways()
     world.run(15.0)
-    assert world.told("b", PeerAddressChanged) == []
-    assert len(world.told("b", MessageReceived)) > 100
+    assert world.events_of("b", PeerAddressChanged) == []
+    assert len(world.events_of("b", MessageReceived)) > 100
 
 
 def test_a_robot_that_moved_is_followed_a_round_trip_after_it_was_missed() -> None:
@@ -244,11 +244,11 @@ def test_a_robot_that_moved_is_followed_a_round_trip_after_it_was_missed() -> No
     world.addresses["b"] = ("10.0.0.99", 8700)
     asked = world.now
     world.send("a", "map", b"where are you", "b")
-    assert world.run(6.0, until=lambda: bool(world.told("a", PeerAddressChanged)))
+    assert world.run(6.0, until=lambda: bool(world.events_of("a", PeerAddressChanged)))
     moves.append(world.now - asked)
     # Heard there at 2 s at the latest (two heartbeats), and 20 ms there and back.
     assert moves[0] < 3.0
-    assert world.run(1.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(1.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
 
 
 def test_two_peers_whose_tags_collide_are_both_heard() -> None:
@@ -279,13 +279,13 @@ def test_two_peers_whose_tags_collide_are_both_heard() -> None:
         world.send("one", "any", b"%d" % number, "base")
         world.run(0.01)
     world.run(1.0)
-    before = len(world.told("base", MessageReceived))
+    before = len(world.events_of("base", MessageReceived))
     for number in range(40):
         for name in ("one", "two"):
             world.send(name, "any", b"%d" % number, "base")
         world.run(0.05)
     world.run(1.0)
-    told = world.told("base", MessageReceived)[before:]
+    told = world.events_of("base", MessageReceived)[before:]
     heard = [event.source for event in told if isinstance(event, MessageReceived)]
     assert (heard.count("one"), heard.count("two")) == (40, 40)
 
@@ -321,10 +321,10 @@ def test_no_number_is_used_twice_for_a_pair_of_boots_however_many_runs_took_the_
         world.nodes.pop("r").close(world.now)
         world.run(15.0)
         world.nodes["r"] = first
-        before = len(world.told("r", MessageReceived))
+        before = len(world.events_of("r", MessageReceived))
         world.run(5.0)
         world.send("base", "any", b"back", "r")
-        assert world.run(10.0, until=lambda: len(world.told("r", MessageReceived)) > before)
+        assert world.run(10.0, until=lambda: len(world.events_of("r", MessageReceived)) > before)
     assert doubles == []
 
 
@@ -353,14 +353,14 @@ def test_a_robot_replaced_for_a_while_is_believed_again(
         world.nodes["base"].receive(datagram.data, "mesh", ATTACKER, world.now)
         world.run(0.3)
     assert not world.nodes["base"].conditions(world.now).peers[0].online
-    assert len(world.told("base", MessageReceived)) == 1
+    assert len(world.events_of("base", MessageReceived)) == 1
     world.nodes["r"] = first
     assert world.run(10.0, until=lambda: world.nodes["base"].conditions(world.now).peers[0].online)
     world.run(2.0)
     world.send("r", "map", b"again", "base")
     world.send("base", "map", b"to you", "r")
-    assert world.run(10.0, until=lambda: len(world.told("base", MessageReceived)) == 2)
-    assert world.run(10.0, until=lambda: bool(world.told("base", MessageDelivered)))
+    assert world.run(10.0, until=lambda: len(world.events_of("base", MessageReceived)) == 2)
+    assert world.run(10.0, until=lambda: bool(world.events_of("base", MessageDelivered)))
 
 
 def test_keys_rotated_away_and_back_open_no_recording_again() -> None:
@@ -394,8 +394,8 @@ def test_a_clock_that_wraps_or_drifts_makes_nothing_old() -> None:
     for minute in range(60 * 24 * 60):
         now = minute * 60.0
         theirs = now * (1 + 5e-4) + 4_294_960.0
-        assert freshness.judge(clock_ms(theirs), now) <= 0.1
-    assert freshness.judge(clock_ms(theirs), now + 2 * ACCEPT_AGE_S) > ACCEPT_AGE_S
+        assert freshness.lateness_s(clock_ms(theirs), now) <= 0.1
+    assert freshness.lateness_s(clock_ms(theirs), now + 2 * ACCEPT_AGE_S) > ACCEPT_AGE_S
 
 
 def test_an_empty_datagram_of_a_key_holder_is_malformed() -> None:
@@ -403,7 +403,7 @@ def test_an_empty_datagram_of_a_key_holder_is_malformed() -> None:
     session = both.a._state.peer_table.peers["b"].session
     assert session is not None
     both.b.receive(session.path.channel.seal(b"")[1], "mesh", A, both.now)
-    both.b.receive(both.a._state.to_all.seal(b"")[1], "mesh", A, both.now)
+    both.b.receive(both.a._state.broadcast_channel.seal(b"")[1], "mesh", A, both.now)
     assert both.b.conditions(both.now).counters.dropped_malformed == 2
 
 
@@ -414,7 +414,7 @@ def test_a_ping_is_answered_where_it_came_from() -> None:
         node.link_up(LinkInfo("cable", LinkKind.BROADCAST, (own, 8700), ("172.16.0.255", 8700)), both.now)
     session = both.a._state.peer_table.peers["b"].session
     assert session is not None
-    challenge(both.a._state, session, "cable", ("172.16.0.2", 8700), both.now)
+    validate_path(both.a._state, session, "cable", ("172.16.0.2", 8700), both.now)
     asked = [datagram for datagram in both.drop(both.a) if datagram.link == "cable" and datagram.data[0] == DATA_BYTE]
     assert len(asked) == 1
     both.b.receive(asked[0].data, "cable", ("172.16.0.1", 8700), both.now)

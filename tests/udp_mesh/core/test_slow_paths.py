@@ -93,4 +93,4 @@ def test_what_a_silent_and_then_slow_peer_was_sent_holds_nothing_up_when_its_pat
     world.run(3.0)
     world.nodes["a"]._state.peer_table.peers["b"].sender.pacer.on_sent(100, world.now, 1.0)
     world.send("a", "map", bytes(50_000), "b")
-    assert world.run(2.0, until=lambda: len(world.told("a", MessageDelivered)) == 2)
+    assert world.run(2.0, until=lambda: len(world.events_of("a", MessageDelivered)) == 2)

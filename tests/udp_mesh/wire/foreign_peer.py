@@ -25,7 +25,7 @@ HELLO, BROADCAST, INTRODUCTION, DATA = range(4)
 TO_ALL = bytes(16)
 RELIABLE, COMPRESSED, FLAG_TO_ALL, REPAIR = 1, 2, 4, 8
 ZLIB, REPAIRS = 1, 2
-UNREPAIRED_FROM = 1 << 31
+FIRST_UNREPAIRED_NUMBER = 1 << 31
 COVER = bytes.fromhex("02ffffffffffff00000000")
 HELLO_S, RESEND_S, HEARD_FOR_S = 0.2, 0.5, 0.7
 
@@ -183,7 +183,7 @@ class Parser:
 
 
 @dataclass
-class Arrived:
+class ReceivedMessage:
     source: str
     topic: str
     type_name: str
@@ -226,7 +226,7 @@ class ForeignNode:
         self.boot = os.urandom(16)
         self.to_all = Channel(self.key, self.boot, TO_ALL)
         self.peers: dict[bytes, Peer] = {}
-        self.arrived: list[Arrived] = []
+        self.arrived: list[ReceivedMessage] = []
         self.casts = 0
 
     def peer(self, name: str) -> Peer | None:
@@ -281,7 +281,7 @@ class ForeignNode:
         """A message to all in one datagram, not repaired."""
         head = (len(payload), 1, 0, 1000 + len(topic), 3, FLAG_TO_ALL)
         announce = b"\x07" + struct.pack(">H", head[3]) + text(topic) + text("")
-        frames = announce + fragment(UNREPAIRED_FROM + self.to_all.next_number, 0, payload, head)
+        frames = announce + fragment(FIRST_UNREPAIRED_NUMBER + self.to_all.next_number, 0, payload, head)
         self.socket.sendto(self.to_all.seal(BROADCAST, frames), self.neighbour)
 
     def bye(self) -> None:
@@ -396,4 +396,4 @@ class ForeignNode:
             raise ValueError(f"{len(body)} bytes arrived of a message of {head['size']}")
         payload = zlib.decompress(body) if head["flags"] & COMPRESSED else body
         topic, type_name = peer.topics[head["topic"]]
-        self.arrived.append(Arrived(peer.name, topic, type_name, payload, head["flags"]))
+        self.arrived.append(ReceivedMessage(peer.name, topic, type_name, payload, head["flags"]))

@@ -38,7 +38,7 @@ from udp_mesh.wire.legacy import (
     LegacyDatagram,
     LegacyPayload,
     PriorityMeshData,
-    cover,
+    encapsulate,
     encode_legacy,
     encode_mesh_data,
 )
@@ -149,7 +149,7 @@ def make_legacy() -> object:
     return {
         "datagrams": datagrams,
         "message": {"message": describe(MESH_DATA), "hex": encode_mesh_data(MESH_DATA).hex()},
-        "covered": {"datagram": COVERED.hex(), "hex": cover(COVERED).hex()},
+        "covered": {"datagram": COVERED.hex(), "hex": encapsulate(COVERED).hex()},
     }
 
 

@@ -14,19 +14,19 @@ from udp_mesh.core.legacy.acks import LegacyAcks
 from udp_mesh.core.legacy.reassembly import LegacyReassembly
 from udp_mesh.core.legacy.sender import LegacySender
 from udp_mesh.core.peers.session import Meters, Peer
-from udp_mesh.core.publish import release_outbox, report_ended, shelve
+from udp_mesh.core.publish import release_outbox, report_ended, store_in_outbox
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.settings import Address, LinkInfo, Neighbour, Settings
-from udp_mesh.core.state import ASLEEP_S, State
+from udp_mesh.core.state import SUSPENDED_S, State
 from udp_mesh.wire.errors import DecodeError
 from udp_mesh.wire.legacy import (
     Host,
     LegacyAck,
     LegacyPayload,
     PriorityMeshData,
-    cover,
     decode_legacy,
+    encapsulate,
     encode_legacy,
     is_ros_name,
     is_ros_type,
@@ -36,14 +36,14 @@ from udp_mesh.wire.limits import PRIORITY_LEVELS
 LEGACY_HEARTBEAT_S = 1.0
 """The fielded period; its receivers report a peer offline after ten."""
 
-MISSED_S = 3.5
+RESTARTED_AFTER_S = 3.5
 """Without a sign of life for this long a fielded program may have been restarted: it says a heartbeat a second."""
 
 SETTLE_S = 10.0
 """After its first heartbeat then, before what an outbox keeps leaves: the program acknowledges from the start, but what
 arrives before its reader has subscribed is lost there (on a slow computer that takes long)."""
 
-MOST_TOPICS = 256
+MAX_TOPICS = 256
 """Topics of one fielded peer: nothing it says is authenticated, and each may become a ROS topic here."""
 
 
@@ -51,7 +51,7 @@ class LegacyPeer:
     """One fielded peer."""
 
     __slots__ = (
-        "_moved",
+        "_upgraded",
         "acks",
         "address",
         "broadcasts",
@@ -82,14 +82,14 @@ class LegacyPeer:
         self.topics: set[str] = set()
         self.received_bytes = 0
         self.meters = peer.legacy_meters = Meters(0.0)
-        self._moved = False
+        self._upgraded = False
 
-    def moved_over(self) -> bool:
+    def is_upgraded(self) -> bool:
         """Whether a node of our own format speaks for it by now."""
-        if not self._moved and self.peer.session is not None:
-            self._moved = True
+        if not self._upgraded and self.peer.session is not None:
+            self._upgraded = True
             self.peer.legacy = self.peer.settling = False
-        return self._moved
+        return self._upgraded
 
 
 class LegacyPeers:
@@ -105,13 +105,13 @@ class LegacyPeers:
 
     def apply(self) -> None:
         """Follow the settings' neighbours; peers that stay keep everything."""
-        wanted = {neighbour.address[0]: neighbour for neighbour in self._state.settings.neighbours if neighbour.legacy}
+        desired = {neighbour.address[0]: neighbour for neighbour in self._state.settings.neighbours if neighbour.legacy}
         for host in list(self._by_host):
-            if host not in wanted or self._by_host[host].neighbour != wanted[host]:
+            if host not in desired or self._by_host[host].neighbour != desired[host]:
                 self._drop(self._by_host.pop(host))
-        for host, neighbour in wanted.items():
+        for host, neighbour in desired.items():
             if host not in self._by_host and neighbour.name is not None:
-                peer = self._state.peer_table.peer(neighbour.name, self._state.settings)
+                peer = self._state.peer_table.get_or_create(neighbour.name, self._state.settings)
                 if peer is not None:
                     peer.legacy = True
                     peer.lost = False
@@ -134,13 +134,13 @@ class LegacyPeers:
         """One datagram without our mark: the fielded format from a configured address, or nothing of ours."""
         counters = self._state.event_queue.counters
         legacy = self._by_host.get(source[0])
-        if legacy is None or legacy.moved_over() or source != legacy.neighbour.address:
+        if legacy is None or legacy.is_upgraded() or source != legacy.neighbour.address:
             # Fielded programs send from the port they listen on; another one on that computer is not believed.
             counters.dropped_unauthenticated += 1
             return
         try:
             datagram = decode_legacy(data)
-            self._heard(legacy, link, source, now)
+            self._on_activity(legacy, link, source, now)
             legacy.received_bytes += len(data) + IP_UDP_BYTES
             match datagram:
                 case Host():
@@ -149,18 +149,18 @@ class LegacyPeers:
                     legacy.sender.acknowledge(sequence, position, now)
                     report_ended(self._state, legacy.peer, now)
                 case LegacyPayload():
-                    self._take(legacy, datagram, link, source, now)
+                    self._receive_fragment(legacy, datagram, link, source, now)
         except DecodeError:
             counters.dropped_malformed += 1
 
-    def _heard(self, legacy: LegacyPeer, link: str, source: Address, now: float) -> None:
-        if now - legacy.last_heard > MISSED_S:
+    def _on_activity(self, legacy: LegacyPeer, link: str, source: Address, now: float) -> None:
+        if now - legacy.last_heard > RESTARTED_AFTER_S:
             legacy.settled_at = now + SETTLE_S
             legacy.peer.settling = True
         legacy.last_heard = now
         legacy.link = link
         legacy.address = source
-        legacy.sender.heard()
+        legacy.sender.on_activity()
         peer = legacy.peer
         peer.legacy_path = (source, link, now)
         peer.lost = False
@@ -169,20 +169,22 @@ class LegacyPeers:
             peer.online_since = now
             self._state.event_queue.emit(PeerOnline(peer.name, source, link))
 
-    def _take(self, legacy: LegacyPeer, piece: LegacyPayload, link: str, source: Address, now: float) -> None:
-        reassembly = legacy.unicasts if piece.wants_ack else legacy.broadcasts
+    def _receive_fragment(
+        self, legacy: LegacyPeer, fragment: LegacyPayload, link: str, source: Address, now: float
+    ) -> None:
+        reassembly = legacy.unicasts if fragment.wants_ack else legacy.broadcasts
         message: PriorityMeshData | None = None
         keep = True
         too_large = reassembly.over_limit
         try:
-            keep, message = reassembly.add(piece, now)
+            keep, message = reassembly.add(fragment, now)
         finally:
             self._state.event_queue.counters.dropped_over_limit += reassembly.over_limit - too_large
-            if keep and piece.wants_ack:
-                more = legacy.acks.came(piece, now)
-                self._acknowledge(legacy, [LegacyAck(piece.sequence, piece.position), *more])
+            if keep and fragment.wants_ack:
+                more = legacy.acks.on_fragment(fragment, now)
+                self._acknowledge(legacy, [LegacyAck(fragment.sequence, fragment.position), *more])
         if message is not None:
-            if not self._may_name(legacy, message):
+            if not self._topic_allowed(legacy, message):
                 self._state.event_queue.counters.dropped_over_limit += 1
                 return
             self._state.event_queue.counters.messages_received += 1
@@ -194,16 +196,16 @@ class LegacyPeers:
                     message.type_name,
                     message.data,
                     priority,
-                    not piece.wants_ack,
+                    not fragment.wants_ack,
                 )
             )
 
-    def _may_name(self, legacy: LegacyPeer, message: PriorityMeshData) -> bool:
+    def _topic_allowed(self, legacy: LegacyPeer, message: PriorityMeshData) -> bool:
         """Whether a message's topic and type are names of ROS, and its topics not too many."""
         if not is_ros_name(message.topic) or not is_ros_type(message.type_name):
             return False
         if message.topic not in legacy.topics:
-            if len(legacy.topics) >= MOST_TOPICS:
+            if len(legacy.topics) >= MAX_TOPICS:
                 return False
             legacy.topics.add(message.topic)
         return True
@@ -212,19 +214,19 @@ class LegacyPeers:
         for ack in acks:
             self._state.outgoing.append(Datagram(legacy.link, legacy.address, encode_legacy(ack), True))
 
-    def covered(self, out: list[Datagram]) -> list[Datagram]:
+    def encapsulate_broadcasts(self, out: list[Datagram]) -> list[Datagram]:
         """The datagrams, those to all in a cover that fielded programs take for one of theirs."""
         to_all = {link.broadcast for link in self._state.links.values()} | {None}
         return [
-            datagram._replace(data=cover(datagram.data)) if datagram.destination in to_all else datagram
+            datagram._replace(data=encapsulate(datagram.data)) if datagram.destination in to_all else datagram
             for datagram in out
         ]
 
-    def leave(self, now: float, out: list[Datagram]) -> None:
+    def send(self, now: float, out: list[Datagram]) -> None:
         """Fragments that may leave now."""
         for legacy in self._active():
             if legacy.link and (legacy.peer.sender.pending or legacy.sender.timer() is not None):
-                legacy.sender.leave(legacy.link, legacy.address, now, out)
+                legacy.sender.send(legacy.link, legacy.address, now, out)
                 report_ended(self._state, legacy.peer, now)
 
     def next_at(self) -> float:
@@ -246,20 +248,20 @@ class LegacyPeers:
         if not self._by_host or now < self._heartbeat_at:
             return
         # This process did not run for so long: silence meanwhile was ours.
-        asleep_s = now - self._heartbeat_at if self._heartbeat_at != float("-inf") else 0.0
+        suspended_s = now - self._heartbeat_at if self._heartbeat_at != float("-inf") else 0.0
         self._heartbeat_at = now + LEGACY_HEARTBEAT_S
         state = self._state
         rates = state.settings.rates
         for legacy in self._active():
             peer = legacy.peer
-            if asleep_s > ASLEEP_S:
-                legacy.last_heard = min(now, legacy.last_heard + asleep_s)
+            if suspended_s > SUSPENDED_S:
+                legacy.last_heard = min(now, legacy.last_heard + suspended_s)
             quiet_s = now - legacy.last_heard
             if peer.online and quiet_s > rates.offline_s:
                 peer.online = False
                 peer.online_since = None
                 state.event_queue.emit(PeerOffline(peer.name, left=False))
-                shelve(state, peer, now)
+                store_in_outbox(state, peer, now)
             if not peer.online and not peer.lost and quiet_s > rates.peer_lost_s:
                 peer.lost = True
                 peer.sender.finish_all(Outcome.PEER_LOST)
@@ -279,7 +281,7 @@ class LegacyPeers:
                 state.outgoing.append(Datagram(link.name, legacy.neighbour.address, host, True))
 
     def _active(self) -> list[LegacyPeer]:
-        return [legacy for legacy in self._by_host.values() if not legacy.moved_over()]
+        return [legacy for legacy in self._by_host.values() if not legacy.is_upgraded()]
 
     def _links(self, legacy: LegacyPeer) -> list[LinkInfo]:
         # The fielded format has room for an IPv4 address only.

@@ -10,12 +10,12 @@ import zlib
 from collections import OrderedDict
 from dataclasses import dataclass
 
-from udp_mesh.core.receiver.reassembly import PIECE_OVERHEAD_BYTES
+from udp_mesh.core.receiver.reassembly import FRAGMENT_OVERHEAD_BYTES
 from udp_mesh.core.settings import Limits
 from udp_mesh.wire.legacy import LegacyPayload, PriorityMeshData, decode_mesh_data
 from udp_mesh.wire.limits import MAX_LEGACY_FRAGMENT_BYTES
 
-PARTIAL_PATIENCE_S = 10.0
+PARTIAL_TIMEOUT_S = 10.0
 """A message whose fragments stop for this long is given up (the fielded system's timeout)."""
 
 FINISHED_REMEMBERED = 1024
@@ -36,20 +36,20 @@ class _Finished:
     total: int
     first_crc32: int
 
-    def repeats(self, piece: LegacyPayload, now: float) -> bool:
-        if piece.total != self.total or now - self.at >= FINISHED_FOR_S:
+    def repeats(self, fragment: LegacyPayload, now: float) -> bool:
+        if fragment.total != self.total or now - self.at >= FINISHED_FOR_S:
             return False
-        if piece.position == 0:
-            return zlib.crc32(piece.data) == self.first_crc32
+        if fragment.position == 0:
+            return zlib.crc32(fragment.data) == self.first_crc32
         return now - self.at < REPEATED_WITHIN_S
 
 
 class _Partial:
-    __slots__ = ("bytes", "pieces", "total", "touched_at")
+    __slots__ = ("bytes", "payloads", "total", "touched_at")
 
     def __init__(self, total: int, now: float) -> None:
         self.total = total
-        self.pieces: dict[int, bytes] = {}
+        self.payloads: dict[int, bytes] = {}
         self.bytes = 0
         self.touched_at = now
 
@@ -71,49 +71,49 @@ class LegacyReassembly:
     def __len__(self) -> int:
         return len(self._partials)
 
-    def add(self, piece: LegacyPayload, now: float) -> tuple[bool, PriorityMeshData | None]:
+    def add(self, fragment: LegacyPayload, now: float) -> tuple[bool, PriorityMeshData | None]:
         """(whether to acknowledge, the message if this completes one); raises DecodeError for a corrupt message."""
-        finished = self._finished.get(piece.sequence)
+        finished = self._finished.get(fragment.sequence)
         if finished is not None:
-            if finished.repeats(piece, now):
+            if finished.repeats(fragment, now):
                 self.duplicates += 1
                 return True, None
-            del self._finished[piece.sequence]
-        partial = self._partials.get(piece.sequence)
+            del self._finished[fragment.sequence]
+        partial = self._partials.get(fragment.sequence)
         if partial is not None and (
-            partial.total != piece.total
-            or now - partial.touched_at > PARTIAL_PATIENCE_S
-            or partial.pieces.get(piece.position, piece.data) != piece.data
+            partial.total != fragment.total
+            or now - partial.touched_at > PARTIAL_TIMEOUT_S
+            or partial.payloads.get(fragment.position, fragment.data) != fragment.data
         ):
             # The number came around, or the sender started anew: these are two messages, and the older one is over.
-            self._drop(piece.sequence)
+            self._drop(fragment.sequence)
             partial = None
-        if (piece.total - 1) * MAX_LEGACY_FRAGMENT_BYTES > self._limits.message_bytes:
+        if (fragment.total - 1) * MAX_LEGACY_FRAGMENT_BYTES > self._limits.message_bytes:
             # Acknowledged all the same: the fielded sender takes a missing answer for a lost peer and drops everything.
             self.over_limit += 1
             return True, None
         if partial is None:
             if len(self._partials) >= self._limits.partials_per_peer:
                 return False, None
-            partial = self._partials[piece.sequence] = _Partial(piece.total, now)
-        if piece.position in partial.pieces:
+            partial = self._partials[fragment.sequence] = _Partial(fragment.total, now)
+        if fragment.position in partial.payloads:
             self.duplicates += 1
             return True, None
-        size = len(piece.data) + PIECE_OVERHEAD_BYTES
+        size = len(fragment.data) + FRAGMENT_OVERHEAD_BYTES
         if self.bytes + size > self._limits.partial_bytes_per_peer:
-            if not partial.pieces:
-                del self._partials[piece.sequence]
+            if not partial.payloads:
+                del self._partials[fragment.sequence]
             return False, None
-        partial.pieces[piece.position] = piece.data
-        partial.bytes += len(piece.data)
+        partial.payloads[fragment.position] = fragment.data
+        partial.bytes += len(fragment.data)
         partial.touched_at = now
         self.bytes += size
-        if len(partial.pieces) < partial.total:
+        if len(partial.payloads) < partial.total:
             return True, None
-        body = b"".join([partial.pieces[position] for position in range(partial.total)])
-        self._finished[piece.sequence] = _Finished(now, partial.total, zlib.crc32(partial.pieces[0]))
-        self._finished.move_to_end(piece.sequence)
-        self._drop(piece.sequence)
+        body = b"".join([partial.payloads[position] for position in range(partial.total)])
+        self._finished[fragment.sequence] = _Finished(now, partial.total, zlib.crc32(partial.payloads[0]))
+        self._finished.move_to_end(fragment.sequence)
+        self._drop(fragment.sequence)
         if len(self._finished) > FINISHED_REMEMBERED:
             self._finished.popitem(last=False)
         return True, decode_mesh_data(body)
@@ -121,10 +121,10 @@ class LegacyReassembly:
     def purge(self, now: float) -> None:
         """Give up each message, by its own age, whose fragments stopped."""
         for sequence in [
-            sequence for sequence, partial in self._partials.items() if now - partial.touched_at > PARTIAL_PATIENCE_S
+            sequence for sequence, partial in self._partials.items() if now - partial.touched_at > PARTIAL_TIMEOUT_S
         ]:
             self._drop(sequence)
 
     def _drop(self, sequence: int) -> None:
         partial = self._partials.pop(sequence)
-        self.bytes -= partial.bytes + PIECE_OVERHEAD_BYTES * len(partial.pieces)
+        self.bytes -= partial.bytes + FRAGMENT_OVERHEAD_BYTES * len(partial.payloads)

@@ -2,7 +2,7 @@
 
 A boot that was forgotten (silent for long, its name taken by another run) may come back. Numbers that began again would
 seal under nonces already used, and open recordings a second time. So what a session counted is kept, and a session
-made for the same boot goes on from there. Past `MOST_BOOTS` the oldest is dropped; sending to any boot not remembered
+made for the same boot goes on from there. Past `MAX_BOOTS` the oldest is dropped; sending to any boot not remembered
 then starts above every number ever dropped, so that no number is used twice however many boots there were.
 """
 
@@ -14,7 +14,7 @@ from udp_mesh.core.peers.session import Session
 from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.receiver.datagram_age import Freshness
 
-MOST_BOOTS = 1024
+MAX_BOOTS = 1024
 """Earlier runs of a fleet's nodes that one run meets; about 1 kB each. Only a key holder makes more."""
 
 
@@ -40,10 +40,10 @@ class BootMemory:
     def __len__(self) -> int:
         return len(self._records)
 
-    def keep(self, session: Session) -> None:
+    def save(self, session: Session) -> None:
         """The session goes. One that was never proven, and to which nothing was sent, leaves nothing behind."""
         number = session.path.channel.next_number
-        if not (session.proven or session.restored or number):
+        if not (session.verified or session.restored or number):
             return
         receiver = session.receiver
         self._records.pop(session.boot_id, None)
@@ -55,7 +55,7 @@ class BootMemory:
             (receiver.unicasts.finished, receiver.broadcasts.finished),
             session.freshness,
         )
-        while len(self._records) > MOST_BOOTS:
+        while len(self._records) > MAX_BOOTS:
             dropped = self._records.pop(next(iter(self._records)))
             self._send_floor = max(self._send_floor, dropped.next_number)
 

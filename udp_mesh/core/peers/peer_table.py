@@ -8,15 +8,15 @@ from enum import Enum
 
 from udp_mesh.core.peers.channel_counters import BootMemory
 from udp_mesh.core.peers.session import Peer, Session
-from udp_mesh.core.receiver.memory_limit import Memory
+from udp_mesh.core.receiver.memory_limit import MemoryBudget
 from udp_mesh.core.settings import Settings
 from udp_mesh.crypto import Key, ReceiveChannel
 
-RETIRED_REMEMBERED = 16
+MAX_RETIRED = 16
 """Earlier boots of a name that are still heard, to notice conflicts; of those before only what they counted is kept."""
 
 
-class Arrival(Enum):
+class VerifyResult(Enum):
     """What a session's proof means for its name."""
 
     NEW = 1
@@ -31,10 +31,10 @@ class PeerTable:
     """`tags` maps a short header's tag to the channels it may mean, unicast and broadcast apart."""
 
     __slots__ = (
-        "_aside",
         "_boots",
         "_limits",
-        "_strangers",
+        "_non_current",
+        "_unverified",
         "broadcast_tags",
         "data_tags",
         "memory",
@@ -50,11 +50,11 @@ class PeerTable:
         self._limits = settings.limits
         self.sessions: dict[bytes, Session] = {}
         self.peers: dict[str, Peer] = {}
-        self._strangers: dict[bytes, None] = {}
-        self._aside: dict[bytes, Session] = {}
+        self._unverified: dict[bytes, None] = {}
+        self._non_current: dict[bytes, Session] = {}
         """Sessions that are no peer's, by boot id."""
         self._boots = BootMemory()
-        self.memory = Memory(settings.limits.partial_bytes)
+        self.memory = MemoryBudget(settings.limits.partial_bytes)
         self.data_tags: dict[int, list[tuple[ReceiveChannel, Session]]] = {}
         self.broadcast_tags: dict[int, list[tuple[ReceiveChannel, Session]]] = {}
 
@@ -62,40 +62,40 @@ class PeerTable:
         self._limits = settings.limits
         self.memory.set_limit(settings.limits.partial_bytes)
 
-    def peer(self, name: str, settings: Settings) -> Peer | None:
+    def get_or_create(self, name: str, settings: Settings) -> Peer | None:
         """The peer of a name, made when first asked for; None when there are too many."""
         peer = self.peers.get(name)
         if peer is None and len(self.peers) < self._limits.peers:
             peer = self.peers[name] = Peer(name, settings)
         return peer
 
-    def stranger(self, name: str, boot_id: bytes, keys: tuple[Key, ...], settings: Settings) -> Session:
+    def add_unverified(self, name: str, boot_id: bytes, keys: tuple[Key, ...], settings: Settings) -> Session:
         """A session for a boot heard for the first time."""
-        while len(self._strangers) >= self._limits.strangers:
-            self.forget(self.sessions[next(iter(self._strangers))])
+        while len(self._unverified) >= self._limits.strangers:
+            self.forget(self.sessions[next(iter(self._unverified))])
         session = Session(name, boot_id, self.own_boot, keys, settings, self.memory)
         self._boots.restore(session)
-        self.sessions[boot_id] = self._aside[boot_id] = session
-        self._strangers[boot_id] = None
+        self.sessions[boot_id] = self._non_current[boot_id] = session
+        self._unverified[boot_id] = None
         self._enter_tags(session)
         return session
 
-    def prove(self, session: Session, settings: Settings) -> tuple[Arrival, Peer | None]:
+    def verify(self, session: Session, settings: Settings) -> tuple[VerifyResult, Peer | None]:
         """The session is alive. NEW and RESTARTED make it its peer's session; `Peer.session` still holds the old
         one."""
-        session.proven = True
+        session.verified = True
         if session.name == self.own_name:
             # It stays among the strangers, who are few: a key holder could invent such boots without end.
-            return Arrival.OWN_NAME, None
-        self._strangers.pop(session.boot_id, None)
-        peer = self.peer(session.name, settings)
+            return VerifyResult.OWN_NAME, None
+        self._unverified.pop(session.boot_id, None)
+        peer = self.get_or_create(session.name, settings)
         if peer is None:
             self.forget(session)
-            return Arrival.FULL, None
+            return VerifyResult.FULL, None
         if session.replaced and peer.session is not None:
             session.peer = peer
-            return Arrival.RETIRED, peer
-        return (Arrival.NEW if peer.session is None else Arrival.RESTARTED), peer
+            return VerifyResult.RETIRED, peer
+        return (VerifyResult.NEW if peer.session is None else VerifyResult.RESTARTED), peer
 
     def replace(self, peer: Peer, session: Session) -> None:
         """The session is its peer's from now on; the earlier one is retired but still heard, to notice conflicts."""
@@ -103,25 +103,25 @@ class PeerTable:
         if old is not None:
             peer.retired[old.boot_id] = None
             old.replaced = True
-            if len(peer.retired) > RETIRED_REMEMBERED:
+            if len(peer.retired) > MAX_RETIRED:
                 oldest = next(iter(peer.retired))
                 del peer.retired[oldest]
                 if oldest in self.sessions:
                     self.forget(self.sessions[oldest])
             if old.boot_id in self.sessions:
-                self._aside[old.boot_id] = old
+                self._non_current[old.boot_id] = old
         peer.retired.pop(session.boot_id, None)
         peer.session = session
         session.peer = peer
-        self._aside.pop(session.boot_id, None)
+        self._non_current.pop(session.boot_id, None)
 
     def forget(self, session: Session) -> None:
         """Drop a session and its channels; what these counted is kept."""
-        self._boots.keep(session)
+        self._boots.save(session)
         session.receiver.close()
         self.sessions.pop(session.boot_id, None)
-        self._strangers.pop(session.boot_id, None)
-        self._aside.pop(session.boot_id, None)
+        self._unverified.pop(session.boot_id, None)
+        self._non_current.pop(session.boot_id, None)
         for table, channels in (
             (self.data_tags, session.data_channels),
             (self.broadcast_tags, session.broadcast_channels),
@@ -143,7 +143,7 @@ class PeerTable:
 
     def not_current(self) -> list[Session]:
         """Strangers, and runs of a name that another one replaced."""
-        return list(self._aside.values())
+        return list(self._non_current.values())
 
     def online(self) -> list[Peer]:
         return [peer for peer in self.peers.values() if peer.online]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, Freshness
-from udp_mesh.core.receiver.memory_limit import Memory
+from udp_mesh.core.receiver.memory_limit import MemoryBudget
 from udp_mesh.core.receiver.receiver import Receiver
 from udp_mesh.core.sender.packetizer import Path
 from udp_mesh.core.sender.sender import Sender
@@ -23,21 +23,21 @@ class Challenge(NamedTuple):
 
     link: str
     address: Address
-    asked_at: float
+    sent_at: float
     in_use: bool
     """It went to the address in use."""
 
 
-ANSWER_WITHIN_S = 60.0
+CHALLENGE_TIMEOUT_S = 60.0
 """Pongs are waited for this long: a path may be as slow as that."""
 
 STALE_PATH_S = 2.0
 """A path not heard for this long is left for one that is: two heartbeats."""
 
-FLOORS_REMEMBERED = 64
+MAX_REMEMBERED_FLOORS = 64
 """Keys taken away of which a session remembers how far their numbers had come: years of rotations."""
 
-OWED_FRAMES = 64
+MAX_PENDING_CONTROL = 64
 """Small frames (pongs, repairs asked for, refusals) waiting to leave to one peer; more is a flood of questions."""
 
 
@@ -61,6 +61,7 @@ class Peer:
     __slots__ = (
         "_settings",
         "conflict_reported_at",
+        "due_at",
         "has_sender",
         "held_until",
         "left",
@@ -76,7 +77,6 @@ class Peer:
         "session",
         "settling",
         "timer_at",
-        "wants_at",
     )
 
     sender: Sender
@@ -102,8 +102,8 @@ class Peer:
         self.retired: dict[bytes, None] = {}
         """Earlier boot ids: never believed again."""
         self.timer_at = float("inf")
-        """Where this peer stands in the node's timer queue: at `wants_at`, or earlier until it comes to the front."""
-        self.wants_at = float("inf")
+        """Where this peer stands in the node's timer queue: at `due_at`, or earlier until it comes to the front."""
+        self.due_at = float("inf")
         """When this peer wants attention."""
         self.held_until: dict[int, float] = {}
         """Priority -> until when the time it is held back for other robots is booked."""
@@ -116,11 +116,11 @@ class Peer:
         self.sender = Sender(self._settings)
         return self.sender
 
-    def book_held(self, levels: int, now: float, until: float) -> None:
+    def record_held(self, levels: int, now: float, until: float) -> None:
         """Levels of the mask wait here and are held back for other robots' urgent messages until then."""
-        for priority, book in enumerate(self.sender.levels):
+        for priority, level in enumerate(self.sender.levels):
             if levels >> priority & 1:
-                book.held_s += max(0.0, until - max(now, self.held_until.get(priority, now)))
+                level.held_s += max(0.0, until - max(now, self.held_until.get(priority, now)))
                 self.held_until[priority] = until
 
     def apply(self, settings: Settings) -> None:
@@ -140,7 +140,6 @@ class Session:
         "broadcast_channels",
         "challenged_at",
         "challenges",
-        "contested",
         "data_channels",
         "features",
         "freshness",
@@ -152,19 +151,20 @@ class Session:
         "met_at",
         "meters",
         "name",
+        "name_conflict",
         "next_wire_id",
-        "owed",
+        "one_way_since",
         "path",
         "peer",
         "peer_receives",
         "peer_sends",
-        "proven",
+        "pending_control",
         "received_bytes",
         "receiver",
         "replaced",
         "restored",
         "timed",
-        "unheard_since",
+        "verified",
         "versions",
     )
 
@@ -175,22 +175,22 @@ class Session:
         own_boot: bytes,
         keys: tuple[Key, ...],
         settings: Settings,
-        memory: Memory | None = None,
+        memory: MemoryBudget | None = None,
     ) -> None:
         """`memory` is that of all peers (None: only this session's own limits hold)."""
         self.name = name
         self.boot_id = boot_id
         self.peer: Peer | None = None
-        self.proven = False
+        self.verified = False
         self.knows_us = False
         """It listed us as heard, or answered us: introductions need no name any more."""
         self.met_at: float | None = None
         """When its first heartbeat was heard."""
         self.lists_us = False
         """Its heartbeats to all have listed us: from one that no longer does something follows."""
-        self.unheard_since: float | None = None
+        self.one_way_since: float | None = None
         """Since when they list us no more and it acknowledges nothing: only its way to us works."""
-        self.contested = False
+        self.name_conflict = False
         """It went on speaking after another run took its name: two nodes share that."""
         self.next_wire_id = 0
         """Of the messages to it, when another run took its name."""
@@ -205,9 +205,9 @@ class Session:
         self.interval_s = settings.rates.heartbeat_s
         self.versions = (1, 1)
         self.features = 0
-        self.receiver = Receiver(settings.rates, settings.limits, memory or Memory(1 << 62))
+        self.receiver = Receiver(settings.rates, settings.limits, memory or MemoryBudget(1 << 62))
         self.path = Path(SendChannel(keys[0], own_boot, boot_id))
-        self.owed: list[Frame] = []
+        self.pending_control: list[Frame] = []
         self.freshness = Freshness()
         self.timed = False
         """It dates what it sends."""
@@ -247,7 +247,7 @@ class Session:
         for channel in before:
             if channel.key not in keys:
                 floors[channel.key.key_id, channel.receiver_boot] = channel.window.next_new
-        while len(floors) > FLOORS_REMEMBERED:
+        while len(floors) > MAX_REMEMBERED_FLOORS:
             self._forgotten_floor = max(self._forgotten_floor, floors.pop(next(iter(floors))))
         channels = []
         for key in keys:
@@ -279,8 +279,8 @@ class Session:
 
     def age_windows(self, now: float) -> None:
         """What was not received for long counts as seen; questions not answered for long are forgotten."""
-        for token, question in list(self.challenges.items()):
-            if now - question.asked_at > ANSWER_WITHIN_S:
+        for token, challenge in list(self.challenges.items()):
+            if now - challenge.sent_at > CHALLENGE_TIMEOUT_S:
                 del self.challenges[token]
         for channel in self.data_channels:
             channel.window.age(now)
@@ -288,39 +288,39 @@ class Session:
             channel.window.age(now)
 
     @property
-    def current(self) -> bool:
+    def is_current(self) -> bool:
         """Whether it is the one that its name means."""
         return self.peer is not None and self.peer.session is self
 
-    def hears_us(self) -> None:
+    def confirm_two_way(self) -> None:
         """It lists us, or acknowledged what left lately."""
         self.knows_us = True
-        self.unheard_since = None
+        self.one_way_since = None
 
-    def take_list(self, heard: tuple[bytes, ...], own_tag: bytes, now: float) -> None:
+    def on_heard_list(self, heard: tuple[bytes, ...], own_tag: bytes, now: float) -> None:
         """What a heartbeat to all says of whether we are heard; a full list may have had no room for us."""
         if own_tag in heard:
             self.lists_us = True
-            self.hears_us()
-        elif self.lists_us and self.unheard_since is None and len(heard) < MAX_HEARD:
-            self.unheard_since = now
+            self.confirm_two_way()
+        elif self.lists_us and self.one_way_since is None and len(heard) < MAX_HEARD:
+            self.one_way_since = now
 
-    def owe(self, frame: Frame) -> None:
+    def queue_control(self, frame: Frame) -> None:
         """A small frame leaves with the next datagrams."""
-        if len(self.owed) < OWED_FRAMES:
-            self.owed.append(frame)
+        if len(self.pending_control) < MAX_PENDING_CONTROL:
+            self.pending_control.append(frame)
 
-    def take_ack(self, now: float, waiting: tuple[Waiting, ...]) -> Ack | None:
+    def build_ack(self, now: float, waiting: tuple[Waiting, ...]) -> Ack | None:
         """The acknowledgement to send now, if there is anything to acknowledge; it then counts as sent."""
         acks = self.receiver.acks
         if acks.largest < 0:
             return None
         delay_us = min((1 << 24) - 1, int(max(0.0, now - acks.arrived_at) * 1e6))
-        acks.sent()
+        acks.on_ack_sent()
         arriving = min(0xFFFFFFFF, int(self.meters.received.per_s(now)))
         return Ack(acks.largest, acks.received >> 1, delay_us, arriving, waiting)
 
-    def learn(self, beat: Heartbeat, now: float) -> None:
+    def update_from(self, beat: Heartbeat, now: float) -> None:
         """What a heartbeat says about its sender."""
         if self.met_at is None:
             self.met_at = now

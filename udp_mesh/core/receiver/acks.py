@@ -8,14 +8,14 @@ from udp_mesh.wire.limits import ACK_BITMAP_BITS
 
 _ALL = (1 << (ACK_BITMAP_BITS + 1)) - 1
 
-MOST_PENDING = ACK_BITMAP_BITS // 4
+MAX_PENDING = ACK_BITMAP_BITS // 4
 """Packets after which an acknowledgement is due whatever the policy: each packet then stands in four of them."""
 
 
 class AckState:
     """`received` has bit 0 for `largest` itself and bit i for `largest - i`."""
 
-    __slots__ = ("arrived_at", "due_at", "largest", "now_wanted", "pending", "received")
+    __slots__ = ("arrived_at", "due_at", "largest", "pending", "received", "send_now")
 
     def __init__(self) -> None:
         self.largest = -1
@@ -25,9 +25,9 @@ class AckState:
         self.arrived_at = 0.0
         """When `largest` arrived."""
         self.due_at: float | None = None
-        self.now_wanted = False
+        self.send_now = False
 
-    def saw(self, number: int, now: float) -> None:
+    def on_packet(self, number: int, now: float) -> None:
         """Any packet (each number once: the replay window stands before)."""
         ahead = number - self.largest
         if ahead == 1:
@@ -41,8 +41,8 @@ class AckState:
         elif -ahead <= ACK_BITMAP_BITS:
             self.received |= 1 << -ahead
 
-    def sent(self) -> None:
+    def on_ack_sent(self) -> None:
         """An acknowledgement leaves."""
         self.pending = 0
         self.due_at = None
-        self.now_wanted = False
+        self.send_now = False

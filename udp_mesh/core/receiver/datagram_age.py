@@ -11,10 +11,10 @@ ACCEPT_AGE_S = 10.0
 """Longer than a route of 800 ms, a cut of some seconds or a full queue of a slow radio holds a datagram back; silence
 of this length takes a peer offline. What is older comes again under a new number, if it still matters to its sender."""
 
-ASK_AFTER_S = ACCEPT_AGE_S / 2
+CHALLENGE_AFTER_S = ACCEPT_AGE_S / 2
 """Without a date so long, under a bulk whose pieces have none, the sender is asked: time enough for some questions."""
 
-CLOCKS_DIFFER = 1e-3
+MAX_CLOCK_DRIFT = 1e-3
 """By which two monotonic clocks may drift apart: 100 ppm each, and 500 ppm while NTP slews one."""
 
 _CLOCK_BITS = 32
@@ -38,14 +38,14 @@ class Freshness:
         self.trusted_until = float("-inf")
         """Until then what has no date needs no look."""
 
-    def judge(self, clock: int, now: float) -> float:
+    def lateness_s(self, clock: int, now: float) -> float:
         """Seconds for which a datagram sent at `clock` was held back; at most `ACCEPT_AGE_S` is fresh."""
         offset_ms = clock_ms(now) - clock & 0xFFFFFFFF
         if self._offset_ms is None:
             self._set(offset_ms, now)
             return 0.0
         late_ms = _signed(offset_ms - self._offset_ms)
-        if late_ms <= (now - self._set_at) * CLOCKS_DIFFER * 1000:
+        if late_ms <= (now - self._set_at) * MAX_CLOCK_DRIFT * 1000:
             self._set(offset_ms, now)
             return 0.0
         late_s = late_ms / 1000
@@ -53,7 +53,7 @@ class Freshness:
             self._is_fresh(now)
         return late_s
 
-    def prove(self, now: float, clock: int | None = None) -> None:
+    def confirm(self, now: float, clock: int | None = None) -> None:
         """What just came answers a question of ours; if dated, its clock is right, whatever was known of it."""
         self._is_fresh(now)
         if clock is not None:
@@ -65,7 +65,7 @@ class Freshness:
 
     def _is_fresh(self, now: float) -> None:
         self.fresh_at = now
-        self.trusted_until = now + ASK_AFTER_S
+        self.trusted_until = now + CHALLENGE_AFTER_S
 
 
 def _signed(difference: int) -> int:

@@ -10,15 +10,15 @@ PARTIAL_BYTES = 600
 TOPIC_BYTES = 400
 """Of a topic's number besides its two names."""
 
-MOST_RANGES = 1 << 18
+MAX_TOTAL_RANGES = 1 << 18
 """Ranges of finished message numbers of all peers: 20 MB. Honest peers have a few each."""
 
-RANGES_LEFT = 16
+MIN_RANGES_PER_PEER = 16
 """Ranges that a peer keeps even then: as many as are reordered or given up at a time."""
 
 
-class Memory:
-    """Counts; who keeps something says so with `take` and `give_back`."""
+class MemoryBudget:
+    """Counts; who keeps something says so with `reserve` and `release`."""
 
     __slots__ = ("_half", "bytes", "holders", "limit", "ranges")
 
@@ -42,7 +42,7 @@ class Memory:
 
     def too_many_ranges(self, own: int) -> bool:
         """Whether a peer with so many ranges must make do with fewer."""
-        return self.ranges > MOST_RANGES and own > RANGES_LEFT
+        return self.ranges > MAX_TOTAL_RANGES and own > MIN_RANGES_PER_PEER
 
 
 class Account:
@@ -50,7 +50,7 @@ class Account:
 
     __slots__ = ("_memory", "bytes", "ranges")
 
-    def __init__(self, memory: Memory) -> None:
+    def __init__(self, memory: MemoryBudget) -> None:
         self._memory = memory
         self.bytes = 0
         self.ranges = 0
@@ -58,13 +58,13 @@ class Account:
     def has_room(self, size: int) -> bool:
         return self._memory.has_room(size, self.bytes)
 
-    def take(self, size: int) -> None:
+    def reserve(self, size: int) -> None:
         if not self.bytes and size:
             self._memory.holders += 1
         self.bytes += size
         self._memory.bytes += size
 
-    def give_back(self, size: int) -> None:
+    def release(self, size: int) -> None:
         self.bytes -= size
         self._memory.bytes -= size
         if not self.bytes and size:
@@ -79,7 +79,7 @@ class Account:
 
     def close(self) -> None:
         """The peer is forgotten, and all that is kept for it."""
-        self.give_back(self.bytes)
+        self.release(self.bytes)
         self.count_ranges(-self.ranges)
         # What is still being inflated ends on its own account.
-        self._memory = Memory(1 << 62)
+        self._memory = MemoryBudget(1 << 62)

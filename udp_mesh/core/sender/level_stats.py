@@ -37,17 +37,17 @@ class LevelStats:
 class PriorityLevels:
     """One `LevelStats` per priority; `queued_bytes` is the sum of what is open on all of them."""
 
-    __slots__ = ("_books", "queued_bytes")
+    __slots__ = ("_levels", "queued_bytes")
 
     def __init__(self) -> None:
-        self._books = [LevelStats() for _ in range(PRIORITY_LEVELS)]
+        self._levels = [LevelStats() for _ in range(PRIORITY_LEVELS)]
         self.queued_bytes = 0
 
     def __getitem__(self, priority: int) -> LevelStats:
-        return self._books[priority]
+        return self._levels[priority]
 
     def __iter__(self) -> Iterator[LevelStats]:
-        return iter(self._books)
+        return iter(self._levels)
 
     def add(self, message: OutgoingMessage) -> None:
         """A message was accepted."""
@@ -56,19 +56,19 @@ class PriorityLevels:
 
     def append(self, message: OutgoingMessage) -> None:
         """The message is the youngest of its level (again: it begins anew under another object)."""
-        book = self._books[message.priority]
-        book.order.append(message)
-        if len(book.order) > 64 + 2 * book.messages:
-            book.order = deque(waiting for waiting in book.order if not waiting.ended)
+        level = self._levels[message.priority]
+        level.order.append(message)
+        if len(level.order) > 64 + 2 * level.messages:
+            level.order = deque(waiting for waiting in level.order if not waiting.ended)
 
     def remove(self, message: OutgoingMessage) -> None:
         """A message ended."""
         self._count(message, -1)
 
     def _count(self, message: OutgoingMessage, sign: int) -> None:
-        book = self._books[message.priority]
-        book.messages += sign
-        book.bytes += sign * len(message.body)
+        level = self._levels[message.priority]
+        level.messages += sign
+        level.bytes += sign * len(message.body)
         self.queued_bytes += sign * len(message.body)
 
     def reprioritize(self, messages: Iterable[OutgoingMessage]) -> bool:
@@ -82,8 +82,8 @@ class PriorityLevels:
                 self._count(message, -1)
                 message.priority = priority
                 self._count(message, 1)
-        for priority, book in enumerate(self._books):
-            book.order = deque(message for message in everything if message.priority == priority)
+        for priority, level in enumerate(self._levels):
+            level.order = deque(message for message in everything if message.priority == priority)
         return True
 
     def record_served(self, served: int, waiting: int, now: float) -> None:
@@ -93,21 +93,21 @@ class PriorityLevels:
         while mask:
             bit = mask & -mask
             mask ^= bit
-            book = self._books[bit.bit_length() - 1]
+            level = self._levels[bit.bit_length() - 1]
             if bit & served:
-                if book.starved_since is not None:
-                    book.starved_s += now - book.starved_since
-                    book.starved_since = None
-                    book.starved_reported = False
-            elif book.starved_since is None:
-                book.starved_since = now
+                if level.starved_since is not None:
+                    level.starved_s += now - level.starved_since
+                    level.starved_since = None
+                    level.starved_reported = False
+            elif level.starved_since is None:
+                level.starved_since = now
 
     def oldest_ages(self, last_priority: int, now: float) -> list[tuple[int, float]]:
         """(priority, age of its oldest open message in s) of levels up to `last_priority`."""
         ages = []
         for priority in range(last_priority + 1):
-            book = self._books[priority]
-            oldest = book.oldest() if book.messages else None
+            level = self._levels[priority]
+            oldest = level.oldest() if level.messages else None
             if oldest is not None:
                 ages.append((priority, now - oldest.queued_at))
         return ages

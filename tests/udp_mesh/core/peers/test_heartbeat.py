@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.udp_mesh.core.pair import KEY, World, settings
 from udp_mesh.core import peer_lifecycle
 from udp_mesh.core.events import PeerOffline, PeerOnline
-from udp_mesh.core.peers.heartbeat import ANSWER_WITHIN_S, LEAST_GAP_S, MEETING_HASTE, HeartbeatScheduler
+from udp_mesh.core.peers.heartbeat import DISCOVERY_RATE_FACTOR, MIN_GAP_S, REPLY_WITHIN_S, HeartbeatScheduler
 from udp_mesh.core.peers.session import Session
 from udp_mesh.core.settings import Rates, Topic
 
@@ -26,17 +26,17 @@ def test_whatever_asks_for_heartbeats_a_node_sends_no_more_than_its_share(
     team: int, waits: list[float], seed: int
 ) -> None:
     heartbeats, now = HeartbeatScheduler(random.Random(seed), RATES, 0.0), 0.0
-    share_s = team / (MEETING_HASTE * RATES.heartbeats_heard_per_s)
+    share_s = team / (DISCOVERY_RATE_FACTOR * RATES.heartbeats_heard_per_s)
     sent: list[float] = []
     for wait in waits:
         now += wait
         while heartbeats.next_at <= now:
             sent.append(heartbeats.next_at)
-            heartbeats.compose(settings("a"), [], (), 0, 0.0, heartbeats.next_at)
-        heartbeats.answer(_session(), team, now)
+            heartbeats.build(settings("a"), [], (), 0, 0.0, heartbeats.next_at)
+        heartbeats.reply_to(_session(), team, now)
     gaps = [later - earlier for earlier, later in itertools.pairwise(sent)]
     # a sparser heartbeat of its own may fall in between two answers
-    assert all(gap >= min(max(LEAST_GAP_S, share_s), 0.9 * RATES.heartbeat_s) - 1e-9 for gap in gaps)
+    assert all(gap >= min(max(MIN_GAP_S, share_s), 0.9 * RATES.heartbeat_s) - 1e-9 for gap in gaps)
 
 
 @given(st.integers(0, 1 << 30))
@@ -44,10 +44,10 @@ def test_a_new_node_is_answered_at_once_in_a_small_team_and_not_by_all_at_once_i
     rng = random.Random(seed)
     small, large = (HeartbeatScheduler(rng, RATES, 0.0) for _ in range(2))
     for heartbeats in (small, large):
-        heartbeats.compose(settings("a"), [], (), 0, 0.0, 0.0)
-    small.answer(_session(), 10, 0.9)
-    large.answer(_session(), 1000, 0.1)
-    assert small.next_at <= 0.9 + ANSWER_WITHIN_S
+        heartbeats.build(settings("a"), [], (), 0, 0.0, 0.0)
+    small.reply_to(_session(), 10, 0.9)
+    large.reply_to(_session(), 1000, 0.1)
+    assert small.next_at <= 0.9 + REPLY_WITHIN_S
     assert large.next_at >= 0.9
 
 
@@ -55,7 +55,7 @@ def test_peers_to_whom_nothing_is_sent_have_no_sending_half() -> None:
     world = World(seed=3)
     for name in ("a", "b", "c"):
         world.add(settings(name, Topic("map")))
-    assert world.run(5.0, until=lambda: all(len(world.told(name, PeerOnline)) == 2 for name in world.nodes))
+    assert world.run(5.0, until=lambda: all(len(world.events_of(name, PeerOnline)) == 2 for name in world.nodes))
     world.run(3.0)
     assert [peer.name for peer in world.nodes["a"]._state.peer_table.peers.values() if peer.has_sender] == []
     conditions = world.nodes["a"].conditions(world.now)
@@ -82,10 +82,10 @@ def test_every_silent_peer_goes_offline_although_a_round_looks_at_few(monkeypatc
     world = World(seed=4)
     for name in "abcdef":
         world.add(settings(name))
-    assert world.run(5.0, until=lambda: len(world.told("a", PeerOnline)) == 5)
+    assert world.run(5.0, until=lambda: len(world.events_of("a", PeerOnline)) == 5)
     for name in "bcdef":
         del world.nodes[name]
-    assert world.run(20.0, until=lambda: len(world.told("a", PeerOffline)) == 5)
+    assert world.run(20.0, until=lambda: len(world.events_of("a", PeerOffline)) == 5)
 
 
 def test_nodes_tell_each_other_what_they_send_and_what_arrives() -> None:
@@ -115,9 +115,9 @@ def test_new_nodes_that_one_heartbeat_cannot_list_are_listed_soon() -> None:
     rng, listed, now = random.Random(2), set[bytes](), 0.0
     strangers = [Session("b", rng.randbytes(16), bytes(16), (KEY,), settings("b")) for _ in range(300)]
     for session in strangers:
-        heartbeats.answer(session, len(strangers), now)
+        heartbeats.reply_to(session, len(strangers), now)
     while len(listed) < len(strangers):
         now = heartbeats.next_at
-        listed.update(heartbeats.compose(settings("a"), strangers, (), 0, 0.0, now).heard)
+        listed.update(heartbeats.build(settings("a"), strangers, (), 0, 0.0, now).heard)
     # four heartbeats at the pace of a meeting, not of a regular round of ten seconds
-    assert now < 5 * len(strangers) / (MEETING_HASTE * RATES.heartbeats_heard_per_s)
+    assert now < 5 * len(strangers) / (DISCOVERY_RATE_FACTOR * RATES.heartbeats_heard_per_s)

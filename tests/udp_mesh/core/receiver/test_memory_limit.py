@@ -6,7 +6,7 @@ import random
 
 from tests.udp_mesh.core.pair import KEY, Pair, pair
 from udp_mesh.core.events import MessageReceived
-from udp_mesh.core.receiver.memory_limit import RANGES_LEFT, Account, Memory
+from udp_mesh.core.receiver.memory_limit import MIN_RANGES_PER_PEER, Account, MemoryBudget
 from udp_mesh.core.settings import Limits
 from udp_mesh.crypto import SendChannel
 from udp_mesh.wire.codec import encode
@@ -90,21 +90,21 @@ def test_whole_messages_give_back_what_their_pieces_took() -> None:
 
 
 def test_past_the_half_a_peer_gets_an_equal_part_and_past_the_whole_nobody_gets_any() -> None:
-    memory = Memory(1000)
+    memory = MemoryBudget(1000)
     greedy, late = Account(memory), Account(memory)
     while greedy.has_room(10):
-        greedy.take(10)
+        greedy.reserve(10)
     assert greedy.bytes == 500
-    late.take(10)
+    late.reserve(10)
     while late.has_room(10):
-        late.take(10)
+        late.reserve(10)
     assert late.bytes == 250
     assert not greedy.has_room(1)
     channel_share = [Account(memory) for _ in range(100)]
     for one in channel_share:
         while one.has_room(1):
-            one.take(1)
+            one.reserve(1)
     assert memory.bytes <= 1000
     late.count_ranges(1 << 20)
-    assert late.too_many_ranges(RANGES_LEFT + 1)
-    assert not late.too_many_ranges(RANGES_LEFT)
+    assert late.too_many_ranges(MIN_RANGES_PER_PEER + 1)
+    assert not late.too_many_ranges(MIN_RANGES_PER_PEER)

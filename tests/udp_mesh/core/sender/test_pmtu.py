@@ -59,11 +59,11 @@ def become(world: World, mtu: int) -> None:
 
 
 def narrow(world: World) -> list[int]:
-    return [event.mtu for event in world.told("a", PathNarrowed) if isinstance(event, PathNarrowed)]
+    return [event.mtu for event in world.events_of("a", PathNarrowed) if isinstance(event, PathNarrowed)]
 
 
 def knows(world: World) -> bool:
-    return bool(world.told("a", PeerOnline) and world.told("b", PeerOnline))
+    return bool(world.events_of("a", PeerOnline) and world.events_of("b", PeerOnline))
 
 
 def found_narrow(world: World) -> bool:
@@ -71,7 +71,9 @@ def found_narrow(world: World) -> bool:
 
 
 def topics(world: World, name: str, kind: type[MessageDelivered] | type[MessageReceived]) -> list[str]:
-    return [event.topic for event in world.told(name, kind) if isinstance(event, MessageDelivered | MessageReceived)]
+    return [
+        event.topic for event in world.events_of(name, kind) if isinstance(event, MessageDelivered | MessageReceived)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -175,12 +177,12 @@ def test_a_message_to_all_is_no_larger_than_ethernet_s_packets_whatever_the_link
 def test_a_path_that_is_wide_again_carries_full_fragments_after_some_time() -> None:
     world = met(1280)
     world.send("a", "map", bytes(100_000), "b")
-    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
     become(world, 1500)
     world.run(12.0)
     before = world.pipes[("a", "b")].carried
     world.send("a", "map", bytes(100_000), "b")
-    assert world.run(20.0, until=lambda: len(world.told("a", MessageDelivered)) == 2)
+    assert world.run(20.0, until=lambda: len(world.events_of("a", MessageDelivered)) == 2)
     # 72 full fragments; 84 would be the smaller ones
     assert world.pipes[("a", "b")].carried - before < 80
 
@@ -188,7 +190,7 @@ def test_a_path_that_is_wide_again_carries_full_fragments_after_some_time() -> N
 def test_a_path_that_is_less_narrow_than_it_was_carries_what_it_can() -> None:
     world = met(900)
     world.send("a", "map", bytes(100_000), "b")
-    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
     become(world, 1400)
     world.run(60.0)
     world.pipes["a", "b"].dropped = 0
@@ -202,7 +204,7 @@ def test_a_path_that_is_less_narrow_than_it_was_carries_what_it_can() -> None:
 def test_a_path_that_stays_narrow_is_asked_ever_more_seldom_and_loses_nothing_but_pings() -> None:
     world = met(1400)
     world.send("a", "map", bytes(100_000), "b")
-    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
     start = world.now
     large: list[float] = []
 
