@@ -26,11 +26,11 @@ class HeldMessage:
 
     accepted: AcceptedMessage
     store_key: int | None
-    begun: OutgoingMessage | None = None
+    started: OutgoingMessage | None = None
     """What has left of it, where the peer may have it."""
     epoch: int = 0
     """`Sender.epoch` in which it began."""
-    gone: bool = False
+    dropped: bool = False
     """Expired or replaced: it stands in its shelf until somebody looks."""
 
     @property
@@ -48,7 +48,7 @@ class _TopicQueue:
 
     def front(self) -> HeldMessage:
         """The oldest. Only of a shelf that holds something."""
-        while self.held[0].gone:
+        while self.held[0].dropped:
             self.held.popleft()
         return self.held[0]
 
@@ -66,11 +66,11 @@ class _TopicQueue:
         self.bytes += new.size
 
     def drop(self, held: HeldMessage) -> None:
-        held.gone = True
+        held.dropped = True
         self.messages -= 1
         self.bytes -= held.size
         if len(self.held) > 64 + 2 * self.messages:
-            self.held = deque(waiting for waiting in self.held if not waiting.gone)
+            self.held = deque(waiting for waiting in self.held if not waiting.dropped)
 
 
 class Outboxes:
@@ -122,20 +122,20 @@ class Outboxes:
         queue.put(new)
         self.bytes += new.size
         self._messages += 1
-        gone: list[tuple[HeldMessage, ExpiryReason]] = []
+        dropped: list[tuple[HeldMessage, ExpiryReason]] = []
         last = topic.outbox is Outbox.LAST
         while queue.messages > 1 if last else queue.bytes > topic.outbox_bytes:
             oldest = queue.front()
             self._drop(queue, oldest)
-            gone.append((oldest, ExpiryReason.SUPERSEDED if last else ExpiryReason.OUTBOX_FULL))
-        if not new.gone:
+            dropped.append((oldest, ExpiryReason.SUPERSEDED if last else ExpiryReason.OUTBOX_FULL))
+        if not new.dropped:
             if not self.on_disk(new.store_key):
                 new.store_key = self.persist(peer, accepted, now)
             self._note_deadline(peer, new)
-        return gone
+        return dropped
 
-    def release(self, peer: str, most: int) -> list[HeldMessage]:
-        """The peer is online: up to `most` of what is held for it leaves the outbox (but not yet the disk), the most
+    def release(self, peer: str, limit: int) -> list[HeldMessage]:
+        """The peer is online: up to `limit` of what is held for it leaves the outbox (but not yet the disk), the most
         urgent first, of those the oldest."""
         queues = self._held.get(peer, {})
         released: list[HeldMessage] = []
@@ -146,7 +146,7 @@ class Outboxes:
         for _, level in sorted(by_urgency.items()):
             heads = [(queue.front().accepted.message_id, place) for place, queue in enumerate(level)]
             heads.sort()
-            while heads and len(released) < most:
+            while heads and len(released) < limit:
                 _, place = heappop(heads)
                 queue = level[place]
                 held = queue.front()
@@ -176,9 +176,9 @@ class Outboxes:
     def expire(self, now: float) -> list[tuple[str, HeldMessage]]:
         """(peer, message) of everything past its deadline, removed."""
         late: list[tuple[str, HeldMessage]] = []
-        while self._deadlines and (self._deadlines[0][0] <= now or self._deadlines[0][3].gone):
+        while self._deadlines and (self._deadlines[0][0] <= now or self._deadlines[0][3].dropped):
             _, _, peer, held = heappop(self._deadlines)
-            if not held.gone:
+            if not held.dropped:
                 self._drop(self._held[peer][held.accepted.channel.topic.name], held)
                 late.append((peer, held))
         return late
@@ -190,7 +190,7 @@ class Outboxes:
             for peer, queues in self._held.items()
             for queue in queues.values()
             for held in queue.held
-            if not held.gone and not self.on_disk(held.store_key)
+            if not held.dropped and not self.on_disk(held.store_key)
         ]
         self._held.clear()
         self._deadlines.clear()
@@ -222,5 +222,5 @@ class Outboxes:
         heappush(self._deadlines, (deadline, self._serial, peer, held))
         if len(self._deadlines) > 64 + 2 * self._messages:
             # What was replaced or sent long before its deadline must not stay in memory until then.
-            self._deadlines = [entry for entry in self._deadlines if not entry[3].gone]
+            self._deadlines = [entry for entry in self._deadlines if not entry[3].dropped]
             heapify(self._deadlines)

@@ -270,9 +270,9 @@ def _refragment(sender: Sender, path: Path, *, include_sent: bool) -> None:
     is too large for the link.
     """
     for message in list(sender.pending):
-        if not include_sent and message.begun and message.next_position >= message.fragments:
+        if not include_sent and message.started and message.next_position >= message.fragments:
             continue
-        if message.begun and any(
+        if message.started and any(
             not there and _fragment_bytes(message, position) > path.fragment_bytes
             for position, there in enumerate(message.arrived)
         ):

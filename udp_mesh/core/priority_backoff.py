@@ -48,9 +48,9 @@ class PriorityBackoff:
             if sender.unresponsive_since is not None:
                 # What waits for a peer out of reach waits for no one else's airtime.
                 continue
-            patience = self._rates.yield_after_s + 3 * (sender.rtt.min_rtt or 0.0)
+            max_wait_s = self._rates.yield_after_s + 3 * (sender.rtt.min_rtt or 0.0)
             for priority, age_s in sender.levels.oldest_ages(self._rates.urgent_priority, now):
-                if age_s > patience:
+                if age_s > max_wait_s:
                     oldest[priority] = max(age_s, oldest.get(priority, 0.0))
         self._waiting = tuple(
             Waiting(priority, min(65_535, int(age_s * 1000))) for priority, age_s in sorted(oldest.items())

@@ -256,10 +256,10 @@ def store_in_outbox(state: State, peer: Peer, now: float) -> None:
         if message.accepted.channel.topic.outbox is Outbox.NONE or message.accepted.broadcast_number is not None:
             continue
         # best effort is not remembered for long over there, and fielded programs know no numbers of ours
-        resumable = message.begun and message.reliable and not peer.legacy
+        resumable = message.started and message.reliable and not peer.legacy
         peer.sender.withdraw(message, to_resume=resumable)
-        begun = message if resumable else None
-        _hold(state, peer.name, HeldMessage(message.accepted, message.store_key, begun, peer.sender.epoch), now)
+        started = message if resumable else None
+        _hold(state, peer.name, HeldMessage(message.accepted, message.store_key, started, peer.sender.epoch), now)
 
 
 def _hold(state: State, name: str, new: HeldMessage, now: float) -> None:
@@ -270,25 +270,25 @@ def _hold(state: State, name: str, new: HeldMessage, now: float) -> None:
 def _drop_held(state: State, name: str, held: HeldMessage, reason: ExpiryReason) -> None:
     """An outbox no longer keeps this one; what the peer has of it, it may forget."""
     peer = state.peer_table.peers.get(name)
-    if held.begun is not None and peer is not None and held.epoch == peer.sender.epoch:
-        peer.sender.cancel(held.begun)
+    if held.started is not None and peer is not None and held.epoch == peer.sender.epoch:
+        peer.sender.cancel(held.started)
     report_expired(state, name, held.accepted, reason)
 
 
 def release_outbox(state: State, peer: Peer, now: float) -> None:
     """The peer is in reach: some of what waited for it is queued, the most urgent and oldest first; more of it soon."""
     for held in state.outboxes.release(peer.name, RELEASE_BATCH):
-        begun, session = held.begun, peer.session
-        if begun is not None and held.epoch == peer.sender.epoch:
+        started, session = held.started, peer.session
+        if started is not None and held.epoch == peer.sender.epoch:
             # One that has left whole may have arrived whole: under a new number it would arrive twice.
-            whole = begun.next_position >= begun.fragments
-            if session is not None and (whole or begun.fragment_bytes <= session.path.fragment_bytes):
-                begun.store_key = held.store_key
-                peer.sender.resume(begun, now)
+            whole = started.next_position >= started.fragments
+            if session is not None and (whole or started.fragment_bytes <= session.path.fragment_bytes):
+                started.store_key = held.store_key
+                peer.sender.resume(started, now)
                 state.ready[peer] = None
                 state.arm(peer)
                 continue
-            peer.sender.cancel(begun)
+            peer.sender.cancel(started)
         accepted = held.accepted if session is None or accepts_compressed(session) else uncompressed(held.accepted)
         _queue(state, peer, accepted, now, held.store_key)
     if state.outboxes.holds(peer.name):

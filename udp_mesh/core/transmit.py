@@ -311,6 +311,6 @@ def _send_nacks(state: State, now: float) -> None:
         if not nacks:
             continue
         state.event_queue.counters.repairs_asked += len(nacks)
-        for ask in nacks:
-            session.queue_control(ask)
+        for nack in nacks:
+            session.queue_control(nack)
         state.schedule_control(session)

@@ -65,12 +65,12 @@ def play(
 ) -> tuple[int, int, FieldedProgram]:
     """Ten urgent messages and twenty bulky ones a second: how many of each arrived."""
     rng, old, program = random.Random(seed), OldRobot(), FieldedProgram()
-    begun = old.now
+    started = old.now
     wire: deque[tuple[float, LegacyPayload]] = deque()
     back: deque[tuple[float, LegacyAck]] = deque()
     urgent = bulk = tick = 0
-    while old.now < begun + seconds + 2.0:
-        if old.now < begun + seconds:
+    while old.now < started + seconds + 2.0:
+        if old.now < started + seconds:
             if tick % 100 == 0:
                 program.push(0, b"urgent%d" % tick)
             if tick % 50 == 0:

@@ -12,13 +12,13 @@ DELAY_S, LOSS, TICK_S = 0.010, 0.2, 0.001
 def play(seed: int, duration_s: float) -> tuple[list[float], int]:
     """What each urgent message (ten a second) took beside endless bulk, in seconds; fragments of that that arrived."""
     rng, old = random.Random(seed), OldRobot()
-    begun = old.now
+    started = old.now
     back: list[tuple[float, int, int]] = []
     sent_at: dict[bytes, float] = {}
     took: dict[bytes, float] = {}
     bulk: set[tuple[int, int]] = set()
     tick = 0
-    while old.now < begun + duration_s:
+    while old.now < started + duration_s:
         if tick % 100 == 0:
             name = b"%d" % tick
             sent_at[name] = old.now

@@ -66,13 +66,13 @@ def test_a_peer_that_hears_our_broadcasts_alone_is_told_as_one_that_does_not_ans
     (before,) = world.nodes["a"].conditions(world.now).peers
     assert before.unanswered_for_s is None
     carry_broadcasts_alone(world, "a", "b")
-    begun = world.now
+    started = world.now
     world.send("a", "map", bytes(5000), "b")
     world.run(20.0)
     (found,) = world.nodes["a"].conditions(world.now).peers
     assert (found.online, found.one_way) == (True, False)
     assert found.unanswered_for_s is not None
-    assert world.now - begun - 2.0 < found.unanswered_for_s <= world.now - begun + 2.0
+    assert world.now - started - 2.0 < found.unanswered_for_s <= world.now - started + 2.0
 
 
 def test_what_no_outbox_keeps_for_a_peer_that_never_hears_us_again_is_told_as_lost() -> None:

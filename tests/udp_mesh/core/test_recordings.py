@@ -153,7 +153,7 @@ def silent_world() -> tuple[World, list[Datagram]]:
     return world, recorded
 
 
-@pytest.mark.parametrize("dated", [True, False])
+@pytest.mark.parametrize("with_timestamp", [True, False])
 def test_an_old_hello_raises_no_peer(with_timestamp: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not with_timestamp:
         without_dates(monkeypatch)
@@ -167,7 +167,7 @@ def test_an_old_hello_raises_no_peer(with_timestamp: bool, monkeypatch: pytest.M
     assert not world.events_of("b", PeerAddressChanged)
 
 
-@pytest.mark.parametrize("dated", [True, False])
+@pytest.mark.parametrize("with_timestamp", [True, False])
 def test_a_peer_that_was_away_comes_back_within_a_round_trip_of_its_hello(
     with_timestamp: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -213,7 +213,7 @@ def roaming(seed: int, loss: float) -> World:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("dated", [True, False])
+@pytest.mark.parametrize("with_timestamp", [True, False])
 def test_resent_datagrams_move_no_path(seed: int, with_timestamp: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """An attacker that repeats overheard datagrams from its own address wins the race where the original is lost."""
     if not with_timestamp:
@@ -329,7 +329,7 @@ def test_no_number_is_used_twice_for_a_pair_of_boots_however_many_runs_took_the_
 
 
 @pytest.mark.parametrize("away_s", [15.0, 200.0])
-@pytest.mark.parametrize("dated", [True, False])
+@pytest.mark.parametrize("with_timestamp", [True, False])
 def test_a_robot_replaced_for_a_while_is_believed_again(
     away_s: float, with_timestamp: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

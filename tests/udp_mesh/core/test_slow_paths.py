@@ -78,7 +78,7 @@ def test_what_is_on_its_way_on_a_path_that_became_slow_holds_no_urgent_message_b
     for number in range(200):
         world.send("a", "status", b"%d" % number, "b")
         world.run(MAX_URGENT_WAIT_S + 0.001)
-        waiting = [message for message in sender.pending if message.priority == 0 and not message.begun]
+        waiting = [message for message in sender.pending if message.priority == 0 and not message.started]
         # a silent peer gets probes instead
         assert not waiting or sender.unresponsive_since is not None
 

@@ -114,8 +114,8 @@ class LegacyAcks:
 
     def next_at(self) -> float:
         at = self._repeats[0][0] if self._repeats else float("inf")
-        look = self._predicted_at + PREDICT_INTERVAL_S
-        return min(at, look) if look < self._payload_at + PREDICT_FOR_S else at
+        predict_at = self._predicted_at + PREDICT_INTERVAL_S
+        return min(at, predict_at) if predict_at < self._payload_at + PREDICT_FOR_S else at
 
     def _predicted(self) -> list[LegacyAck]:
         """What would come next of each message under way, and of those after the latest."""

@@ -117,7 +117,7 @@ class LegacySender:
                 if run is None:
                     break
                 message = run.message
-                if not message.begun and not self._begin(message, now):
+                if not message.started and not self._begin(message, now):
                     sender.finish(message, ExpiryReason.REFUSED)
                     continue
                 run = scheduler.peek(priority)

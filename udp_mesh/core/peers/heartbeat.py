@@ -86,7 +86,7 @@ class HeartbeatScheduler:
         settings: Settings,
         sessions: list[Session],
         waiting: tuple[Waiting, ...],
-        next_cast: int,
+        next_broadcast: int,
         sent_bytes_per_s: float,
         now: float,
     ) -> Heartbeat:
@@ -108,7 +108,7 @@ class HeartbeatScheduler:
             min(65_535, sum(1 for session in sessions if session.peer is not None and session.peer.online)),
             min(0xFFFFFFFF, int(sent_bytes_per_s)),
             0,
-            next_cast,
+            next_broadcast,
             heard,
             waiting,
             clock_ms(now),
@@ -120,11 +120,11 @@ class HeartbeatScheduler:
         for tag in tags:
             del self._pending_replies[tag]
         # Who lost its name to another run is not listed: nothing it sends is taken, and it must know that.
-        taken = [one for one in sessions if one.is_current or not one.verified or one.name == own_name]
-        alive = [session for session in taken if now - session.last_heard < MISSED_HEARTBEATS * session.interval_s]
-        if alive:
-            start = self._next_listed % len(alive)
-            for session in alive[start:] + alive[:start]:
+        listed = [one for one in sessions if one.is_current or not one.verified or one.name == own_name]
+        recent = [session for session in listed if now - session.last_heard < MISSED_HEARTBEATS * session.interval_s]
+        if recent:
+            start = self._next_listed % len(recent)
+            for session in recent[start:] + recent[:start]:
                 if len(tags) >= MAX_HEARD:
                     break
                 if session.heard_tag not in tags:

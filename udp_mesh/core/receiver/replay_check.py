@@ -34,10 +34,10 @@ def data_lateness_s(
         if late_s <= ACCEPT_AGE_S:
             return late_s
     else:
-        silent_s = now - session.freshness.fresh_at
-        if silent_s > CHALLENGE_AFTER_S:
+        undated_s = now - session.freshness.fresh_at
+        if undated_s > CHALLENGE_AFTER_S:
             validate_path(state, session, link, source, now)
-        if silent_s <= ACCEPT_AGE_S:
+        if undated_s <= ACCEPT_AGE_S:
             return 0.0
     drop_stale(state, session, _small_frames(frames), link, source, now)
     return None

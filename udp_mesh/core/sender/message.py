@@ -121,7 +121,7 @@ class OutgoingMessage:
         return copy
 
     @property
-    def begun(self) -> bool:
+    def started(self) -> bool:
         return self.wire_id is not None
 
     @property

@@ -147,11 +147,11 @@ def send_level(
             if urgent:
                 if sender.unresponsive_since is None:
                     sender.wake_at = min(sender.wake_at, urgent_wait_until(sender))
-            elif (again := next_send_at(sender, room, now, pace)) is not None:
-                sender.wake_at = min(sender.wake_at, again)
+            elif (next_at := next_send_at(sender, room, now, pace)) is not None:
+                sender.wake_at = min(sender.wake_at, next_at)
             break
         message = run.message
-        if message.superseded and run.again:
+        if message.superseded and run.retransmit:
             sender.finish(message, ExpiryReason.SUPERSEDED)
             continue
         bucket = rate_limits.get(message.accepted.channel.name) if rate_limits else None
@@ -159,9 +159,9 @@ def send_level(
             sender.scheduler.park_head(run)
             bucket.parked.append((sender, run))
             continue
-        if not message.begun:
+        if not message.started:
             _begin(sender, path, message)
-            run = Run(message, 0, message.fragments, again=False)
+            run = Run(message, 0, message.fragments, retransmit=False)
         before = used
         is_plain = bucket is None and message.accepted.broadcast_number is None
         if run.position and run.length > 2 and quota > 1 and is_plain:
@@ -186,7 +186,7 @@ def send_copies(sender: Sender, path: Path, now: float, out: list[Datagram]) -> 
     for message, position in sender.copies.pop_due(now, sender.urgent_timeout_s()):
         if sender.unresponsive_since is not None:
             continue
-        run = Run(message, position, 1, again=True)
+        run = Run(message, position, 1, retransmit=True)
         _seal_datagram(
             sender,
             path,
@@ -274,13 +274,13 @@ def _send_datagram(
     room = path.room_bytes
     priority = message.priority
     scheduler = sender.scheduler
-    again = 0
+    retransmitted = 0
     spacing = ack_spacing(sender)
     sender.since_ack_requested += 1
     next_run: Run | None = run
     while next_run is not None:
         message = next_run.message
-        if next_run.again and (message, next_run.position) in fragments:
+        if next_run.retransmit and (message, next_run.position) in fragments:
             # Several copies of it were lost: one datagram needs no more than one.
             scheduler.consume(next_run, 1)
             next_run = _next_small(sender, path, priority, room)
@@ -288,7 +288,7 @@ def _send_datagram(
         size = _fragment_frame_bytes(sender, path, next_run)
         if frames and (size > room or len(frames) >= MAX_FRAMES_PER_DATAGRAM - 3):
             break
-        again += next_run.again
+        retransmitted += next_run.retransmit
         fragments.append((message, next_run.position))
         scheduler.consume(next_run, 1)
         last = next_run.position == message.fragments - 1
@@ -297,14 +297,14 @@ def _send_datagram(
         if ack_now:
             sender.since_ack_requested = 0
         room -= size
-        if urgent and message.small and not next_run.again:
+        if urgent and message.small and not next_run.retransmit:
             sender.schedule_copies(message, next_run.position, now)
         if not message.reliable and last:
             sender.finish(message, Outcome.SENT)
         if room < MIN_ROOM_BYTES:
             break
         next_run = _next_small(sender, path, priority, room)
-    sender.retransmitted += again
+    sender.retransmitted += retransmitted
     return _seal_datagram(sender, path, fragments, frames, snapshot, out, urgent=urgent)
 
 
@@ -332,11 +332,11 @@ def _next_small(sender: Sender, path: Path, priority: int, room: int) -> Run | N
     run = sender.scheduler.peek(priority)
     if run is None or run.message.superseded or run.message.accepted.channel.topic.rate_limit_bytes_per_s is not None:
         return None
-    if not run.message.begun:
+    if not run.message.started:
         if len(run.message.body) > room:
             return None
         _begin(sender, path, run.message)
-        run = Run(run.message, 0, run.message.fragments, again=False)
+        run = Run(run.message, 0, run.message.fragments, retransmit=False)
     return run if _fragment_frame_bytes(sender, path, run) <= room else None
 
 

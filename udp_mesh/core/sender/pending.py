@@ -62,11 +62,11 @@ class PendingMessages:
 
     def _replace_older(self, message: OutgoingMessage, keep_last: int) -> None:
         kept = self._kept.get(message.accepted.channel.topic.name, [])
-        alive = [older for older in kept if not older.ended and not older.superseded]
-        alive.append(message)
-        self._kept[message.accepted.channel.topic.name] = alive
-        for older in alive[: max(0, len(alive) - keep_last)]:
-            if not older.begun:
+        recent = [older for older in kept if not older.ended and not older.superseded]
+        recent.append(message)
+        self._kept[message.accepted.channel.topic.name] = recent
+        for older in recent[: max(0, len(recent) - keep_last)]:
+            if not older.started:
                 self.finish(older, ExpiryReason.SUPERSEDED)
             elif older.small:
                 # Its pieces may be arriving right now: it ends as what becomes of them.
@@ -99,7 +99,7 @@ class PendingMessages:
         if message.ended:
             return
         self._remove(message)
-        if message.begun and outcome is not Outcome.DELIVERED and outcome is not Outcome.SENT:
+        if message.started and outcome is not Outcome.DELIVERED and outcome is not Outcome.SENT:
             self.cancel(message)
         self.ended.append(Ended(message, outcome))
 
@@ -111,7 +111,7 @@ class PendingMessages:
         """The message leaves without an outcome: an outbox keeps it, `to_resume` it under its number."""
         if not message.ended:
             self._remove(message)
-            if message.begun and not to_resume:
+            if message.started and not to_resume:
                 self.cancel(message)
 
     def _remove(self, message: OutgoingMessage) -> None:

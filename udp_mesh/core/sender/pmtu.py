@@ -128,8 +128,8 @@ class PathMtu:
                 self._large_lost += 1
                 self._smallest_lost = min(self._smallest_lost, size)
                 left_at = packet.snapshot.sent_at
-                most = MAX_LARGE_LOST_BETWEEN + LOST_PER_ROUND * self._small_lost_between
-                if left_at >= self._counted_at + LOSS_SPACING_S and self._large_lost_between < most:
+                max_lost = MAX_LARGE_LOST_BETWEEN + LOST_PER_ROUND * self._small_lost_between
+                if left_at >= self._counted_at + LOSS_SPACING_S and self._large_lost_between < max_lost:
                     self._counted_at = left_at
                     self._large_lost_between += 1
                     self._large_lost_in_a_row += 1
@@ -138,8 +138,8 @@ class PathMtu:
 
     def on_acked(self, packets: Sequence[Packet], called_lost: int, now: float) -> None:
         """Only to be told while `suspect`; so many of them were called lost before."""
-        least = self._smallest_lost
-        if any(_frames_bytes(packet) >= least for packet in packets):
+        smallest = self._smallest_lost
+        if any(_frames_bytes(packet) >= smallest for packet in packets):
             self.reset()
         else:
             self._on_small_acked(len(packets), called_lost, now)

@@ -40,7 +40,7 @@ class TokenBucket:
         for sender, run in reversed(parked):
             if run.message.ended:
                 continue
-            if run.again:
-                sender.scheduler.push_again(run.message, run.position)
+            if run.retransmit:
+                sender.scheduler.push_retransmit(run.message, run.position)
             else:
                 sender.scheduler.push(run.message, first=True)

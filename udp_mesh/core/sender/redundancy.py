@@ -54,8 +54,8 @@ class RedundantCopies:
         if not twice:
             return
         self._push(now + gap_s, message, position, 0)
-        for least_loss, gaps in EARLY_COPIES:
-            if loss >= least_loss:
+        for min_loss, gaps in EARLY_COPIES:
+            if loss >= min_loss:
                 self._push(now + gaps * gap_s, message, position, 0)
         if message.reliable:
             self._push(now + urgent_timeout_s, message, position, MAX_OVERDUE_COPIES - 1)

@@ -13,27 +13,27 @@ from udp_mesh.core.sender.message import OutgoingMessage
 class Run(NamedTuple):
     """Pieces of one message ready to leave: `length` positions from `position` on.
 
-    `again`: it left before. `stale`: it was set aside and has no claim to be urgent any more.
+    `retransmit`: it left before. `stale`: it was set aside and has no claim to be urgent any more.
     """
 
     message: OutgoingMessage
     position: int
     length: int
-    again: bool
+    retransmit: bool
     stale: bool = False
 
 
 class _Level:
-    __slots__ = ("again", "fresh", "stale_again", "stale_fresh")
+    __slots__ = ("fresh", "retransmit", "stale_fresh", "stale_retransmits")
 
     def __init__(self) -> None:
-        self.again: deque[tuple[OutgoingMessage, int]] = deque()
+        self.retransmit: deque[tuple[OutgoingMessage, int]] = deque()
         self.fresh: deque[OutgoingMessage] = deque()
-        self.stale_again: deque[tuple[OutgoingMessage, int]] = deque()
+        self.stale_retransmits: deque[tuple[OutgoingMessage, int]] = deque()
         self.stale_fresh: deque[OutgoingMessage] = deque()
 
     def empty(self) -> bool:
-        return not (self.again or self.fresh or self.stale_again or self.stale_fresh)
+        return not (self.retransmit or self.fresh or self.stale_retransmits or self.stale_fresh)
 
 
 class _Levels(dict[int, _Level]):
@@ -62,9 +62,9 @@ class Scheduler:
             fresh.append(message)
         self.waiting |= 1 << message.priority
 
-    def push_again(self, message: OutgoingMessage, position: int) -> None:
+    def push_retransmit(self, message: OutgoingMessage, position: int) -> None:
         """One piece of the message was lost and waits anew."""
-        self._levels[message.priority].again.append((message, position))
+        self._levels[message.priority].retransmit.append((message, position))
         self.waiting |= 1 << message.priority
 
     def is_idle(self, priority: int) -> bool:
@@ -74,28 +74,28 @@ class Scheduler:
     def peek(self, priority: int) -> Run | None:
         """What leaves next on this level; None (and the level's bit cleared) when nothing does."""
         level = self._levels[priority]
-        for again, fresh in ((level.again, level.fresh), (level.stale_again, level.stale_fresh)):
-            while again:
-                message, position = again[0]
+        for retransmit, fresh in ((level.retransmit, level.fresh), (level.stale_retransmits, level.stale_fresh)):
+            while retransmit:
+                message, position = retransmit[0]
                 if message.ended or message.arrived[position]:
-                    again.popleft()
+                    retransmit.popleft()
                     continue
-                return Run(message, position, 1, again=True, stale=fresh is level.stale_fresh)
+                return Run(message, position, 1, retransmit=True, stale=fresh is level.stale_fresh)
             while fresh:
                 message = fresh[0]
-                left = message.fragments - message.next_position if message.begun else 1
+                left = message.fragments - message.next_position if message.started else 1
                 if message.ended or left <= 0:
                     fresh.popleft()
                     continue
-                return Run(message, message.next_position, left, again=False, stale=fresh is level.stale_fresh)
+                return Run(message, message.next_position, left, retransmit=False, stale=fresh is level.stale_fresh)
         self.waiting &= ~(1 << priority)
         return None
 
     def consume(self, run: Run, count: int) -> None:
         """The first `count` pieces of the run just peeked leave."""
         level = self._levels[run.message.priority]
-        if run.again:
-            (level.again or level.stale_again).popleft()
+        if run.retransmit:
+            (level.retransmit or level.stale_retransmits).popleft()
             return
         message = run.message
         message.next_position += count
@@ -105,8 +105,8 @@ class Scheduler:
     def park_head(self, run: Run) -> None:
         """The message of the run just peeked leaves this scheduler whole (a rate limit parks it)."""
         level = self._levels[run.message.priority]
-        if run.again:
-            (level.again or level.stale_again).popleft()
+        if run.retransmit:
+            (level.retransmit or level.stale_retransmits).popleft()
         elif level.fresh and level.fresh[0] is run.message:
             level.fresh.popleft()
         else:
@@ -117,9 +117,9 @@ class Scheduler:
         for priority, level in self._levels.items():
             if priority > last_priority:
                 continue
-            if level.again:
-                level.stale_again.extend(level.again)
-                level.again.clear()
+            if level.retransmit:
+                level.stale_retransmits.extend(level.retransmit)
+                level.retransmit.clear()
             if level.fresh:
                 level.stale_fresh.extend(level.fresh)
                 level.fresh.clear()
@@ -130,11 +130,11 @@ class Scheduler:
         kept = []
         if keep_fragments:
             for _, level in sorted(self._levels.items()):
-                kept.extend([*level.again, *level.stale_again])
+                kept.extend([*level.retransmit, *level.stale_retransmits])
         self._levels = _Levels()
         self.waiting = 0
         for message in messages:
-            if not message.begun or message.next_position < message.fragments:
+            if not message.started or message.next_position < message.fragments:
                 self.push(message)
         for message, position in kept:
-            self.push_again(message, position)
+            self.push_retransmit(message, position)

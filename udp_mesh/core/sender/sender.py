@@ -237,7 +237,7 @@ class Sender(PendingMessages):
         if message.superseded:
             self.finish(message, ExpiryReason.SUPERSEDED)
         else:
-            self.scheduler.push_again(message, position)
+            self.scheduler.push_retransmit(message, position)
 
     def schedule_copies(self, message: OutgoingMessage, position: int, now: float) -> None:
         """A small urgent piece left for the first time."""
@@ -411,7 +411,7 @@ class Sender(PendingMessages):
         self.accept(copy, now)
         for position in range(copy.next_position):
             if not copy.arrived[position]:
-                self.scheduler.push_again(copy, position)
+                self.scheduler.push_retransmit(copy, position)
 
     def snapshot(self, now: float, *, urgent: bool = False) -> SendSnapshot:
         """The state in which the packets of one burst leave."""

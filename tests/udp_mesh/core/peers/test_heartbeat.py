@@ -78,7 +78,7 @@ def test_settings_changed_before_anything_was_sent_hold_for_what_is_sent_later()
 
 
 def test_every_silent_peer_goes_offline_although_a_round_looks_at_few(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(peer_lifecycle, "LOOKED_AT_PER_ROUND", 1)
+    monkeypatch.setattr(peer_lifecycle, "IDLE_PEERS_PER_ROUND", 1)
     world = World(seed=4)
     for name in "abcdef":
         world.add(settings(name))

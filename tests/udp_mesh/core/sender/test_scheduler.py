@@ -67,7 +67,7 @@ def test_no_lower_priority_leaves_while_a_higher_one_waits_and_every_piece_leave
             take(number)
         elif what == "lose" and left:
             message, position = left.pop(number % len(left))
-            scheduler.push_again(message, position)
+            scheduler.push_retransmit(message, position)
             waiting.append((message.priority, messages.index(message)))
         elif what == "aside":
             scheduler.demote_stale(number)
