@@ -1,8 +1,8 @@
-"""What is open on each priority level towards one peer, and how the levels fare.
+"""Statistics of the messages pending for one peer, per priority level.
 
-A message enters its level when accepted, may move when its topic's priority changes, and leaves when it ends.
-`record_served` tells the levels which of them just sent: less urgent ones that wait meanwhile starve, and for how long
-is part of the statistics.
+A message is added to its level when accepted, may move when its topic's priority changes, and is removed when it ends.
+`record_served` notes which levels just sent: less urgent levels that wait meanwhile starve, and the statistics say for
+how long.
 """
 
 from collections import deque
@@ -13,13 +13,13 @@ from udp_mesh.wire.limits import PRIORITY_LEVELS
 
 
 class LevelStats:
-    """What is open on one priority level, and how the level fares."""
+    """The pending messages and starvation of one priority level."""
 
     __slots__ = ("bytes", "held_s", "messages", "order", "starved_reported", "starved_s", "starved_since")
 
     def __init__(self) -> None:
         self.order: deque[OutgoingMessage] = deque()
-        """Messages in the order accepted; ended ones are dropped from its front when somebody looks."""
+        """Messages in the order accepted; ended ones are dropped from the front on access."""
         self.messages = 0
         self.bytes = 0
         self.starved_s = 0.0
@@ -35,7 +35,7 @@ class LevelStats:
 
 
 class PriorityLevels:
-    """One `LevelStats` per priority; `queued_bytes` is the sum of what is open on all of them."""
+    """One `LevelStats` per priority. `queued_bytes` is the total pending on all levels."""
 
     __slots__ = ("_levels", "queued_bytes")
 
@@ -50,19 +50,19 @@ class PriorityLevels:
         return iter(self._levels)
 
     def add(self, message: OutgoingMessage) -> None:
-        """A message was accepted."""
+        """Count an accepted message."""
         self._count(message, 1)
         self.append(message)
 
     def append(self, message: OutgoingMessage) -> None:
-        """The message is the youngest of its level (again: it begins anew under another object)."""
+        """Append the message to its level (again, if it restarts as another object)."""
         level = self._levels[message.priority]
         level.order.append(message)
         if len(level.order) > 64 + 2 * level.messages:
             level.order = deque(waiting for waiting in level.order if not waiting.ended)
 
     def remove(self, message: OutgoingMessage) -> None:
-        """A message ended."""
+        """Stop counting a message that ended."""
         self._count(message, -1)
 
     def _count(self, message: OutgoingMessage, sign: int) -> None:
@@ -72,7 +72,8 @@ class PriorityLevels:
         self.queued_bytes += sign * len(message.body)
 
     def reprioritize(self, messages: Iterable[OutgoingMessage]) -> bool:
-        """Give each open message (all of them, in the order accepted) its topic's present priority; False: all had."""
+        """Move each pending message (all of them, in the order accepted) to its topic's current priority. False if none
+        moved."""
         everything = list(messages)
         if all(message.priority == message.accepted.channel.topic.priority for message in everything):
             return False
@@ -87,7 +88,7 @@ class PriorityLevels:
         return True
 
     def record_served(self, served: int, waiting: int, now: float) -> None:
-        """Levels of the mask `served` sent something; less urgent ones of the mask `waiting` did not."""
+        """Levels in the mask `served` sent something; less urgent ones in the mask `waiting` did not."""
         lowest = served & -served
         mask = waiting & ~(lowest - 1) | served
         while mask:
@@ -103,7 +104,7 @@ class PriorityLevels:
                 level.starved_since = now
 
     def oldest_ages(self, last_priority: int, now: float) -> list[tuple[int, float]]:
-        """(priority, age of its oldest open message in s) of levels up to `last_priority`."""
+        """(priority, age in s of the oldest pending message) of the levels up to `last_priority`."""
         ages = []
         for priority in range(last_priority + 1):
             level = self._levels[priority]

@@ -1,4 +1,4 @@
-"""One message on its way to one peer: its bytes, which pieces left, which arrived, and how it must end."""
+"""One message for one peer: its bytes, which fragments were sent and acknowledged, and how it is treated."""
 
 from dataclasses import dataclass
 
@@ -7,14 +7,14 @@ from udp_mesh.core.settings import Topic
 from udp_mesh.wire.frames import MessageFlag
 
 MAX_SMALL_FRAGMENTS = 3
-"""Up to this many fragments an urgent message is worth sending twice, and a newer one may replace it even when
-begun."""
+"""An urgent message of at most this many fragments is worth sending twice, and a newer message may replace it after its
+first fragment was sent."""
 
 
 class TopicChannel:
-    """A topic as this node announces it: its number on the air, its type, and its settings of the moment.
+    """A topic as this node announces it: its number on the wire, its type and its current settings.
 
-    Replacing `topic` is how a run-time change reaches messages already accepted.
+    Replacing `topic` applies changed settings to messages already accepted.
     """
 
     __slots__ = ("name", "number", "topic", "type_name")
@@ -28,27 +28,27 @@ class TopicChannel:
 
 @dataclass(frozen=True, slots=True)
 class AcceptedMessage:
-    """What `Node.send` took on, shared by the copies to every destination."""
+    """A message accepted by `Node.send`, shared by the copies for every destination."""
 
     message_id: MessageId
     channel: TopicChannel
     payload: bytes
-    """The bytes given to `send`."""
+    """The bytes passed to `send`."""
     body: bytes
-    """The bytes that travel (compressed or not)."""
+    """The bytes on the wire (compressed or not)."""
     flags: MessageFlag
     accepted_at: float
     deadline: float | None
     broadcast_number: int | None = None
-    """The broadcast message id this is a repair of."""
+    """The broadcast message id that this message repairs."""
 
     def life_ms(self, now: float) -> int | None:
-        """What remains of its life, for its head; None: it has no deadline."""
+        """Remaining lifetime for the message head. None: no deadline."""
         return None if self.deadline is None else max(1, int((self.deadline - now) * 1000))
 
 
 class OutgoingMessage:
-    """The copy for one peer. `wire_id` is None until its first fragment leaves."""
+    """The copy for one peer. `wire_id` is None until its first fragment is sent."""
 
     __slots__ = (
         "accepted",
@@ -77,19 +77,19 @@ class OutgoingMessage:
         self.store_key: int | None = None
         self.ended = False
         self.superseded = False
-        """A newer one replaced it: what is lost of it is not sent again."""
+        """Replaced by a newer message: its lost fragments are not retransmitted."""
         self.wire_id: int | None = None
         self.fragment_bytes = 0
         self.first_bytes = 0
         self.fragments = 1
         self.next_position = 0
         self.missing = 1
-        """Fragments not known to have arrived."""
+        """Fragments not yet acknowledged."""
         self.arrived = bytearray()
-        """1 per position that arrived; as long as the message has fragments once it has begun."""
+        """1 per acknowledged position. Has one byte per fragment once the message has started."""
 
     def begin(self, wire_id: int, fragment_bytes: int, first_bytes: int) -> None:
-        """Cut it into fragments and give it its number. The first carries less, for the head's sake."""
+        """Assign the wire id and fragment sizes. The first fragment carries less, because of the head."""
         self.wire_id = wire_id
         self.fragment_bytes = fragment_bytes
         self.first_bytes = min(first_bytes, len(self.body))
@@ -105,14 +105,13 @@ class OutgoingMessage:
         return start, min(start + self.fragment_bytes, len(self.body))
 
     def restarted(self) -> "OutgoingMessage":
-        """The same message with nothing of it sent: the peer lost what it had. This one must be marked ended."""
+        """The same message with nothing sent: the peer lost what it had. The caller marks this one ended."""
         copy = OutgoingMessage(self.accepted, self.priority, reliable=self.reliable)
         copy.store_key = self.store_key
         return copy
 
     def resumed(self) -> "OutgoingMessage":
-        """The same message under its number, with what of it is known to have arrived. This one must be marked
-        ended."""
+        """The same message under the same wire id, with its acknowledged fragments. The caller marks this one ended."""
         copy = OutgoingMessage(self.accepted, self.accepted.channel.topic.priority, reliable=self.reliable)
         copy.store_key = self.store_key
         assert self.wire_id is not None
@@ -126,11 +125,11 @@ class OutgoingMessage:
 
     @property
     def small(self) -> bool:
-        """Few fragments; known once it has begun."""
+        """Few fragments. Known once the message has started."""
         return self.fragments <= MAX_SMALL_FRAGMENTS
 
     def mark_arrived(self, position: int) -> bool:
-        """A fragment arrived; True if that was news."""
+        """Record an acknowledged fragment. True if it was not acknowledged before."""
         if self.arrived[position]:
             return False
         self.arrived[position] = 1

@@ -1,8 +1,9 @@
-"""What leaves for one peer, decided at the last moment: level -> pieces -> frames -> sealed datagrams.
+"""Builds the datagrams for one peer at the last moment: level -> fragments -> frames -> sealed datagrams.
 
-`send_level` sends from one priority level until it is empty, or the window, the pacing or the room ends. A run of full
-fragments of one message takes the fast path: one pack, one seal and one record per fragment. Everything else (first and
-last fragments, small messages, pieces sent again) is built frame by frame, small pieces together in one datagram.
+`send_level` sends from one priority level until it is empty or the window, pacing or batch size is exhausted. A run of
+full fragments of one message takes the fast path: one pack, one seal and one record per fragment. Everything else
+(first and last fragments, small messages, retransmissions) is built frame by frame, with small fragments sharing a
+datagram.
 """
 
 import struct
@@ -37,18 +38,18 @@ IP_UDP_BYTES = 28
 """IPv4 and UDP headers."""
 
 IP6_EXTRA_BYTES = 20
-"""IPv6 headers are larger by this."""
+"""Additional size of an IPv6 header."""
 
 MIN_ROOM_BYTES = 64
-"""Less room than this in a datagram is not worth looking for another small message."""
+"""With less room than this in a datagram, no further small message is added."""
 
 PING_BYTES = 9
 DELIVERED_BYTES = 4
 ID_BYTES = 4
-"""Of a PING; of a DELIVERED without its message ids, and of each of these."""
+"""Sizes of a PING, of a DELIVERED without its message ids, and of one message id."""
 
 NO_MESSAGE_ID = 0xFFFF_FFFF
-"""Messages are numbered from 0 on: none comes to this one in the life of a boot."""
+"""Messages are numbered from 0; no boot lives long enough to use this number."""
 
 _NARROW = struct.Struct(">BIH")
 _WIDE = struct.Struct(">BII")
@@ -56,53 +57,54 @@ _NARROW_POSITIONS = 65_536
 
 
 def header_bytes(address: Address) -> int:
-    """IP and UDP headers of a datagram to or from this address."""
+    """Size of the IP and UDP headers of a datagram to or from this address."""
     return IP_UDP_BYTES + (IP6_EXTRA_BYTES if ":" in address[0] else 0)
 
 
 def datagram_room(address: Address, mtu: int, fragment_bytes: int) -> int:
-    """Bytes of frames in a datagram that an IP packet of `mtu` bytes carries, and with it a full fragment."""
+    """Bytes of frames that fit a datagram in an IP packet of `mtu` bytes, at most those of one full fragment."""
     return min(mtu - header_bytes(address) - LONG_OVERHEAD_BYTES, fragment_bytes + FRAGMENT_WIDE_BYTES)
 
 
 class Path:
-    """How datagrams reach the peer now: link, address, sealing, sizes."""
+    """The path to the peer: link, address, sealing and sizes."""
 
     __slots__ = ("address", "channel", "confirmed", "fragment_bytes", "heard_at", "link", "mtu", "room_bytes", "timed")
 
     def __init__(self, channel: SendChannel) -> None:
         self.channel = channel
         self.confirmed = False
-        """The peer has answered in this channel: the short header does."""
+        """The peer has answered in this channel, so the short header suffices."""
         self.link = ""
         self.address: Address = ("", 0)
         self.heard_at = float("-inf")
         """When the peer was last heard from this address."""
         self.mtu = 0
-        """Bytes of the largest IP packet."""
+        """Largest IP packet in bytes."""
         self.room_bytes = 0
-        """Frames of one datagram at most: small pieces that share one make it no larger than a full fragment does."""
+        """Largest size of a datagram's frames. Small fragments that share a datagram make it no larger than a full
+        fragment does."""
         self.fragment_bytes = 0
         """Payload of a full fragment."""
         self.timed = False
-        """The peer takes dated datagrams and heads that say how long their message may live."""
+        """The peer accepts timestamped datagrams and message heads with a remaining lifetime."""
 
     def switch_to(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
-        """Datagrams go this way from now on; messages already begun keep their fragments where these still fit."""
+        """Use this path from now on. Messages already started keep their fragments if these still fit."""
         self.link, self.address, self.mtu = link, address, mtu
         self.room_bytes = datagram_room(address, mtu, fragment_bytes)
         self.fragment_bytes = self.room_bytes - FRAGMENT_WIDE_BYTES
 
     def with_timestamp(self, frames: list[Frame], now: float) -> list[Frame]:
-        """The frames, behind the time where the peer takes that.
+        """The frames, preceded by a timestamp if the peer accepts it.
 
-        It is no part of `room_bytes`: the long header, for which that leaves room, is larger than the short one by more
-        than the date and a remaining life. In a datagram with a long header both are left out where they do not fit.
+        The timestamp is not part of `room_bytes`, which leaves room for the long header: that is larger than the short
+        one by more than a timestamp and a remaining lifetime. With a long header, both are omitted if they do not fit.
         """
         return [Sent(clock_ms(now)), *frames] if self.timed else frames
 
     def encode(self, frames: list[Frame], now: float) -> bytes:
-        """As `with_timestamp`, in bytes that fit the way."""
+        """The encoded frames, with a timestamp if it fits the path."""
         encoded = encode(self.with_timestamp(frames, now))
         return encoded if self.confirmed or len(encoded) <= self.room_bytes else encode(frames)
 
@@ -110,7 +112,7 @@ class Path:
         return self.channel.seal(frames) if self.confirmed else self.channel.seal_long(frames)
 
     def seal_run(self, run: list[bytes]) -> list[bytes]:
-        """Datagrams with the channel's next numbers."""
+        """Seal datagrams under the channel's next numbers."""
         if self.confirmed:
             return self.channel.seal_run(run)
         return [self.channel.seal_long(frames)[1] for frames in run]
@@ -129,7 +131,7 @@ def send_level(
     room_bytes: int,
     rate_limits: dict[str, TokenBucket],
 ) -> int:
-    """Let what waits on one level leave, at most about `room_bytes`; returns the bytes that left."""
+    """Send what waits on one level, at most about `room_bytes`. Returns the bytes sent."""
     urgent_level = priority <= sender.rates.urgent_priority
     level_pace = sender.congestion.pacing_packets_per_s()
     used = 0
@@ -182,7 +184,7 @@ def send_level(
 
 
 def send_copies(sender: Sender, path: Path, now: float, out: list[Datagram]) -> None:
-    """Second copies of small urgent messages whose time has come and that were not acknowledged meanwhile."""
+    """Send the redundant copies that are due and not acknowledged meanwhile."""
     for message, position in sender.copies.pop_due(now, sender.urgent_timeout_s()):
         if sender.unresponsive_since is not None:
             continue
@@ -198,9 +200,9 @@ def send_copies(sender: Sender, path: Path, now: float, out: list[Datagram]) -> 
 
 
 def build_mtu_probe(sender: Sender, path: Path, token: int, frames_bytes: int) -> Datagram:
-    """A ping in a datagram that is no smaller than one with `frames_bytes` of frames, and larger by 7 B at most.
+    """A ping padded to at least `frames_bytes` of frames, and at most 7 B more.
 
-    What fills it are words of a message that no peer ever sends: that we have it whole.
+    The padding is DELIVERED frames for a message id that is never used.
     """
     frames: list[Frame] = [Ping(token)]
     missing = frames_bytes - PING_BYTES
@@ -221,7 +223,7 @@ def _begin(sender: Sender, path: Path, message: OutgoingMessage) -> None:
         first -= LENGTH_BYTES
     broadcast_number = message.accepted.broadcast_number
     if broadcast_number is not None:
-        # the copy of a lost cast keeps its number, or the receiver would take it for another message
+        # The repair of a lost broadcast keeps its number; otherwise the receiver would take it for another message.
         message.begin(broadcast_number, path.fragment_bytes, max(1, first))
         return
     message.begin(sender.next_wire_id, path.fragment_bytes, max(1, first))
@@ -229,7 +231,7 @@ def _begin(sender: Sender, path: Path, message: OutgoingMessage) -> None:
 
 
 def _send_run(sender: Sender, path: Path, run: Run, count: int, snapshot: SendSnapshot, out: list[Datagram]) -> int:
-    """The fast path: `count` full fragments in a row, none of them its message's first or last."""
+    """The fast path: send `count` consecutive full fragments, excluding a message's first and last."""
     message, position = run.message, run.position
     wire_id = message.wire_id
     assert wire_id is not None
@@ -266,7 +268,8 @@ def _send_run(sender: Sender, path: Path, run: Run, count: int, snapshot: SendSn
 def _send_datagram(
     sender: Sender, path: Path, run: Run, urgent: bool, snapshot: SendSnapshot, out: list[Datagram]
 ) -> int:
-    """One datagram with the piece of `run` and, if there is room, small pieces behind it on the same level."""
+    """Send one datagram with the fragment of `run` and, if there is room, the next small fragments of the same
+    level."""
     now = snapshot.sent_at
     message = run.message
     fragments: list[tuple[OutgoingMessage, int]] = []
@@ -281,7 +284,7 @@ def _send_datagram(
     while next_run is not None:
         message = next_run.message
         if next_run.retransmit and (message, next_run.position) in fragments:
-            # Several copies of it were lost: one datagram needs no more than one.
+            # Several copies of it were lost; one datagram needs only one.
             scheduler.consume(next_run, 1)
             next_run = _next_small(sender, path, priority, room)
             continue
@@ -328,7 +331,8 @@ def _seal_datagram(
 
 
 def _next_small(sender: Sender, path: Path, priority: int, room: int) -> Run | None:
-    """The next piece of the level if it is small enough to ride along (ruling out what only the main loop decides)."""
+    """The next fragment of the level if it is small enough to share the datagram and needs no decision of the main
+    loop."""
     run = sender.scheduler.peek(priority)
     if run is None or run.message.superseded or run.message.accepted.channel.topic.rate_limit_bytes_per_s is not None:
         return None
@@ -341,7 +345,7 @@ def _next_small(sender: Sender, path: Path, priority: int, room: int) -> Run | N
 
 
 def _fragment_frame_bytes(sender: Sender, path: Path, run: Run) -> int:
-    """Bytes of the frames that carry one piece."""
+    """Size of the frames that carry one fragment."""
     message = run.message
     start, end = message.span(run.position)
     size = end - start + FRAGMENT_WIDE_BYTES + LENGTH_BYTES
@@ -358,7 +362,7 @@ def _sends_life(path: Path, message: OutgoingMessage) -> bool:
 
 
 def _frames(sender: Sender, path: Path, run: Run, now: float, *, ack_now: bool) -> list[Frame]:
-    """The piece as a fragment, with head and, until the peer knows it, the topic's name in front of the first."""
+    """The frames of one fragment: the first carries the head and, until the peer knows the topic, its announcement."""
     message, position = run.message, run.position
     accepted = message.accepted
     wire_id = message.wire_id

@@ -1,6 +1,6 @@
-"""The messages of one peer that have no outcome yet: taken on -> replaced, expired, begun anew -> ended, once each.
+"""The messages for one peer that have no outcome yet: accepted -> replaced, expired or restarted -> ended, once each.
 
-What becomes of their pieces on the way is `sender`'s part.
+`sender` handles their fragments in flight.
 """
 
 from collections.abc import Iterable
@@ -14,11 +14,11 @@ from udp_mesh.core.sender.message import OutgoingMessage
 
 
 class Outcome(Enum):
-    """How a message ended, besides expiring."""
+    """How a message ended, other than by expiring."""
 
     DELIVERED = 1
     SENT = 2
-    """Best effort: it left, no outcome is reported."""
+    """Best effort: sent; no outcome is reported."""
     PEER_LOST = 3
 
 
@@ -28,7 +28,7 @@ class Ended(NamedTuple):
 
 
 class PendingMessages:
-    """`ended` and `cancelled` are fetched and cleared by the session."""
+    """The session fetches and clears `ended` and `cancelled`."""
 
     def __init__(self) -> None:
         self.pending: dict[OutgoingMessage, None] = {}
@@ -36,14 +36,15 @@ class PendingMessages:
         self.levels = PriorityLevels()
         self.ended: list[Ended] = []
         self.cancelled: list[int] = []
-        """Wire ids given up after they had begun: the peer may forget them."""
+        """Wire ids abandoned after their first fragment was sent: the peer may discard them."""
         self._deadlines: list[tuple[float, int, OutgoingMessage]] = []
         self._deadline_serial = 0
         self._kept: dict[str, list[OutgoingMessage]] = {}
-        """Open messages of topics that keep only the last few."""
+        """Pending messages of topics with `keep_last`."""
 
     def add(self, message: OutgoingMessage) -> None:
-        """One more; older ones that its topic does not keep end, or end as what becomes of their pieces."""
+        """Add a message. Older ones beyond its topic's `keep_last` end now, or when their sent fragments are
+        acknowledged or lost."""
         self.pending[message] = None
         self.levels.add(message)
         self._note_deadline(message)
@@ -56,7 +57,7 @@ class PendingMessages:
             self._deadline_serial += 1
             heappush(self._deadlines, (message.accepted.deadline, self._deadline_serial, message))
             if len(self._deadlines) > 64 + 2 * len(self.pending):
-                # What ended long before its deadline must not stay in memory until then.
+                # Free messages that ended long before their deadline.
                 self._deadlines = [entry for entry in self._deadlines if not entry[2].ended]
                 heapify(self._deadlines)
 
@@ -69,7 +70,7 @@ class PendingMessages:
             if not older.started:
                 self.finish(older, ExpiryReason.SUPERSEDED)
             elif older.small:
-                # Its pieces may be arriving right now: it ends as what becomes of them.
+                # Its fragments may be arriving right now; their fate decides how it ends.
                 older.superseded = True
 
     def next_deadline(self) -> float | None:
@@ -77,12 +78,12 @@ class PendingMessages:
         return self._deadlines[0][0] if self._deadlines else None
 
     def expire(self, now: float) -> None:
-        """Deadlines that have come."""
+        """End messages whose deadline has passed."""
         while self._deadlines and self._deadlines[0][0] <= now:
             self.finish(heappop(self._deadlines)[2], ExpiryReason.DEADLINE)
 
     def restart_message(self, message: OutgoingMessage) -> OutgoingMessage:
-        """The message under another object, nothing of which has left; it is the youngest of its level."""
+        """Replace the message by a copy of which nothing was sent, placed last on its level."""
         message.ended = True
         self.pending.pop(message, None)
         copy = message.restarted()
@@ -95,7 +96,7 @@ class PendingMessages:
         return copy
 
     def finish(self, message: OutgoingMessage, outcome: Outcome | ExpiryReason) -> None:
-        """The one outcome of a message; later ones are ignored."""
+        """Set the outcome of a message. Later outcomes are ignored."""
         if message.ended:
             return
         self._remove(message)
@@ -108,7 +109,7 @@ class PendingMessages:
             self.finish(message, outcome)
 
     def withdraw(self, message: OutgoingMessage, *, to_resume: bool = False) -> None:
-        """The message leaves without an outcome: an outbox keeps it, `to_resume` it under its number."""
+        """Remove a message without an outcome because an outbox keeps it; with `to_resume`, it keeps its wire id."""
         if not message.ended:
             self._remove(message)
             if message.started and not to_resume:
@@ -120,17 +121,19 @@ class PendingMessages:
         self.levels.remove(message)
 
     def cancel(self, message: OutgoingMessage) -> None:
-        """The peer is told to forget what it has of this one."""
+        """Tell the peer to discard what it has of this message."""
         if message.wire_id is not None and message.accepted.broadcast_number is None:
             self.cancelled.append(message.wire_id)
 
     def by_wire_id(self, wire_id: int) -> OutgoingMessage | None:
-        """The open message of this number (copies of casts are numbered apart); a search, for rare answers."""
+        """The pending message with this wire id (broadcast repairs are numbered separately). A linear search, for rare
+        frames."""
         own = (message for message in self.pending if message.accepted.broadcast_number is None)
         return next((message for message in own if message.wire_id == wire_id), None)
 
     def on_delivered(self, wire_ids: Iterable[int]) -> None:
-        """The peer says it has these whole, whatever it acknowledged; a search, for peers of another make."""
+        """The peer reports these messages as complete, whatever it acknowledged. A linear search, for other
+        implementations."""
         known = set(wire_ids)
         for message in list(self.pending):
             if message.wire_id in known and message.accepted.broadcast_number is None:

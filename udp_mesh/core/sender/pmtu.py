@@ -1,12 +1,12 @@
-"""Whether large datagrams vanish on a path that carries small ones: packets lost and arrived in -> a narrower path.
+"""Path MTU black hole detection (RFC 8899): packets lost and acknowledged in -> a smaller path MTU.
 
-Some tunnel or mesh on the way may carry less than our own interface, and say nothing of it (RFC 8899 calls that a black
-hole). A large datagram is one that the next narrower path would not carry.
-1. A round is a small datagram that arrived some time after the last one while large ones kept being lost.
-2. After a few rounds in which nothing arrived that is as large as the least that was lost, the loss of small ones,
-   measured meanwhile, says how likely it is that the large ones vanished by chance. Where that is next to nothing the
-   path is taken for narrower.
-3. From then on pings as large as what was given up ask, ever more seldom, whether the path carries it after all.
+A tunnel or mesh on the path may carry less than our own interface without reporting it. A datagram is large if the next
+smaller MTU would not carry it.
+
+1. A round ends when a small datagram arrives after large ones were lost, some time after the previous round.
+2. After several rounds without an arrival as large as the smallest loss, the loss rate of small datagrams, measured
+   meanwhile, gives the probability that the large ones were lost by chance. If it is negligible, the MTU is reduced.
+3. From then on pings of the larger size probe, ever less often, whether the path carries it after all.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,57 +18,57 @@ ETHERNET_MTU = 1500
 """RFC 894."""
 
 NARROWER_MTUS = (ETHERNET_MTU, 1280, 576)
-"""What to try next, in bytes of IP packet: Ethernet's behind larger ones, the least that IPv6 links carry
-(RFC 8200, 5), and the least that every IPv4 host takes (RFC 1122, 3.3.2)."""
+"""MTUs to try next, in bytes of IP packet: Ethernet, the IPv6 minimum (RFC 8200, 5), and what every IPv4 host accepts
+(RFC 1122, 3.3.2)."""
 
 ROUNDS = 4
 ROUND_S = 0.3
 LOST_PER_ROUND = 2
-"""At least eight large datagrams in more than a second."""
+"""At least eight large datagrams within more than a second."""
 
 MAX_CHANCE = 1e-6
-"""Less likely than this, at the loss of small ones, so many large ones in a row are not lost by chance."""
+"""At the loss rate of small datagrams, a run of large losses less likely than this is not chance."""
 
 LOSS_SPACING_S = 0.1
-"""Large datagrams that left closer together count as one: what loses one of them often loses the others as well."""
+"""Losses of large datagrams sent closer together count as one: what loses one of them often loses the others too."""
 
 MAX_LARGE_LOST_BETWEEN = 8
-"""And no more of them between two small ones that arrived, but for two with each small one lost: a cut loses both."""
+"""Maximum large losses counted between two small arrivals, plus two per small loss: an outage loses both."""
 
 MAX_SMALL_LOST_BETWEEN = 32
-"""Small ones lost between two that arrived: a cut says nothing more however long it lasts."""
+"""Maximum small losses counted between two arrivals: an outage adds no more however long it lasts."""
 
 LOSS_MEMORY_PACKETS = 64
-"""Small datagrams over which their loss is remembered from one doubt to the next: of a few all may arrive by chance."""
+"""Small datagrams over which their loss rate is remembered between suspicions: of only a few, all may arrive by
+chance."""
 
 SUSPECT_S = 2.5
-"""And no large datagram acknowledged for so long since the first round: on a path whose round trip has just become a
-second or two their acknowledgements are still to come, and what is cut anew although it arrived arrives twice."""
+"""The minimum time from the first round without a large acknowledgement. If the round trip has just grown to a second
+or two, acknowledgements are still on their way, and fragments cut again would arrive twice."""
 
 PROBES_PER_SMALL = LOST_PER_ROUND + 1
-"""Of the probes of a silent peer one in so many is small: a round takes the others."""
+"""Of the probes of an unresponsive peer, one in so many is small; a round uses the others."""
 
 PROBE_AFTER_S = 10.0
 MAX_PROBE_INTERVAL_S = 600.0
-"""The larger size is asked for after the first, then after twice as long each time, at last with RFC 8899's
-PMTU_RAISE_TIMER. A mistake costs a tenth of the rate until then; a path that is narrow, three pings each
-time."""
+"""The larger size is first probed after the former time, which doubles up to the latter (RFC 8899's PMTU_RAISE_TIMER).
+Until then a mistake costs a tenth of the rate; a path that is narrow costs three pings each time."""
 
 MAX_PROBES = 3
-"""Pings of a size per time that would be answered (RFC 8899's MAX_PROBES) if as many got through as the loss says: one
-alone proves little."""
+"""Pings per attempt that would be answered at the current loss rate (RFC 8899's MAX_PROBES): one alone proves
+little."""
 
 MIN_ARRIVING = 0.3
-"""Of pings and answers each, whatever the loss: 33 per time at most."""
+"""Assumed minimum delivery rate of pings and of answers: at most 33 pings per attempt."""
 
 INITIAL_LARGE_BYTES = 1200
-"""Until the first look at the way, some half second: about what frames take on the narrowest of IPv6 links."""
+"""Used until the path is first checked, for about half a second: roughly the frames that fit the IPv6 minimum MTU."""
 
 _INFINITY = float("inf")
 
 
 class PathMtu:
-    """What is known about one peer's path. `narrowed_at` is when it was last taken for narrower."""
+    """Path MTU state of one peer. `narrowed_at` is when the MTU was last reduced."""
 
     __slots__ = (
         "_counted_at",
@@ -92,34 +92,34 @@ class PathMtu:
 
     def __init__(self) -> None:
         self.large_bytes: float = INITIAL_LARGE_BYTES
-        """Frames of a datagram that is not large, at most; where nothing narrower is to be tried all are small."""
+        """Largest size of frames in a datagram that is not large; infinite if there is no smaller MTU to try."""
         self._large_lost = 0
         """Large datagrams lost in this round."""
         self._smallest_lost = _INFINITY
-        """Frames of the smallest of them since the doubt began."""
+        """Frame size of the smallest large loss since the suspicion began."""
         self._rounds = 0
         self._round_at = 0.0
         self._suspect_since = 0.0
         self._large_lost_in_a_row = 0
-        """Large datagrams lost since the doubt began, apart from each other."""
+        """Large datagrams lost since the suspicion began, not counting those sent close together."""
         self._counted_at = float("-inf")
-        """When the last of those left."""
+        """When the last counted one was sent."""
         self._small = self._small_lost = 0
-        """Small datagrams since the doubt began."""
+        """Small datagrams since the suspicion began."""
         self._large_lost_between = self._small_lost_between = 0
-        """Of both, the lost ones since a small one arrived."""
+        """Large and small losses since a small datagram arrived."""
         self._past_small = self._past_small_lost = 0.0
-        """Small datagrams of earlier doubts."""
+        """Small datagrams of earlier suspicions."""
         self._probes = 0
         self.narrowed_at: float | None = None
         self.probe = PmtuProbe()
 
     @property
     def suspect(self) -> bool:
-        """Large datagrams were lost and none arrived since."""
+        """Large datagrams were lost and none has arrived since."""
         return self._large_lost > 0 or self._rounds > 0
 
-    # Doubt
+    # Detection
 
     def on_lost(self, packets: Iterable[Packet]) -> None:
         for packet in packets:
@@ -137,7 +137,7 @@ class PathMtu:
                 self._on_small_lost()
 
     def on_acked(self, packets: Sequence[Packet], called_lost: int, now: float) -> None:
-        """Only to be told while `suspect`; so many of them were called lost before."""
+        """Record acknowledged packets while `suspect`; `called_lost` of them had been declared lost."""
         smallest = self._smallest_lost
         if any(_frames_bytes(packet) >= smallest for packet in packets):
             self.reset()
@@ -145,17 +145,17 @@ class PathMtu:
             self._on_small_acked(len(packets), called_lost, now)
 
     def next_probe_is_small(self) -> bool:
-        """Whether the next probe of a silent peer shall be small."""
+        """Whether the next probe of an unresponsive peer is small."""
         self._probes += 1
         return self.suspect and not self._probes % PROBES_PER_SMALL
 
     def on_small_probe_sent(self) -> None:
-        """A small ping left: lost, unless it is answered."""
+        """Count a small ping as lost until it is answered."""
         if self.suspect:
             self._on_small_lost()
 
     def on_pong(self, token: int, now: float) -> None:
-        """A ping was answered."""
+        """Record the answer to a ping."""
         if not self.probe.on_pong(token) and self.suspect:
             self._on_small_acked(1, 1, now)
 
@@ -178,7 +178,7 @@ class PathMtu:
             self._round_at = now
 
     def is_black_hole(self, now: float) -> bool:
-        """Large datagrams do not get through."""
+        """Whether large datagrams do not get through."""
         if self._rounds < ROUNDS or now - self._suspect_since < SUSPECT_S:
             return False
         small_loss = max(
@@ -188,7 +188,7 @@ class PathMtu:
         return bool(small_loss**self._large_lost_in_a_row < MAX_CHANCE)
 
     def reset(self) -> None:
-        """A large datagram arrived, or their size is another from now on."""
+        """Start over: a large datagram arrived, or the sizes changed."""
         self._past_small += self._small
         self._past_small_lost += self._small_lost
         if self._past_small > LOSS_MEMORY_PACKETS:
@@ -198,17 +198,17 @@ class PathMtu:
         self._large_lost_between = self._small_lost_between = 0
         self._smallest_lost = _INFINITY
 
-    # Narrowed
+    # Reduction
 
     def on_narrowed(self, now: float) -> None:
-        """The path is taken for narrower from now on."""
+        """Record that the MTU was reduced."""
         self.reset()
         self.probe.start(now)
         self.narrowed_at = now
 
 
 class PmtuProbe:
-    """When to ask whether a path carries more than it is given, and what was answered."""
+    """Schedules pings that probe a larger MTU and records the answers."""
 
     __slots__ = ("_interval_s", "_next_at", "_sent_probes", "_started_at", "_tokens", "confirmed_mtu")
 
@@ -218,12 +218,13 @@ class PmtuProbe:
         self._interval_s = PROBE_AFTER_S
         self._sent_probes = 0
         self._tokens: dict[int, int] = {}
-        """Of pings that may still be answered -> the MTU they fill."""
+        """Token of a ping that may still be answered -> the MTU it fills."""
         self.confirmed_mtu = 0
-        """The largest MTU for which one was answered."""
+        """The largest MTU for which a ping was answered."""
 
     def start(self, now: float) -> None:
-        """The path is taken for narrow from now on. Where a ping was answered not long ago that proved little."""
+        """Start probing after a reduction. If the previous confirmation was recent, it proved little: probe less
+        often."""
         if now - self._started_at > 2 * MAX_PROBE_INTERVAL_S:
             self._interval_s = PROBE_AFTER_S
         elif self.confirmed_mtu:
@@ -238,8 +239,8 @@ class PmtuProbe:
         self._sent_probes = 0
 
     def due(self, now: float, loss: float) -> bool:
-        """Whether to ask now; to be called some times a second at most, and only while the peer answers. `loss` is that
-        of datagrams to the peer."""
+        """Whether to probe now. Call a few times a second, and only while the peer answers. `loss` is the loss rate
+        towards the peer."""
         if now < self._next_at:
             return False
         if not self._sent_probes:
@@ -254,7 +255,7 @@ class PmtuProbe:
         self._tokens[token] = mtu
 
     def on_pong(self, token: int) -> bool:
-        """Whether it was one of these pings."""
+        """Whether it was the answer to one of these pings."""
         mtu = self._tokens.pop(token, None)
         if mtu is not None:
             self.confirmed_mtu = max(self.confirmed_mtu, mtu)
@@ -262,7 +263,7 @@ class PmtuProbe:
 
 
 def _frames_bytes(packet: Packet) -> int:
-    """About what the packet's frames take: a topic's name is left out."""
+    """Approximate size of the packet's frames, without topic announcements."""
     _, message, position, more = packet
     start, end = message.span(position)
     size = FRAGMENT_BYTES + end - start + (0 if position else HEAD_BYTES)

@@ -1,11 +1,10 @@
-"""A topic's rate limit: bytes leave when the bucket holds them; until then the topic's messages are parked."""
+"""A topic's rate limit as a token bucket: while it is empty, the topic's messages are parked."""
 
 from udp_mesh.core.sender.scheduler import Run
 from udp_mesh.core.sender.sender import Sender
 
 BURST_S = 0.1
-"""The bucket holds this much time: short enough that a limit of one second's mean is kept, long enough for a
-message."""
+"""Capacity of the bucket: short enough to keep the limit over one second, long enough for a message."""
 
 
 class TokenBucket:
@@ -18,16 +17,16 @@ class TokenBucket:
         self._bytes = bytes_per_s * BURST_S
         self._at = now
         self.parked: list[tuple[Sender, Run]] = []
-        """What waits for the bucket: messages, or single pieces to be sent again."""
+        """What waits for tokens: messages, or single fragments to be retransmitted."""
 
     def has_tokens(self, now: float) -> bool:
-        """Whether a datagram may leave now."""
+        """Whether a datagram may be sent now."""
         self._bytes = min(self.bytes_per_s * BURST_S, self._bytes + (now - self._at) * self.bytes_per_s)
         self._at = now
         return self._bytes > 0
 
     def consume(self, count: int) -> None:
-        """`count` bytes left."""
+        """Record that `count` bytes were sent."""
         self._bytes -= count
 
     def ready_at(self) -> float:
@@ -35,7 +34,7 @@ class TokenBucket:
         return self._at + max(0.0, 1.0 - self._bytes) / self.bytes_per_s
 
     def unpark(self) -> None:
-        """Put everything parked back in front of its level, in its order."""
+        """Return everything parked to the front of its level, in order."""
         parked, self.parked = self.parked, []
         for sender, run in reversed(parked):
             if run.message.ended:

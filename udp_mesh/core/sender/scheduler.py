@@ -1,7 +1,8 @@
-"""Strict priority to one peer: messages wait by level, and the most urgent piece is chosen when a datagram leaves.
+"""Strict priority queueing for one peer: messages wait by level, and the most urgent fragment is chosen when a datagram
+is built.
 
-Within a level pieces to be sent again go first, then messages in the order accepted. After a silence of the peer the
-urgent levels put what waited then behind what comes fresh (`demote_stale`): nothing stale stands ahead of fresh.
+Within a level, retransmissions go first, then messages in the order accepted. After the peer was unresponsive,
+`demote_stale` puts what waited on urgent levels behind new messages.
 """
 
 from collections import deque
@@ -11,9 +12,9 @@ from udp_mesh.core.sender.message import OutgoingMessage
 
 
 class Run(NamedTuple):
-    """Pieces of one message ready to leave: `length` positions from `position` on.
+    """Fragments of one message ready to send: `length` positions starting at `position`.
 
-    `retransmit`: it left before. `stale`: it was set aside and has no claim to be urgent any more.
+    `retransmit`: it was sent before. `stale`: it was demoted and is no longer treated as urgent.
     """
 
     message: OutgoingMessage
@@ -37,7 +38,7 @@ class _Level:
 
 
 class _Levels(dict[int, _Level]):
-    """By priority, made when first used: most peers use few levels, and a node may have a thousand peers."""
+    """By priority, created on first use: most peers use few levels, and a node may have a thousand peers."""
 
     def __missing__(self, priority: int) -> _Level:
         level = self[priority] = _Level()
@@ -54,7 +55,7 @@ class Scheduler:
         self.waiting = 0
 
     def push(self, message: OutgoingMessage, *, first: bool = False) -> None:
-        """All of the message (what of it has not left) waits; `first` puts it ahead of its level."""
+        """Queue the unsent part of a message; `first` puts it at the front of its level."""
         fresh = self._levels[message.priority].fresh
         if first:
             fresh.appendleft(message)
@@ -63,16 +64,16 @@ class Scheduler:
         self.waiting |= 1 << message.priority
 
     def push_retransmit(self, message: OutgoingMessage, position: int) -> None:
-        """One piece of the message was lost and waits anew."""
+        """Queue a lost fragment for retransmission."""
         self._levels[message.priority].retransmit.append((message, position))
         self.waiting |= 1 << message.priority
 
     def is_idle(self, priority: int) -> bool:
-        """Whether every level is empty; `priority` is the one just taken from, whose bit may not show it yet."""
+        """Whether every level is empty. The bit of `priority`, the level just consumed from, may not be cleared yet."""
         return not self.waiting & ~(1 << priority) and self._levels[priority].empty()
 
     def peek(self, priority: int) -> Run | None:
-        """What leaves next on this level; None (and the level's bit cleared) when nothing does."""
+        """What is sent next on this level. None, with the level's bit cleared, if it is empty."""
         level = self._levels[priority]
         for retransmit, fresh in ((level.retransmit, level.fresh), (level.stale_retransmits, level.stale_fresh)):
             while retransmit:
@@ -92,7 +93,7 @@ class Scheduler:
         return None
 
     def consume(self, run: Run, count: int) -> None:
-        """The first `count` pieces of the run just peeked leave."""
+        """Remove the first `count` fragments of the run just peeked."""
         level = self._levels[run.message.priority]
         if run.retransmit:
             (level.retransmit or level.stale_retransmits).popleft()
@@ -103,7 +104,7 @@ class Scheduler:
             (level.fresh if level.fresh and level.fresh[0] is message else level.stale_fresh).popleft()
 
     def park_head(self, run: Run) -> None:
-        """The message of the run just peeked leaves this scheduler whole (a rate limit parks it)."""
+        """Remove the message of the run just peeked (a rate limit parks it)."""
         level = self._levels[run.message.priority]
         if run.retransmit:
             (level.retransmit or level.stale_retransmits).popleft()
@@ -113,7 +114,7 @@ class Scheduler:
             level.stale_fresh.popleft()
 
     def demote_stale(self, last_priority: int) -> None:
-        """What waits on levels up to `last_priority` is stale from now on: fresh messages overtake it."""
+        """Mark what waits on levels up to `last_priority` as stale: new messages overtake it."""
         for priority, level in self._levels.items():
             if priority > last_priority:
                 continue
@@ -125,8 +126,7 @@ class Scheduler:
                 level.fresh.clear()
 
     def rebuild(self, messages: list[OutgoingMessage], *, keep_fragments: bool) -> None:
-        """Start anew with these messages in this order; with `keep_fragments`, pieces that wait to be sent again keep
-        waiting."""
+        """Rebuild the queues from these messages in this order; `keep_fragments` keeps queued retransmissions."""
         kept = []
         if keep_fragments:
             for _, level in sorted(self._levels.items()):

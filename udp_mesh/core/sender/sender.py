@@ -1,11 +1,13 @@
-"""Everything on its way to one peer: accepted -> scheduled -> in flight -> delivered, expired or peer lost.
+"""The messages for one peer: accepted -> scheduled -> in flight -> delivered, expired or peer lost.
 
-1. `accept` takes a message on; `departure` pulls pieces when datagrams leave and books them here.
-2. `acknowledge` books what arrived, measures round trip, rate and loss, and puts lost pieces back by priority.
-3. `handle_timer` probes when acknowledgements stay away: first one packet; then the peer is *silent*, everything
-   on its way is waiting again, and single probes leave: window and rate model stay as they were.
-4. `on_activity` ends the silence; `restart` begins anew with a peer that forgot everything.
-Which messages are open, and the one outcome of each, is the book of `open_messages`.
+1. `accept` queues a message. `packetizer` takes fragments from the scheduler when datagrams are built and records them.
+2. `acknowledge` records arrivals, measures round trip, rate and loss, and requeues lost fragments by priority.
+3. `handle_timer` declares packets lost when acknowledgements stay away. After some more time the peer is
+   *unresponsive*: everything in flight is requeued and only probes are sent, while the window and rate model stay
+   unchanged.
+4. `on_activity` resumes sending; `restart` starts over with a peer that lost its state.
+
+`pending` holds the messages without an outcome.
 """
 
 from collections.abc import Iterable
@@ -26,30 +28,30 @@ from udp_mesh.core.settings import Rates, Settings
 from udp_mesh.wire.frames import Ack
 
 FAST_PROBE_INTERVAL_S = 0.025
-"""Between probes in the first second of a silence: most cuts of a moving robot are that short."""
+"""Probe interval in the first second: most outages of a moving robot are that short."""
 
 PROBE_INTERVAL_S = 0.25
-"""Between probes later on: at most this much is lost when the link returns; four packets a second to a dead peer."""
+"""Probe interval later: the time lost when the link returns, at four packets a second to a dead peer."""
 
 FAST_PROBE_FOR_S = 1.0
 
 UNRESPONSIVE_AFTER_PTOS = 3
 UNRESPONSIVE_AFTER_S = 0.25
-"""Without any acknowledgement for both of these the peer is silent. Until then packets are replaced as they time out,
-at the pace of the window: a burst of losses then costs little more than its own length."""
+"""Without an acknowledgement for both of these the peer is unresponsive. Until then timed-out packets are replaced at
+the pace of the window: a burst of losses costs little more than its own length."""
 
 MIN_ACK_GAP_S = 0.02
-"""Acknowledgements must stay away at least this long before packets time out: twice what they are held back."""
+"""Minimum time without acknowledgements before packets time out: twice what the peer holds them back."""
 
 EXPIRE_INTERVAL_S = 0.005
-"""Between two looks for packets that timed out."""
+"""Between two checks for timed-out packets."""
 
 LOSS_MEMORY_PACKETS = 256
 """Packets over which loss is smoothed."""
 
 
 NON_URGENT_RTT_VALID_S = 1.0
-"""So long the round trip of packets that are not urgent is the one that counts."""
+"""While a round trip sample of a packet that is not urgent is younger than this, urgent ones do not count."""
 
 
 class Sender(PendingMessages):
@@ -59,7 +61,7 @@ class Sender(PendingMessages):
         super().__init__()
         self.rtt = RttEstimator()
         self.urgent_rtt = RttEstimator()
-        """Of urgent packets alone: in a radio's queues they pass others (wifi's access categories)."""
+        """Of urgent packets only: in a radio's queues they overtake others (Wi-Fi access categories)."""
         self._non_urgent_sampled_at = float("-inf")
         self.congestion: CongestionController = DelayBasedController(self.rtt)
         self.pacer = Pacer(settings.rates.pace_quantum_s)
@@ -67,20 +69,20 @@ class Sender(PendingMessages):
         self.scheduler = Scheduler()
         self.rates: Rates = settings.rates
         self.announced: set[int] = set()
-        """Numbers of topics that the peer knows by name."""
+        """Numbers of the topics that the peer knows by name."""
         self.next_wire_id = 0
         self.epoch = 0
-        """Counts the runs of the peer: wire ids of earlier ones mean nothing to this one."""
+        """Counts the peer's boots: wire ids of an earlier one mean nothing to the current one."""
         self.copies = RedundantCopies()
         self.served = 0
-        """Mask of levels from which something left in this round."""
+        """Mask of the levels that sent something in this round."""
         self.wake_at = float("inf")
-        """When pacing lets the next quantum leave."""
+        """When pacing permits the next quantum."""
         self.unresponsive_since: float | None = None
         self.timing_out = False
-        """Acknowledgements stay away: packets are taken for lost by their age."""
+        """Acknowledgements stay away: packets are declared lost by their age."""
         self.timed_out: list[Packet] = []
-        """Packets that timed out and are neither known to have arrived nor sent again."""
+        """Packets that timed out and are neither acknowledged nor retransmitted."""
         self.expired_at = float("-inf")
         self.urgent_sent_at = float("-inf")
         self.probe_credit = 0
@@ -89,14 +91,14 @@ class Sender(PendingMessages):
         self.pmtu = PathMtu()
         self.last_progress = 0.0
         self.non_urgent_progress = 0.0
-        """When the last packet that was not urgent arrived."""
+        """When the last packet that was not urgent was acknowledged."""
         self.app_limited = True
-        """The application, not window or pacing, decides how much leaves."""
+        """The application, not window or pacing, limits how much is sent."""
         self.since_ack_requested = 0
-        """Packets sent since the last one that asked for an acknowledgement at once."""
+        """Packets sent since the last one that requested an immediate acknowledgement."""
         self.loss = 0.0
         self.send_twice = False
-        """Loss was seen and has not been gone for long: small urgent messages leave twice."""
+        """Loss was seen recently: small urgent messages are sent twice."""
         self.delivered_packets = 0
         self.delivered_at = 0.0
         self.delivered_sent_at = 0.0
@@ -107,7 +109,7 @@ class Sender(PendingMessages):
         self.apply(settings)
 
     def apply(self, settings: Settings) -> None:
-        """New settings; nothing on its way is touched."""
+        """Apply new settings; nothing in flight is touched."""
         self.rates = settings.rates
         self.pacer = Pacer(settings.rates.pace_quantum_s)
         if isinstance(settings.window, int):
@@ -118,27 +120,27 @@ class Sender(PendingMessages):
     # Accepting
 
     def accept(self, message: OutgoingMessage, now: float) -> None:
-        """Take a message on: it waits on its level."""
+        """Accept a message and queue it on its level."""
         self.add(message)
         if not self.in_flight.outstanding and self.unresponsive_since is None:
             self.last_progress = now
         if self.unresponsive_since is not None and message.priority <= self.rates.urgent_priority:
-            # A fresh urgent message is itself the best probe: what waited until now stands behind it.
+            # A new urgent message is the best probe; what waited until now goes behind it.
             self.allow_probe(now)
         self.scheduler.push(message)
 
     # Acknowledgements
 
     def acknowledge(self, ack: Ack, now: float) -> None:
-        """Book an acknowledgement of the peer."""
+        """Process an acknowledgement from the peer."""
         in_flight = self.in_flight
         received = ack.received << 1 | 1
-        # Sparse traffic has too few successors to lose packets otherwise.
+        # Sparse traffic has too few later packets to detect loss otherwise.
         timed_out = in_flight.confirm_timed_out(ack.largest, received) if ack.largest < in_flight.next_number else 0
         spurious = in_flight.spurious
         acknowledged, lost, newest = in_flight.acknowledge(ack.largest, received)
         if acknowledged:
-            # What was acknowledged late, all at once, says nothing about the rate of the link.
+            # Packets acknowledged late and all at once say nothing about the rate of the link.
             after_silence = self.timing_out or self.unresponsive_since is not None
             self.last_progress = now
             if not all(packet.snapshot.urgent for packet in acknowledged):
@@ -169,7 +171,7 @@ class Sender(PendingMessages):
             app_limited = newest is None or newest.snapshot.app_limited
             outstanding = in_flight.outstanding
             if self.congestion.drain_overdue(now) and not in_flight.non_urgent_outstanding():
-                # The few urgent ones that leave during a drain are no queue.
+                # The few urgent packets sent during a drain do not form a queue.
                 outstanding = 0
             self.congestion.on_ack(
                 count,
@@ -195,7 +197,7 @@ class Sender(PendingMessages):
             self.loss += (lost_packets - self.loss * total) / max(total, LOSS_MEMORY_PACKETS)
 
     def _sample(self, round_trip_s: float, now: float, *, urgent: bool) -> bool:
-        """Whether this round trip tells of the queue by which the window goes."""
+        """Add a round trip sample. True if it counts for the congestion window."""
         if urgent:
             self.urgent_rtt.sample(round_trip_s, now)
             if now < self._non_urgent_sampled_at + NON_URGENT_RTT_VALID_S:
@@ -225,7 +227,7 @@ class Sender(PendingMessages):
                         self.finish(message, Outcome.DELIVERED)
 
     def _requeue(self, packets: Iterable[Packet]) -> None:
-        """Lost pieces of reliable messages wait again on their level."""
+        """Requeue the lost fragments of reliable messages on their level."""
         for packet in packets:
             self._requeue_fragment(packet.message, packet.position)
             for message, position in packet.more:
@@ -240,7 +242,7 @@ class Sender(PendingMessages):
             self.scheduler.push_retransmit(message, position)
 
     def schedule_copies(self, message: OutgoingMessage, position: int, now: float) -> None:
-        """A small urgent piece left for the first time."""
+        """Schedule redundant copies of a small urgent fragment sent for the first time."""
         self.copies.schedule(
             message,
             position,
@@ -252,14 +254,14 @@ class Sender(PendingMessages):
         )
 
     def urgent_timeout_s(self) -> float:
-        """How long the answer to an urgent piece may take."""
+        """Time after which the acknowledgement of an urgent fragment is overdue."""
         smoothed_rtt = self.urgent_rtt.smoothed_rtt or self.rtt.smoothed_rtt
         return INITIAL_PTO_S if smoothed_rtt is None else OVERDUE_ROUND_TRIPS * smoothed_rtt + self.rates.twice_gap_s
 
-    # Silence
+    # Unresponsive peer
 
     def timer(self) -> float | None:
-        """When `handle_timer` wants to be called for probes, deadlines or second copies. Late answers do no harm."""
+        """When `handle_timer` is due for probes, deadlines or redundant copies. Calling it late is harmless."""
         at: float | None = None
         if self.unresponsive_since is not None:
             if self.pending or self.in_flight.outstanding:
@@ -276,7 +278,7 @@ class Sender(PendingMessages):
         return at
 
     def pto_s(self) -> float:
-        """Silence after which the oldest packet counts as lost."""
+        """Probe timeout: time without progress after which the oldest packet counts as lost."""
         return self.rtt.pto_s(self.rates.ack_delay_s, PROBE_INTERVAL_S)
 
     def handle_timer(self, now: float) -> None:
@@ -297,21 +299,22 @@ class Sender(PendingMessages):
                 self._declare_timed_out(now - timeout)
 
     def _expiry_at(self) -> float:
-        """When to look for packets whose acknowledgement is overdue."""
+        """When to check for packets whose acknowledgement is overdue."""
         oldest = self.in_flight.oldest()
         if oldest is None:
             return float("inf")
         timeout = self.pto_s()
-        # Urgent packets overtake others in radios: that they arrive says nothing about one that all others follow.
+        # Urgent packets overtake others in radios, so their acknowledgement is no progress for a packet that is not
+        # urgent.
         progress = self.last_progress if oldest.urgent else self.non_urgent_progress
         quiet = progress + max(MIN_ACK_GAP_S, timeout / 2)
         return max(quiet, oldest.sent_at + timeout, self.expired_at + EXPIRE_INTERVAL_S)
 
     def _declare_timed_out(self, sent_before: float) -> None:
-        """Packets sent until then are no longer counted as on their way, so that others may leave.
+        """Declare packets sent before then lost, so that others may be sent.
 
-        Whether they, or only their acknowledgements, were lost the next acknowledgement will tell: until then urgent
-        pieces are sent again, others only if nothing else waits.
+        The next acknowledgement shows whether they or only their acknowledgements were lost. Until then urgent
+        fragments are retransmitted; others only if nothing else waits.
         """
         self.timing_out = True
         for packet in self.in_flight.declare_lost_before(sent_before):
@@ -339,8 +342,8 @@ class Sender(PendingMessages):
         self._demote_in_flight()
 
     def consume_small_probe(self, now: float) -> bool:
-        """Whether the probe just allowed shall be a ping: nothing waits, or full pieces may be too large for the path
-        (then one probe in a few, once the silence is no short cut)."""
+        """Whether the probe just allowed is to be a ping: nothing waits, or full fragments may be too large for the
+        path (then one probe in a few, once the peer has been unresponsive for longer)."""
         if self.unresponsive_since is None or not self.probe_credit:
             return False
         if self.scheduler.waiting:
@@ -352,7 +355,7 @@ class Sender(PendingMessages):
         return True
 
     def _demote_in_flight(self) -> None:
-        """Everything on its way waits again, urgent messages behind those still to come."""
+        """Requeue everything in flight; urgent messages go behind new ones."""
         self._requeue_timed_out()
         given_up = self.in_flight.abandon_all()
         self.pmtu.on_lost(given_up)
@@ -360,8 +363,8 @@ class Sender(PendingMessages):
         self.scheduler.demote_stale(self.rates.urgent_priority)
 
     def on_activity(self, now: float) -> None:
-        """Something authentic came from the peer. After a silence a first burst leaves, the rest when it is
-        acknowledged."""
+        """Record that an authentic datagram arrived. To an unresponsive peer a first burst is sent; the rest waits for
+        an acknowledgement."""
         if self.unresponsive_since is None or now < self.probed_at + FAST_PROBE_INTERVAL_S * 0.99:
             return
         if self._resume_backoff.due(now):
@@ -375,14 +378,14 @@ class Sender(PendingMessages):
         self.scheduler.demote_stale(self.rates.urgent_priority)
 
     def reprioritize(self) -> None:
-        """Topics changed their priorities: what waits moves to its new level."""
+        """Move waiting messages to their topics' new levels."""
         if self.levels.reprioritize(self.pending):
             self.scheduler.rebuild(list(self.pending), keep_fragments=True)
 
-    # Anew
+    # Restart
 
     def restart(self, now: float) -> None:
-        """The peer runs anew (or must be told anew): every open message begins again under new numbers."""
+        """Restart every pending message under a new number: the peer restarted, or its state is unknown."""
         self.in_flight.restart(0)
         self.timed_out.clear()
         self.announced.clear()
@@ -401,12 +404,12 @@ class Sender(PendingMessages):
         self.scheduler.rebuild(list(self.pending), keep_fragments=False)
 
     def resend_from_start(self, message: OutgoingMessage) -> None:
-        """The peer forgot the pieces it had of this one."""
+        """Restart a message whose fragments the peer discarded."""
         self.announced.discard(message.accepted.channel.number)
         self.scheduler.push(self.restart_message(message))
 
     def resume(self, message: OutgoingMessage, now: float) -> None:
-        """Take a withdrawn message on again where it stopped."""
+        """Resume a withdrawn message where it stopped."""
         copy = message.resumed()
         self.accept(copy, now)
         for position in range(copy.next_position):
@@ -414,7 +417,7 @@ class Sender(PendingMessages):
                 self.scheduler.push_retransmit(copy, position)
 
     def snapshot(self, now: float, *, urgent: bool = False) -> SendSnapshot:
-        """The state in which the packets of one burst leave."""
+        """The state in which one burst of packets is sent."""
         if not self.in_flight.outstanding and not self.timing_out and self.unresponsive_since is None:
             self.delivered_at = self.delivered_sent_at = self.last_progress = now
         return SendSnapshot(

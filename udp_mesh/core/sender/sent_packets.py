@@ -1,9 +1,9 @@
-"""The packets on their way to one peer: sent -> acknowledged or lost.
+"""The packets in flight to one peer: sent -> acknowledged or lost.
 
-Packet numbers grow by one and are never used twice, so the packets stand in a queue by number and an acknowledgement's
-bitmap walks it from the front: mostly a run of ones that is taken off in one go. A packet is lost when
-`reorder_packets` later ones arrived; one that arrives after all teaches a larger number. Urgent packets overtake others
-in a radio's queues (wifi's access categories), so their arrival says nothing about less urgent ones sent before them.
+Packet numbers grow by one and are never reused, so packets form a queue by number, and an acknowledgement's bitmap is
+applied from its front: usually a run of ones. A packet is lost when `reorder_packets` later ones arrived; if it arrives
+after all, that threshold grows. Urgent packets overtake others in a radio's queues (Wi-Fi access categories), so their
+arrival says nothing about less urgent ones sent before them.
 """
 
 from collections import OrderedDict, deque
@@ -14,17 +14,17 @@ from typing import NamedTuple
 from udp_mesh.core.sender.message import OutgoingMessage
 
 REORDER_PACKETS = 3
-"""RFC 9002, 6.1.1: fewer calls reordering a loss, more waits longer."""
+"""kPacketThreshold of RFC 9002, 6.1.1: a lower value takes reordering for loss, a higher one delays detection."""
 
 MAX_REORDER_PACKETS = 64
-"""What learned reordering may reach."""
+"""Upper bound of the learned reordering threshold."""
 
 MAX_REMEMBERED_LOST = 256
-"""Packets called lost that an acknowledgement may still correct: those its bitmap covers."""
+"""Lost packets that a later acknowledgement may correct: those its bitmap covers."""
 
 
 class SendSnapshot(NamedTuple):
-    """The state in which a burst of packets was sent, shared by all of them; for round trip and rate samples."""
+    """The state in which a burst of packets was sent, shared by all of them, for round trip and rate samples."""
 
     sent_at: float
     delivered: int
@@ -32,22 +32,22 @@ class SendSnapshot(NamedTuple):
     delivered_at: float
     """When the last of those was acknowledged."""
     delivered_sent_at: float
-    """When the last of those had been sent."""
+    """When the last of those was sent."""
     app_limited: bool
-    """The application, not the window, decided how much was sent."""
+    """The application, not the window, limited how much was sent."""
     urgent: bool = False
     first: int = 0
     """Number of the burst's first packet."""
     outstanding: int = 0
-    """Packets that were on their way when it left."""
+    """Packets in flight when it was sent."""
 
     def packets_ahead_of(self, number: int) -> int:
-        """Packets of ours that were on their way when packet `number` of the burst left."""
+        """Packets in flight when packet `number` of the burst was sent."""
         return self.outstanding + number - self.first
 
 
 class Packet(NamedTuple):
-    """One packet on its way, and the pieces of messages in it."""
+    """One packet in flight and the fragments in it."""
 
     snapshot: SendSnapshot
     message: OutgoingMessage
@@ -74,12 +74,12 @@ class SentPackets:
         """Number of the packet at the front of the queue."""
         self._packets: deque[Packet | None] = deque()
         self._largest_other = -1
-        """Largest number of a packet that was not urgent and arrived."""
+        """Largest acknowledged number of a packet that was not urgent."""
         self.outstanding = 0
         self.reorder_packets = REORDER_PACKETS
         self._lost: OrderedDict[int, tuple[Packet, bool]] = OrderedDict()
         self._timed_out: list[int] = []
-        """Numbers of urgent packets called lost by their age, of which no acknowledgement has told yet."""
+        """Numbers of urgent packets declared lost by age and not yet covered by an acknowledgement."""
         self.spurious = 0
 
     @property
@@ -91,7 +91,8 @@ class SentPackets:
         return sum(packet is not None and not packet.snapshot.urgent for packet in self._packets)
 
     def add(self, number: int, packet: Packet | None) -> None:
-        """A packet left; None for one that asks for no acknowledgement. Every number of the channel comes, in order."""
+        """Record a sent packet; None for one that requests no acknowledgement. Called for every number of the channel,
+        in order."""
         packets = self._packets
         if packet is not None:
             self.outstanding += 1
@@ -101,17 +102,18 @@ class SentPackets:
         packets.append(packet)
 
     def add_run(self, snapshot: SendSnapshot, message: OutgoingMessage, positions: range) -> None:
-        """As `add` for a packet of each piece, which have the next numbers; without a call in Python for each."""
+        """Record one packet per fragment under the next numbers, without a Python call for each."""
         self.outstanding += len(positions)
         self._packets.extend(
             map(partial(tuple.__new__, Packet), zip(repeat(snapshot), repeat(message), positions, repeat(())))
         )
 
     def acknowledge(self, largest: int, received: int) -> tuple[list[Packet], list[Packet], Packet | None]:
-        """Packets newly acknowledged, packets now lost, and packet `largest` if this is the first word of it.
+        """Returns the newly acknowledged packets, the packets now lost, and packet `largest` if it was not acknowledged
+        before.
 
-        `received` as in `AckState`. An acknowledgement of what was never sent says nothing. One of a packet called lost
-        too early is the first word of it, too: without it a path that became slow would never be measured.
+        `received` is as in `AckState`. An acknowledgement of a number never sent is ignored. A packet declared lost too
+        early is returned as `largest` too: otherwise a path that became slow would never be measured.
         """
         packets = self._packets
         base = self.base
@@ -157,7 +159,7 @@ class SentPackets:
             packets.popleft()
             count -= 1
         self.base = largest + 1 - count
-        # What stands behind a packet that may still come: at most the reordering distance.
+        # Packets behind one that may still arrive: at most the reordering threshold.
         for behind in range(count):
             packet = packets[count - 1 - behind]
             if packet is not None and received >> behind & 1:
@@ -167,7 +169,7 @@ class SentPackets:
         return acknowledged, lost, newest
 
     def confirm_timed_out(self, largest: int, received: int) -> int:
-        """How many urgent packets that timed out were lost indeed, as this acknowledgement tells."""
+        """How many timed-out urgent packets this acknowledgement shows to be really lost."""
         conclusive = largest - self.reorder_packets
         lost = 0
         while self._timed_out and self._timed_out[0] <= conclusive:
@@ -175,20 +177,21 @@ class SentPackets:
         return lost
 
     def abandon_all(self) -> list[Packet]:
-        """Everything on its way counts as lost (the peer is silent); an acknowledgement may still correct that."""
+        """Declare everything in flight lost because the peer is unresponsive; a later acknowledgement may correct
+        that."""
         lost = [packet for packet in self._packets if packet is not None]
         for number, packet in enumerate(self._packets, self.base):
             if packet is not None:
                 self._remember(number, packet, overtaken=False)
         self.base += len(self._packets)
         self._packets.clear()
-        # A silence is a cut, which says nothing of the loss on the way.
+        # An outage says nothing about the loss rate of the path.
         self._timed_out.clear()
         self.outstanding = 0
         return lost
 
     def restart(self, number: int) -> list[Packet]:
-        """The peer runs anew: nothing of this was received. Returns what was on its way."""
+        """Discard everything in flight: the peer restarted and received none of it. Returns those packets."""
         lost = [packet for packet in self._packets if packet is not None]
         self._packets.clear()
         self._lost.clear()
@@ -199,7 +202,7 @@ class SentPackets:
         return lost
 
     def oldest(self) -> SendSnapshot | None:
-        """The mark of the first packet still on its way."""
+        """The snapshot of the oldest packet in flight."""
         packets = self._packets
         while packets and packets[0] is None:
             packets.popleft()
@@ -208,7 +211,7 @@ class SentPackets:
         return front.snapshot if front is not None else None
 
     def declare_lost_before(self, sent_before: float) -> list[Packet]:
-        """Packets sent before that time count as lost."""
+        """Declare packets sent before that time lost."""
         packets = self._packets
         lost = []
         while packets:
