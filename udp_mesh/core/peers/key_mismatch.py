@@ -11,20 +11,20 @@ from udp_mesh.core.events import KeyMismatch
 from udp_mesh.core.settings import Address
 
 REPORT_INTERVAL_S = 60.0
-"""The same address is reported once in this time."""
+"""Minimum time between two reports of the same address."""
 
 BURST = 8
-"""Addresses reported in a row: a team that missed a rotation is seen at a glance."""
+"""Addresses reported in a row, so that a team that missed a key rotation is reported completely."""
 
 REFILL_INTERVAL_S = 10.0
-"""Then one event per so many seconds: a flood of 20,000 a second fills no log."""
+"""After that, one event per interval: a flood of 20,000 datagrams a second fills no log."""
 
 MAX_REMEMBERED = 256
-"""Addresses whose unknown key was reported: a flood of them must not grow memory."""
+"""Reported addresses remembered; bounds memory during a flood."""
 
 
 class KeyMismatchLimiter:
-    """What of unknown keys is reported; `None` where nothing is to be said now."""
+    """Decides which datagrams of unknown keys are reported; returns None if none is to be reported now."""
 
     __slots__ = ("_at", "_last", "_reported", "_tokens", "more")
 
@@ -37,7 +37,7 @@ class KeyMismatchLimiter:
         """Datagrams from addresses not reported yet."""
 
     def on_mismatch(self, source: Address, link: str, now: float) -> KeyMismatch | None:
-        """A datagram of an unknown key came."""
+        """Process a datagram sealed with an unknown key."""
         if now - self._reported.get(source, float("-inf")) < REPORT_INTERVAL_S:
             return None
         if not self._take_token(now):
@@ -51,7 +51,7 @@ class KeyMismatchLimiter:
         return self._event(source, link)
 
     def flush(self, now: float) -> KeyMismatch | None:
-        """To be called now and then: what was not reported yet."""
+        """Report what was not reported yet. Call periodically."""
         if self._last is None or not self._take_token(now):
             return None
         source, link = self._last

@@ -1,10 +1,10 @@
-"""Proves that a peer answers at an address before anything is sent there for good (as RFC 9000, 8.2 and 9).
+"""Path validation (RFC 9000, 8.2 and 9): proves that a peer answers at an address before it is used.
 
-1. A datagram came from another address, or may be a recording: a ping with a random token goes to where it came from,
-   and one to the address in use.
-2. The pong of the first, from that address, proves it. An attacker that only repeats what it overheard cannot make one.
-3. Where the address in use answers too, it stays in use, also when its answer is the later one: the other may be
-   somebody who passes everything on (RFC 9000, 9.3.3).
+1. When a datagram comes from another address, or may be replayed, a ping with a random token is sent to its source, and
+   one to the current address.
+2. The pong from that source validates the path. An attacker that only replays recorded datagrams cannot produce one.
+3. If the current address answers too, it stays in use, even if its answer is the later one: the other may be an on-path
+   attacker that forwards everything (RFC 9000, 9.3.3).
 """
 
 from udp_mesh.core.interfaces import Datagram
@@ -15,14 +15,14 @@ from udp_mesh.wire.codec import encode
 from udp_mesh.wire.frames import Frame, Ping, Pong
 
 CHALLENGE_INTERVAL_S = 0.25
-"""Between two questions to one peer: as often as a silent peer is probed, so that a flood of copies makes few pings."""
+"""Minimum time between two challenges of a peer, equal to the probe interval: a flood of copies causes few pings."""
 
 MAX_CHALLENGES = 8
-"""Questions remembered per peer: four addresses at a time, each with the one in use."""
+"""Challenges remembered per peer: four addresses at a time, each with the current one."""
 
 
 def validate_path(state: State, session: Session, link: str, source: Address, now: float) -> None:
-    """Ask whether the peer is at this address, and whether it still is where it was."""
+    """Challenge this address and the current one."""
     if session.peer is None or now < session.challenged_at + CHALLENGE_INTERVAL_S:
         return
     session.challenged_at = now
@@ -42,7 +42,7 @@ def _send_challenge(state: State, session: Session, challenge: Challenge) -> Non
 
 
 def send_on_path(state: State, session: Session, frame: Frame, link: str, address: Address, now: float) -> None:
-    """One small frame to this address, whatever the way in use."""
+    """Send one small frame to this address, regardless of the current path."""
     number, data = session.path.seal(encode(session.path.with_timestamp([frame], now)))
     if session.is_current and session.peer is not None:
         session.peer.sender.in_flight.add(number, None)
@@ -50,7 +50,7 @@ def send_on_path(state: State, session: Session, frame: Frame, link: str, addres
 
 
 def match_response(session: Session, pong: Pong, link: str, source: Address, now: float) -> Challenge | None:
-    """The question that this pong answers, if it came from where that went."""
+    """The challenge answered by this pong, if it came from the challenged address."""
     challenge = session.challenges.get(pong.token)
     if challenge is None or (challenge.link, challenge.address) != (link, source):
         return None

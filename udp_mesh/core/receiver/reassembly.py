@@ -1,8 +1,7 @@
-"""Pieces of messages of one peer -> whole messages, each once, within a memory cap.
+"""Fragments of one peer -> complete messages, each once, within a memory cap.
 
-Nothing is allocated from a number on the wire: a piece is kept under its position, memory grows only by what arrived,
-and the head's total is a number to compare with. A piece that is refused must not be acknowledged, so that it comes
-again.
+Nothing is allocated from a number on the wire: fragments are stored by position, memory grows only by what arrived, and
+the head's total is only compared. A refused fragment must not be acknowledged, so that it is retransmitted.
 """
 
 from enum import Enum
@@ -14,15 +13,16 @@ from udp_mesh.core.settings import Limits
 from udp_mesh.wire.frames import Fragment, MessageFlag, MessageHead
 
 FRAGMENT_OVERHEAD_BYTES = 120
-"""Counted per piece besides its bytes (dict entry, object headers), so that tiny pieces meet the cap too."""
+"""Counted per fragment in addition to its bytes (dict entry, object headers), so that the cap covers tiny fragments
+too."""
 
 BEST_EFFORT_TIMEOUT_S = 2.0
-"""A best-effort message whose pieces stop for this long will not be completed."""
+"""A best-effort message is dropped after this long without a new fragment."""
 
 
 RELIABLE_TIMEOUT_S = 300.0
-"""A reliable message may wait this long behind more urgent ones; then its memory is taken back and, if a piece still
-comes, the sender told to begin anew."""
+"""A reliable message may wait this long behind more urgent ones. Then its memory is released, and if another fragment
+arrives, the sender is asked to restart the message."""
 
 
 class CompleteMessage(NamedTuple):
@@ -34,21 +34,21 @@ class CompleteMessage(NamedTuple):
 
 
 class FragmentStatus(Enum):
-    """What became of a piece that did not complete its message."""
+    """The result of a fragment that did not complete its message."""
 
     KEPT = 1
     DUPLICATE = 2
-    """Already here, or of a finished message: acknowledge, deliver nothing."""
+    """Already received, or of a finished message: acknowledge, deliver nothing."""
     FULL = 3
-    """No memory now: do not acknowledge."""
+    """Out of memory: do not acknowledge."""
     TOO_LARGE = 4
-    """The message can never be taken: refuse it."""
+    """The message is over the limit: refuse it."""
     CORRUPT = 5
     """It contradicts its head: refuse it."""
     FORGOTTEN = 6
-    """Its earlier pieces were given up: it must be sent anew."""
+    """Its earlier fragments were dropped: the sender must restart the message."""
     EXPIRED = 7
-    """Its life is over: its sender has reported so, and expects no acknowledgement."""
+    """Its lifetime is over: its sender has already reported that and expects no acknowledgement."""
 
 
 class _Partial:
@@ -59,27 +59,27 @@ class _Partial:
         self.head: MessageHead | None = None
         self.bytes = 0
         self.expires_at = float("inf")
-        """When its sender gives it up, by our clock: not before the sender does."""
+        """When its sender gives it up, by our clock: never earlier than the sender does."""
         self.touched_at = now
         self.seen = 0
-        """Pieces at the last `purge`."""
+        """Fragments at the last `purge`."""
 
 
 RESERVE_STEP_BYTES = 1 << 16
-"""Taken from the memory of all peers at a time: a piece alone costs no more than a comparison."""
+"""Reserved from the shared budget at a time, so that a single fragment costs only a comparison."""
 
 
 class Reassembly:
-    """`bytes` is what all unfinished messages hold, at most `Limits.partial_bytes_per_peer`."""
+    """`bytes` is the size of all unfinished messages, at most `Limits.partial_bytes_per_peer`."""
 
     __slots__ = ("_account", "_limits", "_partials", "_reserved", "bytes", "finished", "forgotten")
 
     def __init__(self, limits: Limits, account: Account | None = None) -> None:
-        """`account` is what this peer holds of the memory of all (None: there is no such bound)."""
+        """`account` is this peer's share of the budget of all peers (None: unlimited)."""
         self._limits = limits
         self._account = account or Account(MemoryBudget(1 << 62))
         self._reserved = 0
-        """What `bytes` may reach before more is taken from the account."""
+        """What `bytes` may reach before more is reserved."""
         self._partials: dict[int, _Partial] = {}
         self.bytes = 0
         self.finished = RangeSet()
@@ -92,7 +92,7 @@ class Reassembly:
         self._limits = limits
 
     def add(self, fragment: Fragment, now: float, late_s: float = 0.0) -> CompleteMessage | FragmentStatus:
-        """Take in one piece, `late_s` longer on its way than others."""
+        """Add one fragment that was delayed by `late_s`."""
         message_id, position, payload, head = fragment[:4]
         expires_at = float("inf")
         if head is not None and head.life_ms is not None:
@@ -158,7 +158,7 @@ class Reassembly:
         return CompleteMessage(message_id, known, body)
 
     def add_plain(self, message_id: int, position: int, payload: bytes) -> bool:
-        """The fast path of `add` for a new piece in the middle of a known message; False where `add` must decide."""
+        """The fast path of `add` for a new fragment in the middle of a known message. False if `add` must decide."""
         partial = self._partials.get(message_id)
         if partial is None or partial.head is None:
             return False
@@ -178,7 +178,7 @@ class Reassembly:
         return True
 
     def forget(self, message_id: int) -> bool:
-        """Drop what is here of an unfinished message; False if nothing was."""
+        """Drop an unfinished message. False if there is none."""
         partial = self._partials.pop(message_id, None)
         if partial is None:
             return False
@@ -191,7 +191,7 @@ class Reassembly:
         return True
 
     def _reserve(self, more: int) -> bool:
-        """Whether so many bytes more may be held."""
+        """Whether `more` bytes may be held."""
         if self.bytes + more > self._limits.partial_bytes_per_peer:
             return False
         needed = self.bytes + more - self._reserved
@@ -204,12 +204,12 @@ class Reassembly:
         return False
 
     def end(self, message_id: int) -> None:
-        """The message is over without being delivered (cancelled, refused): later pieces of it are duplicates."""
+        """End the message without delivering it (cancelled, refused): later fragments of it are duplicates."""
         self.forget(message_id)
         self._finish(message_id)
 
     def purge(self, now: float) -> None:
-        """Drop messages whose pieces stopped coming."""
+        """Drop messages that receive no more fragments."""
         for message_id, partial in list(self._partials.items()):
             if partial.seen != len(partial.payloads):
                 partial.seen = len(partial.payloads)
@@ -228,7 +228,7 @@ class Reassembly:
                 self.end(message_id)
 
     def missing(self, message_id: int) -> list[tuple[int, int]] | None:
-        """(first, count) of the positions not yet here; None where nothing is known of the message."""
+        """(first, count) of the missing positions. None if the message is unknown."""
         partial = self._partials.get(message_id)
         if partial is None or partial.head is None:
             return None
@@ -249,7 +249,7 @@ class Reassembly:
         before = len(numbers)
         numbers.add(message_id)
         if len(numbers) > self._limits.finished_ranges_per_peer or self._account.too_many_ranges(len(numbers)):
-            # The oldest gap is given up: what would still fill it is older than thousands of finished messages.
+            # Close the oldest gap: what could still fill it is older than thousands of finished messages.
             numbers.fill_lowest_gap()
         if len(numbers) != before:
             self._account.count_ranges(len(numbers) - before)

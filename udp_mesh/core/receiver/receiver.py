@@ -1,8 +1,8 @@
-"""The receiving half of a session: opened datagrams in -> whole messages and what is owed to the sender out.
+"""The receiving half of a session: opened datagrams in -> complete messages, acknowledgements and refusals out.
 
-1. `receive_fragment` reads a datagram's fragments; a plain full fragment takes the fast path without building a frame.
-2. Pieces go to the reassembly of the channel they are numbered in (the sender's unicast or its broadcasts).
-3. A datagram all of whose pieces were kept is acknowledged; one with a refused piece is not, so that it comes again.
+1. `receive_fragment` processes a fragment; a plain full fragment takes the fast path without building a frame.
+2. Fragments go to the reassembly of the channel they are numbered in (the sender's unicasts or its broadcasts).
+3. A datagram is acknowledged only if all of its fragments were accepted; otherwise it is retransmitted.
 """
 
 import struct
@@ -23,11 +23,11 @@ _WIDE = struct.Struct(">BII")
 _PLAIN_MASK = 0xFF & ~FRAGMENT_ACK_NOW
 
 MAX_REFUSED_REMEMBERED = 256
-"""Messages of one peer refused for good, remembered so that each of their pieces is refused again."""
+"""Refused messages of one peer remembered, so that each of their fragments is refused again."""
 
 
 class ReceivedMessage(NamedTuple):
-    """A whole message, ready for the application."""
+    """A complete message for the application."""
 
     topic: str
     type_name: str
@@ -35,7 +35,7 @@ class ReceivedMessage(NamedTuple):
     priority: int
     to_all: bool
     from_broadcast: int | None
-    """Its broadcast number, where it is numbered so."""
+    """Its broadcast number, if it has one."""
 
 
 def _topic_bytes(names: tuple[str, str]) -> int:
@@ -43,7 +43,7 @@ def _topic_bytes(names: tuple[str, str]) -> int:
 
 
 class Receiver:
-    """`received` and `refusals` are fetched and cleared by the session."""
+    """The session fetches and clears `completed` and `refusals`."""
 
     __slots__ = (
         "_account",
@@ -75,10 +75,10 @@ class Receiver:
         self.completed: list[ReceivedMessage] = []
         self.refusals: list[Refused] = []
         self.inflating: deque[tuple[Decompression, ReceivedMessage]] = deque()
-        """Whole messages still being inflated, with what is told of them but for the payload."""
+        """Complete messages still being inflated, with everything but their payload."""
         self.duplicates = 0
         self.expired = 0
-        """Pieces of messages whose senders have given them up by now."""
+        """Fragments of messages that their senders have given up by now."""
         self.fragments = 0
         self.over_limit = 0
         self._refused: dict[tuple[bool, int], RefuseReason] = {}
@@ -98,7 +98,7 @@ class Receiver:
         self.broadcasts.set_limits(limits)
 
     def receive_plain(self, frames: bytes, number: int, now: float) -> bool:
-        """The fast path: one fragment without a head that fills its datagram. False if this is something else."""
+        """The fast path: one fragment without a head that fills its datagram. False for anything else."""
         first = frames[0]
         kind = first & _PLAIN_MASK
         if kind == FRAGMENT and len(frames) > FRAGMENT_BYTES:
@@ -118,7 +118,7 @@ class Receiver:
         return True
 
     def on_topic_announce(self, frame: TopicAnnounce) -> None:
-        """Learn a topic's number; bounded, since only a faulty peer announces without end."""
+        """Store a topic's number. Bounded, because a faulty peer may announce topics without end."""
         names = (frame.name, frame.type_name)
         known = self.topics.get(frame.topic_id)
         if known == names:
@@ -131,12 +131,12 @@ class Receiver:
         self.topics[frame.topic_id] = names
 
     def close(self) -> None:
-        """The peer is forgotten: what is kept for it no longer counts."""
+        """Release what is held for a dropped peer."""
         self._account.close()
 
     def receive_fragment(self, fragment: Fragment, now: float, *, broadcast: bool, late_s: float = 0.0) -> bool:
-        """Take in one piece, `late_s` longer on its way than others; False if it was refused, so that its datagram must
-        not be acknowledged."""
+        """Process one fragment that was delayed by `late_s`. False if it was refused, so that its datagram must not be
+        acknowledged."""
         by_broadcast = broadcast or fragment.broadcast_id
         self.fragments += 1
         key = (by_broadcast, fragment.message_id)
@@ -171,10 +171,10 @@ class Receiver:
                 return False
 
     def on_accepted(self, number: int, now: float, *, ack_now: bool) -> None:
-        """A datagram that wants an acknowledgement was taken in whole."""
+        """Record that a datagram that requests an acknowledgement was accepted."""
         acks = self.acks
         if number > acks.largest + 1:
-            # A gap: the sender can call it a loss once it knows of three later packets, so tell it then.
+            # A gap: the sender can declare a loss once three later packets arrived, so acknowledge then.
             if self._gap_ack_at is None:
                 self._gap_ack_at = number + REORDER_PACKETS - 1
             ack_now = ack_now or acks.largest < 0
@@ -189,7 +189,7 @@ class Receiver:
             acks.due_at = now + self._rates.ack_delay_s
 
     def ack_overdue(self) -> bool:
-        """So many packets are pending that an acknowledgement must be cut before more arrive."""
+        """Whether so many packets are pending that an acknowledgement must be built before more arrive."""
         return self.acks.pending >= MAX_PENDING
 
     def _deliver(self, complete: CompleteMessage, by_broadcast: bool) -> bool:
@@ -225,9 +225,9 @@ class Receiver:
         return True
 
     def inflate_step(self) -> bool:
-        """Inflate some more of the first message that waits for it; False where it turned out to be corrupt.
+        """Inflate more of the first waiting message. False if it turned out to be corrupt.
 
-        Its pieces were acknowledged already: only a faulty peer compresses what cannot be inflated.
+        Its fragments are already acknowledged: only a faulty peer sends what cannot be inflated.
         """
         inflating, received = self.inflating[0]
         if not inflating.step():

@@ -1,10 +1,10 @@
-"""Whether an opened datagram may be a recording: its date, what came lately beside it, and answers to our questions.
+"""Checks whether an opened datagram may be replayed: by its timestamp, by recent traffic, and by answers to challenges.
 
-1. A dated datagram is as late as its sender's clock says (`freshness`).
-2. One without a date (a piece in the middle of a message) is taken for as fresh as what came lately from its sender;
-   where that becomes long ago, the sender is asked.
-3. What is too late is dropped, and its sender asked (`paths`): an answer proves that it is there, and sets its clock
-   right. Questions are answered however late they are.
+1. A datagram with a timestamp is as late as its sender's clock says (`datagram_age`).
+2. One without a timestamp (a fragment in the middle of a message) counts as fresh while its sender sent something fresh
+   recently; after that the sender is challenged.
+3. A datagram that is too late is dropped and its sender challenged (`path_validation`): the answer proves that it is
+   there and corrects its clock. Pings are answered however late they are.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from udp_mesh.wire.frames import Frame, Heartbeat, Ping, Pong, Sent
 def data_lateness_s(
     state: State, session: Session, frames: bytes, link: str, source: Address, now: float
 ) -> float | None:
-    """Seconds for which a datagram in the channel between two boots was held back; None: it must not be taken."""
+    """Seconds by which a datagram between two boots was delayed. None: drop it."""
     clock = timestamp_of(frames)
     if session.challenges and _has_response(state, session, _small_frames(frames), clock, link, source, now):
         return 0.0
@@ -44,7 +44,7 @@ def data_lateness_s(
 
 
 def _small_frames(frames: bytes) -> list[Frame]:
-    """The frames of a datagram that may hold a ping or a pong; none where they are malformed (counted later)."""
+    """The frames of a datagram that may hold a ping or a pong; none if they are malformed (counted later)."""
     if frames[0] >= FRAGMENT:
         return []
     try:
@@ -56,7 +56,7 @@ def _small_frames(frames: bytes) -> list[Frame]:
 def long_lateness_s(
     state: State, session: Session, frames: Sequence[Frame], link: str, source: Address, now: float
 ) -> float | None:
-    """The same of a hello or an introduction; without a date, as earlier versions send it, it is taken."""
+    """The same for a HELLO or an INTRODUCTION; without a timestamp, as from earlier versions, it is accepted."""
     clock = None
     for frame in frames:
         if isinstance(frame, Sent) or (isinstance(frame, Heartbeat) and frame.clock_ms is not None):
@@ -73,7 +73,7 @@ def long_lateness_s(
 def broadcast_lateness_s(
     state: State, session: Session, frames: bytes, link: str, source: Address, now: float
 ) -> float | None:
-    """The same of a message to all; without a date, as it is where some node takes none, its number alone decides: the
+    """The same for a broadcast. Without a timestamp, which some peers do not accept, only its number decides:
     heartbeats are numbered in the same channel."""
     clock = timestamp_of(frames)
     late_s = 0.0 if clock is None else session.freshness.lateness_s(clock, now)
@@ -84,14 +84,15 @@ def broadcast_lateness_s(
 
 
 def timestamp_of(frames: bytes) -> int | None:
-    """The clock in the first frame of a datagram, where its date stands."""
+    """The timestamp at the front of a datagram, if it has one."""
     if frames[0] != Type.SENT or len(frames) < SENT_BYTES:
         return None
     return int.from_bytes(frames[1:SENT_BYTES], "big")
 
 
 def drop_stale(state: State, session: Session, frames: Sequence[Frame], link: str, source: Address, now: float) -> None:
-    """A recording; or its sender's clock stood still (its computer slept), and then its answer says so."""
+    """Drop a replayed datagram, or one whose sender's clock stood still (its computer was suspended): the answer to the
+    challenge shows which."""
     state.event_queue.counters.dropped_stale += 1
     for frame in frames:
         if isinstance(frame, Ping) and session.peer is not None:
@@ -108,7 +109,7 @@ def _has_response(
     source: Address,
     now: float,
 ) -> bool:
-    """Whether one of the frames answers a question of ours from where that went: then all of them are fresh."""
+    """Whether a frame answers a challenge from the challenged address: then all of the frames are fresh."""
     for frame in frames:
         if isinstance(frame, Pong):
             challenge = match_response(session, frame, link, source, now)
