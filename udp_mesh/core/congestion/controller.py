@@ -1,28 +1,28 @@
-"""What decides how many packets may be on their way to one peer: the seam, and the scheme that never decides anew.
+"""The interface of congestion controllers, and the fixed window.
 
-The law that follows the link is in `adaptive`.
+The controller that follows the link is in `delay_based`.
 """
 
 from typing import Protocol
 
 
 class CongestionController(Protocol):
-    """Decides how much may be in flight and how fast it leaves."""
+    """Decides how much may be in flight and how fast it is sent."""
 
     queue_share: float
-    """The part of a single sender's queue that is ours to keep (see `channel_share`)."""
+    """Our fraction of a single sender's queue (see `channel_share`)."""
 
     @property
     def cwnd(self) -> float:
-        """How many packets may be on their way."""
+        """The congestion window in packets."""
         ...
 
     def drain_overdue(self, now: float) -> bool:
-        """Whether a drain takes longer than what was on its way before it."""
+        """Whether a drain takes longer than the packets in flight before it."""
         ...
 
     def pacing_packets_per_s(self) -> float | None:
-        """Pacing (None: as fast as the window allows)."""
+        """The pacing rate (None: as fast as the window allows)."""
         ...
 
     def on_ack(
@@ -38,21 +38,21 @@ class CongestionController(Protocol):
         loss: float,
         now: float,
     ) -> None:
-        """`count` packets were newly acknowledged, up to number `largest`; `rate` is a delivery rate sample.
-        When the newest of them was sent, `ahead` others were in flight; `app_limited`: there was no more to send."""
+        """`count` packets were newly acknowledged, up to number `largest`; `rate` is a delivery rate sample. When the
+        newest of them was sent, `ahead` others were in flight; `app_limited`: there was no more to send."""
         ...
 
     def capacity_packets_per_s(self) -> float | None:
-        """Estimated packets/s of the path."""
+        """The estimated capacity of the path."""
         ...
 
     def assume_delivery(self) -> bool:
-        """Whether the link can be presumed to go on delivering as it did while acknowledgements are late."""
+        """Whether the link can be assumed to keep delivering while acknowledgements are late."""
         ...
 
 
 class FixedWindow:
-    """A number of packets, whatever happens: the paper's scheme."""
+    """A constant window, as in the paper."""
 
     __slots__ = ("cwnd", "queue_share")
 

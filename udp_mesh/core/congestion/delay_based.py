@@ -1,23 +1,20 @@
-"""How many packets may be on their way to one peer: delay decides, loss does not (radio loss is not congestion).
+"""Delay-based congestion control: round trip times decide, loss does not (radio loss is not congestion).
 
 1. Startup doubles the window once per round trip until the round trip has grown by `STARTUP_QUEUE_S`.
-2. Then, once per round trip: w <- w/2 + (w * least / standing + a) / 2, where a is `QUEUE_S` worth of packets (less on
-   a short path, more where packets are lost): the window settles where the sender keeps that much queue at the
-   bottleneck, and no more.
-3. w never exceeds by much what the measured delivery rate needs, plus a, and growth that delivers nothing more ends: a
-   queue too short to be seen as delay is not overrun.
-4. A *drain* lets the queue run empty for one round trip, so that the least round trip is seen again: after
-   `DRAIN_INTERVAL_S` without having seen it, and as soon as the round trip looks longer than our own queue explains. If
-   it stays long while the queue is empty, the route has changed: the window moves at once to the new round trip times
-   the delivery rate, by no more than startup would; on a route so long that this rate is none of its own it starts up
-   again.
-5. The least round trip is *proved* where it was seen with next to nothing of ours on its way. Once it differs from
-   that (the path changed, or no drain has seen the empty path for long) the next drain goes down to
-   `MIN_CWND` - 1 packets: a queue that stands for good would otherwise be taken for the path, and what it loses
-   for the loss of a radio.
+2. Then, once per round trip: w <- w/2 + (w * min_rtt / windowed_rtt + a) / 2, where a is `QUEUE_S` worth of packets
+   (less on a short path, more on a lossy one). The window settles where the sender keeps exactly that much queue at the
+   bottleneck.
+3. w never exceeds what the measured delivery rate needs, plus a, by much, and growth that delivers nothing more stops:
+   a queue too short to show as delay is not overrun.
+4. A *drain* empties the queue for one round trip, so that the minimum RTT is seen again: after `DRAIN_INTERVAL_S`
+   without seeing it, and as soon as the round trip is longer than our own queue explains. If it stays long with an
+   empty queue, the route has changed: the window moves at once to the new round trip times the delivery rate, by no
+   more than startup would. On a route too long for that rate to be its own, startup begins again.
+5. The minimum RTT is *verified* if it was seen with next to nothing in flight. Once it differs (the path changed, or no
+   drain has seen the empty path for long) the next drain goes down to `MIN_CWND` - 1 packets: otherwise a standing
+   queue would be taken for the path, and its losses for radio loss.
 
-The idea of step 2 is that of FAST TCP (Jin, Wei, Low 2004), that of steps 3 and 4 of BBR's bandwidth model (Cardwell
-and others 2016).
+Step 2 is based on FAST TCP (Jin, Wei, Low 2004), steps 3 and 4 on BBR's bandwidth model (Cardwell et al. 2016).
 """
 
 from collections import deque
@@ -26,113 +23,110 @@ from enum import Enum
 from udp_mesh.core.congestion.rtt import MIN_WINDOWED_RTT_S, RttEstimator
 
 QUEUE_S = 0.003
-"""Queue the sender keeps at the bottleneck: covers batched acknowledgements and pacing; adds this much to urgent
-latency."""
+"""Target queue at the bottleneck: covers batched acknowledgements and pacing, and adds this much to urgent latency."""
 
 MIN_QUEUE_S = 0.002
 QUEUE_PER_ROUND_TRIP = 0.3
-"""Acknowledgements come every few packets of a small window: on a short path less of a queue covers them."""
+"""On a short path the window is small and acknowledged every few packets, so less queue suffices."""
 
 LOSS_QUEUE_S = 0.002
 FULL_LOSS_QUEUE_AT = 0.05
-"""Losses leave holes in the queue: so much more of it keeps the link busy, up to what urgent messages can bear."""
+"""Losses leave holes in the queue: this much more keeps the link busy, limited by what urgent messages tolerate."""
 
 STARTUP_QUEUE_S = 0.006
-"""Growth of the round trip that ends the startup: more than the scatter of a radio, less than an urgent message's
-slack."""
+"""RTT growth that ends startup: more than a radio's jitter, less than the slack of an urgent message."""
 
 MIN_QUEUE_PACKETS = 2.0
 """The same at low rates: fewer packets leave the link idle between acknowledgements."""
 
 MIN_SHARED_QUEUE_PACKETS = 1.0
-"""The same where others send on the channel too: they keep it busy meanwhile."""
+"""The same if other nodes send on the channel too and keep it busy."""
 
 UNSHARED_FROM_LOSS = 0.2
-"""The more is lost the more often all wait at once, and the longer urgent messages may take: from this loss on the
+"""With more loss all nodes wait at once more often, and urgent messages may take longer: from this loss rate on, the
 queue is that of a single sender."""
 
 MIN_CWND = 4.0
-"""Packets: below, a lost packet has too few successors to be noticed without a timeout."""
+"""Packets: below this, a lost packet has too few successors to be detected without a timeout."""
 
 MAX_CWND = 8192.0
-"""Packets: 92 Mbit at 1400 B, more than any link these robots have; bounds the state kept per packet."""
+"""Packets: 92 Mbit at 1400 B, more than any link of these robots needs. Bounds the state per packet."""
 
 PACE_GAIN = 1.25
-"""The window, not the pacing, limits what is on its way: pacing only spreads it."""
+"""The window, not pacing, limits what is in flight: pacing only spreads it."""
 
 CAPACITY_GAIN = 1.05
-"""Pacing above the measured rate by this much notices when the link becomes faster, without building a queue."""
+"""Pacing this much above the measured rate detects a faster link without building a queue."""
 
 LOSS_GAIN = 0.3
-"""And by this much of the loss: its estimate scatters, and too slow a pace costs throughput."""
+"""Plus this fraction of the loss rate: its estimate is noisy, and pacing too slowly costs throughput."""
 
 MAX_LOSS = 0.35
-"""The measured rate is that of deliveries; what is lost comes on top, up to this share of what is sent."""
+"""The measured rate counts deliveries; lost packets are added, up to this fraction of what is sent."""
 
 INITIAL_CWND = 10.0
-"""Packets before anything is known (RFC 6928)."""
+"""Initial window in packets (RFC 6928)."""
 
 MIN_UPDATE_S = MIN_WINDOWED_RTT_S
-"""On links faster than this round trip the law runs at this pace: until then the standing round trip still tells of the
-window before."""
+"""Minimum update interval on links with a shorter round trip: until then the windowed RTT still reflects the previous
+window."""
 
 MIN_STARTUP_UPDATE_S = 0.004
-"""The same while starting, when only growth counts."""
+"""The same during startup, when only growth counts."""
 
 RATE_WINDOW_S = 2.0
-"""How long a measured delivery rate is believed."""
+"""How long a delivery rate sample is valid."""
 
 DRAIN_INTERVAL_S = 2.0
 DRAIN_ROUND_TRIPS = 15.0
-"""Between two drains, at least: each costs about a quarter of a round trip of throughput."""
+"""Minimum time between two drains: each costs about a quarter of a round trip of throughput."""
 
 UNVERIFIED_DRAIN_ROUND_TRIPS = 4.0
-"""The same while the least round trip is not proved: what is built on it is wrong meanwhile."""
+"""The same while the minimum RTT is not verified and everything based on it may be wrong."""
 
 DRAIN_FRACTION = 0.95
 DRAIN_PACKETS = 3
-"""Part of the pipe filled while draining, less these packets: on a short path a burst of them is the queue."""
+"""Fraction of the pipe kept full during a drain, less these packets: on a short path a burst of them is the queue."""
 
 GROWTH = 1.25
-"""Growth per round trip while the window is used up and yet no queue is seen: the link has become faster."""
+"""Growth per round trip while the window is used up without any queue: the link has become faster."""
 
 GROWTH_AFTER_ROUNDS = 3
-"""Round trips without a queue before growth: two happen by themselves around the law's balance."""
+"""Round trips without a queue before growth: two occur by chance near equilibrium."""
 
 FULL_GROWTH = 1.1
 FULL_ROUNDS = 3
-"""A link that did not deliver a tenth more after so many rounds of growth is full, whatever its delay says."""
+"""A link that delivers less than a tenth more after so many rounds of growth is full, whatever its delay."""
 
 GROWTH_PAUSE_S = 2.0
-"""How long after that growth is not tried again."""
+"""How long to wait after that before growing again."""
 
 RATE_BOUND = 1.2
 STARTUP_RATE_BOUND = 2.5
-"""The window never exceeds this many times what the measured rate needs; growing it must run ahead of the
-measurement."""
+"""Upper bounds of the window relative to what the measured rate needs; growth has to run ahead of the measurement."""
 
 ACK_BATCH_S = 0.008
-"""About how long batched acknowledgements hold packets in the window beyond the round trip."""
+"""About how long batched acknowledgements keep packets in the window beyond the round trip."""
 
 SUSPECT_QUEUE_S = 0.015
-"""Queueing of this much is more than our own window explains."""
+"""More queueing than our own window explains."""
 
 SUSPECT_DRAIN_INTERVAL_S = 0.3
 MAX_SUSPECT_DRAIN_INTERVAL_S = 4.0
-"""Between two drains on suspicion, doubled each time one finds nothing."""
+"""Minimum time between two drains on suspicion, doubled each time one finds nothing."""
 
 
 class Phase(Enum):
     STARTUP = 1
     CRUISE = 2
     DRAIN = 3
-    """Waiting until little enough is in flight."""
+    """Waiting until few enough packets are in flight."""
     HOLD = 4
     """The queue is empty: waiting for the round trip of a packet sent now."""
 
 
 class DelayBasedController:
-    """The law of the module's docstring."""
+    """The controller described in the module's docstring."""
 
     __slots__ = (
         "_cwnd_before_drain",
@@ -193,7 +187,7 @@ class DelayBasedController:
         return self._rates[0][1] if self._rates else None
 
     def assume_delivery(self) -> bool:
-        # A queue that our window does not explain is work enough for the link; and a drain wants it empty.
+        # A queue that our window does not explain keeps the link busy anyway, and a drain wants the queue empty.
         return bool(self._rates) and self.phase in (Phase.STARTUP, Phase.CRUISE) and not self._unexplained_queue()
 
     def drain_overdue(self, now: float) -> bool:
@@ -239,8 +233,8 @@ class DelayBasedController:
         self._last_rtts.append(rtt.latest_rtt)
         self._uncontended_acks = self._uncontended_acks + 1 if ahead < MIN_CWND - 1 else 0
         if app_limited and self._uncontended_acks >= 4 and min(self._last_rtts) > 1.15 * rtt.min_rtt + STARTUP_QUEUE_S:
-            # None of the four found more of ours on its way than a drain leaves: the path itself is longer now. (An
-            # application that pauses says nothing of that: a link that became slow still holds what it sent before.)
+            # None of the four had more of our packets ahead of it than a drain leaves: the path itself is longer now.
+            # (A pausing application alone proves nothing: a link that became slow still holds what was sent before.)
             rtt.reset_min_rtt(min(self._last_rtts), now)
             self._verified_min_rtt = rtt.min_rtt
         if self.phase is Phase.DRAIN:
@@ -267,7 +261,7 @@ class DelayBasedController:
         self._round_ends_at = next_number
         self._updated_at = now
         if rtt.latest_rtt <= rtt.min_rtt * 1.02 + 0.0005 and self._min_rtt_is_verified():
-            # The empty path was seen just now: no drain is needed to see it.
+            # The empty path was just seen: no drain is needed.
             self._drained_at = now
         self._update(app_limited=app_limited, now=now)
 
@@ -283,8 +277,8 @@ class DelayBasedController:
         )
 
     def _min_rtt_is_verified(self) -> bool:
-        """Whether the least round trip is the one seen when next to nothing of ours was on its way; otherwise it may
-        hold a queue that never ran empty."""
+        """Whether the minimum RTT was seen with next to nothing in flight; otherwise it may include a standing
+        queue."""
         min_rtt = self._rtt.min_rtt
         return (
             min_rtt is not None
@@ -292,7 +286,7 @@ class DelayBasedController:
         )
 
     def _jitter_s(self) -> float:
-        """What the packets that a drain leaves on their way may take, and a radio's scatter."""
+        """Serialization time of the packets left in flight by a drain, plus a radio's jitter."""
         return STARTUP_QUEUE_S / 3 + (MIN_CWND - 1) / (self.capacity_packets_per_s() or float("inf"))
 
     def _update(self, *, app_limited: bool, now: float) -> None:
@@ -300,7 +294,7 @@ class DelayBasedController:
         assert min_rtt is not None
         assert windowed_rtt is not None
         if self.phase is Phase.STARTUP:
-            # It begins with little on its way.
+            # Startup begins with little in flight.
             self._verified_min_rtt = min_rtt
             if not app_limited:
                 self._grow_startup(min_rtt, windowed_rtt, now)
@@ -343,14 +337,15 @@ class DelayBasedController:
             self.cwnd = self._bounded(min(target, 2 * self.cwnd), min_rtt, windowed_rtt)
 
     def _restart(self, packets: float) -> None:
-        """A route so much longer that what was measured on the one before does not tell how much it holds."""
+        """Start up again on a route so much longer that the measured rate says nothing about its capacity."""
         self.phase = Phase.STARTUP
         self.cwnd = min(MAX_CWND, max(INITIAL_CWND, packets))
         self._rates.clear()
         self._full_capacity, self._full_rounds = 0.0, 0
 
     def _grow_startup(self, min_rtt: float, windowed_rtt: float, now: float) -> None:
-        """Double, unless the link has not become faster by it for some round trips (its queue is too short to see)."""
+        """Double the window, unless that has not made the link faster for some round trips (its queue is too short to
+        see)."""
         capacity = self.capacity_packets_per_s() or 0.0
         if capacity > FULL_GROWTH * self._full_capacity:
             self._full_capacity = capacity
@@ -376,7 +371,7 @@ class DelayBasedController:
         return min(QUEUE_S, max(MIN_QUEUE_S, QUEUE_PER_ROUND_TRIP * min_rtt))
 
     def _shared_queue(self, queue_s: float, packets_per_s: float) -> float:
-        """Packets of queue: `queue_s` at this rate and a least number, less of both where others send too."""
+        """Queue in packets: `queue_s` at this rate, with a minimum; less of both if other nodes send too."""
         if self.queue_share == 1.0:
             return max(MIN_QUEUE_PACKETS, queue_s * packets_per_s)
         relief = min(1.0, self._loss / UNSHARED_FROM_LOSS)
@@ -389,7 +384,7 @@ class DelayBasedController:
         capacity = self.capacity_packets_per_s()
         if capacity is not None:
             factor = RATE_BOUND if self.phase is Phase.CRUISE and not self._growing else STARTUP_RATE_BOUND
-            # What waits for a batched acknowledgement is on its way too, and what is lost takes part in the window.
+            # Packets waiting for a batched acknowledgement are in flight too, and lost ones occupy the window.
             pipe = capacity * (min_rtt + ACK_BATCH_S) / (1 - min(self._loss, MAX_LOSS))
             packets = min(packets, max(INITIAL_CWND, factor * pipe + self._queue_packets(windowed_rtt)))
         return min(MAX_CWND, max(MIN_CWND, packets))
@@ -414,7 +409,7 @@ class DelayBasedController:
         hold_min_rtt = self._hold_min_rtt
         self.phase = Phase.CRUISE
         self._drained_at = self._updated_at = now
-        # The queue is empty because of the drain: no reason to grow for the next round trips.
+        # The drain emptied the queue: no reason to grow for the next round trips.
         self._grow_after = now + 3 * self._windowed_rtt_before_drain
         self._suspect_rounds = 0
         throughput = self._cwnd_before_drain / self._windowed_rtt_before_drain
@@ -440,12 +435,12 @@ class DelayBasedController:
             return
         base = min(hold_min_rtt, self._windowed_rtt_before_drain) if hold_min_rtt != float("inf") else min_rtt
         queue = self._shared_queue(self._target_queue_s(), throughput)
-        # The rate may have changed with the route: no further ahead of what was measured than when starting.
+        # The rate may have changed with the route: stay within the bound of startup.
         max_cwnd = min(MAX_CWND, STARTUP_RATE_BOUND * max(INITIAL_CWND, self._cwnd_before_drain))
         self.cwnd = min(max_cwnd, max(MIN_CWND, throughput * base + queue))
 
     def _add_rate_sample(self, rate: float, *, app_limited: bool, now: float) -> None:
-        """Windowed maximum; a rate the application limited says nothing unless it is larger."""
+        """Add to the windowed maximum; an application-limited sample counts only if it is larger."""
         rates = self._rates
         while rates and rates[0][0] < now - RATE_WINDOW_S and not (app_limited and len(rates) == 1):
             rates.popleft()

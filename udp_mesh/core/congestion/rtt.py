@@ -1,33 +1,34 @@
-"""The round trip to one peer: a sample per acknowledgement -> smoothed, least and standing round trip.
+"""Round-trip time to one peer: a sample per acknowledgement -> smoothed, minimum and windowed RTT.
 
-*Least* is the path without queues (minimum over about 5 s), *standing* is what packets take now, free of single late
-acknowledgements (minimum over half a round trip, at least 20 ms). Smoothed and variation as RFC 6298.
+*Minimum* is the path without queues (over about 5 s). *Windowed* is the current round trip without single late
+acknowledgements (minimum over half a round trip, at least 20 ms). Smoothed RTT and variation follow RFC 6298.
 """
 
 from collections import deque
 
 MIN_RTT_WINDOW_S = 5.0
-"""Longer hides a route that became longer for that time; shorter forgets the empty path between two drains."""
+"""A longer window hides for that time that a route became longer; a shorter one forgets the empty path between two
+drains."""
 
 MIN_RTT_WINDOW_ROUND_TRIPS = 37.5
-"""The same on long paths, 2.5 drains of 15 round trips apart."""
+"""The same on long paths: 2.5 drains that are 15 round trips apart."""
 
 MIN_WINDOWED_RTT_S = 0.020
-"""At least this much: fast links acknowledge in bursts of a scheduler's tick."""
+"""Lower bound of the window: fast links acknowledge in bursts of a scheduler tick."""
 
 INITIAL_PTO_S = 0.25
-"""Until the first sample: the longest wait between probes of a silent peer."""
+"""Until the first sample: the longest probe interval."""
 
 MIN_PTO_ROUND_TRIPS = 2.0
-"""Round trips that an answer is always waited for: to send all again before it can be acknowledged would keep a slow
-path as slow as it is."""
+"""An acknowledgement is always awaited for so many round trips: retransmitting everything before it can arrive would
+keep a slow path slow."""
 
 MAX_RTT_OUTLIER_S = 2.0
-"""A round trip longer than this, and than twice what is usual, counts as that: a process or machine that stood still in
-the middle would otherwise be taken for a path on which a packet in some seconds is enough."""
+"""A longer sample that is also more than twice the usual is clamped: a process or machine suspended in between would
+otherwise look like a path on which one packet every few seconds suffices."""
 
 TIMER_GRANULARITY_S = 0.005
-"""Added to timeouts: drivers and radios are late by this much without anything being lost."""
+"""Added to timeouts: drivers and radios are late by this much without any loss."""
 
 
 class RttEstimator:
@@ -45,7 +46,7 @@ class RttEstimator:
         self._windowed_samples: deque[tuple[float, float]] = deque()
 
     def sample(self, round_trip_s: float, now: float) -> None:
-        """One measured round trip, without the time the peer held its acknowledgement back."""
+        """Add a measured round trip, without the time the peer held its acknowledgement back."""
         round_trip_s = min(round_trip_s, max(MAX_RTT_OUTLIER_S, 2 * (self.smoothed_rtt or 0.0)))
         self.latest_rtt = round_trip_s
         if self.smoothed_rtt is None:
@@ -61,14 +62,14 @@ class RttEstimator:
         )
 
     def reset_min_rtt(self, round_trip_s: float, now: float) -> None:
-        """The path changed: its least round trip is now this."""
+        """Replace the minimum RTT: the path changed."""
         self._min_samples.clear()
         self._min_samples.append((now, round_trip_s))
         self.min_rtt = round_trip_s
 
     def pto_s(self, ack_delay_s: float, max_s: float = float("inf")) -> float:
-        """How long after the last progress the oldest packet or its acknowledgement must be lost; at most `max_s` on
-        a path that is not slow itself."""
+        """Probe timeout (RFC 9002, 6.2): time after the last progress in which the oldest packet or its acknowledgement
+        must have been lost; at most `max_s` on a path that is not itself slow."""
         if self.smoothed_rtt is None:
             return min(max_s, INITIAL_PTO_S)
         timeout_s = self.smoothed_rtt + max(4 * self.rttvar, TIMER_GRANULARITY_S) + ack_delay_s
@@ -76,7 +77,7 @@ class RttEstimator:
 
 
 def _minimum(samples: deque[tuple[float, float]], value: float, now: float, window_s: float) -> float:
-    """Add `value` to a sliding minimum; returns the minimum of the window. Amortized constant time."""
+    """Add `value` to a sliding minimum and return the minimum of the window. Amortized constant time."""
     while samples and samples[-1][1] >= value:
         samples.pop()
     samples.append((now, value))

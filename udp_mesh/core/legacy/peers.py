@@ -1,11 +1,11 @@
-"""Peers that speak the fielded format, each named by configuration: both directions, priorities kept.
+"""Peers that speak the legacy format, each named in the configuration. Both directions, with priorities.
 
-A datagram of that format is taken only from a configured address, and only under the configured name: what it claims
-about itself is not authenticated. Heartbeats, offline after silence, queues and outcomes are as for other peers.
+A legacy datagram is accepted only from a configured address and under the configured name: what it claims about itself
+is not authenticated. Heartbeats, offline detection, queues and outcomes work as for other peers.
 
-A robot that moves over is noticed: once a node of our own format has proved itself under the configured name, it is
-that peer, whatever the configuration still says, and the fielded format is not spoken with it any more. What waits for
-it begins anew (`presence`). Broadcasts stay covered for as long as the configuration names any fielded peer.
+Upgrades are detected: once a node of our own format is verified under the configured name, it is that peer, whatever
+the configuration says, and the legacy format is no longer spoken with it. Pending messages restart (`peer_lifecycle`).
+Broadcasts stay encapsulated while the configuration names any legacy peer.
 """
 
 from udp_mesh.core.events import MessageReceived, PeerOffline, PeerOnline
@@ -34,21 +34,21 @@ from udp_mesh.wire.legacy import (
 from udp_mesh.wire.limits import PRIORITY_LEVELS
 
 LEGACY_HEARTBEAT_S = 1.0
-"""The fielded period; its receivers report a peer offline after ten."""
+"""The legacy heartbeat period; legacy receivers report a peer offline after ten."""
 
 RESTARTED_AFTER_S = 3.5
-"""Without a sign of life for this long a fielded program may have been restarted: it says a heartbeat a second."""
+"""After this long without a datagram a legacy program may have been restarted: it sends a heartbeat every second."""
 
 SETTLE_S = 10.0
-"""After its first heartbeat then, before what an outbox keeps leaves: the program acknowledges from the start, but what
-arrives before its reader has subscribed is lost there (on a slow computer that takes long)."""
+"""After its first heartbeat, how long outboxes wait before they send: the program acknowledges from the start, but what
+arrives before its reader has subscribed is lost (which takes long on a slow computer)."""
 
 MAX_TOPICS = 256
-"""Topics of one fielded peer: nothing it says is authenticated, and each may become a ROS topic here."""
+"""Topics of one legacy peer: nothing it sends is authenticated, and each may become a ROS topic here."""
 
 
 class LegacyPeer:
-    """One fielded peer."""
+    """One legacy peer."""
 
     __slots__ = (
         "_upgraded",
@@ -78,14 +78,14 @@ class LegacyPeer:
         self.last_heard = float("-inf")
         self.acks = LegacyAcks()
         self.settled_at: float | None = None
-        """When what waits in outboxes may leave; None: it has."""
+        """When outboxes may send; None: they do already."""
         self.topics: set[str] = set()
         self.received_bytes = 0
         self.meters = peer.legacy_meters = Meters(0.0)
         self._upgraded = False
 
     def is_upgraded(self) -> bool:
-        """Whether a node of our own format speaks for it by now."""
+        """Whether a node of our own format has taken its place."""
         if not self._upgraded and self.peer.session is not None:
             self._upgraded = True
             self.peer.legacy = self.peer.settling = False
@@ -93,7 +93,7 @@ class LegacyPeer:
 
 
 class LegacyPeers:
-    """All of them, by host address. `next_at` is when something is due."""
+    """All legacy peers by host address. `next_at` is when something is due."""
 
     __slots__ = ("_by_host", "_heartbeat_at", "_state")
 
@@ -104,7 +104,7 @@ class LegacyPeers:
         self.apply()
 
     def apply(self) -> None:
-        """Follow the settings' neighbours; peers that stay keep everything."""
+        """Apply the settings' neighbors; peers that stay keep their state."""
         desired = {neighbour.address[0]: neighbour for neighbour in self._state.settings.neighbours if neighbour.legacy}
         for host in list(self._by_host):
             if host not in desired or self._by_host[host].neighbour != desired[host]:
@@ -118,7 +118,7 @@ class LegacyPeers:
                     self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings, self._state.rng)
 
     def _drop(self, gone: LegacyPeer) -> None:
-        """It is not named any more; one that was never heard, and for which nothing waits, was never there."""
+        """Remove a peer no longer configured; forget it completely if it was never heard and nothing waits for it."""
         peer, state = gone.peer, self._state
         peer.legacy = peer.settling = False
         peer.legacy_meters = None
@@ -131,11 +131,11 @@ class LegacyPeers:
         return len(self._by_host)
 
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
-        """One datagram without our mark: the fielded format from a configured address, or nothing of ours."""
+        """Process a datagram without our mark: the legacy format from a configured address, or foreign."""
         counters = self._state.event_queue.counters
         legacy = self._by_host.get(source[0])
         if legacy is None or legacy.is_upgraded() or source != legacy.neighbour.address:
-            # Fielded programs send from the port they listen on; another one on that computer is not believed.
+            # Legacy programs send from the port they listen on; other ports of that computer are not trusted.
             counters.dropped_unauthenticated += 1
             return
         try:
@@ -201,7 +201,7 @@ class LegacyPeers:
             )
 
     def _topic_allowed(self, legacy: LegacyPeer, message: PriorityMeshData) -> bool:
-        """Whether a message's topic and type are names of ROS, and its topics not too many."""
+        """Whether a message's topic and type are valid ROS names, and its topics not too many."""
         if not is_ros_name(message.topic) or not is_ros_type(message.type_name):
             return False
         if message.topic not in legacy.topics:
@@ -215,7 +215,7 @@ class LegacyPeers:
             self._state.outgoing.append(Datagram(legacy.link, legacy.address, encode_legacy(ack), True))
 
     def encapsulate_broadcasts(self, out: list[Datagram]) -> list[Datagram]:
-        """The datagrams, those to all in a cover that fielded programs take for one of theirs."""
+        """Encapsulate broadcasts so that legacy programs ignore them."""
         to_all = {link.broadcast for link in self._state.links.values()} | {None}
         return [
             datagram._replace(data=encapsulate(datagram.data)) if datagram.destination in to_all else datagram
@@ -223,14 +223,14 @@ class LegacyPeers:
         ]
 
     def send(self, now: float, out: list[Datagram]) -> None:
-        """Fragments that may leave now."""
+        """Send the fragments that may be sent now."""
         for legacy in self._active():
             if legacy.link and (legacy.peer.sender.pending or legacy.sender.timer() is not None):
                 legacy.sender.send(legacy.link, legacy.address, now, out)
                 report_ended(self._state, legacy.peer, now)
 
     def next_at(self) -> float:
-        """When `handle_timer` wants to be called."""
+        """When `handle_timer` is due."""
         if not self._by_host:
             return float("inf")
         at = self._heartbeat_at
@@ -241,13 +241,13 @@ class LegacyPeers:
         return at
 
     def handle_timer(self, now: float) -> None:
-        """Acknowledgements that are due; heartbeats, silences and purges, once a second."""
+        """Send acknowledgements that are due; once a second heartbeats, offline checks and purges."""
         for legacy in self._active():
             if legacy.link:
                 self._acknowledge(legacy, legacy.acks.due(now))
         if not self._by_host or now < self._heartbeat_at:
             return
-        # This process did not run for so long: silence meanwhile was ours.
+        # This process was suspended for that long: the silence was ours.
         suspended_s = now - self._heartbeat_at if self._heartbeat_at != float("-inf") else 0.0
         self._heartbeat_at = now + LEGACY_HEARTBEAT_S
         state = self._state
@@ -284,7 +284,7 @@ class LegacyPeers:
         return [legacy for legacy in self._by_host.values() if not legacy.is_upgraded()]
 
     def _links(self, legacy: LegacyPeer) -> list[LinkInfo]:
-        # The fielded format has room for an IPv4 address only.
+        # The legacy format has room for an IPv4 address only.
         links = [link for link in self._state.links.values() if ":" not in link.address[0]]
         named = [link for link in links if link.name == (legacy.neighbour.link or legacy.link)]
         return named or links

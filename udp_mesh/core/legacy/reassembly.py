@@ -1,9 +1,8 @@
-"""Fragments of one peer of the fielded format -> whole messages, each once, within a memory cap.
+"""Fragments of one legacy peer -> complete messages, each once, within a memory cap.
 
-Unlike the fielded receiver this one allocates nothing from the wire, remembers finished messages so that a repeated
-fragment opens no new one, and gives an old partial message up when its number comes around again. Numbers start at 1
-whenever the fielded program is started: what a fragment holds, not its number alone, tells a repetition from a new
-message.
+Unlike the legacy receiver, this one allocates nothing from numbers on the wire, remembers finished messages so that a
+repeated fragment starts no new one, and drops an old partial message when its number wraps around. Numbers restart at 1
+with the legacy program: the contents of a fragment, not its number alone, distinguish a repetition from a new message.
 """
 
 import zlib
@@ -16,21 +15,22 @@ from udp_mesh.wire.legacy import LegacyPayload, PriorityMeshData, decode_mesh_da
 from udp_mesh.wire.limits import MAX_LEGACY_FRAGMENT_BYTES
 
 PARTIAL_TIMEOUT_S = 10.0
-"""A message whose fragments stop for this long is given up (the fielded system's timeout)."""
+"""A message is dropped after this long without a fragment (the timeout of the legacy system)."""
 
 FINISHED_REMEMBERED = 1024
 """Finished messages of one peer: far fewer than its 32,767 numbers, far more than its window of three."""
 
 FINISHED_FOR_S = 30.0
-"""A number finished this long ago belongs to a new message."""
+"""A number finished longer ago belongs to a new message."""
 
 REPEATED_WITHIN_S = 2.0
-"""The network repeats a fragment within this; the fielded sender never does, and takes longer to start again."""
+"""The network repeats a fragment within this time; the legacy sender never does, and takes longer to restart."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Finished:
-    """What tells a repeated fragment of a finished message from the first one of another with the same number."""
+    """Distinguishes a repeated fragment of a finished message from the first one of a new message with the same
+    number."""
 
     at: float
     total: int
@@ -72,7 +72,7 @@ class LegacyReassembly:
         return len(self._partials)
 
     def add(self, fragment: LegacyPayload, now: float) -> tuple[bool, PriorityMeshData | None]:
-        """(whether to acknowledge, the message if this completes one); raises DecodeError for a corrupt message."""
+        """Returns (whether to acknowledge, the completed message if any). Raises DecodeError for a corrupt message."""
         finished = self._finished.get(fragment.sequence)
         if finished is not None:
             if finished.repeats(fragment, now):
@@ -85,11 +85,11 @@ class LegacyReassembly:
             or now - partial.touched_at > PARTIAL_TIMEOUT_S
             or partial.payloads.get(fragment.position, fragment.data) != fragment.data
         ):
-            # The number came around, or the sender started anew: these are two messages, and the older one is over.
+            # The number wrapped around, or the sender restarted: this is a new message, and the older one is over.
             self._drop(fragment.sequence)
             partial = None
         if (fragment.total - 1) * MAX_LEGACY_FRAGMENT_BYTES > self._limits.message_bytes:
-            # Acknowledged all the same: the fielded sender takes a missing answer for a lost peer and drops everything.
+            # Acknowledged anyway: without an answer the legacy sender assumes a lost peer and drops everything.
             self.over_limit += 1
             return True, None
         if partial is None:
@@ -119,7 +119,7 @@ class LegacyReassembly:
         return True, decode_mesh_data(body)
 
     def purge(self, now: float) -> None:
-        """Give up each message, by its own age, whose fragments stopped."""
+        """Drop each message that received no fragment for too long."""
         for sequence in [
             sequence for sequence, partial in self._partials.items() if now - partial.touched_at > PARTIAL_TIMEOUT_S
         ]:

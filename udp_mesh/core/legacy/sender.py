@@ -1,7 +1,7 @@
-"""Messages to one peer of the fielded format: pieces in priority order, a window of three, resent until acknowledged.
+"""Messages to one legacy peer: fragments in priority order, a window of three, retransmitted until acknowledged.
 
-The fielded receiver acknowledges every fragment at once; the fielded sender never resent one. Here a fragment is sent
-again when its acknowledgement is overdue by the measured round trip, and a silent peer is probed with single
+The legacy receiver acknowledges every fragment at once; the legacy sender never retransmits. This sender retransmits a
+fragment when its acknowledgement is overdue by the measured round trip, and probes an unresponsive peer with single
 fragments.
 """
 
@@ -28,52 +28,52 @@ from udp_mesh.wire.legacy import (
 from udp_mesh.wire.limits import MAX_LEGACY_FRAGMENT_BYTES, PRIORITY_LEVELS
 
 LEGACY_WINDOW = 3
-"""Fragments in flight to a fielded peer: its own choice, above which its radios were seen to interfere."""
+"""Fragments in flight to a legacy peer: the value it uses itself; with more, its radios were seen to interfere."""
 
 TRIES_BEFORE_UNRESPONSIVE = 3
-"""Tries of one fragment, with nothing acknowledged meanwhile, after which only single probes leave."""
+"""Attempts at one fragment, with nothing acknowledged meanwhile, after which only single probes are sent."""
 
 MAX_DOUBLINGS, MAX_DOUBLINGS_WHILE_ACKED = 3, 1
-"""How often the patience with one fragment doubles. Of a peer that acknowledges others some are lost, and with patience
-for that an urgent one would take most of a second; once it doubles all the same: the path may have become slower."""
+"""How often the timeout of a fragment doubles. If the peer acknowledges others, some fragments are simply lost, and
+waiting longer would cost an urgent one most of a second. It still doubles once: the path may have become slower."""
 
 MIN_TIMEOUT_S = 0.025
-"""Before a fragment is sent again at the earliest: fielded programs answer when their interpreter gets to it."""
+"""Earliest retransmission: legacy programs answer when their interpreter is scheduled."""
 
 MAX_TIMEOUT_S = 0.2
-"""What that grows to where both tries of a fragment are answered: then the second was needless, and a message of one
-fragment arrived twice over there, where no finished message is remembered."""
+"""Upper bound of that minimum, which grows if both transmissions of a fragment are acknowledged: the second was
+needless, and a one-fragment message was delivered twice, because finished messages are not remembered there."""
 
 RESENT_REMEMBERED = 64
-"""Fragments answered after a resend of which another answer may come."""
+"""Fragments acknowledged after a retransmission that may be acknowledged again."""
 
 TIMEOUT_DECAY = 0.995
-"""Per answer at the first try, back towards `MIN_TIMEOUT_S`: some hundred answers after it was needed."""
+"""Decay towards `MIN_TIMEOUT_S` per acknowledgement of a first attempt: it takes some hundred of them."""
 
 
 @dataclass(slots=True)
 class _SentFragment:
-    """One fragment on its way."""
+    """One fragment in flight."""
 
     message: OutgoingMessage
     position: int
     sent_at: float
     tries: int
     acks: int
-    """Acknowledgements of any fragment that had come when it was sent last."""
+    """Acknowledgements of any fragment received when it was last sent."""
     unanswered: int
-    """Its tries since the last of them."""
+    """Its attempts since the last of them."""
 
 
 def can_publish(type_name: str) -> bool:
-    """Whether a fielded robot can publish a message of this type: `pkg/Type`, or one not said. Anything else (a
-    bridge's own messages, ROS 2, Zenoh) ends the callback of its reader with a traceback."""
+    """Whether a legacy robot can publish a message of this type: `pkg/Type`, or none given. Anything else (a bridge's
+    own messages, ROS 2, Zenoh) ends its reader's callback with a traceback."""
     name = type_name.partition(" ")[0]
     return not name or is_ros_type(name)
 
 
 class LegacySender:
-    """The sending half for one fielded peer; queues and outcomes are those of its `Sender`."""
+    """The sending half for one legacy peer; queues and outcomes are those of its `Sender`."""
 
     __slots__ = (
         "_acks",
@@ -90,7 +90,7 @@ class LegacySender:
     )
 
     def __init__(self, sender: Sender, own_name: str, first_sequence: int) -> None:
-        """`first_sequence` is drawn for each run: the peer may still hold pieces of our last one (its defect 8)."""
+        """`first_sequence` is random per run: the peer may still hold fragments of our previous run (its defect 8)."""
         self.sender = sender
         self.unresponsive = False
         self._acks = 0
@@ -104,7 +104,7 @@ class LegacySender:
         self._fragments: dict[OutgoingMessage, tuple[int, list[bytes]]] = {}
 
     def send(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
-        """What may leave now: overdue fragments first by age, then new ones, most urgent first."""
+        """Send what may be sent now: overdue fragments first, then new ones, most urgent first."""
         self._forget_ended()
         self._resend(link, address, now, out)
         sender = self.sender
@@ -128,7 +128,7 @@ class LegacySender:
                     sender.finish(message, Outcome.SENT)
 
     def acknowledge(self, sequence: int, position: int, now: float) -> None:
-        """The peer has this fragment; unknown ones are ignored."""
+        """Process an acknowledgement; unknown ones are ignored."""
         sent = self._in_flight.pop((sequence, position), None)
         self.unresponsive = False
         self._acks += 1
@@ -143,7 +143,7 @@ class LegacySender:
                 self._resent.popitem(last=False)
         else:
             self._min_timeout_s = max(MIN_TIMEOUT_S, TIMEOUT_DECAY * self._min_timeout_s)
-            # Karn: which try a later acknowledgement answers is unknown.
+            # Karn's algorithm: after a retransmission the acknowledged attempt is unknown.
             self.sender.rtt.sample(max(1e-5, now - sent.sent_at), now)
         message = sent.message
         if not message.ended and message.mark_arrived(position):
@@ -154,7 +154,7 @@ class LegacySender:
         self.sender.delivered_at = now
 
     def on_activity(self) -> None:
-        """Anything from the peer ends its silence: everything on its way is due at once."""
+        """Something came from an unresponsive peer: everything in flight is due at once."""
         if self.unresponsive:
             self.unresponsive = False
             for sent in self._in_flight.values():
@@ -184,14 +184,14 @@ class LegacySender:
             self._send(sent.message, sent.position, sent.tries + 1, link, address, now, out)
             self.sender.retransmitted += 1
             if self.unresponsive:
-                # One probe; the others wait until it is answered.
+                # One probe; the others wait until it is acknowledged.
                 for other in self._in_flight.values():
                     if other is not sent:
                         other.sent_at = now
                 break
 
     def _begin(self, message: OutgoingMessage, now: float) -> bool:
-        """Serialize, cut and number; False if the format cannot carry it (it then ends as refused)."""
+        """Serialize, fragment and number the message. False if the format cannot carry it (it then ends as refused)."""
         accepted = message.accepted
         if not can_publish(accepted.channel.type_name):
             return False
@@ -200,7 +200,7 @@ class LegacySender:
         seconds = int(now)
         data = PriorityMeshData(
             self._own_name,
-            # what our bridges add behind the type's name (its md5sum), a fielded robot would take for the type
+            # Our bridges append an md5sum to the type name; a legacy robot would take it for part of the type.
             channel.type_name.partition(" ")[0],
             message.priority,
             channel.name,
@@ -220,7 +220,7 @@ class LegacySender:
         return True
 
     def _next_sequence(self) -> int:
-        """The next number after the wrap not in use: a new message never meets an old one's pieces."""
+        """The next number not in use: a new message never meets an old one's fragments."""
         while True:
             self._sequence = self._sequence % LAST_SEQUENCE + 1
             if self._sequence not in self._sequences:
