@@ -1,10 +1,9 @@
-"""Messages to all in one datagram: sealed once for everyone, sent on every link, and repaired where their topic says
-so.
+"""Broadcast messages: sealed once, sent on every link in one datagram, and repaired if their topic says so.
 
-Sending: a cast waits on its priority level and leaves between the peers' pieces of that level; small urgent ones leave
-twice once loss is seen. Casts with repair are numbered 0, 1, 2, ... and kept for a while; the others are numbered
-apart. Receiving: a gap in the numbers (or a heartbeat that counts further) is asked for with a Nack after a short
-random wait, again a few times, and answered per peer, or with a Cancel where it is no longer kept.
+Sending: a broadcast waits on its priority level and is sent between the peers' fragments of that level; small urgent
+ones are sent twice once loss is seen. Broadcasts with repair are numbered 0, 1, 2, ... and kept for a while; the others
+are numbered separately. Receiving: after a short random delay a gap in the numbers (or a heartbeat that counts further)
+is requested with a Nack, a few times. The answer is a unicast copy, or a Cancel if it is no longer kept.
 """
 
 from collections import OrderedDict, deque
@@ -22,22 +21,22 @@ from udp_mesh.wire.frames import Fragment, Frame, MessageFlag, MessageHead, Nack
 from udp_mesh.wire.limits import PRIORITY_LEVELS
 
 FIRST_UNREPAIRED_NUMBER = 1 << 31
-"""Numbers of casts without repair start here, so that a lost one leaves no gap among those with repair."""
+"""First number of broadcasts without repair, so that losing one leaves no gap among those with repair."""
 
 NACK_DELAY_S = 0.02
-"""Between noticing a gap and asking: a reordered cast still comes, and not everyone asks at once."""
+"""Delay from noticing a gap to the Nack: a reordered broadcast still arrives, and not all receivers ask at once."""
 
 NACK_INTERVAL_S = 0.25
-"""Between two requests for one cast: a round trip and a resend, generously."""
+"""Between two Nacks for one broadcast: generously a round trip and a retransmission."""
 
 MAX_NACKS = 8
 
 MAX_MISSING = 256
-"""Casts asked for at a time per peer: a sender that jumps ahead must not make us ask for millions."""
+"""Broadcasts requested at a time per peer: a sender whose numbers jump ahead must not cause millions of requests."""
 
 
 class BroadcastQueue:
-    """Casts waiting to leave, by level; `waiting` as in `Scheduler`."""
+    """Broadcasts waiting to be sent, by level; `waiting` as in `Scheduler`."""
 
     __slots__ = (
         "_copies",
@@ -62,7 +61,7 @@ class BroadcastQueue:
 
     @property
     def next_number(self) -> int:
-        """Of the next cast with repair."""
+        """Number of the next broadcast with repair."""
         return self._number
 
     @property
@@ -80,7 +79,7 @@ class BroadcastQueue:
         self.waiting |= 1 << topic.priority
 
     def reprioritize(self) -> None:
-        """Topics changed their priorities: what waits moves to its new level."""
+        """Move waiting broadcasts to their topics' new levels."""
         waiting = [accepted for level in self._levels for accepted in level]
         for level in self._levels:
             level.clear()
@@ -90,7 +89,7 @@ class BroadcastQueue:
             self.waiting |= 1 << accepted.channel.topic.priority
 
     def queued(self) -> int:
-        """Casts that have not left."""
+        """Broadcasts not sent yet."""
         return sum(len(level) for level in self._levels)
 
     def send_level(
@@ -106,9 +105,8 @@ class BroadcastQueue:
         repairable_limit_bytes: int,
         max_timestamped_bytes: int,
     ) -> None:
-        """Let the casts of a level leave on all `paths` (link, address); `copy_after_s` sends them a second time
-        then. Those of at
-        most `max_timestamped_bytes` say when they left."""
+        """Send the broadcasts of a level on all `paths` (link, address); `copy_after_s` sends them once more after that
+        time. Those of at most `max_timestamped_bytes` carry a timestamp."""
         level = self._levels[priority]
         paths = list(paths)
         while level:
@@ -128,7 +126,7 @@ class BroadcastQueue:
             datagrams = [Datagram(link, address, data, urgent) for link, address in paths]
             out.extend(datagrams)
             if copy_after_s is not None:
-                # The same packet number: whoever has it drops the copy before deciphering it.
+                # The copy has the same packet number: nodes that have it drop the copy before decrypting it.
                 self._copies.append((now + copy_after_s, datagrams))
         self.waiting &= ~(1 << priority)
 
@@ -137,12 +135,12 @@ class BroadcastQueue:
             out.extend(self._copies.popleft()[1])
 
     def next_at(self) -> float:
-        """When something wants to leave that could not yet."""
+        """When something can be sent that could not be sent yet."""
         at = self._copies[0][0] if self._copies else float("inf")
         return min(at, self.free_at) if self.waiting else at
 
     def repair(self, number: int) -> AcceptedMessage | None:
-        """The cast of this number, if still kept."""
+        """The broadcast with this number, if still kept."""
         return self._repairable.get(number)
 
     def _frames(self, accepted: AcceptedMessage, now: float, limit_bytes: int) -> tuple[TopicAnnounce, Fragment]:
@@ -168,7 +166,7 @@ class BroadcastQueue:
 
 
 def _with_timestamp(frames: tuple[TopicAnnounce, Fragment], accepted: AcceptedMessage, now: float) -> list[Frame]:
-    """The same, with the time and what remains of the message's life."""
+    """The frames with a timestamp and the message's remaining lifetime."""
     announce, fragment = frames
     assert fragment.head is not None
     head = replace(fragment.head, life_ms=accepted.life_ms(now))
@@ -176,22 +174,22 @@ def _with_timestamp(frames: tuple[TopicAnnounce, Fragment], accepted: AcceptedMe
 
 
 class NackRepair:
-    """Which casts of one peer are missing here, and when to ask for them."""
+    """The broadcasts of one peer that are missing here, and when to request them."""
 
     __slots__ = ("_expected", "_missing", "_rng", "next_at")
 
     def __init__(self, rng: RandomSource) -> None:
         self._rng = rng
         self._expected: int | None = None
-        """All numbers below were received, are missing, or were given up."""
+        """All lower numbers were received, are missing, or were abandoned."""
         self._missing: dict[int, tuple[float, int]] = {}
-        """Number -> (when to ask, how often asked)."""
+        """Number -> (when to request it, how often it was requested)."""
         self.next_at = float("inf")
 
     def on_counter(self, next_number: int, now: float, received: RangeSet) -> None:
-        """A heartbeat counts casts up to `next_number`: those not here are missing."""
+        """Process a heartbeat's counter: broadcasts below `next_number` that are not here are missing."""
         if self._expected is None:
-            # Casts from before we met are not for us.
+            # Broadcasts from before we met are not for us.
             self._expected = next_number
             return
         if next_number <= self._expected:
@@ -204,7 +202,7 @@ class NackRepair:
         self._expected = next_number
 
     def on_received(self, number: int, now: float, received: RangeSet) -> None:
-        """A cast with repair arrived."""
+        """Record the arrival of a broadcast with repair."""
         self._missing.pop(number, None)
         if self._expected is None:
             self._expected = number
@@ -213,11 +211,11 @@ class NackRepair:
             self._expected = number + 1
 
     def abandon(self, number: int) -> None:
-        """The sender no longer has it."""
+        """Stop requesting a broadcast that the sender no longer keeps."""
         self._missing.pop(number, None)
 
     def due_nacks(self, now: float) -> list[Nack]:
-        """What to ask for now."""
+        """The Nacks to send now."""
         nacks = []
         for number, (at, times) in list(self._missing.items()):
             if at > now:

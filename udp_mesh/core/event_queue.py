@@ -1,4 +1,4 @@
-"""What the node has to tell: events in order, bounded, and counters."""
+"""The node's event queue (bounded, in order) and its counters."""
 
 from collections import deque
 
@@ -7,7 +7,7 @@ from udp_mesh.core.events import Event, MessageReceived
 
 
 class EventQueue:
-    """Events not yet fetched and totals. A driver that stops reading loses the oldest received messages, never
+    """Events not fetched yet, and totals. If the driver stops reading, the oldest received messages are dropped, never
     outcomes."""
 
     __slots__ = ("_events", "_limit", "counters")
@@ -28,7 +28,7 @@ class EventQueue:
 
     @property
     def has_events(self) -> bool:
-        """Whether an event is to be fetched."""
+        """Whether an event waits to be fetched."""
         return bool(self._events)
 
     def next_event(self) -> Event | None:

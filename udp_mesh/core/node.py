@@ -1,6 +1,7 @@
-"""A node: bytes and the time in; datagrams, events and one timer out. It never waits, reads no clock and opens nothing.
+"""A node: bytes and the time in; datagrams, events and one timer out. It never blocks, reads no clock and opens
+nothing.
 
-A driver repeats: `receive` what arrived, `handle_timer` when `next_timer` has come, then `datagrams_to_send` until it
+A driver repeats: `receive` what arrived, `handle_timer` when `next_timer` is due, then `datagrams_to_send` until it
 returns none, then `next_event` until None.
 """
 
@@ -24,14 +25,14 @@ from udp_mesh.wire.legacy import decapsulate
 from udp_mesh.wire.limits import BOOT_ID_BYTES
 
 REPORTED_RATE_VALID_S = 2.0
-"""What an acknowledgement says about rates holds for the second it averages, and one more."""
+"""A rate reported in an acknowledgement is valid for the second it averages, and one more."""
 
 UNVERIFIED_AFTER_S = 3.0
-"""A node heard for so long without hearing us is told of; meeting takes a fraction of that."""
+"""A node heard for this long without hearing us is listed as unverified; discovery takes a fraction of that."""
 
 
 class Node:
-    """One run of one named node. `boot_id` (16 random bytes, never used before) tells this run from all others."""
+    """One run of one named node. `boot_id` (16 random bytes, never used before) identifies the run."""
 
     def __init__(
         self, settings: Settings, *, boot_id: bytes, rng: RandomSource, now: float, store: Store | None = None
@@ -49,7 +50,7 @@ class Node:
         return self._state.settings
 
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
-        """Take in one datagram. Bad bytes are counted and dropped; this never raises because of what was received."""
+        """Process one datagram. Bad bytes are counted and dropped; received data never makes this raise."""
         if len(data) and data[0] < MARK:
             covered = decapsulate(data)
             if covered is not None:
@@ -60,9 +61,9 @@ class Node:
             receive_datagram(self._state, data, link, source, now)
 
     def datagrams_to_send(self, now: float, *, max_bytes: int | None = None) -> list[Datagram]:
-        """The datagrams that leave now, most urgent first, about 64 KiB at most per call (`max_bytes`, if given).
+        """The datagrams to send now, most urgent first, about 64 KiB at most per call (`max_bytes`, if given).
 
-        Call again while it `has_datagrams`. With `max_bytes` a driver whose socket is full asks for less.
+        Call again while it `has_datagrams`. A driver whose socket is full limits `max_bytes`.
         """
         out = transmit.collect(self._state, now, max_bytes)
         if self._legacy:
@@ -73,7 +74,7 @@ class Node:
         return out
 
     def next_timer(self) -> float | None:
-        """When `handle_timer` wants to be called next (None: never). Cheap; may be in the past."""
+        """When `handle_timer` is due next (None: never). Cheap; may be in the past."""
         at = transmit.next_timer(self._state)
         if self._legacy and at is not None:
             return min(at, self._legacy.next_at())
@@ -87,14 +88,14 @@ class Node:
 
     @property
     def has_datagrams(self) -> bool:
-        """Whether `datagrams_to_send` may return something; False right after it returned all there was."""
+        """Whether `datagrams_to_send` may return something. False right after it returned everything."""
         return bool(self._legacy) or transmit.has_datagrams(self._state)
 
     @property
     def is_quiet(self) -> bool:
-        """Whether nothing is to be sent or told until `next_timer`: the driver may leave the node alone.
+        """Whether there is nothing to send and no event until `next_timer`, so that the driver may skip the node.
 
-        True after most datagrams of a bulk, of which only every few ask for an answer.
+        True after most bulk datagrams, of which only every few request an acknowledgement.
         """
         return not self._legacy and transmit.is_quiet(self._state)
 
@@ -107,7 +108,7 @@ class Node:
     ) -> MessageId | Rejected:
         """Accept a message for one peer, or (None) for the topic's destinations, or for all.
 
-        Per destination of a reliable topic exactly one outcome event follows. A message to all that fits one datagram
+        For a reliable topic exactly one outcome event follows per destination. A message to all that fits one datagram
         is broadcast and has no outcome. A peer never heard of is `UNKNOWN_PEER` unless an outbox may hold the message.
         """
         return publish.send(self._state, topic, payload, destination, type_name, now)
@@ -117,13 +118,13 @@ class Node:
         reconfigure.link_up(self._state, link, now)
 
     def link_down(self, name: str, now: float) -> None:
-        """The attachment is gone; peers reached over it are reached over others as they are heard there."""
+        """The attachment is gone; its peers are reached over other links once they are heard there."""
         reconfigure.link_down(self._state, name)
 
     def apply(self, settings: Settings, now: float) -> list[str]:
-        """Change topics, window, rates, limits, keys and neighbours; returns one line per change made.
+        """Change topics, window, rates, limits, keys and neighbors. Returns one line per change made.
 
-        Drops no accepted message. A changed name or port raises ValueError: these need a new run.
+        Drops no accepted message. Raises ValueError if the name or port changed: that requires a restart.
         """
         lines = reconfigure.apply(self._state, settings, now)
         self._legacy.apply()
@@ -134,7 +135,7 @@ class Node:
         return _snapshot(self._state, now)
 
     def close(self, now: float) -> None:
-        """Say good-bye: fetch the last datagrams and events after it. Reliable messages still open end as expired."""
+        """Say goodbye; fetch the last datagrams and events afterwards. Pending reliable messages end as expired."""
         reconfigure.close(self._state, now)
 
 
@@ -221,7 +222,7 @@ def _peer_conditions(state: State, peer: Peer, sender: Sender, now: float) -> Pe
 
 
 def _current_path(peer: Peer) -> tuple[Address | None, str | None, float | None]:
-    """Address, link and when something last came from there."""
+    """Address, link, and when something last came from there."""
     session = peer.session
     if session is not None:
         path = session.path
@@ -250,7 +251,7 @@ def _queue_conditions(sender: Sender, now: float) -> tuple[QueueConditions, ...]
 
 
 def _reported_bits_per_s(rate: tuple[int, float], for_s: float, now: float) -> float | None:
-    """Bits per second of what a peer said, unless that was too long ago."""
+    """The rate in bits per second that a peer reported, unless the report is too old."""
     bytes_per_s, reported_at = rate
     return 8.0 * bytes_per_s if now - reported_at <= for_s else None
 

@@ -1,4 +1,4 @@
-"""Messages held for peers that are offline, as their topic's outbox says: none, the last, or all within a bound.
+"""Messages held for offline peers according to their topic's outbox: none, the last one, or all within a limit.
 
 1. `persist` writes a message to disk when it is accepted, if its topic requires that. It stays there until its outcome
    is known, so a crash in between sends it again.
@@ -22,16 +22,16 @@ from udp_mesh.core.settings import Outbox
 
 @dataclass(slots=True, eq=False)
 class HeldMessage:
-    """One message held for one peer; `store_key` where it is on disk."""
+    """One message held for one peer; `store_key` is set if it is on disk."""
 
     accepted: AcceptedMessage
     store_key: int | None
     started: OutgoingMessage | None = None
-    """What has left of it, where the peer may have it."""
+    """The partly sent message, if the peer may have some of it."""
     epoch: int = 0
-    """`Sender.epoch` in which it began."""
+    """`Sender.epoch` in which it was started."""
     dropped: bool = False
-    """Expired or replaced: it stands in its shelf until somebody looks."""
+    """Expired or replaced; it stays in its queue until the next access."""
 
     @property
     def size(self) -> int:
@@ -40,20 +40,20 @@ class HeldMessage:
 
 @dataclass(slots=True)
 class _TopicQueue:
-    """What is held of one topic for one peer, in the order accepted."""
+    """The messages of one topic held for one peer, in the order accepted."""
 
     held: deque[HeldMessage] = field(default_factory=deque)
     messages: int = 0
     bytes: int = 0
 
     def front(self) -> HeldMessage:
-        """The oldest. Only of a shelf that holds something."""
+        """The oldest message. Call only if there is one."""
         while self.held[0].dropped:
             self.held.popleft()
         return self.held[0]
 
     def put(self, new: HeldMessage) -> None:
-        """In its place: the newest, or one taken back, which then is older than all that came meanwhile."""
+        """Insert in order: usually the newest; one returned by the sender is older than all that came meanwhile."""
         later: list[HeldMessage] = []
         if self.messages and new.accepted.message_id < self.front().accepted.message_id:
             self.held.appendleft(new)
@@ -88,7 +88,7 @@ class Outboxes:
         self.bytes = 0
 
     def load(self) -> list[StoredMessage]:
-        """What the last run left on disk, oldest first; the node takes each on anew with `hold` and its key."""
+        """The messages that the last run left on disk, oldest first; the node adds each one with `hold` and its key."""
         if self._store is None:
             return []
         stored = self._store.load()
@@ -96,7 +96,7 @@ class Outboxes:
         return stored
 
     def persist(self, peer: str, accepted: AcceptedMessage, now: float) -> int | None:
-        """Put a message on disk, where its topic wants that; its key there, None where it is held in memory alone."""
+        """Write a message to disk if its topic requires that. Returns its key, or None if it is in memory only."""
         topic = accepted.channel.topic
         if self._store is None or not topic.outbox_on_disk or topic.outbox is Outbox.NONE:
             return None
@@ -108,11 +108,11 @@ class Outboxes:
         return key if self._store.put(stored) else None
 
     def on_disk(self, store_key: int | None) -> bool:
-        """Whether a message will be there in the next run."""
+        """Whether the message will survive a restart."""
         return store_key is not None and self._store is not None and self._store.holds(store_key)
 
     def hold(self, peer: str, new: HeldMessage, now: float) -> list[tuple[HeldMessage, ExpiryReason]]:
-        """Keep a message; returns those that had to go for it (perhaps this one)."""
+        """Hold a message. Returns those dropped for it (perhaps this one)."""
         accepted = new.accepted
         topic = accepted.channel.topic
         if new.size > topic.outbox_bytes:
@@ -135,8 +135,8 @@ class Outboxes:
         return dropped
 
     def release(self, peer: str, limit: int) -> list[HeldMessage]:
-        """The peer is online: up to `limit` of what is held for it leaves the outbox (but not yet the disk), the most
-        urgent first, of those the oldest."""
+        """Release up to `limit` messages for a peer that is online, most urgent first, then oldest. They stay on
+        disk."""
         queues = self._held.get(peer, {})
         released: list[HeldMessage] = []
         by_urgency: dict[int, list[_TopicQueue]] = {}
@@ -160,7 +160,7 @@ class Outboxes:
         return released
 
     def holds(self, peer: str, topic: str | None = None) -> bool:
-        """Whether something (of this topic) is held for a peer."""
+        """Whether a message (of this topic) is held for a peer."""
         queues = self._held.get(peer)
         if not queues:
             return False
@@ -169,12 +169,12 @@ class Outboxes:
         return topic in queues and queues[topic].messages > 0
 
     def forget(self, store_key: int | None) -> None:
-        """The outcome is known: the disk may forget it."""
+        """Remove a message from disk: its outcome is known."""
         if store_key is not None and self._store is not None:
             self._store.remove(store_key)
 
     def expire(self, now: float) -> list[tuple[str, HeldMessage]]:
-        """(peer, message) of everything past its deadline, removed."""
+        """Remove everything past its deadline; returns (peer, message)."""
         late: list[tuple[str, HeldMessage]] = []
         while self._deadlines and (self._deadlines[0][0] <= now or self._deadlines[0][3].dropped):
             _, _, peer, held = heappop(self._deadlines)
@@ -184,7 +184,7 @@ class Outboxes:
         return late
 
     def drop_all(self) -> list[tuple[str, HeldMessage]]:
-        """At the end of the node: what is only in memory is lost with it; what is on disk stays there."""
+        """Close: returns the messages that are in memory only and now lost; what is on disk stays there."""
         everything = [
             (peer, held)
             for peer, queues in self._held.items()
@@ -221,6 +221,6 @@ class Outboxes:
         self._serial += 1
         heappush(self._deadlines, (deadline, self._serial, peer, held))
         if len(self._deadlines) > 64 + 2 * self._messages:
-            # What was replaced or sent long before its deadline must not stay in memory until then.
+            # Free messages that were replaced or sent long before their deadline.
             self._deadlines = [entry for entry in self._deadlines if not entry[3].dropped]
             heapify(self._deadlines)

@@ -36,17 +36,16 @@ from udp_mesh.wire.header import VERSION
 from udp_mesh.wire.limits import HEARD_TAG_BYTES
 
 IDLE_PEERS_PER_ROUND = 64
-"""Peers without traffic looked at per round: of 1,000 each is looked at every 8 s, and a round stays short."""
+"""Peers without traffic checked per round: each of 1,000 is checked every 8 s, and a round stays short."""
 
 REPORT_INTERVAL_S = 60.0
-"""The same conflict, mismatch or incompatibility is reported once in this time."""
+"""Minimum time between two reports of the same conflict, mismatch or incompatibility."""
 
 
 def on_heartbeat(
     state: State, session: Session, beat: Heartbeat, link: str, source: Address, now: float, *, to_all: bool
 ) -> None:
-    """An authentic heartbeat of a session (to all, or to us alone), perhaps a recording until the session is
-    proven."""
+    """Process an authentic heartbeat (broadcast or unicast), which may be replayed until the session is verified."""
     session.update_from(beat, now)
     state.channel_share.on_send_rate(
         session.boot_id, beat.send_rate, now, valid_s=MISSED_HEARTBEATS * session.interval_s
@@ -76,7 +75,7 @@ def on_heartbeat(
         if session.name == state.settings.name:
             _own_name(state, session, now)
     if not (session.verified and session.knows_us):
-        # It does not hear us, or we cannot know yet that it does.
+        # It does not hear us, or we cannot know that yet.
         state.heartbeats.reply_to(session, len(state.peer_table.sessions), now)
     if session.verified and session.peer is not None:
         repairs = state.repairs.get(session.boot_id)
@@ -91,7 +90,7 @@ def on_heartbeat(
 
 
 def on_verified(state: State, session: Session, now: float) -> None:
-    """The session has shown that it hears this run of ours."""
+    """The session has proved that it hears our current boot."""
     arrival, peer = state.peer_table.verify(session, state.settings)
     if arrival is VerifyResult.OWN_NAME:
         _own_name(state, session, now)
@@ -100,7 +99,7 @@ def on_verified(state: State, session: Session, now: float) -> None:
         state.event_queue.counters.dropped_over_limit += 1
         return
     if arrival is VerifyResult.RETIRED:
-        # Served again when it is heard and the later run is gone (`on_activity`).
+        # It becomes current again when it is heard and the later boot is gone (`on_activity`).
         return
     session.freshness.confirm(now)
     _replace(state, peer, session, now)
@@ -112,7 +111,7 @@ def on_verified(state: State, session: Session, now: float) -> None:
 
 
 def _own_name(state: State, session: Session, now: float) -> None:
-    """Another node uses our name: told as long as it does, and no more often for all the boots one may invent."""
+    """Report that another node uses our name, at a limited rate however many boots are invented."""
     if now - state.own_name_reported_at < REPORT_INTERVAL_S:
         return
     state.own_name_reported_at = now
@@ -121,7 +120,7 @@ def _own_name(state: State, session: Session, now: float) -> None:
 
 
 def _replace(state: State, peer: Peer, session: Session, now: float) -> None:
-    """The session is what the name means from now on; what waits for the name begins anew with it."""
+    """Make the session the current one of its name; pending messages restart with it."""
     old = peer.session
     state.peer_table.replace(peer, session)
     if old is not None:
@@ -131,7 +130,7 @@ def _replace(state: State, peer: Peer, session: Session, now: float) -> None:
             old.next_wire_id = peer.sender.next_wire_id
     if peer.has_sender:
         peer.sender.restart(now)
-        # Of a run that is taken back the numbers go on: it remembers what it had.
+        # A boot that becomes current again remembers what it had: its numbers continue.
         peer.sender.in_flight.restart(session.path.channel.next_number)
         peer.sender.next_wire_id = session.next_wire_id
         state.ready[peer] = None
@@ -139,7 +138,7 @@ def _replace(state: State, peer: Peer, session: Session, now: float) -> None:
 
 
 def set_online(state: State, peer: Peer, session: Session, now: float) -> None:
-    """The peer is there (again)."""
+    """The peer is online (again)."""
     peer.left = False
     peer.lost = False
     if peer.online:
@@ -151,7 +150,7 @@ def set_online(state: State, peer: Peer, session: Session, now: float) -> None:
 
 
 def on_activity(state: State, session: Session, link: str, source: Address, now: float) -> None:
-    """Something authentic came from a proven session."""
+    """An authentic datagram came from a verified session."""
     session.last_heard = now
     path = session.path
     if source == path.address and link == path.link:
@@ -163,7 +162,7 @@ def on_activity(state: State, session: Session, link: str, source: Address, now:
         if peer is None or peer.online:
             report_name_conflict(state, session, source, now)
             return
-        # Of two nodes with one name the later one went: its name means this one again, if this is its voice.
+        # Of two nodes with one name the later one is gone: the name means this one again, if the datagram is fresh.
         if not session.is_fresh(now):
             validate_path(state, session, link, source, now)
             return
@@ -172,7 +171,7 @@ def on_activity(state: State, session: Session, link: str, source: Address, now:
         return
     if not peer.online:
         if not session.is_fresh(now):
-            # It may be a recording that never arrived: an answer to a question cannot be one.
+            # It may be a replayed datagram that never arrived; the answer to a challenge cannot be one.
             validate_path(state, session, link, source, now)
             return
         set_online(state, peer, session, now)
@@ -182,12 +181,12 @@ def on_activity(state: State, session: Session, link: str, source: Address, now:
 
 
 def report_name_conflict(state: State, session: Session, source: Address, now: float) -> None:
-    """A run that was replaced by a later one still speaks: two nodes use one name."""
+    """A boot that was replaced by a later one is still heard: two nodes use one name."""
     peer = session.peer or state.peer_table.peers.get(session.name)
     if peer is None or peer.session is None:
         return
     if peer.online_since is not None and now - peer.online_since < STALE_PATH_S:
-        # The last packets of a run that ended may come behind the first ones of the next.
+        # The last packets of a boot may arrive after the first ones of the next.
         return
     session.name_conflict = True
     if now - peer.conflict_reported_at < REPORT_INTERVAL_S:
@@ -197,11 +196,11 @@ def report_name_conflict(state: State, session: Session, source: Address, now: f
 
 
 def migrate_path(state: State, session: Session, link: str, source: Address, now: float) -> None:
-    """The session was heard at an address: use it if it is the only one, or the one in use has gone quiet, and the peer
-    answers there.
+    """The session was heard at another address: use it if there is none yet, or if the current one has gone quiet and
+    the peer answers there.
 
-    A peer of an earlier version answers to where it was heard before, perhaps over a link that is gone: where nothing
-    at all comes from there it is followed without a question.
+    A peer of an earlier version answers to where it was heard before, perhaps over a link that is gone. If nothing at
+    all comes from its old address, its path migrates without validation.
     """
     if link not in state.links:
         return
@@ -220,11 +219,11 @@ def migrate_path(state: State, session: Session, link: str, source: Address, now
 
 
 def on_path_validated(state: State, session: Session, challenge: Challenge, now: float) -> None:
-    """The peer answered a ping of ours from where that went: it is alive, and there."""
+    """The peer answered a challenge: it is alive and at that address."""
     session.freshness.confirm(now)
     path = session.path
     if challenge.in_use:
-        # The way in use works: whatever came from elsewhere was no move. If it has been left since, it is gone back to.
+        # The current path works, so datagrams from elsewhere were no migration. If it was left meanwhile, return to it.
         session.challenges.clear()
     if (path.link, path.address) != (challenge.link, challenge.address):
         _switch_path(state, session, challenge.link, challenge.address, now)
@@ -232,7 +231,7 @@ def on_path_validated(state: State, session: Session, challenge: Challenge, now:
 
 
 def _switch_path(state: State, session: Session, link: str, source: Address, now: float) -> None:
-    """Datagrams go there from now on."""
+    """Send datagrams to that address from now on."""
     info = state.links.get(link)
     if info is None:
         return
@@ -250,8 +249,7 @@ def _switch_path(state: State, session: Session, link: str, source: Address, now
 
 
 def update_mtu(state: State, session: Session, mtu: int) -> None:
-    """The link, or the settings, changed under a session's way: what leaves from now on fits both, and what the path
-    was found to carry."""
+    """The link or the settings changed under a session's path: fit both, and what the path was found to carry."""
     path = session.path
     sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
     if sender is not None and sender.pmtu.narrowed_at is not None:
@@ -286,7 +284,7 @@ def _fragment_bytes(message: OutgoingMessage, position: int) -> int:
 
 
 def _update_pmtu(state: State, peer: Peer, session: Session, now: float) -> None:
-    """Smaller fragments where full ones do not get through; larger ones again where a ping of that size does."""
+    """Use smaller fragments if full ones do not get through, and larger ones again if a probe of that size does."""
     sender, path = peer.sender, session.path
     size, info = sender.pmtu, state.links.get(path.link)
     fragment_bytes = state.settings.fragment_bytes
@@ -317,7 +315,7 @@ def _update_pmtu(state: State, peer: Peer, session: Session, now: float) -> None
 
 
 def on_bye(state: State, session: Session, now: float) -> None:
-    """The peer said good-bye."""
+    """The peer said goodbye."""
     peer = session.peer
     if peer is None or peer.session is not session or not peer.online:
         return
@@ -325,7 +323,7 @@ def on_bye(state: State, session: Session, now: float) -> None:
 
 
 def set_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
-    """The peer is out of reach: what its topics' outboxes keep goes there, the rest waits for `peer_lost_s`."""
+    """The peer is unreachable: messages with an outbox move there; the rest waits for `peer_lost_s`."""
     peer.online = False
     peer.left = left
     peer.online_since = None
@@ -337,7 +335,7 @@ def set_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
 
 
 def maintain(state: State, now: float) -> None:
-    """A round: all peers with traffic, and of the others as many as one round bears."""
+    """One maintenance round: all peers with traffic, and a limited number of the others."""
     suspended_s = now - state.maintained_at - MAINTENANCE_INTERVAL_S
     state.maintained_at = now
     if suspended_s > SUSPENDED_S:
@@ -364,7 +362,7 @@ def maintain(state: State, now: float) -> None:
     for session in state.peer_table.not_current():
         session.age_windows(now)
         if session.name_conflict and session.peer is not None:
-            # It may be taken back for as long as its name is remembered.
+            # It may become current again as long as its name is remembered.
             session.receiver.unicasts.purge(now)
             session.receiver.broadcasts.purge(now)
         elif now - session.last_heard > state.settings.rates.offline_s:
@@ -374,7 +372,7 @@ def maintain(state: State, now: float) -> None:
 
 
 def _discount_suspension(state: State, suspended_s: float, now: float) -> None:
-    """This process did not run for so long (it was stopped, its machine stood still): silence meanwhile was ours."""
+    """This process was suspended for that long (stopped, or its machine was): the silence was ours."""
     for session in state.peer_table.sessions.values():
         session.last_heard = min(now, session.last_heard + suspended_s)
         if session.one_way_since is not None:

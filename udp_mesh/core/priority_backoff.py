@@ -1,8 +1,8 @@
-"""No robot drowns another's urgent traffic: levels waiting elsewhere -> less urgent levels hold back here, for a while.
+"""Priority backoff between nodes: while urgent levels wait elsewhere, less urgent levels are held back here.
 
-Each node says in heartbeats and acknowledgements which urgent levels wait at it, and how long. Who hears it holds
-back its own less urgent levels for `yield_hold_s`, but never for more than `yield_share` of the time, so that none
-starves.
+Each node reports in heartbeats and acknowledgements which urgent levels wait at it, and for how long. Nodes that hear
+this hold back their own less urgent levels for `yield_hold_s`, but never for more than `yield_share` of the time, so
+that none starves.
 """
 
 from collections.abc import Iterable
@@ -14,14 +14,14 @@ from udp_mesh.wire.frames import Waiting
 ALL_LEVELS = 0xFFFF
 
 BUDGET_S = 1.0
-"""Holding back is budgeted over this much time."""
+"""Period of the hold-back budget."""
 
 CHECK_INTERVAL_S = 0.02
-"""What waits here is looked up no more often than this."""
+"""Minimum time between two checks of the local queues."""
 
 
 class PriorityBackoff:
-    """`allowed(now)` is the bit mask of levels that may leave."""
+    """`allowed_levels(now)` is the bit mask of levels that may be sent."""
 
     __slots__ = ("_allowed", "_budget_at", "_budget_s", "_checked_at", "_rates", "_until", "_waiting", "held_total_s")
 
@@ -39,14 +39,14 @@ class PriorityBackoff:
         self._rates = rates
 
     def local_waiting(self, senders: Iterable[Sender], now: float) -> tuple[Waiting, ...]:
-        """The urgent levels at which something has waited too long, most urgent first."""
+        """The urgent levels with a message that has waited too long, most urgent first."""
         if now < self._checked_at + CHECK_INTERVAL_S:
             return self._waiting
         self._checked_at = now
         oldest: dict[int, float] = {}
         for sender in senders:
             if sender.unresponsive_since is not None:
-                # What waits for a peer out of reach waits for no one else's airtime.
+                # Messages to an unresponsive peer do not wait for other nodes' airtime.
                 continue
             max_wait_s = self._rates.yield_after_s + 3 * (sender.rtt.min_rtt or 0.0)
             for priority, age_s in sender.levels.oldest_ages(self._rates.urgent_priority, now):
@@ -58,7 +58,7 @@ class PriorityBackoff:
         return self._waiting
 
     def on_waiting(self, waiting: tuple[Waiting, ...], now: float) -> None:
-        """Another node's waiting levels."""
+        """Process another node's waiting levels."""
         level = min(entry.priority for entry in waiting)
         if level > self._rates.urgent_priority or self._rates.yield_share <= 0:
             return

@@ -36,13 +36,13 @@ from udp_mesh.wire.legacy import LEGACY_OVERHEAD_BYTES
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
 
 ANNOUNCE_BYTES = 5
-"""Of a topic's announcement besides its two names."""
+"""Size of a topic announcement without its two names."""
 
 RELEASE_BATCH = 400
-"""Messages of an outbox queued in one go: some milliseconds, in which no urgent one can leave."""
+"""Outbox messages queued at a time: some milliseconds, in which no urgent message can be sent."""
 
 RELEASE_INTERVAL_S = 0.02
-"""Until the next: 20,000 messages a second, more than a robot's link carries."""
+"""Time between two batches: 20,000 messages a second, more than a robot's link carries."""
 
 MAX_CHANNELS = 65_536
 """Topic numbers are 16 bits."""
@@ -91,7 +91,7 @@ def send(
 
 
 def compress_step(state: State, now: float) -> None:
-    """Compress some more of what waits for that; what is done goes on its way."""
+    """Compress one step; queue a message when it is done."""
     done = state.compression_queue.step()
     if done is not None:
         message, packed = done
@@ -100,7 +100,7 @@ def compress_step(state: State, now: float) -> None:
 
 
 def flush_compression(state: State, now: float) -> None:
-    """Everything goes on its way as it is."""
+    """Queue everything that waits for compression, uncompressed."""
     for message in state.compression_queue.drain():
         accepted = _accept(message.message_id, message.channel, message.payload, None, message.accepted_at)
         _enqueue_all(state, accepted, message.names, now, message.store_keys)
@@ -142,8 +142,8 @@ def _check_capacity(state: State, topic: Topic, names: list[str], size_bytes: in
 
 
 def topic_channel(state: State, topic: Topic, type_name: str) -> TopicChannel | None:
-    """The topic's number on the air with this type; None when there are too many, or where no receiver takes the type's
-    name: it would refuse every datagram that announces it, with all that is packed beside it."""
+    """The topic's number on the wire with this type. None if there are too many, or if no receiver would accept the
+    type name: receivers drop every datagram that announces it, with everything else in it."""
     channel = state.channels.get((topic.name, type_name))
     if channel is None:
         if len(state.channels) >= MAX_CHANNELS or not is_type_name(type_name):
@@ -166,7 +166,7 @@ def _accept(
 
 
 def enqueue(state: State, name: str, accepted: AcceptedMessage, now: float, store_key: int | None = None) -> None:
-    """One destination's copy: into the queue of a peer in reach, else where the topic's outbox says."""
+    """Queue one destination's copy: to the peer if it is online, otherwise to the topic's outbox."""
     topic = accepted.channel.topic
     peer = state.peer_table.get_or_create(name, state.settings)
     if peer is None or ((not peer.online) and topic.outbox is not Outbox.NONE):
@@ -176,7 +176,7 @@ def enqueue(state: State, name: str, accepted: AcceptedMessage, now: float, stor
         accepted = uncompressed(accepted)
     keeps = topic.outbox is not Outbox.NONE and peer.settling
     if (keeps or state.outboxes.holds(name, topic.name)) and topic.priority > state.settings.rates.urgent_priority:
-        # Older ones of the topic are still to come; only what is urgent goes ahead of what is stale.
+        # Older messages of the topic still wait in the outbox; only urgent ones go ahead of stale ones.
         _hold(state, name, HeldMessage(accepted, store_key), now)
         return
     if store_key is None and topic.reliable:
@@ -185,7 +185,7 @@ def enqueue(state: State, name: str, accepted: AcceptedMessage, now: float, stor
 
 
 def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, store_key: int | None) -> None:
-    """On its way to a peer, in reach or not."""
+    """Queue a message to a peer, online or not."""
     topic = accepted.channel.topic
     message = OutgoingMessage(accepted, topic.priority, reliable=topic.reliable)
     message.store_key = store_key
@@ -201,7 +201,7 @@ def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, stor
 
 
 def accepts_compressed(session: Session) -> bool:
-    """Whether the peer takes compressed messages."""
+    """Whether the peer accepts compressed messages."""
     return bool(session.features & Feature.ZLIB)
 
 
@@ -229,8 +229,8 @@ def _broadcast(state: State, accepted: AcceptedMessage, now: float) -> None:
 
 
 def broadcast_room(state: State, sessions: Iterable[Session]) -> int:
-    """Bytes of a datagram that everybody's path carries, as far as that is known. On links that take larger packets
-    than Ethernet's it is Ethernet's all the same: nobody would notice that a mesh behind them does not."""
+    """Size of a datagram that every known path carries. On links with a larger MTU than Ethernet's it is still limited
+    to Ethernet's: a mesh behind such a link may not carry more, and a lost broadcast is not noticed."""
     links = [link.mtu - header_bytes(link.address) for link in state.links.values()]
     paths = [path.mtu - header_bytes(path.address) for path in (session.path for session in sessions) if path.link]
     room = min([*links, *paths, max(ETHERNET_MTU, state.settings.fragment_bytes) - IP_UDP_BYTES], default=0)
@@ -240,7 +240,7 @@ def broadcast_room(state: State, sessions: Iterable[Session]) -> int:
 
 
 def _broadcast_bytes(accepted: AcceptedMessage) -> int:
-    """The datagram of a broadcast of this message."""
+    """Size of the datagram that broadcasts this message."""
     channel = accepted.channel
     names = ANNOUNCE_BYTES + len(channel.name.encode()) + len(channel.type_name.encode())
     fragment = FRAGMENT_BYTES + HEAD_BYTES + LENGTH_BYTES + len(accepted.body)
@@ -248,14 +248,14 @@ def _broadcast_bytes(accepted: AcceptedMessage) -> int:
 
 
 def store_in_outbox(state: State, peer: Peer, now: float) -> None:
-    """The peer went out of reach: move what its outboxes keep out of the queue."""
+    """Move messages from the queue of a peer that went offline to their outboxes."""
     everything = list(peer.sender.pending) if peer.has_sender else []
-    # The newest first: each then stands in front of those already there.
+    # Newest first: each one goes in front of those already there.
     everything.sort(key=lambda message: message.accepted.message_id, reverse=True)
     for message in everything:
         if message.accepted.channel.topic.outbox is Outbox.NONE or message.accepted.broadcast_number is not None:
             continue
-        # best effort is not remembered for long over there, and fielded programs know no numbers of ours
+        # Best effort is not remembered for long by the receiver, and legacy programs do not know our numbers.
         resumable = message.started and message.reliable and not peer.legacy
         peer.sender.withdraw(message, to_resume=resumable)
         started = message if resumable else None
@@ -268,7 +268,7 @@ def _hold(state: State, name: str, new: HeldMessage, now: float) -> None:
 
 
 def _drop_held(state: State, name: str, held: HeldMessage, reason: ExpiryReason) -> None:
-    """An outbox no longer keeps this one; what the peer has of it, it may forget."""
+    """Drop a message from an outbox; the peer may discard what it has of it."""
     peer = state.peer_table.peers.get(name)
     if held.started is not None and peer is not None and held.epoch == peer.sender.epoch:
         peer.sender.cancel(held.started)
@@ -276,11 +276,11 @@ def _drop_held(state: State, name: str, held: HeldMessage, reason: ExpiryReason)
 
 
 def release_outbox(state: State, peer: Peer, now: float) -> None:
-    """The peer is in reach: some of what waited for it is queued, the most urgent and oldest first; more of it soon."""
+    """The peer is online: queue some of its outbox, most urgent and oldest first; more of it soon."""
     for held in state.outboxes.release(peer.name, RELEASE_BATCH):
         started, session = held.started, peer.session
         if started is not None and held.epoch == peer.sender.epoch:
-            # One that has left whole may have arrived whole: under a new number it would arrive twice.
+            # A message sent completely may have arrived completely; under a new number it would arrive twice.
             whole = started.next_position >= started.fragments
             if session is not None and (whole or started.fragment_bytes <= session.path.fragment_bytes):
                 started.store_key = held.store_key
@@ -296,7 +296,7 @@ def release_outbox(state: State, peer: Peer, now: float) -> None:
 
 
 def report_ended(state: State, peer: Peer, now: float) -> None:
-    """Turn the ends of messages to one peer into events."""
+    """Turn the outcomes of messages to one peer into events."""
     ended = peer.sender.ended
     if not ended:
         return
@@ -325,13 +325,13 @@ def report_ended(state: State, peer: Peer, now: float) -> None:
 
 
 def report_expired(state: State, peer: str, accepted: AcceptedMessage, reason: ExpiryReason) -> None:
-    """An accepted message was given up."""
+    """Report an accepted message that was given up."""
     state.event_queue.counters.messages_expired += 1
     if accepted.flags & MessageFlag.RELIABLE:
         state.event_queue.emit(MessageExpired(accepted.message_id, peer, accepted.channel.name, reason))
 
 
 def expire_held(state: State, now: float) -> None:
-    """Messages in outboxes whose deadline passed."""
+    """Expire messages in outboxes."""
     for peer, held in state.outboxes.expire(now):
         _drop_held(state, peer, held, ExpiryReason.DEADLINE)

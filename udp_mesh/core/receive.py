@@ -1,8 +1,8 @@
-"""Datagrams in: header -> channel -> opened frames -> effects. Whatever arrives, this returns.
+"""Datagrams in: header -> channel -> opened frames -> effects. Never raises, whatever arrives.
 
-1. A short header's tag finds the channels it may mean; opening one proves who sent it. Replays cost no decryption.
-2. A plain fragment goes straight to the reassembly; other frames are decoded and taken one by one.
-3. A long header introduces a boot: its check is verified before anything is derived or remembered for it.
+1. A short header's tag selects candidate channels; opening one authenticates the sender. Replays cost no decryption.
+2. A plain fragment goes straight to reassembly; other frames are decoded and processed one by one.
+3. A long header introduces a boot: its check is verified before anything is derived or stored for it.
 """
 
 from udp_mesh.core.broadcast import FIRST_UNREPAIRED_NUMBER
@@ -65,7 +65,7 @@ def receive_datagram(state: State, data: bytes | memoryview, link: str, source: 
             try:
                 number, frames = channel.open(data, low)
             except ReplayError:
-                # Perhaps a new one of another channel with this tag.
+                # It may be a new packet of another channel with this tag.
                 replayed = True
                 continue
             except OpenError:
@@ -117,7 +117,7 @@ def _count_unopened(counters: Counters, *, replayed: bool) -> None:
 def _receive_data(
     state: State, session: Session, number: int, frames: bytes, link: str, source: Address, now: float
 ) -> None:
-    """An opened datagram bound to this run of ours: its sender is alive, or was when it was recorded."""
+    """Process a datagram bound to our current boot: its sender is alive, or was when it was recorded."""
     path = session.path
     peer = session.peer
     session.received_bytes += len(frames) + 51
@@ -161,7 +161,7 @@ def _receive_data(
         state.event_queue.counters.dropped_malformed += 1
         return
     if session.timed and timestamp_of(frames) is None:
-        # Its sender dates every message that begins: one without a date would have none when it is late.
+        # Its sender timestamps every first fragment: one without a timestamp could be replayed later.
         decoded = [frame for frame in decoded if not (isinstance(frame, Fragment) and frame.head is not None)]
     _receive_frames(state, session, decoded, number, link, source, now, late_s or 0.0)
 
@@ -176,7 +176,7 @@ def _receive_frames(
     now: float,
     late_s: float = 0.0,
 ) -> None:
-    """The frames of a unicast datagram of a peer's session, in order."""
+    """Process the frames of a unicast datagram, in order."""
     receiver = session.receiver
     peer = session.peer
     assert peer is not None
@@ -221,14 +221,14 @@ def _receive_frames(
                     session.queue_control(Pong(token, 0))
                     state.schedule_control(session)
                 else:
-                    # It asks whether we are there, not whether we know another way.
+                    # The ping validates the path it came on: answer to that address.
                     send_on_path(state, session, Pong(token, 0), link, source, now)
             case Pong(token):
                 sender.pmtu.on_pong(token, now)
             case Bye():
                 on_bye(state, session, now)
             case _:
-                # Heartbeats are taken where introductions are.
+                # Heartbeats are processed with long headers.
                 pass
     _deliver(state, session, now)
     if not wants_ack:
@@ -246,7 +246,7 @@ def _receive_frames(
 
 
 def _ack_mid_batch(state: State, session: Session, now: float) -> None:
-    """Acknowledge in the middle of a large batch: the bitmap must not lose sight of its beginning."""
+    """Acknowledge in the middle of a large batch, before its beginning leaves the bitmap."""
     ack = session.build_ack(now, ())
     if ack is not None:
         session.queue_control(ack)
@@ -274,14 +274,14 @@ def _on_refused(state: State, session: Session, refused: Refused) -> None:
         case RefuseReason.FORGOTTEN:
             sender.resend_from_start(message)
         case RefuseReason.NO_MEMORY:
-            # Its packets stay unacknowledged and come again by themselves.
+            # Its packets stay unacknowledged and are retransmitted anyway.
             return
         case RefuseReason.TOO_LARGE | RefuseReason.CORRUPT:
             sender.finish(message, ExpiryReason.REFUSED)
 
 
 def _on_nack(state: State, session: Session, number: int, now: float) -> None:
-    """A peer misses a cast: send it for itself, or say that it is gone."""
+    """A peer misses a broadcast: send it a unicast copy, or a Cancel if it is no longer kept."""
     peer = session.peer
     assert peer is not None
     accepted = state.broadcasts.repair(number)
@@ -307,7 +307,7 @@ def _on_nack(state: State, session: Session, number: int, now: float) -> None:
 
 
 def _deliver(state: State, session: Session, now: float) -> None:
-    """Whole messages become events."""
+    """Turn complete messages into events."""
     receiver = session.receiver
     if receiver.inflating:
         state.inflating[session] = None
@@ -329,19 +329,19 @@ def _deliver(state: State, session: Session, now: float) -> None:
 
 
 def inflate_step(state: State, now: float) -> None:
-    """Inflate some more of a message that is whole, of each session in turn."""
+    """Inflate one step of a complete message, of each session in turn."""
     session = next(iter(state.inflating))
     held = sum(one.receiver.inflating_bytes for one in state.inflating)
     if not session.receiver.inflate_step():
         state.event_queue.counters.dropped_malformed += 1
     if held <= 2 * state.settings.limits.message_bytes or not session.receiver.inflating:
-        # In turn, but where much is held already: then what was begun ends before more grows.
+        # In turn, unless much memory is held already: then finish this one before others grow.
         del state.inflating[session]
     _deliver(state, session, now)
 
 
 def _receive_broadcast(state: State, session: Session, frames: bytes, link: str, source: Address, now: float) -> None:
-    """An opened datagram to all. Until the sender is proven and its floor known, it may be a recording."""
+    """Process a broadcast datagram. Until the sender is verified and its floor known, it may be replayed."""
     peer = session.peer
     if peer is None or peer.session is not session or session.boot_id not in state.repairs:
         state.event_queue.counters.dropped_unproven += 1
@@ -375,7 +375,7 @@ def _receive_broadcast(state: State, session: Session, frames: bytes, link: str,
 def _receive_long(
     state: State, data: bytes | memoryview, header: LongHeader, link: str, source: Address, now: float
 ) -> None:
-    """A hello or an introduction; raises the decoder's and the cipher's errors."""
+    """Process a HELLO or an INTRODUCTION. Raises the decoder's and the cipher's errors."""
     if header.boot_id == state.boot_id:
         return
     key = _key(state, header.key_id)
@@ -393,13 +393,13 @@ def _receive_long(
         decoded = decode(frames)
         beat = _beat(decoded)
         if beat is None:
-            # An introduction without a name: its sender believes that we know it. Its heartbeats will tell.
+            # An introduction without a name: its sender assumes that we know it. Wait for its heartbeat.
             state.event_queue.counters.dropped_unproven += 1
             return
         session = state.peer_table.add_unverified(beat.name, header.boot_id, state.keys, state.settings)
         channel = _channel(session.data_channels if introduced else session.broadcast_channels, key)
         if not channel.window.accept(number):
-            # Of a boot that was forgotten, and whose numbers were not.
+            # The session was forgotten, but its counters were restored: a replay.
             state.peer_table.forget(session)
             raise ReplayError(f"packet {number} was already seen or is too old")
     if beat is not None and beat.name != session.name:
@@ -427,7 +427,7 @@ def _receive_long(
     if session.peer.session is not session:
         return
     _receive_frames(state, session, decoded, number, link, source, now, late_s)
-    # The sender writes long headers until it is answered.
+    # The sender uses long headers until it is answered.
     session.receiver.acks.send_now = True
     state.schedule_control(session)
 

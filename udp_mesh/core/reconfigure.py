@@ -1,6 +1,6 @@
 """Changes of a running node: links come and go, settings are replaced, outboxes are restored, the node closes.
 
-Nothing here drops an accepted message: a topic's new settings reach the messages already waiting on it.
+No accepted message is dropped: a topic's new settings apply to messages already waiting.
 """
 
 from dataclasses import fields, replace
@@ -21,7 +21,7 @@ from udp_mesh.wire.frames import Bye, MessageFlag
 
 
 def restore_outboxes(state: State, now: float) -> None:
-    """What the last run left on disk waits again."""
+    """Queue the messages that the last run left on disk."""
     for stored in state.outboxes.load():
         topic = state.topics.get(stored.topic)
         if topic is None and state.settings.undeclared is not None:
@@ -39,7 +39,7 @@ def restore_outboxes(state: State, now: float) -> None:
 
 
 def link_up(state: State, link: LinkInfo, now: float) -> None:
-    """A new or changed link; heartbeats introduce it soon."""
+    """Add or change a link; a heartbeat follows soon."""
     state.links[link.name] = link
     for session in state.peer_table.sessions.values():
         if session.path.link == link.name:
@@ -48,7 +48,7 @@ def link_up(state: State, link: LinkInfo, now: float) -> None:
 
 
 def link_down(state: State, name: str) -> None:
-    """Peers keep their last way until they are heard on another."""
+    """Remove a link. Peers keep their last path until they are heard on another link."""
     state.links.pop(name, None)
 
 
@@ -137,7 +137,7 @@ def _differences(old: object, new: object) -> list[str]:
 
 
 def _shown(value: object) -> str:
-    """As it stands in a configuration."""
+    """The value as written in the configuration."""
     match value:
         case None:
             return "none"
@@ -152,7 +152,7 @@ def _shown(value: object) -> str:
 
 
 def _retopic(state: State, now: float) -> None:
-    """Give every topic its new settings; messages already waiting follow a new priority."""
+    """Apply the new settings to every topic; waiting messages move to the new priority."""
     for channel in state.channels.values():
         topic: Topic | None = state.topics.get(channel.name)
         if topic is None and state.settings.undeclared is not None:

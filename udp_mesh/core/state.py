@@ -1,8 +1,8 @@
-"""What the parts of one node share: settings, who is there, what waits, and who has something to send.
+"""The state shared by the parts of one node: settings, peers, queues, and who has something to send.
 
-The parts, in the order bytes and messages pass them: `intake` (datagrams in), `presence` (peers come and go),
-`acceptance` (messages in), `dispatch` (datagrams out, timers), `survey` (conditions out). Each is functions of this
-state and of `now`.
+The parts, in the order that bytes and messages pass them: `receive` (datagrams in), `peer_lifecycle` (peers come and
+go), `publish` (messages in), `transmit` (datagrams out, timers), `node` (conditions out). Each consists of functions of
+this state and of `now`.
 """
 
 from collections.abc import Iterator
@@ -29,19 +29,19 @@ from udp_mesh.crypto import Key, Keyring, SendChannel
 _NEVER = float("inf")
 
 MAINTENANCE_INTERVAL_S = 0.5
-"""Between two rounds through all peers: offline, purges, starvation."""
+"""Interval of maintenance rounds: offline checks, purges, starvation."""
 
 SUSPENDED_S = 1.0
-"""A round so much later than it should be: this process did not run. A busy machine is late by less."""
+"""A round that is this late means that the process was suspended. A busy machine causes less."""
 
 
 def live_keys(settings: Settings) -> tuple[Key, ...]:
-    """The keys of the settings, or the key everyone knows."""
+    """The keys of the settings, or the public key of unkeyed mode."""
     return settings.keys or Keyring.unkeyed().keys
 
 
 class State:
-    """See the module's docstring. Only the parts of a node touch it."""
+    """See the module's docstring. Used only by the parts of a node."""
 
     def __init__(self, settings: Settings, boot_id: bytes, rng: RandomSource, now: float, store: Store | None) -> None:
         self.settings = settings
@@ -51,7 +51,7 @@ class State:
         self.links: dict[str, LinkInfo] = {}
         self.peer_table = PeerTable(settings, boot_id)
         self.sent = Meter(now)
-        """Wire bytes of this node, to everybody."""
+        """Wire bytes sent by this node to all nodes."""
         self.channel_share = ChannelShare()
         self.event_queue = EventQueue(settings.limits.events)
         self.outboxes = Outboxes(store)
@@ -59,25 +59,25 @@ class State:
         self.broadcasts = BroadcastQueue()
         self.compression_queue = CompressionQueue()
         self.inflating: dict[Session, None] = {}
-        """Sessions of which a message is being inflated."""
+        """Sessions with a message being inflated."""
         self.broadcast_channel = SendChannel(self.keys[0], boot_id)
         self.priority_backoff = PriorityBackoff(settings.rates, now)
         self.repairs: dict[bytes, NackRepair] = {}
         """By the sender's boot id."""
         self.repairs_due: dict[bytes, None] = {}
-        """Those of `repairs` in which something is missing."""
+        """Those of `repairs` with missing broadcasts."""
         self.maintain_from = 0
-        """Where the next round of housekeeping begins."""
+        """Index of the first idle peer of the next maintenance round."""
         self.topics: dict[str, Topic] = {topic.name: topic for topic in settings.topics}
         self.channels: dict[tuple[str, str], TopicChannel] = {}
         self.rate_limits: dict[str, TokenBucket] = {}
         self.next_message_id = 1
         self.ready: dict[Peer, None] = {}
-        """Peers to which something may be able to leave."""
+        """Peers to which something may be ready to send."""
         self.control_ready: dict[Session, None] = {}
-        """Sessions that are owed an acknowledgement or small frames now."""
+        """Sessions with an acknowledgement or control frames to send now."""
         self.outgoing: list[Datagram] = []
-        """Datagrams already built: heartbeats, second copies."""
+        """Datagrams already built: heartbeats, redundant copies."""
         self.timers: list[tuple[float, int, Peer]] = []
         self.timer_serial = 0
         self.maintenance_at = now
@@ -88,13 +88,13 @@ class State:
         self.closed = False
 
     def set_timer(self, peer: Peer, at: float) -> None:
-        """The peer wants attention at `at` too; an earlier wish stands."""
+        """Set the peer's timer to `at`, unless it is due earlier."""
         if at < peer.due_at:
             peer.due_at = at
             self._queue(peer)
 
     def arm(self, peer: Peer) -> None:
-        """Bring the peer's timer up to what its halves want now, be it later than before."""
+        """Set the peer's timer to what its sender and receiver need now, even if that is later than before."""
         at = peer.sender.timer() if peer.has_sender else None
         session = peer.session
         if session is not None:
@@ -111,8 +111,8 @@ class State:
             heappush(self.timers, (peer.timer_at, self.timer_serial, peer))
 
     def next_peer_at(self) -> float:
-        """When the first peer wants attention. Who stands in front but wants it later goes to its place now: it may
-        have changed its mind a hundred times since."""
+        """When the first peer's timer is due. Entries rescheduled to a later time are moved only when they reach the
+        front, because they may be rescheduled a hundred times before."""
         timers = self.timers
         while timers:
             at, _, peer = timers[0]
@@ -127,21 +127,21 @@ class State:
         return _NEVER
 
     def schedule_repair(self, boot_id: bytes, repairs: NackRepair) -> None:
-        """Ask this sender for what is missing, when it is time."""
+        """Schedule the requests for what is missing from this sender."""
         if repairs.next_at != float("inf"):
             self.repairs_due[boot_id] = None
             self.maintenance_at = min(self.maintenance_at, repairs.next_at)
 
     def schedule_control(self, session: Session) -> None:
-        """The session has small frames or an acknowledgement to send now."""
+        """Mark the session as having an acknowledgement or control frames to send."""
         self.control_ready[session] = None
 
     def waiting_senders(self) -> Iterator[Sender]:
-        """Of peers in reach with open messages."""
+        """The senders of online peers with pending messages."""
         for peer in self.peer_table.peers.values():
             if peer.has_sender and peer.online and peer.sender.pending:
                 yield peer.sender
 
     def can_broadcast(self) -> bool:
-        """Whether some link reaches everyone with one datagram."""
+        """Whether a link reaches all nodes with one datagram."""
         return any(link.kind is LinkKind.BROADCAST for link in self.links.values())

@@ -1,8 +1,8 @@
-"""Datagrams out and timers: what leaves now, most urgent first, and when somebody wants attention next.
+"""Datagrams out and timers: what is sent now, most urgent first, and when the next timer is due.
 
-One call of `collect`: heartbeats already due, what is owed (acknowledgements and small frames), second copies, then
-level by level, casts and peers in turn. A peer from which nothing more can leave drops out of `State.ready` until an
-acknowledgement, a timer or a new message brings it back.
+One call of `collect` returns datagrams already built (heartbeats), then acknowledgements and control frames, redundant
+copies, and finally level by level broadcasts and the peers in turn. A peer with nothing more to send leaves
+`State.ready` until an acknowledgement, a timer or a new message returns it.
 """
 
 from heapq import heappop
@@ -23,7 +23,7 @@ from udp_mesh.wire.header import VERSION
 from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
 
 BATCH_BYTES = 65_536
-"""What one call returns at most, about: one system call with segmentation offload."""
+"""Approximate maximum of one call: one system call with segmentation offload."""
 
 INTRODUCTION_INTERVAL_S = 0.25
 """Between two introductions to a peer that has not answered one."""
@@ -52,14 +52,14 @@ def collect(state: State, now: float, max_bytes: int | None) -> list[Datagram]:
 
 
 def count_sent(state: State, out: list[Datagram]) -> None:
-    """Datagrams leave, in whatever format."""
+    """Count the datagrams being sent, in whatever format."""
     counters = state.event_queue.counters
     counters.datagrams_sent += len(out)
     counters.bytes_sent += sum([len(datagram[2]) for datagram in out]) + IP_UDP_BYTES * len(out)
 
 
 def _send_control(state: State, session: Session, now: float, out: list[Datagram]) -> None:
-    """Acknowledgement and small frames of one session, together in as few datagrams as they fit."""
+    """Send a session's acknowledgement and control frames in as few datagrams as possible."""
     path = session.path
     peer = session.peer
     if not path.link or peer is None:
@@ -93,7 +93,7 @@ def _send_control(state: State, session: Session, now: float, out: list[Datagram
 
 
 def _introduction(state: State, session: Session, now: float) -> Heartbeat:
-    """Who we are, for a peer that may not know this run of ours yet."""
+    """A heartbeat for a peer that may not know our current boot yet."""
     settings = state.settings
     return Heartbeat(
         settings.name,
@@ -164,7 +164,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
                 sender.served |= bit
             room -= used
             if room <= 0:
-                # Whoever used up the room stands behind the others next time.
+                # A peer that used up the room is served last next time.
                 state.ready[peer] = state.ready.pop(peer)
                 break
     for peer in peers:
@@ -213,7 +213,7 @@ def _send_broadcasts(state: State, priority: int, now: float, out: list[Datagram
 
 
 def _max_timestamped_bytes(state: State) -> int:
-    """The largest broadcast that may say when it left: none, where some peer takes no dates."""
+    """Size of the largest broadcast that may carry a timestamp; 0 if some peer does not accept timestamps."""
     sessions = [peer.session for peer in state.peer_table.online() if peer.session is not None]
     return broadcast_room(state, sessions) if all(session.timed for session in sessions) else 0
 
@@ -235,7 +235,7 @@ def next_timer(state: State) -> float | None:
         if bucket.parked:
             at = min(at, bucket.ready_at())
     if (state.compression_queue or state.inflating) and not state.closed:
-        # At once, again and again; whatever else is due is done in between.
+        # Due at once, repeatedly; other timers are handled in between.
         return _ALWAYS
     return None if at == _INFINITY or state.closed else at
 
