@@ -52,9 +52,9 @@ class Node:
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
         """Process one datagram. Bad bytes are counted and dropped; received data never makes this raise."""
         if len(data) and data[0] < MARK:
-            covered = decapsulate(data)
-            if covered is not None:
-                data = covered
+            inner = decapsulate(data)
+            if inner is not None:
+                data = inner
         if len(data) and data[0] < MARK and self._legacy:
             self._legacy.receive(data, link, source, now)
         else:

@@ -1,9 +1,9 @@
 """Frames to bytes and back: `encode` for a datagram's frames, `decode` for an opened datagram.
 
-A frame starts with its type byte. Types with bit 7 set are fragments, whose low bits are flags; the others follow the
-table `Type`. Every field is big-endian. A fragment that ends its datagram carries no length; any other frame knows
-its own. Decoding either returns frames within every cap of `limits` or raises `DecodeError`; `decode(encode(frames))
-== frames`.
+A frame starts with its type byte. Types with bit 7 set are fragments, whose low bits are flags; the others are listed
+in `Type`. All fields are big-endian. A fragment that ends its datagram has no length field; any other frame has a known
+length. Decoding either returns frames within every cap of `limits` or raises `DecodeError`; `decode(encode(frames)) ==
+frames`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from udp_mesh.wire.frames import (
 
 
 class Type(IntEnum):
-    """The type byte of every frame but the fragment."""
+    """The type byte of every frame except the fragment."""
 
     HEARTBEAT = 1
     ACK = 2
@@ -51,7 +51,7 @@ class Type(IntEnum):
     PONG = 9
     BYE = 10
     SENT = 12
-    """11 stays free: the first version's tests take it for a type nobody knows."""
+    """11 stays free: the tests of the first version use it as an unknown type."""
 
 
 FRAGMENT = 0x80
@@ -62,7 +62,7 @@ FRAGMENT_WIDE = 0x08
 """The position takes 32 bits instead of 16."""
 FRAGMENT_BROADCAST_ID = 0x10
 FRAGMENT_HAS_LIFE = 0x20
-"""The head ends with the message's remaining life."""
+"""The head ends with the message's remaining lifetime."""
 _FRAGMENT_KNOWN = 0x80 | 0x3F
 
 _NARROW = struct.Struct(">BIH")
@@ -76,19 +76,19 @@ FRAGMENT_BYTES = _NARROW.size
 """7 B in front of the payload of a fragment that ends its datagram (9 B from position 65,536 on)."""
 FRAGMENT_WIDE_BYTES = _WIDE.size
 LENGTH_BYTES = _LENGTH.size
-"""2 B more for a fragment with other frames behind it."""
+"""2 B more for a fragment followed by other frames."""
 HEAD_BYTES = _HEAD.size
 """16 B more in the fragment at position 0."""
 
 LIFE_BYTES = 4
-"""4 B more in a head that says how much longer its message may live."""
+"""4 B more in a head with the message's remaining lifetime."""
 SENT_BYTES = 5
 """The frame `Sent`."""
 
 _NO_EXTENSION = b"\x00"
-"""Length of what later versions may add to a heartbeat; a reader skips what it does not know."""
+"""Length of an empty heartbeat extension; a reader skips extension fields it does not know."""
 _CLOCK = struct.Struct(">I")
-"""The first field of the extension: the speaker's clock."""
+"""The first field of the extension: the sender's clock."""
 
 _BITMAP_ONES = (1 << limits.ACK_BITMAP_BITS) - 1
 
@@ -97,9 +97,9 @@ _BITMAP_ONES = (1 << limits.ACK_BITMAP_BITS) - 1
 
 
 def encode(frames: Sequence[Frame]) -> bytes:
-    """The bytes of a datagram's frames, in order; the last one, if a fragment, is written without its length.
+    """The encoded frames of a datagram, in order; a fragment at the end is written without its length.
 
-    Raises ValueError for a value the format cannot carry: that is our own caller's mistake.
+    Raises ValueError for a value the format cannot carry (a mistake of the caller).
     """
     if len(frames) == 1:
         return _encode_frame(frames[0], last=True)
@@ -110,7 +110,7 @@ def encode(frames: Sequence[Frame]) -> bytes:
 
 
 def encode_fragment(fragment: Fragment, *, last: bool = True) -> bytes:
-    """The bytes of one fragment; `last` where no frame follows it in its datagram."""
+    """One encoded fragment; `last` if no frame follows it in its datagram."""
     message_id, position, payload, head, ack_now, broadcast_id = fragment
     first = FRAGMENT
     if ack_now:
@@ -193,7 +193,7 @@ def _encode_frame(frame: Frame, *, last: bool) -> bytes:
 
 def _encode_ack(ack: Ack) -> bytes:
     missing = ~ack.received & _BITMAP_ONES if ack.largest else 0
-    # Nothing below packet 0 was ever sent: those bits say nothing and cost nothing.
+    # No packet below 0 was ever sent: those bits carry nothing and cost nothing.
     missing &= (1 << min(ack.largest, limits.ACK_BITMAP_BITS)) - 1
     width = (missing.bit_length() + 7) // 8
     return b"".join(

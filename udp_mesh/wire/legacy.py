@@ -1,10 +1,10 @@
-"""The fielded format (docs/facts/legacy-wire.md): datagrams of one-byte types, messages as serialized
+"""The legacy format (docs/facts/legacy-wire.md): datagrams with one-byte types, messages as serialized
 `PriorityMeshData`.
 
 Datagram -> `Host`, `Payload`, `LegacyAck` or `PayloadNoAck`; the payloads of one message, in order ->
-`PriorityMeshData`. Both directions, so that nodes of either kind can share a fleet while it moves over. Nothing in
-this format is authenticated: whoever decodes it must believe an address, not a name. Little-endian throughout, unlike
-the rest of `wire`.
+`PriorityMeshData`. Both directions, so that nodes of either kind can share a fleet during an upgrade. Nothing in this
+format is authenticated: a reader must trust the address, not the name. Little-endian throughout, unlike the rest of
+`wire`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _ROS_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
 
 
 def is_ros_name(name: str) -> bool:
-    """Whether ROS 1 takes this as the name of a topic (wiki.ros.org/Names), relative or global."""
+    """Whether ROS 1 accepts this as a topic name (wiki.ros.org/Names), relative or global."""
     return _ROS_NAME.fullmatch(name) is not None and "//" not in name and name.strip("/") != ""
 
 
@@ -66,7 +66,7 @@ class Host:
 
 @dataclass(frozen=True, slots=True)
 class LegacyPayload:
-    """A fragment; `wants_ack` tells PAYLOAD from PAYLOAD_NOACK (broadcast)."""
+    """A fragment; `wants_ack` distinguishes PAYLOAD from PAYLOAD_NOACK (broadcast)."""
 
     sequence: int
     position: int
@@ -88,7 +88,7 @@ LegacyDatagram: TypeAlias = Host | LegacyPayload | LegacyAck
 
 @dataclass(frozen=True, slots=True)
 class PriorityMeshData:
-    """The message that the fielded system reassembles: opaque user bytes with where they belong."""
+    """The message that the legacy system reassembles: opaque user bytes with their topic, type and priority."""
 
     host: str
     type_name: str
@@ -103,27 +103,27 @@ class PriorityMeshData:
 
 
 _ENCAPSULATION = _HEADER.pack(LegacyType.ACK, 0xFFFF, 0xFFFFFFFF, 0, 0)[:-2]
-"""An acknowledgement of a message that nobody sends: unicast numbers end at 0x7fff, and broadcasts are never
+"""An acknowledgement of a message that is never sent: unicast numbers end at 0x7fff, and broadcasts are not
 acknowledged."""
 
 
 def encapsulate(data: bytes) -> bytes:
-    """A datagram of ours that may reach fielded programs: in the payload of an acknowledgement they ignore.
+    """Encapsulate a datagram that may reach legacy programs in the payload of an acknowledgement they ignore.
 
-    A datagram of another type than theirs, which a broadcast would bring them, ends them.
+    A legacy program that receives a datagram of an unknown type, as by broadcast, crashes.
     """
     return _ENCAPSULATION + struct.pack("<H", len(data)) + data + b"\x00"
 
 
 def decapsulate(data: bytes | memoryview) -> bytes | memoryview | None:
-    """What `encapsulate` was given; None where this is something else."""
+    """The datagram passed to `encapsulate`; None for anything else."""
     if len(data) < LEGACY_OVERHEAD_BYTES or bytes(data[: len(_ENCAPSULATION)]) != _ENCAPSULATION:
         return None
     return data[_HEADER.size : -1]
 
 
 def is_legacy(data: bytes | memoryview) -> bool:
-    """Whether the first byte is a type of the fielded format."""
+    """Whether the first byte is a type of the legacy format."""
     return len(data) >= LEGACY_OVERHEAD_BYTES and data[0] in (1, 2, 4, 5)
 
 
@@ -151,7 +151,7 @@ def _frame(kind: LegacyType, sequence: int, position: int, total: int, data: byt
 
 
 def decode_legacy(raw: bytes | memoryview) -> LegacyDatagram:
-    """Raises DecodeError for anything else; the trailing checksum byte is ignored, as the fielded receiver does."""
+    """Raises DecodeError for anything else. The trailing checksum byte is ignored, as by the legacy receiver."""
     if len(raw) < LEGACY_OVERHEAD_BYTES:
         raise DecodeError(f"legacy datagram: expected {LEGACY_OVERHEAD_BYTES} bytes or more, found {len(raw)}")
     kind, sequence, position, total, length = _HEADER.unpack_from(raw)
@@ -178,7 +178,8 @@ def decode_legacy(raw: bytes | memoryview) -> LegacyDatagram:
 
 
 def fragment_legacy(message: bytes) -> list[bytes]:
-    """The fragments of a message as the fielded receiver counts them: `n // 1300 + 1`, an exact multiple ends empty."""
+    """Split a message as the legacy receiver expects: `n // 1300 + 1` fragments, so an exact multiple ends with an
+    empty one."""
     size = MAX_LEGACY_FRAGMENT_BYTES
     return [message[start : start + size] for start in range(0, len(message) // size * size + 1, size)]
 
@@ -205,7 +206,7 @@ def _string(raw: bytes) -> bytes:
 
 
 def decode_mesh_data(raw: bytes) -> PriorityMeshData:
-    """The inverse of `encode_mesh_data`; raises DecodeError, also for bytes behind the message."""
+    """The inverse of `encode_mesh_data`. Raises DecodeError, also for trailing bytes."""
     if len(raw) < 12:
         raise DecodeError(f"legacy message: expected a header of 12 bytes, found {len(raw)}")
     sequence, stamp_s, stamp_ns = struct.unpack_from("<III", raw)
