@@ -66,7 +66,7 @@ def send(
     if channel is None:
         return Rejected(
             RejectReason.UNKNOWN_TOPIC,
-            f"every topic number is taken, or the type's name is not printable text of at most {MAX_TYPE_BYTES} bytes",
+            f"too many topics, or the type name is not printable text of at most {MAX_TYPE_BYTES} bytes",
         )
     if destination is not None:
         names = [destination]
@@ -124,7 +124,7 @@ def _check_capacity(state: State, topic: Topic, names: list[str], size_bytes: in
             if topic.outbox is Outbox.NONE and name not in topic.destinations:
                 return Rejected(RejectReason.UNKNOWN_PEER, f"{name} was never heard of")
             if len(state.peer_table.peers) >= limits.peers:
-                return Rejected(RejectReason.QUEUE_FULL, f"already {limits.peers} peers")
+                return Rejected(RejectReason.QUEUE_FULL, f"limit of {limits.peers} peers reached")
             continue
         if not peer.has_sender:
             continue
@@ -133,11 +133,11 @@ def _check_capacity(state: State, topic: Topic, names: list[str], size_bytes: in
             sender.levels.queued_bytes + size_bytes > limits.queue_bytes_per_peer
             or len(sender.pending) >= limits.queue_messages_per_peer
         ):
-            return Rejected(RejectReason.QUEUE_FULL, f"too much waits for {name}")
+            return Rejected(RejectReason.QUEUE_FULL, f"queue for {name} is full")
     if topic.compression and state.compression_queue.bytes + size_bytes > limits.queue_bytes_per_peer:
-        return Rejected(RejectReason.QUEUE_FULL, "too much waits to be compressed")
+        return Rejected(RejectReason.QUEUE_FULL, "compression queue is full")
     if not names and state.broadcasts.queued() >= limits.queue_messages_per_peer:
-        return Rejected(RejectReason.QUEUE_FULL, "too many broadcasts wait")
+        return Rejected(RejectReason.QUEUE_FULL, "broadcast queue is full")
     return None
 
 

@@ -56,7 +56,7 @@ def apply(state: State, settings: Settings, now: float) -> list[str]:
     """See `Node.apply`."""
     old = state.settings
     if (settings.name, settings.port) != (old.name, old.port):
-        raise ValueError("name and port need a new run of the node")
+        raise ValueError("name and port cannot change at run time; restart the node")
     changes = _changes(old, settings)
     state.settings = settings
     state.topics = {topic.name: topic for topic in settings.topics}

@@ -128,7 +128,7 @@ class Neighbour:
 
     def __post_init__(self) -> None:
         if self.legacy and self.name is None:
-            raise ValueError(f"neighbour {self.address[0]}: a legacy neighbour needs a name")
+            raise ValueError(f"neighbour {self.address[0]}: legacy requires a name")
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +244,7 @@ class Settings:
         if "/" in self.name:
             raise ValueError(f"name {self.name!r}: expected no slash (names are parts of topic names)")
         if not self.keys and not self.unkeyed:
-            raise ValueError("keys: expected a fleet key, or unkeyed=True said explicitly; found neither")
+            raise ValueError("keys: expected a fleet key or an explicit unkeyed=True, found neither")
         if self.keys and self.unkeyed:
             raise ValueError("keys: expected either keys or unkeyed=True, found both")
         if len(self.keys) > 2:

@@ -72,7 +72,7 @@ class _Channel:
 
     def __init__(self, key: Key, sender_boot: bytes, receiver_boot: bytes) -> None:
         if len(sender_boot) != BOOT_ID_BYTES or len(receiver_boot) != BOOT_ID_BYTES:
-            raise ValueError(f"a boot id has {BOOT_ID_BYTES} bytes")
+            raise ValueError(f"boot id: expected {BOOT_ID_BYTES} bytes")
         material = hmac.digest(key.prk, b"channel" + sender_boot + receiver_boot + b"\x01", "sha256")
         self.key = key
         self._secret = material[:16]
@@ -129,7 +129,7 @@ class SendChannel(_Channel):
         """The first of `count` consecutive numbers."""
         number = self.next_number
         if number + count - 1 > MAX_PACKET_NUMBER:
-            raise OverflowError("packet numbers of this channel are used up; the node needs a new boot id")
+            raise OverflowError("packet numbers of this channel are exhausted; restart the node for a new boot id")
         self.next_number = number + count
         return number
 
@@ -163,7 +163,7 @@ class ReceiveChannel(_Channel):
         try:
             frames = self._cipher.decrypt(_NONCE.pack(self._salt, number), view[header_bytes:], view[:header_bytes])
         except InvalidTag as error:
-            raise OpenError(f"packet {number} does not open") from error
+            raise OpenError(f"packet {number} cannot be decrypted") from error
         window.accept(number)
         return number, frames
 

@@ -38,7 +38,7 @@ class Key:
 
     def __post_init__(self) -> None:
         if len(self.secret) != SECRET_BYTES:
-            raise ValueError(f"a fleet key has {SECRET_BYTES} bytes, this one {len(self.secret)}")
+            raise ValueError(f"fleet key: expected {SECRET_BYTES} bytes, found {len(self.secret)}")
         prk = hmac.digest(_EXTRACT_SALT, self.secret, "sha256")
         object.__setattr__(self, "prk", prk)
         object.__setattr__(self, "key_id", hmac.digest(prk, b"key id", "sha256")[:KEY_ID_BYTES])
@@ -70,7 +70,7 @@ class UnknownKeyError(DecodeError):
     """A datagram sealed with a key that is not live here; `key_id` is what it claims (unauthenticated)."""
 
     def __init__(self, key_id: bytes) -> None:
-        super().__init__(f"sealed with key {key_id.hex()}, which is not live here")
+        super().__init__(f"sealed with unknown key {key_id.hex()}")
         self.key_id = key_id
 
 

@@ -73,5 +73,5 @@ def encode_text(value: str, limit_bytes: int, what: str) -> bytes:
     """The inverse of `Reader.text`. Raises ValueError if the text is too long (a mistake of the caller)."""
     raw = value.encode("utf-8")
     if len(raw) > limit_bytes:
-        raise ValueError(f"{what}: at most {limit_bytes} bytes of UTF-8, got {len(raw)}")
+        raise ValueError(f"{what}: expected at most {limit_bytes} bytes of UTF-8, found {len(raw)}")
     return bytes((len(raw),)) + raw

@@ -104,7 +104,7 @@ def encode(frames: Sequence[Frame]) -> bytes:
     if len(frames) == 1:
         return _encode_frame(frames[0], last=True)
     if not 1 <= len(frames) <= limits.MAX_FRAMES_PER_DATAGRAM:
-        raise ValueError(f"a datagram carries 1 to {limits.MAX_FRAMES_PER_DATAGRAM} frames, not {len(frames)}")
+        raise ValueError(f"datagram: expected 1 to {limits.MAX_FRAMES_PER_DATAGRAM} frames, found {len(frames)}")
     final = len(frames) - 1
     return b"".join([_encode_frame(frame, last=place == final) for place, frame in enumerate(frames)])
 
@@ -118,7 +118,7 @@ def encode_fragment(fragment: Fragment, *, last: bool = True) -> bytes:
     if broadcast_id:
         first |= FRAGMENT_BROADCAST_ID
     if (head is None) != (position != 0):
-        raise ValueError("a fragment carries its message's head exactly at position 0")
+        raise ValueError("fragment: expected a head exactly at position 0")
     if last and head is None:
         if position < 65_536:
             return _NARROW.pack(first, message_id, position) + payload
@@ -142,15 +142,15 @@ def encode_fragment(fragment: Fragment, *, last: bool = True) -> bytes:
 
 def _encode_head(head: MessageHead) -> bytes:
     if head.size_bytes > limits.MAX_MESSAGE_BYTES or not 1 <= head.fragments <= max(1, head.size_bytes):
-        raise ValueError(f"no such message: {head.size_bytes} bytes in {head.fragments} fragments")
+        raise ValueError(f"message head: {head.size_bytes} bytes in {head.fragments} fragments is out of range")
     if head.fragments > limits.MAX_FRAGMENTS_PER_MESSAGE or not 0 <= head.priority < limits.PRIORITY_LEVELS:
-        raise ValueError(f"no such message: {head.fragments} fragments, priority {head.priority}")
+        raise ValueError(f"message head: {head.fragments} fragments, priority {head.priority} is out of range")
     age_ms = min(head.age_ms, 0xFFFFFFFF)
     packed = _HEAD.pack(head.size_bytes, head.fragments, age_ms, head.topic_id, head.priority, head.flags)
     if head.life_ms is None:
         return packed
     if head.life_ms < 1:
-        raise ValueError(f"no such message: {head.life_ms} ms to live")
+        raise ValueError(f"message head: expected a remaining lifetime of at least 1 ms, found {head.life_ms}")
     return packed + min(head.life_ms, 0xFFFFFFFF).to_bytes(LIFE_BYTES, "big")
 
 
@@ -170,7 +170,7 @@ def _encode_frame(frame: Frame, *, last: bool) -> bytes:
             return bytes((Type.CANCEL,)) + _encode_ids(message_ids, broadcast_ids)
         case Nack(message_id, ranges):
             if len(ranges) > limits.MAX_RANGES:
-                raise ValueError(f"at most {limits.MAX_RANGES} ranges, got {len(ranges)}")
+                raise ValueError(f"nack: expected at most {limits.MAX_RANGES} ranges, found {len(ranges)}")
             packed = b"".join(struct.pack(">II", first, count) for first, count in ranges)
             return struct.pack(">BIB", Type.NACK, message_id, len(ranges)) + packed
         case TopicAnnounce(topic_id, name, type_name):
@@ -208,7 +208,10 @@ def _encode_ack(ack: Ack) -> bytes:
 
 def _encode_heartbeat(beat: Heartbeat) -> bytes:
     if len(beat.heard) > limits.MAX_HEARD or any(len(tag) != limits.HEARD_TAG_BYTES for tag in beat.heard):
-        raise ValueError(f"at most {limits.MAX_HEARD} tags of {limits.HEARD_TAG_BYTES} bytes, got {len(beat.heard)}")
+        raise ValueError(
+            f"heartbeat: expected at most {limits.MAX_HEARD} tags of {limits.HEARD_TAG_BYTES} bytes, "
+            f"found {len(beat.heard)}"
+        )
     return b"".join(
         (
             bytes((Type.HEARTBEAT,)),
@@ -233,7 +236,7 @@ def _encode_heartbeat(beat: Heartbeat) -> bytes:
 
 def _encode_waiting(waiting: Sequence[Waiting]) -> bytes:
     if len(waiting) > limits.MAX_WAITING:
-        raise ValueError(f"at most {limits.MAX_WAITING} waiting levels, got {len(waiting)}")
+        raise ValueError(f"expected at most {limits.MAX_WAITING} waiting levels, found {len(waiting)}")
     return bytes((len(waiting),)) + b"".join(
         struct.pack(">BH", level.priority, min(level.age_ms, 0xFFFF)) for level in waiting
     )
@@ -242,7 +245,7 @@ def _encode_waiting(waiting: Sequence[Waiting]) -> bytes:
 def _encode_ids(ids: Iterable[int], broadcast: bool) -> bytes:
     packed = [struct.pack(">I", number) for number in ids]
     if not 1 <= len(packed) <= limits.MAX_IDS:
-        raise ValueError(f"1 to {limits.MAX_IDS} message ids, got {len(packed)}")
+        raise ValueError(f"expected 1 to {limits.MAX_IDS} message ids, found {len(packed)}")
     return struct.pack(">BH", broadcast, len(packed)) + b"".join(packed)
 
 
@@ -286,7 +289,7 @@ def _decode_fragment(first: int, reader: Reader) -> Fragment:
     if position >= limits.MAX_FRAGMENTS_PER_MESSAGE or (first & FRAGMENT_WIDE and position < 65_536):
         raise DecodeError(f"fragment position: {position} is out of range")
     if first & FRAGMENT_HAS_LIFE and not first & FRAGMENT_HAS_HEAD:
-        raise DecodeError("fragment: expected a remaining life only in a head")
+        raise DecodeError("fragment: expected a remaining lifetime only in a head")
     head = _decode_head(reader, with_life=first & FRAGMENT_HAS_LIFE != 0) if first & FRAGMENT_HAS_HEAD else None
     if (head is None) != (position != 0):
         raise DecodeError(f"fragment: expected a head exactly at position 0, found position {position}")
@@ -316,9 +319,9 @@ def _decode_head(reader: Reader, *, with_life: bool) -> MessageHead:
     topic_id = reader.integer(2, "topic id")
     priority = reader.at_most(1, limits.PRIORITY_LEVELS - 1, "priority")
     flags = reader.integer(1, "message flags")
-    life_ms = reader.integer(LIFE_BYTES, "remaining life") if with_life else None
+    life_ms = reader.integer(LIFE_BYTES, "remaining lifetime") if with_life else None
     if life_ms == 0:
-        raise DecodeError("remaining life: expected at least 1 ms, found 0")
+        raise DecodeError("remaining lifetime: expected at least 1 ms, found 0")
     return MessageHead(size_bytes, fragments, topic_id, priority, flags, age_ms, life_ms)
 
 

@@ -9,5 +9,5 @@ class UnknownVersionError(DecodeError):
     """A datagram of this protocol in an unsupported version; `version` is what it claims (unauthenticated)."""
 
     def __init__(self, version: int) -> None:
-        super().__init__(f"wire version {version} is not spoken here")
+        super().__init__(f"wire version {version} is not supported")
         self.version = version

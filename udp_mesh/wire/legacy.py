@@ -187,7 +187,7 @@ def fragment_legacy(message: bytes) -> list[bytes]:
 def encode_mesh_data(message: PriorityMeshData) -> bytes:
     """ROS 1 serialization of `PriorityMeshData`. Raises ValueError for a priority outside 0 to 255."""
     if not 0 <= message.priority <= 255:
-        raise ValueError(f"legacy priority: expected 0 to 255, got {message.priority}")
+        raise ValueError(f"legacy priority: expected 0 to 255, found {message.priority}")
     return b"".join(
         (
             struct.pack("<III", message.sequence, message.stamp_s, message.stamp_ns),
@@ -220,7 +220,7 @@ def decode_mesh_data(raw: bytes) -> PriorityMeshData:
     topic, place = _take_text(raw, place + 1, MAX_TOPIC_BYTES, "topic")
     data, place = _take(raw, place, len(raw), "data")
     if place != len(raw):
-        raise DecodeError(f"legacy message: {len(raw) - place} bytes too many")
+        raise DecodeError(f"legacy message: {len(raw) - place} trailing bytes")
     return PriorityMeshData(host, type_name, priority, topic, data, sequence, stamp_s, stamp_ns, frame_id)
 
 
