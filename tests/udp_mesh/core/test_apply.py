@@ -1,4 +1,4 @@
-"""Changes of the running node drop no accepted message and take effect at once."""
+"""Changes of a running node drop no accepted message and take effect at once."""
 
 from __future__ import annotations
 

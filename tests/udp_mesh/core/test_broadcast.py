@@ -1,4 +1,4 @@
-"""Messages to all: one datagram where it fits, copies where not, repair, and outboxes for those out of reach."""
+"""Broadcasts: one datagram if the message fits, copies otherwise, repair, and outboxes for offline peers."""
 
 from __future__ import annotations
 

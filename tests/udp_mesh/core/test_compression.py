@@ -1,4 +1,4 @@
-"""Large messages are compressed and inflated step by step: nothing waits for them but what comes behind them."""
+"""Large messages are compressed and inflated in steps: only later messages of the same topic wait for them."""
 
 import random
 import zlib

@@ -1,4 +1,4 @@
-"""A fielded robot on a link that loses: its program resends nothing, so our acknowledgements must let it go on."""
+"""A legacy robot on a lossy link: its program never retransmits, so our acknowledgements must keep it going."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ DELAY_S, TICK_S = 0.010, 0.001
 
 @dataclass
 class FieldedProgram:
-    """Its sending half, as the facts of the fielded format tell: three on their way, never sent again, all dropped
-    where one is unanswered for 10 s."""
+    """Its sending half, as documented: three fragments in flight, no retransmission, everything dropped if one is
+    unanswered for 10 s."""
 
     queue: list[tuple[int, int, int, LegacyPayload]] = field(default_factory=list)
     on_way: dict[tuple[int, int], float] = field(default_factory=dict)
@@ -63,7 +63,7 @@ class FieldedProgram:
 def play(
     loss: float, seconds: float, *, seed: int = 1, restart_at: float | None = None
 ) -> tuple[int, int, FieldedProgram]:
-    """Ten urgent messages and twenty bulky ones a second: how many of each arrived."""
+    """Send ten urgent messages and twenty bulk messages a second; returns how many of each arrived."""
     rng, old, program = random.Random(seed), OldRobot(), FieldedProgram()
     started = old.now
     wire: deque[tuple[float, LegacyPayload]] = deque()
@@ -124,7 +124,7 @@ def test_a_restart_of_ours_stalls_a_fielded_sender_for_no_ten_seconds() -> None:
 
 
 def test_acknowledgements_besides_stay_few_without_loss() -> None:
-    """One repeat each, and some guesses per second: no more airtime than that."""
+    """One repetition each and some predictions per second: no more airtime than that."""
     acks, now, more = LegacyAcks(), 0.0, 0
     for sequence in range(1, 1001):
         piece = LegacyPayload(sequence, 0, 1, b"x", wants_ack=True)
@@ -139,7 +139,7 @@ def fielded(*topics: Topic) -> OldRobot:
 
 
 def test_what_an_outbox_keeps_waits_until_a_fielded_robot_has_started() -> None:
-    """It acknowledges before its reader has subscribed: what comes then is lost there."""
+    """It acknowledges before its reader has subscribed: what arrives before that is lost."""
     old = fielded(Topic("kept", priority=8, outbox=Outbox.ALL))
     old.now += 20.0
     old.hear()
@@ -229,7 +229,8 @@ def test_the_status_of_a_fielded_robot_and_our_own_rate_say_what_goes_to_it() ->
 
 
 def test_answers_that_come_too_soon_after_a_resend_teach_patience() -> None:
-    """The fielded program answers when its interpreter gets to it; a small message resent needlessly comes twice."""
+    """The legacy program answers when its interpreter is scheduled; a small message retransmitted needlessly is
+    delivered twice."""
     old = OldRobot()
     rng = random.Random(2)
     answers: list[tuple[float, LegacyAck]] = []

@@ -1,8 +1,8 @@
 """Any bytes at every decoder of the network: frames within their caps, or a counted drop, never an exception.
 
-`make test` runs 4,000 inputs per surface. The proof runs as many as `UDP_MESH_FUZZ_INPUTS` says, over all surfaces:
-10^8 by default, some hours of a core. `RAN` is what was really run. Inputs are random bytes, mutations of real
-datagrams, and sealed frames of a key holder; a third of them comes from an IPv6 address.
+`make test` runs 4,000 inputs per surface. The proof runs `UDP_MESH_FUZZ_INPUTS` inputs over all surfaces: 10^8 by
+default, some hours of one core. `RAN` is what was really run. Inputs are random bytes, mutations of real datagrams, and
+sealed frames of a key holder; a third of them comes from an IPv6 address.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ FOUR, SIX = ("10.0.0.66", 8700), ("fe80::66", 8700)
 OLD = ("10.0.0.9", 8700)
 A = ("10.0.0.1", 8700)
 FRESH_PAIR_EVERY = 20_000
-"""Inputs after which both nodes are replaced: what grew is seen then, and state that stuck does not hide the rest."""
+"""Inputs after which both nodes are replaced: growth shows by then, and stuck state does not hide other failures."""
 
 
 class Fuzzer:
-    """One pair of nodes, a dual-stack link each, and dice."""
+    """One pair of nodes, a dual-stack link each, and a random source."""
 
     def __init__(self, seed: int) -> None:
         self.dice = random.Random(seed)
@@ -133,7 +133,7 @@ def sealed_to_all(fuzzer: Fuzzer) -> None:
 
 
 def mutated_datagrams(fuzzer: Fuzzer) -> None:
-    """What was sealed, changed on its way: it opens nowhere."""
+    """Sealed datagrams modified in transit: they cannot be opened."""
     assert fuzzer.insider is not None
     number, data = fuzzer.insider.path.channel.seal(fuzzer.dice.choice(fuzzer.seeds))
     fuzzer.both.a._state.peer_table.peers["b"].sender.in_flight.add(number, None)

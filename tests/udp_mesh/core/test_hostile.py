@@ -1,4 +1,5 @@
-"""Hostile bytes: random, mutated, replayed, forged by a key holder; nothing crashes, grows, or delays the urgent."""
+"""Hostile bytes: random, mutated, replayed, forged by a key holder. Nothing crashes, grows, or delays urgent
+messages."""
 
 from __future__ import annotations
 
@@ -88,7 +89,7 @@ def test_a_flood_of_invented_senders_holds_bounded_state() -> None:
 @pytest.mark.parametrize("name", ["b", "ghost", "ghost{}"])
 @pytest.mark.parametrize("versions", [(1, 1), (2, 3)])
 def test_a_flood_of_boots_that_a_key_holder_invents_holds_bounded_state(name: str, versions: tuple[int, int]) -> None:
-    """They know whom they talk to, so each is proven at once: under one name, under the victim's own, under many."""
+    """They hear our boot, so each is verified at once: under one name, under the victim's own, under many."""
     both = pair(limits=Limits(strangers=8, peers=16))
     state = both.b._state
     rng = random.Random(1)
@@ -107,7 +108,7 @@ def test_a_flood_of_boots_that_a_key_holder_invents_holds_bounded_state(name: st
 
 
 def insider(both: Pair, frames: list[Frame]) -> None:
-    """A datagram from a's session with frames of the test's choice: a key holder gone bad."""
+    """A datagram from a's session with arbitrary frames: a malicious key holder."""
     peer = both.a._state.peer_table.peers["b"]
     assert peer.session is not None
     number, data = peer.session.path.seal(encode(frames))

@@ -1,4 +1,4 @@
-"""Peers of the fielded format, and each of its known defects held as a law of ours."""
+"""Peers of the legacy format, and a test for each known defect of the legacy system."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ OLD = ("10.0.0.9", 8700)
 
 
 class OldRobot:
-    """A node of ours with one fielded neighbour `old`, played by hand."""
+    """Our node with one legacy neighbor `old`, which the test plays."""
 
     def __init__(self, **changes: object) -> None:
         self.now = 1000.0
@@ -55,7 +55,7 @@ class OldRobot:
         self.node.receive(encode_legacy(datagram), "mesh", OLD, self.now)
 
     def hear(self) -> list[Host | LegacyPayload | LegacyAck]:
-        """What leaves to the old robot now."""
+        """What is sent to the old robot now."""
         self.node.handle_timer(self.now)
         out: list[Datagram] = []
         while datagrams := self.node.datagrams_to_send(self.now):
@@ -154,7 +154,7 @@ def test_a_message_to_all_reaches_fielded_peers_too() -> None:
     assert [decode_mesh_data(piece.data).data for piece in old.hear_payloads()] == [b"all"]
 
 
-# The defects, in the order of the list of the fielded system's facts.
+# The defects, in the order listed in the facts about the legacy system.
 
 
 def test_defect_1_a_lost_fragment_is_sent_again_and_stalls_nothing() -> None:
@@ -335,7 +335,7 @@ def test_defect_10_a_send_to_a_host_never_heard_of_is_refused_and_the_node_goes_
 @pytest.mark.parametrize("fragments", [1, 2, 3])
 def test_defect_11_an_exact_multiple_of_the_fragment_size_sends_no_empty_fragment(fragments: int) -> None:
     both = pair(Topic("t"), fragment_bytes=100)
-    # The first fragment gives up room for its head and the announcement of the topic.
+    # The first fragment reserves room for its head and the topic announcement.
     both.a.send("t", b"learn the name", destination="b", now=both.now)
     both.roundtrip(times=5)
     both.events(both.b)
@@ -399,7 +399,7 @@ def test_a_fielded_program_that_starts_anew_is_understood_although_its_numbers_s
         for piece in pieces(sequence, b"x" * 2000):
             old.say(piece)
     assert len(old.received()) == 2
-    # the second message of the next run is cut off in the middle by yet another start
+    # The second message of the next run is cut off in the middle by another restart.
     old.now += 5.0
     for piece in [*pieces(1, b"y" * 2000), *pieces(2, b"y" * 2000)[:1]]:
         old.say(piece)

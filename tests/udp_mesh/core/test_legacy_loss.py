@@ -1,4 +1,4 @@
-"""A fielded peer on a link that loses a fifth each way: urgent messages keep overtaking, bulk keeps moving."""
+"""A legacy peer on a link that loses a fifth each way: urgent messages keep overtaking, bulk keeps moving."""
 
 import heapq
 import random
@@ -10,7 +10,8 @@ DELAY_S, LOSS, TICK_S = 0.010, 0.2, 0.001
 
 
 def play(seed: int, duration_s: float) -> tuple[list[float], int]:
-    """What each urgent message (ten a second) took beside endless bulk, in seconds; fragments of that that arrived."""
+    """Latencies in seconds of urgent messages (ten a second) beside endless bulk, and the bulk fragments that
+    arrived."""
     rng, old = random.Random(seed), OldRobot()
     started = old.now
     back: list[tuple[float, int, int]] = []
@@ -57,7 +58,7 @@ def test_a_fielded_peer_that_answered_and_fell_silent_is_probed_gently() -> None
     for turn in range(12):
         old.now += 0.010
         for place, piece in enumerate(old.hear()):
-            # one of each three never arrives
+            # One of three never arrives.
             if isinstance(piece, LegacyPayload) and (turn + place) % 3:
                 old.say(LegacyAck(piece.sequence, piece.position))
     silent_from, left = old.now + 2.0, 0

@@ -1,4 +1,4 @@
-"""A fleet moves over robot by robot: who still takes a robot for a fielded one finds out by itself that it is none."""
+"""A fleet is upgraded robot by robot: nodes that take an upgraded robot for a legacy one detect the upgrade."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ MAP = bytes(range(256)) * 200
 
 
 class Move:
-    """`a` and `c` are ours and take `b` for fielded, which it is: a program that answers as the fielded one does."""
+    """`a` and `c` run our format and take `b` for a legacy robot, which it is: a program that answers like the legacy
+    one."""
 
     def __init__(self) -> None:
         self.world = world = World(seed=4)
@@ -45,7 +46,7 @@ class Move:
             )
 
     def move(self) -> None:
-        """The fielded program ends; a node of ours starts in its place."""
+        """The legacy program ends; our node starts in its place."""
         self.answers = False
         self.world.run(1.0)
         self.world.add(settings("b", Topic("map", priority=7)), address=OLD[0])
@@ -63,7 +64,7 @@ def test_messages_go_on_after_a_fielded_robot_has_moved_over_although_nobody_was
     assert world.run(5.0, until=lambda: len(world.events_of("a", MessageDelivered)) == 1)
     assert move.payloads
     move.answers = False
-    # These begin in the old format and find nobody there.
+    # These start in the old format and reach no receiver.
     world.send("a", "map", MAP, "b")
     world.send("a", "status", b"waits", "b")
     world.run(0.5)

@@ -1,4 +1,4 @@
-"""A link of which one direction works: nobody is called online who cannot be reached, and every message ends."""
+"""A link that works in one direction only: an unreachable peer is never online, and every message ends."""
 
 from tests.udp_mesh.core.pair import BROADCAST, World, settings
 from udp_mesh.core.events import (
@@ -24,7 +24,7 @@ def met(seed: int) -> World:
 
 
 def peer(world: World, name: str) -> tuple[bool, bool]:
-    """(online, one way) as the node holds its only peer."""
+    """(online, one way) of a node's only peer."""
     (found,) = world.nodes[name].conditions(world.now).peers
     return found.online, found.one_way
 
@@ -40,7 +40,7 @@ def test_a_peer_that_is_heard_and_does_not_hear_us_goes_offline_and_returns() ->
     assert world.events_of("b", PeerOffline)
     world.run(10.0)
     assert len(world.events_of("a", PeerOnline)) == 1
-    # while it waits what b sends is taken: that way works
+    # Meanwhile b's messages are accepted: that direction works.
     world.send("b", "map", b"one way", "a")
     world.pipes[("a", "b")].up = True
     assert world.run(10.0, until=lambda: len(world.events_of("a", PeerOnline)) == 2)
@@ -50,7 +50,7 @@ def test_a_peer_that_is_heard_and_does_not_hear_us_goes_offline_and_returns() ->
 
 
 def carry_broadcasts_alone(world: World, source: str, target: str) -> None:
-    """As behind a firewall that lets no unicast through this way."""
+    """As behind a firewall that blocks unicast in this direction."""
     to_one = False
 
     def look(name: str, datagram: Datagram, now: float) -> None:

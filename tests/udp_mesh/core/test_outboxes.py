@@ -37,7 +37,7 @@ def reach(world: World, up: bool) -> None:
 
 
 def away(*topics: Topic) -> World:
-    """A world in which a holds b for offline."""
+    """A world in which b is offline for a."""
     world = met(*topics)
     reach(world, up=False)
     assert world.run(30.0, until=lambda: bool(world.events_of("a", PeerOffline)))
@@ -45,7 +45,7 @@ def away(*topics: Topic) -> World:
 
 
 def send(world: World, topic: str, numbers: range) -> None:
-    """Without letting virtual time, or the pumping of all nodes, come between."""
+    """Without advancing virtual time or running other nodes in between."""
     for number in numbers:
         world.nodes["a"].send(topic, b"%d" % number, destination="b", now=world.now)
 
@@ -107,7 +107,7 @@ def test_a_full_outbox_is_emptied_in_steps_in_order_and_once() -> None:
     reach(world, up=True)
     assert world.run(20.0, until=lambda: held(world) < 3 * RELEASE_BATCH)
     assert held(world) == 2 * RELEASE_BATCH
-    # what is published meanwhile comes behind
+    # Messages published meanwhile come later.
     send(world, "log", range(3 * RELEASE_BATCH, 3 * RELEASE_BATCH + 50))
     world.run(10.0)
     assert arrived(world, "log") == list(range(3 * RELEASE_BATCH + 50))
@@ -150,7 +150,7 @@ def test_what_has_ended_is_not_kept_in_memory_until_its_deadline(
     for payload in payloads:
         world.send("a", "t", payload, "b")
         world.run(0.03)
-    # the list, the loop, the argument
+    # The list, the loop, the argument.
     assert sum(sys.getrefcount(payload) > 3 for payload in payloads) < 150
 
 
@@ -171,7 +171,7 @@ def test_a_message_is_on_disk_from_its_acceptance_to_its_outcome(size_bytes: int
     payload = world.rng.randbytes(size_bytes // 2) + bytes(size_bytes - size_bytes // 2)
     world.nodes["a"].send("t", payload, destination="b", now=world.now)
     assert [kept.payload for kept in disk.kept.values()] == [payload]
-    # the robot's battery is pulled while the message is under way
+    # The robot loses power while the message is being sent.
     world.run(0.005)
     world.add(settings("a", topic), store=disk)
     assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
@@ -187,7 +187,7 @@ class FullDisk(Disk):
 
 
 class FailingDisk(Disk):
-    """Takes everything, and finds out later that it cannot write."""
+    """Accepts everything and later fails to write it."""
 
     def put(self, message: StoredMessage) -> bool:
         return True

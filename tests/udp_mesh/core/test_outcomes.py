@@ -1,6 +1,6 @@
 """Every accepted reliable message ends, per destination, in exactly one of delivered, expired, peer lost.
 
-And a delivered one arrived whole, once per run of its receiver.
+A delivered one arrived completely, once per run of its receiver.
 """
 
 import random
@@ -68,7 +68,7 @@ def soak(seed: int, seconds: float) -> World:
             world.add(settings("b", *TOPICS, rates=QUICK))
     for pipe in world.pipes.values():
         pipe.up = True
-    # the limited topic may have more waiting than it is let send in a minute
+    # The rate-limited topic may have more waiting than it may send in a minute.
     world.run(300.0, until=lambda: not world.nodes["a"].conditions(world.now).queued_bytes)
     world.run(8.0)
     ends = outcomes(world, "a")

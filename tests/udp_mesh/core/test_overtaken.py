@@ -1,4 +1,4 @@
-"""Urgent packets overtake others in a radio and do not tell of their loss: time does, however many arrive."""
+"""Urgent packets overtake others in a radio, so their arrival does not reveal the loss of others: only time does."""
 
 import random
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ LARGE_BYTES = 1000
 
 @dataclass
 class Wall(Pipe):
-    """Loses large datagrams while it stands."""
+    """Loses large datagrams while the outage lasts."""
 
     stands: bool = False
 

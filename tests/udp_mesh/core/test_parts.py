@@ -1,4 +1,5 @@
-"""The small parts against obvious slow versions: ranges, flight, reassembly, compression, acknowledgements, buckets."""
+"""The small parts against simple slow models: ranges, packets in flight, reassembly, compression, acknowledgements,
+buckets."""
 
 import zlib
 from itertools import pairwise
@@ -113,7 +114,7 @@ def test_every_packet_is_acknowledged_or_lost_as_a_plain_model_says(plan: list[t
     def book(packets: list[Packet], how: str) -> None:
         for packet in packets:
             index = packet.position
-            # Only what was called lost may change its mind, once.
+            # Only a packet declared lost may change its outcome, once.
             assert index not in ended or (ended[index], how) == ("lost", "acknowledged")
             ended[index] = how
 
@@ -154,7 +155,7 @@ def test_urgent_packets_that_overtake_others_in_the_radio_are_no_sign_of_loss() 
     acknowledged, lost, _ = in_flight.acknowledge(7, 0b111111)
     assert len(acknowledged) == 6
     assert lost == []
-    # Three later ones of its own kind are.
+    # Three later ones of the same kind declare it lost.
     for number in range(8, 12):
         in_flight.add(number, Packet(MARK, outgoing(1, 1), number))
     assert in_flight.acknowledge(11, 0b1111111111)[1] == bulk
@@ -172,7 +173,7 @@ def test_urgent_packets_that_timed_out_count_as_lost_once_an_acknowledgement_say
     for number in range(8):
         in_flight.add(number, Packet(URGENT, outgoing(1, 1), number))
         in_flight.declare_lost_before(1.0)
-    # 0, 2, 4 and 6 arrived; of 5 and 7 it is too early to tell.
+    # 0, 2, 4 and 6 arrived; for 5 and 7 it is too early.
     assert in_flight.confirm_timed_out(7, 0b10101010) == 2
     assert in_flight.confirm_timed_out(7, 0b10101010) == 0
 
@@ -210,7 +211,7 @@ def test_anything_that_is_not_zlib_is_refused(body: bytes) -> None:
 
 def test_what_left_at_the_pace_of_a_slow_path_holds_nothing_up_on_a_fast_one() -> None:
     pacer, now = Pacer(0.003), 10.0
-    # ten bursts to a peer that was silent, when a packet took ten seconds
+    # Ten bursts to an unresponsive peer, when a packet took ten seconds.
     for _ in range(10):
         pacer.on_sent(10, now, 0.1)
     assert pacer.packets_allowed(now, 0.1) == 0

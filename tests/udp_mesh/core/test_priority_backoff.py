@@ -1,4 +1,4 @@
-"""No robot drowns another's urgent traffic: less urgent levels elsewhere hold back, for a bounded share of the time."""
+"""Urgent traffic holds back less urgent levels of other nodes, for a bounded share of the time."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -39,7 +39,7 @@ def test_a_node_whose_urgent_messages_wait_is_given_way_by_another_ones_bulk() -
     for name in ("a", "b", "c"):
         world.add(settings(name, *topics))
     world.run(2.0)
-    # b's urgent messages crawl to c: b says so whenever it acknowledges a's bulk.
+    # b's urgent messages crawl to c: b reports so whenever it acknowledges a's bulk.
     world.pipes[("b", "c")].rate_bits_per_s = 20_000
     for _ in range(10):
         world.send("b", "stop", bytes(1000), "c")
@@ -48,6 +48,6 @@ def test_a_node_whose_urgent_messages_wait_is_given_way_by_another_ones_bulk() -
     held_s = world.nodes["a"]._state.priority_backoff.held_total_s
     assert held_s > 0
     queues = {queue.priority: queue for queue in world.nodes["a"].conditions(world.now).peers[0].queues}
-    # what the level waited for others is told, and is no more than the node held back at all
+    # The reported hold-back of the level is no more than the node's total.
     assert 0 < queues[9].held_s <= held_s + 1e-9
     assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))

@@ -1,4 +1,4 @@
-"""Recordings: what was overheard and never arrived is worth nothing later, whatever address it comes from."""
+"""Replays: a recorded datagram that never arrived is rejected later, whatever address it comes from."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BEST = Topic("pose", priority=5, reliable=False)
 
 
 def acquainted(*topics: Topic) -> Pair:
-    """Two nodes that have answered each other, so that short headers do."""
+    """Two nodes that have answered each other, so that short headers suffice."""
     both = pair(*topics)
     for node, other in ((both.a, "b"), (both.b, "a")):
         node.send("any", b"hello", destination=other, now=both.now)
@@ -49,7 +49,7 @@ def payloads(both: Pair) -> list[bytes]:
 
 
 def overheard(both: Pair, topic: str, payload: bytes) -> list[Datagram]:
-    """What leaves for b now, and does not get there."""
+    """What is sent to b now, and lost."""
     both.a.send(topic, payload, destination="b", now=both.now)
     return [datagram for datagram in both.drop(both.a) if datagram.data[0] == DATA_BYTE]
 
@@ -60,7 +60,7 @@ def replay(both: Pair, recorded: list[Datagram]) -> None:
 
 
 def without_dates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both nodes as the first version was: neither says when it sends, nor takes it."""
+    """Both nodes as in the first version: they neither send nor accept timestamps."""
     monkeypatch.setattr(heartbeat, "OWN_FEATURES", Feature.ZLIB | Feature.REPAIR)
     monkeypatch.setattr(transmit, "OWN_FEATURES", Feature.ZLIB | Feature.REPAIR)
     monkeypatch.setattr(heartbeat, "clock_ms", lambda now: None)
@@ -71,7 +71,7 @@ def without_dates(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_lost_command_is_not_delivered_late(topic: Topic) -> None:
     both = acquainted(topic)
     recorded = overheard(both, topic.name, b"stop")
-    # The peers go on hearing each other; what was lost is never sent again by hand of the test.
+    # The peers keep hearing each other; the test never retransmits what was lost.
     both.a._state.peer_table.peers["b"].sender.finish_all(ExpiryReason.DEADLINE)
     both.roundtrip(times=900, step_s=0.1)
     before = both.b.conditions(both.now).counters
@@ -105,7 +105,7 @@ def test_what_a_slow_route_or_a_short_cut_holds_back_arrives(held_s: float) -> N
 
 
 def test_a_message_whose_life_is_over_is_not_put_together() -> None:
-    """Its last piece was lost and overheard; its sender knows that it expired."""
+    """Its last fragment was lost and recorded; its sender knows that the message expired."""
     both = acquainted(Topic("plan", priority=6, deadline_s=1.0))
     both.a.send("plan", bytes(5000), destination="b", now=both.now)
     *arrived, last = [datagram for datagram in both.drop(both.a) if datagram.data[0] == DATA_BYTE]
@@ -137,7 +137,7 @@ def test_messages_outlive_cuts_of_several_seconds_and_routes_that_become_slow() 
 
 
 def silent_world() -> tuple[World, list[Datagram]]:
-    """`a` and `b` have met; then `a` says hellos that b does not hear, and is gone."""
+    """`a` and `b` have met; then `a` sends hellos that b does not hear, and leaves."""
     world = World(seed=2)
     for name in "ab":
         world.add(settings(name))
@@ -188,7 +188,7 @@ def test_a_peer_that_was_away_comes_back_within_a_round_trip_of_its_hello(
 
 
 def test_a_peer_whose_computer_slept_is_believed_again_within_a_second() -> None:
-    """Its clock stood still: everything it says is dated an hour ago, until it answers a question."""
+    """Its clock stood still: its timestamps are an hour old until it answers a challenge."""
     world = World(seed=5)
     for name in "ab":
         world.add(settings(name))
@@ -215,7 +215,7 @@ def roaming(seed: int, loss: float) -> World:
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("with_timestamp", [True, False])
 def test_resent_datagrams_move_no_path(seed: int, with_timestamp: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An attacker that repeats overheard datagrams from its own address wins the race where the original is lost."""
+    """An attacker that replays recorded datagrams from its own address wins the race if the original is lost."""
     if not with_timestamp:
         without_dates(monkeypatch)
     world = roaming(seed, 0.2)
@@ -246,7 +246,7 @@ def test_a_robot_that_moved_is_followed_a_round_trip_after_it_was_missed() -> No
     world.send("a", "map", b"where are you", "b")
     assert world.run(6.0, until=lambda: bool(world.events_of("a", PeerAddressChanged)))
     moves.append(world.now - asked)
-    # Heard there at 2 s at the latest (two heartbeats), and 20 ms there and back.
+    # Heard there within 2 s (two heartbeats), plus a round trip of 20 ms.
     assert moves[0] < 3.0
     assert world.run(1.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
 
@@ -275,7 +275,7 @@ def test_two_peers_whose_tags_collide_are_both_heard() -> None:
     world.rng = usual
     world.run(3.0)
     for number in range(300):
-        # The numbers of the one are all seen when those of the other come.
+        # The numbers of the one are all seen when those of the other arrive.
         world.send("one", "any", b"%d" % number, "base")
         world.run(0.01)
     world.run(1.0)
@@ -408,7 +408,7 @@ def test_an_empty_datagram_of_a_key_holder_is_malformed() -> None:
 
 
 def test_a_ping_is_answered_where_it_came_from() -> None:
-    """Over two links, one of them dead one way, each side must be able to prove the other."""
+    """Over two links, one of them dead in one direction, each side must be able to verify the other."""
     both = acquainted()
     for node, own in ((both.a, "172.16.0.1"), (both.b, "172.16.0.2")):
         node.link_up(LinkInfo("cable", LinkKind.BROADCAST, (own, 8700), ("172.16.0.255", 8700)), both.now)

@@ -1,4 +1,5 @@
-"""A message that an outbox takes back in the middle keeps its number: who had all of it does not get it twice."""
+"""A message returned to an outbox while being sent keeps its number: a peer that had all of it does not deliver it
+twice."""
 
 from hypothesis import given
 from hypothesis import settings as examples
@@ -36,7 +37,7 @@ def test_a_cut_at_any_moment_delivers_a_message_once(size_bytes: int, after_s: f
     world = met(ART)
     world.send("a", "art", bytes(size_bytes), "b")
     world.run(after_s)
-    # what had left arrives, and is not acknowledged any more
+    # What was sent arrives but is no longer acknowledged.
     cut(world, ("b", "a"))
     world.run(0.02)
     cut(world, ("a", "b"))

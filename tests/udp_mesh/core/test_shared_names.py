@@ -38,7 +38,7 @@ def conflict() -> World:
 
 
 def exchange(world: World, name: str) -> None:
-    """One message each way between c and the node that its name a means."""
+    """One message each way between c and the node that c knows as a."""
     before = {who: len(world.events_of(who, MessageReceived)) for who in ("c", name)}
     ended = {who: len(world.events_of(who, MessageDelivered)) for who in ("c", name)}
     world.send(name, "map", bytes(20_000), "c")

@@ -1,4 +1,4 @@
-"""A path that becomes a hundred times slower is measured anew, not filled with copies of what is still on its way."""
+"""A path that becomes a hundred times slower is measured again, not filled with copies of what is still in flight."""
 
 import pytest
 
@@ -13,9 +13,9 @@ TOPICS = (Topic("status", priority=0), Topic("map", priority=7), Topic("video", 
 @pytest.mark.parametrize(
     ("rate_bits_per_s", "delay_s", "urgent_within_s"),
     [
-        # a full queue of this link holds six seconds
+        # A full queue of this link holds six seconds.
         (200e3, 0.01, 1.5),
-        # the pauses of an application that sends on and on say nothing of the queue
+        # The pauses of a continuously sending application say nothing about the queue.
         (1e6, 0.01, 0.1),
         (20e6, 0.8, 0.9),
     ],
@@ -63,7 +63,7 @@ def test_urgent_messages_stay_urgent_on_a_path_that_became_slow(
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("loss", [0.0, 0.1])
 def test_what_is_on_its_way_on_a_path_that_became_slow_holds_no_urgent_message_back(seed: int, loss: float) -> None:
-    """Hundreds of packets may stand in the path's queue, or be lost without anybody knowing: urgent ones join them."""
+    """Hundreds of packets may be in the path's queue, or lost without notice: urgent ones join them."""
     world = World(seed=seed)
     for name in "ab":
         world.add(settings(name, *TOPICS))
@@ -79,12 +79,12 @@ def test_what_is_on_its_way_on_a_path_that_became_slow_holds_no_urgent_message_b
         world.send("a", "status", b"%d" % number, "b")
         world.run(MAX_URGENT_WAIT_S + 0.001)
         waiting = [message for message in sender.pending if message.priority == 0 and not message.started]
-        # a silent peer gets probes instead
+        # An unresponsive peer gets probes instead.
         assert not waiting or sender.unresponsive_since is not None
 
 
 def test_what_a_silent_and_then_slow_peer_was_sent_holds_nothing_up_when_its_path_is_well_again() -> None:
-    """Probes and bursts leave ahead of the pace, and were once owed for a minute at that of a path of seconds."""
+    """Probes and bursts are sent ahead of the pace; that debt once blocked for a minute at the pace of a slow path."""
     world = World(seed=1)
     for name in "ab":
         world.add(settings(name, *TOPICS))

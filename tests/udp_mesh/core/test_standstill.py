@@ -1,4 +1,4 @@
-"""A process or machine that stands still (stopped, swapped out, a virtual machine put aside) loses nothing by it."""
+"""A suspended process or machine (stopped, swapped out, a paused virtual machine) causes no loss."""
 
 import pytest
 
@@ -42,7 +42,7 @@ def test_a_team_that_stood_still_goes_on_where_it_was(stopped_s: float, lost: bo
 
 
 def stop(world: World, name: str, stopped_s: float) -> None:
-    """One node stands still, and what is sent to it meanwhile is lost; then it goes on."""
+    """Suspend one node and lose what is sent to it meanwhile; then resume it."""
     stopped = world.nodes.pop(name)
     world.run(stopped_s)
     world.nodes[name] = stopped
@@ -50,7 +50,7 @@ def stop(world: World, name: str, stopped_s: float) -> None:
 
 @pytest.mark.parametrize("stopped_s", [5.0, 45.0, 200.0])
 def test_a_stopped_sender_takes_nobody_for_lost(stopped_s: float) -> None:
-    """What the others said meanwhile did not fit the socket's buffer: to the sender they were silent."""
+    """What the others sent meanwhile did not fit the socket's buffer: to the sender they were silent."""
     world = met(3)
     world.send("a", "map", bytes(MAP_BYTES), "b")
     world.run(0.3)

@@ -1,8 +1,8 @@
 """A node written from docs/wire-format.md alone: nothing of udp_mesh is imported, only an AEAD cipher.
 
-It does what that page asks of another implementation, in the plainest way: says hello, believes who hears it, takes
-messages apart and together, acknowledges each datagram by itself, and sends what is missing again twice a second.
-A test lets it talk with a real daemon; where it fails, the page or the daemon is wrong.
+It does what that page requires of another implementation, in the simplest way: sends a hello, believes nodes that hear
+it, fragments and reassembles messages, acknowledges each datagram individually, and retransmits what is missing twice a
+second. A test connects it to a real daemon; if that fails, the page or the daemon is wrong.
 """
 
 from __future__ import annotations
@@ -213,12 +213,12 @@ class Peer:
         self.finished: set[tuple[bool, int]] = set()
         self.next_id = 0
         self.under_way: dict[int, list[tuple[bytes, set[int]]]] = {}
-        """Message id -> per fragment its frames and the packets it left in."""
+        """Message id -> per fragment its frames and the packets that carried it."""
         self.ends: dict[int, str] = {}
 
 
 class ForeignNode:
-    """`run` lets it live on the socket until something is true."""
+    """`run` runs it on the socket until a condition holds."""
 
     def __init__(self, secret: bytes, name: str, own: socket.socket, neighbour: Address, features: int = 0) -> None:
         self.key, self.name, self.socket, self.neighbour = FleetKey(secret), name, own, neighbour
@@ -233,7 +233,7 @@ class ForeignNode:
         return next((peer for peer in self.peers.values() if peer.name == name and peer.believed), None)
 
     def run(self, until: Callable[[], object], seconds: float) -> bool:
-        """Live until `until` holds; False if that is not within `seconds`."""
+        """Run until `until` holds; False if that is not within `seconds`."""
         deadline, hello_at, resend_at = time.monotonic() + seconds, 0.0, 0.0
         self.socket.settimeout(0.02)
         while not until():
@@ -265,7 +265,7 @@ class ForeignNode:
     def send(
         self, peer: Peer, topic: str, payload: bytes, *, priority: int = 5, size: int = 1000, flags: int = RELIABLE
     ) -> int:
-        """A message to one peer, cut into pieces of `size`; its number."""
+        """Send a message to one peer in fragments of `size`; returns its number."""
         number, peer.next_id = peer.next_id, peer.next_id + 1
         pieces = [payload[start : start + size] for start in range(0, len(payload), size)] or [b""]
         head = (len(payload), len(pieces), 0, 1000 + len(topic), priority, flags)
@@ -278,7 +278,7 @@ class ForeignNode:
         return number
 
     def broadcast(self, topic: str, payload: bytes) -> None:
-        """A message to all in one datagram, not repaired."""
+        """Broadcast a message in one datagram, without repair."""
         head = (len(payload), 1, 0, 1000 + len(topic), 3, FLAG_TO_ALL)
         announce = b"\x07" + struct.pack(">H", head[3]) + text(topic) + text("")
         frames = announce + fragment(FIRST_UNREPAIRED_NUMBER + self.to_all.next_number, 0, payload, head)
@@ -292,7 +292,7 @@ class ForeignNode:
             packets.add(self.say(peer, frames))
 
     def say(self, peer: Peer, frames: bytes) -> int:
-        """One datagram to one boot; its number."""
+        """Send one datagram to one boot; returns its number."""
         kind = DATA if peer.answered else INTRODUCTION
         number = peer.out.next_number
         frames = frames if peer.answered else self.heartbeat() + frames

@@ -1,4 +1,4 @@
-"""Laws of the fielded format, and its reader's defects that ours does not have."""
+"""Properties of the legacy format, and defects of the legacy reader that ours does not have."""
 
 import struct
 

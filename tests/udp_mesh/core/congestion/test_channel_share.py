@@ -1,4 +1,4 @@
-"""Several senders on one channel keep less queue each, and equal shares."""
+"""Several senders on one channel keep less queue each, in equal shares."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_in_a_large_team_what_was_said_holds_until_the_next_heartbeat_is_overdue
 
 
 def settled_queue(share: float, loss: float) -> float:
-    """Packets above the path's own that the window settles at: 150 packets/s over 20 ms."""
+    """Packets beyond the path's own at which the window settles: 150 packets/s over 20 ms."""
     rtt = RttEstimator()
     window = DelayBasedController(rtt)
     window.queue_share = share

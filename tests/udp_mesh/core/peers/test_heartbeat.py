@@ -1,4 +1,4 @@
-"""Discovery costs a large team a bounded share of its channel, and a node no more than it uses."""
+"""Discovery costs a large team a bounded share of its channel, and a node only what it uses."""
 
 import itertools
 import random
@@ -35,7 +35,7 @@ def test_whatever_asks_for_heartbeats_a_node_sends_no_more_than_its_share(
             heartbeats.build(settings("a"), [], (), 0, 0.0, heartbeats.next_at)
         heartbeats.reply_to(_session(), team, now)
     gaps = [later - earlier for earlier, later in itertools.pairwise(sent)]
-    # a sparser heartbeat of its own may fall in between two answers
+    # One of its own sparse heartbeats may fall between two answers.
     assert all(gap >= min(max(MIN_GAP_S, share_s), 0.9 * RATES.heartbeat_s) - 1e-9 for gap in gaps)
 
 
@@ -98,7 +98,7 @@ def test_nodes_tell_each_other_what_they_send_and_what_arrives() -> None:
         world.run(0.1)
     sending = world.nodes["a"].conditions(world.now)
     to_b = next(peer for peer in sending.peers if peer.name == "b")
-    # 10 kB ten times a second, with headers
+    # 10 kB ten times a second, with headers.
     assert 0.8e6 < sending.sent_bits_per_s < 1.0e6
     assert to_b.arrived_bits_per_s is not None
     assert 0.8e6 < to_b.arrived_bits_per_s < 1.0e6
@@ -119,5 +119,5 @@ def test_new_nodes_that_one_heartbeat_cannot_list_are_listed_soon() -> None:
     while len(listed) < len(strangers):
         now = heartbeats.next_at
         listed.update(heartbeats.build(settings("a"), strangers, (), 0, 0.0, now).heard)
-    # four heartbeats at the pace of a meeting, not of a regular round of ten seconds
+    # Four heartbeats at the pace of discovery, not of a regular interval of ten seconds.
     assert now < 5 * len(strangers) / (DISCOVERY_RATE_FACTOR * RATES.heartbeats_heard_per_s)

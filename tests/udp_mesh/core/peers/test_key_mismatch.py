@@ -1,4 +1,4 @@
-"""Hellos of unknown keys are reported, but a flood of them makes few events."""
+"""Hellos with unknown keys are reported, but a flood of them causes few events."""
 
 import random
 

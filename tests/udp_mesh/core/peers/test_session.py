@@ -1,4 +1,4 @@
-"""Sessions: meeting, restarts, moving, clashing names, keys, versions, replays, links that come and go."""
+"""Sessions: discovery, restarts, migration, name conflicts, keys, versions, replays, links that come and go."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_two_nodes_meet_within_three_exchanges() -> None:
 
 
 def told_of(versions: tuple[int, int], *, times: int, apart_s: float) -> list[Event]:
-    """What a node tells that hears a newcomer of these wire versions so many times."""
+    """The events of a node that hears a new node of these wire versions that many times."""
     both = pair()
     boot_id = random.Random(5).randbytes(16)
     channel = SendChannel(KEY, boot_id, TO_ALL)
@@ -86,7 +86,7 @@ def test_everything_recorded_from_an_earlier_run_is_worthless_to_the_next() -> N
     for datagram in recorded:
         both.b.receive(datagram.data, "mesh", A, both.now)
     assert both.events(both.b) == []
-    # Nor once the two have met: what was broadcast before that stays a recording.
+    # Nor after the two have met: what was broadcast before stays a replay.
     for _ in range(300):
         both.roundtrip()
     both.events(both.b)

@@ -1,4 +1,4 @@
-"""One bound over all peers: names are free to a key holder, memory is not."""
+"""One bound for all peers: a key holder invents names freely, but not memory."""
 
 from __future__ import annotations
 

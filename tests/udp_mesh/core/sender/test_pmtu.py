@@ -1,4 +1,4 @@
-"""A path that swallows large datagrams in silence is found out; loss of any other kind is not taken for one."""
+"""A path that silently drops large datagrams is detected; loss of any other kind is not mistaken for that."""
 
 import random
 from collections.abc import Callable
@@ -21,7 +21,7 @@ TOPICS = (Topic("status", priority=0), Topic("map"), Topic("seen", reliable=Fals
 
 @dataclass
 class Narrow(Pipe):
-    """Loses every IP packet above `mtu` and says nothing."""
+    """Silently drops every IP packet above `mtu`."""
 
     mtu: int = 1500
 
@@ -52,7 +52,7 @@ def met(
 
 
 def become(world: World, mtu: int) -> None:
-    """Every path carries so much from now on."""
+    """Set the MTU of every path."""
     for path in world.pipes.values():
         assert isinstance(path, Narrow)
         path.mtu = mtu
@@ -99,7 +99,7 @@ def test_a_large_message_crosses_a_path_that_is_narrower_than_its_link(
 
 
 def largest_of(world: World) -> list[int]:
-    """The largest IP packet that leaves a from now on."""
+    """The largest IP packet that a sends from now on."""
     largest = [0]
 
     def look(name: str, datagram: Datagram, _: float) -> None:
@@ -131,7 +131,7 @@ def test_small_messages_that_share_datagrams_cross_a_narrow_path(size_bytes: int
 
 
 def test_messages_that_share_datagrams_do_not_make_them_larger_than_a_full_fragment() -> None:
-    # The loopback, and some tunnels, say that they carry 64 KiB.
+    # The loopback, and some tunnels, claim an MTU of 64 KiB.
     world = met(1500, 0.1, link_mtu=65_535)
     largest = largest_of(world)
     for _ in range(300):
@@ -147,7 +147,7 @@ def test_messages_that_share_datagrams_do_not_make_them_larger_than_a_full_fragm
         (9000, 8192, 1500, [1500]),
         (65_535, 8192, 1500, [1500]),
         (65_535, 8192, 1300, [1500, 1280]),
-        # Its fragments fit 1280 bytes anyhow.
+        # Its fragments fit 1280 bytes anyway.
         (1500, 1000, 900, [576]),
     ],
 )
@@ -183,7 +183,7 @@ def test_a_path_that_is_wide_again_carries_full_fragments_after_some_time() -> N
     before = world.pipes[("a", "b")].carried
     world.send("a", "map", bytes(100_000), "b")
     assert world.run(20.0, until=lambda: len(world.events_of("a", MessageDelivered)) == 2)
-    # 72 full fragments; 84 would be the smaller ones
+    # 72 full fragments; 84 would be the smaller ones.
     assert world.pipes[("a", "b")].carried - before < 80
 
 
@@ -220,7 +220,7 @@ def test_a_path_that_stays_narrow_is_asked_ever_more_seldom_and_loses_nothing_bu
 
     publish()
     world.run(2 * MAX_PROBE_INTERVAL_S + 50.0)
-    # 10, 20, 40 .. 320, 600 s after the one before
+    # 10, 20, 40 .. 320, 600 s after the previous one.
     assert [round(at / 10) * 10 for at in large[::MAX_PROBES]] == [10, 30, 70, 150, 310, 630, 1240]
     assert len(large) == 7 * MAX_PROBES
     assert narrow(world) == [1280]
@@ -276,7 +276,7 @@ def packet(size_bytes: int, now: float) -> Packet:
 
 
 def narrowings(hours: float, arrives: Callable[[float], bool], *, large_arrive: bool = True) -> int:
-    """How often a silent peer, probed four times a second, is taken for behind a narrow path."""
+    """How often the path to an unresponsive peer, probed four times a second, is wrongly narrowed."""
     size = PathMtu()
     large, small = packet(1350, 0.0), packet(100, 0.0)
     count = 0
@@ -320,14 +320,14 @@ def test_hours_of_cuts_are_not_taken_for_a_narrow_path(cut_s: float, share: floa
 
 def test_no_mistake_comes_of_a_path_that_loses_much_from_one_moment_to_the_next() -> None:
     rng = random.Random(9)
-    # A minute of each, again and again.
+    # A minute of each, repeatedly.
     assert narrowings(10.0, lambda now: rng.random() >= (0.0 if now % 120 < 60 else 0.84)) == 0
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2, 0.36])
 def test_a_silent_peer_behind_a_narrow_path_is_known_for_one_within_seconds(loss: float) -> None:
     rng = random.Random(10)
-    # Every narrowing begins a new doubt: on an average they are so far apart.
+    # Every reduction starts a new suspicion: the average distance between them.
     assert 3600 / narrowings(1.0, lambda _: rng.random() >= loss, large_arrive=False) < 10.0
 
 
@@ -372,7 +372,7 @@ def test_loss_and_cuts_of_any_size_are_not_taken_for_a_narrow_path(loss: float) 
 
 
 def under_way(world: World) -> list[int]:
-    """Sizes of the datagrams that leave a from now on, as IP packets."""
+    """Sizes, as IP packets, of the datagrams that a sends from now on."""
     sizes: list[int] = []
     world.tap = lambda name, datagram, _: sizes.append(len(datagram.data) + IP_UDP_BYTES) if name == "a" else None
     world.send("a", "map", bytes(500_000), "b")
@@ -396,7 +396,7 @@ def test_what_had_left_whole_when_the_link_became_narrower_arrives_once() -> Non
     world = met(1500)
     for _ in range(20):
         world.send("a", "map", bytes(3_000), "b")
-        # all of it is on its way, and nothing is acknowledged
+        # All of it is in flight, and nothing is acknowledged.
         world.run(0.012)
         link = LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a"], BROADCAST, mtu=700)
         world.nodes["a"].link_up(link, world.now)

@@ -1,4 +1,4 @@
-"""Small urgent pieces leave again: soon where the way loses much, and whenever their answer is overdue."""
+"""Small urgent fragments are sent again: soon on a lossy path, and whenever their acknowledgement is overdue."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def piece(*, reliable: bool = True) -> OutgoingMessage:
 
 
 def sendings(message: OutgoingMessage, *, twice: bool, loss: float, answered_at: float = float("inf")) -> list[float]:
-    """When copies of a piece leave that was sent at 0."""
+    """When copies of a fragment sent at 0 are due."""
     copies = RedundantCopies()
     copies.schedule(message, 0, 0.0, gap_s=GAP_S, twice=twice, loss=loss, urgent_timeout_s=OVERDUE_S)
     times = []
@@ -72,5 +72,5 @@ def test_the_window_does_not_go_by_urgent_packets_that_pass_the_others() -> None
     assert not sender._sample(0.001, run.world.now, urgent=True)
     assert sender.rtt.smoothed_rtt == smoothed
     assert sender._sample(0.030, run.world.now, urgent=False)
-    # where nothing else is sent urgent packets are all there is to measure
+    # With no other traffic, urgent packets are all there is to measure.
     assert sender._sample(0.001, run.world.now + 10.0, urgent=True)

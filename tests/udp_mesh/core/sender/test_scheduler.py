@@ -1,4 +1,4 @@
-"""Strict priority, decided per fragment when a datagram leaves."""
+"""Strict priority, decided per fragment when a datagram is built."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -39,7 +39,7 @@ def test_no_lower_priority_leaves_while_a_higher_one_waits_and_every_piece_leave
 ) -> None:
     scheduler = Scheduler()
     waiting: list[tuple[int, int]] = []
-    """(priority, serial of the message) of every piece that waits: the obvious slow version."""
+    """(priority, serial of the message) of every waiting fragment: the simple slow model."""
     messages: list[OutgoingMessage] = []
     left: list[tuple[OutgoingMessage, int]] = []
 

@@ -1,4 +1,5 @@
-"""How many packets may leave: while acknowledgements are late the link is presumed to go on, for a bounded time."""
+"""How many packets may be sent: while acknowledgements are late the link is assumed to keep delivering, for a bounded
+time."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from udp_mesh.core.settings import Settings
 
 
 def busy_outbound(**link: object) -> tuple[Sender, float]:
-    """The sending half that has filled its link for a while, and the time of its last acknowledgement."""
+    """A sender that has filled its link for a while, and the time of its last acknowledgement."""
     run = Run(urgent=False)
     run.link(**link)
     run.start()
@@ -66,7 +67,7 @@ def test_bursts_that_swallow_whole_trains_of_acknowledgements_cost_little() -> N
             state = [False]
 
             def lost(rng: object, _: float, state: list[bool] = state) -> bool:
-                # Gilbert and Elliott's chain per frame: bursts of ten frames, a fifth of all.
+                # Gilbert-Elliott loss per frame: bursts of ten frames, a fifth of all.
                 state[0] = rng.random() >= 0.1 if state[0] else rng.random() < 0.025  # type: ignore[attr-defined]
                 return state[0]
 
