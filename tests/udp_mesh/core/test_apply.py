@@ -101,7 +101,7 @@ def test_an_undeclared_topic_is_refused_unless_all_are_allowed() -> None:
 
 def test_name_and_port_need_a_new_run() -> None:
     both = pair()
-    with pytest.raises(ValueError, match="new run"):
+    with pytest.raises(ValueError, match="restart the node"):
         both.a.apply(replace(both.a.settings, name="z"), both.now)
 
 

@@ -387,7 +387,7 @@ def test_without_fielded_neighbours_their_format_is_dropped() -> None:
 
 
 def test_settings_of_a_fielded_neighbour_need_its_name() -> None:
-    with pytest.raises(ValueError, match="needs a name"):
+    with pytest.raises(ValueError, match="requires a name"):
         Neighbour(OLD, legacy=True)
     assert isinstance(settings("x"), Settings)
     assert PeerOnline is not None
