@@ -1,7 +1,7 @@
-"""Message bodies, compressed on request of their topic and never inflated past the receiver's limit.
+"""Compression of message bodies: on request of their topic, and never inflated beyond the receiver's limit.
 
-Both ways go step by step, a millisecond each: whoever carries a map of 20 MB goes on with everything else in between.
-`Packing` and `Unpacking` are one body under way; `PackingQueue` is what a node still has to compress.
+Both directions run in steps of about a millisecond, so that a map of 20 MB blocks nothing else. `Compression` and
+`Decompression` process one body; `CompressionQueue` holds what a node has yet to compress.
 """
 
 import zlib
@@ -9,23 +9,23 @@ from collections import deque
 from dataclasses import dataclass
 
 from udp_mesh.core.events import MessageId
-from udp_mesh.core.sender.message import Channel
+from udp_mesh.core.sender.message import TopicChannel
 
 LEVEL = 1
-"""zlib's fastest: an embedded core compresses several times faster than a mesh carries."""
+"""zlib's fastest: an embedded core compresses several times faster than a mesh transmits."""
 
-LEAST_BYTES = 128
+MIN_BYTES = 128
 """Shorter messages gain nothing over zlib's own header."""
 
 STEP_BYTES = 1 << 16
-"""Compressed in one step: about a millisecond."""
+"""Compressed per step: about a millisecond."""
 
 INFLATE_STEP_BYTES = 1 << 18
-"""Inflated in one step, which is faster."""
+"""Inflated per step; inflating is faster."""
 
 
-class Packing:
-    """A payload being compressed (zlib, RFC 1950). When done, `body` is None where that is not shorter."""
+class Compression:
+    """A payload being compressed (zlib, RFC 1950). When done, `body` is None if it would not be shorter."""
 
     __slots__ = ("_at", "_compressor", "_packed", "_payload", "_size", "body")
 
@@ -38,9 +38,9 @@ class Packing:
         self.body: bytes | None = None
 
     def step(self) -> bool:
-        """Compress some more; True when done."""
+        """Compress one step. True when done."""
         size = len(self._payload)
-        if size < LEAST_BYTES:
+        if size < MIN_BYTES:
             return True
         self._add(self._compressor.compress(self._payload[self._at : self._at + STEP_BYTES]))
         self._at += STEP_BYTES
@@ -58,9 +58,9 @@ class Packing:
         self._size += len(packed)
 
 
-class Unpacking:
-    """A body being inflated. When done, `payload` is None for what is not zlib, is cut short, carries a tail, or grows
-    past the limit."""
+class Decompression:
+    """A body being inflated. When done, `payload` is None if the body is not zlib, is truncated, has trailing bytes, or
+    exceeds the limit."""
 
     __slots__ = ("_at", "_body", "_inflater", "_limit_bytes", "_parts", "held_bytes", "payload")
 
@@ -71,11 +71,11 @@ class Unpacking:
         self._parts: list[bytes] = []
         self._at = 0
         self.held_bytes = len(body)
-        """The body and what was made of it until now."""
+        """Size of the body and of what was inflated so far."""
         self.payload: bytes | None = None
 
     def step(self) -> bool:
-        """Inflate some more; True when done."""
+        """Inflate one step. True when done."""
         inflater = self._inflater
         room = INFLATE_STEP_BYTES
         while room > 0:
@@ -97,78 +97,79 @@ class Unpacking:
                     self.payload = b"".join(self._parts)
                 return True
             if not part and not inflater.unconsumed_tail and self._at == len(self._body):
-                # Cut short: nothing is left, and nothing comes of it.
+                # Truncated: no input is left and nothing more comes out.
                 return True
         return False
 
 
 def compress(payload: bytes) -> bytes | None:
-    """The payload as zlib, or None where that is not shorter."""
-    packing = Packing(payload)
-    while not packing.step():
+    """The compressed payload, or None if it is not shorter."""
+    compression = Compression(payload)
+    while not compression.step():
         pass
-    return packing.body
+    return compression.body
 
 
 def decompress(body: bytes, limit_bytes: int) -> bytes | None:
-    """The inverse of `compress`; None as `Unpacking.payload`."""
-    unpacking = Unpacking(body, limit_bytes)
-    while not unpacking.step():
+    """The inverse of `compress`; None as in `Decompression.payload`."""
+    decompression = Decompression(body, limit_bytes)
+    while not decompression.step():
         pass
-    return unpacking.payload
+    return decompression.payload
 
 
 @dataclass(frozen=True, slots=True)
-class Unpacked:
-    """A message accepted but not yet compressed; `names` are its destinations, none for all, `store_keys` where each of
-    their copies is on disk."""
+class Uncompressed:
+    """A message accepted but not yet compressed. `names` are its destinations (empty: broadcast); `store_keys` are the
+    keys of their copies on disk."""
 
     message_id: MessageId
-    channel: Channel
+    channel: TopicChannel
     payload: bytes
     names: tuple[str, ...]
     accepted_at: float
     store_keys: tuple[int | None, ...] = ()
 
 
-class PackingQueue:
-    """What waits to be compressed: of one topic in the order accepted, of several topics the most urgent first."""
+class CompressionQueue:
+    """Messages waiting to be compressed: in the order accepted within a topic, the most urgent topic first."""
 
-    __slots__ = ("_topics", "_under_way", "bytes")
+    __slots__ = ("_in_progress", "_topics", "bytes")
 
     def __init__(self) -> None:
-        self._topics: dict[str, deque[Unpacked]] = {}
-        self._under_way: dict[str, Packing] = {}
+        self._topics: dict[str, deque[Uncompressed]] = {}
+        self._in_progress: dict[str, Compression] = {}
         self.bytes = 0
 
     def __len__(self) -> int:
         return len(self._topics)
 
-    def holds(self, topic: str) -> bool:
-        """Whether something of this topic waits, so that what comes later must wait behind it."""
+    def has_topic(self, topic: str) -> bool:
+        """Whether a message of this topic waits, so that later ones must wait behind it."""
         return topic in self._topics
 
-    def add(self, message: Unpacked) -> None:
+    def add(self, message: Uncompressed) -> None:
         self._topics.setdefault(message.channel.name, deque()).append(message)
         self.bytes += len(message.payload)
 
-    def step(self) -> tuple[Unpacked, bytes | None] | None:
-        """Compress some more; a message and its compressed body (None: send it as it is) when one is done."""
+    def step(self) -> tuple[Uncompressed, bytes | None] | None:
+        """Compress one step. Returns a message and its compressed body (None: send it uncompressed) when one is
+        done."""
         name = min(self._topics, key=lambda topic: self._topics[topic][0].channel.topic.priority)
-        packing = self._under_way.get(name)
-        if packing is None:
-            packing = self._under_way[name] = Packing(self._topics[name][0].payload)
-        if not packing.step():
+        compression = self._in_progress.get(name)
+        if compression is None:
+            compression = self._in_progress[name] = Compression(self._topics[name][0].payload)
+        if not compression.step():
             return None
-        del self._under_way[name]
-        return self._take(name), packing.body
+        del self._in_progress[name]
+        return self._take(name), compression.body
 
-    def take_all(self) -> list[Unpacked]:
-        """Everything, as it is: the node closes."""
-        self._under_way.clear()
+    def drain(self) -> list[Uncompressed]:
+        """Remove and return everything uncompressed, because the node closes."""
+        self._in_progress.clear()
         return [self._take(name) for name in list(self._topics) for _ in range(len(self._topics[name]))]
 
-    def _take(self, name: str) -> Unpacked:
+    def _take(self, name: str) -> Uncompressed:
         waiting = self._topics[name]
         message = waiting.popleft()
         if not waiting:

@@ -1,4 +1,4 @@
-"""How the network is, for the autonomy to decide by: per peer rates, round trip, loss, queues; counters of the node."""
+"""Network conditions for the autonomy: rates, round trip, loss and queues per peer, and counters of the node."""
 
 from dataclasses import dataclass
 
@@ -7,22 +7,22 @@ from udp_mesh.core.settings import Address
 
 @dataclass(frozen=True, slots=True)
 class QueueConditions:
-    """What waits for one peer on one priority level, and how that level fares."""
+    """The messages waiting for one peer on one priority level, and the level's starvation."""
 
     priority: int
     messages: int
     bytes: int
     oldest_s: float
-    """Age of the message at the head."""
+    """Age of the oldest message."""
     starved_s: float
-    """Time in which this level waited while only more urgent ones were sent, since this run of ours began."""
+    """Time in which this level waited while only more urgent ones were sent, since the node started."""
     held_s: float
     """Time in which this level was held back for other robots' more urgent messages."""
 
 
 @dataclass(frozen=True, slots=True)
-class Stranger:
-    """A node that is heard and does not hear us: no peer, since nothing would reach it."""
+class UnverifiedNode:
+    """A node that is heard but does not hear us. It is no peer, because nothing would reach it."""
 
     name: str
     address: Address
@@ -33,7 +33,7 @@ class Stranger:
 
 @dataclass(frozen=True, slots=True)
 class PeerConditions:
-    """One peer. Rates are over the last second; times in seconds; None where nothing was measured yet."""
+    """One peer. Rates are over the last second; times in seconds; None if not measured yet."""
 
     name: str
     online: bool
@@ -45,19 +45,19 @@ class PeerConditions:
     round_trip_s: float | None
     least_round_trip_s: float | None
     loss: float
-    """Share of packets lost on the way to the peer, 0 to 1, smoothed."""
+    """Fraction of packets to the peer that are lost, 0 to 1, smoothed."""
     sent_bits_per_s: float
-    """Wire bits of messages sent to the peer, with IP and UDP headers; acknowledgements and the like are left out."""
+    """Wire bits of messages sent to the peer, with IP and UDP headers, without acknowledgements and control frames."""
     delivered_bits_per_s: float
     """Payload bits the peer acknowledged."""
     received_bits_per_s: float
     """Wire bits received from the peer."""
     arrived_bits_per_s: float | None
-    """Wire bits sent to the peer that arrive, as the peer itself says in its acknowledgements."""
+    """Wire bits received by the peer from us, as reported in its acknowledgements."""
     peer_sends_bits_per_s: float | None
-    """Wire bits that the peer says it sends to everybody."""
+    """Wire bits that the peer reports sending to all nodes."""
     capacity_bits_per_s: float | None
-    """The link's estimated rate for payload, where enough was sent to see it."""
+    """The link's estimated capacity for payload, if enough was sent to measure it."""
     window_packets: float
     in_flight_packets: int
     retransmitted_packets: int
@@ -65,14 +65,15 @@ class PeerConditions:
     outbox_messages: int
     outbox_bytes: int
     one_way: bool
-    """It is heard, and its heartbeats say that it does not hear us; if that lasts it is not online."""
+    """We hear the peer, but its heartbeats show that it does not hear us; if that lasts, it goes offline."""
     unanswered_for_s: float | None
-    """So long nothing sent to it was answered, although it may be heard; None where nothing waits for an answer."""
+    """How long nothing sent to the peer was acknowledged, even if it is heard; None if nothing awaits an
+    acknowledgement."""
 
 
 @dataclass(slots=True)
 class Counters:
-    """Totals since the node's start. The node counts in its own; a snapshot holds a copy."""
+    """Totals since the node's start. The node keeps one instance; a snapshot holds a copy."""
 
     datagrams_sent: int = 0
     bytes_sent: int = 0
@@ -94,7 +95,7 @@ class Counters:
     dropped_replayed: int = 0
     dropped_unproven: int = 0
     dropped_stale: int = 0
-    """Authentic, never seen before, and too old: a recording, or held back for longer than `ACCEPT_AGE_S`."""
+    """Authentic and never seen before, but too old: replayed, or delayed by more than `ACCEPT_AGE_S`."""
     dropped_over_limit: int = 0
     events_dropped: int = 0
     repairs_asked: int = 0
@@ -110,10 +111,10 @@ class Conditions:
     peers: tuple[PeerConditions, ...]
     counters: Counters
     sent_bits_per_s: float
-    """Wire bits of this node, to everybody."""
+    """Wire bits sent by this node to all nodes."""
     heard_bits_per_s: float
-    """Wire bits that this node and the peers online say they send together: how busy the channel is."""
+    """Wire bits that this node and its online peers send together, as reported: how busy the channel is."""
     partial_bytes: int
     queued_bytes: int
     repair_bytes: int
-    strangers: tuple[Stranger, ...]
+    strangers: tuple[UnverifiedNode, ...]

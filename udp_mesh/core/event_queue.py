@@ -1,4 +1,4 @@
-"""What the node has to tell: events in order, bounded, and counters."""
+"""The node's event queue (bounded, in order) and its counters."""
 
 from collections import deque
 
@@ -6,8 +6,8 @@ from udp_mesh.core.conditions import Counters
 from udp_mesh.core.events import Event, MessageReceived
 
 
-class Ledger:
-    """Events not yet fetched and totals. A driver that stops reading loses the oldest received messages, never
+class EventQueue:
+    """Events not fetched yet, and totals. If the driver stops reading, the oldest received messages are dropped, never
     outcomes."""
 
     __slots__ = ("_events", "_limit", "counters")
@@ -20,15 +20,15 @@ class Ledger:
     def set_limit(self, limit: int) -> None:
         self._limit = limit
 
-    def tell(self, event: Event) -> None:
+    def emit(self, event: Event) -> None:
         """Queue an event for the driver."""
         if len(self._events) >= self._limit:
             self._drop_one()
         self._events.append(event)
 
     @property
-    def waits(self) -> bool:
-        """Whether an event is to be fetched."""
+    def has_events(self) -> bool:
+        """Whether an event waits to be fetched."""
         return bool(self._events)
 
     def next_event(self) -> Event | None:

@@ -1,4 +1,4 @@
-"""What a node tells its driver, in the order it happened: peers come and go, messages arrive, sent messages end.
+"""The events of a node, in the order they happened: peers come and go, messages arrive, sent messages end.
 
 Every reliable message ends, per destination, in exactly one of `MessageDelivered`, `MessageExpired`, `MessagePeerLost`.
 """
@@ -10,11 +10,11 @@ from typing import NewType
 from udp_mesh.core.settings import Address
 
 MessageId = NewType("MessageId", int)
-"""Number of one `Node.send`, unique within a node's life; its outcomes carry it once per destination."""
+"""Identifies one `Node.send`, unique within a node's life; its outcomes carry it once per destination."""
 
 
 class RejectReason(Enum):
-    """Why `Node.send` took nothing on."""
+    """Why `Node.send` did not accept a message."""
 
     UNKNOWN_TOPIC = "unknown topic"
     UNKNOWN_PEER = "unknown peer"
@@ -44,7 +44,7 @@ class ExpiryReason(Enum):
 
 @dataclass(frozen=True, slots=True)
 class PeerOnline:
-    """A peer proved itself alive for the first time, or after having been offline."""
+    """A peer was verified for the first time, or after having been offline."""
 
     peer: str
     address: Address
@@ -53,7 +53,7 @@ class PeerOnline:
 
 @dataclass(frozen=True, slots=True)
 class PeerOffline:
-    """Nothing came from the peer for `offline_s`, or it said good-bye (`left`)."""
+    """Nothing came from the peer for `offline_s`, or it said goodbye (`left`)."""
 
     peer: str
     left: bool
@@ -61,14 +61,14 @@ class PeerOffline:
 
 @dataclass(frozen=True, slots=True)
 class PeerRestarted:
-    """The peer runs anew: whatever it had not finished receiving is being sent again."""
+    """The peer restarted: whatever it had not finished receiving is sent again."""
 
     peer: str
 
 
 @dataclass(frozen=True, slots=True)
 class PeerAddressChanged:
-    """The same run of the same peer is now reached elsewhere."""
+    """The peer, without having restarted, is now reached at another address."""
 
     peer: str
     old: Address
@@ -78,7 +78,7 @@ class PeerAddressChanged:
 
 @dataclass(frozen=True, slots=True)
 class NameConflict:
-    """Two running nodes use one name (ours, when `own`). Messages go to the one that appeared last."""
+    """Two running nodes use one name (ours if `own`). Messages go to the one that appeared last."""
 
     name: str
     first: Address
@@ -88,18 +88,18 @@ class NameConflict:
 
 @dataclass(frozen=True, slots=True)
 class KeyMismatch:
-    """Datagrams come from here that none of our keys opens (once a minute per address, and not more than a few a minute
-    in all)."""
+    """Datagrams from this address are sealed with an unknown key (at most once a minute per address, and a few a minute
+    in total)."""
 
     address: Address
     link: str
     more: int = 0
-    """Such datagrams, from other addresses, not reported by an event since the last one."""
+    """Such datagrams from other addresses that no event has reported since the last one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Incompatible:
-    """A peer speaks only versions that we do not (`versions` is its lowest and highest)."""
+    """A peer speaks only versions that this node does not (`versions` is its lowest and highest)."""
 
     peer: str
     address: Address
@@ -108,7 +108,7 @@ class Incompatible:
 
 @dataclass(frozen=True, slots=True)
 class MessageReceived:
-    """A complete message. `payload` is as given to the sender's `send`."""
+    """A complete message. `payload` is as passed to the sender's `send`."""
 
     source: str
     topic: str
@@ -120,7 +120,7 @@ class MessageReceived:
 
 @dataclass(frozen=True, slots=True)
 class MessageDelivered:
-    """The destination holds the whole message. `latency_s` is from `send` to knowing it."""
+    """The destination has the complete message. `latency_s` is from `send` to its acknowledgement."""
 
     message_id: MessageId
     peer: str
@@ -149,7 +149,7 @@ class MessagePeerLost:
 
 @dataclass(frozen=True, slots=True)
 class TopicStarved:
-    """Messages of the topic have waited this long because more urgent ones keep leaving first."""
+    """Messages of the topic have waited this long because more urgent ones are always sent first."""
 
     peer: str
     topic: str
@@ -158,7 +158,8 @@ class TopicStarved:
 
 @dataclass(frozen=True, slots=True)
 class PathNarrowed:
-    """Small datagrams reach the peer, full ones do not: it gets fragments of `fragment_bytes` in packets of `mtu`."""
+    """Small datagrams reach the peer, full ones do not: it now gets fragments of `fragment_bytes` in packets of
+    `mtu`."""
 
     peer: str
     mtu: int

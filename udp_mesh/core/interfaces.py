@@ -1,4 +1,5 @@
-"""What the driver hands to a node besides bytes and the time, and what the node hands back to be sent."""
+"""The interfaces between a node and its driver, apart from events and settings: datagrams, random numbers, the
+store."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -12,8 +13,8 @@ from udp_mesh.core.settings import Address
 class Datagram(NamedTuple):
     """One UDP datagram to send on a link. `destination` None means the link's broadcast address.
 
-    Consecutive bulk datagrams to one destination have one size (the last may be shorter), ready for segmentation
-    offload. An `urgent` one is worth its own system call if the driver batches. A tuple, because it is made tens of
+    Consecutive bulk datagrams to one destination have the same size (the last may be shorter), ready for segmentation
+    offload. An `urgent` one is worth its own system call if the driver batches. A tuple, because it is created tens of
     thousands of times a second.
     """
 
@@ -24,12 +25,12 @@ class Datagram(NamedTuple):
 
     @classmethod
     def run(cls, link: str, destination: Address, run: Iterable[bytes]) -> Iterator["Datagram"]:
-        """Bulk datagrams to one destination, made without a call in Python for each."""
+        """Bulk datagrams to one destination, created without a Python call for each."""
         return map(partial(tuple.__new__, cls), zip(repeat(link), repeat(destination), run, repeat(False)))
 
 
 class RandomSource(Protocol):
-    """The part of `random.Random` that a node draws from."""
+    """The part of `random.Random` that a node uses."""
 
     def random(self) -> float:
         """A float in [0, 1)."""
@@ -44,8 +45,8 @@ class RandomSource(Protocol):
 class StoredMessage:
     """One message held for one peer by a topic whose outbox is on disk.
 
-    `key` is unique within the store and orders messages by age. `wall_deadline` is not kept: a deadline's life restarts
-    when the node does, so `remaining_s` is what was left when it was stored.
+    `key` is unique within the store and orders messages by age. Deadlines are not stored as wall-clock times:
+    `remaining_s` is what was left of the lifetime when the message was stored, and it restarts with the node.
     """
 
     key: int
@@ -57,20 +58,22 @@ class StoredMessage:
 
 
 class Store(Protocol):
-    """Where outboxes on disk live; the daemon's is a directory. Calls are few and wait for no disk."""
+    """Where outboxes on disk are kept; the daemon's store is a directory. Calls are few and do not wait for the
+    disk."""
 
     def put(self, message: StoredMessage) -> bool:
-        """Keep the message until `remove`; False: there is no room. When it survives a crash is the store's to tell."""
+        """Keep the message until `remove`. False: no room. The store defines from when on the message survives a
+        crash."""
         ...
 
     def holds(self, key: int) -> bool:
-        """Whether the message is kept, or about to be; False once the disk has refused it."""
+        """Whether the message is kept, or about to be. False once the disk has refused it."""
         ...
 
     def remove(self, key: int) -> None:
-        """Forget the message; unknown keys are ignored."""
+        """Remove the message; unknown keys are ignored."""
         ...
 
     def load(self) -> list[StoredMessage]:
-        """Everything kept, oldest first; called once, when a node starts."""
+        """Everything kept, oldest first. Called once, when a node starts."""
         ...

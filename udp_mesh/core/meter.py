@@ -1,8 +1,8 @@
-"""A rate over the last second, from a running total read now and then."""
+"""A rate over the last second, computed from a running total."""
 
 
 class Meter:
-    """Feed it totals; it answers the rate over the last whole period of about a second."""
+    """Call `feed` with running totals; `per_s` is the rate over the last complete period of about a second."""
 
     __slots__ = ("_at", "_rate", "_total")
 
@@ -14,7 +14,7 @@ class Meter:
         self._rate = 0.0
 
     def feed(self, total: int, now: float) -> None:
-        """The running total at `now`; call at least every second."""
+        """Record the running total at `now`. Call at least every second."""
         elapsed = now - self._at
         if elapsed >= self.PERIOD_S:
             self._rate = (total - self._total) / elapsed
@@ -22,5 +22,5 @@ class Meter:
             self._at = now
 
     def per_s(self, now: float) -> float:
-        """Units per second; zero when nothing was fed for long."""
+        """Units per second; zero if nothing was fed for long."""
         return self._rate if now - self._at < 4 * self.PERIOD_S else 0.0

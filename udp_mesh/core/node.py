@@ -1,24 +1,38 @@
-"""A node: bytes and the time in; datagrams, events and one timer out. It never waits, reads no clock and opens nothing.
+"""A node: bytes and the time in; datagrams, events and one timer out. It never blocks, reads no clock and opens
+nothing.
 
-A driver repeats: `receive` what arrived, `handle_timer` when `next_timer` has come, then `datagrams_to_send` until it
+A driver repeats: `receive` what arrived, `handle_timer` when `next_timer` is due, then `datagrams_to_send` until it
 returns none, then `next_event` until None.
 """
 
-from udp_mesh.core import publish, reconfigure, survey, transmit
-from udp_mesh.core.conditions import Conditions
+from collections.abc import Iterator
+from dataclasses import replace
+
+from udp_mesh.core import publish, reconfigure, transmit
+from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions, UnverifiedNode
 from udp_mesh.core.events import Event, MessageId, Rejected
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
 from udp_mesh.core.legacy.peers import LegacyPeers
-from udp_mesh.core.receive import take_datagram
+from udp_mesh.core.meter import Meter
+from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
+from udp_mesh.core.peers.session import Peer, Session
+from udp_mesh.core.receive import receive_datagram
+from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address, LinkInfo, Settings
 from udp_mesh.core.state import State
 from udp_mesh.wire.header import MARK
-from udp_mesh.wire.legacy import uncover
+from udp_mesh.wire.legacy import decapsulate
 from udp_mesh.wire.limits import BOOT_ID_BYTES
+
+REPORTED_RATE_VALID_S = 2.0
+"""A rate reported in an acknowledgement is valid for the second it averages, and one more."""
+
+UNVERIFIED_AFTER_S = 3.0
+"""A node heard for this long without hearing us is listed as unverified; discovery takes a fraction of that."""
 
 
 class Node:
-    """One run of one named node. `boot_id` (16 random bytes, never used before) tells this run from all others."""
+    """One run of one named node. `boot_id` (16 random bytes, never used before) identifies the run."""
 
     def __init__(
         self, settings: Settings, *, boot_id: bytes, rng: RandomSource, now: float, store: Store | None = None
@@ -36,31 +50,31 @@ class Node:
         return self._state.settings
 
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
-        """Take in one datagram. Bad bytes are counted and dropped; this never raises because of what was received."""
+        """Process one datagram. Bad bytes are counted and dropped; received data never makes this raise."""
         if len(data) and data[0] < MARK:
-            covered = uncover(data)
-            if covered is not None:
-                data = covered
+            inner = decapsulate(data)
+            if inner is not None:
+                data = inner
         if len(data) and data[0] < MARK and self._legacy:
             self._legacy.receive(data, link, source, now)
         else:
-            take_datagram(self._state, data, link, source, now)
+            receive_datagram(self._state, data, link, source, now)
 
     def datagrams_to_send(self, now: float, *, max_bytes: int | None = None) -> list[Datagram]:
-        """The datagrams that leave now, most urgent first, about 64 KiB at most per call (`max_bytes`, if given).
+        """The datagrams to send now, most urgent first, about 64 KiB at most per call (`max_bytes`, if given).
 
-        Call again while it `has_datagrams`. With `max_bytes` a driver whose socket is full asks for less.
+        Call again while it `has_datagrams`. A driver whose socket is full limits `max_bytes`.
         """
         out = transmit.collect(self._state, now, max_bytes)
         if self._legacy:
-            out = self._legacy.covered(out)
-            self._legacy.leave(now, out)
+            out = self._legacy.encapsulate_broadcasts(out)
+            self._legacy.send(now, out)
         if out:
             transmit.count_sent(self._state, out)
         return out
 
     def next_timer(self) -> float | None:
-        """When `handle_timer` wants to be called next (None: never). Cheap; may be in the past."""
+        """When `handle_timer` is due next (None: never). Cheap; may be in the past."""
         at = transmit.next_timer(self._state)
         if self._legacy and at is not None:
             return min(at, self._legacy.next_at())
@@ -74,27 +88,27 @@ class Node:
 
     @property
     def has_datagrams(self) -> bool:
-        """Whether `datagrams_to_send` may return something; False right after it returned all there was."""
+        """Whether `datagrams_to_send` may return something. False right after it returned everything."""
         return bool(self._legacy) or transmit.has_datagrams(self._state)
 
     @property
     def is_quiet(self) -> bool:
-        """Whether nothing is to be sent or told until `next_timer`: the driver may leave the node alone.
+        """Whether there is nothing to send and no event until `next_timer`, so that the driver may skip the node.
 
-        True after most datagrams of a bulk, of which only every few ask for an answer.
+        True after most bulk datagrams, of which only every few request an acknowledgement.
         """
         return not self._legacy and transmit.is_quiet(self._state)
 
     def next_event(self) -> Event | None:
         """The oldest event not yet fetched."""
-        return self._state.ledger.next_event()
+        return self._state.event_queue.next_event()
 
     def send(
         self, topic: str, payload: bytes, *, destination: str | None = None, now: float, type_name: str = ""
     ) -> MessageId | Rejected:
         """Accept a message for one peer, or (None) for the topic's destinations, or for all.
 
-        Per destination of a reliable topic exactly one outcome event follows. A message to all that fits one datagram
+        For a reliable topic exactly one outcome event follows per destination. A message to all that fits one datagram
         is broadcast and has no outcome. A peer never heard of is `UNKNOWN_PEER` unless an outbox may hold the message.
         """
         return publish.send(self._state, topic, payload, destination, type_name, now)
@@ -104,13 +118,13 @@ class Node:
         reconfigure.link_up(self._state, link, now)
 
     def link_down(self, name: str, now: float) -> None:
-        """The attachment is gone; peers reached over it are reached over others as they are heard there."""
+        """The attachment is gone; its peers are reached over other links once they are heard there."""
         reconfigure.link_down(self._state, name)
 
     def apply(self, settings: Settings, now: float) -> list[str]:
-        """Change topics, window, rates, limits, keys and neighbours; returns one line per change made.
+        """Change topics, window, rates, limits, keys and neighbors. Returns one line per change made.
 
-        Drops no accepted message. A changed name or port raises ValueError: these need a new run.
+        Drops no accepted message. Raises ValueError if the name or port changed: that requires a restart.
         """
         lines = reconfigure.apply(self._state, settings, now)
         self._legacy.apply()
@@ -118,8 +132,129 @@ class Node:
 
     def conditions(self, now: float) -> Conditions:
         """A snapshot for the autonomy, the status page and the metrics."""
-        return survey.conditions(self._state, now)
+        return _snapshot(self._state, now)
 
     def close(self, now: float) -> None:
-        """Say good-bye: fetch the last datagrams and events after it. Reliable messages still open end as expired."""
+        """Say goodbye; fetch the last datagrams and events afterwards. Pending reliable messages end as expired."""
         reconfigure.close(self._state, now)
+
+
+def _snapshot(state: State, now: float) -> Conditions:
+    """See `Node.conditions`."""
+    idle = Sender(state.settings)
+    peers = tuple(
+        _peer_conditions(state, peer, peer.sender if peer.has_sender else idle, now)
+        for _, peer in sorted(state.peer_table.peers.items())
+    )
+    senders = [peer.sender for peer in state.peer_table.peers.values() if peer.has_sender]
+    counters = state.event_queue.counters
+    sent_bits_per_s = _bits_per_s(state.sent, now)
+    receivers = [session.receiver for session in state.peer_table.sessions.values()]
+    return Conditions(
+        now,
+        state.settings.name,
+        peers,
+        replace(
+            counters,
+            fragments_received=sum(receiver.fragments for receiver in receivers),
+            duplicates_received=sum(receiver.duplicates for receiver in receivers),
+            fragments_retransmitted=sum(sender.retransmitted for sender in senders),
+            fragments_sent=sum(sender.sent_packets for sender in senders),
+            dropped_stale=counters.dropped_stale + sum(receiver.expired for receiver in receivers),
+            dropped_over_limit=counters.dropped_over_limit + sum(receiver.over_limit for receiver in receivers),
+        ),
+        sent_bits_per_s,
+        sent_bits_per_s + sum(peer.peer_sends_bits_per_s or 0.0 for peer in peers if peer.online),
+        sum(receiver.partial_bytes + receiver.inflating_bytes for receiver in receivers),
+        sum(sender.levels.queued_bytes for sender in senders) + state.compression_queue.bytes,
+        state.broadcasts.kept_bytes,
+        tuple(_unverified_nodes(state, now)),
+    )
+
+
+def _unverified_nodes(state: State, now: float) -> Iterator[UnverifiedNode]:
+    for session in sorted(state.peer_table.not_current(), key=lambda session: session.name):
+        met_at, path = session.met_at, session.path
+        if session.verified or met_at is None or now - met_at < UNVERIFIED_AFTER_S or not _recently_heard(session, now):
+            continue
+        yield UnverifiedNode(session.name, path.address, path.link, met_at, session.last_heard)
+
+
+def _recently_heard(session: Session, now: float) -> bool:
+    return now - session.last_heard < MISSED_HEARTBEATS * session.interval_s
+
+
+def _peer_conditions(state: State, peer: Peer, sender: Sender, now: float) -> PeerConditions:
+    session = peer.session
+    held_messages, held_bytes = state.outboxes.count(peer.name)
+    capacity = sender.congestion.capacity_packets_per_s()
+    fragment_bytes = session.path.fragment_bytes if session is not None else state.settings.fragment_bytes
+    meters = session.meters if session is not None else peer.legacy_meters
+    address, link, last_heard = _current_path(peer)
+    return PeerConditions(
+        peer.name,
+        peer.online,
+        peer.legacy,
+        address,
+        link,
+        peer.online_since,
+        last_heard,
+        sender.rtt.smoothed_rtt,
+        sender.rtt.min_rtt,
+        sender.loss,
+        _bits_per_s(meters.sent, now) if meters is not None else 0.0,
+        _bits_per_s(meters.delivered, now) if meters is not None else 0.0,
+        _bits_per_s(meters.received, now) if meters is not None else 0.0,
+        _reported_bits_per_s(session.peer_receives, REPORTED_RATE_VALID_S, now) if session is not None else None,
+        _reported_bits_per_s(session.peer_sends, MISSED_HEARTBEATS * session.interval_s, now)
+        if session is not None
+        else None,
+        None if capacity is None else capacity * fragment_bytes * 8,
+        sender.congestion.cwnd,
+        sender.in_flight.outstanding,
+        sender.retransmitted,
+        _queue_conditions(sender, now),
+        held_messages,
+        held_bytes,
+        session is not None and session.one_way_since is not None and _recently_heard(session, now),
+        now - sender.last_progress if sender.unresponsive_since is not None and sender.pending else None,
+    )
+
+
+def _current_path(peer: Peer) -> tuple[Address | None, str | None, float | None]:
+    """Address, link, and when something last came from there."""
+    session = peer.session
+    if session is not None:
+        path = session.path
+        return (path.address, path.link, session.last_heard) if path.link else (None, None, session.last_heard)
+    return peer.legacy_path or (None, None, None)
+
+
+def _queue_conditions(sender: Sender, now: float) -> tuple[QueueConditions, ...]:
+    queues = []
+    for priority, level in enumerate(sender.levels):
+        oldest = level.oldest()
+        starved_s = level.starved_s + (now - level.starved_since if level.starved_since is not None else 0.0)
+        if not level.messages and not starved_s and not level.held_s:
+            continue
+        queues.append(
+            QueueConditions(
+                priority,
+                level.messages,
+                level.bytes,
+                now - oldest.queued_at if oldest is not None else 0.0,
+                starved_s,
+                level.held_s,
+            )
+        )
+    return tuple(queues)
+
+
+def _reported_bits_per_s(rate: tuple[int, float], for_s: float, now: float) -> float | None:
+    """The rate in bits per second that a peer reported, unless the report is too old."""
+    bytes_per_s, reported_at = rate
+    return 8.0 * bytes_per_s if now - reported_at <= for_s else None
+
+
+def _bits_per_s(meter: Meter, now: float) -> float:
+    return 8 * meter.per_s(now)

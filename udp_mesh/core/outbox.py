@@ -1,13 +1,13 @@
-"""Messages held for peers that are offline, as their topic's outbox says: none, the last, or all within a bound.
+"""Messages held for offline peers according to their topic's outbox: none, the last one, or all within a limit.
 
-1. `keep` puts a message on disk as soon as it is accepted, where its topic says so: it stays there until its outcome is
-   known, not only until it is sent. A crash in between sends it again.
-2. `hold` keeps it while its peer is away, in the order accepted, and says which older ones had to go for it.
-3. `release` gives back the most urgent and oldest ones, some at a time: a long absence leaves a hundred thousand.
-4. `settle` forgets it on disk: its outcome is known.
+1. `persist` writes a message to disk when it is accepted, if its topic requires that. It stays there until its outcome
+   is known, so a crash in between sends it again.
+2. `hold` queues it while its peer is offline, in the order accepted, and returns the older ones dropped for it.
+3. `release` returns the most urgent and oldest messages in batches: a long absence accumulates a hundred thousand.
+4. `forget` removes it from disk once its outcome is known.
 
-A message that had begun to leave keeps its number, so that a peer which had all of it before the cut does not take it
-twice.
+A partly sent message keeps its number, so that a peer that received all of it before the link was lost does not deliver
+it twice.
 """
 
 from collections import deque
@@ -16,22 +16,22 @@ from heapq import heapify, heappop, heappush
 
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.interfaces import Store, StoredMessage
-from udp_mesh.core.sender.message import Accepted, Outgoing
+from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage
 from udp_mesh.core.settings import Outbox
 
 
 @dataclass(slots=True, eq=False)
-class Held:
-    """One message held for one peer; `store_key` where it is on disk."""
+class HeldMessage:
+    """One message held for one peer; `store_key` is set if it is on disk."""
 
-    accepted: Accepted
+    accepted: AcceptedMessage
     store_key: int | None
-    begun: Outgoing | None = None
-    """What has left of it, where the peer may have it."""
+    started: OutgoingMessage | None = None
+    """The partly sent message, if the peer may have some of it."""
     epoch: int = 0
-    """`Outbound.epoch` in which it began."""
-    gone: bool = False
-    """Expired or replaced: it stands in its shelf until somebody looks."""
+    """`Sender.epoch` in which it was started."""
+    dropped: bool = False
+    """Expired or replaced; it stays in its queue until the next access."""
 
     @property
     def size(self) -> int:
@@ -39,22 +39,22 @@ class Held:
 
 
 @dataclass(slots=True)
-class _Shelf:
-    """What is held of one topic for one peer, in the order accepted."""
+class _TopicQueue:
+    """The messages of one topic held for one peer, in the order accepted."""
 
-    held: deque[Held] = field(default_factory=deque)
+    held: deque[HeldMessage] = field(default_factory=deque)
     messages: int = 0
     bytes: int = 0
 
-    def front(self) -> Held:
-        """The oldest. Only of a shelf that holds something."""
-        while self.held[0].gone:
+    def front(self) -> HeldMessage:
+        """The oldest message. Call only if there is one."""
+        while self.held[0].dropped:
             self.held.popleft()
         return self.held[0]
 
-    def put(self, new: Held) -> None:
-        """In its place: the newest, or one taken back, which then is older than all that came meanwhile."""
-        later: list[Held] = []
+    def put(self, new: HeldMessage) -> None:
+        """Insert in order: usually the newest; one returned by the sender is older than all that came meanwhile."""
+        later: list[HeldMessage] = []
         if self.messages and new.accepted.message_id < self.front().accepted.message_id:
             self.held.appendleft(new)
         else:
@@ -65,12 +65,12 @@ class _Shelf:
         self.messages += 1
         self.bytes += new.size
 
-    def drop(self, held: Held) -> None:
-        held.gone = True
+    def drop(self, held: HeldMessage) -> None:
+        held.dropped = True
         self.messages -= 1
         self.bytes -= held.size
         if len(self.held) > 64 + 2 * self.messages:
-            self.held = deque(waiting for waiting in self.held if not waiting.gone)
+            self.held = deque(waiting for waiting in self.held if not waiting.dropped)
 
 
 class Outboxes:
@@ -79,8 +79,8 @@ class Outboxes:
     __slots__ = ("_deadlines", "_held", "_messages", "_next_key", "_serial", "_store", "bytes")
 
     def __init__(self, store: Store | None) -> None:
-        self._held: dict[str, dict[str, _Shelf]] = {}
-        self._deadlines: list[tuple[float, int, str, Held]] = []
+        self._held: dict[str, dict[str, _TopicQueue]] = {}
+        self._deadlines: list[tuple[float, int, str, HeldMessage]] = []
         self._messages = 0
         self._serial = 0
         self._store = store
@@ -88,15 +88,15 @@ class Outboxes:
         self.bytes = 0
 
     def load(self) -> list[StoredMessage]:
-        """What the last run left on disk, oldest first; the node takes each on anew with `hold` and its key."""
+        """The messages that the last run left on disk, oldest first; the node adds each one with `hold` and its key."""
         if self._store is None:
             return []
         stored = self._store.load()
         self._next_key = max((message.key for message in stored), default=-1) + 1
         return stored
 
-    def keep(self, peer: str, accepted: Accepted, now: float) -> int | None:
-        """Put a message on disk, where its topic wants that; its key there, None where it is held in memory alone."""
+    def persist(self, peer: str, accepted: AcceptedMessage, now: float) -> int | None:
+        """Write a message to disk if its topic requires that. Returns its key, or None if it is in memory only."""
         topic = accepted.channel.topic
         if self._store is None or not topic.outbox_on_disk or topic.outbox is Outbox.NONE:
             return None
@@ -108,89 +108,89 @@ class Outboxes:
         return key if self._store.put(stored) else None
 
     def on_disk(self, store_key: int | None) -> bool:
-        """Whether a message will be there in the next run."""
+        """Whether the message will survive a restart."""
         return store_key is not None and self._store is not None and self._store.holds(store_key)
 
-    def hold(self, peer: str, new: Held, now: float) -> list[tuple[Held, ExpiryReason]]:
-        """Keep a message; returns those that had to go for it (perhaps this one)."""
+    def hold(self, peer: str, new: HeldMessage, now: float) -> list[tuple[HeldMessage, ExpiryReason]]:
+        """Hold a message. Returns those dropped for it (perhaps this one)."""
         accepted = new.accepted
         topic = accepted.channel.topic
         if new.size > topic.outbox_bytes:
-            self.settle(new.store_key)
+            self.forget(new.store_key)
             return [(new, ExpiryReason.OUTBOX_FULL)]
-        shelf = self._held.setdefault(peer, {}).setdefault(topic.name, _Shelf())
-        shelf.put(new)
+        queue = self._held.setdefault(peer, {}).setdefault(topic.name, _TopicQueue())
+        queue.put(new)
         self.bytes += new.size
         self._messages += 1
-        gone: list[tuple[Held, ExpiryReason]] = []
+        dropped: list[tuple[HeldMessage, ExpiryReason]] = []
         last = topic.outbox is Outbox.LAST
-        while shelf.messages > 1 if last else shelf.bytes > topic.outbox_bytes:
-            oldest = shelf.front()
-            self._drop(shelf, oldest)
-            gone.append((oldest, ExpiryReason.SUPERSEDED if last else ExpiryReason.OUTBOX_FULL))
-        if not new.gone:
+        while queue.messages > 1 if last else queue.bytes > topic.outbox_bytes:
+            oldest = queue.front()
+            self._drop(queue, oldest)
+            dropped.append((oldest, ExpiryReason.SUPERSEDED if last else ExpiryReason.OUTBOX_FULL))
+        if not new.dropped:
             if not self.on_disk(new.store_key):
-                new.store_key = self.keep(peer, accepted, now)
+                new.store_key = self.persist(peer, accepted, now)
             self._note_deadline(peer, new)
-        return gone
+        return dropped
 
-    def release(self, peer: str, most: int) -> list[Held]:
-        """The peer is online: up to `most` of what is held for it leaves the outbox (but not yet the disk), the most
-        urgent first, of those the oldest."""
-        shelves = self._held.get(peer, {})
-        released: list[Held] = []
-        by_urgency: dict[int, list[_Shelf]] = {}
-        for shelf in shelves.values():
-            if shelf.messages:
-                by_urgency.setdefault(shelf.front().accepted.channel.topic.priority, []).append(shelf)
+    def release(self, peer: str, limit: int) -> list[HeldMessage]:
+        """Release up to `limit` messages for a peer that is online, most urgent first, then oldest. They stay on
+        disk."""
+        queues = self._held.get(peer, {})
+        released: list[HeldMessage] = []
+        by_urgency: dict[int, list[_TopicQueue]] = {}
+        for queue in queues.values():
+            if queue.messages:
+                by_urgency.setdefault(queue.front().accepted.channel.topic.priority, []).append(queue)
         for _, level in sorted(by_urgency.items()):
-            heads = [(shelf.front().accepted.message_id, place) for place, shelf in enumerate(level)]
+            heads = [(queue.front().accepted.message_id, place) for place, queue in enumerate(level)]
             heads.sort()
-            while heads and len(released) < most:
+            while heads and len(released) < limit:
                 _, place = heappop(heads)
-                shelf = level[place]
-                held = shelf.front()
-                shelf.held.popleft()
-                self._take(shelf, held)
+                queue = level[place]
+                held = queue.front()
+                queue.held.popleft()
+                self._take(queue, held)
                 released.append(held)
-                if shelf.messages:
-                    heappush(heads, (shelf.front().accepted.message_id, place))
+                if queue.messages:
+                    heappush(heads, (queue.front().accepted.message_id, place))
         if not self.holds(peer):
             self._held.pop(peer, None)
         return released
 
     def holds(self, peer: str, topic: str | None = None) -> bool:
-        """Whether something (of this topic) is held for a peer."""
-        shelves = self._held.get(peer)
-        if not shelves:
+        """Whether a message (of this topic) is held for a peer."""
+        queues = self._held.get(peer)
+        if not queues:
             return False
         if topic is None:
-            return any(shelf.messages for shelf in shelves.values())
-        return topic in shelves and shelves[topic].messages > 0
+            return any(queue.messages for queue in queues.values())
+        return topic in queues and queues[topic].messages > 0
 
-    def settle(self, store_key: int | None) -> None:
-        """The outcome is known: the disk may forget it."""
+    def forget(self, store_key: int | None) -> None:
+        """Remove a message from disk: its outcome is known."""
         if store_key is not None and self._store is not None:
             self._store.remove(store_key)
 
-    def expire(self, now: float) -> list[tuple[str, Held]]:
-        """(peer, message) of everything past its deadline, removed."""
-        late: list[tuple[str, Held]] = []
-        while self._deadlines and (self._deadlines[0][0] <= now or self._deadlines[0][3].gone):
+    def expire(self, now: float) -> list[tuple[str, HeldMessage]]:
+        """Remove everything past its deadline; returns (peer, message)."""
+        late: list[tuple[str, HeldMessage]] = []
+        while self._deadlines and (self._deadlines[0][0] <= now or self._deadlines[0][3].dropped):
             _, _, peer, held = heappop(self._deadlines)
-            if not held.gone:
+            if not held.dropped:
                 self._drop(self._held[peer][held.accepted.channel.topic.name], held)
                 late.append((peer, held))
         return late
 
-    def drop_all(self) -> list[tuple[str, Held]]:
-        """At the end of the node: what is only in memory is lost with it; what is on disk stays there."""
+    def drop_all(self) -> list[tuple[str, HeldMessage]]:
+        """Close: returns the messages that are in memory only and now lost; what is on disk stays there."""
         everything = [
             (peer, held)
-            for peer, shelves in self._held.items()
-            for shelf in shelves.values()
-            for held in shelf.held
-            if not held.gone and not self.on_disk(held.store_key)
+            for peer, queues in self._held.items()
+            for queue in queues.values()
+            for held in queue.held
+            if not held.dropped and not self.on_disk(held.store_key)
         ]
         self._held.clear()
         self._deadlines.clear()
@@ -202,25 +202,25 @@ class Outboxes:
 
     def count(self, peer: str) -> tuple[int, int]:
         """(messages, bytes) held for a peer."""
-        shelves = self._held.get(peer, {}).values()
-        return sum(shelf.messages for shelf in shelves), sum(shelf.bytes for shelf in shelves)
+        queues = self._held.get(peer, {}).values()
+        return sum(queue.messages for queue in queues), sum(queue.bytes for queue in queues)
 
-    def _drop(self, shelf: _Shelf, held: Held) -> None:
-        self._take(shelf, held)
-        self.settle(held.store_key)
+    def _drop(self, queue: _TopicQueue, held: HeldMessage) -> None:
+        self._take(queue, held)
+        self.forget(held.store_key)
 
-    def _take(self, shelf: _Shelf, held: Held) -> None:
-        shelf.drop(held)
+    def _take(self, queue: _TopicQueue, held: HeldMessage) -> None:
+        queue.drop(held)
         self.bytes -= held.size
         self._messages -= 1
 
-    def _note_deadline(self, peer: str, held: Held) -> None:
+    def _note_deadline(self, peer: str, held: HeldMessage) -> None:
         deadline = held.accepted.deadline
         if deadline is None:
             return
         self._serial += 1
         heappush(self._deadlines, (deadline, self._serial, peer, held))
         if len(self._deadlines) > 64 + 2 * self._messages:
-            # What was replaced or sent long before its deadline must not stay in memory until then.
-            self._deadlines = [entry for entry in self._deadlines if not entry[3].gone]
+            # Free messages that were replaced or sent long before their deadline.
+            self._deadlines = [entry for entry in self._deadlines if not entry[3].dropped]
             heapify(self._deadlines)

@@ -1,12 +1,14 @@
-"""Peers come, move, restart, clash and go: heartbeats and proofs in -> sessions, events, and what becomes of messages.
+"""The life of a peer: heartbeats and authenticated datagrams in -> sessions, events and the outcome of messages out.
 
-1. `greet` takes a heartbeat: a stranger is remembered and answered; one that lists us is proven.
-2. `prove` makes a session its name's session: online, or restarted; a retired run that still speaks is a conflict.
-3. `heard` keeps an online peer online and follows it to new addresses; one that does not hear us stays offline.
-4. `housekeep` finds the silent and the deaf ones: offline, then lost; their messages go to the outbox or end.
+1. `on_heartbeat` processes a heartbeat: an unknown boot is remembered and answered; one that lists us is verified.
+2. `on_verified` makes a session the current one of its name: online or restarted. A retired boot that is still heard is
+   a name conflict.
+3. `on_activity` keeps a peer online and migrates its path to a new address. A peer that does not hear us stays offline.
+4. `maintain` takes peers that are silent or do not hear us offline, then declares them lost; their messages move to the
+   outbox or end.
 """
 
-from udp_mesh.core.broadcast import Repairs
+from udp_mesh.core.broadcast import NackRepair
 from udp_mesh.core.events import (
     Incompatible,
     NameConflict,
@@ -18,398 +20,399 @@ from udp_mesh.core.events import (
     TopicStarved,
 )
 from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
-from udp_mesh.core.peers.path_validation import challenge
-from udp_mesh.core.peers.peer_table import Arrival
+from udp_mesh.core.peers.path_validation import validate_path
+from udp_mesh.core.peers.peer_table import VerifyResult
 from udp_mesh.core.peers.session import STALE_PATH_S, Challenge, Peer, Session
-from udp_mesh.core.publish import release_outbox, report_ended, shelve
-from udp_mesh.core.sender.message import Outgoing
-from udp_mesh.core.sender.packetizer import Way, datagram_room, leave_large_ping
+from udp_mesh.core.publish import release_outbox, report_ended, store_in_outbox
+from udp_mesh.core.sender.message import OutgoingMessage
+from udp_mesh.core.sender.packetizer import Path, build_mtu_probe, datagram_room
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.pmtu import NARROWER_MTUS
-from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address
-from udp_mesh.core.state import ASLEEP_S, HOUSEKEEPING_S, State
+from udp_mesh.core.state import MAINTENANCE_INTERVAL_S, SUSPENDED_S, State
 from udp_mesh.wire.frames import Heartbeat
 from udp_mesh.wire.header import VERSION
 from udp_mesh.wire.limits import HEARD_TAG_BYTES
 
-LOOKED_AT_PER_ROUND = 64
-"""Peers without traffic looked at per round: of 1,000 each is looked at every 8 s, and a round stays short."""
+IDLE_PEERS_PER_ROUND = 64
+"""Peers without traffic checked per round: each of 1,000 is checked every 8 s, and a round stays short."""
 
-REPORT_AGAIN_S = 60.0
-"""The same conflict, mismatch or incompatibility is reported once in this time."""
+REPORT_INTERVAL_S = 60.0
+"""Minimum time between two reports of the same conflict, mismatch or incompatibility."""
 
 
-def greet(
+def on_heartbeat(
     state: State, session: Session, beat: Heartbeat, link: str, source: Address, now: float, *, to_all: bool
 ) -> None:
-    """An authentic heartbeat of a session (to all, or to us alone), perhaps a recording until the session is
-    proven."""
-    session.learn(beat, now)
-    state.crowd.told(session.boot_id, beat.send_rate, now, holds_s=MISSED_HEARTBEATS * session.interval_s)
+    """Process an authentic heartbeat (broadcast or unicast), which may be replayed until the session is verified."""
+    session.update_from(beat, now)
+    state.channel_share.on_send_rate(
+        session.boot_id, beat.send_rate, now, valid_s=MISSED_HEARTBEATS * session.interval_s
+    )
     session.last_heard = now
     if not beat.min_version <= VERSION <= beat.max_version:
-        if now - state.incompatible_reported.get(session.boot_id, float("-inf")) > REPORT_AGAIN_S:
+        if now - state.incompatible_reported.get(session.boot_id, float("-inf")) > REPORT_INTERVAL_S:
             state.incompatible_reported[session.boot_id] = now
             if len(state.incompatible_reported) > state.settings.limits.strangers:
                 del state.incompatible_reported[next(iter(state.incompatible_reported))]
-            state.ledger.tell(Incompatible(session.name, source, session.versions))
+            state.event_queue.emit(Incompatible(session.name, source, session.versions))
         return
     lists_us = state.boot_id[:HEARD_TAG_BYTES] in beat.heard
     if to_all:
-        session.take_list(beat.heard, state.boot_id[:HEARD_TAG_BYTES], now)
+        session.on_heard_list(beat.heard, state.boot_id[:HEARD_TAG_BYTES], now)
     elif lists_us:
-        session.hears_us()
-    if not session.proven:
-        if (link, source) == (session.way.link, session.way.address):
-            session.way.heard_at = now
+        session.confirm_two_way()
+    if not session.verified:
+        if (link, source) == (session.path.link, session.path.address):
+            session.path.heard_at = now
         else:
-            follow(state, session, link, source, now)
+            migrate_path(state, session, link, source, now)
         if lists_us:
-            prove(state, session, now)
+            on_verified(state, session, now)
     else:
-        heard(state, session, link, source, now)
+        on_activity(state, session, link, source, now)
         if session.name == state.settings.name:
             _own_name(state, session, now)
-    if not (session.proven and session.knows_us):
-        # It does not hear us, or we cannot know yet that it does.
-        state.discovery.answer(session, len(state.roster.sessions), now)
-    if session.proven and session.peer is not None:
+    if not (session.verified and session.knows_us):
+        # It does not hear us, or we cannot know that yet.
+        state.heartbeats.reply_to(session, len(state.peer_table.sessions), now)
+    if session.verified and session.peer is not None:
         repairs = state.repairs.get(session.boot_id)
         if repairs is None:
-            repairs = state.repairs[session.boot_id] = Repairs(state.rng)
+            repairs = state.repairs[session.boot_id] = NackRepair(state.rng)
             for channel in session.broadcast_channels:
                 channel.window.raise_floor(beat.broadcast_number)
-        repairs.counted(beat.broadcast_messages, now, session.inbound.broadcasts.finished)
-        state.ask_by(session.boot_id, repairs)
+        repairs.on_counter(beat.broadcast_messages, now, session.receiver.broadcasts.finished)
+        state.schedule_repair(session.boot_id, repairs)
         if beat.waiting:
-            state.yielding.heard(beat.waiting, now)
+            state.priority_backoff.on_waiting(beat.waiting, now)
 
 
-def prove(state: State, session: Session, now: float) -> None:
-    """The session has shown that it hears this run of ours."""
-    arrival, peer = state.roster.prove(session, state.settings)
-    if arrival is Arrival.OWN_NAME:
+def on_verified(state: State, session: Session, now: float) -> None:
+    """The session has proved that it hears our current boot."""
+    arrival, peer = state.peer_table.verify(session, state.settings)
+    if arrival is VerifyResult.OWN_NAME:
         _own_name(state, session, now)
         return
     if peer is None:
-        state.ledger.counters.dropped_over_limit += 1
+        state.event_queue.counters.dropped_over_limit += 1
         return
-    if arrival is Arrival.RETIRED:
-        # Served again when it is heard and the later run is gone (`heard`).
+    if arrival is VerifyResult.RETIRED:
+        # It becomes current again when it is heard and the later boot is gone (`on_activity`).
         return
-    session.freshness.prove(now)
+    session.freshness.confirm(now)
     _replace(state, peer, session, now)
-    if arrival is Arrival.RESTARTED and peer.online:
-        state.ledger.tell(PeerRestarted(peer.name))
+    if arrival is VerifyResult.RESTARTED and peer.online:
+        state.event_queue.emit(PeerRestarted(peer.name))
         peer.online_since = now
-    come_online(state, peer, session, now)
+    set_online(state, peer, session, now)
     state.arm(peer)
 
 
 def _own_name(state: State, session: Session, now: float) -> None:
-    """Another node uses our name: told as long as it does, and no more often for all the boots one may invent."""
-    if now - state.own_name_reported_at < REPORT_AGAIN_S:
+    """Report that another node uses our name, at a limited rate however many boots are invented."""
+    if now - state.own_name_reported_at < REPORT_INTERVAL_S:
         return
     state.own_name_reported_at = now
     own = next(iter(state.links.values())).address if state.links else ("", state.settings.port)
-    state.ledger.tell(NameConflict(session.name, own, session.way.address, own=True))
+    state.event_queue.emit(NameConflict(session.name, own, session.path.address, own=True))
 
 
 def _replace(state: State, peer: Peer, session: Session, now: float) -> None:
-    """The session is what the name means from now on; what waits for the name begins anew with it."""
+    """Make the session the current one of its name; pending messages restart with it."""
     old = peer.session
-    state.roster.replace(peer, session)
+    state.peer_table.replace(peer, session)
     if old is not None:
         state.repairs.pop(old.boot_id, None)
-        state.owing.pop(old, None)
-        if peer.engaged:
-            old.next_wire_id = peer.outbound.next_wire_id
-    if peer.engaged:
-        peer.outbound.restart(now)
-        # Of a run that is taken back the numbers go on: it remembers what it had.
-        peer.outbound.flight.restart(session.way.channel.next_number)
-        peer.outbound.next_wire_id = session.next_wire_id
+        state.control_ready.pop(old, None)
+        if peer.has_sender:
+            old.next_wire_id = peer.sender.next_wire_id
+    if peer.has_sender:
+        peer.sender.restart(now)
+        # A boot that becomes current again remembers what it had: its numbers continue.
+        peer.sender.in_flight.restart(session.path.channel.next_number)
+        peer.sender.next_wire_id = session.next_wire_id
         state.ready[peer] = None
-    state.discovery.answer(session, len(state.roster.sessions), now)
+    state.heartbeats.reply_to(session, len(state.peer_table.sessions), now)
 
 
-def come_online(state: State, peer: Peer, session: Session, now: float) -> None:
-    """The peer is there (again)."""
+def set_online(state: State, peer: Peer, session: Session, now: float) -> None:
+    """The peer is online (again)."""
     peer.left = False
     peer.lost = False
     if peer.online:
         return
     peer.online = True
     peer.online_since = now
-    state.ledger.tell(PeerOnline(peer.name, session.way.address, session.way.link))
+    state.event_queue.emit(PeerOnline(peer.name, session.path.address, session.path.link))
     release_outbox(state, peer, now)
 
 
-def heard(state: State, session: Session, link: str, source: Address, now: float) -> None:
-    """Something authentic came from a proven session."""
+def on_activity(state: State, session: Session, link: str, source: Address, now: float) -> None:
+    """An authentic datagram came from a verified session."""
     session.last_heard = now
-    way = session.way
-    if source == way.address and link == way.link:
-        way.heard_at = now
+    path = session.path
+    if source == path.address and link == path.link:
+        path.heard_at = now
     else:
-        follow(state, session, link, source, now)
+        migrate_path(state, session, link, source, now)
     peer = session.peer
     if peer is None or peer.session is not session:
         if peer is None or peer.online:
-            conflict(state, session, source, now)
+            report_name_conflict(state, session, source, now)
             return
-        # Of two nodes with one name the later one went: its name means this one again, if this is its voice.
+        # Of two nodes with one name the later one is gone: the name means this one again, if the datagram is fresh.
         if not session.is_fresh(now):
-            challenge(state, session, link, source, now)
+            validate_path(state, session, link, source, now)
             return
         _replace(state, peer, session, now)
-    if session.unheard_since is not None:
+    if session.one_way_since is not None:
         return
     if not peer.online:
         if not session.is_fresh(now):
-            # It may be a recording that never arrived: an answer to a question cannot be one.
-            challenge(state, session, link, source, now)
+            # It may be a replayed datagram that never arrived; the answer to a challenge cannot be one.
+            validate_path(state, session, link, source, now)
             return
-        come_online(state, peer, session, now)
-    if peer.engaged and peer.outbound.silent_since is not None:
-        peer.outbound.heard(now)
+        set_online(state, peer, session, now)
+    if peer.has_sender and peer.sender.unresponsive_since is not None:
+        peer.sender.on_activity(now)
         state.ready[peer] = None
 
 
-def conflict(state: State, session: Session, source: Address, now: float) -> None:
-    """A run that was replaced by a later one still speaks: two nodes use one name."""
-    peer = session.peer or state.roster.peers.get(session.name)
+def report_name_conflict(state: State, session: Session, source: Address, now: float) -> None:
+    """A boot that was replaced by a later one is still heard: two nodes use one name."""
+    peer = session.peer or state.peer_table.peers.get(session.name)
     if peer is None or peer.session is None:
         return
     if peer.online_since is not None and now - peer.online_since < STALE_PATH_S:
-        # The last packets of a run that ended may come behind the first ones of the next.
+        # The last packets of a boot may arrive after the first ones of the next.
         return
-    session.contested = True
-    if now - peer.conflict_reported_at < REPORT_AGAIN_S:
+    session.name_conflict = True
+    if now - peer.conflict_reported_at < REPORT_INTERVAL_S:
         return
     peer.conflict_reported_at = now
-    state.ledger.tell(NameConflict(session.name, source, peer.session.way.address, own=False))
+    state.event_queue.emit(NameConflict(session.name, source, peer.session.path.address, own=False))
 
 
-def follow(state: State, session: Session, link: str, source: Address, now: float) -> None:
-    """The session was heard at an address: use it if it is the only one, or the one in use has gone quiet, and the peer
-    answers there.
+def migrate_path(state: State, session: Session, link: str, source: Address, now: float) -> None:
+    """The session was heard at another address: use it if there is none yet, or if the current one has gone quiet and
+    the peer answers there.
 
-    A peer of an earlier version answers to where it was heard before, perhaps over a link that is gone: where nothing
-    at all comes from there it is followed without a question.
+    A peer of an earlier version answers to where it was heard before, perhaps over a link that is gone. If nothing at
+    all comes from its old address, its path migrates without validation.
     """
     if link not in state.links:
         return
-    way = session.way
-    outbound = session.peer.outbound if session.peer is not None and session.peer.engaged else None
-    struggling = outbound is not None and (outbound.struggling or outbound.silent_since is not None)
-    first = not way.link
-    quiet = now - way.heard_at >= STALE_PATH_S or way.link not in state.links
-    if not first and not quiet and not struggling:
+    path = session.path
+    sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
+    timing_out = sender is not None and (sender.timing_out or sender.unresponsive_since is not None)
+    first = not path.link
+    quiet = now - path.heard_at >= STALE_PATH_S or path.link not in state.links
+    if not first and not quiet and not timing_out:
         return
     peer = session.peer
-    if not first and session.proven and peer is not None and (session.timed or not quiet or not peer.online):
-        challenge(state, session, link, source, now)
+    if not first and session.verified and peer is not None and (session.timed or not quiet or not peer.online):
+        validate_path(state, session, link, source, now)
         return
-    _move(state, session, link, source, now)
+    _switch_path(state, session, link, source, now)
 
 
-def path_proven(state: State, session: Session, question: Challenge, now: float) -> None:
-    """The peer answered a ping of ours from where that went: it is alive, and there."""
-    session.freshness.prove(now)
-    way = session.way
-    if question.in_use:
-        # The way in use works: whatever came from elsewhere was no move. If it has been left since, it is gone back to.
+def on_path_validated(state: State, session: Session, challenge: Challenge, now: float) -> None:
+    """The peer answered a challenge: it is alive and at that address."""
+    session.freshness.confirm(now)
+    path = session.path
+    if challenge.in_use:
+        # The current path works, so datagrams from elsewhere were no migration. If it was left meanwhile, return to it.
         session.challenges.clear()
-    if (way.link, way.address) != (question.link, question.address):
-        _move(state, session, question.link, question.address, now)
-    heard(state, session, question.link, question.address, now)
+    if (path.link, path.address) != (challenge.link, challenge.address):
+        _switch_path(state, session, challenge.link, challenge.address, now)
+    on_activity(state, session, challenge.link, challenge.address, now)
 
 
-def _move(state: State, session: Session, link: str, source: Address, now: float) -> None:
-    """Datagrams go there from now on."""
+def _switch_path(state: State, session: Session, link: str, source: Address, now: float) -> None:
+    """Send datagrams to that address from now on."""
     info = state.links.get(link)
     if info is None:
         return
-    way = session.way
-    outbound = session.peer.outbound if session.peer is not None and session.peer.engaged else None
-    first = not way.link
-    old = way.address
-    before = way.fragment_bytes
-    way.lead(link, source, info.mtu, state.settings.fragment_bytes)
-    way.heard_at = now
-    if not first and session.proven and session.peer is not None:
-        state.ledger.tell(PeerAddressChanged(session.name, old, source, link))
-    if outbound is not None and way.fragment_bytes < before:
-        _fit(outbound, way, all_of_it=False)
+    path = session.path
+    sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
+    first = not path.link
+    old = path.address
+    before = path.fragment_bytes
+    path.switch_to(link, source, info.mtu, state.settings.fragment_bytes)
+    path.heard_at = now
+    if not first and session.verified and session.peer is not None:
+        state.event_queue.emit(PeerAddressChanged(session.name, old, source, link))
+    if sender is not None and path.fragment_bytes < before:
+        _refragment(sender, path, include_sent=False)
 
 
-def refit(state: State, session: Session, mtu: int) -> None:
-    """The link, or the settings, changed under a session's way: what leaves from now on fits both, and what the path
-    was found to carry."""
-    way = session.way
-    outbound = session.peer.outbound if session.peer is not None and session.peer.engaged else None
-    if outbound is not None and outbound.path_size.narrowed_at is not None:
-        mtu = min(mtu, way.mtu)
-    before = way.mtu
-    way.lead(way.link, way.address, mtu, state.settings.fragment_bytes)
-    if outbound is not None and mtu < before:
-        _fit(outbound, way, all_of_it=False)
+def update_mtu(state: State, session: Session, mtu: int) -> None:
+    """The link or the settings changed under a session's path: fit both, and what the path was found to carry."""
+    path = session.path
+    sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
+    if sender is not None and sender.pmtu.narrowed_at is not None:
+        mtu = min(mtu, path.mtu)
+    before = path.mtu
+    path.switch_to(path.link, path.address, mtu, state.settings.fragment_bytes)
+    if sender is not None and mtu < before:
+        _refragment(sender, path, include_sent=False)
 
 
-def _fit(outbound: Outbound, way: Way, *, all_of_it: bool) -> None:
-    """What was cut into larger fragments than the way carries now begins anew.
+def _refragment(sender: Sender, path: Path, *, include_sent: bool) -> None:
+    """Restart messages whose fragments are larger than the path now carries.
 
-    One that has left whole may have arrived whole, and under a new number it would arrive twice: it only does so with
-    `all_of_it`, where none of its large pieces get through anyhow. Our own kernel cuts what is too large for our link.
+    A message sent completely may have arrived completely, and under a new number it would arrive twice. It is restarted
+    only with `include_sent`, when none of its large fragments get through anyway. Otherwise the kernel fragments what
+    is too large for the link.
     """
-    for message in list(outbound.open):
-        if not all_of_it and message.begun and message.next_position >= message.fragments:
+    for message in list(sender.pending):
+        if not include_sent and message.started and message.next_position >= message.fragments:
             continue
-        if message.begun and any(
-            not there and _size(message, position) > way.fragment_bytes
+        if message.started and any(
+            not there and _fragment_bytes(message, position) > path.fragment_bytes
             for position, there in enumerate(message.arrived)
         ):
-            outbound.cancel(message)
-            outbound.send_anew(message)
+            sender.cancel(message)
+            sender.resend_from_start(message)
 
 
-def _size(message: Outgoing, position: int) -> int:
+def _fragment_bytes(message: OutgoingMessage, position: int) -> int:
     start, end = message.span(position)
     return end - start
 
 
-def _measure_path(state: State, peer: Peer, session: Session, now: float) -> None:
-    """Smaller fragments where full ones do not get through; larger ones again where a ping of that size does."""
-    outbound, way = peer.outbound, session.way
-    size, info = outbound.path_size, state.links.get(way.link)
+def _update_pmtu(state: State, peer: Peer, session: Session, now: float) -> None:
+    """Use smaller fragments if full ones do not get through, and larger ones again if a probe of that size does."""
+    sender, path = peer.sender, session.path
+    size, info = sender.pmtu, state.links.get(path.link)
     fragment_bytes = state.settings.fragment_bytes
-    rooms = {mtu: datagram_room(way.address, mtu, fragment_bytes) for mtu in NARROWER_MTUS}
-    narrower = [mtu for mtu, room in rooms.items() if room < way.room_bytes]
-    if size.too_narrow(now) and narrower:
-        way.lead(way.link, way.address, narrower.pop(0), fragment_bytes)
-        size.narrowed(now)
-        state.ledger.tell(PathNarrowed(peer.name, way.mtu, way.fragment_bytes))
-        _fit(outbound, way, all_of_it=True)
+    rooms = {mtu: datagram_room(path.address, mtu, fragment_bytes) for mtu in NARROWER_MTUS}
+    narrower = [mtu for mtu, room in rooms.items() if room < path.room_bytes]
+    if size.is_black_hole(now) and narrower:
+        path.switch_to(path.link, path.address, narrower.pop(0), fragment_bytes)
+        size.on_narrowed(now)
+        state.event_queue.emit(PathNarrowed(peer.name, path.mtu, path.fragment_bytes))
+        _refragment(sender, path, include_sent=True)
         state.ready[peer] = None
     size.large_bytes = rooms[narrower[0]] if narrower else float("inf")
     if size.narrowed_at is None or info is None:
         return
-    if size.asking.carries > way.mtu:
-        way.lead(way.link, way.address, min(size.asking.carries, info.mtu), fragment_bytes)
+    if size.probe.confirmed_mtu > path.mtu:
+        path.switch_to(path.link, path.address, min(size.probe.confirmed_mtu, info.mtu), fragment_bytes)
         size.reset()
     rooms = {mtu: room for mtu, room in rooms.items() if mtu < info.mtu}
-    rooms[info.mtu] = datagram_room(way.address, info.mtu, fragment_bytes)
-    larger = {room: mtu for mtu, room in rooms.items() if room > way.room_bytes}
+    rooms[info.mtu] = datagram_room(path.address, info.mtu, fragment_bytes)
+    larger = {room: mtu for mtu, room in rooms.items() if room > path.room_bytes}
     if not larger:
         size.narrowed_at = None
-    elif peer.online and way.confirmed and outbound.silent_since is None and size.asking.due(now, outbound.loss):
+    elif peer.online and path.confirmed and sender.unresponsive_since is None and size.probe.due(now, sender.loss):
         for room, mtu in larger.items():
             token = state.rng.getrandbits(64)
-            size.asking.asked(token, mtu)
-            state.outgoing.append(leave_large_ping(outbound, way, token, room))
+            size.probe.on_probe_sent(token, mtu)
+            state.outgoing.append(build_mtu_probe(sender, path, token, room))
 
 
-def leave(state: State, session: Session, now: float) -> None:
-    """The peer said good-bye."""
+def on_bye(state: State, session: Session, now: float) -> None:
+    """The peer said goodbye."""
     peer = session.peer
     if peer is None or peer.session is not session or not peer.online:
         return
-    go_offline(state, peer, now, left=True)
+    set_offline(state, peer, now, left=True)
 
 
-def go_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
-    """The peer is out of reach: what its topics' outboxes keep goes there, the rest waits for `peer_lost_s`."""
+def set_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
+    """The peer is unreachable: messages with an outbox move there; the rest waits for `peer_lost_s`."""
     peer.online = False
     peer.left = left
     peer.online_since = None
-    state.ledger.tell(PeerOffline(peer.name, left))
-    if peer.engaged and peer.outbound.silent_since is None and peer.outbound.flight.outstanding:
-        peer.outbound.silent_since = now
-        peer.outbound.allow_probe(now)
-    shelve(state, peer, now)
+    state.event_queue.emit(PeerOffline(peer.name, left))
+    if peer.has_sender and peer.sender.unresponsive_since is None and peer.sender.in_flight.outstanding:
+        peer.sender.unresponsive_since = now
+        peer.sender.allow_probe(now)
+    store_in_outbox(state, peer, now)
 
 
-def housekeep(state: State, now: float) -> None:
-    """A round: all peers with traffic, and of the others as many as one round bears."""
-    asleep_s = now - state.housekept_at - HOUSEKEEPING_S
-    state.housekept_at = now
-    if asleep_s > ASLEEP_S:
-        _excuse(state, asleep_s, now)
-    mismatch = state.mismatches.rest(now)
+def maintain(state: State, now: float) -> None:
+    """One maintenance round: all peers with traffic, and a limited number of the others."""
+    suspended_s = now - state.maintained_at - MAINTENANCE_INTERVAL_S
+    state.maintained_at = now
+    if suspended_s > SUSPENDED_S:
+        _discount_suspension(state, suspended_s, now)
+    mismatch = state.key_mismatches.flush(now)
     if mismatch is not None:
-        state.ledger.tell(mismatch)
-    state.sent.feed(state.ledger.counters.bytes_sent, now)
-    queue_share = state.crowd.queue_share(state.sent.per_s(now), now)
-    peers = list(state.roster.peers.values())
-    start = state.look_from if state.look_from < len(peers) else 0
-    state.look_from = start + LOOKED_AT_PER_ROUND
-    engaged = [peer for peer in peers if peer.engaged]
-    for peer in engaged:
-        peer.outbound.window.queue_share = queue_share
-        _look_at(state, peer, now)
-    for peer in peers[start : state.look_from]:
-        if not peer.engaged:
-            _look_at(state, peer, now)
+        state.event_queue.emit(mismatch)
+    state.sent.feed(state.event_queue.counters.bytes_sent, now)
+    queue_share = state.channel_share.queue_share(state.sent.per_s(now), now)
+    peers = list(state.peer_table.peers.values())
+    start = state.maintain_from if state.maintain_from < len(peers) else 0
+    state.maintain_from = start + IDLE_PEERS_PER_ROUND
+    has_sender = [peer for peer in peers if peer.has_sender]
+    for peer in has_sender:
+        peer.sender.congestion.queue_share = queue_share
+        _maintain_peer(state, peer, now)
+    for peer in peers[start : state.maintain_from]:
+        if not peer.has_sender:
+            _maintain_peer(state, peer, now)
     for name in state.outboxes.peers():
-        holding = state.roster.peers.get(name)
+        holding = state.peer_table.peers.get(name)
         if holding is not None and holding.online and not holding.settling:
             release_outbox(state, holding, now)
-    for session in state.roster.not_current():
+    for session in state.peer_table.not_current():
         session.age_windows(now)
-        if session.contested and session.peer is not None:
-            # It may be taken back for as long as its name is remembered.
-            session.inbound.unicasts.purge(now)
-            session.inbound.broadcasts.purge(now)
+        if session.name_conflict and session.peer is not None:
+            # It may become current again as long as its name is remembered.
+            session.receiver.unicasts.purge(now)
+            session.receiver.broadcasts.purge(now)
         elif now - session.last_heard > state.settings.rates.offline_s:
-            state.roster.forget(session)
+            state.peer_table.forget(session)
             state.repairs.pop(session.boot_id, None)
             state.incompatible_reported.pop(session.boot_id, None)
 
 
-def _excuse(state: State, asleep_s: float, now: float) -> None:
-    """This process did not run for so long (it was stopped, its machine stood still): silence meanwhile was ours."""
-    for session in state.roster.sessions.values():
-        session.last_heard = min(now, session.last_heard + asleep_s)
-        if session.unheard_since is not None:
-            session.unheard_since = min(now, session.unheard_since + asleep_s)
+def _discount_suspension(state: State, suspended_s: float, now: float) -> None:
+    """This process was suspended for that long (stopped, or its machine was): the silence was ours."""
+    for session in state.peer_table.sessions.values():
+        session.last_heard = min(now, session.last_heard + suspended_s)
+        if session.one_way_since is not None:
+            session.one_way_since = min(now, session.one_way_since + suspended_s)
 
 
-def _look_at(state: State, peer: Peer, now: float) -> None:
+def _maintain_peer(state: State, peer: Peer, now: float) -> None:
     session = peer.session
     if session is None:
         return
     rates = state.settings.rates
     session.age_windows(now)
     quiet_s = now - session.last_heard
-    deaf_s = now - session.unheard_since if session.unheard_since is not None else 0.0
-    patience_s = max(rates.offline_s, MISSED_HEARTBEATS * session.interval_s)
-    if peer.online and max(quiet_s, deaf_s) > patience_s:
-        go_offline(state, peer, now, left=False)
-    if not peer.online and not peer.lost and max(quiet_s, deaf_s) > rates.peer_lost_s:
+    one_way_s = now - session.one_way_since if session.one_way_since is not None else 0.0
+    offline_after_s = max(rates.offline_s, MISSED_HEARTBEATS * session.interval_s)
+    if peer.online and max(quiet_s, one_way_s) > offline_after_s:
+        set_offline(state, peer, now, left=False)
+    if not peer.online and not peer.lost and max(quiet_s, one_way_s) > rates.peer_lost_s:
         peer.lost = True
-        if peer.engaged:
-            peer.outbound.finish_all(Outcome.PEER_LOST)
+        if peer.has_sender:
+            peer.sender.finish_all(Outcome.PEER_LOST)
             report_ended(state, peer, now)
-    if session.inbound.fragments:
-        session.inbound.unicasts.purge(now)
-        session.inbound.broadcasts.purge(now)
+    if session.receiver.fragments:
+        session.receiver.unicasts.purge(now)
+        session.receiver.broadcasts.purge(now)
     if session.received_bytes:
         session.meters.received.feed(session.received_bytes, now)
-    if peer.engaged:
+    if peer.has_sender:
         _report_starved(state, peer, now)
-        _measure_path(state, peer, session, now)
-        session.meters.sent.feed(peer.outbound.sent_bytes, now)
-        session.meters.delivered.feed(peer.outbound.delivered_bytes, now)
+        _update_pmtu(state, peer, session, now)
+        session.meters.sent.feed(peer.sender.sent_bytes, now)
+        session.meters.delivered.feed(peer.sender.delivered_bytes, now)
 
 
 def _report_starved(state: State, peer: Peer, now: float) -> None:
-    for book in peer.outbound.levels:
-        since = book.starved_since
-        if since is None or book.starved_reported or now - since < state.settings.rates.starved_s:
+    for level in peer.sender.levels:
+        since = level.starved_since
+        if since is None or level.starved_reported or now - since < state.settings.rates.starved_s:
             continue
-        oldest = book.oldest()
+        oldest = level.oldest()
         if oldest is not None:
-            book.starved_reported = True
-            state.ledger.tell(TopicStarved(peer.name, oldest.accepted.channel.name, now - since))
+            level.starved_reported = True
+            state.event_queue.emit(TopicStarved(peer.name, oldest.accepted.channel.name, now - since))

@@ -1,29 +1,29 @@
-"""No robot drowns another's urgent traffic: levels waiting elsewhere -> less urgent levels hold back here, for a while.
+"""Priority backoff between nodes: while urgent levels wait elsewhere, less urgent levels are held back here.
 
-Each node says in heartbeats and acknowledgements which urgent levels wait at it, and how long. Who hears it holds
-back its own less urgent levels for `yield_hold_s`, but never for more than `yield_share` of the time, so that none
-starves.
+Each node reports in heartbeats and acknowledgements which urgent levels wait at it, and for how long. Nodes that hear
+this hold back their own less urgent levels for `yield_hold_s`, but never for more than `yield_share` of the time, so
+that none starves.
 """
 
 from collections.abc import Iterable
 
-from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Rates
 from udp_mesh.wire.frames import Waiting
 
 ALL_LEVELS = 0xFFFF
 
 BUDGET_S = 1.0
-"""Holding back is budgeted over this much time."""
+"""Period of the hold-back budget."""
 
-LOOK_EVERY_S = 0.02
-"""What waits here is looked up no more often than this."""
+CHECK_INTERVAL_S = 0.02
+"""Minimum time between two checks of the local queues."""
 
 
-class Yielding:
-    """`allowed(now)` is the bit mask of levels that may leave."""
+class PriorityBackoff:
+    """`allowed_levels(now)` is the bit mask of levels that may be sent."""
 
-    __slots__ = ("_allowed", "_budget_at", "_budget_s", "_looked_at", "_rates", "_until", "_waiting", "held_total_s")
+    __slots__ = ("_allowed", "_budget_at", "_budget_s", "_checked_at", "_rates", "_until", "_waiting", "held_total_s")
 
     def __init__(self, rates: Rates, now: float) -> None:
         self._rates = rates
@@ -31,34 +31,34 @@ class Yielding:
         self._until = float("-inf")
         self._budget_s = BUDGET_S * rates.yield_share
         self._budget_at = now
-        self._looked_at = float("-inf")
+        self._checked_at = float("-inf")
         self._waiting: tuple[Waiting, ...] = ()
         self.held_total_s = 0.0
 
     def apply(self, rates: Rates) -> None:
         self._rates = rates
 
-    def waiting_here(self, outbounds: Iterable[Outbound], now: float) -> tuple[Waiting, ...]:
-        """The urgent levels at which something has waited too long, most urgent first."""
-        if now < self._looked_at + LOOK_EVERY_S:
+    def local_waiting(self, senders: Iterable[Sender], now: float) -> tuple[Waiting, ...]:
+        """The urgent levels with a message that has waited too long, most urgent first."""
+        if now < self._checked_at + CHECK_INTERVAL_S:
             return self._waiting
-        self._looked_at = now
+        self._checked_at = now
         oldest: dict[int, float] = {}
-        for outbound in outbounds:
-            if outbound.silent_since is not None:
-                # What waits for a peer out of reach waits for no one else's airtime.
+        for sender in senders:
+            if sender.unresponsive_since is not None:
+                # Messages to an unresponsive peer do not wait for other nodes' airtime.
                 continue
-            patience = self._rates.yield_after_s + 3 * (outbound.trip.least or 0.0)
-            for priority, age_s in outbound.levels.oldest_ages(self._rates.urgent_priority, now):
-                if age_s > patience:
+            max_wait_s = self._rates.yield_after_s + 3 * (sender.rtt.min_rtt or 0.0)
+            for priority, age_s in sender.levels.oldest_ages(self._rates.urgent_priority, now):
+                if age_s > max_wait_s:
                     oldest[priority] = max(age_s, oldest.get(priority, 0.0))
         self._waiting = tuple(
             Waiting(priority, min(65_535, int(age_s * 1000))) for priority, age_s in sorted(oldest.items())
         )
         return self._waiting
 
-    def heard(self, waiting: tuple[Waiting, ...], now: float) -> None:
-        """Another node's waiting levels."""
+    def on_waiting(self, waiting: tuple[Waiting, ...], now: float) -> None:
+        """Process another node's waiting levels."""
         level = min(entry.priority for entry in waiting)
         if level > self._rates.urgent_priority or self._rates.yield_share <= 0:
             return
@@ -74,8 +74,8 @@ class Yielding:
         self.held_total_s += extension
         self._until = now + self._rates.yield_hold_s
 
-    def allowed(self, now: float) -> int:
+    def allowed_levels(self, now: float) -> int:
         return self._allowed if now < self._until else ALL_LEVELS
 
-    def holds_until(self, now: float) -> float | None:
+    def held_until(self, now: float) -> float | None:
         return self._until if now < self._until else None

@@ -1,15 +1,15 @@
-"""Messages in: topic -> destinations -> queues, the broadcast, or an outbox; and their outcomes out.
+"""Messages in: topic -> destinations -> a peer's queue, the broadcast queue or an outbox; outcomes out as events.
 
-`send` decides where a message goes (a large one first waits until `pack` has compressed it, step by step); `shelve`
-and `release_outbox` move messages between a peer's queue and its outbox as it goes and comes; `report_ended` turns
-ends into events.
+`send` chooses where a message goes; a large one is first compressed in steps by `compress_step`. `store_in_outbox` and
+`release_outbox` move messages between a peer's queue and its outbox as the peer goes offline and returns.
+`report_ended` turns outcomes into events.
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 
-from udp_mesh.core.compression import STEP_BYTES, Unpacked, compress
+from udp_mesh.core.compression import STEP_BYTES, Uncompressed, compress
 from udp_mesh.core.events import (
     ExpiryReason,
     MessageDelivered,
@@ -19,14 +19,14 @@ from udp_mesh.core.events import (
     Rejected,
     RejectReason,
 )
-from udp_mesh.core.legacy.sender import carries
-from udp_mesh.core.outbox import Held
+from udp_mesh.core.legacy.sender import can_publish
+from udp_mesh.core.outbox import HeldMessage
 from udp_mesh.core.peers.session import Peer, Session
-from udp_mesh.core.sender.message import Accepted, Channel, Outgoing
+from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, header_bytes
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.pmtu import ETHERNET_MTU
-from udp_mesh.core.sender.rate_limit import Gate
+from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.settings import Outbox, Topic, is_type_name
 from udp_mesh.core.state import State
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
@@ -36,15 +36,15 @@ from udp_mesh.wire.legacy import LEGACY_OVERHEAD_BYTES
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
 
 ANNOUNCE_BYTES = 5
-"""Of a topic's announcement besides its two names."""
+"""Size of a topic announcement without its two names."""
 
-RELEASED_AT_ONCE = 400
-"""Messages of an outbox queued in one go: some milliseconds, in which no urgent one can leave."""
+RELEASE_BATCH = 400
+"""Outbox messages queued at a time: some milliseconds, in which no urgent message can be sent."""
 
-RELEASE_AGAIN_S = 0.02
-"""Until the next: 20,000 messages a second, more than a robot's link carries."""
+RELEASE_INTERVAL_S = 0.02
+"""Time between two batches: 20,000 messages a second, more than a robot's link carries."""
 
-MOST_CHANNELS = 65_536
+MAX_CHANNELS = 65_536
 """Topic numbers are 16 bits."""
 
 
@@ -62,11 +62,11 @@ def send(
     limits = state.settings.limits
     if len(payload) > limits.message_bytes:
         return Rejected(RejectReason.TOO_LARGE, f"expected at most {limits.message_bytes} bytes, found {len(payload)}")
-    channel = channel_of(state, topic, type_name)
+    channel = topic_channel(state, topic, type_name)
     if channel is None:
         return Rejected(
             RejectReason.UNKNOWN_TOPIC,
-            f"every topic number is taken, or the type's name is not printable text of at most {MAX_TYPE_BYTES} bytes",
+            f"too many topics, or the type name is not printable text of at most {MAX_TYPE_BYTES} bytes",
         )
     if destination is not None:
         names = [destination]
@@ -74,238 +74,238 @@ def send(
         names = [name for name in topic.destinations if name != state.settings.name]
     else:
         names = []
-    rejected = _room_for(state, topic, names, len(payload))
+    rejected = _check_capacity(state, topic, names, len(payload))
     if rejected is not None:
         return rejected
     message_id = MessageId(state.next_message_id)
     state.next_message_id += 1
-    state.ledger.counters.messages_sent += 1
-    if topic.compression and (len(payload) > STEP_BYTES or state.packing.holds(topic.name)):
+    state.event_queue.counters.messages_sent += 1
+    if topic.compression and (len(payload) > STEP_BYTES or state.compression_queue.has_topic(topic.name)):
         plain = _accept(message_id, channel, payload, None, now)
-        keys = tuple(state.outboxes.keep(name, plain, now) for name in names) if topic.reliable else ()
-        state.packing.add(Unpacked(message_id, channel, payload, tuple(names), now, keys))
+        keys = tuple(state.outboxes.persist(name, plain, now) for name in names) if topic.reliable else ()
+        state.compression_queue.add(Uncompressed(message_id, channel, payload, tuple(names), now, keys))
     else:
         packed = compress(payload) if topic.compression else None
         _enqueue_all(state, _accept(message_id, channel, payload, packed, now), names, now)
     return message_id
 
 
-def pack(state: State, now: float) -> None:
-    """Compress some more of what waits for that; what is done goes on its way."""
-    done = state.packing.step()
+def compress_step(state: State, now: float) -> None:
+    """Compress one step; queue a message when it is done."""
+    done = state.compression_queue.step()
     if done is not None:
         message, packed = done
         accepted = _accept(message.message_id, message.channel, message.payload, packed, message.accepted_at)
         _enqueue_all(state, accepted, message.names, now, message.store_keys)
 
 
-def stop_packing(state: State, now: float) -> None:
-    """Everything goes on its way as it is."""
-    for message in state.packing.take_all():
+def flush_compression(state: State, now: float) -> None:
+    """Queue everything that waits for compression, uncompressed."""
+    for message in state.compression_queue.drain():
         accepted = _accept(message.message_id, message.channel, message.payload, None, message.accepted_at)
         _enqueue_all(state, accepted, message.names, now, message.store_keys)
 
 
 def _enqueue_all(
-    state: State, accepted: Accepted, names: Sequence[str], now: float, store_keys: Sequence[int | None] = ()
+    state: State, accepted: AcceptedMessage, names: Sequence[str], now: float, store_keys: Sequence[int | None] = ()
 ) -> None:
     if names:
         for name, store_key in zip_longest(names, store_keys):
             enqueue(state, name, accepted, now, store_key)
     else:
-        _to_all(state, accepted, now)
+        _broadcast(state, accepted, now)
 
 
-def _room_for(state: State, topic: Topic, names: list[str], size_bytes: int) -> Rejected | None:
+def _check_capacity(state: State, topic: Topic, names: list[str], size_bytes: int) -> Rejected | None:
     limits = state.settings.limits
-    for name in names or [peer.name for peer in state.roster.online()]:
-        peer = state.roster.peers.get(name)
+    for name in names or [peer.name for peer in state.peer_table.online()]:
+        peer = state.peer_table.peers.get(name)
         if peer is None:
             if topic.outbox is Outbox.NONE and name not in topic.destinations:
                 return Rejected(RejectReason.UNKNOWN_PEER, f"{name} was never heard of")
-            if len(state.roster.peers) >= limits.peers:
-                return Rejected(RejectReason.QUEUE_FULL, f"already {limits.peers} peers")
+            if len(state.peer_table.peers) >= limits.peers:
+                return Rejected(RejectReason.QUEUE_FULL, f"limit of {limits.peers} peers reached")
             continue
-        if not peer.engaged:
+        if not peer.has_sender:
             continue
-        outbound = peer.outbound
+        sender = peer.sender
         if (
-            outbound.levels.queued_bytes + size_bytes > limits.queue_bytes_per_peer
-            or len(outbound.open) >= limits.queue_messages_per_peer
+            sender.levels.queued_bytes + size_bytes > limits.queue_bytes_per_peer
+            or len(sender.pending) >= limits.queue_messages_per_peer
         ):
-            return Rejected(RejectReason.QUEUE_FULL, f"too much waits for {name}")
-    if topic.compression and state.packing.bytes + size_bytes > limits.queue_bytes_per_peer:
-        return Rejected(RejectReason.QUEUE_FULL, "too much waits to be compressed")
-    if not names and state.casts.queued() >= limits.queue_messages_per_peer:
-        return Rejected(RejectReason.QUEUE_FULL, "too many broadcasts wait")
+            return Rejected(RejectReason.QUEUE_FULL, f"queue for {name} is full")
+    if topic.compression and state.compression_queue.bytes + size_bytes > limits.queue_bytes_per_peer:
+        return Rejected(RejectReason.QUEUE_FULL, "compression queue is full")
+    if not names and state.broadcasts.queued() >= limits.queue_messages_per_peer:
+        return Rejected(RejectReason.QUEUE_FULL, "broadcast queue is full")
     return None
 
 
-def channel_of(state: State, topic: Topic, type_name: str) -> Channel | None:
-    """The topic's number on the air with this type; None when there are too many, or where no receiver takes the type's
-    name: it would refuse every datagram that announces it, with all that is packed beside it."""
+def topic_channel(state: State, topic: Topic, type_name: str) -> TopicChannel | None:
+    """The topic's number on the wire with this type. None if there are too many, or if no receiver would accept the
+    type name: receivers drop every datagram that announces it, with everything else in it."""
     channel = state.channels.get((topic.name, type_name))
     if channel is None:
-        if len(state.channels) >= MOST_CHANNELS or not is_type_name(type_name):
+        if len(state.channels) >= MAX_CHANNELS or not is_type_name(type_name):
             return None
-        channel = Channel(len(state.channels), topic, topic.name, type_name)
+        channel = TopicChannel(len(state.channels), topic, topic.name, type_name)
         state.channels[(topic.name, type_name)] = channel
     return channel
 
 
 def _accept(
-    message_id: MessageId, channel: Channel, payload: bytes, packed: bytes | None, accepted_at: float
-) -> Accepted:
+    message_id: MessageId, channel: TopicChannel, payload: bytes, packed: bytes | None, accepted_at: float
+) -> AcceptedMessage:
     topic = channel.topic
     flags = MessageFlag.RELIABLE if topic.reliable else MessageFlag(0)
     if packed is not None:
         flags |= MessageFlag.COMPRESSED
     deadline = None if topic.deadline_s is None else accepted_at + topic.deadline_s
     body = payload if packed is None else packed
-    return Accepted(message_id, channel, payload, body, flags, accepted_at, deadline)
+    return AcceptedMessage(message_id, channel, payload, body, flags, accepted_at, deadline)
 
 
-def enqueue(state: State, name: str, accepted: Accepted, now: float, store_key: int | None = None) -> None:
-    """One destination's copy: into the queue of a peer in reach, else where the topic's outbox says."""
+def enqueue(state: State, name: str, accepted: AcceptedMessage, now: float, store_key: int | None = None) -> None:
+    """Queue one destination's copy: to the peer if it is online, otherwise to the topic's outbox."""
     topic = accepted.channel.topic
-    peer = state.roster.peer(name, state.settings)
+    peer = state.peer_table.get_or_create(name, state.settings)
     if peer is None or ((not peer.online) and topic.outbox is not Outbox.NONE):
-        _hold(state, name, Held(accepted, store_key), now)
+        _hold(state, name, HeldMessage(accepted, store_key), now)
         return
-    if peer.session is not None and not inflates(peer.session):
-        accepted = unpacked(accepted)
+    if peer.session is not None and not accepts_compressed(peer.session):
+        accepted = uncompressed(accepted)
     keeps = topic.outbox is not Outbox.NONE and peer.settling
     if (keeps or state.outboxes.holds(name, topic.name)) and topic.priority > state.settings.rates.urgent_priority:
-        # Older ones of the topic are still to come; only what is urgent goes ahead of what is stale.
-        _hold(state, name, Held(accepted, store_key), now)
+        # Older messages of the topic still wait in the outbox; only urgent ones go ahead of stale ones.
+        _hold(state, name, HeldMessage(accepted, store_key), now)
         return
     if store_key is None and topic.reliable:
-        store_key = state.outboxes.keep(name, accepted, now)
+        store_key = state.outboxes.persist(name, accepted, now)
     _queue(state, peer, accepted, now, store_key)
 
 
-def _queue(state: State, peer: Peer, accepted: Accepted, now: float, store_key: int | None) -> None:
-    """On its way to a peer, in reach or not."""
+def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, store_key: int | None) -> None:
+    """Queue a message to a peer, online or not."""
     topic = accepted.channel.topic
-    message = Outgoing(accepted, topic.priority, reliable=topic.reliable)
+    message = OutgoingMessage(accepted, topic.priority, reliable=topic.reliable)
     message.store_key = store_key
-    outbound = peer.outbound
-    outbound.accept(message, now)
+    sender = peer.sender
+    sender.accept(message, now)
     if peer.lost:
-        outbound.finish(message, Outcome.PEER_LOST)
-    if topic.rate_limit_bytes_per_s is not None and topic.name not in state.gates:
-        state.gates[topic.name] = Gate(topic.rate_limit_bytes_per_s, now)
+        sender.finish(message, Outcome.PEER_LOST)
+    if topic.rate_limit_bytes_per_s is not None and topic.name not in state.rate_limits:
+        state.rate_limits[topic.name] = TokenBucket(topic.rate_limit_bytes_per_s, now)
     report_ended(state, peer, now)
     state.ready[peer] = None
     state.arm(peer)
 
 
-def inflates(session: Session) -> bool:
-    """Whether the peer takes compressed messages."""
+def accepts_compressed(session: Session) -> bool:
+    """Whether the peer accepts compressed messages."""
     return bool(session.features & Feature.ZLIB)
 
 
-def unpacked(accepted: Accepted) -> Accepted:
+def uncompressed(accepted: AcceptedMessage) -> AcceptedMessage:
     """The message as it was accepted."""
     if not accepted.flags & MessageFlag.COMPRESSED:
         return accepted
     return replace(accepted, body=accepted.payload, flags=accepted.flags & ~MessageFlag.COMPRESSED)
 
 
-def _to_all(state: State, accepted: Accepted, now: float) -> None:
+def _broadcast(state: State, accepted: AcceptedMessage, now: float) -> None:
     topic = accepted.channel.topic
     accepted = replace(accepted, flags=accepted.flags | MessageFlag.TO_ALL)
-    sessions = [peer.session for peer in state.roster.online() if peer.session is not None]
-    if not all(map(inflates, sessions)):
-        accepted = unpacked(accepted)
-    fits = state.broadcasts() and _broadcast_bytes(accepted) <= broadcast_room(state, sessions)
+    sessions = [peer.session for peer in state.peer_table.online() if peer.session is not None]
+    if not all(map(accepts_compressed, sessions)):
+        accepted = uncompressed(accepted)
+    fits = state.can_broadcast() and _broadcast_bytes(accepted) <= broadcast_room(state, sessions)
     if fits:
-        state.casts.push(accepted)
-    for peer in list(state.roster.peers.values()):
-        if peer.legacy and not carries(accepted.channel.type_name):
+        state.broadcasts.push(accepted)
+    for peer in list(state.peer_table.peers.values()):
+        if peer.legacy and not can_publish(accepted.channel.type_name):
             continue
         if (peer.online and (not fits or peer.legacy)) or (not peer.online and topic.outbox is not Outbox.NONE):
             enqueue(state, peer.name, accepted, now)
 
 
 def broadcast_room(state: State, sessions: Iterable[Session]) -> int:
-    """Bytes of a datagram that everybody's path carries, as far as that is known. On links that take larger packets
-    than Ethernet's it is Ethernet's all the same: nobody would notice that a mesh behind them does not."""
+    """Size of a datagram that every known path carries. On links with a larger MTU than Ethernet's it is still limited
+    to Ethernet's: a mesh behind such a link may not carry more, and a lost broadcast is not noticed."""
     links = [link.mtu - header_bytes(link.address) for link in state.links.values()]
-    paths = [way.mtu - header_bytes(way.address) for way in (session.way for session in sessions) if way.link]
+    paths = [path.mtu - header_bytes(path.address) for path in (session.path for session in sessions) if path.link]
     room = min([*links, *paths, max(ETHERNET_MTU, state.settings.fragment_bytes) - IP_UDP_BYTES], default=0)
     if any(neighbour.legacy for neighbour in state.settings.neighbours):
         room -= LEGACY_OVERHEAD_BYTES
     return room
 
 
-def _broadcast_bytes(accepted: Accepted) -> int:
-    """The datagram of a broadcast of this message."""
+def _broadcast_bytes(accepted: AcceptedMessage) -> int:
+    """Size of the datagram that broadcasts this message."""
     channel = accepted.channel
     names = ANNOUNCE_BYTES + len(channel.name.encode()) + len(channel.type_name.encode())
     fragment = FRAGMENT_BYTES + HEAD_BYTES + LENGTH_BYTES + len(accepted.body)
     return SHORT_OVERHEAD_BYTES + names + fragment
 
 
-def shelve(state: State, peer: Peer, now: float) -> None:
-    """The peer went out of reach: move what its outboxes keep out of the queue."""
-    everything = list(peer.outbound.open) if peer.engaged else []
-    # The newest first: each then stands in front of those already there.
+def store_in_outbox(state: State, peer: Peer, now: float) -> None:
+    """Move messages from the queue of a peer that went offline to their outboxes."""
+    everything = list(peer.sender.pending) if peer.has_sender else []
+    # Newest first: each one goes in front of those already there.
     everything.sort(key=lambda message: message.accepted.message_id, reverse=True)
     for message in everything:
         if message.accepted.channel.topic.outbox is Outbox.NONE or message.accepted.broadcast_number is not None:
             continue
-        # best effort is not remembered for long over there, and fielded programs know no numbers of ours
-        resumable = message.begun and message.reliable and not peer.legacy
-        peer.outbound.withdraw(message, to_resume=resumable)
-        begun = message if resumable else None
-        _hold(state, peer.name, Held(message.accepted, message.store_key, begun, peer.outbound.epoch), now)
+        # Best effort is not remembered for long by the receiver, and legacy programs do not know our numbers.
+        resumable = message.started and message.reliable and not peer.legacy
+        peer.sender.withdraw(message, to_resume=resumable)
+        started = message if resumable else None
+        _hold(state, peer.name, HeldMessage(message.accepted, message.store_key, started, peer.sender.epoch), now)
 
 
-def _hold(state: State, name: str, new: Held, now: float) -> None:
+def _hold(state: State, name: str, new: HeldMessage, now: float) -> None:
     for held, reason in state.outboxes.hold(name, new, now):
-        _give_up_held(state, name, held, reason)
+        _drop_held(state, name, held, reason)
 
 
-def _give_up_held(state: State, name: str, held: Held, reason: ExpiryReason) -> None:
-    """An outbox no longer keeps this one; what the peer has of it, it may forget."""
-    peer = state.roster.peers.get(name)
-    if held.begun is not None and peer is not None and held.epoch == peer.outbound.epoch:
-        peer.outbound.cancel(held.begun)
-    tell_expired(state, name, held.accepted, reason)
+def _drop_held(state: State, name: str, held: HeldMessage, reason: ExpiryReason) -> None:
+    """Drop a message from an outbox; the peer may discard what it has of it."""
+    peer = state.peer_table.peers.get(name)
+    if held.started is not None and peer is not None and held.epoch == peer.sender.epoch:
+        peer.sender.cancel(held.started)
+    report_expired(state, name, held.accepted, reason)
 
 
 def release_outbox(state: State, peer: Peer, now: float) -> None:
-    """The peer is in reach: some of what waited for it is queued, the most urgent and oldest first; more of it soon."""
-    for held in state.outboxes.release(peer.name, RELEASED_AT_ONCE):
-        begun, session = held.begun, peer.session
-        if begun is not None and held.epoch == peer.outbound.epoch:
-            # One that has left whole may have arrived whole: under a new number it would arrive twice.
-            whole = begun.next_position >= begun.fragments
-            if session is not None and (whole or begun.fragment_bytes <= session.way.fragment_bytes):
-                begun.store_key = held.store_key
-                peer.outbound.resume(begun, now)
+    """The peer is online: queue some of its outbox, most urgent and oldest first; more of it soon."""
+    for held in state.outboxes.release(peer.name, RELEASE_BATCH):
+        started, session = held.started, peer.session
+        if started is not None and held.epoch == peer.sender.epoch:
+            # A message sent completely may have arrived completely; under a new number it would arrive twice.
+            whole = started.next_position >= started.fragments
+            if session is not None and (whole or started.fragment_bytes <= session.path.fragment_bytes):
+                started.store_key = held.store_key
+                peer.sender.resume(started, now)
                 state.ready[peer] = None
                 state.arm(peer)
                 continue
-            peer.outbound.cancel(begun)
-        accepted = held.accepted if session is None or inflates(session) else unpacked(held.accepted)
+            peer.sender.cancel(started)
+        accepted = held.accepted if session is None or accepts_compressed(session) else uncompressed(held.accepted)
         _queue(state, peer, accepted, now, held.store_key)
     if state.outboxes.holds(peer.name):
-        state.housekeeping_at = min(state.housekeeping_at, now + RELEASE_AGAIN_S)
+        state.maintenance_at = min(state.maintenance_at, now + RELEASE_INTERVAL_S)
 
 
 def report_ended(state: State, peer: Peer, now: float) -> None:
-    """Turn the ends of messages to one peer into events."""
-    ended = peer.outbound.ended
+    """Turn the outcomes of messages to one peer into events."""
+    ended = peer.sender.ended
     if not ended:
         return
-    peer.outbound.ended = []
-    counters = state.ledger.counters
+    peer.sender.ended = []
+    counters = state.event_queue.counters
     for message, outcome in ended:
         accepted = message.accepted
         if message.store_key is not None:
-            state.outboxes.settle(message.store_key)
+            state.outboxes.forget(message.store_key)
         if accepted.broadcast_number is not None:
             continue
         topic = accepted.channel.name
@@ -315,23 +315,23 @@ def report_ended(state: State, peer: Peer, now: float) -> None:
             counters.messages_delivered += 1
             if message.reliable:
                 latency_s = now - accepted.accepted_at
-                state.ledger.tell(MessageDelivered(accepted.message_id, peer.name, topic, latency_s))
+                state.event_queue.emit(MessageDelivered(accepted.message_id, peer.name, topic, latency_s))
         elif outcome is Outcome.PEER_LOST:
             counters.messages_peer_lost += 1
             if message.reliable:
-                state.ledger.tell(MessagePeerLost(accepted.message_id, peer.name, topic))
+                state.event_queue.emit(MessagePeerLost(accepted.message_id, peer.name, topic))
         elif isinstance(outcome, ExpiryReason):
-            tell_expired(state, peer.name, accepted, outcome)
+            report_expired(state, peer.name, accepted, outcome)
 
 
-def tell_expired(state: State, peer: str, accepted: Accepted, reason: ExpiryReason) -> None:
-    """An accepted message was given up."""
-    state.ledger.counters.messages_expired += 1
+def report_expired(state: State, peer: str, accepted: AcceptedMessage, reason: ExpiryReason) -> None:
+    """Report an accepted message that was given up."""
+    state.event_queue.counters.messages_expired += 1
     if accepted.flags & MessageFlag.RELIABLE:
-        state.ledger.tell(MessageExpired(accepted.message_id, peer, accepted.channel.name, reason))
+        state.event_queue.emit(MessageExpired(accepted.message_id, peer, accepted.channel.name, reason))
 
 
 def expire_held(state: State, now: float) -> None:
-    """Messages in outboxes whose deadline passed."""
+    """Expire messages in outboxes."""
     for peer, held in state.outboxes.expire(now):
-        _give_up_held(state, peer, held, ExpiryReason.DEADLINE)
+        _drop_held(state, peer, held, ExpiryReason.DEADLINE)

@@ -1,10 +1,10 @@
-"""A set of numbers kept as ranges: which messages of a peer are finished, in little memory however many there were."""
+"""A set of integers stored as ranges: the finished messages of a peer, in little memory however many there were."""
 
 from bisect import bisect_right
 
 
 class RangeSet:
-    """Integers as disjoint, sorted, inclusive ranges. Adding the number after the last one costs no search."""
+    """Integers as disjoint, sorted, inclusive ranges. Adding the successor of the largest number needs no search."""
 
     __slots__ = ("_firsts", "_lasts")
 
@@ -17,7 +17,7 @@ class RangeSet:
         return place >= 0 and number <= self._lasts[place]
 
     def __len__(self) -> int:
-        """Ranges, not numbers: what the memory cap counts."""
+        """The number of ranges, which the memory cap limits."""
         return len(self._firsts)
 
     def add(self, number: int) -> None:

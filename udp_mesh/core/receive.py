@@ -1,19 +1,19 @@
-"""Datagrams in: header -> channel -> opened frames -> effects. Whatever arrives, this returns.
+"""Datagrams in: header -> channel -> opened frames -> effects. Never raises, whatever arrives.
 
-1. A short header's tag finds the channels it may mean; opening one proves who sent it. Replays cost no decryption.
-2. A plain fragment goes straight to the reassembly; other frames are decoded and taken one by one.
-3. A long header introduces a boot: its check is verified before anything is derived or remembered for it.
+1. A short header's tag selects candidate channels; opening one authenticates the sender. Replays cost no decryption.
+2. A plain fragment goes straight to reassembly; other frames are decoded and processed one by one.
+3. A long header introduces a boot: its check is verified before anything is derived or stored for it.
 """
 
-from udp_mesh.core.broadcast import UNREPAIRED_FROM
+from udp_mesh.core.broadcast import FIRST_UNREPAIRED_NUMBER
 from udp_mesh.core.conditions import Counters
 from udp_mesh.core.events import ExpiryReason, MessageReceived
-from udp_mesh.core.peer_lifecycle import follow, greet, heard, leave, prove
+from udp_mesh.core.peer_lifecycle import migrate_path, on_activity, on_bye, on_heartbeat, on_verified
 from udp_mesh.core.peers.path_validation import send_on_path
 from udp_mesh.core.peers.session import Session
 from udp_mesh.core.publish import report_ended
-from udp_mesh.core.receiver.replay_check import broadcast_lateness_s, data_lateness_s, date_of, long_lateness_s
-from udp_mesh.core.sender.message import Accepted, Outgoing
+from udp_mesh.core.receiver.replay_check import broadcast_lateness_s, data_lateness_s, long_lateness_s, timestamp_of
+from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
 from udp_mesh.crypto import TO_ALL, Key, OpenError, ReceiveChannel, ReplayError, UnknownKeyError, check_long
@@ -45,38 +45,38 @@ from udp_mesh.wire.header import (
     parse_header,
 )
 
-_LEAST_BYTES = SHORT_HEADER_BYTES + SEAL_TAG_BYTES
+_MIN_BYTES = SHORT_HEADER_BYTES + SEAL_TAG_BYTES
 
 
-def take_datagram(state: State, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
+def receive_datagram(state: State, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
     """See `Node.receive`."""
-    counters = state.ledger.counters
+    counters = state.event_queue.counters
     size = len(data)
     counters.datagrams_received += 1
     counters.bytes_received += size + 28
-    if size < _LEAST_BYTES:
+    if size < _MIN_BYTES:
         counters.dropped_malformed += 1
         return
     first = data[0]
     if first == DATA_BYTE:
         replayed = False
         _, tag, low = SHORT_HEADER.unpack_from(data)
-        for channel, session in state.roster.data_tags.get(tag, ()):
+        for channel, session in state.peer_table.data_tags.get(tag, ()):
             try:
                 number, frames = channel.open(data, low)
             except ReplayError:
-                # Perhaps a new one of another channel with this tag.
+                # It may be a new packet of another channel with this tag.
                 replayed = True
                 continue
             except OpenError:
                 continue
-            _take_data(state, session, number, frames, link, source, now)
+            _receive_data(state, session, number, frames, link, source, now)
             return
         _count_unopened(counters, replayed=replayed)
     elif first == BROADCAST_BYTE:
         replayed = False
         _, tag, low = SHORT_HEADER.unpack_from(data)
-        for channel, session in state.roster.broadcast_tags.get(tag, ()):
+        for channel, session in state.peer_table.broadcast_tags.get(tag, ()):
             try:
                 _, frames = channel.open(data, low)
             except ReplayError:
@@ -84,19 +84,19 @@ def take_datagram(state: State, data: bytes | memoryview, link: str, source: Add
                 continue
             except OpenError:
                 continue
-            _take_broadcast(state, session, frames, link, source, now)
+            _receive_broadcast(state, session, frames, link, source, now)
             return
         _count_unopened(counters, replayed=replayed)
     else:
         try:
             header = parse_header(data)
             if isinstance(header, LongHeader):
-                _take_long(state, data, header, link, source, now)
+                _receive_long(state, data, header, link, source, now)
         except UnknownKeyError:
             counters.dropped_unauthenticated += 1
-            mismatch = state.mismatches.seen(source, link, now)
+            mismatch = state.key_mismatches.on_mismatch(source, link, now)
             if mismatch is not None:
-                state.ledger.tell(mismatch)
+                state.event_queue.emit(mismatch)
         except ReplayError:
             counters.dropped_replayed += 1
         except OpenError:
@@ -114,15 +114,15 @@ def _count_unopened(counters: Counters, *, replayed: bool) -> None:
         counters.dropped_unauthenticated += 1
 
 
-def _take_data(
+def _receive_data(
     state: State, session: Session, number: int, frames: bytes, link: str, source: Address, now: float
 ) -> None:
-    """An opened datagram bound to this run of ours: its sender is alive, or was when it was recorded."""
-    way = session.way
+    """Process a datagram bound to our current boot: its sender is alive, or was when it was recorded."""
+    path = session.path
     peer = session.peer
     session.received_bytes += len(frames) + 51
     if not frames:
-        state.ledger.counters.dropped_malformed += 1
+        state.event_queue.counters.dropped_malformed += 1
         return
     late_s: float | None = 0.0
     if frames[0] < FRAGMENT or now > session.freshness.trusted_until:
@@ -133,40 +133,40 @@ def _take_data(
         peer is not None
         and peer.online
         and peer.session is session
-        and source == way.address
-        and link == way.link
-        and peer.outbound.silent_since is None
+        and source == path.address
+        and link == path.link
+        and peer.sender.unresponsive_since is None
     ):
-        session.last_heard = way.heard_at = now
+        session.last_heard = path.heard_at = now
     else:
-        if not session.proven:
-            prove(state, session, now)
-        heard(state, session, link, source, now)
+        if not session.verified:
+            on_verified(state, session, now)
+        on_activity(state, session, link, source, now)
         peer = session.peer
         if peer is None or peer.session is not session:
             return
-    inbound = session.inbound
-    if inbound.take_plain(frames, number, now):
-        acks = inbound.acks
-        if acks.now_wanted:
-            state.owing[session] = None
-            if inbound.overdue():
-                _cut_ack(state, session, now)
-        elif acks.due_at is not None and acks.due_at < peer.wants_at:
+    receiver = session.receiver
+    if receiver.receive_plain(frames, number, now):
+        acks = receiver.acks
+        if acks.send_now:
+            state.control_ready[session] = None
+            if receiver.ack_overdue():
+                _ack_mid_batch(state, session, now)
+        elif acks.due_at is not None and acks.due_at < peer.due_at:
             state.set_timer(peer, acks.due_at)
         return
     try:
         decoded = decode(frames)
     except DecodeError:
-        state.ledger.counters.dropped_malformed += 1
+        state.event_queue.counters.dropped_malformed += 1
         return
-    if session.timed and date_of(frames) is None:
-        # Its sender dates every message that begins: one without a date would have none when it is late.
+    if session.timed and timestamp_of(frames) is None:
+        # Its sender timestamps every first fragment: one without a timestamp could be replayed later.
         decoded = [frame for frame in decoded if not (isinstance(frame, Fragment) and frame.head is not None)]
-    _take_frames(state, session, decoded, number, link, source, now, late_s or 0.0)
+    _receive_frames(state, session, decoded, number, link, source, now, late_s or 0.0)
 
 
-def _take_frames(
+def _receive_frames(
     state: State,
     session: Session,
     frames: list[Frame],
@@ -176,11 +176,11 @@ def _take_frames(
     now: float,
     late_s: float = 0.0,
 ) -> None:
-    """The frames of a unicast datagram of a peer's session, in order."""
-    inbound = session.inbound
+    """Process the frames of a unicast datagram, in order."""
+    receiver = session.receiver
     peer = session.peer
     assert peer is not None
-    outbound = peer.outbound
+    sender = peer.sender
     wants_ack = ack_now = False
     kept = True
     for frame in frames:
@@ -188,111 +188,111 @@ def _take_frames(
             case Fragment():
                 wants_ack = True
                 ack_now = ack_now or frame.ack_now
-                kept = inbound.take(frame, now, broadcast=False, late_s=late_s) and kept
+                kept = receiver.receive_fragment(frame, now, broadcast=False, late_s=late_s) and kept
             case Ack():
-                if frame.largest < session.way.channel.next_number:
-                    session.way.confirmed = session.knows_us = True
+                if frame.largest < session.path.channel.next_number:
+                    session.path.confirmed = session.knows_us = True
                     session.peer_receives = (frame.receive_rate, now)
-                    arrived_before = outbound.delivered_packets
-                    outbound.acknowledge(frame, now)
-                    if outbound.delivered_packets > arrived_before:
-                        session.hears_us()
+                    arrived_before = sender.delivered_packets
+                    sender.acknowledge(frame, now)
+                    if sender.delivered_packets > arrived_before:
+                        session.confirm_two_way()
                     report_ended(state, peer, now)
                     state.ready[peer] = None
                 if frame.waiting:
-                    state.yielding.heard(frame.waiting, now)
+                    state.priority_backoff.on_waiting(frame.waiting, now)
             case TopicAnnounce():
-                inbound.announce(frame)
+                receiver.on_topic_announce(frame)
             case Cancel(message_ids, broadcast_ids):
-                _take_cancel(state, session, message_ids, broadcast_ids=broadcast_ids)
+                _on_cancel(state, session, message_ids, broadcast_ids=broadcast_ids)
             case Refused():
                 if not frame.broadcast_id:
-                    _take_refusal(state, session, frame)
+                    _on_refused(state, session, frame)
                     report_ended(state, peer, now)
                     state.ready[peer] = None
             case Delivered(message_ids, broadcast_ids):
                 if not broadcast_ids:
-                    outbound.told_delivered(message_ids)
+                    sender.on_delivered(message_ids)
                     report_ended(state, peer, now)
             case Nack(message_id):
-                _repair(state, session, message_id, now)
+                _on_nack(state, session, message_id, now)
             case Ping(token):
-                if (link, source) == (session.way.link, session.way.address):
-                    session.owe(Pong(token, 0))
-                    state.owe(session)
+                if (link, source) == (session.path.link, session.path.address):
+                    session.queue_control(Pong(token, 0))
+                    state.schedule_control(session)
                 else:
-                    # It asks whether we are there, not whether we know another way.
+                    # The ping validates the path it came on: answer to that address.
                     send_on_path(state, session, Pong(token, 0), link, source, now)
             case Pong(token):
-                outbound.path_size.answered(token, now)
+                sender.pmtu.on_pong(token, now)
             case Bye():
-                leave(state, session, now)
+                on_bye(state, session, now)
             case _:
-                # Heartbeats are taken where introductions are.
+                # Heartbeats are processed with long headers.
                 pass
-    _hand_over(state, session, now)
+    _deliver(state, session, now)
     if not wants_ack:
-        inbound.acks.saw(number, now)
+        receiver.acks.on_packet(number, now)
     elif kept:
-        inbound.accepted(number, now, ack_now=ack_now)
-        if inbound.acks.now_wanted:
-            state.owe(session)
-    if inbound.refusals:
-        for refusal in inbound.refusals:
-            session.owe(refusal)
-        inbound.refusals.clear()
-        state.owe(session)
+        receiver.on_accepted(number, now, ack_now=ack_now)
+        if receiver.acks.send_now:
+            state.schedule_control(session)
+    if receiver.refusals:
+        for refusal in receiver.refusals:
+            session.queue_control(refusal)
+        receiver.refusals.clear()
+        state.schedule_control(session)
     state.arm(peer)
 
 
-def _cut_ack(state: State, session: Session, now: float) -> None:
-    """Acknowledge in the middle of a large batch: the bitmap must not lose sight of its beginning."""
-    ack = session.take_ack(now, ())
+def _ack_mid_batch(state: State, session: Session, now: float) -> None:
+    """Acknowledge in the middle of a large batch, before its beginning leaves the bitmap."""
+    ack = session.build_ack(now, ())
     if ack is not None:
-        session.owe(ack)
+        session.queue_control(ack)
 
 
-def _take_cancel(state: State, session: Session, message_ids: tuple[int, ...], *, broadcast_ids: bool) -> None:
+def _on_cancel(state: State, session: Session, message_ids: tuple[int, ...], *, broadcast_ids: bool) -> None:
     if broadcast_ids:
         repairs = state.repairs.get(session.boot_id)
         for message_id in message_ids:
             if repairs is not None:
-                repairs.give_up(message_id)
+                repairs.abandon(message_id)
         return
     for message_id in message_ids:
-        session.inbound.unicasts.end(message_id)
+        session.receiver.unicasts.end(message_id)
 
 
-def _take_refusal(state: State, session: Session, refused: Refused) -> None:
+def _on_refused(state: State, session: Session, refused: Refused) -> None:
     peer = session.peer
     assert peer is not None
-    outbound = peer.outbound
-    message = outbound.by_wire_id(refused.message_id)
+    sender = peer.sender
+    message = sender.by_wire_id(refused.message_id)
     if message is None:
         return
     match refused.reason:
         case RefuseReason.FORGOTTEN:
-            outbound.send_anew(message)
+            sender.resend_from_start(message)
         case RefuseReason.NO_MEMORY:
-            # Its packets stay unacknowledged and come again by themselves.
+            # Its packets stay unacknowledged and are retransmitted anyway.
             return
         case RefuseReason.TOO_LARGE | RefuseReason.CORRUPT:
-            outbound.finish(message, ExpiryReason.REFUSED)
+            sender.finish(message, ExpiryReason.REFUSED)
 
 
-def _repair(state: State, session: Session, number: int, now: float) -> None:
-    """A peer misses a cast: send it for itself, or say that it is gone."""
+def _on_nack(state: State, session: Session, number: int, now: float) -> None:
+    """A peer misses a broadcast: send it a unicast copy, or a Cancel if it is no longer kept."""
     peer = session.peer
     assert peer is not None
-    accepted = state.casts.repair(number)
+    accepted = state.broadcasts.repair(number)
     if accepted is None:
-        session.owe(Cancel((number,), broadcast_ids=True))
-        state.owe(session)
+        session.queue_control(Cancel((number,), broadcast_ids=True))
+        state.schedule_control(session)
         return
-    if any(message.accepted.broadcast_number == number for message in peer.outbound.open):
+    if any(message.accepted.broadcast_number == number for message in peer.sender.pending):
         return
-    state.ledger.counters.repairs_sent += 1
-    copy = Accepted(
+    state.event_queue.counters.repairs_sent += 1
+    copy = AcceptedMessage(
         accepted.message_id,
         accepted.channel,
         accepted.payload,
@@ -302,85 +302,85 @@ def _repair(state: State, session: Session, number: int, now: float) -> None:
         accepted.deadline,
         number,
     )
-    peer.outbound.accept(Outgoing(copy, accepted.channel.topic.priority, reliable=True), now)
+    peer.sender.accept(OutgoingMessage(copy, accepted.channel.topic.priority, reliable=True), now)
     state.ready[peer] = None
 
 
-def _hand_over(state: State, session: Session, now: float) -> None:
-    """Whole messages become events."""
-    inbound = session.inbound
-    if inbound.unpacking:
-        state.unpacking[session] = None
-    if not inbound.arrived:
+def _deliver(state: State, session: Session, now: float) -> None:
+    """Turn complete messages into events."""
+    receiver = session.receiver
+    if receiver.inflating:
+        state.inflating[session] = None
+    if not receiver.completed:
         return
-    arrived, inbound.arrived = inbound.arrived, []
+    completed, receiver.completed = receiver.completed, []
     repairs = state.repairs.get(session.boot_id)
-    for message in arrived:
+    for message in completed:
         number = message.from_broadcast
-        if number is not None and number < UNREPAIRED_FROM and repairs is not None:
-            repairs.received(number, now, inbound.broadcasts.finished)
-            state.ask_by(session.boot_id, repairs)
-        state.ledger.counters.messages_received += 1
-        state.ledger.tell(
+        if number is not None and number < FIRST_UNREPAIRED_NUMBER and repairs is not None:
+            repairs.on_received(number, now, receiver.broadcasts.finished)
+            state.schedule_repair(session.boot_id, repairs)
+        state.event_queue.counters.messages_received += 1
+        state.event_queue.emit(
             MessageReceived(
                 session.name, message.topic, message.type_name, message.payload, message.priority, message.to_all
             )
         )
 
 
-def unpack(state: State, now: float) -> None:
-    """Inflate some more of a message that is whole, of each session in turn."""
-    session = next(iter(state.unpacking))
-    held = sum(one.inbound.unpacking_bytes for one in state.unpacking)
-    if not session.inbound.unpack():
-        state.ledger.counters.dropped_malformed += 1
-    if held <= 2 * state.settings.limits.message_bytes or not session.inbound.unpacking:
-        # In turn, but where much is held already: then what was begun ends before more grows.
-        del state.unpacking[session]
-    _hand_over(state, session, now)
+def inflate_step(state: State, now: float) -> None:
+    """Inflate one step of a complete message, of each session in turn."""
+    session = next(iter(state.inflating))
+    held = sum(one.receiver.inflating_bytes for one in state.inflating)
+    if not session.receiver.inflate_step():
+        state.event_queue.counters.dropped_malformed += 1
+    if held <= 2 * state.settings.limits.message_bytes or not session.receiver.inflating:
+        # In turn, unless much memory is held already: then finish this one before others grow.
+        del state.inflating[session]
+    _deliver(state, session, now)
 
 
-def _take_broadcast(state: State, session: Session, frames: bytes, link: str, source: Address, now: float) -> None:
-    """An opened datagram to all. Until the sender is proven and its floor known, it may be a recording."""
+def _receive_broadcast(state: State, session: Session, frames: bytes, link: str, source: Address, now: float) -> None:
+    """Process a broadcast datagram. Until the sender is verified and its floor known, it may be replayed."""
     peer = session.peer
     if peer is None or peer.session is not session or session.boot_id not in state.repairs:
-        state.ledger.counters.dropped_unproven += 1
+        state.event_queue.counters.dropped_unproven += 1
         return
     if not frames:
-        state.ledger.counters.dropped_malformed += 1
+        state.event_queue.counters.dropped_malformed += 1
         return
     late_s = broadcast_lateness_s(state, session, frames, link, source, now)
     if late_s is None:
         return
-    heard(state, session, link, source, now)
+    on_activity(state, session, link, source, now)
     try:
         decoded = decode(frames)
     except DecodeError:
-        state.ledger.counters.dropped_malformed += 1
+        state.event_queue.counters.dropped_malformed += 1
         return
     for frame in decoded:
         match frame:
             case Fragment():
-                session.inbound.take(frame, now, broadcast=True, late_s=late_s)
+                session.receiver.receive_fragment(frame, now, broadcast=True, late_s=late_s)
             case TopicAnnounce():
-                session.inbound.announce(frame)
+                session.receiver.on_topic_announce(frame)
             case Bye():
-                leave(state, session, now)
+                on_bye(state, session, now)
             case _:
                 pass
-    session.inbound.refusals.clear()
-    _hand_over(state, session, now)
+    session.receiver.refusals.clear()
+    _deliver(state, session, now)
 
 
-def _take_long(
+def _receive_long(
     state: State, data: bytes | memoryview, header: LongHeader, link: str, source: Address, now: float
 ) -> None:
-    """A hello or an introduction; raises the decoder's and the cipher's errors."""
+    """Process a HELLO or an INTRODUCTION. Raises the decoder's and the cipher's errors."""
     if header.boot_id == state.boot_id:
         return
     key = _key(state, header.key_id)
     check_long(key, data, header)
-    session = state.roster.sessions.get(header.boot_id)
+    session = state.peer_table.sessions.get(header.boot_id)
     introduced = header.kind is Kind.INTRODUCTION
     if session is not None:
         channel = _channel(session.data_channels if introduced else session.broadcast_channels, key)
@@ -393,43 +393,43 @@ def _take_long(
         decoded = decode(frames)
         beat = _beat(decoded)
         if beat is None:
-            # An introduction without a name: its sender believes that we know it. Its heartbeats will tell.
-            state.ledger.counters.dropped_unproven += 1
+            # An introduction without a name: its sender assumes that we know it. Wait for its heartbeat.
+            state.event_queue.counters.dropped_unproven += 1
             return
-        session = state.roster.stranger(beat.name, header.boot_id, state.keys, state.settings)
+        session = state.peer_table.add_unverified(beat.name, header.boot_id, state.keys, state.settings)
         channel = _channel(session.data_channels if introduced else session.broadcast_channels, key)
         if not channel.window.accept(number):
-            # Of a boot that was forgotten, and whose numbers were not.
-            state.roster.forget(session)
+            # The session was forgotten, but its counters were restored: a replay.
+            state.peer_table.forget(session)
             raise ReplayError(f"packet {number} was already seen or is too old")
     if beat is not None and beat.name != session.name:
-        state.ledger.counters.dropped_malformed += 1
+        state.event_queue.counters.dropped_malformed += 1
         return
     late_s = long_lateness_s(state, session, decoded, link, source, now)
     if late_s is None:
         return
     if not introduced:
         if beat is not None:
-            greet(state, session, beat, link, source, now, to_all=True)
+            on_heartbeat(state, session, beat, link, source, now, to_all=True)
         for frame in decoded:
-            if isinstance(frame, Bye) and session.proven:
-                leave(state, session, now)
+            if isinstance(frame, Bye) and session.verified:
+                on_bye(state, session, now)
         return
-    if beat is not None and not session.proven:
-        session.learn(beat, now)
-        follow(state, session, link, source, now)
-        prove(state, session, now)
+    if beat is not None and not session.verified:
+        session.update_from(beat, now)
+        migrate_path(state, session, link, source, now)
+        on_verified(state, session, now)
     if beat is not None:
-        greet(state, session, beat, link, source, now, to_all=False)
-    if not session.proven or session.peer is None:
+        on_heartbeat(state, session, beat, link, source, now, to_all=False)
+    if not session.verified or session.peer is None:
         return
-    heard(state, session, link, source, now)
+    on_activity(state, session, link, source, now)
     if session.peer.session is not session:
         return
-    _take_frames(state, session, decoded, number, link, source, now, late_s)
-    # The sender writes long headers until it is answered.
-    session.inbound.acks.now_wanted = True
-    state.owe(session)
+    _receive_frames(state, session, decoded, number, link, source, now, late_s)
+    # The sender uses long headers until it is answered.
+    session.receiver.acks.send_now = True
+    state.schedule_control(session)
 
 
 def _key(state: State, key_id: bytes) -> Key:

@@ -1,6 +1,6 @@
 """Changes of a running node: links come and go, settings are replaced, outboxes are restored, the node closes.
 
-Nothing here drops an accepted message: a topic's new settings reach the messages already waiting on it.
+No accepted message is dropped: a topic's new settings apply to messages already waiting.
 """
 
 from dataclasses import fields, replace
@@ -8,11 +8,11 @@ from enum import Enum
 
 from udp_mesh.core.events import ExpiryReason, MessageId
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.peer_lifecycle import refit
-from udp_mesh.core.peers.heartbeat import leads
-from udp_mesh.core.publish import channel_of, enqueue, report_ended, stop_packing, tell_expired
-from udp_mesh.core.sender.message import Accepted
-from udp_mesh.core.sender.rate_limit import Gate
+from udp_mesh.core.peer_lifecycle import update_mtu
+from udp_mesh.core.peers.heartbeat import uses_link
+from udp_mesh.core.publish import enqueue, flush_compression, report_ended, report_expired, topic_channel
+from udp_mesh.core.sender.message import AcceptedMessage
+from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.settings import LinkInfo, LinkKind, Neighbour, Settings, Topic
 from udp_mesh.core.state import State, live_keys
 from udp_mesh.crypto import SendChannel
@@ -21,12 +21,12 @@ from udp_mesh.wire.frames import Bye, MessageFlag
 
 
 def restore_outboxes(state: State, now: float) -> None:
-    """What the last run left on disk waits again."""
+    """Queue the messages that the last run left on disk."""
     for stored in state.outboxes.load():
         topic = state.topics.get(stored.topic)
         if topic is None and state.settings.undeclared is not None:
             topic = replace(state.settings.undeclared, name=stored.topic)
-        channel = channel_of(state, topic, stored.type_name) if topic is not None else None
+        channel = topic_channel(state, topic, stored.type_name) if topic is not None else None
         if channel is None:
             # Its topic is no longer declared: it stays on disk for a run that declares it.
             continue
@@ -34,21 +34,21 @@ def restore_outboxes(state: State, now: float) -> None:
         state.next_message_id += 1
         flags = MessageFlag.RELIABLE if channel.topic.reliable else MessageFlag(0)
         deadline = None if stored.remaining_s is None else now + stored.remaining_s
-        accepted = Accepted(message_id, channel, stored.payload, stored.payload, flags, now, deadline)
+        accepted = AcceptedMessage(message_id, channel, stored.payload, stored.payload, flags, now, deadline)
         enqueue(state, stored.peer, accepted, now, stored.key)
 
 
 def link_up(state: State, link: LinkInfo, now: float) -> None:
-    """A new or changed link; heartbeats introduce it soon."""
+    """Add or change a link; a heartbeat follows soon."""
     state.links[link.name] = link
-    for session in state.roster.sessions.values():
-        if session.way.link == link.name:
-            refit(state, session, link.mtu)
-    state.discovery.hurry(len(state.roster.sessions), now)
+    for session in state.peer_table.sessions.values():
+        if session.path.link == link.name:
+            update_mtu(state, session, link.mtu)
+    state.heartbeats.schedule_now(len(state.peer_table.sessions), now)
 
 
 def link_down(state: State, name: str) -> None:
-    """Peers keep their last way until they are heard on another."""
+    """Remove a link. Peers keep their last path until they are heard on another link."""
     state.links.pop(name, None)
 
 
@@ -56,33 +56,33 @@ def apply(state: State, settings: Settings, now: float) -> list[str]:
     """See `Node.apply`."""
     old = state.settings
     if (settings.name, settings.port) != (old.name, old.port):
-        raise ValueError("name and port need a new run of the node")
+        raise ValueError("name and port cannot change at run time; restart the node")
     changes = _changes(old, settings)
     state.settings = settings
     state.topics = {topic.name: topic for topic in settings.topics}
-    state.ledger.set_limit(settings.limits.events)
-    state.roster.apply(settings)
-    state.yielding.apply(settings.rates)
+    state.event_queue.set_limit(settings.limits.events)
+    state.peer_table.apply(settings)
+    state.priority_backoff.apply(settings.rates)
     _retopic(state, now)
     keys = live_keys(settings)
     if keys != state.keys:
         state.keys = keys
-        number = state.to_all.next_number
-        state.to_all = SendChannel(keys[0], state.boot_id)
-        state.to_all.next_number = number
-        state.roster.set_keys(keys)
-    for session in state.roster.sessions.values():
-        session.inbound.apply(settings.rates, settings.limits)
-    for peer in state.roster.peers.values():
+        number = state.broadcast_channel.next_number
+        state.broadcast_channel = SendChannel(keys[0], state.boot_id)
+        state.broadcast_channel.next_number = number
+        state.peer_table.set_keys(keys)
+    for session in state.peer_table.sessions.values():
+        session.receiver.apply(settings.rates, settings.limits)
+    for peer in state.peer_table.peers.values():
         peer.apply(settings)
-        if peer.engaged:
+        if peer.has_sender:
             state.ready[peer] = None
         state.arm(peer)
-    for session in state.roster.sessions.values():
-        info = state.links.get(session.way.link)
+    for session in state.peer_table.sessions.values():
+        info = state.links.get(session.path.link)
         if info is not None:
-            refit(state, session, info.mtu)
-    state.discovery.hurry(len(state.roster.sessions), now)
+            update_mtu(state, session, info.mtu)
+    state.heartbeats.schedule_now(len(state.peer_table.sessions), now)
     return changes
 
 
@@ -137,7 +137,7 @@ def _differences(old: object, new: object) -> list[str]:
 
 
 def _shown(value: object) -> str:
-    """As it stands in a configuration."""
+    """The value as written in the configuration."""
     match value:
         case None:
             return "none"
@@ -152,53 +152,53 @@ def _shown(value: object) -> str:
 
 
 def _retopic(state: State, now: float) -> None:
-    """Give every topic its new settings; messages already waiting follow a new priority."""
+    """Apply the new settings to every topic; waiting messages move to the new priority."""
     for channel in state.channels.values():
         topic: Topic | None = state.topics.get(channel.name)
         if topic is None and state.settings.undeclared is not None:
             topic = replace(state.settings.undeclared, name=channel.name)
         if topic is not None:
             channel.topic = topic
-    for name in list(state.gates):
+    for name in list(state.rate_limits):
         rate = state.topics[name].rate_limit_bytes_per_s if name in state.topics else None
-        gate = state.gates[name]
-        gate.release()
+        bucket = state.rate_limits[name]
+        bucket.unpark()
         if rate is None:
-            del state.gates[name]
+            del state.rate_limits[name]
         else:
-            gate.bytes_per_s = rate
+            bucket.bytes_per_s = rate
     for topic in state.topics.values():
-        if topic.rate_limit_bytes_per_s is not None and topic.name not in state.gates:
-            state.gates[topic.name] = Gate(topic.rate_limit_bytes_per_s, now)
-    for peer in state.roster.peers.values():
-        if peer.engaged:
-            peer.outbound.reprioritize()
-    state.casts.reprioritize()
+        if topic.rate_limit_bytes_per_s is not None and topic.name not in state.rate_limits:
+            state.rate_limits[topic.name] = TokenBucket(topic.rate_limit_bytes_per_s, now)
+    for peer in state.peer_table.peers.values():
+        if peer.has_sender:
+            peer.sender.reprioritize()
+    state.broadcasts.reprioritize()
 
 
 def close(state: State, now: float) -> None:
     """See `Node.close`."""
     if state.closed:
         return
-    stop_packing(state, now)
-    for peer in state.roster.peers.values():
-        if not peer.engaged:
+    flush_compression(state, now)
+    for peer in state.peer_table.peers.values():
+        if not peer.has_sender:
             continue
-        for message in list(peer.outbound.open):
+        for message in list(peer.sender.pending):
             if state.outboxes.on_disk(message.store_key):
-                peer.outbound.withdraw(message)
+                peer.sender.withdraw(message)
             else:
-                peer.outbound.finish(message, ExpiryReason.CLOSED)
+                peer.sender.finish(message, ExpiryReason.CLOSED)
         report_ended(state, peer, now)
     for name, held in state.outboxes.drop_all():
-        tell_expired(state, name, held.accepted, ExpiryReason.CLOSED)
+        report_expired(state, name, held.accepted, ExpiryReason.CLOSED)
     links = list(state.links.values())
     for link in links:
-        _, data = state.to_all.seal_long(encode([Bye("closed")]))
+        _, data = state.broadcast_channel.seal_long(encode([Bye("closed")]))
         if link.kind is LinkKind.BROADCAST:
             state.outgoing.append(Datagram(link.name, link.broadcast, data, True))
         for neighbour in state.settings.neighbours:
-            if not neighbour.legacy and leads(neighbour, link, links):
+            if not neighbour.legacy and uses_link(neighbour, link, links):
                 state.outgoing.append(Datagram(link.name, neighbour.address, data, True))
     state.ready.clear()
     state.closed = True

@@ -1,7 +1,7 @@
-"""What an operator chooses about a node: topics, peers, rates and limits, all values, checked when made.
+"""The settings of a node: topics, neighbors, rates and limits, as validated values.
 
-A `Settings` is handed to `Node` at its start and, changed at run time, to `Node.apply`; it never changes in place
-(`dataclasses.replace` makes the next one).
+A `Settings` is passed to `Node` at start and, if changed at run time, to `Node.apply`. It is immutable;
+`dataclasses.replace` creates the next one.
 """
 
 from dataclasses import dataclass, field
@@ -15,22 +15,22 @@ Address = tuple[str, int]
 """IPv4 or IPv6 host and UDP port."""
 
 DEFAULT_PORT = 8700
-"""UDP port of the fielded system, kept so that one firewall rule serves both."""
+"""UDP port of the legacy system, kept so that one firewall rule serves both."""
 
 
 def is_name(name: str, limit_bytes: int) -> bool:
-    """Whether the wire accepts this as the name of a node or a topic."""
-    # half a surrogate pair is not printable, so that what is encoded here can be
+    """Whether the wire format accepts this as the name of a node or a topic."""
+    # Surrogates are not printable, so a printable string can be encoded.
     return name.isprintable() and not any(map(str.isspace, name)) and 1 <= len(name.encode()) <= limit_bytes
 
 
 def is_type_name(name: str) -> bool:
-    """Whether the wire accepts this as the name of a topic's type, which may be empty."""
+    """Whether the wire format accepts this as the name of a topic's type, which may be empty."""
     return name.isprintable() and len(name.encode()) <= MAX_TYPE_BYTES
 
 
 def _check_name(name: str, what: str, limit_bytes: int) -> None:
-    """Raises ValueError unless this `is_name`."""
+    """Raises ValueError unless `is_name` holds."""
     if not 0 < len(name.encode()) <= limit_bytes:
         raise ValueError(f"{what} {name!r}: expected 1 to {limit_bytes} bytes")
     if not is_name(name, limit_bytes):
@@ -38,7 +38,7 @@ def _check_name(name: str, what: str, limit_bytes: int) -> None:
 
 
 class Outbox(Enum):
-    """What a topic keeps for a peer that is offline."""
+    """What a topic keeps for an offline peer."""
 
     NONE = "none"
     LAST = "last"
@@ -46,7 +46,7 @@ class Outbox(Enum):
 
 
 class LinkKind(Enum):
-    """Whether a link reaches everyone with one datagram, or only configured neighbours one by one."""
+    """Whether a link reaches all nodes with one datagram, or only configured neighbors individually."""
 
     BROADCAST = "broadcast"
     NEIGHBOURS = "neighbours"
@@ -54,7 +54,7 @@ class LinkKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class LinkInfo:
-    """One network attachment of this node, as the kernel (or the simulator) describes it.
+    """One network attachment of this node, as described by the kernel (or the simulator).
 
     `mtu` is that of IP packets, in bytes. A link of kind `NEIGHBOURS` needs no `broadcast` address.
     """
@@ -73,17 +73,17 @@ class LinkInfo:
 
 
 MIN_LINK_MTU = 200
-"""Smallest IP MTU in bytes that leaves room for headers and a useful piece of payload."""
+"""Smallest IP MTU in bytes that leaves room for headers and a useful payload."""
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """How messages of one name travel.
+    """How the messages of one topic are sent.
 
-    `priority` 0 is the most urgent. `keep_last` bounds how many messages of the topic wait for one destination: a newer
-    one replaces the oldest (None: no such bound). `deadline_s` is a message's life from its `send`. `destinations`
-    names the peers a message without a destination goes to (empty: all). `repair` lets receivers ask again for a lost
-    broadcast.
+    `priority` 0 is the most urgent. `keep_last` limits how many messages of the topic wait for one destination: a newer
+    one replaces the oldest (None: no limit). `deadline_s` is a message's lifetime from its `send`. `destinations` lists
+    the peers that get a message sent without a destination (empty: all). `repair` lets receivers request a lost
+    broadcast again.
     """
 
     name: str
@@ -115,11 +115,10 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Neighbour:
-    """A peer reached by configuration instead of, or besides, broadcast.
+    """A configured peer address, used instead of or in addition to broadcast.
 
-    `link` picks the link (None: every link of kind `NEIGHBOURS`, or the first link when there is none). A `legacy`
-    neighbour speaks the fielded format; its `name` is then required, since names announced in that format are not
-    authenticated and are not believed.
+    `link` selects the link (None: every link of kind `NEIGHBOURS`, or the first link if there is none). A `legacy`
+    neighbor speaks the legacy format; its `name` is then required, because names in that format are not authenticated.
     """
 
     address: Address
@@ -129,7 +128,7 @@ class Neighbour:
 
     def __post_init__(self) -> None:
         if self.legacy and self.name is None:
-            raise ValueError(f"neighbour {self.address[0]}: a legacy neighbour needs a name")
+            raise ValueError(f"neighbour {self.address[0]}: legacy requires a name")
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,42 +136,43 @@ class Rates:
     """Times and thresholds of the protocol, in seconds, priorities and packets."""
 
     heartbeat_s: float = 1.0
-    """Between two heartbeats of an idle node (the fielded system's period)."""
+    """Heartbeat interval of an idle node (that of the legacy system)."""
     heartbeat_sparse_s: float = 3.0
-    """Between two heartbeats where traffic already proves every link; under a third of `offline_s`."""
+    """Heartbeat interval while traffic already proves every link; less than a third of `offline_s`."""
     heartbeats_heard_per_s: float = 30.0
-    """In teams so large that more would be heard, everyone's heartbeats grow sparser: discovery then costs a
-    constant."""
+    """In larger teams every node sends heartbeats less often, so that the cost of discovery stays constant."""
     offline_s: float = 10.0
-    """Silence after which a peer is reported offline (the fielded system's)."""
+    """Silence after which a peer is reported offline (that of the legacy system)."""
     peer_lost_s: float = 60.0
-    """Silence after which reliable messages that no outbox keeps end as peer lost; longer than a tunnel's shadow."""
+    """Silence after which reliable messages without an outbox end as peer lost; longer than driving through a
+    tunnel."""
     urgent_priority: int = 3
-    """The last level that counts as urgent: it bypasses pacing, is acknowledged at once, may be sent twice."""
+    """The last level that counts as urgent: not paced, acknowledged at once, sent twice on a lossy path."""
     urgent_excess_packets: int = 4
     """How far urgent packets may exceed the window."""
     twice_loss: float = 0.005
-    """Measured loss from which small urgent messages are sent twice: where one in a hundred is lost, the slowest one in
-    a hundred is a lost one. A single loss of many packets is less."""
+    """Loss rate from which small urgent messages are sent twice: with one in a hundred lost, the slowest percent is
+    made of lost ones. A single loss among many packets stays below."""
     twice_gap_s: float = 0.003
-    """Between the two sendings: longer than most bursts at a radio, short against a deadline."""
+    """Between the two transmissions: longer than most loss bursts of a radio, short against a deadline."""
     ack_every_packets: int = 10
-    """Packets per acknowledgement under bulk: at 8 to 16 acknowledgements cost under 5 % of a half-duplex channel."""
+    """Packets per acknowledgement under bulk: with 8 to 16, acknowledgements cost under 5 % of a half-duplex
+    channel."""
     ack_delay_s: float = 0.008
-    """Longest an acknowledgement waits; under bulk the sender asks for most of them at once (see `allowance`)."""
+    """Maximum delay of an acknowledgement; under bulk the sender requests most of them at once (see `ack_spacing`)."""
     pace_quantum_s: float = 0.003
-    """Packets of this much time leave together; less costs CPU per wake-up, more costs latency."""
+    """Packets worth this much time are sent together; less costs CPU per wake-up, more costs latency."""
     broadcast_packets_per_s: float = 400.0
-    """Less urgent broadcasts leave no faster: nothing acknowledges them, so no window can hold them back."""
+    """Rate limit of less urgent broadcasts: they are not acknowledged, so no window limits them."""
     starved_s: float = 5.0
     """How long a level waits while others are sent before its topic is reported as starved."""
     yield_after_s: float = 0.03
-    """How much longer than three round trips an urgent message waits here before others are asked to hold back their
+    """How much longer than three round trips an urgent message waits here before other nodes are asked to hold back
     less urgent traffic."""
     yield_hold_s: float = 0.1
-    """How long less urgent traffic is held back for others after one such report."""
+    """How long less urgent traffic is held back after one such request."""
     yield_share: float = 0.8
-    """The largest share of time a level may be held back for others, so that none starves."""
+    """Maximum fraction of time for which a level may be held back, so that none starves."""
 
     def __post_init__(self) -> None:
         for name in ("heartbeat_s", "heartbeat_sparse_s", "offline_s", "peer_lost_s", "ack_delay_s", "pace_quantum_s"):
@@ -184,31 +184,30 @@ class Rates:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The most memory each part may hold, and the attack or overload each cap bounds."""
+    """Memory limits, and the attack or overload that each one bounds."""
 
     message_bytes: int = 64 << 20
-    """One message, sent or received (also the most a compressed one may grow to): a peer announcing a huge one."""
+    """One message, sent or received, also after decompression: a peer announcing a huge one."""
     peers: int = 1024
     """Sessions: a key holder inventing names."""
     strangers: int = 256
-    """Senders seen but not yet proven fresh, or undecryptable: a flood of invented senders."""
+    """Unverified or undecryptable senders: a flood of invented senders."""
     partial_bytes_per_peer: int = 128 << 20
-    """Bytes of unfinished messages of one peer: messages begun and never finished."""
+    """Bytes of unfinished messages of one peer: messages started and never finished."""
     partial_bytes: int = 256 << 20
-    """The same of all peers, and their topics' names: a key holder inventing names."""
+    """The same for all peers, including their topics' names: a key holder inventing names."""
     partials_per_peer: int = 4096
     """Unfinished messages of one peer: as above, with tiny fragments."""
     finished_ranges_per_peer: int = 4096
     """Ranges of remembered finished message numbers: numbers chosen with gaps."""
     queue_bytes_per_peer: int = 256 << 20
-    """Bytes accepted for one peer and not yet ended: an application faster than the link."""
+    """Bytes pending for one peer: an application faster than the link."""
     queue_messages_per_peer: int = 65536
-    """Messages accepted for one peer and not yet ended: as above, with tiny messages."""
+    """Messages pending for one peer: as above, with tiny messages."""
     repair_bytes: int = 4 << 20
     """Broadcasts kept for repair: an application that broadcasts without end."""
     events: int = 65536
-    """Events not fetched: a driver that stopped reading. The oldest best-effort messages are then dropped and
-    counted."""
+    """Events not fetched: a driver that stopped reading. The oldest received messages are then dropped and counted."""
     topics_per_peer: int = 1024
     """Topic names a peer may announce: a key holder inventing names."""
 
@@ -220,12 +219,12 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Everything a node is told. `keys` holds at most two: the first seals, both open. Without keys the node runs
-    unkeyed, which `unkeyed` must say explicitly.
+    """The complete settings of a node. `keys` holds at most two: the first seals, both open. To run without keys, set
+    `unkeyed` explicitly.
 
-    `window` is "adaptive" or a fixed number of packets in flight per peer (the paper's is 3). `fragment_bytes` is the
-    payload of one datagram at most; a link's MTU may lower it. `undeclared` is how topics that `topics` does not list
-    travel (None: they are refused).
+    `window` is "adaptive" or a fixed number of packets in flight per peer (3 in the paper). `fragment_bytes` is the
+    maximum payload of one datagram; a link's MTU may lower it. `undeclared` applies to topics that `topics` does not
+    list (None: they are refused).
     """
 
     name: str
@@ -245,7 +244,7 @@ class Settings:
         if "/" in self.name:
             raise ValueError(f"name {self.name!r}: expected no slash (names are parts of topic names)")
         if not self.keys and not self.unkeyed:
-            raise ValueError("keys: expected a fleet key, or unkeyed=True said explicitly; found neither")
+            raise ValueError("keys: expected a fleet key or an explicit unkeyed=True, found neither")
         if self.keys and self.unkeyed:
             raise ValueError("keys: expected either keys or unkeyed=True, found both")
         if len(self.keys) > 2:

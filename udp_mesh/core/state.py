@@ -1,47 +1,47 @@
-"""What the parts of one node share: settings, who is there, what waits, and who has something to send.
+"""The state shared by the parts of one node: settings, peers, queues, and who has something to send.
 
-The parts, in the order bytes and messages pass them: `intake` (datagrams in), `presence` (peers come and go),
-`acceptance` (messages in), `dispatch` (datagrams out, timers), `survey` (conditions out). Each is functions of this
-state and of `now`.
+The parts, in the order that bytes and messages pass them: `receive` (datagrams in), `peer_lifecycle` (peers come and
+go), `publish` (messages in), `transmit` (datagrams out, timers), `node` (conditions out). Each consists of functions of
+this state and of `now`.
 """
 
 from collections.abc import Iterator
 from heapq import heappop, heappush
 
-from udp_mesh.core.broadcast import CastQueue, Repairs
-from udp_mesh.core.compression import PackingQueue
-from udp_mesh.core.congestion.channel_share import Crowd
-from udp_mesh.core.event_queue import Ledger
+from udp_mesh.core.broadcast import BroadcastQueue, NackRepair
+from udp_mesh.core.compression import CompressionQueue
+from udp_mesh.core.congestion.channel_share import ChannelShare
+from udp_mesh.core.event_queue import EventQueue
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.outbox import Outboxes
-from udp_mesh.core.peers.heartbeat import Discovery
-from udp_mesh.core.peers.key_mismatch import Mismatches
-from udp_mesh.core.peers.peer_table import Roster
+from udp_mesh.core.peers.heartbeat import HeartbeatScheduler
+from udp_mesh.core.peers.key_mismatch import KeyMismatchLimiter
+from udp_mesh.core.peers.peer_table import PeerTable
 from udp_mesh.core.peers.session import Peer, Session
-from udp_mesh.core.priority_backoff import Yielding
-from udp_mesh.core.sender.message import Channel
-from udp_mesh.core.sender.rate_limit import Gate
-from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.priority_backoff import PriorityBackoff
+from udp_mesh.core.sender.message import TopicChannel
+from udp_mesh.core.sender.rate_limit import TokenBucket
+from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
 from udp_mesh.crypto import Key, Keyring, SendChannel
 
 _NEVER = float("inf")
 
-HOUSEKEEPING_S = 0.5
-"""Between two rounds through all peers: offline, purges, starvation."""
+MAINTENANCE_INTERVAL_S = 0.5
+"""Interval of maintenance rounds: offline checks, purges, starvation."""
 
-ASLEEP_S = 1.0
-"""A round so much later than it should be: this process did not run. A busy machine is late by less."""
+SUSPENDED_S = 1.0
+"""A round that is this late means that the process was suspended. A busy machine causes less."""
 
 
 def live_keys(settings: Settings) -> tuple[Key, ...]:
-    """The keys of the settings, or the key everyone knows."""
+    """The keys of the settings, or the public key of unkeyed mode."""
     return settings.keys or Keyring.unkeyed().keys
 
 
 class State:
-    """See the module's docstring. Only the parts of a node touch it."""
+    """See the module's docstring. Used only by the parts of a node."""
 
     def __init__(self, settings: Settings, boot_id: bytes, rng: RandomSource, now: float, store: Store | None) -> None:
         self.settings = settings
@@ -49,76 +49,76 @@ class State:
         self.rng = rng
         self.keys = live_keys(settings)
         self.links: dict[str, LinkInfo] = {}
-        self.roster = Roster(settings, boot_id)
+        self.peer_table = PeerTable(settings, boot_id)
         self.sent = Meter(now)
-        """Wire bytes of this node, to everybody."""
-        self.crowd = Crowd()
-        self.ledger = Ledger(settings.limits.events)
+        """Wire bytes sent by this node to all nodes."""
+        self.channel_share = ChannelShare()
+        self.event_queue = EventQueue(settings.limits.events)
         self.outboxes = Outboxes(store)
-        self.discovery = Discovery(rng, settings.rates, now)
-        self.casts = CastQueue()
-        self.packing = PackingQueue()
-        self.unpacking: dict[Session, None] = {}
-        """Sessions of which a message is being inflated."""
-        self.to_all = SendChannel(self.keys[0], boot_id)
-        self.yielding = Yielding(settings.rates, now)
-        self.repairs: dict[bytes, Repairs] = {}
+        self.heartbeats = HeartbeatScheduler(rng, settings.rates, now)
+        self.broadcasts = BroadcastQueue()
+        self.compression_queue = CompressionQueue()
+        self.inflating: dict[Session, None] = {}
+        """Sessions with a message being inflated."""
+        self.broadcast_channel = SendChannel(self.keys[0], boot_id)
+        self.priority_backoff = PriorityBackoff(settings.rates, now)
+        self.repairs: dict[bytes, NackRepair] = {}
         """By the sender's boot id."""
-        self.asking: dict[bytes, None] = {}
-        """Those of `repairs` in which something is missing."""
-        self.look_from = 0
-        """Where the next round of housekeeping begins."""
+        self.repairs_due: dict[bytes, None] = {}
+        """Those of `repairs` with missing broadcasts."""
+        self.maintain_from = 0
+        """Index of the first idle peer of the next maintenance round."""
         self.topics: dict[str, Topic] = {topic.name: topic for topic in settings.topics}
-        self.channels: dict[tuple[str, str], Channel] = {}
-        self.gates: dict[str, Gate] = {}
+        self.channels: dict[tuple[str, str], TopicChannel] = {}
+        self.rate_limits: dict[str, TokenBucket] = {}
         self.next_message_id = 1
         self.ready: dict[Peer, None] = {}
-        """Peers to which something may be able to leave."""
-        self.owing: dict[Session, None] = {}
-        """Sessions that are owed an acknowledgement or small frames now."""
+        """Peers to which something may be ready to send."""
+        self.control_ready: dict[Session, None] = {}
+        """Sessions with an acknowledgement or control frames to send now."""
         self.outgoing: list[Datagram] = []
-        """Datagrams already built: heartbeats, second copies."""
+        """Datagrams already built: heartbeats, redundant copies."""
         self.timers: list[tuple[float, int, Peer]] = []
         self.timer_serial = 0
-        self.housekeeping_at = now
-        self.housekept_at = now
-        self.mismatches = Mismatches()
+        self.maintenance_at = now
+        self.maintained_at = now
+        self.key_mismatches = KeyMismatchLimiter()
         self.incompatible_reported: dict[bytes, float] = {}
         self.own_name_reported_at = float("-inf")
         self.closed = False
 
     def set_timer(self, peer: Peer, at: float) -> None:
-        """The peer wants attention at `at` too; an earlier wish stands."""
-        if at < peer.wants_at:
-            peer.wants_at = at
+        """Set the peer's timer to `at`, unless it is due earlier."""
+        if at < peer.due_at:
+            peer.due_at = at
             self._queue(peer)
 
     def arm(self, peer: Peer) -> None:
-        """Bring the peer's timer up to what its halves want now, be it later than before."""
-        at = peer.outbound.timer() if peer.engaged else None
+        """Set the peer's timer to what its sender and receiver need now, even if that is later than before."""
+        at = peer.sender.timer() if peer.has_sender else None
         session = peer.session
         if session is not None:
-            due = session.inbound.acks.due_at
+            due = session.receiver.acks.due_at
             if due is not None and (at is None or due < at):
                 at = due
-        peer.wants_at = _NEVER if at is None else at
+        peer.due_at = _NEVER if at is None else at
         self._queue(peer)
 
     def _queue(self, peer: Peer) -> None:
-        if peer.wants_at < peer.timer_at:
-            peer.timer_at = peer.wants_at
+        if peer.due_at < peer.timer_at:
+            peer.timer_at = peer.due_at
             self.timer_serial += 1
             heappush(self.timers, (peer.timer_at, self.timer_serial, peer))
 
     def next_peer_at(self) -> float:
-        """When the first peer wants attention. Who stands in front but wants it later goes to its place now: it may
-        have changed its mind a hundred times since."""
+        """When the first peer's timer is due. Entries rescheduled to a later time are moved only when they reach the
+        front, because they may be rescheduled a hundred times before."""
         timers = self.timers
         while timers:
             at, _, peer = timers[0]
             if peer.timer_at != at:
                 heappop(timers)
-            elif peer.wants_at > at:
+            elif peer.due_at > at:
                 peer.timer_at = _NEVER
                 heappop(timers)
                 self._queue(peer)
@@ -126,22 +126,22 @@ class State:
                 return at
         return _NEVER
 
-    def ask_by(self, boot_id: bytes, repairs: Repairs) -> None:
-        """Ask this sender for what is missing, when it is time."""
+    def schedule_repair(self, boot_id: bytes, repairs: NackRepair) -> None:
+        """Schedule the requests for what is missing from this sender."""
         if repairs.next_at != float("inf"):
-            self.asking[boot_id] = None
-            self.housekeeping_at = min(self.housekeeping_at, repairs.next_at)
+            self.repairs_due[boot_id] = None
+            self.maintenance_at = min(self.maintenance_at, repairs.next_at)
 
-    def owe(self, session: Session) -> None:
-        """The session has small frames or an acknowledgement to send now."""
-        self.owing[session] = None
+    def schedule_control(self, session: Session) -> None:
+        """Mark the session as having an acknowledgement or control frames to send."""
+        self.control_ready[session] = None
 
-    def waiting_outbounds(self) -> Iterator[Outbound]:
-        """Of peers in reach with open messages."""
-        for peer in self.roster.peers.values():
-            if peer.engaged and peer.online and peer.outbound.open:
-                yield peer.outbound
+    def waiting_senders(self) -> Iterator[Sender]:
+        """The senders of online peers with pending messages."""
+        for peer in self.peer_table.peers.values():
+            if peer.has_sender and peer.online and peer.sender.pending:
+                yield peer.sender
 
-    def broadcasts(self) -> bool:
-        """Whether some link reaches everyone with one datagram."""
+    def can_broadcast(self) -> bool:
+        """Whether a link reaches all nodes with one datagram."""
         return any(link.kind is LinkKind.BROADCAST for link in self.links.values())

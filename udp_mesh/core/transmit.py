@@ -1,31 +1,31 @@
-"""Datagrams out and timers: what leaves now, most urgent first, and when somebody wants attention next.
+"""Datagrams out and timers: what is sent now, most urgent first, and when the next timer is due.
 
-One call of `collect`: heartbeats already due, what is owed (acknowledgements and small frames), second copies, then
-level by level, casts and peers in turn. A peer from which nothing more can leave drops out of `State.ready` until an
-acknowledgement, a timer or a new message brings it back.
+One call of `collect` returns datagrams already built (heartbeats), then acknowledgements and control frames, redundant
+copies, and finally level by level broadcasts and the peers in turn. A peer with nothing more to send leaves
+`State.ready` until an acknowledgement, a timer or a new message returns it.
 """
 
 from heapq import heappop
 
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.peer_lifecycle import housekeep
-from udp_mesh.core.peers.heartbeat import OWN_FEATURES, announce
+from udp_mesh.core.peer_lifecycle import maintain
+from udp_mesh.core.peers.heartbeat import OWN_FEATURES, heartbeat_datagrams
 from udp_mesh.core.peers.session import Peer, Session
-from udp_mesh.core.publish import broadcast_room, expire_held, pack, report_ended
-from udp_mesh.core.receive import unpack
+from udp_mesh.core.publish import broadcast_room, compress_step, expire_held, report_ended
+from udp_mesh.core.receive import inflate_step
 from udp_mesh.core.receiver.datagram_age import clock_ms
-from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, leave_copies, leave_level
+from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, send_copies, send_level
 from udp_mesh.core.settings import Address, LinkKind
-from udp_mesh.core.state import HOUSEKEEPING_S, State
+from udp_mesh.core.state import MAINTENANCE_INTERVAL_S, State
 from udp_mesh.wire.codec import encode
 from udp_mesh.wire.frames import Cancel, Frame, Heartbeat, Ping
 from udp_mesh.wire.header import VERSION
 from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
 
 BATCH_BYTES = 65_536
-"""What one call returns at most, about: one system call with segmentation offload."""
+"""Approximate maximum of one call: one system call with segmentation offload."""
 
-INTRODUCE_AGAIN_S = 0.25
+INTRODUCTION_INTERVAL_S = 0.25
 """Between two introductions to a peer that has not answered one."""
 
 _INFINITY = float("inf")
@@ -41,59 +41,59 @@ def collect(state: State, now: float, max_bytes: int | None) -> list[Datagram]:
     if state.outgoing:
         out.extend(state.outgoing)
         state.outgoing.clear()
-    if state.owing:
-        sessions = list(state.owing)
-        state.owing.clear()
+    if state.control_ready:
+        sessions = list(state.control_ready)
+        state.control_ready.clear()
         for session in sessions:
-            _leave_owed(state, session, now, out)
-    if state.ready or state.casts.waiting:
-        _leave_levels(state, now, out, room)
+            _send_control(state, session, now, out)
+    if state.ready or state.broadcasts.waiting:
+        _send_levels(state, now, out, room)
     return out
 
 
 def count_sent(state: State, out: list[Datagram]) -> None:
-    """Datagrams leave, in whatever format."""
-    counters = state.ledger.counters
+    """Count the datagrams being sent, in whatever format."""
+    counters = state.event_queue.counters
     counters.datagrams_sent += len(out)
     counters.bytes_sent += sum([len(datagram[2]) for datagram in out]) + IP_UDP_BYTES * len(out)
 
 
-def _leave_owed(state: State, session: Session, now: float, out: list[Datagram]) -> None:
-    """Acknowledgement and small frames of one session, together in as few datagrams as they fit."""
-    way = session.way
+def _send_control(state: State, session: Session, now: float, out: list[Datagram]) -> None:
+    """Send a session's acknowledgement and control frames in as few datagrams as possible."""
+    path = session.path
     peer = session.peer
-    if not way.link or peer is None:
+    if not path.link or peer is None:
         return
     frames: list[Frame] = []
-    if session.inbound.acks.pending or session.inbound.acks.now_wanted:
-        waiting = state.yielding.waiting_here(state.waiting_outbounds(), now)
-        ack = session.take_ack(now, waiting[:1])
+    if session.receiver.acks.pending or session.receiver.acks.send_now:
+        waiting = state.priority_backoff.local_waiting(state.waiting_senders(), now)
+        ack = session.build_ack(now, waiting[:1])
         if ack is not None:
             frames.append(ack)
-            state.ledger.counters.acknowledgements_sent += 1
-    frames.extend(session.owed)
-    session.owed.clear()
-    cancelled = peer.outbound.cancelled
+            state.event_queue.counters.acknowledgements_sent += 1
+    frames.extend(session.pending_control)
+    session.pending_control.clear()
+    cancelled = peer.sender.cancelled
     while cancelled:
         frames.append(Cancel(tuple(cancelled[:MAX_IDS])))
         del cancelled[:MAX_IDS]
-    if not way.confirmed and frames and not session.knows_us:
+    if not path.confirmed and frames and not session.knows_us:
         frames.insert(0, _introduction(state, session, now))
     while frames:
         count = min(len(frames), MAX_FRAMES_PER_DATAGRAM - 1)
-        encoded = way.encode(frames[:count], now)
-        while count > 1 and len(encoded) > way.room_bytes:
-            count = max(1, count * way.room_bytes // len(encoded) - 1)
-            encoded = way.encode(frames[:count], now)
-        number, data = way.seal(encoded)
-        peer.outbound.flight.add(number, None)
-        out.append(Datagram(way.link, way.address, data, True))
+        encoded = path.encode(frames[:count], now)
+        while count > 1 and len(encoded) > path.room_bytes:
+            count = max(1, count * path.room_bytes // len(encoded) - 1)
+            encoded = path.encode(frames[:count], now)
+        number, data = path.seal(encoded)
+        peer.sender.in_flight.add(number, None)
+        out.append(Datagram(path.link, path.address, data, True))
         del frames[:count]
     state.arm(peer)
 
 
 def _introduction(state: State, session: Session, now: float) -> Heartbeat:
-    """Who we are, for a peer that may not know this run of ours yet."""
+    """A heartbeat for a peer that may not know our current boot yet."""
     settings = state.settings
     return Heartbeat(
         settings.name,
@@ -103,41 +103,45 @@ def _introduction(state: State, session: Session, now: float) -> Heartbeat:
         min(65_535, int(settings.rates.heartbeat_sparse_s * 1000)),
         0,
         0,
-        state.to_all.next_number,
-        state.casts.next_number,
+        state.broadcast_channel.next_number,
+        state.broadcasts.next_number,
         (session.heard_tag,),
         (),
         clock_ms(now),
     )
 
 
-def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> None:
-    allowed = state.yielding.allowed(now)
-    casts = state.casts
+def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> None:
+    allowed = state.priority_backoff.allowed_levels(now)
+    broadcasts = state.broadcasts
     peers: list[Peer] = []
-    mask = casts.waiting
+    mask = broadcasts.waiting
     for peer in list(state.ready):
-        outbound = peer.outbound
+        sender = peer.sender
         session = peer.session
-        if session is None or not session.way.link:
+        if session is None or not session.path.link:
             del state.ready[peer]
             continue
-        if outbound.cancelled and not outbound.scheduler.waiting:
-            state.owe(session)
-        if outbound.copies:
-            leave_copies(outbound, session.way, now, out)
-        if outbound.scheduler.waiting:
-            if not session.way.confirmed and not session.knows_us and now >= session.introduced_at + INTRODUCE_AGAIN_S:
+        if sender.cancelled and not sender.scheduler.waiting:
+            state.schedule_control(session)
+        if sender.copies:
+            send_copies(sender, session.path, now, out)
+        if sender.scheduler.waiting:
+            if (
+                not session.path.confirmed
+                and not session.knows_us
+                and now >= session.introduced_at + INTRODUCTION_INTERVAL_S
+            ):
                 session.introduced_at = now
-                number, data = session.way.seal(encode([_introduction(state, session, now)]))
-                outbound.flight.add(number, None)
-                out.append(Datagram(session.way.link, session.way.address, data, True))
+                number, data = session.path.seal(encode([_introduction(state, session, now)]))
+                sender.in_flight.add(number, None)
+                out.append(Datagram(session.path.link, session.path.address, data, True))
             peers.append(peer)
-            outbound.wake_at = _INFINITY
-            mask |= outbound.scheduler.waiting
+            sender.wake_at = _INFINITY
+            mask |= sender.scheduler.waiting
         else:
             del state.ready[peer]
-            outbound.limited = True
+            sender.app_limited = True
             state.arm(peer)
     held = mask & ~allowed
     mask &= allowed
@@ -145,93 +149,93 @@ def _leave_levels(state: State, now: float, out: list[Datagram], room: int) -> N
         bit = mask & -mask
         mask ^= bit
         priority = bit.bit_length() - 1
-        if casts.waiting & bit:
+        if broadcasts.waiting & bit:
             before = len(out)
-            _leave_casts(state, priority, now, out)
+            _send_broadcasts(state, priority, now, out)
             room -= sum(len(datagram.data) for datagram in out[before:])
         for peer in peers:
-            outbound = peer.outbound
-            if not outbound.scheduler.waiting & bit:
+            sender = peer.sender
+            if not sender.scheduler.waiting & bit:
                 continue
             session = peer.session
             assert session is not None
-            used = leave_level(outbound, session.way, priority, now, out, room, state.gates)
+            used = send_level(sender, session.path, priority, now, out, room, state.rate_limits)
             if used:
-                outbound.served |= bit
+                sender.served |= bit
             room -= used
             if room <= 0:
-                # Whoever used up the room stands behind the others next time.
+                # A peer that used up the room is served last next time.
                 state.ready[peer] = state.ready.pop(peer)
                 break
     for peer in peers:
-        outbound = peer.outbound
-        if outbound.served:
-            outbound.levels.book_served(outbound.served, outbound.scheduler.waiting, now)
-            outbound.served = 0
-        if outbound.ended:
+        sender = peer.sender
+        if sender.served:
+            sender.levels.record_served(sender.served, sender.scheduler.waiting, now)
+            sender.served = 0
+        if sender.ended:
             report_ended(state, peer, now)
         if room > 0:
             state.ready.pop(peer, None)
-            outbound.limited = not outbound.scheduler.waiting
-        if held & outbound.scheduler.waiting:
-            until = state.yielding.holds_until(now)
+            sender.app_limited = not sender.scheduler.waiting
+        if held & sender.scheduler.waiting:
+            until = state.priority_backoff.held_until(now)
             if until is not None:
-                peer.book_held(held & outbound.scheduler.waiting, now, until)
-                outbound.wake_at = min(outbound.wake_at, until)
+                peer.record_held(held & sender.scheduler.waiting, now, until)
+                sender.wake_at = min(sender.wake_at, until)
         state.arm(peer)
 
 
-def _leave_casts(state: State, priority: int, now: float, out: list[Datagram]) -> None:
+def _send_broadcasts(state: State, priority: int, now: float, out: list[Datagram]) -> None:
     rates = state.settings.rates
     urgent = priority <= rates.urgent_priority
-    twice = urgent and any(peer.engaged and peer.outbound.send_twice for peer in state.roster.online())
-    ways: list[tuple[str, Address | None]] = [
+    twice = urgent and any(peer.has_sender and peer.sender.send_twice for peer in state.peer_table.online())
+    paths: list[tuple[str, Address | None]] = [
         (link.name, link.broadcast) for link in state.links.values() if link.kind is LinkKind.BROADCAST
     ]
-    for peer in state.roster.online():
+    for peer in state.peer_table.online():
         session = peer.session
         if session is None:
             continue
-        link = state.links.get(session.way.link)
+        link = state.links.get(session.path.link)
         if link is not None and link.kind is LinkKind.NEIGHBOURS:
-            ways.append((link.name, session.way.address))
-    state.casts.leave(
+            paths.append((link.name, session.path.address))
+    state.broadcasts.send_level(
         priority,
-        state.to_all,
-        ways,
+        state.broadcast_channel,
+        paths,
         now,
         out,
         packets_per_s=None if urgent else rates.broadcast_packets_per_s,
         copy_after_s=rates.twice_gap_s if twice else None,
-        kept_limit_bytes=state.settings.limits.repair_bytes,
-        dated_bytes=_dated_bytes(state),
+        repairable_limit_bytes=state.settings.limits.repair_bytes,
+        max_timestamped_bytes=_max_timestamped_bytes(state),
     )
 
 
-def _dated_bytes(state: State) -> int:
-    """The largest broadcast that may say when it left: none, where some peer takes no dates."""
-    sessions = [peer.session for peer in state.roster.online() if peer.session is not None]
+def _max_timestamped_bytes(state: State) -> int:
+    """Size of the largest broadcast that may carry a timestamp; 0 if some peer does not accept timestamps."""
+    sessions = [peer.session for peer in state.peer_table.online() if peer.session is not None]
     return broadcast_room(state, sessions) if all(session.timed for session in sessions) else 0
 
 
 def has_datagrams(state: State) -> bool:
     """See `Node.has_datagrams`."""
-    return bool(state.owing or state.ready or state.outgoing or state.casts.waiting)
+    return bool(state.control_ready or state.ready or state.outgoing or state.broadcasts.waiting)
 
 
 def is_quiet(state: State) -> bool:
     """See `Node.is_quiet`."""
-    return not (has_datagrams(state) or state.ledger.waits)
+    return not (has_datagrams(state) or state.event_queue.has_events)
 
 
 def next_timer(state: State) -> float | None:
     """See `Node.next_timer`."""
-    at = min(state.housekeeping_at, state.discovery.next_at, state.casts.next_at(), state.next_peer_at())
-    for gate in state.gates.values():
-        if gate.parked:
-            at = min(at, gate.opens_at())
-    if (state.packing or state.unpacking) and not state.closed:
-        # At once, again and again; whatever else is due is done in between.
+    at = min(state.maintenance_at, state.heartbeats.next_at, state.broadcasts.next_at(), state.next_peer_at())
+    for bucket in state.rate_limits.values():
+        if bucket.parked:
+            at = min(at, bucket.ready_at())
+    if (state.compression_queue or state.inflating) and not state.closed:
+        # Due at once, repeatedly; other timers are handled in between.
         return _ALWAYS
     return None if at == _INFINITY or state.closed else at
 
@@ -243,70 +247,70 @@ def handle_timer(state: State, now: float) -> None:
     due_peers: list[Peer] = []
     while state.next_peer_at() <= now:
         _, _, peer = heappop(state.timers)
-        peer.timer_at = peer.wants_at = _INFINITY
+        peer.timer_at = peer.due_at = _INFINITY
         due_peers.append(peer)
     for peer in due_peers:
-        outbound = peer.outbound
-        outbound.handle_timer(now)
+        sender = peer.sender
+        sender.handle_timer(now)
         report_ended(state, peer, now)
         session = peer.session
         if session is not None:
-            due = session.inbound.acks.due_at
+            due = session.receiver.acks.due_at
             if due is not None and due <= now:
-                session.inbound.acks.now_wanted = True
-                session.inbound.acks.due_at = None
-                state.owe(session)
-            if outbound.probes_small(now):
-                session.owe(Ping(state.rng.getrandbits(64)))
-                state.owe(session)
+                session.receiver.acks.send_now = True
+                session.receiver.acks.due_at = None
+                state.schedule_control(session)
+            if sender.consume_small_probe(now):
+                session.queue_control(Ping(state.rng.getrandbits(64)))
+                state.schedule_control(session)
         state.ready[peer] = None
         state.arm(peer)
-    if state.discovery.next_at <= now:
+    if state.heartbeats.next_at <= now:
         _send_heartbeats(state, now)
-    for gate in state.gates.values():
-        if gate.parked and gate.open(now):
-            waiting = {outbound for outbound, _ in gate.parked}
-            gate.release()
-            for peer in state.roster.peers.values():
-                if peer.engaged and peer.outbound in waiting:
+    for bucket in state.rate_limits.values():
+        if bucket.parked and bucket.has_tokens(now):
+            waiting = {sender for sender, _ in bucket.parked}
+            bucket.unpark()
+            for peer in state.peer_table.peers.values():
+                if peer.has_sender and peer.sender in waiting:
                     state.ready[peer] = None
-    casts: list[Datagram] = []
-    state.casts.leave_copies(now, casts)
-    state.outgoing.extend(casts)
-    if state.packing:
-        pack(state, now)
-    if state.unpacking:
-        unpack(state, now)
-    if state.housekeeping_at <= now:
-        state.housekeeping_at = now + HOUSEKEEPING_S
-        housekeep(state, now)
+    broadcasts: list[Datagram] = []
+    state.broadcasts.send_copies(now, broadcasts)
+    state.outgoing.extend(broadcasts)
+    if state.compression_queue:
+        compress_step(state, now)
+    if state.inflating:
+        inflate_step(state, now)
+    if state.maintenance_at <= now:
+        state.maintenance_at = now + MAINTENANCE_INTERVAL_S
+        maintain(state, now)
         expire_held(state, now)
-        _ask_for_repairs(state, now)
+        _send_nacks(state, now)
 
 
 def _send_heartbeats(state: State, now: float) -> None:
-    sessions = list(state.roster.sessions.values())
-    waiting = state.yielding.waiting_here(state.waiting_outbounds(), now)
+    sessions = list(state.peer_table.sessions.values())
+    waiting = state.priority_backoff.local_waiting(state.waiting_senders(), now)
     sent = state.sent.per_s(now)
-    beat = state.discovery.compose(state.settings, sessions, waiting, state.casts.next_number, sent, now)
-    datagrams = announce(beat, state.to_all, state.links.values(), state.settings.neighbours)
-    state.ledger.counters.heartbeats_sent += len(datagrams)
+    beat = state.heartbeats.build(state.settings, sessions, waiting, state.broadcasts.next_number, sent, now)
+    datagrams = heartbeat_datagrams(beat, state.broadcast_channel, state.links.values(), state.settings.neighbours)
+    state.event_queue.counters.heartbeats_sent += len(datagrams)
     state.outgoing.extend(datagrams)
 
 
-def _ask_for_repairs(state: State, now: float) -> None:
-    asking = list(state.asking)
-    state.asking.clear()
-    for boot_id in asking:
+def _send_nacks(state: State, now: float) -> None:
+    repairs_due = list(state.repairs_due)
+    state.repairs_due.clear()
+    for boot_id in repairs_due:
         repairs = state.repairs.get(boot_id)
-        session = state.roster.sessions.get(boot_id)
+        session = state.peer_table.sessions.get(boot_id)
         if repairs is None or session is None:
             continue
-        asks = repairs.ask(now) if repairs.next_at <= now else []
-        state.ask_by(boot_id, repairs)
-        if not asks:
+        nacks = repairs.due_nacks(now) if repairs.next_at <= now else []
+        state.schedule_repair(boot_id, repairs)
+        if not nacks:
             continue
-        state.ledger.counters.repairs_asked += len(asks)
-        for ask in asks:
-            session.owe(ask)
-        state.owe(session)
+        state.event_queue.counters.repairs_asked += len(nacks)
+        for nack in nacks:
+            session.queue_control(nack)
+        state.schedule_control(session)

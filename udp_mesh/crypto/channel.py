@@ -1,14 +1,14 @@
 """A channel: all datagrams from one boot of a node to one boot of another, or to all.
 
 1. Both ends derive the channel's key from the fleet key and the two boot ids (HKDF-Expand, RFC 5869). Boot ids are
-   random per process, so a restarted sender or receiver has new keys: packet numbers may start at 0 again without
-   ever repeating a nonce, and packets recorded for an earlier boot open nowhere.
+   random per process, so a restarted sender or receiver has new keys: packet numbers may restart at 0 without ever
+   reusing a nonce, and packets recorded for an earlier boot cannot be opened.
 2. The sender seals: header | AES-128-GCM(key, nonce = salt ‖ packet number, frames, associated data = header).
 3. The receiver checks the header's hash (long header), the replay window, and only then the cipher.
 
-A channel to all is keyed by the sender's boot alone, so its packets can be replayed to a node that has just started
-and has no window yet: accept them only from a boot that has proved itself in a channel of its own (an INTRODUCTION or
-DATA datagram bound to our boot), and raise the window's floor to that heartbeat's `broadcast_number`.
+A channel to all is keyed by the sender's boot alone, so its packets can be replayed to a node that has just started and
+has no window yet. Accept them only from a boot that was verified in a channel of its own (an INTRODUCTION or DATA
+datagram bound to our boot), and raise the window's floor to that heartbeat's `broadcast_number`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from udp_mesh.wire.header import (
 from udp_mesh.wire.limits import BOOT_ID_BYTES
 
 MAX_PACKET_NUMBER = (1 << 48) - 1
-"""An acknowledgement names a packet in 48 bits: 89 years at 100,000 packets a second."""
+"""An acknowledgement carries a packet number in 48 bits: 89 years at 100,000 packets a second."""
 
 SHORT_OVERHEAD_BYTES = SHORT_HEADER_BYTES + SEAL_TAG_BYTES
 """23 B: what a BROADCAST or DATA datagram adds to its frames."""
@@ -47,13 +47,13 @@ LONG_OVERHEAD_BYTES = LONG_HEADER_BYTES + SEAL_TAG_BYTES
 """49 B: what a HELLO or INTRODUCTION datagram adds to its frames."""
 
 TO_ALL = bytes(BOOT_ID_BYTES)
-"""Stands for the receiver's boot in a channel to all."""
+"""Used as the receiver's boot in a channel to all."""
 
 _NONCE = struct.Struct(">4sQ")
 
 
 class OpenError(DecodeError):
-    """The datagram does not open: forged, damaged, or for another boot."""
+    """The datagram cannot be opened: forged, damaged, or for another boot."""
 
 
 class ReplayError(OpenError):
@@ -63,7 +63,7 @@ class ReplayError(OpenError):
 class _Channel:
     """What both ends derive: cipher, nonce salt and the public tag.
 
-    The cipher is set up when first needed: of a large team most nodes never send each other anything.
+    The cipher is created on first use: in a large team most nodes never send each other anything.
     """
 
     __slots__ = ("_cipher", "_salt", "_secret", "key", "tag")
@@ -72,13 +72,13 @@ class _Channel:
 
     def __init__(self, key: Key, sender_boot: bytes, receiver_boot: bytes) -> None:
         if len(sender_boot) != BOOT_ID_BYTES or len(receiver_boot) != BOOT_ID_BYTES:
-            raise ValueError(f"a boot id has {BOOT_ID_BYTES} bytes")
+            raise ValueError(f"boot id: expected {BOOT_ID_BYTES} bytes")
         material = hmac.digest(key.prk, b"channel" + sender_boot + receiver_boot + b"\x01", "sha256")
         self.key = key
         self._secret = material[:16]
         self._salt = material[16:20]
         self.tag = int.from_bytes(material[20:22], "big")
-        """Two derived bytes: short headers carry it; several channels may share one, try each."""
+        """Two derived bytes carried by short headers. Several channels may share a tag; try each."""
 
     def __getattr__(self, name: str) -> AESGCM:
         # Only called for a slot not yet set.
@@ -89,7 +89,7 @@ class _Channel:
 
 
 class SendChannel(_Channel):
-    """Seals; owns the packet numbers. `receiver_boot=TO_ALL` for the channel to all."""
+    """Seals datagrams and assigns the packet numbers. `receiver_boot=TO_ALL` for the channel to all."""
 
     __slots__ = ("_first_byte", "_long", "boot_id", "next_number")
 
@@ -108,8 +108,7 @@ class SendChannel(_Channel):
         return number, self.seal_run((frames,))[0]
 
     def seal_run(self, run: Sequence[bytes | bytearray | memoryview]) -> list[bytes]:
-        """As `seal`, for datagrams that get the next numbers in order: of a fast link's processor time much is the cost
-        of calls."""
+        """Seal datagrams under consecutive numbers. On a fast link most of the processor time is the cost of calls."""
         first = self._take_numbers(len(run))
         first_byte, tag, salt = self._first_byte, self.tag, self._salt
         pack_header, pack_nonce, encrypt = SHORT_HEADER.pack, _NONCE.pack, self._cipher.encrypt
@@ -120,17 +119,17 @@ class SendChannel(_Channel):
         return sealed
 
     def seal_long(self, frames: bytes | bytearray | memoryview) -> tuple[int, bytes]:
-        """Packet number and datagram with the long header (49 B more): for who may not know this boot yet."""
+        """Packet number and datagram with the long header (49 B more), for peers that may not know this boot yet."""
         number = self._take_numbers(1)
         clear = encode_long(self._long, self.key.key_id, self.boot_id, number)
         header = clear + self.key.check(clear)
         return number, header + self._cipher.encrypt(_NONCE.pack(self._salt, number), frames, header)
 
     def _take_numbers(self, count: int) -> int:
-        """The first of so many numbers in a row."""
+        """The first of `count` consecutive numbers."""
         number = self.next_number
         if number + count - 1 > MAX_PACKET_NUMBER:
-            raise OverflowError("packet numbers of this channel are used up; the node needs a new boot id")
+            raise OverflowError("packet numbers of this channel are exhausted; restart the node for a new boot id")
         self.next_number = number + count
         return number
 
@@ -152,7 +151,7 @@ class ReceiveChannel(_Channel):
         return self._open(memoryview(data), number, SHORT_HEADER_BYTES)
 
     def open_long(self, data: bytes | bytearray | memoryview, header: LongHeader) -> tuple[int, bytes]:
-        """The same of a datagram with a long header whose check has passed (`check_long`)."""
+        """The same for a datagram with a long header whose check has passed (`check_long`)."""
         if header.number > MAX_PACKET_NUMBER:
             raise OpenError(f"packet number: expected at most 48 bits, found {header.number}")
         return self._open(memoryview(data), header.number, LONG_HEADER_BYTES)
@@ -164,7 +163,7 @@ class ReceiveChannel(_Channel):
         try:
             frames = self._cipher.decrypt(_NONCE.pack(self._salt, number), view[header_bytes:], view[:header_bytes])
         except InvalidTag as error:
-            raise OpenError(f"packet {number} does not open") from error
+            raise OpenError(f"packet {number} cannot be decrypted") from error
         window.accept(number)
         return number, frames
 
@@ -177,8 +176,7 @@ def check_long(key: Key, data: bytes | bytearray | memoryview, header: LongHeade
 
 
 def expand_number(low: int, largest: int) -> int:
-    """The full packet number with these low 32 bits that lies nearest to the number expected next (as RFC 9000,
-    A.3)."""
+    """The full packet number with these low 32 bits that is nearest to the next expected number (as RFC 9000, A.3)."""
     expected = largest + 1
     candidate = (expected & ~0xFFFFFFFF) | low
     if candidate <= expected - 0x80000000:

@@ -1,8 +1,8 @@
-"""The fleet's keys: 32 secret bytes each, one or two live at a time; the first one seals, all of them open.
+"""The fleet's keys: 32 secret bytes each, one or two live at a time. The first one seals, all of them open.
 
-Rotation without a gap: every node gets (old, new), then (new, old), then (new,). `Keyring.unkeyed()` uses a key
-everyone knows: the same format and the same code, no protection; nodes with it cannot talk to nodes with a real key,
-and say so.
+Rotation without interruption: every node gets (old, new), then (new, old), then (new,). `Keyring.unkeyed()` uses a
+public key: the same format and code without protection. Such nodes cannot communicate with nodes that have a real key,
+and report that.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from udp_mesh.wire.header import CHECK_BYTES
 SECRET_BYTES = 32
 KEY_ID_BYTES = 4
 MAX_LIVE_KEYS = 2
-"""More would multiply what a forged datagram can make us compute; rotation needs two."""
+"""More would multiply the work that a forged datagram causes; rotation needs two."""
 
 _EXTRACT_SALT = b"udp_mesh wire 1 fleet key"
 _UNKEYED_SECRET = hashlib.sha256(b"udp_mesh: no key, no protection").digest()
@@ -33,12 +33,12 @@ class Key:
     prk: bytes = field(init=False, compare=False)
     """HKDF-Extract of the secret (RFC 5869), from which every channel's key is expanded."""
     key_id: bytes = field(init=False, compare=False)
-    """4 public bytes by which a peer names the key it used."""
+    """4 public bytes that identify the key a peer used."""
     check_key: bytes = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
         if len(self.secret) != SECRET_BYTES:
-            raise ValueError(f"a fleet key has {SECRET_BYTES} bytes, this one {len(self.secret)}")
+            raise ValueError(f"fleet key: expected {SECRET_BYTES} bytes, found {len(self.secret)}")
         prk = hmac.digest(_EXTRACT_SALT, self.secret, "sha256")
         object.__setattr__(self, "prk", prk)
         object.__setattr__(self, "key_id", hmac.digest(prk, b"key id", "sha256")[:KEY_ID_BYTES])
@@ -49,7 +49,7 @@ class Key:
 
     @classmethod
     def parse(cls, text: str) -> Key:
-        """A key from 64 hexadecimal digits or 44 characters of base64; raises ValueError (without the text)."""
+        """Parse a key of 64 hexadecimal digits or 44 characters of base64. Raises ValueError (without the text)."""
         compact = text.strip()
         try:
             if len(compact) == 2 * SECRET_BYTES:
@@ -62,15 +62,15 @@ class Key:
             ) from error
 
     def check(self, header: bytes | memoryview) -> bytes:
-        """The 4-byte keyed hash behind a long header (RFC 7693): cheap, and enough to drop invented senders."""
+        """The 4-byte keyed hash at the end of a long header (RFC 7693): cheap, and enough to drop invented senders."""
         return hashlib.blake2s(header, key=self.check_key, digest_size=CHECK_BYTES).digest()
 
 
 class UnknownKeyError(DecodeError):
-    """A datagram sealed with a key that is not live here; `key_id` is what it names (unauthenticated)."""
+    """A datagram sealed with a key that is not live here; `key_id` is what it claims (unauthenticated)."""
 
     def __init__(self, key_id: bytes) -> None:
-        super().__init__(f"sealed with key {key_id.hex()}, which is not live here")
+        super().__init__(f"sealed with unknown key {key_id.hex()}")
         self.key_id = key_id
 
 
@@ -86,7 +86,7 @@ class Keyring:
 
     @classmethod
     def unkeyed(cls) -> Keyring:
-        """The key everyone knows: for the bench only."""
+        """The public key: for testing only."""
         return cls((Key(_UNKEYED_SECRET),))
 
     @property
@@ -98,7 +98,7 @@ class Keyring:
         return self.keys[0]
 
     def find(self, key_id: bytes) -> Key:
-        """The live key of this id; raises `UnknownKeyError`."""
+        """The live key with this id. Raises `UnknownKeyError`."""
         for key in self.keys:
             if key.key_id == key_id:
                 return key

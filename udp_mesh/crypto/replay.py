@@ -1,7 +1,6 @@
-"""Which packet numbers were already seen: the sliding window of RFC 6479 (blocks in a ring, so that nothing is
-shifted).
+"""Replay protection: the sliding window of RFC 6479 over packet numbers (blocks in a ring, so that nothing is shifted).
 
-`would_accept(number)` before the cipher (a replay costs no decryption), `accept(number)` after it succeeded.
+Call `would_accept(number)` before decrypting (a replay costs no decryption), `accept(number)` after it succeeded.
 """
 
 from __future__ import annotations
@@ -9,11 +8,11 @@ from __future__ import annotations
 BLOCK_BITS = 64
 WINDOW_BLOCKS = 64
 WINDOW_PACKETS = (WINDOW_BLOCKS - 1) * BLOCK_BITS
-"""4,032 packets: at a gigabit of full datagrams 45 ms of reordering, at 10 Mbit/s over 4 s; 512 B of memory per
+"""4,032 packets: 45 ms of reordering with full datagrams at a gigabit, over 4 s at 10 Mbit/s; 512 B of memory per
 channel."""
 
 AGE_STEP_S = 5.0
-"""Half of what a slow route, a queue or a cut may hold a datagram back (`freshness.ACCEPT_AGE_S`)."""
+"""Half of the maximum age of an accepted datagram (`datagram_age.ACCEPT_AGE_S`)."""
 
 
 class ReplayWindow:
@@ -33,14 +32,14 @@ class ReplayWindow:
 
     @property
     def next_new(self) -> int:
-        """From this number on nothing was accepted or ruled out."""
+        """No number from this one on was accepted or ruled out."""
         return max(self.largest + 1, self._floor)
 
     def age(self, now: float) -> None:
-        """To be called now and then: what is below the largest number of two steps (10 s) ago counts as seen.
+        """Call periodically: everything below the largest number of two steps (10 s) ago counts as seen.
 
-        A lost datagram that somebody else overheard is worth nothing after that: its pieces were sent again under new
-        numbers long before.
+        An attacker may replay a datagram that was lost. After that time it is worthless: its fragments were
+        retransmitted under new numbers long before.
         """
         if self._aged_at is None:
             self._aged_at = now
@@ -60,7 +59,7 @@ class ReplayWindow:
         return not (self._blocks[(number >> 6) % WINDOW_BLOCKS] >> (number & 63)) & 1
 
     def accept(self, number: int) -> bool:
-        """Marks `number` as seen; False if it already was, or is too old to know."""
+        """Mark `number` as seen. False if it already was, or is older than the window."""
         block = number >> 6
         top = self.largest
         if number > top:
@@ -77,5 +76,5 @@ class ReplayWindow:
         return True
 
     def raise_floor(self, number: int) -> None:
-        """From now on nothing below `number` is accepted."""
+        """Reject all numbers below `number` from now on."""
         self._floor = max(self._floor, number)

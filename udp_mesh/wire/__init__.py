@@ -1,6 +1,6 @@
-"""The bytes on the air: header -> sealed frames -> frozen values, and back.
+"""The wire format: header -> sealed frames -> immutable values, and back.
 
-`header` reads and writes the few clear bytes in front of a datagram, `frames` are the values inside it, `codec` turns
-the one into the other through the bounded reader of `buffer`, `limits` names every cap, `legacy` is the fielded
-format of older fleets. Nothing here knows a key, a clock or a socket. The format is described in docs/wire-format.md.
+`header` reads and writes the clear bytes in front of a datagram, `frames` defines the values inside it, `codec`
+converts between bytes and frames with the bounded reader of `buffer`, `limits` defines every cap, and `legacy` is the
+format of older fleets. Nothing here uses a key, a clock or a socket. The format is described in docs/wire-format.md.
 """

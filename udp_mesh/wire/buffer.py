@@ -1,7 +1,7 @@
-"""A reader that cannot run past its slice, and the text checks every decoder shares.
+"""A reader that cannot run past its slice, and the text checks that all decoders share.
 
-Big-endian integers, length-prefixed text and bytes. Every read names what it wanted, so that an error says it. The
-idea is that of dnspython's `wirebase`: a decoder built on it can only return a value or raise `DecodeError`.
+Big-endian integers, length-prefixed text and bytes. Every read names what it expects, for the error message. As with
+dnspython's `wirebase`, a decoder built on it can only return a value or raise `DecodeError`.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ class Reader:
         return value
 
     def text(self, limit_bytes: int, what: str) -> str:
-        """Text of UTF-8 behind a length byte, without control characters."""
+        """UTF-8 text after a length byte, without control characters."""
         raw = self.take(self.at_most(1, limit_bytes, f"length of {what}"), what)
         return decode_text(bytes(raw), what)
 
     def name(self, limit_bytes: int, what: str) -> str:
-        """Text that names something: not empty, no white space."""
+        """Text used as a name: not empty, no white space."""
         value = self.text(limit_bytes, what)
         if not value or any(character.isspace() for character in value):
             raise DecodeError(f"{what}: expected a name without white space, found {value!r}")
@@ -70,8 +70,8 @@ def decode_text(raw: bytes, what: str) -> str:
 
 
 def encode_text(value: str, limit_bytes: int, what: str) -> bytes:
-    """The inverse of `Reader.text`; raises ValueError where the text is too long (our own caller's mistake)."""
+    """The inverse of `Reader.text`. Raises ValueError if the text is too long (a mistake of the caller)."""
     raw = value.encode("utf-8")
     if len(raw) > limit_bytes:
-        raise ValueError(f"{what}: at most {limit_bytes} bytes of UTF-8, got {len(raw)}")
+        raise ValueError(f"{what}: expected at most {limit_bytes} bytes of UTF-8, found {len(raw)}")
     return bytes((len(raw),)) + raw

@@ -1,9 +1,9 @@
 """Frames to bytes and back: `encode` for a datagram's frames, `decode` for an opened datagram.
 
-A frame starts with its type byte. Types with bit 7 set are fragments, whose low bits are flags; the others follow the
-table `Type`. Every field is big-endian. A fragment that ends its datagram carries no length; any other frame knows
-its own. Decoding either returns frames within every cap of `limits` or raises `DecodeError`; `decode(encode(frames))
-== frames`.
+A frame starts with its type byte. Types with bit 7 set are fragments, whose low bits are flags; the others are listed
+in `Type`. All fields are big-endian. A fragment that ends its datagram has no length field; any other frame has a known
+length. Decoding either returns frames within every cap of `limits` or raises `DecodeError`; `decode(encode(frames)) ==
+frames`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from udp_mesh.wire.frames import (
 
 
 class Type(IntEnum):
-    """The type byte of every frame but the fragment."""
+    """The type byte of every frame except the fragment."""
 
     HEARTBEAT = 1
     ACK = 2
@@ -51,7 +51,7 @@ class Type(IntEnum):
     PONG = 9
     BYE = 10
     SENT = 12
-    """11 stays free: the first version's tests take it for a type nobody knows."""
+    """11 stays free: the tests of the first version use it as an unknown type."""
 
 
 FRAGMENT = 0x80
@@ -62,7 +62,7 @@ FRAGMENT_WIDE = 0x08
 """The position takes 32 bits instead of 16."""
 FRAGMENT_BROADCAST_ID = 0x10
 FRAGMENT_HAS_LIFE = 0x20
-"""The head ends with the message's remaining life."""
+"""The head ends with the message's remaining lifetime."""
 _FRAGMENT_KNOWN = 0x80 | 0x3F
 
 _NARROW = struct.Struct(">BIH")
@@ -76,19 +76,19 @@ FRAGMENT_BYTES = _NARROW.size
 """7 B in front of the payload of a fragment that ends its datagram (9 B from position 65,536 on)."""
 FRAGMENT_WIDE_BYTES = _WIDE.size
 LENGTH_BYTES = _LENGTH.size
-"""2 B more for a fragment with other frames behind it."""
+"""2 B more for a fragment followed by other frames."""
 HEAD_BYTES = _HEAD.size
 """16 B more in the fragment at position 0."""
 
 LIFE_BYTES = 4
-"""4 B more in a head that says how much longer its message may live."""
+"""4 B more in a head with the message's remaining lifetime."""
 SENT_BYTES = 5
 """The frame `Sent`."""
 
 _NO_EXTENSION = b"\x00"
-"""Length of what later versions may add to a heartbeat; a reader skips what it does not know."""
+"""Length of an empty heartbeat extension; a reader skips extension fields it does not know."""
 _CLOCK = struct.Struct(">I")
-"""The first field of the extension: the speaker's clock."""
+"""The first field of the extension: the sender's clock."""
 
 _BITMAP_ONES = (1 << limits.ACK_BITMAP_BITS) - 1
 
@@ -97,20 +97,20 @@ _BITMAP_ONES = (1 << limits.ACK_BITMAP_BITS) - 1
 
 
 def encode(frames: Sequence[Frame]) -> bytes:
-    """The bytes of a datagram's frames, in order; the last one, if a fragment, is written without its length.
+    """The encoded frames of a datagram, in order; a fragment at the end is written without its length.
 
-    Raises ValueError for a value the format cannot carry: that is our own caller's mistake.
+    Raises ValueError for a value the format cannot carry (a mistake of the caller).
     """
     if len(frames) == 1:
         return _encode_frame(frames[0], last=True)
     if not 1 <= len(frames) <= limits.MAX_FRAMES_PER_DATAGRAM:
-        raise ValueError(f"a datagram carries 1 to {limits.MAX_FRAMES_PER_DATAGRAM} frames, not {len(frames)}")
+        raise ValueError(f"datagram: expected 1 to {limits.MAX_FRAMES_PER_DATAGRAM} frames, found {len(frames)}")
     final = len(frames) - 1
     return b"".join([_encode_frame(frame, last=place == final) for place, frame in enumerate(frames)])
 
 
 def encode_fragment(fragment: Fragment, *, last: bool = True) -> bytes:
-    """The bytes of one fragment; `last` where no frame follows it in its datagram."""
+    """One encoded fragment; `last` if no frame follows it in its datagram."""
     message_id, position, payload, head, ack_now, broadcast_id = fragment
     first = FRAGMENT
     if ack_now:
@@ -118,7 +118,7 @@ def encode_fragment(fragment: Fragment, *, last: bool = True) -> bytes:
     if broadcast_id:
         first |= FRAGMENT_BROADCAST_ID
     if (head is None) != (position != 0):
-        raise ValueError("a fragment carries its message's head exactly at position 0")
+        raise ValueError("fragment: expected a head exactly at position 0")
     if last and head is None:
         if position < 65_536:
             return _NARROW.pack(first, message_id, position) + payload
@@ -142,15 +142,15 @@ def encode_fragment(fragment: Fragment, *, last: bool = True) -> bytes:
 
 def _encode_head(head: MessageHead) -> bytes:
     if head.size_bytes > limits.MAX_MESSAGE_BYTES or not 1 <= head.fragments <= max(1, head.size_bytes):
-        raise ValueError(f"no such message: {head.size_bytes} bytes in {head.fragments} fragments")
+        raise ValueError(f"message head: {head.size_bytes} bytes in {head.fragments} fragments is out of range")
     if head.fragments > limits.MAX_FRAGMENTS_PER_MESSAGE or not 0 <= head.priority < limits.PRIORITY_LEVELS:
-        raise ValueError(f"no such message: {head.fragments} fragments, priority {head.priority}")
+        raise ValueError(f"message head: {head.fragments} fragments, priority {head.priority} is out of range")
     age_ms = min(head.age_ms, 0xFFFFFFFF)
     packed = _HEAD.pack(head.size_bytes, head.fragments, age_ms, head.topic_id, head.priority, head.flags)
     if head.life_ms is None:
         return packed
     if head.life_ms < 1:
-        raise ValueError(f"no such message: {head.life_ms} ms to live")
+        raise ValueError(f"message head: expected a remaining lifetime of at least 1 ms, found {head.life_ms}")
     return packed + min(head.life_ms, 0xFFFFFFFF).to_bytes(LIFE_BYTES, "big")
 
 
@@ -170,7 +170,7 @@ def _encode_frame(frame: Frame, *, last: bool) -> bytes:
             return bytes((Type.CANCEL,)) + _encode_ids(message_ids, broadcast_ids)
         case Nack(message_id, ranges):
             if len(ranges) > limits.MAX_RANGES:
-                raise ValueError(f"at most {limits.MAX_RANGES} ranges, got {len(ranges)}")
+                raise ValueError(f"nack: expected at most {limits.MAX_RANGES} ranges, found {len(ranges)}")
             packed = b"".join(struct.pack(">II", first, count) for first, count in ranges)
             return struct.pack(">BIB", Type.NACK, message_id, len(ranges)) + packed
         case TopicAnnounce(topic_id, name, type_name):
@@ -193,7 +193,7 @@ def _encode_frame(frame: Frame, *, last: bool) -> bytes:
 
 def _encode_ack(ack: Ack) -> bytes:
     missing = ~ack.received & _BITMAP_ONES if ack.largest else 0
-    # Nothing below packet 0 was ever sent: those bits say nothing and cost nothing.
+    # No packet below 0 was ever sent: those bits carry nothing and cost nothing.
     missing &= (1 << min(ack.largest, limits.ACK_BITMAP_BITS)) - 1
     width = (missing.bit_length() + 7) // 8
     return b"".join(
@@ -208,7 +208,10 @@ def _encode_ack(ack: Ack) -> bytes:
 
 def _encode_heartbeat(beat: Heartbeat) -> bytes:
     if len(beat.heard) > limits.MAX_HEARD or any(len(tag) != limits.HEARD_TAG_BYTES for tag in beat.heard):
-        raise ValueError(f"at most {limits.MAX_HEARD} tags of {limits.HEARD_TAG_BYTES} bytes, got {len(beat.heard)}")
+        raise ValueError(
+            f"heartbeat: expected at most {limits.MAX_HEARD} tags of {limits.HEARD_TAG_BYTES} bytes, "
+            f"found {len(beat.heard)}"
+        )
     return b"".join(
         (
             bytes((Type.HEARTBEAT,)),
@@ -233,7 +236,7 @@ def _encode_heartbeat(beat: Heartbeat) -> bytes:
 
 def _encode_waiting(waiting: Sequence[Waiting]) -> bytes:
     if len(waiting) > limits.MAX_WAITING:
-        raise ValueError(f"at most {limits.MAX_WAITING} waiting levels, got {len(waiting)}")
+        raise ValueError(f"expected at most {limits.MAX_WAITING} waiting levels, found {len(waiting)}")
     return bytes((len(waiting),)) + b"".join(
         struct.pack(">BH", level.priority, min(level.age_ms, 0xFFFF)) for level in waiting
     )
@@ -242,7 +245,7 @@ def _encode_waiting(waiting: Sequence[Waiting]) -> bytes:
 def _encode_ids(ids: Iterable[int], broadcast: bool) -> bytes:
     packed = [struct.pack(">I", number) for number in ids]
     if not 1 <= len(packed) <= limits.MAX_IDS:
-        raise ValueError(f"1 to {limits.MAX_IDS} message ids, got {len(packed)}")
+        raise ValueError(f"expected 1 to {limits.MAX_IDS} message ids, found {len(packed)}")
     return struct.pack(">BH", broadcast, len(packed)) + b"".join(packed)
 
 
@@ -286,7 +289,7 @@ def _decode_fragment(first: int, reader: Reader) -> Fragment:
     if position >= limits.MAX_FRAGMENTS_PER_MESSAGE or (first & FRAGMENT_WIDE and position < 65_536):
         raise DecodeError(f"fragment position: {position} is out of range")
     if first & FRAGMENT_HAS_LIFE and not first & FRAGMENT_HAS_HEAD:
-        raise DecodeError("fragment: expected a remaining life only in a head")
+        raise DecodeError("fragment: expected a remaining lifetime only in a head")
     head = _decode_head(reader, with_life=first & FRAGMENT_HAS_LIFE != 0) if first & FRAGMENT_HAS_HEAD else None
     if (head is None) != (position != 0):
         raise DecodeError(f"fragment: expected a head exactly at position 0, found position {position}")
@@ -316,9 +319,9 @@ def _decode_head(reader: Reader, *, with_life: bool) -> MessageHead:
     topic_id = reader.integer(2, "topic id")
     priority = reader.at_most(1, limits.PRIORITY_LEVELS - 1, "priority")
     flags = reader.integer(1, "message flags")
-    life_ms = reader.integer(LIFE_BYTES, "remaining life") if with_life else None
+    life_ms = reader.integer(LIFE_BYTES, "remaining lifetime") if with_life else None
     if life_ms == 0:
-        raise DecodeError("remaining life: expected at least 1 ms, found 0")
+        raise DecodeError("remaining lifetime: expected at least 1 ms, found 0")
     return MessageHead(size_bytes, fragments, topic_id, priority, flags, age_ms, life_ms)
 
 

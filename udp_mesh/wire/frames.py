@@ -1,13 +1,13 @@
-"""The frames: what one node says to another inside a sealed datagram.
+"""The frames inside a sealed datagram.
 
 A datagram carries one or more frames. Discovery: `Heartbeat` (to all, or to one peer as an introduction), `Bye`.
-Messages: `TopicAnnounce` gives a number to a topic, `Fragment` carries a piece of a message (the first piece carries
-the `MessageHead`), `Delivered`, `Refused` and `Cancel` end it. Reliability: `Ack` answers packets, `Nack` asks for
-missing pieces of a broadcast. `Ping` and `Pong` prove a path, `Sent` dates a datagram. Fields that come from the wire
-have already passed the caps of `limits`; a constructor checks nothing.
+Messages: `TopicAnnounce` assigns a number to a topic, `Fragment` carries a part of a message (the first one with its
+`MessageHead`), `Delivered`, `Refused` and `Cancel` end it. Reliability: `Ack` acknowledges packets, `Nack` requests
+missing fragments of a broadcast. `Ping` and `Pong` validate a path, `Sent` timestamps a datagram. Fields from the wire
+have already passed the caps of `limits`; constructors check nothing.
 
-Numbers: a *packet number* counts the datagrams of one channel (sender's boot to one receiver's boot, or to all),
-starts at 0 and is never used twice; a *message id* counts the messages of one such channel and is the same in every
+Numbers: a *packet number* counts the datagrams of one channel (sender's boot to one receiver's boot, or to all), starts
+at 0 and is never reused. A *message id* counts the messages of one such channel and stays the same in every
 retransmission.
 """
 
@@ -21,52 +21,52 @@ Payload: TypeAlias = bytes | bytearray | memoryview
 
 
 class Feature(IntFlag):
-    """Optional abilities a node announces; an unknown bit is ignored."""
+    """Optional features that a node announces; unknown bits are ignored."""
 
     ZLIB = 1
-    """Takes messages compressed with zlib (RFC 1950)."""
+    """Accepts messages compressed with zlib (RFC 1950)."""
     REPAIR = 2
-    """Asks for lost broadcasts with `Nack`, and answers it."""
+    """Requests lost broadcasts with `Nack`, and answers such requests."""
     TIMED = 4
-    """Takes `Sent` and a head's remaining life, stamps what it sends, and answers a ping where it came from."""
+    """Accepts `Sent` and a head's remaining lifetime, timestamps what it sends, and answers a ping to its source."""
 
 
 class Waiting(NamedTuple):
-    """One priority level with something waiting at the speaker; other nodes' lower levels yield to it."""
+    """One priority level with a message waiting at the sender; other nodes hold back their less urgent levels."""
 
     priority: int
     """0 (most urgent) to 15."""
     age_ms: int
-    """How long its oldest message has waited, at most 65,535 ms."""
+    """Age of its oldest message, at most 65,535 ms."""
 
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """Who speaks and what it hears. The boot id stands in the datagram's long header, authenticated with it."""
+    """The sender and the boots it hears. Its boot id is in the datagram's long header, authenticated with it."""
 
     name: str
     """The node's name, 1 to 63 bytes of UTF-8 without space, control character or slash."""
     min_version: int
     max_version: int
-    """Wire versions spoken, 1 to 7."""
+    """Supported wire versions, 1 to 7."""
     features: int
     """Bits of `Feature`."""
     interval_ms: int
-    """When to expect the next one at the latest, 1 to 65,535 ms: heartbeats grow sparser where traffic proves the
-    link."""
+    """Maximum time until the next one, 1 to 65,535 ms: heartbeats are sparser while traffic proves the link."""
     known_peers: int
-    """Peers online at the speaker."""
+    """Peers online at the sender."""
     send_rate: int
-    """What the speaker sends to everybody, wire bytes/s averaged over about 1 s: how busy the channel is."""
+    """Wire bytes/s that the sender sends to all nodes, averaged over about 1 s: how busy the channel is."""
     broadcast_number: int
-    """The speaker's next packet number to all; a verified peer accepts no older broadcast packet (replays)."""
+    """The sender's next broadcast packet number; a verified peer accepts no older broadcast packet (replays)."""
     broadcast_messages: int
-    """The speaker's next broadcast message id: a receiver that is short of one asks with `Nack`."""
+    """The sender's next broadcast message id: a receiver that misses one requests it with `Nack`."""
     heard: tuple[bytes, ...] = ()
-    """First 8 bytes of the boot ids heard lately: a node finds itself here and knows the link works both ways."""
+    """First 8 bytes of the boot ids heard recently: a node that finds itself here knows that the link works both
+    ways."""
     waiting: tuple[Waiting, ...] = ()
     clock_ms: int | None = None
-    """The speaker's clock as in `Sent`; None where its version does not say."""
+    """The sender's clock as in `Sent`; None if its version does not include it."""
 
 
 class MessageFlag(IntFlag):
@@ -77,33 +77,33 @@ class MessageFlag(IntFlag):
     COMPRESSED = 2
     """The bytes are zlib (RFC 1950); the receiver bounds what they may inflate to."""
     TO_ALL = 4
-    """Addressed to every node, whichever way this copy came."""
+    """Addressed to every node, whether this copy was broadcast or not."""
     REPAIR = 8
-    """A broadcast that may be asked for again with `Nack`."""
+    """A broadcast that can be requested again with `Nack`."""
 
 
 @dataclass(frozen=True, slots=True)
 class MessageHead:
-    """What the first fragment (position 0) says about its message."""
+    """Properties of a message, carried by its first fragment (position 0)."""
 
     size_bytes: int
     """Bytes of the whole message as sent (after compression)."""
     fragments: int
     """Number of fragments, at least 1, none of them empty unless the message is."""
     topic_id: int
-    """Number given by a `TopicAnnounce` of the same sender boot, 0 to 65,535."""
+    """Number assigned by a `TopicAnnounce` of the same sender boot, 0 to 65,535."""
     priority: int
     """0 (most urgent) to 15."""
     flags: int
     """Bits of `MessageFlag`."""
     age_ms: int = 0
-    """How long ago the message was accepted for sending, when this copy left; up to 2**32-1 ms (49 days)."""
+    """Time since the message was accepted for sending, when this copy was sent; up to 2**32-1 ms (49 days)."""
     life_ms: int | None = None
-    """How much longer it is worth delivering, when this copy left, at least 1; None: no deadline, or not said."""
+    """Remaining lifetime when this copy was sent, at least 1; None: no deadline, or not included."""
 
 
 class Fragment(NamedTuple):
-    """A piece of a message. A NamedTuple because this is the one frame built tens of thousands of times a second."""
+    """A part of a message. A NamedTuple because it is the one frame built tens of thousands of times a second."""
 
     message_id: int
     """32 bits, counts the messages of this channel (or the broadcast channel, see `broadcast_id`)."""
@@ -112,9 +112,9 @@ class Fragment(NamedTuple):
     payload: Payload
     """The bytes; a decoded fragment's is a view into its datagram."""
     head: MessageHead | None = None
-    """Present exactly where position is 0."""
+    """Present exactly if position is 0."""
     ack_now: bool = False
-    """Acknowledge at once, do not wait to batch (urgent messages, the last fragments in flight)."""
+    """Acknowledge at once instead of batching (urgent messages, the last fragments in flight)."""
     broadcast_id: bool = False
     """In a unicast datagram: `message_id` counts in the sender's broadcast channel (repair, or per-peer copy of it)."""
 
@@ -129,13 +129,13 @@ class Ack(NamedTuple):
     delay_us: int
     """From the arrival of `largest` to this acknowledgement's sending, at most 2**24-1 us."""
     receive_rate: int
-    """Wire bytes/s arriving at the speaker from this peer, averaged over about 1 s (0 = none, or not known yet)."""
+    """Wire bytes/s arriving from this peer, averaged over about 1 s (0: none, or not known yet)."""
     waiting: tuple[Waiting, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Delivered:
-    """These messages are complete and handed over at the receiver."""
+    """These messages are complete and delivered at the receiver."""
 
     message_ids: tuple[int, ...]
     broadcast_ids: bool = False
@@ -149,12 +149,12 @@ class RefuseReason(IntEnum):
     CORRUPT = 3
     """The bytes do not decompress, or the fragments contradict their head."""
     FORGOTTEN = 4
-    """The receiver no longer has the fragments it acknowledged (or the topic's name): send the message anew."""
+    """The receiver no longer has the fragments it acknowledged (or the topic's name): restart the message."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """The receiver will not take this message."""
+    """The receiver does not accept this message."""
 
     message_id: int
     reason: RefuseReason
@@ -163,7 +163,7 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class Cancel:
-    """The sender gives these messages up (expired, replaced by a newer one): forget the parts."""
+    """The sender gives these messages up (expired, replaced by a newer one): discard their fragments."""
 
     message_ids: tuple[int, ...]
     broadcast_ids: bool = False
@@ -171,7 +171,7 @@ class Cancel:
 
 @dataclass(frozen=True, slots=True)
 class Nack:
-    """Pieces missing of one broadcast message; no ranges: all of it."""
+    """Missing fragments of one broadcast message; no ranges: all of it."""
 
     message_id: int
     ranges: tuple[tuple[int, int], ...] = ()
@@ -180,7 +180,7 @@ class Nack:
 
 @dataclass(frozen=True, slots=True)
 class TopicAnnounce:
-    """Gives a number to a topic, for the life of the sender's boot."""
+    """Assigns a number to a topic, for the life of the sender's boot."""
 
     topic_id: int
     name: str
@@ -204,7 +204,7 @@ class Pong:
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """When this datagram left, by the sender's own clock: only differences mean something."""
+    """When this datagram was sent, by the sender's own clock: only differences are meaningful."""
 
     clock_ms: int
     """Milliseconds, modulo 2**32."""
@@ -212,7 +212,7 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class Bye:
-    """The speaker stops in order; peers report it offline at once."""
+    """The sender shuts down; peers report it offline at once."""
 
     reason: str = ""
 

@@ -1,14 +1,14 @@
-"""The clear bytes in front of the sealed ones.
+"""The clear header in front of the sealed frames.
 
-First byte: bit 7 set (so that it never looks like the fielded format, whose types are 1, 2, 4 and 5), bits 6-4 the wire
+First byte: bit 7 set (so that it never looks like the legacy format, whose types are 1, 2, 4 and 5), bits 6-4 the wire
 version, bits 3-0 the kind. Then either
 
-- the long header (33 B: HELLO to all, INTRODUCTION to one peer that may not know us yet):
-  key id (4), sender's boot id (16), packet number (8), check (4); or
+- the long header (33 B: HELLO to all, INTRODUCTION to one peer that may not know us yet): key id (4), sender's boot id
+  (16), packet number (8), check (4); or
 - the short header (7 B: BROADCAST, DATA): channel tag (2), low 32 bits of the packet number (4).
 
-The check is a short keyed hash of the long header: a flood of invented senders is dropped before any key is derived
-for them. The tag is derived from the channel's key, so that only who holds the key can link it to a node.
+The check is a short keyed hash of the long header: a flood of invented senders is dropped before any key is derived for
+them. The tag is derived from the channel's key, so that only key holders can link it to a node.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from udp_mesh.wire.errors import DecodeError, UnknownVersionError
 from udp_mesh.wire.limits import MAX_DATAGRAM_BYTES
 
 VERSION = 1
-"""The one version written and read by this code; 3 bits on the wire."""
+"""The only version written and read by this code; 3 bits on the wire."""
 
 MARK = 0x80
-"""Bit 7 of the first byte: not a fielded datagram."""
+"""Bit 7 of the first byte: not a legacy datagram."""
 
 
 class Kind(IntEnum):
@@ -59,7 +59,7 @@ SHORT_HEADER_BYTES = SHORT_HEADER.size
 LONG_HEADER_BYTES = _LONG.size
 CHECK_BYTES = 4
 SEAL_TAG_BYTES = 16
-"""What AES-128-GCM adds behind the sealed frames."""
+"""Authentication tag that AES-128-GCM appends to the sealed frames."""
 
 _HELLO_BYTE = MARK | VERSION << 4 | Kind.HELLO
 BROADCAST_BYTE = MARK | VERSION << 4 | Kind.BROADCAST
@@ -69,7 +69,7 @@ NUMBER_LOW_MASK = 0xFFFFFFFF
 
 
 def is_ours(data: bytes | bytearray | memoryview) -> bool:
-    """Whether the first byte has the mark of this protocol (any version); otherwise it may be the fielded format."""
+    """Whether the first byte has the mark of this protocol (any version); otherwise it may be the legacy format."""
     return len(data) > 0 and data[0] >= MARK
 
 
@@ -78,14 +78,14 @@ def encode_short(kind: Kind, tag: int, number: int) -> bytes:
 
 
 def encode_long(kind: Kind, key_id: bytes, boot_id: bytes, number: int) -> bytes:
-    """The long header without its check, which the key adds (`Key.check`)."""
+    """The long header without its check, which `Key.check` computes."""
     return _LONG.pack(MARK | VERSION << 4 | kind, key_id, boot_id, number, b"")[:-CHECK_BYTES]
 
 
 def parse_header(data: bytes | bytearray | memoryview) -> LongHeader | ShortHeader:
     """The header of a datagram.
 
-    Raises `UnknownVersionError` for another version, `DecodeError` for anything that is not ours or too short to be
+    Raises `UnknownVersionError` for another version, `DecodeError` for a foreign datagram or one too short to be
     sealed.
     """
     size = len(data)

@@ -1,10 +1,10 @@
-"""The fielded format (docs/facts/legacy-wire.md): datagrams of one-byte types, messages as serialized
+"""The legacy format (docs/facts/legacy-wire.md): datagrams with one-byte types, messages as serialized
 `PriorityMeshData`.
 
 Datagram -> `Host`, `Payload`, `LegacyAck` or `PayloadNoAck`; the payloads of one message, in order ->
-`PriorityMeshData`. Both directions, so that nodes of either kind can share a fleet while it moves over. Nothing in
-this format is authenticated: whoever decodes it must believe an address, not a name. Little-endian throughout, unlike
-the rest of `wire`.
+`PriorityMeshData`. Both directions, so that nodes of either kind can share a fleet during an upgrade. Nothing in this
+format is authenticated: a reader must trust the address, not the name. Little-endian throughout, unlike the rest of
+`wire`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,6 @@ from udp_mesh.wire.limits import (
 _HEADER = struct.Struct("<BHIIH")
 LEGACY_OVERHEAD_BYTES = _HEADER.size + 1
 """Header and the trailing byte of a disabled checksum."""
-BROADCAST_SEQUENCE = 0x8000
-"""High bit of a sequence number: counts messages to all; unicast numbers run 1 to 0x7fff per peer and wrap to 1."""
 LAST_SEQUENCE = 0x7FFF
 """Unicast sequence numbers run from 1 to this, then from 1 again."""
 _HOST = struct.Struct("<64p16p")
@@ -42,7 +40,7 @@ _ROS_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
 
 
 def is_ros_name(name: str) -> bool:
-    """Whether ROS 1 takes this as the name of a topic (wiki.ros.org/Names), relative or global."""
+    """Whether ROS 1 accepts this as a topic name (wiki.ros.org/Names), relative or global."""
     return _ROS_NAME.fullmatch(name) is not None and "//" not in name and name.strip("/") != ""
 
 
@@ -68,7 +66,7 @@ class Host:
 
 @dataclass(frozen=True, slots=True)
 class LegacyPayload:
-    """A fragment; `wants_ack` tells PAYLOAD from PAYLOAD_NOACK (broadcast)."""
+    """A fragment; `wants_ack` distinguishes PAYLOAD from PAYLOAD_NOACK (broadcast)."""
 
     sequence: int
     position: int
@@ -90,7 +88,7 @@ LegacyDatagram: TypeAlias = Host | LegacyPayload | LegacyAck
 
 @dataclass(frozen=True, slots=True)
 class PriorityMeshData:
-    """The message that the fielded system reassembles: opaque user bytes with where they belong."""
+    """The message that the legacy system reassembles: opaque user bytes with their topic, type and priority."""
 
     host: str
     type_name: str
@@ -104,28 +102,28 @@ class PriorityMeshData:
     frame_id: str = ""
 
 
-_COVER = _HEADER.pack(LegacyType.ACK, 0xFFFF, 0xFFFFFFFF, 0, 0)[:-2]
-"""An acknowledgement of a message that nobody sends: unicast numbers end at 0x7fff, and broadcasts are never
+_ENCAPSULATION = _HEADER.pack(LegacyType.ACK, 0xFFFF, 0xFFFFFFFF, 0, 0)[:-2]
+"""An acknowledgement of a message that is never sent: unicast numbers end at 0x7fff, and broadcasts are not
 acknowledged."""
 
 
-def cover(data: bytes) -> bytes:
-    """A datagram of ours that may reach fielded programs: in the payload of an acknowledgement they ignore.
+def encapsulate(data: bytes) -> bytes:
+    """Encapsulate a datagram that may reach legacy programs in the payload of an acknowledgement they ignore.
 
-    A datagram of another type than theirs, which a broadcast would bring them, ends them.
+    A legacy program that receives a datagram of an unknown type, as by broadcast, crashes.
     """
-    return _COVER + struct.pack("<H", len(data)) + data + b"\x00"
+    return _ENCAPSULATION + struct.pack("<H", len(data)) + data + b"\x00"
 
 
-def uncover(data: bytes | memoryview) -> bytes | memoryview | None:
-    """What `cover` was given; None where this is something else."""
-    if len(data) < LEGACY_OVERHEAD_BYTES or bytes(data[: len(_COVER)]) != _COVER:
+def decapsulate(data: bytes | memoryview) -> bytes | memoryview | None:
+    """The datagram passed to `encapsulate`; None for anything else."""
+    if len(data) < LEGACY_OVERHEAD_BYTES or bytes(data[: len(_ENCAPSULATION)]) != _ENCAPSULATION:
         return None
     return data[_HEADER.size : -1]
 
 
 def is_legacy(data: bytes | memoryview) -> bool:
-    """Whether the first byte is a type of the fielded format."""
+    """Whether the first byte is a type of the legacy format."""
     return len(data) >= LEGACY_OVERHEAD_BYTES and data[0] in (1, 2, 4, 5)
 
 
@@ -153,7 +151,7 @@ def _frame(kind: LegacyType, sequence: int, position: int, total: int, data: byt
 
 
 def decode_legacy(raw: bytes | memoryview) -> LegacyDatagram:
-    """Raises DecodeError for anything else; the trailing checksum byte is ignored, as the fielded receiver does."""
+    """Raises DecodeError for anything else. The trailing checksum byte is ignored, as by the legacy receiver."""
     if len(raw) < LEGACY_OVERHEAD_BYTES:
         raise DecodeError(f"legacy datagram: expected {LEGACY_OVERHEAD_BYTES} bytes or more, found {len(raw)}")
     kind, sequence, position, total, length = _HEADER.unpack_from(raw)
@@ -180,7 +178,8 @@ def decode_legacy(raw: bytes | memoryview) -> LegacyDatagram:
 
 
 def fragment_legacy(message: bytes) -> list[bytes]:
-    """The fragments of a message as the fielded receiver counts them: `n // 1300 + 1`, an exact multiple ends empty."""
+    """Split a message as the legacy receiver expects: `n // 1300 + 1` fragments, so an exact multiple ends with an
+    empty one."""
     size = MAX_LEGACY_FRAGMENT_BYTES
     return [message[start : start + size] for start in range(0, len(message) // size * size + 1, size)]
 
@@ -188,7 +187,7 @@ def fragment_legacy(message: bytes) -> list[bytes]:
 def encode_mesh_data(message: PriorityMeshData) -> bytes:
     """ROS 1 serialization of `PriorityMeshData`. Raises ValueError for a priority outside 0 to 255."""
     if not 0 <= message.priority <= 255:
-        raise ValueError(f"legacy priority: expected 0 to 255, got {message.priority}")
+        raise ValueError(f"legacy priority: expected 0 to 255, found {message.priority}")
     return b"".join(
         (
             struct.pack("<III", message.sequence, message.stamp_s, message.stamp_ns),
@@ -207,7 +206,7 @@ def _string(raw: bytes) -> bytes:
 
 
 def decode_mesh_data(raw: bytes) -> PriorityMeshData:
-    """The inverse of `encode_mesh_data`; raises DecodeError, also for bytes behind the message."""
+    """The inverse of `encode_mesh_data`. Raises DecodeError, also for trailing bytes."""
     if len(raw) < 12:
         raise DecodeError(f"legacy message: expected a header of 12 bytes, found {len(raw)}")
     sequence, stamp_s, stamp_ns = struct.unpack_from("<III", raw)
@@ -221,7 +220,7 @@ def decode_mesh_data(raw: bytes) -> PriorityMeshData:
     topic, place = _take_text(raw, place + 1, MAX_TOPIC_BYTES, "topic")
     data, place = _take(raw, place, len(raw), "data")
     if place != len(raw):
-        raise DecodeError(f"legacy message: {len(raw) - place} bytes too many")
+        raise DecodeError(f"legacy message: {len(raw) - place} trailing bytes")
     return PriorityMeshData(host, type_name, priority, topic, data, sequence, stamp_s, stamp_ns, frame_id)
 
 

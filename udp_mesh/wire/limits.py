@@ -1,20 +1,21 @@
 """Every cap of the wire format, with the attack or overload it bounds.
 
-A decoder raises `DecodeError` on anything past its cap, before it allocates. Sizes are bytes unless the name says
+A decoder raises `DecodeError` for anything beyond its cap before it allocates. Sizes are bytes unless the name says
 otherwise.
 """
 
 MAX_DATAGRAM_BYTES = 65_507
-"""Largest UDP payload over IPv4: nothing larger can arrive, nothing larger is built."""
+"""Largest UDP payload over IPv4: nothing larger can arrive or is built."""
 
 MAX_FRAMES_PER_DATAGRAM = 64
 """Bounds the work one datagram can cause (a flood of two-byte frames); real datagrams carry one to ten."""
 
 MAX_NAME_BYTES = 63
-"""A node's name: fits the fielded 64-byte Pascal string, and bounds the memory a heartbeat can pin per peer."""
+"""A node's name: fits the 64-byte Pascal string of the legacy format, and bounds the memory a heartbeat can pin per
+peer."""
 
 MAX_TOPIC_BYTES = 255
-"""A topic's name: ROS names stay below; bounds the memory of the announced-topic table."""
+"""A topic's name: ROS names are shorter; bounds the memory of the table of announced topics."""
 
 MAX_TYPE_BYTES = 255
 """A topic's type name (`pkg/Type`, optionally with a checksum): same reason as MAX_TOPIC_BYTES."""
@@ -27,15 +28,14 @@ MAX_MESSAGE_BYTES = 1 << 30
 reserve."""
 
 MAX_FRAGMENTS_PER_MESSAGE = 1 << 21
-"""2 Mi fragments (1 GiB at 512 B each). The fielded code allocated straight from a 32-bit field: this is the cap it
+"""2 Mi fragments (1 GiB at 512 B each). The legacy code allocated directly from a 32-bit field: this is the cap it
 lacked."""
 
 MAX_HEARD = 96
-"""Neighbours a heartbeat lists as heard (8 B each, 768 B): keeps a heartbeat in one datagram whatever the team's
-size."""
+"""Neighbors that a heartbeat lists as heard (8 B each, 768 B): keeps it in one datagram whatever the team's size."""
 
 MAX_WAITING = 16
-"""One entry per priority level, and there are 16 levels: a longer list is nonsense."""
+"""One entry for each of the 16 priority levels."""
 
 MAX_IDS = 256
 """Message ids in one Delivered or Cancel (4 B each): bounds the lookups one datagram can cause."""
@@ -44,7 +44,7 @@ MAX_RANGES = 64
 """Ranges of missing fragments in one Nack: bounds the repairs one datagram can ask for."""
 
 ACK_BITMAP_BITS = 256
-"""Packets an acknowledgement covers below its largest number (32 B at most, 0 B where nothing is missing)."""
+"""Packets that an acknowledgement covers below its largest number (32 B at most, 0 B if none is missing)."""
 
 PRIORITY_LEVELS = 16
 """Priorities 0 (most urgent) to 15: four bits on the wire."""
@@ -53,10 +53,10 @@ BOOT_ID_BYTES = 16
 """A node's random name for one run of its process: 128 bits never repeat in a fleet's life."""
 
 HEARD_TAG_BYTES = 8
-"""Leading bytes of a boot id by which a heartbeat says whom it hears: 64 bits do not collide within a team."""
+"""Leading bytes of a boot id that identify heard nodes in a heartbeat: 64 bits do not collide within a team."""
 
 MAX_LEGACY_FRAGMENT_BYTES = 1300
-"""Fragment payload of the fielded format."""
+"""Fragment payload of the legacy format."""
 
 MAX_LEGACY_FRAGMENTS = 1 << 16
-"""Fragments of one fielded message (85 MB): the fielded code took any 32-bit number and allocated it."""
+"""Fragments of one legacy message (85 MB): the legacy code accepted any 32-bit number and allocated it."""

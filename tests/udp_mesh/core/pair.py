@@ -1,8 +1,8 @@
-"""Nodes in memory under a virtual clock: whole sessions as transcripts, lossy links as deterministic models.
+"""Nodes in memory under a virtual clock: complete sessions as transcripts, lossy links as deterministic models.
 
-`pair()` makes two nodes that have met. `roundtrip()` carries everything both ways at once; `drop()` loses what would
-leave.
-`World` runs any number of nodes over modelled links (`Pipe`: rate, delay, finite queue, loss) for a virtual time.
+`pair()` makes two nodes that have met. `roundtrip()` delivers everything both ways at once; `drop()` loses what a node
+would send. `World` runs any number of nodes over modeled links (`Pipe`: rate, delay, finite queue, loss) in virtual
+time.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Pipe:
     queue_packets: int = 100
     loss: float = 0.0
     lost: Callable[[random.Random, float], bool] | None = None
-    """A loss model of its own instead of `loss`."""
+    """A custom loss model instead of `loss`."""
     up: bool = True
     carried_bytes: int = 0
     carried: int = 0
@@ -95,12 +95,12 @@ class World:
         return node
 
     def at(self, when: float, call: Callable[[], None]) -> None:
-        """Do something at a virtual time."""
+        """Call a function at a virtual time."""
         self._serial += 1
         heapq.heappush(self._calls, (when, self._serial, call))
 
     def run(self, seconds: float, until: Callable[[], bool] | None = None) -> bool:
-        """Let virtual time pass; stops early, and returns True, once `until` holds."""
+        """Advance virtual time; stops early, and returns True, once `until` holds."""
         end = self.now + seconds
         for name in list(self.nodes):
             self._pump(name)
@@ -131,13 +131,13 @@ class World:
                 self._pump(name)
 
     def send(self, source: str, topic: str, payload: bytes, destination: str | None = None) -> object:
-        """`Node.send`, and let it leave."""
+        """Call `Node.send` and transmit."""
         result = self.nodes[source].send(topic, payload, destination=destination, now=self.now)
         self._pump(source)
         return result
 
-    def told(self, name: str, kind: type) -> list[Event]:
-        """Events of one kind that a node told so far."""
+    def events_of(self, name: str, kind: type) -> list[Event]:
+        """A node's events of one kind so far."""
         self._fetch(name)
         return [event for _, event in self.events[name] if isinstance(event, kind)]
 
@@ -167,7 +167,7 @@ class World:
 
 
 class Pair:
-    """Two nodes, `a` and `b`, and a clock moved by hand."""
+    """Two nodes, `a` and `b`, and a manual clock."""
 
     def __init__(self, a: Settings, b: Settings) -> None:
         self.now = 1000.0
@@ -178,7 +178,7 @@ class Pair:
         self.b.link_up(LinkInfo("mesh", LinkKind.BROADCAST, ("10.0.0.2", 8700), BROADCAST), self.now)
 
     def leave(self, node: Node) -> list[Datagram]:
-        """Everything that leaves a node now."""
+        """Everything that a node sends now."""
         node.handle_timer(self.now)
         out = []
         while datagrams := node.datagrams_to_send(self.now):
@@ -186,7 +186,7 @@ class Pair:
         return out
 
     def roundtrip(self, times: int = 1, step_s: float = 0.01) -> int:
-        """Carry everything both ways, then let `step_s` pass; returns datagrams carried."""
+        """Deliver everything both ways, then advance by `step_s`; returns the number of datagrams."""
         carried = 0
         for _ in range(times):
             to_b, to_a = self.leave(self.a), self.leave(self.b)
@@ -199,19 +199,19 @@ class Pair:
         return carried
 
     def drop(self, node: Node) -> list[Datagram]:
-        """What leaves a node now is lost; returned for a look or a later replay."""
+        """Lose what a node sends now; returned for inspection or a later replay."""
         return self.leave(node)
 
     def events(self, node: Node) -> list[Event]:
-        """Everything a node told since the last look."""
-        told = []
+        """A node's events since the last call."""
+        events = []
         while (event := node.next_event()) is not None:
-            told.append(event)
-        return told
+            events.append(event)
+        return events
 
 
 def pair(*topics: Topic, **changes: object) -> Pair:
-    """Two nodes that have met; their events of meeting are already fetched."""
+    """Two nodes that have met; the events of that are already fetched."""
     both = Pair(settings("a", *topics, **changes), settings("b", *topics, **changes))
     both.roundtrip(times=60)
     both.events(both.a)

@@ -1,4 +1,4 @@
-"""Changes of the running node drop no accepted message and take effect at once."""
+"""Changes of a running node drop no accepted message and take effect at once."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def test_every_kind_of_change_in_the_middle_of_transfers_loses_nothing() -> None
             sent += isinstance(result, int)
         world.run(0.05)
         assert world.nodes["a"].apply(replace(base, **change), world.now)  # type: ignore[arg-type]
-    assert world.run(30.0, until=lambda: len(world.told("a", MessageDelivered)) == sent)
-    assert len(world.told("b", MessageReceived)) == sent
+    assert world.run(30.0, until=lambda: len(world.events_of("a", MessageDelivered)) == sent)
+    assert len(world.events_of("b", MessageReceived)) == sent
 
 
 def test_a_new_priority_reaches_messages_already_waiting() -> None:
@@ -52,8 +52,8 @@ def test_a_new_priority_reaches_messages_already_waiting() -> None:
             world.send("a", name, bytes(300_000), "b")
     world.run(0.1)
     world.nodes["a"].apply(settings("a", Topic("map", priority=9), Topic("video", priority=5)), world.now)
-    assert world.run(20.0, until=lambda: len(world.told("b", MessageReceived)) == 6)
-    order = [event.topic for event in world.told("b", MessageReceived) if isinstance(event, MessageReceived)]
+    assert world.run(20.0, until=lambda: len(world.events_of("b", MessageReceived)) == 6)
+    order = [event.topic for event in world.events_of("b", MessageReceived) if isinstance(event, MessageReceived)]
     assert order[:3] == ["video"] * 3
 
 
@@ -101,7 +101,7 @@ def test_an_undeclared_topic_is_refused_unless_all_are_allowed() -> None:
 
 def test_name_and_port_need_a_new_run() -> None:
     both = pair()
-    with pytest.raises(ValueError, match="new run"):
+    with pytest.raises(ValueError, match="restart the node"):
         both.a.apply(replace(both.a.settings, name="z"), both.now)
 
 
@@ -113,7 +113,7 @@ def test_a_fixed_window_is_never_exceeded_by_bulk(window: int) -> None:
     world.run(1.5)
     world.send("a", "any", bytes(200_000), "b")
     most = 0
-    while not world.told("a", MessageDelivered):
+    while not world.events_of("a", MessageDelivered):
         world.run(0.005)
         most = max(most, world.nodes["a"].conditions(world.now).peers[0].in_flight_packets)
     assert most == window
@@ -131,7 +131,7 @@ def test_a_rate_limit_is_kept_and_holds_no_other_topic_back() -> None:
     ended: dict[int, float] = {}
     while len(ended) < 2:
         world.run(0.02)
-        for event in world.told("a", MessageDelivered):
+        for event in world.events_of("a", MessageDelivered):
             assert isinstance(event, MessageDelivered)
             ended.setdefault(event.message_id, world.now - start)
     assert isinstance(slow, int)

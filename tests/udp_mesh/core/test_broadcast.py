@@ -1,4 +1,4 @@
-"""Messages to all: one datagram where it fits, copies where not, repair, and outboxes for those out of reach."""
+"""Broadcasts: one datagram if the message fits, copies otherwise, repair, and outboxes for offline peers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def team(*topics: Topic, rates: Rates = QUICK) -> World:
 
 
 def payloads(world: World, name: str) -> list[bytes]:
-    return [event.payload for event in world.told(name, MessageReceived) if isinstance(event, MessageReceived)]
+    return [event.payload for event in world.events_of(name, MessageReceived) if isinstance(event, MessageReceived)]
 
 
 def test_a_message_to_all_that_fits_is_one_datagram_for_everyone() -> None:
@@ -52,7 +52,9 @@ def test_a_message_to_all_that_does_not_fit_goes_to_each_peer_with_an_outcome_ea
     world.send("a", "any", bytes(5000))
     world.run(1.0)
     assert [payloads(world, name) for name in "bcd"] == [[bytes(5000)]] * 3
-    assert sorted(event.peer for event in world.told("a", MessageDelivered) if isinstance(event, MessageDelivered)) == [
+    assert sorted(
+        event.peer for event in world.events_of("a", MessageDelivered) if isinstance(event, MessageDelivered)
+    ) == [
         "b",
         "c",
         "d",
@@ -92,11 +94,11 @@ def test_broadcasts_without_repair_ask_for_nothing() -> None:
 
 def test_a_repair_no_longer_kept_is_called_off() -> None:
     world = team(Topic("t", repair=True))
-    world.nodes["a"]._state.casts._kept.clear()
+    world.nodes["a"]._state.broadcasts._repairable.clear()
     world.pipes[("a", "b")].up = False
     world.send("a", "t", b"gone")
     world.run(0.001)
-    world.nodes["a"]._state.casts._kept.clear()
+    world.nodes["a"]._state.broadcasts._repairable.clear()
     world.pipes[("a", "b")].up = True
     world.run(5.0)
     asked = world.nodes["b"].conditions(world.now).counters.repairs_asked
@@ -132,7 +134,7 @@ def out_of_reach(world: World, up: bool) -> None:
 def test_an_outbox_keeps_for_an_absent_peer_what_its_topic_says(outbox: Outbox, expected: list[bytes]) -> None:
     world = team(Topic("t", outbox=outbox))
     out_of_reach(world, up=False)
-    assert world.run(10.0, until=lambda: bool(world.told("a", PeerOffline)))
+    assert world.run(10.0, until=lambda: bool(world.events_of("a", PeerOffline)))
     world.run(30.0)
     for number in range(3):
         world.send("a", "t", str(number).encode(), "b")
@@ -145,10 +147,10 @@ def test_an_outbox_keeps_for_an_absent_peer_what_its_topic_says(outbox: Outbox, 
 def test_an_outbox_is_bounded_and_the_oldest_goes_first() -> None:
     world = team(Topic("t", outbox=Outbox.ALL, outbox_bytes=2500))
     out_of_reach(world, up=False)
-    assert world.run(10.0, until=lambda: bool(world.told("a", PeerOffline)))
+    assert world.run(10.0, until=lambda: bool(world.events_of("a", PeerOffline)))
     for number in range(4):
         world.send("a", "t", bytes([number]) * 1000, "b")
-    gone = [event for event in world.told("a", MessageExpired) if isinstance(event, MessageExpired)]
+    gone = [event for event in world.events_of("a", MessageExpired) if isinstance(event, MessageExpired)]
     assert [(event.message_id, event.reason) for event in gone] == [
         (1, ExpiryReason.OUTBOX_FULL),
         (2, ExpiryReason.OUTBOX_FULL),
@@ -188,7 +190,7 @@ def test_an_outbox_on_disk_survives_a_restart_until_its_messages_are_delivered()
     world.add(settings("a", topic), store=disk)
     world.run(1.0)
     world.add(settings("b", topic))
-    assert world.run(10.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(10.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
     assert payloads(world, "b") == [b"for later"]
     assert disk.kept == {}
 
@@ -241,8 +243,8 @@ def test_a_robot_ferries_data_between_two_that_never_meet() -> None:
     data = dice.randbytes(40_000)
     world.send("scout", "log", data, "base")
     world.run(60.0)
-    assert not world.told("scout", PeerOnline)
+    assert not world.events_of("scout", PeerOnline)
     for pipe in world.pipes.values():
         pipe.up = True
-    assert world.run(20.0, until=lambda: bool(world.told("scout", MessageDelivered)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("scout", MessageDelivered)))
     assert payloads(world, "base") == [data]

@@ -1,4 +1,4 @@
-"""Large messages are compressed and inflated step by step: nothing waits for them but what comes behind them."""
+"""Large messages are compressed and inflated in steps: only later messages of the same topic wait for them."""
 
 import random
 import zlib
@@ -10,8 +10,8 @@ from tests.udp_mesh.core.pair import World, settings
 from udp_mesh.core.compression import (
     INFLATE_STEP_BYTES,
     STEP_BYTES,
-    Packing,
-    Unpacking,
+    Compression,
+    Decompression,
     compress,
     decompress,
 )
@@ -52,41 +52,41 @@ def test_what_is_cut_short_or_carries_a_tail_is_refused(payload: bytes, cut: int
 
 
 def test_a_step_is_short_however_large_the_message() -> None:
-    packing = Packing(MAP)
+    compression_queue = Compression(MAP)
     steps = 1
-    while not packing.step():
+    while not compression_queue.step():
         steps += 1
     assert steps == len(MAP) // STEP_BYTES
-    assert packing.body is not None
-    unpacking = Unpacking(packing.body, len(MAP))
+    assert compression_queue.body is not None
+    inflating = Decompression(compression_queue.body, len(MAP))
     steps = 1
-    while not unpacking.step():
+    while not inflating.step():
         steps += 1
     assert steps >= len(MAP) // INFLATE_STEP_BYTES
-    assert unpacking.payload == MAP
+    assert inflating.payload == MAP
 
 
 def test_a_bomb_grows_no_further_than_a_step_beyond_the_limit() -> None:
-    unpacking = Unpacking(zlib.compress(bytes(100 * INFLATE_STEP_BYTES)), INFLATE_STEP_BYTES)
-    while not unpacking.step():
+    inflating = Decompression(zlib.compress(bytes(100 * INFLATE_STEP_BYTES)), INFLATE_STEP_BYTES)
+    while not inflating.step():
         pass
-    assert unpacking.payload is None
-    assert unpacking.held_bytes < 3 * INFLATE_STEP_BYTES
+    assert inflating.payload is None
+    assert inflating.held_bytes < 3 * INFLATE_STEP_BYTES
 
 
 def test_an_urgent_message_leaves_while_a_map_is_still_being_compressed() -> None:
     made = world()
     made.nodes["a"].send("map", MAP, destination="b", now=made.now)
-    assert made.nodes["a"]._state.packing.bytes == len(MAP)
+    assert made.nodes["a"]._state.compression_queue.bytes == len(MAP)
     assert made.nodes["a"].conditions(made.now).queued_bytes == len(MAP)
     made.nodes["a"].handle_timer(made.now)
     made.send("a", "stop", b"now", "b")
-    assert made.nodes["a"]._state.packing.bytes == len(MAP)
-    assert made.run(60.0, until=lambda: len(made.told("b", MessageReceived)) == 2)
-    topics = [event.topic for event in made.told("b", MessageReceived) if isinstance(event, MessageReceived)]
+    assert made.nodes["a"]._state.compression_queue.bytes == len(MAP)
+    assert made.run(60.0, until=lambda: len(made.events_of("b", MessageReceived)) == 2)
+    topics = [event.topic for event in made.events_of("b", MessageReceived) if isinstance(event, MessageReceived)]
     assert topics == ["stop", "map"]
-    assert [event for event in made.told("b", MessageReceived) if getattr(event, "payload", b"") == MAP]
-    assert made.run(5.0, until=lambda: len(made.told("a", MessageDelivered)) == 2)
+    assert [event for event in made.events_of("b", MessageReceived) if getattr(event, "payload", b"") == MAP]
+    assert made.run(5.0, until=lambda: len(made.events_of("a", MessageDelivered)) == 2)
 
 
 def test_messages_of_one_topic_keep_their_order_behind_one_that_is_being_compressed() -> None:
@@ -94,12 +94,12 @@ def test_messages_of_one_topic_keep_their_order_behind_one_that_is_being_compres
     for payload in (MAP, b"second", bytes(3 * STEP_BYTES), b"fourth"):
         made.nodes["a"].send("map", payload, destination="b", now=made.now)
     made.nodes["a"].send("tiles", b"more urgent", destination="b", now=made.now)
-    outbound = made.nodes["a"]._state.roster.peers["b"].outbound
-    while made.nodes["a"]._state.packing:
+    sender = made.nodes["a"]._state.peer_table.peers["b"].sender
+    while made.nodes["a"]._state.compression_queue:
         made.nodes["a"].handle_timer(made.now)
-    assert [len(message.accepted.payload) for message in outbound.open] == [11, len(MAP), 6, 3 * STEP_BYTES, 6]
-    assert made.run(60.0, until=lambda: len(made.told("a", MessageDelivered)) == 5)
-    assert len(made.told("b", MessageReceived)) == 5
+    assert [len(message.accepted.payload) for message in sender.pending] == [11, len(MAP), 6, 3 * STEP_BYTES, 6]
+    assert made.run(60.0, until=lambda: len(made.events_of("a", MessageDelivered)) == 5)
+    assert len(made.events_of("b", MessageReceived)) == 5
 
 
 def test_what_waits_to_be_compressed_is_bounded() -> None:
@@ -114,5 +114,5 @@ def test_a_node_that_closes_ends_what_it_has_not_compressed() -> None:
         made.nodes["a"].send("map", MAP, destination="b", now=made.now)
     made.nodes["a"].handle_timer(made.now)
     made.nodes["a"].close(made.now)
-    ended = [event for event in made.told("a", MessageExpired) if isinstance(event, MessageExpired)]
+    ended = [event for event in made.events_of("a", MessageExpired) if isinstance(event, MessageExpired)]
     assert [event.reason for event in ended] == [ExpiryReason.CLOSED] * 2

@@ -1,8 +1,8 @@
 """Any bytes at every decoder of the network: frames within their caps, or a counted drop, never an exception.
 
-`make test` runs 4,000 inputs per surface. The proof runs as many as `UDP_MESH_FUZZ_INPUTS` says, over all surfaces:
-10^8 by default, some hours of a core. `RAN` is what was really run. Inputs are random bytes, mutations of real
-datagrams, and sealed frames of a key holder; a third of them comes from an IPv6 address.
+`make test` runs 4,000 inputs per surface. The proof runs `UDP_MESH_FUZZ_INPUTS` inputs over all surfaces: 10^8 by
+default, some hours of one core. `RAN` is what was really run. Inputs are random bytes, mutations of real datagrams, and
+sealed frames of a key holder; a third of them comes from an IPv6 address.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ FOUR, SIX = ("10.0.0.66", 8700), ("fe80::66", 8700)
 OLD = ("10.0.0.9", 8700)
 A = ("10.0.0.1", 8700)
 FRESH_PAIR_EVERY = 20_000
-"""Inputs after which both nodes are replaced: what grew is seen then, and state that stuck does not hide the rest."""
+"""Inputs after which both nodes are replaced: growth shows by then, and stuck state does not hide other failures."""
 
 
 class Fuzzer:
-    """One pair of nodes, a dual-stack link each, and dice."""
+    """One pair of nodes, a dual-stack link each, and a random source."""
 
     def __init__(self, seed: int) -> None:
         self.dice = random.Random(seed)
@@ -55,7 +55,7 @@ class Fuzzer:
         for node, other in ((both.a, "b"), (both.b, "a")):
             node.send("any", b"hello", destination=other, now=both.now)
         both.roundtrip(times=30)
-        self.insider = both.a._state.roster.peers["b"].session
+        self.insider = both.a._state.peer_table.peers["b"].session
         self.stranger = SendChannel(both.a._state.keys[0], self.dice.randbytes(16), TO_ALL)
         return both
 
@@ -99,8 +99,8 @@ class Fuzzer:
                     pass
         if self.inputs % FRESH_PAIR_EVERY == 0:
             state = self.both.b._state
-            assert state.roster.memory.bytes <= 2_000_000
-            assert len(state.roster.peers) <= 64 + 1
+            assert state.peer_table.memory.bytes <= 2_000_000
+            assert len(state.peer_table.peers) <= 64 + 1
             self.both = self.new_pair()
 
 
@@ -119,33 +119,33 @@ def decoder(fuzzer: Fuzzer) -> None:
 def sealed_data(fuzzer: Fuzzer) -> None:
     """To one boot, short and long headers."""
     assert fuzzer.insider is not None
-    way = fuzzer.insider.way
-    seal = way.channel.seal if fuzzer.dice.random() < 0.7 else way.channel.seal_long
+    path = fuzzer.insider.path
+    seal = path.channel.seal if fuzzer.dice.random() < 0.7 else path.channel.seal_long
     number, data = seal(fuzzer.frames())
-    fuzzer.both.a._state.roster.peers["b"].outbound.flight.add(number, None)
+    fuzzer.both.a._state.peer_table.peers["b"].sender.in_flight.add(number, None)
     fuzzer.receive(data)
 
 
 def sealed_to_all(fuzzer: Fuzzer) -> None:
-    channel = fuzzer.both.a._state.to_all if fuzzer.dice.random() < 0.7 else fuzzer.stranger
+    channel = fuzzer.both.a._state.broadcast_channel if fuzzer.dice.random() < 0.7 else fuzzer.stranger
     seal = channel.seal if fuzzer.dice.random() < 0.5 else channel.seal_long
     fuzzer.receive(seal(fuzzer.frames())[1])
 
 
 def mutated_datagrams(fuzzer: Fuzzer) -> None:
-    """What was sealed, changed on its way: it opens nowhere."""
+    """Sealed datagrams modified in transit: they cannot be opened."""
     assert fuzzer.insider is not None
-    number, data = fuzzer.insider.way.channel.seal(fuzzer.dice.choice(fuzzer.seeds))
-    fuzzer.both.a._state.roster.peers["b"].outbound.flight.add(number, None)
+    number, data = fuzzer.insider.path.channel.seal(fuzzer.dice.choice(fuzzer.seeds))
+    fuzzer.both.a._state.peer_table.peers["b"].sender.in_flight.add(number, None)
     fuzzer.receive(fuzzer.mutated(data))
 
 
-def fielded(fuzzer: Fuzzer) -> None:
+def legacy(fuzzer: Fuzzer) -> None:
     data = fuzzer.mutated(fuzzer.dice.choice(fuzzer.old))
     fuzzer.node().receive(data, "mesh", OLD, fuzzer.both.now)
 
 
-SURFACES = (random_bytes, decoder, sealed_data, sealed_to_all, mutated_datagrams, fielded)
+SURFACES = (random_bytes, decoder, sealed_data, sealed_to_all, mutated_datagrams, legacy)
 
 
 @pytest.mark.parametrize("surface", SURFACES)
@@ -158,7 +158,7 @@ def test_any_bytes_are_taken_or_counted(surface: Callable[[Fuzzer], None]) -> No
 def test_after_any_bytes_the_pair_still_talks() -> None:
     fuzzer = Fuzzer(seed=77)
     for _ in range(3000):
-        fuzzer.step(fuzzer.dice.choice((random_bytes, mutated_datagrams, fielded)))
+        fuzzer.step(fuzzer.dice.choice((random_bytes, mutated_datagrams, legacy)))
     both = fuzzer.both
     both.roundtrip(times=30)
     both.events(both.b)

@@ -1,4 +1,5 @@
-"""Hostile bytes: random, mutated, replayed, forged by a key holder; nothing crashes, grows, or delays the urgent."""
+"""Hostile bytes: random, mutated, replayed, forged by a key holder. Nothing crashes, grows, or delays urgent
+messages."""
 
 from __future__ import annotations
 
@@ -11,9 +12,9 @@ from hypothesis import strategies as st
 
 from tests.udp_mesh.core.pair import KEY, Pair, World, pair, settings
 from udp_mesh.core.events import MessageDelivered, MessageReceived
-from udp_mesh.core.peers.heartbeat import MOST_TO_ANSWER
-from udp_mesh.core.peers.peer_table import RETIRED_REMEMBERED
-from udp_mesh.core.peers.session import OWED_FRAMES
+from udp_mesh.core.peers.heartbeat import MAX_PENDING_REPLIES
+from udp_mesh.core.peers.peer_table import MAX_RETIRED
+from udp_mesh.core.peers.session import MAX_PENDING_CONTROL
 from udp_mesh.core.settings import Limits, Neighbour, Topic
 from udp_mesh.crypto import TO_ALL, SendChannel
 from udp_mesh.wire.codec import encode
@@ -80,7 +81,7 @@ def test_a_flood_of_invented_senders_holds_bounded_state() -> None:
         beat = Heartbeat(f"ghost{number}", 1, 1, 0, 1000, 0, 0, 0, 0)
         _, data = channel.seal_long(encode([beat]))
         both.b.receive(data, "mesh", FORGER, both.now)
-    assert len(both.b._state.roster.sessions) <= 1 + 8
+    assert len(both.b._state.peer_table.sessions) <= 1 + 8
     assert [peer.name for peer in both.b.conditions(both.now).peers] == ["a"]
     assert still_works(both)
 
@@ -88,7 +89,7 @@ def test_a_flood_of_invented_senders_holds_bounded_state() -> None:
 @pytest.mark.parametrize("name", ["b", "ghost", "ghost{}"])
 @pytest.mark.parametrize("versions", [(1, 1), (2, 3)])
 def test_a_flood_of_boots_that_a_key_holder_invents_holds_bounded_state(name: str, versions: tuple[int, int]) -> None:
-    """They know whom they talk to, so each is proven at once: under one name, under the victim's own, under many."""
+    """They hear our boot, so each is verified at once: under one name, under the victim's own, under many."""
     both = pair(limits=Limits(strangers=8, peers=16))
     state = both.b._state
     rng = random.Random(1)
@@ -97,21 +98,21 @@ def test_a_flood_of_boots_that_a_key_holder_invents_holds_bounded_state(name: st
         beat = Heartbeat(name.format(number), *versions, 0, 1000, 0, 0, 0, 0, (state.boot_id[:HEARD_TAG_BYTES],))
         _, data = SendChannel(KEY, boot_id, TO_ALL).seal_long(encode([beat]))
         both.b.receive(data, "mesh", FORGER, both.now)
-    assert len(state.roster.sessions) <= 1 + 8 + 16 + RETIRED_REMEMBERED
-    assert len(state.repairs) <= 1 + 8 + 16 + RETIRED_REMEMBERED
+    assert len(state.peer_table.sessions) <= 1 + 8 + 16 + MAX_RETIRED
+    assert len(state.repairs) <= 1 + 8 + 16 + MAX_RETIRED
     assert len(state.incompatible_reported) <= 8
-    assert len(state.discovery._to_answer) <= MOST_TO_ANSWER
+    assert len(state.heartbeats._pending_replies) <= MAX_PENDING_REPLIES
     both.events(both.b)
     both.now += 60.0
     assert still_works(both)
 
 
 def insider(both: Pair, frames: list[Frame]) -> None:
-    """A datagram from a's session with frames of the test's choice: a key holder gone bad."""
-    peer = both.a._state.roster.peers["b"]
+    """A datagram from a's session with arbitrary frames: a malicious key holder."""
+    peer = both.a._state.peer_table.peers["b"]
     assert peer.session is not None
-    number, data = peer.session.way.seal(encode(frames))
-    peer.outbound.flight.add(number, None)
+    number, data = peer.session.path.seal(encode(frames))
+    peer.sender.in_flight.add(number, None)
     both.b.receive(data, "mesh", A, both.now)
 
 
@@ -129,9 +130,9 @@ def test_an_insider_who_announces_topics_without_end_meets_the_cap() -> None:
     both = pair(limits=Limits(topics_per_peer=10))
     for number in range(200):
         insider(both, [TopicAnnounce(number, f"t{number}")])
-    session = both.b._state.roster.peers["a"].session
+    session = both.b._state.peer_table.peers["a"].session
     assert session is not None
-    assert len(session.inbound.topics) <= 10
+    assert len(session.receiver.topics) <= 10
 
 
 frames = st.lists(
@@ -170,9 +171,9 @@ def test_whatever_an_insider_says_nothing_crashes_and_little_is_owed(datagrams: 
             for ack in datagram
         ]
         insider(both, mended)
-    session = both.b._state.roster.peers["a"].session
+    session = both.b._state.peer_table.peers["a"].session
     assert session is not None
-    assert len(session.owed) <= OWED_FRAMES
+    assert len(session.pending_control) <= MAX_PENDING_CONTROL
     both.roundtrip(times=10)
 
 
@@ -183,10 +184,10 @@ def test_a_message_larger_than_the_limit_is_refused_and_its_sender_told() -> Non
     world.run(1.5)
     world.send("a", "any", bytes(20_000), "b")
     world.run(3.0)
-    told = [str(getattr(event, "reason", "")) for _, event in world.events["a"]]
-    assert "ExpiryReason.REFUSED" in told
+    events = [str(getattr(event, "reason", "")) for _, event in world.events["a"]]
+    assert "ExpiryReason.REFUSED" in events
     world.send("a", "any", bytes(9_000), "b")
-    assert world.run(3.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(3.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
 
 
 @pytest.mark.parametrize("flood_per_s", [2000])
@@ -206,8 +207,8 @@ def test_a_flood_of_garbage_delays_no_urgent_message(flood_per_s: int) -> None:
     for _ in range(20):
         sent = world.now
         world.send("a", "stop", b"!", "b")
-        before = len(world.told("b", MessageReceived))
-        assert world.run(1.0, until=lambda before=before: len(world.told("b", MessageReceived)) > before)  # type: ignore[misc]
+        before = len(world.events_of("b", MessageReceived))
+        assert world.run(1.0, until=lambda before=before: len(world.events_of("b", MessageReceived)) > before)  # type: ignore[misc]
         latencies.append(world.now - sent)
     assert max(latencies) < 0.012
 
@@ -219,9 +220,9 @@ def test_waiting_levels_claimed_without_end_hold_nobody_back_for_good() -> None:
     world.run(1.5)
 
     def claim() -> None:
-        world.nodes["a"]._state.yielding.heard((Waiting(0, 60_000),), world.now)
+        world.nodes["a"]._state.priority_backoff.on_waiting((Waiting(0, 60_000),), world.now)
         world.at(world.now + 0.01, claim)
 
     claim()
     world.send("a", "bulk", bytes(500_000), "b")
-    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))

@@ -1,4 +1,4 @@
-"""Peers of the fielded format, and each of its known defects held as a law of ours."""
+"""Peers of the legacy format, and a test for each known defect of the legacy system."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ OLD = ("10.0.0.9", 8700)
 
 
 class OldRobot:
-    """A node of ours with one fielded neighbour `old`, played by hand."""
+    """Our node with one legacy neighbor `old`, which the test plays."""
 
     def __init__(self, **changes: object) -> None:
         self.now = 1000.0
@@ -55,7 +55,7 @@ class OldRobot:
         self.node.receive(encode_legacy(datagram), "mesh", OLD, self.now)
 
     def hear(self) -> list[Host | LegacyPayload | LegacyAck]:
-        """What leaves to the old robot now."""
+        """What is sent to the old robot now."""
         self.node.handle_timer(self.now)
         out: list[Datagram] = []
         while datagrams := self.node.datagrams_to_send(self.now):
@@ -66,10 +66,10 @@ class OldRobot:
         return [datagram for datagram in self.hear() if isinstance(datagram, LegacyPayload)]
 
     def events(self) -> list[Event]:
-        told = []
+        events = []
         while (event := self.node.next_event()) is not None:
-            told.append(event)
-        return told
+            events.append(event)
+        return events
 
     def received(self) -> list[MessageReceived]:
         return [event for event in self.events() if isinstance(event, MessageReceived)]
@@ -79,7 +79,7 @@ def message(data: bytes, topic: str = "chat", priority: int = 4) -> list[bytes]:
     return fragment_legacy(encode_mesh_data(PriorityMeshData("old", "std_msgs/String", priority, topic, data)))
 
 
-def pieces(sequence: int, data: bytes, *, wants_ack: bool = True) -> list[LegacyPayload]:
+def fragments(sequence: int, data: bytes, *, wants_ack: bool = True) -> list[LegacyPayload]:
     chunks = message(data)
     return [LegacyPayload(sequence, place, len(chunks), chunk, wants_ack) for place, chunk in enumerate(chunks)]
 
@@ -88,23 +88,23 @@ def test_messages_go_to_a_fielded_peer_in_its_own_format_with_their_priority() -
     old = OldRobot()
     sent_type = "std_msgs/Empty d41d8cd98f00b204e9800998ecf8427e"
     old.node.send("stop", b"halt", destination="old", now=old.now, type_name=sent_type)
-    (piece,) = old.hear_payloads()
-    told = decode_mesh_data(piece.data)
-    assert (told.host, told.topic, told.type_name, told.priority, told.data) == (
+    (fragment,) = old.hear_payloads()
+    events = decode_mesh_data(fragment.data)
+    assert (events.host, events.topic, events.type_name, events.priority, events.data) == (
         "new",
         "stop",
         "std_msgs/Empty",
         0,
         b"halt",
     )
-    old.say(LegacyAck(piece.sequence, piece.position))
+    old.say(LegacyAck(fragment.sequence, fragment.position))
     assert [type(event) for event in old.events()] == [MessageDelivered]
 
 
 def test_messages_of_a_fielded_peer_arrive_and_are_acknowledged() -> None:
     old = OldRobot()
-    for piece in reversed(pieces(5, b"x" * 4000)):
-        old.say(piece)
+    for fragment in reversed(fragments(5, b"x" * 4000)):
+        old.say(fragment)
     acks = [answer for answer in old.hear() if isinstance(answer, LegacyAck)]
     assert {(ack.sequence, ack.position) for ack in acks} == {(5, 0), (5, 1), (5, 2), (5, 3)}
     (event,) = old.received()
@@ -133,7 +133,7 @@ def test_a_neighbour_no_longer_named_is_forgotten_unless_it_was_heard_or_somethi
 
 def test_a_broadcast_of_a_fielded_peer_arrives_without_an_acknowledgement() -> None:
     old = OldRobot()
-    old.say(pieces(0x8001, b"all", wants_ack=False)[0])
+    old.say(fragments(0x8001, b"all", wants_ack=False)[0])
     assert not [answer for answer in old.hear() if isinstance(answer, LegacyAck)]
     assert [event.broadcast for event in old.received()] == [True]
 
@@ -151,10 +151,10 @@ def test_three_fragments_are_in_flight_to_a_fielded_peer_and_urgent_ones_go_firs
 def test_a_message_to_all_reaches_fielded_peers_too() -> None:
     old = OldRobot()
     old.node.send("stop", b"all", now=old.now)
-    assert [decode_mesh_data(piece.data).data for piece in old.hear_payloads()] == [b"all"]
+    assert [decode_mesh_data(fragment.data).data for fragment in old.hear_payloads()] == [b"all"]
 
 
-# The defects, in the order of the list of the fielded system's facts.
+# The defects, in the order listed in the facts about the legacy system.
 
 
 def test_defect_1_a_lost_fragment_is_sent_again_and_stalls_nothing() -> None:
@@ -163,12 +163,12 @@ def test_defect_1_a_lost_fragment_is_sent_again_and_stalls_nothing() -> None:
     seen: set[int] = set()
     dropped = False
     for _ in range(200):
-        for piece in old.hear_payloads():
-            if piece.position == 1 and not dropped:
+        for fragment in old.hear_payloads():
+            if fragment.position == 1 and not dropped:
                 dropped = True
                 continue
-            seen.add(piece.position)
-            old.say(LegacyAck(piece.sequence, piece.position))
+            seen.add(fragment.position)
+            old.say(LegacyAck(fragment.sequence, fragment.position))
         old.now += 0.01
         if any(isinstance(event, MessageDelivered) for event in old.events()):
             break
@@ -188,7 +188,7 @@ def test_defect_3_a_fragment_past_its_total_is_counted_and_dropped() -> None:
     raw[3:7] = (7).to_bytes(4, "little")
     old.node.receive(bytes(raw), "mesh", OLD, old.now)
     assert old.node.conditions(old.now).counters.dropped_malformed == 1
-    old.say(pieces(2, b"fine")[0])
+    old.say(fragments(2, b"fine")[0])
     assert [event.payload for event in old.received()] == [b"fine"]
 
 
@@ -198,15 +198,15 @@ def test_defect_4_an_unknown_type_is_counted_and_dropped(kind: int) -> None:
     raw = bytearray(encode_legacy(Host("old", "10.0.0.9")))
     raw[0] = kind
     old.node.receive(bytes(raw), "mesh", OLD, old.now)
-    old.say(pieces(2, b"fine")[0])
+    old.say(fragments(2, b"fine")[0])
     assert [event.payload for event in old.received()] == [b"fine"]
 
 
 def test_defect_4_nothing_that_is_sent_to_all_ends_a_fielded_program() -> None:
     world = World(seed=9)
-    fielded = Neighbour(("10.0.0.50", 8700), name="old", legacy=True)
+    legacy = Neighbour(("10.0.0.50", 8700), name="old", legacy=True)
     topic = Topic("cast", repair=True)
-    world.add(settings("a", topic, neighbours=(fielded,)))
+    world.add(settings("a", topic, neighbours=(legacy,)))
     world.add(settings("b", topic))
     to_all: list[Datagram] = []
 
@@ -215,7 +215,7 @@ def test_defect_4_nothing_that_is_sent_to_all_ends_a_fielded_program() -> None:
             to_all.append(datagram)
 
     world.tap = tap
-    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    assert world.run(5.0, until=lambda: bool(world.events_of("a", PeerOnline) and world.events_of("b", PeerOnline)))
     for size in (0, 100, 1300, 1380, 1400, 3000):
         world.send("a", "cast", bytes(size))
         world.run(0.5)
@@ -225,7 +225,9 @@ def test_defect_4_nothing_that_is_sent_to_all_ends_a_fielded_program() -> None:
     for datagram in to_all:
         assert decode_legacy(datagram.data) == LegacyAck(0xFFFF, 0xFFFFFFFF)
         assert len(datagram.data) <= 1500 - 28
-    assert [len(event.payload) for event in world.told("b", MessageReceived) if isinstance(event, MessageReceived)] == [
+    assert [
+        len(event.payload) for event in world.events_of("b", MessageReceived) if isinstance(event, MessageReceived)
+    ] == [
         0,
         100,
         1300,
@@ -233,17 +235,17 @@ def test_defect_4_nothing_that_is_sent_to_all_ends_a_fielded_program() -> None:
         1400,
         3000,
     ]
-    assert world.told("b", PeerOffline)
+    assert world.events_of("b", PeerOffline)
 
 
 def test_defect_5_a_name_is_not_believed_as_announced() -> None:
     old = OldRobot()
     old.say(Host("base", "10.0.0.9"))
-    old.say(pieces(2, b"who")[0])
+    old.say(fragments(2, b"who")[0])
     assert [event.source for event in old.received()] == ["old"]
     stranger = ("10.0.0.66", 8700)
     old.node.receive(encode_legacy(Host("old", "10.0.0.66")), "mesh", stranger, old.now)
-    old.node.receive(encode_legacy(pieces(3, b"forged")[0]), "mesh", stranger, old.now)
+    old.node.receive(encode_legacy(fragments(3, b"forged")[0]), "mesh", stranger, old.now)
     assert old.received() == []
     assert old.node.conditions(old.now).counters.dropped_unauthenticated == 2
 
@@ -264,10 +266,10 @@ def test_defect_5_among_our_own_nodes_a_taken_name_is_reported() -> None:
     for other in ("a", "b"):
         world.pipes[("b2", other)] = world.pipes[("a", "b")]
         world.pipes[(other, "b2")] = world.pipes[("a", "b")]
-    assert world.run(20.0, until=lambda: bool(world.told("a", NameConflict)))
-    assert [event.name for event in world.told("a", NameConflict) if isinstance(event, NameConflict)] == ["b"]
-    assert world.run(5.0, until=lambda: bool(world.told("b", NameConflict)))
-    assert any(event.own for event in world.told("b", NameConflict) if isinstance(event, NameConflict))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", NameConflict)))
+    assert [event.name for event in world.events_of("a", NameConflict) if isinstance(event, NameConflict)] == ["b"]
+    assert world.run(5.0, until=lambda: bool(world.events_of("b", NameConflict)))
+    assert any(event.own for event in world.events_of("b", NameConflict) if isinstance(event, NameConflict))
 
 
 @pytest.mark.parametrize("broadcast", ["10.0.15.255", "10.0.0.15", "192.168.255.255"])
@@ -280,19 +282,19 @@ def test_defect_6_the_broadcast_address_is_the_one_given_never_guessed(broadcast
 
 def test_defect_7_each_partial_message_is_purged_by_its_own_age() -> None:
     reassembly = LegacyReassembly(Limits())
-    reassembly.add(pieces(1, bytes(2000))[0], 0.0)
-    reassembly.add(pieces(2, bytes(2000))[0], 9.0)
+    reassembly.add(fragments(1, bytes(2000))[0], 0.0)
+    reassembly.add(fragments(2, bytes(2000))[0], 9.0)
     reassembly.purge(11.0)
     assert len(reassembly) == 1
-    _, whole = reassembly.add(pieces(2, bytes(2000))[1], 11.0)
+    _, whole = reassembly.add(fragments(2, bytes(2000))[1], 11.0)
     assert whole is not None
 
 
 def test_defect_8_a_number_that_comes_around_does_not_meet_an_old_partial_message() -> None:
     reassembly = LegacyReassembly(Limits())
-    reassembly.add(pieces(7, b"a" * 2000)[0], 0.0)
-    fresh = pieces(7, b"b" * 3000)
-    wholes = [reassembly.add(piece, 1.0)[1] for piece in fresh]
+    reassembly.add(fragments(7, b"a" * 2000)[0], 0.0)
+    fresh = fragments(7, b"b" * 3000)
+    wholes = [reassembly.add(fragment, 1.0)[1] for fragment in fresh]
     assert wholes[-1] is not None
     assert wholes[-1].data == b"b" * 3000
 
@@ -315,9 +317,9 @@ def test_defect_9_priority_order_survives_the_wrap_of_the_sequence_numbers() -> 
         old.node.send("map", bytes([number]), destination="old", now=old.now)
     order = []
     for _ in range(6):
-        for piece in old.hear_payloads():
-            order.append(decode_mesh_data(piece.data).data[0])
-            old.say(LegacyAck(piece.sequence, piece.position))
+        for fragment in old.hear_payloads():
+            order.append(decode_mesh_data(fragment.data).data[0])
+            old.say(LegacyAck(fragment.sequence, fragment.position))
     assert order == sorted(order)
 
 
@@ -333,7 +335,7 @@ def test_defect_10_a_send_to_a_host_never_heard_of_is_refused_and_the_node_goes_
 @pytest.mark.parametrize("fragments", [1, 2, 3])
 def test_defect_11_an_exact_multiple_of_the_fragment_size_sends_no_empty_fragment(fragments: int) -> None:
     both = pair(Topic("t"), fragment_bytes=100)
-    # The first fragment gives up room for its head and the announcement of the topic.
+    # The first fragment reserves room for its head and the topic announcement.
     both.a.send("t", b"learn the name", destination="b", now=both.now)
     both.roundtrip(times=5)
     both.events(both.b)
@@ -349,13 +351,13 @@ def test_defect_11_the_fielded_receiver_still_gets_the_empty_fragment_it_counts_
     overhead = len(encode_mesh_data(PriorityMeshData("new", "", 9, "map", b"")))
     old = OldRobot()
     old.node.send("map", bytes(1300 - overhead), destination="old", now=old.now)
-    assert [len(piece.data) for piece in old.hear_payloads()] == [1300, 0]
+    assert [len(fragment.data) for fragment in old.hear_payloads()] == [1300, 0]
 
 
 def test_a_repeated_fragment_of_a_finished_message_is_acknowledged_and_opens_no_new_one() -> None:
     old = OldRobot()
-    for piece in pieces(5, b"x" * 2000) * 2:
-        old.say(piece)
+    for fragment in fragments(5, b"x" * 2000) * 2:
+        old.say(fragment)
     assert len(old.received()) == 1
     assert len([answer for answer in old.hear() if isinstance(answer, LegacyAck)]) == 4
 
@@ -371,8 +373,8 @@ def test_a_silent_fielded_peer_is_probed_gently_and_loses_nothing() -> None:
     old.say(Host("old", "10.0.0.9"))
     delivered = False
     for _ in range(400):
-        for piece in old.hear_payloads():
-            old.say(LegacyAck(piece.sequence, piece.position))
+        for fragment in old.hear_payloads():
+            old.say(LegacyAck(fragment.sequence, fragment.position))
         delivered = delivered or any(isinstance(event, MessageDelivered) for event in old.events())
         old.now += 0.01
     assert delivered
@@ -385,7 +387,7 @@ def test_without_fielded_neighbours_their_format_is_dropped() -> None:
 
 
 def test_settings_of_a_fielded_neighbour_need_its_name() -> None:
-    with pytest.raises(ValueError, match="needs a name"):
+    with pytest.raises(ValueError, match="requires a name"):
         Neighbour(OLD, legacy=True)
     assert isinstance(settings("x"), Settings)
     assert PeerOnline is not None
@@ -394,26 +396,28 @@ def test_settings_of_a_fielded_neighbour_need_its_name() -> None:
 def test_a_fielded_program_that_starts_anew_is_understood_although_its_numbers_start_anew() -> None:
     old = OldRobot()
     for sequence in (1, 2):
-        for piece in pieces(sequence, b"x" * 2000):
-            old.say(piece)
+        for fragment in fragments(sequence, b"x" * 2000):
+            old.say(fragment)
     assert len(old.received()) == 2
-    # the second message of the next run is cut off in the middle by yet another start
+    # The second message of the next run is cut off in the middle by another restart.
     old.now += 5.0
-    for piece in [*pieces(1, b"y" * 2000), *pieces(2, b"y" * 2000)[:1]]:
-        old.say(piece)
+    for fragment in [*fragments(1, b"y" * 2000), *fragments(2, b"y" * 2000)[:1]]:
+        old.say(fragment)
     old.now += 5.0
     for sequence in (1, 2):
-        for piece in pieces(sequence, b"z" * 2000):
-            old.say(piece)
+        for fragment in fragments(sequence, b"z" * 2000):
+            old.say(fragment)
     assert [event.payload[:1] for event in old.received()] == [b"y", b"z", b"z"]
 
 
 def test_a_message_above_the_limit_stalls_no_fielded_sender() -> None:
     old = OldRobot(limits=Limits(message_bytes=5000))
-    for piece in [*pieces(1, bytes(20_000)), *pieces(2, b"small")]:
-        old.say(piece)
+    for fragment in [*fragments(1, bytes(20_000)), *fragments(2, b"small")]:
+        old.say(fragment)
     assert [event.payload for event in old.received()] == [b"small"]
-    assert len([answer for answer in old.hear() if isinstance(answer, LegacyAck)]) == len(pieces(1, bytes(20_000))) + 1
+    assert (
+        len([answer for answer in old.hear() if isinstance(answer, LegacyAck)]) == len(fragments(1, bytes(20_000))) + 1
+    )
 
 
 def test_a_run_of_ours_starts_at_a_number_of_its_own() -> None:

@@ -1,7 +1,7 @@
-"""Goals on a modelled link in virtual time: goodput, latency of urgent messages, recovery, changes of the link.
+"""Goals on a modeled link in virtual time: goodput, latency of urgent messages, recovery, changes of the link.
 
-10 Mbit/s, 20 ms round trip, a queue of 100, loss both ways (acknowledgements too) where not said otherwise. Seeded, so
-the figures are the same on every machine.
+10 Mbit/s, 20 ms round trip, a queue of 100 packets, loss both ways (including acknowledgements) unless stated
+otherwise. Seeded, so the results are the same on every machine.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ class Run:
         self.urgent = urgent
         self.arrived: list[tuple[float, float]] = []
         """(sent, arrived) of urgent messages."""
-        self.world.on_event = self._note
+        self.world.on_event = self._push
 
-    def _note(self, name: str, event: Event, now: float) -> None:
+    def _push(self, name: str, event: Event, now: float) -> None:
         if isinstance(event, MessageReceived) and event.topic == "stop":
             self.arrived.append((float(event.payload[:20]), now))
 
@@ -74,13 +74,13 @@ class Run:
         self.world.at(self.world.now + PERIOD_S, self._urgent)
 
     def measure(self, seconds: float) -> Figures:
-        """Let it run on and look."""
+        """Run on and measure."""
         world = self.world
-        outbound = world.nodes["a"]._state.roster.peers["b"].outbound
+        sender = world.nodes["a"]._state.peer_table.peers["b"].sender
         pipe = world.pipes[("a", "b")]
-        start, delivered, carried = world.now, outbound.delivered_bytes, pipe.carried_bytes
+        start, delivered, carried = world.now, sender.delivered_bytes, pipe.carried_bytes
         world.run(seconds)
-        payload = outbound.delivered_bytes - delivered
+        payload = sender.delivered_bytes - delivered
         return Figures(
             8 * payload / (world.now - start),
             [arrived - sent for sent, arrived in self.arrived if sent >= start],
@@ -107,10 +107,10 @@ def test_bulk_fills_a_lossy_link(loss: float, share: float) -> None:
 
 
 @pytest.mark.parametrize(("loss", "least_p99_s"), [(0.0, 0.020), (0.05, 0.028), (0.2, 0.050)])
-def test_an_urgent_message_overtakes_the_bulk_that_fills_the_link(loss: float, least_p99_s: float) -> None:
+def test_an_urgent_message_overtakes_the_bulk_that_fills_the_link(loss: float, min_p99_s: float) -> None:
     figures = settled(15.0, loss=loss)
     assert figures.latency(0.5) <= 0.022
-    assert figures.latency(0.99) <= least_p99_s
+    assert figures.latency(0.99) <= min_p99_s
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ def test_a_route_that_became_eighty_times_longer_is_filled_within_some_seconds()
 
 
 def test_the_queue_that_a_long_route_left_is_not_taken_for_the_short_one() -> None:
-    # A window for the long route keeps the queue of the short one full for good, and half of what is sent is lost.
+    # A window for the long route keeps the queue of the short one full permanently, and half of what is sent is lost.
     run = Run()
     run.link(rate_bits_per_s=20e6, delay_s=0.005)
     run.start()
@@ -215,7 +215,7 @@ def test_a_slower_link_is_not_flooded() -> None:
 
 
 def test_a_link_without_room_to_queue_is_filled_and_overrun_no_more_than_the_rate_model_allows() -> None:
-    # Its losses look like a radio's, which must not slow us: only the cap on compensated loss bounds what is sent.
+    # Its losses look like a radio's, which must not slow us down: only the cap on compensated loss limits what is sent.
     figures = settled(urgent=False, queue_packets=6)
     assert figures.wire_ratio <= 2.0
     assert figures.goodput_bits_per_s >= 0.9 * 10e6

@@ -1,4 +1,4 @@
-"""A fleet moves over robot by robot: who still takes a robot for a fielded one finds out by itself that it is none."""
+"""A fleet is upgraded robot by robot: nodes that take an upgraded robot for a legacy one detect the upgrade."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ MAP = bytes(range(256)) * 200
 
 
 class Move:
-    """`a` and `c` are ours and take `b` for fielded, which it is: a program that answers as the fielded one does."""
+    """`a` and `c` run our format and take `b` for a legacy robot, which it is: a program that answers like the legacy
+    one."""
 
     def __init__(self) -> None:
         self.world = world = World(seed=4)
@@ -27,7 +28,7 @@ class Move:
         world.tap = lambda name, datagram, now: self._take(name, datagram.destination, bytes(datagram.data))
         for turn in range(8):
             world.at(world.now + turn, self._announce)
-        assert world.run(3.0, until=lambda: len(world.told("a", PeerOnline)) == 2)
+        assert world.run(3.0, until=lambda: len(world.events_of("a", PeerOnline)) == 2)
 
     def _announce(self) -> None:
         for node in self.world.nodes.values() if self.answers else ():
@@ -45,28 +46,30 @@ class Move:
             )
 
     def move(self) -> None:
-        """The fielded program ends; a node of ours starts in its place."""
+        """The legacy program ends; our node starts in its place."""
         self.answers = False
         self.world.run(1.0)
         self.world.add(settings("b", Topic("map", priority=7)), address=OLD[0])
 
     def received(self, name: str) -> list[bytes]:
-        return [event.payload for event in self.world.told(name, MessageReceived) if isinstance(event, MessageReceived)]
+        return [
+            event.payload for event in self.world.events_of(name, MessageReceived) if isinstance(event, MessageReceived)
+        ]
 
 
 def test_messages_go_on_after_a_fielded_robot_has_moved_over_although_nobody_was_told() -> None:
     move = Move()
     world = move.world
     world.send("a", "map", MAP, "b")
-    assert world.run(5.0, until=lambda: len(world.told("a", MessageDelivered)) == 1)
+    assert world.run(5.0, until=lambda: len(world.events_of("a", MessageDelivered)) == 1)
     assert move.payloads
     move.answers = False
-    # These begin in the old format and find nobody there.
+    # These start in the old format and reach no receiver.
     world.send("a", "map", MAP, "b")
     world.send("a", "status", b"waits", "b")
     world.run(0.5)
     move.move()
-    assert world.run(10.0, until=lambda: len(world.told("a", MessageDelivered)) == 3)
+    assert world.run(10.0, until=lambda: len(world.events_of("a", MessageDelivered)) == 3)
     world.send("b", "map", MAP, "a")
     world.send("a", "map", MAP)
     assert world.run(10.0, until=lambda: len(move.received("a")) == 1 and len(move.received("b")) == 3)
@@ -79,7 +82,7 @@ def test_a_robot_that_has_moved_over_stays_online() -> None:
     move.move()
     move.world.run(60.0)
     for name in ("a", "c"):
-        assert move.world.told(name, PeerOffline) == []
+        assert move.world.events_of(name, PeerOffline) == []
     with_b = [peer for peer in move.world.nodes["a"].conditions(move.world.now).peers if peer.name == "b"]
     assert [(peer.online, peer.legacy) for peer in with_b] == [(True, False)]
 

@@ -1,4 +1,4 @@
-"""A link of which one direction works: nobody is called online who cannot be reached, and every message ends."""
+"""A link that works in one direction only: an unreachable peer is never online, and every message ends."""
 
 from tests.udp_mesh.core.pair import BROADCAST, World, settings
 from udp_mesh.core.events import (
@@ -18,13 +18,13 @@ def met(seed: int) -> World:
     world = World(seed=seed)
     for name in ("a", "b"):
         world.add(settings(name, *TOPICS))
-    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    assert world.run(5.0, until=lambda: bool(world.events_of("a", PeerOnline) and world.events_of("b", PeerOnline)))
     world.run(3.0)
     return world
 
 
 def peer(world: World, name: str) -> tuple[bool, bool]:
-    """(online, one way) as the node holds its only peer."""
+    """(online, one way) of a node's only peer."""
     (found,) = world.nodes[name].conditions(world.now).peers
     return found.online, found.one_way
 
@@ -35,22 +35,22 @@ def test_a_peer_that_is_heard_and_does_not_hear_us_goes_offline_and_returns() ->
     world.send("a", "map", bytes(5000), "b")
     world.send("a", "art", b"found", "b")
     assert world.run(20.0, until=lambda: peer(world, "a") == (True, True))
-    assert world.run(20.0, until=lambda: bool(world.told("a", PeerOffline)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", PeerOffline)))
     assert peer(world, "a") == (False, True)
-    assert world.told("b", PeerOffline)
+    assert world.events_of("b", PeerOffline)
     world.run(10.0)
-    assert len(world.told("a", PeerOnline)) == 1
-    # while it waits what b sends is taken: that way works
+    assert len(world.events_of("a", PeerOnline)) == 1
+    # Meanwhile b's messages are accepted: that direction works.
     world.send("b", "map", b"one way", "a")
     world.pipes[("a", "b")].up = True
-    assert world.run(10.0, until=lambda: len(world.told("a", PeerOnline)) == 2)
-    assert world.run(5.0, until=lambda: len(world.told("a", MessageDelivered)) == 2)
+    assert world.run(10.0, until=lambda: len(world.events_of("a", PeerOnline)) == 2)
+    assert world.run(5.0, until=lambda: len(world.events_of("a", MessageDelivered)) == 2)
     assert peer(world, "a") == (True, False)
-    assert len(world.told("b", MessageReceived)) == 2
+    assert len(world.events_of("b", MessageReceived)) == 2
 
 
 def carry_broadcasts_alone(world: World, source: str, target: str) -> None:
-    """As behind a firewall that lets no unicast through this way."""
+    """As behind a firewall that blocks unicast in this direction."""
     to_one = False
 
     def look(name: str, datagram: Datagram, now: float) -> None:
@@ -66,22 +66,22 @@ def test_a_peer_that_hears_our_broadcasts_alone_is_told_as_one_that_does_not_ans
     (before,) = world.nodes["a"].conditions(world.now).peers
     assert before.unanswered_for_s is None
     carry_broadcasts_alone(world, "a", "b")
-    begun = world.now
+    started = world.now
     world.send("a", "map", bytes(5000), "b")
     world.run(20.0)
     (found,) = world.nodes["a"].conditions(world.now).peers
     assert (found.online, found.one_way) == (True, False)
     assert found.unanswered_for_s is not None
-    assert world.now - begun - 2.0 < found.unanswered_for_s <= world.now - begun + 2.0
+    assert world.now - started - 2.0 < found.unanswered_for_s <= world.now - started + 2.0
 
 
 def test_what_no_outbox_keeps_for_a_peer_that_never_hears_us_again_is_told_as_lost() -> None:
     world = met(2)
     world.pipes[("a", "b")].up = False
     world.send("a", "map", bytes(5000), "b")
-    assert world.run(120.0, until=lambda: bool(world.told("a", MessagePeerLost)))
-    assert len(world.told("a", MessagePeerLost)) == 1
-    assert not world.told("a", MessageDelivered)
+    assert world.run(120.0, until=lambda: bool(world.events_of("a", MessagePeerLost)))
+    assert len(world.events_of("a", MessagePeerLost)) == 1
+    assert not world.events_of("a", MessageDelivered)
 
 
 def test_a_node_that_never_heard_us_is_no_peer_and_is_told_of_as_a_stranger() -> None:
@@ -95,14 +95,14 @@ def test_a_node_that_never_heard_us_is_no_peer_and_is_told_of_as_a_stranger() ->
     assert [(stranger.name, stranger.address) for stranger in conditions.strangers] == [("b", ("10.0.0.2", 8700))]
     assert not world.nodes["b"].conditions(world.now).strangers
     world.pipes[("a", "b")].up = True
-    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    assert world.run(5.0, until=lambda: bool(world.events_of("a", PeerOnline) and world.events_of("b", PeerOnline)))
     assert not world.nodes["a"].conditions(world.now).strangers
 
 
 def test_losses_of_half_of_all_datagrams_call_nobody_offline() -> None:
     world = met(4)
-    for way in world.pipes.values():
-        way.loss = 0.5
+    for path in world.pipes.values():
+        path.loss = 0.5
     world.run(300.0)
-    assert not world.told("a", PeerOffline)
-    assert not world.told("b", PeerOffline)
+    assert not world.events_of("a", PeerOffline)
+    assert not world.events_of("b", PeerOffline)

@@ -16,7 +16,7 @@ from udp_mesh.core.events import (
     PeerOnline,
 )
 from udp_mesh.core.interfaces import Store, StoredMessage
-from udp_mesh.core.publish import RELEASED_AT_ONCE
+from udp_mesh.core.publish import RELEASE_BATCH
 from udp_mesh.core.settings import Outbox, Topic
 
 LOG = Topic("log", priority=8, outbox=Outbox.ALL)
@@ -27,7 +27,7 @@ def met(*topics: Topic, store: Store | None = None) -> World:
     world = World(seed=1)
     world.add(settings("a", *topics), store=store)
     world.add(settings("b", *topics))
-    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    assert world.run(5.0, until=lambda: bool(world.events_of("a", PeerOnline) and world.events_of("b", PeerOnline)))
     return world
 
 
@@ -37,21 +37,21 @@ def reach(world: World, up: bool) -> None:
 
 
 def away(*topics: Topic) -> World:
-    """A world in which a holds b for offline."""
+    """A world in which b is offline for a."""
     world = met(*topics)
     reach(world, up=False)
-    assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))
+    assert world.run(30.0, until=lambda: bool(world.events_of("a", PeerOffline)))
     return world
 
 
 def send(world: World, topic: str, numbers: range) -> None:
-    """Without letting virtual time, or the pumping of all nodes, come between."""
+    """Without advancing virtual time or running other nodes in between."""
     for number in numbers:
         world.nodes["a"].send(topic, b"%d" % number, destination="b", now=world.now)
 
 
 def arrived(world: World, topic: str) -> list[int]:
-    events = [event for event in world.told("b", MessageReceived) if isinstance(event, MessageReceived)]
+    events = [event for event in world.events_of("b", MessageReceived) if isinstance(event, MessageReceived)]
     return [int(event.payload) for event in events if event.topic == topic]
 
 
@@ -95,7 +95,7 @@ def test_to_take_back_what_was_under_way_costs_the_same_per_message() -> None:
         reach(world, up=False)
         send(world, "log", range(messages))
         with Calls() as calls:
-            assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))  # noqa: B023
+            assert world.run(30.0, until=lambda: bool(world.events_of("a", PeerOffline)))  # noqa: B023
         assert held(world) == messages
         counts.append(calls.count)
     assert counts[1] < 8 * counts[0]
@@ -103,41 +103,41 @@ def test_to_take_back_what_was_under_way_costs_the_same_per_message() -> None:
 
 def test_a_full_outbox_is_emptied_in_steps_in_order_and_once() -> None:
     world = away(LOG)
-    send(world, "log", range(3 * RELEASED_AT_ONCE))
+    send(world, "log", range(3 * RELEASE_BATCH))
     reach(world, up=True)
-    assert world.run(20.0, until=lambda: held(world) < 3 * RELEASED_AT_ONCE)
-    assert held(world) == 2 * RELEASED_AT_ONCE
-    # what is published meanwhile comes behind
-    send(world, "log", range(3 * RELEASED_AT_ONCE, 3 * RELEASED_AT_ONCE + 50))
+    assert world.run(20.0, until=lambda: held(world) < 3 * RELEASE_BATCH)
+    assert held(world) == 2 * RELEASE_BATCH
+    # Messages published meanwhile come later.
+    send(world, "log", range(3 * RELEASE_BATCH, 3 * RELEASE_BATCH + 50))
     world.run(10.0)
-    assert arrived(world, "log") == list(range(3 * RELEASED_AT_ONCE + 50))
-    assert len(world.told("a", MessageDelivered)) == 3 * RELEASED_AT_ONCE + 50
+    assert arrived(world, "log") == list(range(3 * RELEASE_BATCH + 50))
+    assert len(world.events_of("a", MessageDelivered)) == 3 * RELEASE_BATCH + 50
     assert held(world) == 0
 
 
 def test_urgent_messages_do_not_wait_for_the_outbox() -> None:
     world = away(LOG, STATUS)
-    send(world, "log", range(3 * RELEASED_AT_ONCE))
+    send(world, "log", range(3 * RELEASE_BATCH))
     send(world, "status", range(2))
     reach(world, up=True)
-    assert world.run(20.0, until=lambda: held(world) < 3 * RELEASED_AT_ONCE + 2)
+    assert world.run(20.0, until=lambda: held(world) < 3 * RELEASE_BATCH + 2)
     send(world, "status", range(2, 3))
     assert world.run(20.0, until=lambda: len(arrived(world, "status")) == 3)
-    assert len(arrived(world, "log")) < RELEASED_AT_ONCE
+    assert len(arrived(world, "log")) < RELEASE_BATCH
 
 
 def test_what_a_second_absence_takes_back_stands_in_front_of_what_was_still_held() -> None:
     world = away(LOG)
-    send(world, "log", range(3 * RELEASED_AT_ONCE))
+    send(world, "log", range(3 * RELEASE_BATCH))
     reach(world, up=True)
-    assert world.run(20.0, until=lambda: held(world) < 3 * RELEASED_AT_ONCE)
+    assert world.run(20.0, until=lambda: held(world) < 3 * RELEASE_BATCH)
     reach(world, up=False)
     world.run(20.0)
-    assert held(world) + len(world.told("a", MessageDelivered)) == 3 * RELEASED_AT_ONCE
+    assert held(world) + len(world.events_of("a", MessageDelivered)) == 3 * RELEASE_BATCH
     reach(world, up=True)
     world.run(20.0)
-    assert sorted(arrived(world, "log")) == list(range(3 * RELEASED_AT_ONCE))
-    assert arrived(world, "log")[-RELEASED_AT_ONCE:] == list(range(2 * RELEASED_AT_ONCE, 3 * RELEASED_AT_ONCE))
+    assert sorted(arrived(world, "log")) == list(range(3 * RELEASE_BATCH))
+    assert arrived(world, "log")[-RELEASE_BATCH:] == list(range(2 * RELEASE_BATCH, 3 * RELEASE_BATCH))
 
 
 @pytest.mark.parametrize("deadline_s", [None, 3600.0])
@@ -150,7 +150,7 @@ def test_what_has_ended_is_not_kept_in_memory_until_its_deadline(
     for payload in payloads:
         world.send("a", "t", payload, "b")
         world.run(0.03)
-    # the list, the loop, the argument
+    # The list, the loop, the argument.
     assert sum(sys.getrefcount(payload) > 3 for payload in payloads) < 150
 
 
@@ -171,12 +171,12 @@ def test_a_message_is_on_disk_from_its_acceptance_to_its_outcome(size_bytes: int
     payload = world.rng.randbytes(size_bytes // 2) + bytes(size_bytes - size_bytes // 2)
     world.nodes["a"].send("t", payload, destination="b", now=world.now)
     assert [kept.payload for kept in disk.kept.values()] == [payload]
-    # the robot's battery is pulled while the message is under way
+    # The robot loses power while the message is being sent.
     world.run(0.005)
     world.add(settings("a", topic), store=disk)
-    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
     assert payload in [
-        event.payload for event in world.told("b", MessageReceived) if isinstance(event, MessageReceived)
+        event.payload for event in world.events_of("b", MessageReceived) if isinstance(event, MessageReceived)
     ]
     assert disk.kept == {}
 
@@ -187,7 +187,7 @@ class FullDisk(Disk):
 
 
 class FailingDisk(Disk):
-    """Takes everything, and finds out later that it cannot write."""
+    """Accepts everything and later fails to write it."""
 
     def put(self, message: StoredMessage) -> bool:
         return True
@@ -200,8 +200,8 @@ def test_a_message_the_disk_had_no_room_for_ends_with_the_node(online: bool, dis
     world = met(topic, store=disk())
     reach(world, up=False)
     if not online:
-        assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))
+        assert world.run(30.0, until=lambda: bool(world.events_of("a", PeerOffline)))
     world.send("a", "t", b"only in memory", "b")
     world.nodes["a"].close(world.now)
-    ends = [event for event in world.told("a", MessageExpired) if isinstance(event, MessageExpired)]
+    ends = [event for event in world.events_of("a", MessageExpired) if isinstance(event, MessageExpired)]
     assert [end.reason for end in ends] == [ExpiryReason.CLOSED]

@@ -1,6 +1,6 @@
 """Every accepted reliable message ends, per destination, in exactly one of delivered, expired, peer lost.
 
-And a delivered one arrived whole, once per run of its receiver.
+A delivered one arrived completely, once per run of its receiver.
 """
 
 import random
@@ -68,7 +68,7 @@ def soak(seed: int, seconds: float) -> World:
             world.add(settings("b", *TOPICS, rates=QUICK))
     for pipe in world.pipes.values():
         pipe.up = True
-    # the limited topic may have more waiting than it is let send in a minute
+    # The rate-limited topic may have more waiting than it may send in a minute.
     world.run(300.0, until=lambda: not world.nodes["a"].conditions(world.now).queued_bytes)
     world.run(8.0)
     ends = outcomes(world, "a")
@@ -99,8 +99,8 @@ def test_what_is_delivered_arrived_once_and_whole() -> None:
     for payload in payloads:
         world.send("a", "any", payload, "b")
         world.run(0.02)
-    assert world.run(60.0, until=lambda: len(world.told("a", MessageDelivered)) == len(payloads))
-    received = [event.payload for event in world.told("b", MessageReceived) if isinstance(event, MessageReceived)]
+    assert world.run(60.0, until=lambda: len(world.events_of("a", MessageDelivered)) == len(payloads))
+    received = [event.payload for event in world.events_of("b", MessageReceived) if isinstance(event, MessageReceived)]
     assert sorted(received) == sorted(payloads)
 
 
@@ -136,8 +136,8 @@ def test_a_peer_that_stays_silent_is_lost_and_its_messages_with_it() -> None:
         pipe.up = False
     world.send("a", "any", b"x" * 5000, "b")
     world.run(4.0)
-    assert not world.told("a", MessagePeerLost)
-    assert world.run(6.0, until=lambda: bool(world.told("a", MessagePeerLost)))
+    assert not world.events_of("a", MessagePeerLost)
+    assert world.run(6.0, until=lambda: bool(world.events_of("a", MessagePeerLost)))
     assert not outcomes(world, "a") - Counter({(1, "b"): 1})
 
 
@@ -151,9 +151,9 @@ def test_a_receiver_that_restarts_in_the_middle_gets_the_whole_message_in_its_ne
     world.send("a", "any", payload, "b")
     world.run(0.8)
     world.add(settings("b"))
-    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
-    assert world.told("a", PeerRestarted)
-    received = [event for event in world.told("b", MessageReceived) if isinstance(event, MessageReceived)]
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
+    assert world.events_of("a", PeerRestarted)
+    received = [event for event in world.events_of("b", MessageReceived) if isinstance(event, MessageReceived)]
     assert [event.payload for event in received] == [payload]
 
 

@@ -1,4 +1,4 @@
-"""Urgent packets overtake others in a radio and do not tell of their loss: time does, however many arrive."""
+"""Urgent packets overtake others in a radio, so their arrival does not reveal the loss of others: only time does."""
 
 import random
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ LARGE_BYTES = 1000
 
 @dataclass
 class Wall(Pipe):
-    """Loses large datagrams while it stands."""
+    """Loses large datagrams while the outage lasts."""
 
     stands: bool = False
 
@@ -33,7 +33,7 @@ def test_bulk_that_was_lost_all_at_once_is_sent_again_while_urgent_messages_keep
         world.add(settings(name, *TOPICS))
     walls = [Wall(delay_s=0.05) for _ in world.pipes]
     world.pipes.update(zip(world.pipes, walls, strict=True))
-    assert world.run(20.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", PeerOnline) and world.events_of("b", PeerOnline)))
 
     def report() -> None:
         world.send("a", "telemetry", bytes(100), "b")
@@ -50,7 +50,7 @@ def test_bulk_that_was_lost_all_at_once_is_sent_again_while_urgent_messages_keep
     world.at(world.now + 0.08, fall)
 
     def maps() -> list[str]:
-        events = [event for event in world.told("a", MessageDelivered) if isinstance(event, MessageDelivered)]
+        events = [event for event in world.events_of("a", MessageDelivered) if isinstance(event, MessageDelivered)]
         return [event.topic for event in events if event.topic == "map"]
 
     assert world.run(5.0, until=lambda: bool(maps()))

@@ -1,4 +1,5 @@
-"""The small parts against obvious slow versions: ranges, flight, reassembly, compression, acknowledgements, buckets."""
+"""The small parts against simple slow models: ranges, packets in flight, reassembly, compression, acknowledgements,
+buckets."""
 
 import zlib
 from itertools import pairwise
@@ -8,12 +9,12 @@ from hypothesis import strategies as st
 
 from tests.udp_mesh.core.sender.test_scheduler import outgoing
 from udp_mesh.core.compression import compress, decompress
-from udp_mesh.core.congestion.pacer import MOST_DEBT_S, Pacer
+from udp_mesh.core.congestion.pacer import MAX_DEBT_S, Pacer
 from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.receiver.acks import AckState
-from udp_mesh.core.receiver.reassembly import PIECE_OVERHEAD_BYTES, Reassembly, Verdict, Whole
-from udp_mesh.core.sender.rate_limit import Gate
-from udp_mesh.core.sender.sent_packets import Flight, Mark, Packet
+from udp_mesh.core.receiver.reassembly import FRAGMENT_OVERHEAD_BYTES, CompleteMessage, FragmentStatus, Reassembly
+from udp_mesh.core.sender.rate_limit import TokenBucket
+from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot, SentPackets
 from udp_mesh.core.settings import Limits
 from udp_mesh.wire.frames import Fragment, MessageFlag, MessageHead
 
@@ -32,7 +33,7 @@ def test_a_range_set_equals_a_plain_set(numbers: list[int]) -> None:
     assert all(before[1] + 1 < after[0] for before, after in pairwise(pairs))
 
 
-def pieces_of(body: bytes, size: int, message_id: int = 1) -> list[Fragment]:
+def fragments_of(body: bytes, size: int, message_id: int = 1) -> list[Fragment]:
     chunks = [body[start : start + size] for start in range(0, len(body), size)] or [b""]
     head = MessageHead(len(body), len(chunks), 0, 3, RELIABLE)
     return [
@@ -42,13 +43,13 @@ def pieces_of(body: bytes, size: int, message_id: int = 1) -> list[Fragment]:
 
 @given(st.binary(max_size=400), st.integers(1, 50), st.data())
 def test_reassembly_does_not_depend_on_order_or_repetition(body: bytes, size: int, data: st.DataObject) -> None:
-    pieces = pieces_of(body, size)
-    order = data.draw(st.permutations(pieces + pieces[: len(pieces) // 2]))
+    fragments = fragments_of(body, size)
+    order = data.draw(st.permutations(fragments + fragments[: len(fragments) // 2]))
     reassembly = Reassembly(Limits())
-    results = [reassembly.add(piece, 0.0) for piece in order]
-    wholes = [result for result in results if isinstance(result, Whole)]
+    results = [reassembly.add(fragment, 0.0) for fragment in order]
+    wholes = [result for result in results if isinstance(result, CompleteMessage)]
     assert [whole.body for whole in wholes] == [body]
-    assert set(results) - set(wholes) <= {Verdict.KEPT, Verdict.DUPLICATE}
+    assert set(results) - set(wholes) <= {FragmentStatus.KEPT, FragmentStatus.DUPLICATE}
     assert reassembly.bytes == 0
 
 
@@ -74,15 +75,15 @@ def test_reassembly_never_holds_more_than_its_cap_whatever_fragments_claim(claim
 
 
 def test_a_refused_piece_leaves_nothing_behind_and_is_taken_when_there_is_room() -> None:
-    reassembly = Reassembly(Limits(partial_bytes_per_peer=PIECE_OVERHEAD_BYTES + 50))
-    first, second = pieces_of(bytes(60), 30)
-    assert reassembly.add(first, 0.0) is Verdict.KEPT
+    reassembly = Reassembly(Limits(partial_bytes_per_peer=FRAGMENT_OVERHEAD_BYTES + 50))
+    first, second = fragments_of(bytes(60), 30)
+    assert reassembly.add(first, 0.0) is FragmentStatus.KEPT
     other = Fragment(2, 1, bytes(30))
-    assert reassembly.add(other, 0.0) is Verdict.FULL
+    assert reassembly.add(other, 0.0) is FragmentStatus.FULL
     assert len(reassembly) == 1
-    assert reassembly.add(second, 0.0) is Verdict.FULL
+    assert reassembly.add(second, 0.0) is FragmentStatus.FULL
     reassembly.forget(1)
-    assert reassembly.add(other, 0.0) is Verdict.KEPT
+    assert reassembly.add(other, 0.0) is FragmentStatus.KEPT
 
 
 def test_a_best_effort_message_that_stops_is_purged_by_its_own_age() -> None:
@@ -96,7 +97,7 @@ def test_a_best_effort_message_that_stops_is_purged_by_its_own_age() -> None:
     assert reassembly.missing(2) == [(1, 1)]
 
 
-MARK = Mark(0.0, 0, 0.0, 0.0, False)
+MARK = SendSnapshot(0.0, 0, 0.0, 0.0, False)
 
 
 @given(
@@ -105,7 +106,7 @@ MARK = Mark(0.0, 0, 0.0, 0.0, False)
     )
 )
 def test_every_packet_is_acknowledged_or_lost_as_a_plain_model_says(plan: list[tuple[str, int]]) -> None:
-    flight, state = Flight(), AckState()
+    in_flight, state = SentPackets(), AckState()
     sent: dict[int, Packet] = {}
     ended: dict[int, str] = {}
     number = 0
@@ -113,68 +114,68 @@ def test_every_packet_is_acknowledged_or_lost_as_a_plain_model_says(plan: list[t
     def book(packets: list[Packet], how: str) -> None:
         for packet in packets:
             index = packet.position
-            # Only what was called lost may change its mind, once.
+            # Only a packet declared lost may change its outcome, once.
             assert index not in ended or (ended[index], how) == ("lost", "acknowledged")
             ended[index] = how
 
     for what, choice in plan:
         if what == "send":
             sent[number] = Packet(MARK, outgoing(1, 1), number)
-            flight.add(number, sent[number])
+            in_flight.add(number, sent[number])
             number += 1
         elif what == "skip":
-            flight.add(number, None)
+            in_flight.add(number, None)
             number += 1
         elif what == "arrive" and number:
-            state.saw(number - 1 - choice % min(number, 12), 0.0) if not received(
+            state.on_packet(number - 1 - choice % min(number, 12), 0.0) if not received(
                 state, number - 1 - choice % min(number, 12)
             ) else None
         elif what == "ack" and state.largest >= 0:
-            acknowledged, lost, _ = flight.acknowledge(state.largest, state.received)
+            acknowledged, lost, _ = in_flight.acknowledge(state.largest, state.received)
             book(acknowledged, "acknowledged")
             book(lost, "lost")
         elif what == "give up":
-            book(flight.give_up(), "lost")
-        assert flight.outstanding == sum(1 for index in sent if index not in ended)
+            book(in_flight.abandon_all(), "lost")
+        assert in_flight.outstanding == sum(1 for index in sent if index not in ended)
     for index, how in ended.items():
         if how == "acknowledged":
             assert received(state, index)
 
 
-URGENT = Mark(0.0, 0, 0.0, 0.0, False, urgent=True)
+URGENT = SendSnapshot(0.0, 0, 0.0, 0.0, False, urgent=True)
 
 
 def test_urgent_packets_that_overtake_others_in_the_radio_are_no_sign_of_loss() -> None:
-    flight = Flight()
+    in_flight = SentPackets()
     bulk = [Packet(MARK, outgoing(1, 1), 0), Packet(MARK, outgoing(1, 1), 1)]
     for number in range(2):
-        flight.add(number, bulk[number])
+        in_flight.add(number, bulk[number])
     for number in range(2, 8):
-        flight.add(number, Packet(URGENT, outgoing(1, 1), number))
-    acknowledged, lost, _ = flight.acknowledge(7, 0b111111)
+        in_flight.add(number, Packet(URGENT, outgoing(1, 1), number))
+    acknowledged, lost, _ = in_flight.acknowledge(7, 0b111111)
     assert len(acknowledged) == 6
     assert lost == []
-    # Three later ones of its own kind are.
+    # Three later ones of the same kind declare it lost.
     for number in range(8, 12):
-        flight.add(number, Packet(MARK, outgoing(1, 1), number))
-    assert flight.acknowledge(11, 0b1111111111)[1] == bulk
+        in_flight.add(number, Packet(MARK, outgoing(1, 1), number))
+    assert in_flight.acknowledge(11, 0b1111111111)[1] == bulk
 
 
 def test_a_lost_urgent_packet_is_noticed_by_the_urgent_ones_behind_it() -> None:
-    flight = Flight()
+    in_flight = SentPackets()
     for number in range(5):
-        flight.add(number, Packet(URGENT, outgoing(1, 1), number))
-    assert [packet.position for packet in flight.acknowledge(4, 0b1111)[1]] == [0]
+        in_flight.add(number, Packet(URGENT, outgoing(1, 1), number))
+    assert [packet.position for packet in in_flight.acknowledge(4, 0b1111)[1]] == [0]
 
 
 def test_urgent_packets_that_timed_out_count_as_lost_once_an_acknowledgement_says_so() -> None:
-    flight = Flight()
+    in_flight = SentPackets()
     for number in range(8):
-        flight.add(number, Packet(URGENT, outgoing(1, 1), number))
-        flight.lose_before(1.0)
-    # 0, 2, 4 and 6 arrived; of 5 and 7 it is too early to tell.
-    assert flight.confirm_timed_out(7, 0b10101010) == 2
-    assert flight.confirm_timed_out(7, 0b10101010) == 0
+        in_flight.add(number, Packet(URGENT, outgoing(1, 1), number))
+        in_flight.declare_lost_before(1.0)
+    # 0, 2, 4 and 6 arrived; for 5 and 7 it is too early.
+    assert in_flight.confirm_timed_out(7, 0b10101010) == 2
+    assert in_flight.confirm_timed_out(7, 0b10101010) == 0
 
 
 def received(state: AckState, number: int) -> bool:
@@ -183,10 +184,10 @@ def received(state: AckState, number: int) -> bool:
 
 
 def test_an_acknowledgement_of_what_was_never_sent_says_nothing() -> None:
-    flight = Flight()
-    flight.add(0, Packet(MARK, outgoing(1, 1), 0))
-    assert flight.acknowledge(7, 0xFF) == ([], [], None)
-    assert flight.outstanding == 1
+    in_flight = SentPackets()
+    in_flight.add(0, Packet(MARK, outgoing(1, 1), 0))
+    assert in_flight.acknowledge(7, 0xFF) == ([], [], None)
+    assert in_flight.outstanding == 1
 
 
 @given(st.binary(max_size=2000))
@@ -210,23 +211,23 @@ def test_anything_that_is_not_zlib_is_refused(body: bytes) -> None:
 
 def test_what_left_at_the_pace_of_a_slow_path_holds_nothing_up_on_a_fast_one() -> None:
     pacer, now = Pacer(0.003), 10.0
-    # ten bursts to a peer that was silent, when a packet took ten seconds
+    # Ten bursts to an unresponsive peer, when a packet took ten seconds.
     for _ in range(10):
-        pacer.spend(10, now, 0.1)
-    assert pacer.allowance(now, 0.1) == 0
+        pacer.on_sent(10, now, 0.1)
+    assert pacer.packets_allowed(now, 0.1) == 0
     assert pacer.wake_at(0.1) <= now + 10.0
-    assert pacer.allowance(now, 100.0) == 0
-    assert pacer.wake_at(100.0) <= now + MOST_DEBT_S
-    assert pacer.allowance(now + MOST_DEBT_S, 100.0) == 1
+    assert pacer.packets_allowed(now, 100.0) == 0
+    assert pacer.wake_at(100.0) <= now + MAX_DEBT_S
+    assert pacer.packets_allowed(now + MAX_DEBT_S, 100.0) == 1
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 0.5), st.integers(1, 3000)), max_size=50))
 def test_a_bucket_lets_no_more_through_than_its_rate_and_burst(visits: list[tuple[float, int]]) -> None:
-    gate, now, spent = Gate(10_000, 0.0), 0.0, 0
+    bucket, now, spent = TokenBucket(10_000, 0.0), 0.0, 0
     for wait, size in visits:
         now += wait
-        if gate.open(now):
-            gate.spend(size)
+        if bucket.has_tokens(now):
+            bucket.consume(size)
             spent += size
     assert spent <= 10_000 * now + 1000 + 3000
 
@@ -234,8 +235,8 @@ def test_a_bucket_lets_no_more_through_than_its_rate_and_burst(visits: list[tupl
 def test_pacing_spreads_packets_over_time_at_its_rate() -> None:
     pacer, now, left = Pacer(0.003), 0.0, 0
     while now < 1.0:
-        count = pacer.allowance(now, 850.0)
-        pacer.spend(count, now, 850.0)
+        count = pacer.packets_allowed(now, 850.0)
+        pacer.on_sent(count, now, 850.0)
         left += count
         now = max(now + 1e-9, pacer.wake_at(850.0))
     assert 845 <= left <= 856

@@ -1,36 +1,36 @@
-"""No robot drowns another's urgent traffic: less urgent levels elsewhere hold back, for a bounded share of the time."""
+"""Urgent traffic holds back less urgent levels of other nodes, for a bounded share of the time."""
 
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.udp_mesh.core.pair import World, settings
 from udp_mesh.core.events import MessageDelivered
-from udp_mesh.core.priority_backoff import ALL_LEVELS, BUDGET_S, Yielding
+from udp_mesh.core.priority_backoff import ALL_LEVELS, BUDGET_S, PriorityBackoff
 from udp_mesh.core.settings import Rates, Topic
 from udp_mesh.wire.frames import Waiting
 
 
 def test_levels_less_urgent_than_the_one_waiting_elsewhere_hold_back_for_a_while() -> None:
-    yielding = Yielding(Rates(), 0.0)
-    yielding.heard((Waiting(2, 50),), 1.0)
-    assert yielding.allowed(1.05) == 0b111
-    assert yielding.allowed(1.2) == ALL_LEVELS
+    priority_backoff = PriorityBackoff(Rates(), 0.0)
+    priority_backoff.on_waiting((Waiting(2, 50),), 1.0)
+    assert priority_backoff.allowed_levels(1.05) == 0b111
+    assert priority_backoff.allowed_levels(1.2) == ALL_LEVELS
 
 
 def test_bulk_waiting_elsewhere_holds_nobody_back() -> None:
-    yielding = Yielding(Rates(), 0.0)
-    yielding.heard((Waiting(9, 60_000),), 1.0)
-    assert yielding.allowed(1.0) == ALL_LEVELS
+    priority_backoff = PriorityBackoff(Rates(), 0.0)
+    priority_backoff.on_waiting((Waiting(9, 60_000),), 1.0)
+    assert priority_backoff.allowed_levels(1.0) == ALL_LEVELS
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 0.3), st.integers(0, 3)), max_size=80))
 def test_no_level_is_held_back_for_more_than_its_share_of_the_time(reports: list[tuple[float, int]]) -> None:
     rates = Rates()
-    yielding, now = Yielding(rates, 0.0), 0.0
+    priority_backoff, now = PriorityBackoff(rates, 0.0), 0.0
     for wait, level in reports:
         now += wait
-        yielding.heard((Waiting(level, 100),), now)
-    assert yielding.held_total_s <= rates.yield_share * (now + BUDGET_S) + 1e-6
+        priority_backoff.on_waiting((Waiting(level, 100),), now)
+    assert priority_backoff.held_total_s <= rates.yield_share * (now + BUDGET_S) + 1e-6
 
 
 def test_a_node_whose_urgent_messages_wait_is_given_way_by_another_ones_bulk() -> None:
@@ -39,15 +39,15 @@ def test_a_node_whose_urgent_messages_wait_is_given_way_by_another_ones_bulk() -
     for name in ("a", "b", "c"):
         world.add(settings(name, *topics))
     world.run(2.0)
-    # b's urgent messages crawl to c: b says so whenever it acknowledges a's bulk.
+    # b's urgent messages crawl to c: b reports so whenever it acknowledges a's bulk.
     world.pipes[("b", "c")].rate_bits_per_s = 20_000
     for _ in range(10):
         world.send("b", "stop", bytes(1000), "c")
     world.send("a", "bulk", bytes(300_000), "b")
     world.run(0.5)
-    held_s = world.nodes["a"]._state.yielding.held_total_s
+    held_s = world.nodes["a"]._state.priority_backoff.held_total_s
     assert held_s > 0
     queues = {queue.priority: queue for queue in world.nodes["a"].conditions(world.now).peers[0].queues}
-    # what the level waited for others is told, and is no more than the node held back at all
+    # The reported hold-back of the level is no more than the node's total.
     assert 0 < queues[9].held_s <= held_s + 1e-9
-    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))

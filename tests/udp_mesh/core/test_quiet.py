@@ -1,4 +1,4 @@
-"""A node that calls itself quiet has nothing to send, to tell or to do, so a driver may leave it alone."""
+"""A quiet node has nothing to send, to report or to do, so a driver may skip it."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ TOPICS = (Topic("stop", priority=0), Topic("map", priority=9, compression=True))
 
 
 class Watched(World):
-    """Asks each node before every look at it whether the look is needed."""
+    """Checks before every call to a node whether `is_quiet` was right."""
 
     looks = quiet = 0
 
     def _pump(self, name: str) -> None:
         node = self.nodes[name]
         due = node.next_timer()
-        told = len(self.events[name])
+        events = len(self.events[name])
         is_quiet = node.is_quiet and (due is None or due > self.now)
         sent: list[object] = []
         self.tap = lambda source, datagram, now: sent.append(datagram)
@@ -25,8 +25,8 @@ class Watched(World):
         if is_quiet:
             self.quiet += 1
             assert not sent
-            assert len(self.events[name]) == told
-        # packets that the pacing holds back wait for a timer, not for another call
+            assert len(self.events[name]) == events
+        # Packets held back by pacing wait for a timer, not for another call.
         assert not node.has_datagrams
 
 
@@ -49,7 +49,7 @@ def test_a_quiet_node_misses_nothing_when_it_is_left_alone() -> None:
 
 
 def test_taking_in_a_bulk_calls_for_hardly_more_timers_than_lying_idle() -> None:
-    """Each wake-up costs ten times what a datagram costs: acknowledgements that left need no timer any more."""
+    """Each wake-up costs ten times what a datagram costs: acknowledgements already sent need no timer."""
     world = World(seed=5)
     for name in ("a", "b"):
         world.add(settings(name, *TOPICS))

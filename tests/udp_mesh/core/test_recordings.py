@@ -1,4 +1,4 @@
-"""Recordings: what was overheard and never arrived is worth nothing later, whatever address it comes from."""
+"""Replays: a recorded datagram that never arrived is rejected later, whatever address it comes from."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peers import heartbeat
-from udp_mesh.core.peers.path_validation import challenge
+from udp_mesh.core.peers.path_validation import validate_path
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, Freshness, clock_ms
 from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
 from udp_mesh.crypto import Key, ReceiveChannel, SendChannel
@@ -34,7 +34,7 @@ BEST = Topic("pose", priority=5, reliable=False)
 
 
 def acquainted(*topics: Topic) -> Pair:
-    """Two nodes that have answered each other, so that short headers do."""
+    """Two nodes that have answered each other, so that short headers suffice."""
     both = pair(*topics)
     for node, other in ((both.a, "b"), (both.b, "a")):
         node.send("any", b"hello", destination=other, now=both.now)
@@ -49,7 +49,7 @@ def payloads(both: Pair) -> list[bytes]:
 
 
 def overheard(both: Pair, topic: str, payload: bytes) -> list[Datagram]:
-    """What leaves for b now, and does not get there."""
+    """What is sent to b now, and lost."""
     both.a.send(topic, payload, destination="b", now=both.now)
     return [datagram for datagram in both.drop(both.a) if datagram.data[0] == DATA_BYTE]
 
@@ -60,7 +60,7 @@ def replay(both: Pair, recorded: list[Datagram]) -> None:
 
 
 def without_dates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both nodes as the first version was: neither says when it sends, nor takes it."""
+    """Both nodes as in the first version: they neither send nor accept timestamps."""
     monkeypatch.setattr(heartbeat, "OWN_FEATURES", Feature.ZLIB | Feature.REPAIR)
     monkeypatch.setattr(transmit, "OWN_FEATURES", Feature.ZLIB | Feature.REPAIR)
     monkeypatch.setattr(heartbeat, "clock_ms", lambda now: None)
@@ -71,8 +71,8 @@ def without_dates(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_lost_command_is_not_delivered_late(topic: Topic) -> None:
     both = acquainted(topic)
     recorded = overheard(both, topic.name, b"stop")
-    # The peers go on hearing each other; what was lost is never sent again by hand of the test.
-    both.a._state.roster.peers["b"].outbound.finish_all(ExpiryReason.DEADLINE)
+    # The peers keep hearing each other; the test never retransmits what was lost.
+    both.a._state.peer_table.peers["b"].sender.finish_all(ExpiryReason.DEADLINE)
     both.roundtrip(times=900, step_s=0.1)
     before = both.b.conditions(both.now).counters
     replay(both, recorded)
@@ -105,7 +105,7 @@ def test_what_a_slow_route_or_a_short_cut_holds_back_arrives(held_s: float) -> N
 
 
 def test_a_message_whose_life_is_over_is_not_put_together() -> None:
-    """Its last piece was lost and overheard; its sender knows that it expired."""
+    """Its last fragment was lost and recorded; its sender knows that the message expired."""
     both = acquainted(Topic("plan", priority=6, deadline_s=1.0))
     both.a.send("plan", bytes(5000), destination="b", now=both.now)
     *arrived, last = [datagram for datagram in both.drop(both.a) if datagram.data[0] == DATA_BYTE]
@@ -131,13 +131,13 @@ def test_messages_outlive_cuts_of_several_seconds_and_routes_that_become_slow() 
         world.run(cut_s)
         for pipe in world.pipes.values():
             pipe.up, pipe.delay_s = True, 0.8
-        before = len(world.told("a", MessageDelivered))
-        assert world.run(15.0, until=lambda before=before: len(world.told("a", MessageDelivered)) > before)  # type: ignore[misc]
-    assert len(world.told("b", MessageReceived)) == 2
+        before = len(world.events_of("a", MessageDelivered))
+        assert world.run(15.0, until=lambda before=before: len(world.events_of("a", MessageDelivered)) > before)  # type: ignore[misc]
+    assert len(world.events_of("b", MessageReceived)) == 2
 
 
 def silent_world() -> tuple[World, list[Datagram]]:
-    """`a` and `b` have met; then `a` says hellos that b does not hear, and is gone."""
+    """`a` and `b` have met; then `a` sends hellos that b does not hear, and leaves."""
     world = World(seed=2)
     for name in "ab":
         world.add(settings(name))
@@ -148,58 +148,58 @@ def silent_world() -> tuple[World, list[Datagram]]:
     world.run(4.0)
     world.tap = None
     del world.nodes["a"]
-    assert world.run(30.0, until=lambda: bool(world.told("b", PeerOffline)))
+    assert world.run(30.0, until=lambda: bool(world.events_of("b", PeerOffline)))
     world.run(ACCEPT_AGE_S)
     return world, recorded
 
 
-@pytest.mark.parametrize("dated", [True, False])
-def test_an_old_hello_raises_no_peer(dated: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not dated:
+@pytest.mark.parametrize("with_timestamp", [True, False])
+def test_an_old_hello_raises_no_peer(with_timestamp: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not with_timestamp:
         without_dates(monkeypatch)
     world, recorded = silent_world()
-    online = len(world.told("b", PeerOnline))
+    online = len(world.events_of("b", PeerOnline))
     assert recorded
     for datagram in recorded:
         world.nodes["b"].receive(datagram.data, "mesh", ATTACKER, world.now)
         world.run(0.3)
-    assert len(world.told("b", PeerOnline)) == online
-    assert not world.told("b", PeerAddressChanged)
+    assert len(world.events_of("b", PeerOnline)) == online
+    assert not world.events_of("b", PeerAddressChanged)
 
 
-@pytest.mark.parametrize("dated", [True, False])
+@pytest.mark.parametrize("with_timestamp", [True, False])
 def test_a_peer_that_was_away_comes_back_within_a_round_trip_of_its_hello(
-    dated: bool, monkeypatch: pytest.MonkeyPatch
+    with_timestamp: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if not dated:
+    if not with_timestamp:
         without_dates(monkeypatch)
     world = World(seed=2)
     for name in "ab":
         world.add(settings(name))
     world.run(3.0)
     world.pipes["a", "b"].up = False
-    assert world.run(30.0, until=lambda: bool(world.told("b", PeerOffline)))
+    assert world.run(30.0, until=lambda: bool(world.events_of("b", PeerOffline)))
     world.pipes["a", "b"].up = True
     heard: list[float] = []
     world.tap = lambda name, datagram, now: heard.append(now) if name == "a" else None
-    online = len(world.told("b", PeerOnline))
-    assert world.run(5.0, until=lambda: len(world.told("b", PeerOnline)) > online)
+    online = len(world.events_of("b", PeerOnline))
+    assert world.run(5.0, until=lambda: len(world.events_of("b", PeerOnline)) > online)
     assert world.now - heard[0] < 0.010 + 0.020 + 0.005
 
 
 def test_a_peer_whose_computer_slept_is_believed_again_within_a_second() -> None:
-    """Its clock stood still: everything it says is dated an hour ago, until it answers a question."""
+    """Its clock stood still: its timestamps are an hour old until it answers a challenge."""
     world = World(seed=5)
     for name in "ab":
         world.add(settings(name))
     world.run(3.0)
-    session = world.nodes["b"]._state.roster.peers["a"].session
+    session = world.nodes["b"]._state.peer_table.peers["a"].session
     assert session is not None
     assert session.freshness._offset_ms is not None
     session.freshness._offset_ms = (session.freshness._offset_ms - 3_600_000) & 0xFFFFFFFF
-    session.freshness.prove(world.now)
+    session.freshness.confirm(world.now)
     world.send("a", "any", b"awake", "b")
-    assert world.run(1.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(1.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
 
 
 def roaming(seed: int, loss: float) -> World:
@@ -207,16 +207,16 @@ def roaming(seed: int, loss: float) -> World:
     for name in "ab":
         world.add(settings(name, Topic("map", priority=8)))
     world.run(3.0)
-    for way in world.pipes.values():
-        way.loss = loss
+    for path in world.pipes.values():
+        path.loss = loss
     return world
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("dated", [True, False])
-def test_resent_datagrams_move_no_path(seed: int, dated: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An attacker that repeats overheard datagrams from its own address wins the race where the original is lost."""
-    if not dated:
+@pytest.mark.parametrize("with_timestamp", [True, False])
+def test_resent_datagrams_move_no_path(seed: int, with_timestamp: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An attacker that replays recorded datagrams from its own address wins the race if the original is lost."""
+    if not with_timestamp:
         without_dates(monkeypatch)
     world = roaming(seed, 0.2)
 
@@ -234,8 +234,8 @@ def test_resent_datagrams_move_no_path(seed: int, dated: bool, monkeypatch: pyte
 
     both_ways()
     world.run(15.0)
-    assert world.told("b", PeerAddressChanged) == []
-    assert len(world.told("b", MessageReceived)) > 100
+    assert world.events_of("b", PeerAddressChanged) == []
+    assert len(world.events_of("b", MessageReceived)) > 100
 
 
 def test_a_robot_that_moved_is_followed_a_round_trip_after_it_was_missed() -> None:
@@ -244,11 +244,11 @@ def test_a_robot_that_moved_is_followed_a_round_trip_after_it_was_missed() -> No
     world.addresses["b"] = ("10.0.0.99", 8700)
     asked = world.now
     world.send("a", "map", b"where are you", "b")
-    assert world.run(6.0, until=lambda: bool(world.told("a", PeerAddressChanged)))
+    assert world.run(6.0, until=lambda: bool(world.events_of("a", PeerAddressChanged)))
     moves.append(world.now - asked)
-    # Heard there at 2 s at the latest (two heartbeats), and 20 ms there and back.
+    # Heard there within 2 s (two heartbeats), plus a round trip of 20 ms.
     assert moves[0] < 3.0
-    assert world.run(1.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(1.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
 
 
 def test_two_peers_whose_tags_collide_are_both_heard() -> None:
@@ -275,18 +275,18 @@ def test_two_peers_whose_tags_collide_are_both_heard() -> None:
     world.rng = usual
     world.run(3.0)
     for number in range(300):
-        # The numbers of the one are all seen when those of the other come.
+        # The numbers of the one are all seen when those of the other arrive.
         world.send("one", "any", b"%d" % number, "base")
         world.run(0.01)
     world.run(1.0)
-    before = len(world.told("base", MessageReceived))
+    before = len(world.events_of("base", MessageReceived))
     for number in range(40):
         for name in ("one", "two"):
             world.send(name, "any", b"%d" % number, "base")
         world.run(0.05)
     world.run(1.0)
-    told = world.told("base", MessageReceived)[before:]
-    heard = [event.source for event in told if isinstance(event, MessageReceived)]
+    events = world.events_of("base", MessageReceived)[before:]
+    heard = [event.source for event in events if isinstance(event, MessageReceived)]
     assert (heard.count("one"), heard.count("two")) == (40, 40)
 
 
@@ -321,19 +321,19 @@ def test_no_number_is_used_twice_for_a_pair_of_boots_however_many_runs_took_the_
         world.nodes.pop("r").close(world.now)
         world.run(15.0)
         world.nodes["r"] = first
-        before = len(world.told("r", MessageReceived))
+        before = len(world.events_of("r", MessageReceived))
         world.run(5.0)
         world.send("base", "any", b"back", "r")
-        assert world.run(10.0, until=lambda: len(world.told("r", MessageReceived)) > before)
+        assert world.run(10.0, until=lambda: len(world.events_of("r", MessageReceived)) > before)
     assert doubles == []
 
 
 @pytest.mark.parametrize("away_s", [15.0, 200.0])
-@pytest.mark.parametrize("dated", [True, False])
+@pytest.mark.parametrize("with_timestamp", [True, False])
 def test_a_robot_replaced_for_a_while_is_believed_again(
-    away_s: float, dated: bool, monkeypatch: pytest.MonkeyPatch
+    away_s: float, with_timestamp: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if not dated:
+    if not with_timestamp:
         without_dates(monkeypatch)
     world = World(seed=7)
     world.add(settings("base", Topic("map", priority=7)))
@@ -353,14 +353,14 @@ def test_a_robot_replaced_for_a_while_is_believed_again(
         world.nodes["base"].receive(datagram.data, "mesh", ATTACKER, world.now)
         world.run(0.3)
     assert not world.nodes["base"].conditions(world.now).peers[0].online
-    assert len(world.told("base", MessageReceived)) == 1
+    assert len(world.events_of("base", MessageReceived)) == 1
     world.nodes["r"] = first
     assert world.run(10.0, until=lambda: world.nodes["base"].conditions(world.now).peers[0].online)
     world.run(2.0)
     world.send("r", "map", b"again", "base")
     world.send("base", "map", b"to you", "r")
-    assert world.run(10.0, until=lambda: len(world.told("base", MessageReceived)) == 2)
-    assert world.run(10.0, until=lambda: bool(world.told("base", MessageDelivered)))
+    assert world.run(10.0, until=lambda: len(world.events_of("base", MessageReceived)) == 2)
+    assert world.run(10.0, until=lambda: bool(world.events_of("base", MessageDelivered)))
 
 
 def test_keys_rotated_away_and_back_open_no_recording_again() -> None:
@@ -394,27 +394,27 @@ def test_a_clock_that_wraps_or_drifts_makes_nothing_old() -> None:
     for minute in range(60 * 24 * 60):
         now = minute * 60.0
         theirs = now * (1 + 5e-4) + 4_294_960.0
-        assert freshness.judge(clock_ms(theirs), now) <= 0.1
-    assert freshness.judge(clock_ms(theirs), now + 2 * ACCEPT_AGE_S) > ACCEPT_AGE_S
+        assert freshness.lateness_s(clock_ms(theirs), now) <= 0.1
+    assert freshness.lateness_s(clock_ms(theirs), now + 2 * ACCEPT_AGE_S) > ACCEPT_AGE_S
 
 
 def test_an_empty_datagram_of_a_key_holder_is_malformed() -> None:
     both = acquainted()
-    session = both.a._state.roster.peers["b"].session
+    session = both.a._state.peer_table.peers["b"].session
     assert session is not None
-    both.b.receive(session.way.channel.seal(b"")[1], "mesh", A, both.now)
-    both.b.receive(both.a._state.to_all.seal(b"")[1], "mesh", A, both.now)
+    both.b.receive(session.path.channel.seal(b"")[1], "mesh", A, both.now)
+    both.b.receive(both.a._state.broadcast_channel.seal(b"")[1], "mesh", A, both.now)
     assert both.b.conditions(both.now).counters.dropped_malformed == 2
 
 
 def test_a_ping_is_answered_where_it_came_from() -> None:
-    """Over two links, one of them dead one way, each side must be able to prove the other."""
+    """Over two links, one of them dead in one direction, each side must be able to verify the other."""
     both = acquainted()
     for node, own in ((both.a, "172.16.0.1"), (both.b, "172.16.0.2")):
         node.link_up(LinkInfo("cable", LinkKind.BROADCAST, (own, 8700), ("172.16.0.255", 8700)), both.now)
-    session = both.a._state.roster.peers["b"].session
+    session = both.a._state.peer_table.peers["b"].session
     assert session is not None
-    challenge(both.a._state, session, "cable", ("172.16.0.2", 8700), both.now)
+    validate_path(both.a._state, session, "cable", ("172.16.0.2", 8700), both.now)
     asked = [datagram for datagram in both.drop(both.a) if datagram.link == "cable" and datagram.data[0] == DATA_BYTE]
     assert len(asked) == 1
     both.b.receive(asked[0].data, "cable", ("172.16.0.1", 8700), both.now)

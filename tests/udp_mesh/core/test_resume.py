@@ -1,4 +1,5 @@
-"""A message that an outbox takes back in the middle keeps its number: who had all of it does not get it twice."""
+"""A message returned to an outbox while being sent keeps its number: a peer that had all of it does not deliver it
+twice."""
 
 from hypothesis import given
 from hypothesis import settings as examples
@@ -15,18 +16,18 @@ def met(*topics: Topic, **changes: object) -> World:
     world = World(seed=1)
     for name in ("a", "b"):
         world.add(settings(name, *topics, **changes))
-    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    assert world.run(5.0, until=lambda: bool(world.events_of("a", PeerOnline) and world.events_of("b", PeerOnline)))
     return world
 
 
-def cut(world: World, *ways: tuple[str, str]) -> None:
-    for way in ways:
-        world.pipes[way].up = False
+def cut(world: World, *paths: tuple[str, str]) -> None:
+    for path in paths:
+        world.pipes[path].up = False
 
 
 def heal(world: World) -> None:
-    for way in world.pipes.values():
-        way.up = True
+    for path in world.pipes.values():
+        path.up = True
     assert world.run(20.0, until=lambda: all(peer.online for peer in world.nodes["a"].conditions(world.now).peers))
 
 
@@ -36,16 +37,16 @@ def test_a_cut_at_any_moment_delivers_a_message_once(size_bytes: int, after_s: f
     world = met(ART)
     world.send("a", "art", bytes(size_bytes), "b")
     world.run(after_s)
-    # what had left arrives, and is not acknowledged any more
+    # What was sent arrives but is no longer acknowledged.
     cut(world, ("b", "a"))
     world.run(0.02)
     cut(world, ("a", "b"))
-    assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))
+    assert world.run(30.0, until=lambda: bool(world.events_of("a", PeerOffline)))
     heal(world)
-    assert world.run(10.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(10.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
     world.run(3.0)
-    assert len(world.told("a", MessageDelivered)) == 1
-    assert len(world.told("b", MessageReceived)) == 1
+    assert len(world.events_of("a", MessageDelivered)) == 1
+    assert len(world.events_of("b", MessageReceived)) == 1
 
 
 def test_what_had_arrived_of_a_large_message_is_not_sent_again() -> None:
@@ -53,9 +54,9 @@ def test_what_had_arrived_of_a_large_message_is_not_sent_again() -> None:
     world.send("a", "art", bytes(2_000_000), "b")
     world.run(1.0)
     cut(world, *world.pipes)
-    assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))
+    assert world.run(30.0, until=lambda: bool(world.events_of("a", PeerOffline)))
     heal(world)
-    assert world.run(10.0, until=lambda: bool(world.told("b", MessageReceived)))
+    assert world.run(10.0, until=lambda: bool(world.events_of("b", MessageReceived)))
     assert (
         world.pipes[("a", "b")].carried_bytes < 2_700_000
     )  # with the probes of ten seconds; all of it again would be 3.2 MB
@@ -65,14 +66,14 @@ def test_one_that_had_left_whole_arrives_once_although_the_link_became_narrower(
     world = met(ART)
     cut(world, ("b", "a"))
     world.send("a", "art", bytes(4_000), "b")
-    assert world.run(1.0, until=lambda: bool(world.told("b", MessageReceived)))
+    assert world.run(1.0, until=lambda: bool(world.events_of("b", MessageReceived)))
     cut(world, *world.pipes)
-    assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))
+    assert world.run(30.0, until=lambda: bool(world.events_of("a", PeerOffline)))
     link = LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a"], BROADCAST, mtu=700)
     world.nodes["a"].link_up(link, world.now)
     heal(world)
-    assert world.run(10.0, until=lambda: bool(world.told("a", MessageDelivered)))
-    assert len(world.told("b", MessageReceived)) == 1
+    assert world.run(10.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
+    assert len(world.events_of("b", MessageReceived)) == 1
 
 
 def test_a_peer_that_restarted_gets_the_message_anew() -> None:
@@ -80,11 +81,13 @@ def test_a_peer_that_restarted_gets_the_message_anew() -> None:
     world.send("a", "art", bytes(500_000), "b")
     world.run(0.2)
     cut(world, *world.pipes)
-    assert world.run(30.0, until=lambda: bool(world.told("a", PeerOffline)))
+    assert world.run(30.0, until=lambda: bool(world.events_of("a", PeerOffline)))
     world.add(settings("b", ART))
     heal(world)
-    assert world.run(10.0, until=lambda: bool(world.told("b", MessageReceived) and world.told("a", MessageDelivered)))
-    assert len(world.told("b", MessageReceived)) == 1
+    assert world.run(
+        10.0, until=lambda: bool(world.events_of("b", MessageReceived) and world.events_of("a", MessageDelivered))
+    )
+    assert len(world.events_of("b", MessageReceived)) == 1
 
 
 def test_a_peer_that_forgot_its_pieces_meanwhile_gets_the_message_anew() -> None:
@@ -94,8 +97,10 @@ def test_a_peer_that_forgot_its_pieces_meanwhile_gets_the_message_anew() -> None
     cut(world, *world.pipes)
     world.run(400.0)
     heal(world)
-    assert world.run(10.0, until=lambda: bool(world.told("b", MessageReceived) and world.told("a", MessageDelivered)))
-    assert len(world.told("b", MessageReceived)) == 1
+    assert world.run(
+        10.0, until=lambda: bool(world.events_of("b", MessageReceived) and world.events_of("a", MessageDelivered))
+    )
+    assert len(world.events_of("b", MessageReceived)) == 1
 
 
 def test_a_message_that_expires_in_the_outbox_frees_what_the_peer_had_of_it() -> None:
@@ -104,8 +109,8 @@ def test_a_message_that_expires_in_the_outbox_frees_what_the_peer_had_of_it() ->
     world.run(0.2)
     cut(world, *world.pipes)
     world.run(60.0)
-    assert len(world.told("a", MessageExpired)) == 1
+    assert len(world.events_of("a", MessageExpired)) == 1
     assert world.nodes["b"].conditions(world.now).partial_bytes > 0
     heal(world)
     assert world.run(5.0, until=lambda: world.nodes["b"].conditions(world.now).partial_bytes == 0)
-    assert not world.told("b", MessageReceived)
+    assert not world.events_of("b", MessageReceived)

@@ -12,7 +12,7 @@ from udp_mesh.core.events import (
     PeerOnline,
 )
 from udp_mesh.core.node import Node
-from udp_mesh.core.peer_lifecycle import REPORT_AGAIN_S
+from udp_mesh.core.peer_lifecycle import REPORT_INTERVAL_S
 from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
 
 MAP = Topic("map", priority=7)
@@ -23,7 +23,7 @@ def conflict() -> World:
     world = World(seed=1)
     for name in ("a", "c"):
         world.add(settings(name, MAP))
-    assert world.run(5.0, until=lambda: bool(world.told("c", PeerOnline)))
+    assert world.run(5.0, until=lambda: bool(world.events_of("c", PeerOnline)))
     exchange(world, "a")
     second = Node(settings("a", MAP), boot_id=world.rng.randbytes(16), rng=world.rng, now=world.now)
     world.nodes["a2"], world.addresses["a2"], world.events["a2"] = second, ("10.0.0.9", 8700), []
@@ -32,21 +32,21 @@ def conflict() -> World:
         world.pipes["a2", other] = Pipe()
         world.pipes[other, "a2"] = Pipe()
     for name in ("a", "a2", "c"):
-        assert world.run(10.0, until=lambda: bool(world.told(name, NameConflict)))  # noqa: B023
+        assert world.run(10.0, until=lambda: bool(world.events_of(name, NameConflict)))  # noqa: B023
     exchange(world, "a2")
     return world
 
 
 def exchange(world: World, name: str) -> None:
-    """One message each way between c and the node that its name a means."""
-    before = {who: len(world.told(who, MessageReceived)) for who in ("c", name)}
-    ended = {who: len(world.told(who, MessageDelivered)) for who in ("c", name)}
+    """One message each way between c and the node that c knows as a."""
+    before = {who: len(world.events_of(who, MessageReceived)) for who in ("c", name)}
+    ended = {who: len(world.events_of(who, MessageDelivered)) for who in ("c", name)}
     world.send(name, "map", bytes(20_000), "c")
     world.send("c", "map", bytes(20_000), "a")
     world.run(2.0)
     for who in ("c", name):
-        assert len(world.told(who, MessageReceived)) == before[who] + 1
-        assert len(world.told(who, MessageDelivered)) == ended[who] + 1
+        assert len(world.events_of(who, MessageReceived)) == before[who] + 1
+        assert len(world.events_of(who, MessageDelivered)) == ended[who] + 1
 
 
 def test_each_of_them_is_told_as_long_as_it_lasts_and_once_a_minute_whatever_boots_are_invented() -> None:
@@ -56,9 +56,11 @@ def test_each_of_them_is_told_as_long_as_it_lasts_and_once_a_minute_whatever_boo
         again.link_up(LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a2"], BROADCAST), world.now)
         world.nodes["a2"] = again
         world.run(9.0)
-        told = [event for event in world.told("a", NameConflict) if isinstance(event, NameConflict) and event.own]
-        assert len(told) <= 1 + (number + 2) * 9.0 / REPORT_AGAIN_S
-    assert len(told) >= 3
+        events = [
+            event for event in world.events_of("a", NameConflict) if isinstance(event, NameConflict) and event.own
+        ]
+        assert len(events) <= 1 + (number + 2) * 9.0 / REPORT_INTERVAL_S
+    assert len(events) >= 3
 
 
 @pytest.mark.parametrize("how", ["says good-bye", "is killed"])
@@ -70,8 +72,8 @@ def test_when_one_of_them_goes_the_other_is_served_again(how: str, meanwhile_s: 
         world.nodes["a2"].close(world.now)
         world._pump("a2")
     del world.nodes["a2"]
-    online = len(world.told("c", PeerOnline))
-    assert world.run(20.0, until=lambda: len(world.told("c", PeerOnline)) > online)
+    online = len(world.events_of("c", PeerOnline))
+    assert world.run(20.0, until=lambda: len(world.events_of("c", PeerOnline)) > online)
     world.run(3.0)
     exchange(world, "a")
     assert world.run(10.0, until=lambda: all(peer.online for peer in world.nodes["a"].conditions(world.now).peers))
@@ -92,13 +94,13 @@ def test_the_first_one_is_served_again_although_it_was_silent_for_long() -> None
 def test_what_the_one_not_served_sends_ends_too() -> None:
     world = conflict()
     world.send("a", "map", bytes(20_000), "c")
-    assert world.run(15.0, until=lambda: bool(world.told("a", PeerOffline)))
-    assert world.run(60.0, until=lambda: bool(world.told("a", MessagePeerLost)))
+    assert world.run(15.0, until=lambda: bool(world.events_of("a", PeerOffline)))
+    assert world.run(60.0, until=lambda: bool(world.events_of("a", MessagePeerLost)))
 
 
 def test_what_waited_for_the_name_goes_to_who_is_there() -> None:
     world = conflict()
     del world.nodes["a2"]
     world.send("c", "map", bytes(20_000), "a")
-    assert world.run(20.0, until=lambda: len(world.told("c", MessageDelivered)) == 3)
-    assert len(world.told("a", MessageReceived)) == 2
+    assert world.run(20.0, until=lambda: len(world.events_of("c", MessageDelivered)) == 3)
+    assert len(world.events_of("a", MessageReceived)) == 2

@@ -1,10 +1,10 @@
-"""A path that becomes a hundred times slower is measured anew, not filled with copies of what is still on its way."""
+"""A path that becomes a hundred times slower is measured again, not filled with copies of what is still in flight."""
 
 import pytest
 
 from tests.udp_mesh.core.pair import World, settings
 from udp_mesh.core.events import MessageDelivered, MessageReceived
-from udp_mesh.core.sender.send_quota import URGENT_WAIT_S
+from udp_mesh.core.sender.send_quota import MAX_URGENT_WAIT_S
 from udp_mesh.core.settings import Topic
 
 TOPICS = (Topic("status", priority=0), Topic("map", priority=7), Topic("video", priority=9, reliable=False))
@@ -13,9 +13,9 @@ TOPICS = (Topic("status", priority=0), Topic("map", priority=7), Topic("video", 
 @pytest.mark.parametrize(
     ("rate_bits_per_s", "delay_s", "urgent_within_s"),
     [
-        # a full queue of this link holds six seconds
+        # A full queue of this link holds six seconds.
         (200e3, 0.01, 1.5),
-        # the pauses of an application that sends on and on say nothing of the queue
+        # The pauses of a continuously sending application say nothing about the queue.
         (1e6, 0.01, 0.1),
         (20e6, 0.8, 0.9),
     ],
@@ -27,8 +27,8 @@ def test_urgent_messages_stay_urgent_on_a_path_that_became_slow(
     for name in "ab":
         world.add(settings(name, *TOPICS))
     world.run(3.0)
-    for way in world.pipes.values():
-        way.rate_bits_per_s = 20e6
+    for path in world.pipes.values():
+        path.rate_bits_per_s = 20e6
     sent: dict[bytes, float] = {}
 
     def publish() -> None:
@@ -44,8 +44,8 @@ def test_urgent_messages_stay_urgent_on_a_path_that_became_slow(
 
     world.at(world.now, publish)
     world.run(3.0)
-    for way in world.pipes.values():
-        way.rate_bits_per_s, way.delay_s = rate_bits_per_s, delay_s
+    for path in world.pipes.values():
+        path.rate_bits_per_s, path.delay_s = rate_bits_per_s, delay_s
     slow_since = world.now
     world.run(30.0)
     took = {
@@ -63,34 +63,34 @@ def test_urgent_messages_stay_urgent_on_a_path_that_became_slow(
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("loss", [0.0, 0.1])
 def test_what_is_on_its_way_on_a_path_that_became_slow_holds_no_urgent_message_back(seed: int, loss: float) -> None:
-    """Hundreds of packets may stand in the path's queue, or be lost without anybody knowing: urgent ones join them."""
+    """Hundreds of packets may be in the path's queue, or lost without notice: urgent ones join them."""
     world = World(seed=seed)
     for name in "ab":
         world.add(settings(name, *TOPICS))
     world.run(3.0)
-    for way in world.pipes.values():
-        way.rate_bits_per_s, way.loss = 20e6, loss
+    for path in world.pipes.values():
+        path.rate_bits_per_s, path.loss = 20e6, loss
     world.send("a", "map", bytes(20_000_000), "b")
     world.run(2.0)
-    for way in world.pipes.values():
-        way.rate_bits_per_s = 200e3
-    outbound = world.nodes["a"]._state.roster.peers["b"].outbound
+    for path in world.pipes.values():
+        path.rate_bits_per_s = 200e3
+    sender = world.nodes["a"]._state.peer_table.peers["b"].sender
     for number in range(200):
         world.send("a", "status", b"%d" % number, "b")
-        world.run(URGENT_WAIT_S + 0.001)
-        waiting = [message for message in outbound.open if message.priority == 0 and not message.begun]
-        # a silent peer gets probes instead
-        assert not waiting or outbound.silent_since is not None
+        world.run(MAX_URGENT_WAIT_S + 0.001)
+        waiting = [message for message in sender.pending if message.priority == 0 and not message.started]
+        # An unresponsive peer gets probes instead.
+        assert not waiting or sender.unresponsive_since is not None
 
 
 def test_what_a_silent_and_then_slow_peer_was_sent_holds_nothing_up_when_its_path_is_well_again() -> None:
-    """Probes and bursts leave ahead of the pace, and were once owed for a minute at that of a path of seconds."""
+    """Probes and bursts are sent ahead of the pace; that debt once blocked for a minute at the pace of a slow path."""
     world = World(seed=1)
     for name in "ab":
         world.add(settings(name, *TOPICS))
     world.run(3.0)
     world.send("a", "map", bytes(50_000), "b")
     world.run(3.0)
-    world.nodes["a"]._state.roster.peers["b"].outbound.pacer.spend(100, world.now, 1.0)
+    world.nodes["a"]._state.peer_table.peers["b"].sender.pacer.on_sent(100, world.now, 1.0)
     world.send("a", "map", bytes(50_000), "b")
-    assert world.run(2.0, until=lambda: len(world.told("a", MessageDelivered)) == 2)
+    assert world.run(2.0, until=lambda: len(world.events_of("a", MessageDelivered)) == 2)

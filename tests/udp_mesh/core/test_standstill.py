@@ -1,4 +1,4 @@
-"""A process or machine that stands still (stopped, swapped out, a virtual machine put aside) loses nothing by it."""
+"""A suspended process or machine (stopped, swapped out, a paused virtual machine) causes no loss."""
 
 import pytest
 
@@ -14,16 +14,16 @@ def met(seed: int) -> World:
     world = World(seed=seed)
     for name in ("a", "b"):
         world.add(settings(name, *TOPICS))
-    assert world.run(5.0, until=lambda: bool(world.told("a", PeerOnline) and world.told("b", PeerOnline)))
+    assert world.run(5.0, until=lambda: bool(world.events_of("a", PeerOnline) and world.events_of("b", PeerOnline)))
     return world
 
 
 def delivered_once(world: World, within_s: float) -> None:
-    assert world.run(within_s, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(within_s, until=lambda: bool(world.events_of("a", MessageDelivered)))
     world.run(5.0)
-    assert len(world.told("a", MessageDelivered)) == 1
-    assert len(world.told("b", MessageReceived)) == 1
-    assert not world.told("a", MessagePeerLost)
+    assert len(world.events_of("a", MessageDelivered)) == 1
+    assert len(world.events_of("b", MessageReceived)) == 1
+    assert not world.events_of("a", MessagePeerLost)
 
 
 @pytest.mark.parametrize("stopped_s", [2.0, 20.0, 120.0, 1000.0])
@@ -37,12 +37,12 @@ def test_a_team_that_stood_still_goes_on_where_it_was(stopped_s: float, lost: bo
     if lost:
         world._queue.clear()
     delivered_once(world, within_s=3.0)
-    assert not world.told("a", PeerOffline)
-    assert not world.told("b", PeerOffline)
+    assert not world.events_of("a", PeerOffline)
+    assert not world.events_of("b", PeerOffline)
 
 
 def stop(world: World, name: str, stopped_s: float) -> None:
-    """One node stands still, and what is sent to it meanwhile is lost; then it goes on."""
+    """Suspend one node and lose what is sent to it meanwhile; then resume it."""
     stopped = world.nodes.pop(name)
     world.run(stopped_s)
     world.nodes[name] = stopped
@@ -50,14 +50,14 @@ def stop(world: World, name: str, stopped_s: float) -> None:
 
 @pytest.mark.parametrize("stopped_s", [5.0, 45.0, 200.0])
 def test_a_stopped_sender_takes_nobody_for_lost(stopped_s: float) -> None:
-    """What the others said meanwhile did not fit the socket's buffer: to the sender they were silent."""
+    """What the others sent meanwhile did not fit the socket's buffer: to the sender they were silent."""
     world = met(3)
     world.send("a", "map", bytes(MAP_BYTES), "b")
     world.run(0.3)
     stop(world, "a", stopped_s)
     delivered_once(world, within_s=6.0)
-    assert not world.told("a", PeerOffline)
-    assert bool(world.told("b", PeerOffline)) == (stopped_s > 10)
+    assert not world.events_of("a", PeerOffline)
+    assert bool(world.events_of("b", PeerOffline)) == (stopped_s > 10)
 
 
 @pytest.mark.parametrize("stopped_s", [5.0, 45.0])
@@ -67,8 +67,8 @@ def test_a_stopped_receiver_gets_the_message_when_it_goes_on(stopped_s: float) -
     world.run(0.3)
     stop(world, "b", stopped_s)
     delivered_once(world, within_s=6.0)
-    assert not world.told("b", PeerOffline)
-    assert bool(world.told("a", PeerOffline)) == (stopped_s > 10)
+    assert not world.events_of("b", PeerOffline)
+    assert bool(world.events_of("a", PeerOffline)) == (stopped_s > 10)
 
 
 def test_a_peer_that_is_silent_afterwards_is_lost_all_the_same() -> None:
@@ -77,6 +77,6 @@ def test_a_peer_that_is_silent_afterwards_is_lost_all_the_same() -> None:
     del world.nodes["b"]
     world.now += 500.0
     world.run(9.0)
-    assert not world.told("a", PeerOffline)
-    assert world.run(3.0, until=lambda: bool(world.told("a", PeerOffline)))
-    assert world.run(60.0, until=lambda: bool(world.told("a", MessagePeerLost)))
+    assert not world.events_of("a", PeerOffline)
+    assert world.run(3.0, until=lambda: bool(world.events_of("a", PeerOffline)))
+    assert world.run(60.0, until=lambda: bool(world.events_of("a", MessagePeerLost)))

@@ -1,4 +1,4 @@
-"""Laws of sealing: what is sealed opens once, at its receiver, and nowhere else."""
+"""Properties of sealing: what is sealed opens once, at its receiver, and nowhere else."""
 
 import pytest
 from hypothesis import given

@@ -1,8 +1,7 @@
-"""Writes the wire vectors: `python -m tests.udp_mesh.wire.make_vectors`. The tests compare the files with what it
-makes.
+"""Write the wire vectors: `python -m tests.udp_mesh.wire.make_vectors`. The tests compare the files with its output.
 
-Another implementation reads `vectors/*.json`: frames as JSON with their bytes in hexadecimal, sealed datagrams with
-the keys and boot ids that open them, and datagrams and messages of the fielded format.
+Other implementations read `vectors/*.json`: frames as JSON with their bytes in hexadecimal, sealed datagrams with the
+keys and boot ids that open them, and datagrams and messages of the legacy format.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from udp_mesh.wire.legacy import (
     LegacyDatagram,
     LegacyPayload,
     PriorityMeshData,
-    cover,
+    encapsulate,
     encode_legacy,
     encode_mesh_data,
 )
@@ -98,13 +97,13 @@ def describe(value: object) -> object:
         return {"type": type(value).__name__, **{name: describe(field) for name, field in fields.items()}}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         named = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-        # What a frame may leave out is left out here too: files of earlier versions stay as they are.
+        # Optional fields of a frame are omitted here too: files of earlier versions stay unchanged.
         said = {name: describe(field) for name, field in named.items() if field is not None}
         return {"type": type(value).__name__, **said}
     if isinstance(value, tuple | list):
         return [describe(item) for item in value]
     if isinstance(value, int) and not isinstance(value, bool):
-        # A bitmap of 256 bits is no number that every JSON reader can hold.
+        # Not every JSON reader can hold a bitmap of 256 bits as a number.
         return hex(value) if value >= 1 << 53 else int(value)
     return value
 
@@ -149,7 +148,7 @@ def make_legacy() -> object:
     return {
         "datagrams": datagrams,
         "message": {"message": describe(MESH_DATA), "hex": encode_mesh_data(MESH_DATA).hex()},
-        "covered": {"datagram": COVERED.hex(), "hex": cover(COVERED).hex()},
+        "covered": {"datagram": COVERED.hex(), "hex": encapsulate(COVERED).hex()},
     }
 
 

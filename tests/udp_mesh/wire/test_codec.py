@@ -1,4 +1,4 @@
-"""Laws of the frames: what is encoded is decoded, and any bytes give frames or DecodeError."""
+"""Properties of the frames: what is encoded is decoded, and any bytes give frames or DecodeError."""
 
 import struct
 
@@ -39,7 +39,7 @@ def test_any_bytes_give_frames_within_the_caps_or_an_error(raw: bytes) -> None:
     except DecodeError:
         return
     assert 1 <= len(frames) <= limits.MAX_FRAMES_PER_DATAGRAM
-    # Nothing is accepted that would not be written: the format has one spelling per value, but for trailing lengths.
+    # Only what would be written is accepted: the format has one encoding per value, except for trailing lengths.
     assert decode(encode(frames)) == frames
 
 

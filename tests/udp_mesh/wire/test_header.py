@@ -1,4 +1,4 @@
-"""Laws of the clear header."""
+"""Properties of the clear header."""
 
 import pytest
 from hypothesis import given

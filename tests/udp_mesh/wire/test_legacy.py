@@ -1,4 +1,4 @@
-"""Laws of the fielded format, and its reader's defects that ours does not have."""
+"""Properties of the legacy format, and defects of the legacy reader that ours does not have."""
 
 import struct
 
@@ -14,14 +14,14 @@ from udp_mesh.wire.legacy import (
     LegacyDatagram,
     LegacyPayload,
     PriorityMeshData,
-    cover,
+    decapsulate,
     decode_legacy,
     decode_mesh_data,
+    encapsulate,
     encode_legacy,
     encode_mesh_data,
     fragment_legacy,
     is_legacy,
-    uncover,
 )
 
 words = st.text(st.characters(min_codepoint=0x21, max_codepoint=0x7E), min_size=1, max_size=15).filter(
@@ -116,12 +116,12 @@ def test_defect_4_an_unknown_type_is_bad_bytes_like_any_other() -> None:
 
 @given(st.binary(max_size=1500))
 def test_what_is_covered_is_an_acknowledgement_to_fielded_programs_and_itself_to_us(data: bytes) -> None:
-    covered = cover(data)
+    covered = encapsulate(data)
     assert decode_legacy(covered) == LegacyAck(0xFFFF, 0xFFFFFFFF)
-    assert uncover(covered) == data
+    assert decapsulate(covered) == data
     assert len(covered) == len(data) + LEGACY_OVERHEAD_BYTES
 
 
 @given(st.binary(max_size=40))
 def test_anything_else_is_not_uncovered(data: bytes) -> None:
-    assert data[:11] == cover(b"")[:11] or uncover(data) is None
+    assert data[:11] == encapsulate(b"")[:11] or decapsulate(data) is None

@@ -33,7 +33,7 @@ def test_published_datagrams_open() -> None:
             check_long(key, data, header)
             number, frames = channel.open_long(data, header)
         else:
-            # A short header is read by who has heard of the channel: its receiver knows about where the numbers are.
+            # A short header is read by a receiver that knows the channel and about where its numbers are.
             channel.window.accept(vector["packet_number"] - 1)
             assert header.tag == vector["tag"]
             number, frames = channel.open(data, header.number_low)

@@ -1,1 +1,1 @@
-"""How much may be in flight to one peer: round-trip times in, window and pacing rate out."""
+"""Congestion control per peer: round-trip times in, congestion window and pacing rate out."""

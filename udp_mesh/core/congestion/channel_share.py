@@ -1,59 +1,61 @@
-"""Several nodes send on one channel: what each says in heartbeats that it sends -> how much queue is ours to keep.
+"""Our share of a channel on which several nodes send: reported send rates in -> fraction of the target queue out.
 
-1. `told` takes in what another node says it sends; those that send next to nothing are left out.
-2. `queue_share` counts the senders, each by its share: (sum of rates)^2 / sum of squares. Four nodes that send alike
-   are 4, one with three that only acknowledge is little more than 1, and all who hear each other come to one number.
+1. `on_send_rate` records what another node reports to send; nodes that send next to nothing are ignored.
+2. `queue_share` estimates the number of senders as (sum of rates)^2 / sum of squares: four nodes that send alike count
+   as 4, one with three that only acknowledge as little more than 1, and all nodes that hear each other get the same
+   number.
 
-The channel stays busy while anyone has a frame to send, so each of n senders need keep less queue than a single one
-would, and an urgent message stands behind less of its own robot's bulk; the root of n was found to cost little
-throughput. Who sends less than the others keeps more, who sends more keeps less: that draws the shares together.
+The channel stays busy while any node has a frame to send, so each of n senders needs less queue than a single one, and
+an urgent message waits behind less of its own robot's bulk. Dividing by the root of n was measured to cost little
+throughput. Nodes that send less than others keep more queue, and vice versa, which equalizes the shares.
 """
 
 import math
 
-LEAST_BYTES_PER_S = 10_000.0
-"""Who sends less takes hardly any of the slowest channel (1 Mbit/s); and bounds what is remembered in a large team."""
+MIN_BYTES_PER_S = 10_000.0
+"""Slower nodes use hardly any of the slowest channel (1 Mbit/s). Also bounds what is stored in a large team."""
 
-LEAST_SENDERS = 1.5
-"""Fewer are one sender and those who answer it."""
+MIN_SENDERS = 1.5
+"""Fewer are one sender and the nodes that acknowledge it."""
 
-MOST_CORRECTION = 2.0
-"""By so much at most unequal shares are corrected: rates of the last second scatter."""
+MAX_CORRECTION = 2.0
+"""Bounds the correction of unequal shares: rates of the last second are noisy."""
 
-MOST_SHARE = 0.9
-"""Among others, whatever the correction."""
+MAX_SHARE = 0.9
+"""With other senders, whatever the correction."""
 
-HOLDS_S = 10.5
-"""What a heartbeat says holds at least so long: until some of the most sparse ones of a small team have been missed."""
+RATE_VALID_S = 10.5
+"""A reported rate is valid for at least this long, until several of the sparsest heartbeats of a small team were
+missed."""
 
 
-class Crowd:
-    """The nodes heard to send much, by boot id."""
+class ChannelShare:
+    """The nodes known to send much, by boot id."""
 
     __slots__ = ("_others",)
 
     def __init__(self) -> None:
         self._others: dict[bytes, tuple[float, float]] = {}
-        """Bytes per second, and until when that holds."""
+        """Bytes per second, and until when that is valid."""
 
-    def told(self, boot_id: bytes, bytes_per_s: float, now: float, *, holds_s: float = HOLDS_S) -> None:
-        """A heartbeat says how much its sender sends to everybody; the next one is missed after `holds_s`."""
-        if bytes_per_s >= LEAST_BYTES_PER_S:
-            self._others[boot_id] = (bytes_per_s, now + max(HOLDS_S, holds_s))
+    def on_send_rate(self, boot_id: bytes, bytes_per_s: float, now: float, *, valid_s: float = RATE_VALID_S) -> None:
+        """Record the total send rate reported in a heartbeat; the next heartbeat is overdue after `valid_s`."""
+        if bytes_per_s >= MIN_BYTES_PER_S:
+            self._others[boot_id] = (bytes_per_s, now + max(RATE_VALID_S, valid_s))
         elif self._others:
             self._others.pop(boot_id, None)
 
     def queue_share(self, own_bytes_per_s: float, now: float) -> float:
-        """The part of a single sender's queue that is ours to keep: 1 alone, below 1 among others."""
+        """Our fraction of a single sender's queue: 1 if no other node sends, otherwise less."""
         others = self._others
         if not others:
             return 1.0
         for boot_id in [boot_id for boot_id, (_, until) in others.items() if now > until]:
             del others[boot_id]
-        rates = [max(own_bytes_per_s, LEAST_BYTES_PER_S), *(rate for rate, _ in others.values())]
+        rates = [max(own_bytes_per_s, MIN_BYTES_PER_S), *(rate for rate, _ in others.values())]
         total = sum(rates)
         senders = total * total / sum(rate * rate for rate in rates)
-        if senders < LEAST_SENDERS:
+        if senders < MIN_SENDERS:
             return 1.0
         correction = total / senders / rates[0]
-        return min(MOST_SHARE, min(MOST_CORRECTION, max(1 / MOST_CORRECTION, correction)) / math.sqrt(senders))
+        return min(MAX_SHARE, min(MAX_CORRECTION, max(1 / MAX_CORRECTION, correction)) / math.sqrt(senders))

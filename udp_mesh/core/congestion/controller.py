@@ -1,31 +1,31 @@
-"""What decides how many packets may be on their way to one peer: the seam, and the scheme that never decides anew.
+"""The interface of congestion controllers, and the fixed window.
 
-The law that follows the link is in `adaptive`.
+The controller that follows the link is in `delay_based`.
 """
 
 from typing import Protocol
 
 
-class Window(Protocol):
-    """Decides how much may be in flight and how fast it leaves."""
+class CongestionController(Protocol):
+    """Decides how much may be in flight and how fast it is sent."""
 
     queue_share: float
-    """The part of a single sender's queue that is ours to keep (see `crowd`)."""
+    """Our fraction of a single sender's queue (see `channel_share`)."""
 
     @property
-    def packets(self) -> float:
-        """How many packets may be on their way."""
+    def cwnd(self) -> float:
+        """The congestion window in packets."""
         ...
 
-    def draining(self, now: float) -> bool:
-        """Whether a drain takes longer than what was on its way before it."""
+    def drain_overdue(self, now: float) -> bool:
+        """Whether a drain takes longer than the packets in flight before it."""
         ...
 
-    def packets_per_s(self) -> float | None:
-        """Pacing (None: as fast as the window allows)."""
+    def pacing_packets_per_s(self) -> float | None:
+        """The pacing rate (None: as fast as the window allows)."""
         ...
 
-    def acknowledged(
+    def on_ack(
         self,
         count: int,
         largest: int,
@@ -33,40 +33,40 @@ class Window(Protocol):
         in_flight: int,
         rate: float | None,
         *,
-        limited: bool,
+        app_limited: bool,
         ahead: int,
         loss: float,
         now: float,
     ) -> None:
-        """`count` packets were newly acknowledged, up to number `largest`; `rate` is a delivery rate sample.
-        When the newest of them left, `ahead` others were on their way; its burst was `limited` by the application."""
+        """`count` packets were newly acknowledged, up to number `largest`; `rate` is a delivery rate sample. When the
+        newest of them was sent, `ahead` others were in flight; `app_limited`: there was no more to send."""
         ...
 
-    def capacity(self) -> float | None:
-        """Estimated packets/s of the path."""
+    def capacity_packets_per_s(self) -> float | None:
+        """The estimated capacity of the path."""
         ...
 
-    def presumable(self) -> bool:
-        """Whether the link can be presumed to go on delivering as it did while acknowledgements are late."""
+    def assume_delivery(self) -> bool:
+        """Whether the link can be assumed to keep delivering while acknowledgements are late."""
         ...
 
 
 class FixedWindow:
-    """A number of packets, whatever happens: the paper's scheme."""
+    """A constant window, as in the paper."""
 
-    __slots__ = ("packets", "queue_share")
+    __slots__ = ("cwnd", "queue_share")
 
     def __init__(self, packets: int) -> None:
-        self.packets = float(packets)
+        self.cwnd = float(packets)
         self.queue_share = 1.0
 
-    def draining(self, now: float) -> bool:
+    def drain_overdue(self, now: float) -> bool:
         return False
 
-    def packets_per_s(self) -> float | None:
+    def pacing_packets_per_s(self) -> float | None:
         return None
 
-    def acknowledged(
+    def on_ack(
         self,
         count: int,
         largest: int,
@@ -74,15 +74,15 @@ class FixedWindow:
         in_flight: int,
         rate: float | None,
         *,
-        limited: bool,
+        app_limited: bool,
         ahead: int,
         loss: float,
         now: float,
     ) -> None:
         return
 
-    def capacity(self) -> float | None:
+    def capacity_packets_per_s(self) -> float | None:
         return None
 
-    def presumable(self) -> bool:
+    def assume_delivery(self) -> bool:
         return False

@@ -1,223 +1,217 @@
-"""How many packets may be on their way to one peer: delay decides, loss does not (radio loss is not congestion).
+"""Delay-based congestion control: round trip times decide, loss does not (radio loss is not congestion).
 
-1. Startup doubles the window once per round trip until the round trip has grown by `START_QUEUE_S`.
-2. Then, once per round trip: w <- w/2 + (w * least / standing + a) / 2, where a is `QUEUE_S` worth of packets (less on
-   a short path, more where packets are lost): the window settles where the sender keeps that much queue at the
-   bottleneck, and no more.
-3. w never exceeds by much what the measured delivery rate needs, plus a, and growth that delivers nothing more ends: a
-   queue too short to be seen as delay is not overrun.
-4. A *drain* lets the queue run empty for one round trip, so that the least round trip is seen again: after
-   `DRAIN_EVERY_S` without having seen it, and as soon as the round trip looks longer than our own queue explains. If
-   it stays long while the queue is empty, the route has changed: the window moves at once to the new round trip times
-   the delivery rate, by no more than startup would; on a route so long that this rate is none of its own it starts up
-   again.
-5. The least round trip is *proved* where it was seen with next to nothing of ours on its way. Once it differs from
-   that (the path changed, or no drain has seen the empty path for long) the next drain goes down to
-   `LEAST_WINDOW` - 1 packets: a queue that stands for good would otherwise be taken for the path, and what it loses
-   for the loss of a radio.
+1. Startup doubles the window once per round trip until the round trip has grown by `STARTUP_QUEUE_S`.
+2. Then, once per round trip: w <- w/2 + (w * min_rtt / windowed_rtt + a) / 2, where a is `QUEUE_S` worth of packets
+   (less on a short path, more on a lossy one). The window settles where the sender keeps exactly that much queue at the
+   bottleneck.
+3. w never exceeds what the measured delivery rate needs, plus a, by much, and growth that delivers nothing more stops:
+   a queue too short to show as delay is not overrun.
+4. A *drain* empties the queue for one round trip, so that the minimum RTT is seen again: after `DRAIN_INTERVAL_S`
+   without seeing it, and as soon as the round trip is longer than our own queue explains. If it stays long with an
+   empty queue, the route has changed: the window moves at once to the new round trip times the delivery rate, by no
+   more than startup would. On a route too long for that rate to be its own, startup begins again.
+5. The minimum RTT is *verified* if it was seen with next to nothing in flight. Once it differs (the path changed, or no
+   drain has seen the empty path for long) the next drain goes down to `MIN_CWND` - 1 packets: otherwise a standing
+   queue would be taken for the path, and its losses for radio loss.
 
-The idea of step 2 is that of FAST TCP (Jin, Wei, Low 2004), that of steps 3 and 4 of BBR's bandwidth model (Cardwell
-and others 2016).
+Step 2 is based on FAST TCP (Jin, Wei, Low 2004), steps 3 and 4 on BBR's bandwidth model (Cardwell et al. 2016).
 """
 
 from collections import deque
 from enum import Enum
 
-from udp_mesh.core.congestion.rtt import STANDING_WINDOW_S, RoundTrip
+from udp_mesh.core.congestion.rtt import MIN_WINDOWED_RTT_S, RttEstimator
 
 QUEUE_S = 0.003
-"""Queue the sender keeps at the bottleneck: covers batched acknowledgements and pacing; adds this much to urgent
-latency."""
+"""Target queue at the bottleneck: covers batched acknowledgements and pacing, and adds this much to urgent latency."""
 
-SHORT_QUEUE_S = 0.002
+MIN_QUEUE_S = 0.002
 QUEUE_PER_ROUND_TRIP = 0.3
-"""Acknowledgements come every few packets of a small window: on a short path less of a queue covers them."""
+"""On a short path the window is small and acknowledged every few packets, so less queue suffices."""
 
 LOSS_QUEUE_S = 0.002
-LOSS_QUEUE_UP_TO = 0.05
-"""Losses leave holes in the queue: so much more of it keeps the link busy, up to what urgent messages can bear."""
+FULL_LOSS_QUEUE_AT = 0.05
+"""Losses leave holes in the queue: this much more keeps the link busy, limited by what urgent messages tolerate."""
 
-START_QUEUE_S = 0.006
-"""Growth of the round trip that ends the startup: more than the scatter of a radio, less than an urgent message's
-slack."""
+STARTUP_QUEUE_S = 0.006
+"""RTT growth that ends startup: more than a radio's jitter, less than the slack of an urgent message."""
 
-LEAST_QUEUE_PACKETS = 2.0
+MIN_QUEUE_PACKETS = 2.0
 """The same at low rates: fewer packets leave the link idle between acknowledgements."""
 
-LEAST_SHARED_QUEUE_PACKETS = 1.0
-"""The same where others send on the channel too: they keep it busy meanwhile."""
+MIN_SHARED_QUEUE_PACKETS = 1.0
+"""The same if other nodes send on the channel too and keep it busy."""
 
-SHARED_UP_TO_LOSS = 0.2
-"""The more is lost the more often all wait at once, and the longer urgent messages may take: from this loss on the
+UNSHARED_FROM_LOSS = 0.2
+"""With more loss all nodes wait at once more often, and urgent messages may take longer: from this loss rate on, the
 queue is that of a single sender."""
 
-LEAST_WINDOW = 4.0
-"""Packets: below, a lost packet has too few successors to be noticed without a timeout."""
+MIN_CWND = 4.0
+"""Packets: below this, a lost packet has too few successors to be detected without a timeout."""
 
-MOST_WINDOW = 8192.0
-"""Packets: 92 Mbit at 1400 B, more than any link these robots have; bounds the state kept per packet."""
+MAX_CWND = 8192.0
+"""Packets: 92 Mbit at 1400 B, more than any link of these robots needs. Bounds the state per packet."""
 
 PACE_GAIN = 1.25
-"""The window, not the pacing, limits what is on its way: pacing only spreads it."""
+"""The window, not pacing, limits what is in flight: pacing only spreads it."""
 
 CAPACITY_GAIN = 1.05
-"""Pacing above the measured rate by this much notices when the link becomes faster, without building a queue."""
+"""Pacing this much above the measured rate detects a faster link without building a queue."""
 
 LOSS_GAIN = 0.3
-"""And by this much of the loss: its estimate scatters, and too slow a pace costs throughput."""
+"""Plus this fraction of the loss rate: its estimate is noisy, and pacing too slowly costs throughput."""
 
-MOST_LOSS = 0.35
-"""The measured rate is that of deliveries; what is lost comes on top, up to this share of what is sent."""
+MAX_LOSS = 0.35
+"""The measured rate counts deliveries; lost packets are added, up to this fraction of what is sent."""
 
-START_WINDOW = 10.0
-"""Packets before anything is known (RFC 6928)."""
+INITIAL_CWND = 10.0
+"""Initial window in packets (RFC 6928)."""
 
-LEAST_UPDATE_S = STANDING_WINDOW_S
-"""On links faster than this round trip the law runs at this pace: until then the standing round trip still tells of the
-window before."""
+MIN_UPDATE_S = MIN_WINDOWED_RTT_S
+"""Minimum update interval on links with a shorter round trip: until then the windowed RTT still reflects the previous
+window."""
 
-LEAST_START_S = 0.004
-"""The same while starting, when only growth counts."""
+MIN_STARTUP_UPDATE_S = 0.004
+"""The same during startup, when only growth counts."""
 
 RATE_WINDOW_S = 2.0
-"""How long a measured delivery rate is believed."""
+"""How long a delivery rate sample is valid."""
 
-DRAIN_EVERY_S = 2.0
-DRAIN_EVERY_ROUND_TRIPS = 15.0
-"""Between two drains, at least: each costs about a quarter of a round trip of throughput."""
+DRAIN_INTERVAL_S = 2.0
+DRAIN_ROUND_TRIPS = 15.0
+"""Minimum time between two drains: each costs about a quarter of a round trip of throughput."""
 
-PROVE_EVERY_ROUND_TRIPS = 4.0
-"""The same while the least round trip is not proved: what is built on it is wrong meanwhile."""
+UNVERIFIED_DRAIN_ROUND_TRIPS = 4.0
+"""The same while the minimum RTT is not verified and everything based on it may be wrong."""
 
-DRAIN_TO = 0.95
+DRAIN_FRACTION = 0.95
 DRAIN_PACKETS = 3
-"""Part of the pipe filled while draining, less these packets: on a short path a burst of them is the queue."""
+"""Fraction of the pipe kept full during a drain, less these packets: on a short path a burst of them is the queue."""
 
 GROWTH = 1.25
-"""Growth per round trip while the window is used up and yet no queue is seen: the link has become faster."""
+"""Growth per round trip while the window is used up without any queue: the link has become faster."""
 
-GROW_AFTER_ROUNDS = 3
-"""Round trips without a queue before growth: two happen by themselves around the law's balance."""
+GROWTH_AFTER_ROUNDS = 3
+"""Round trips without a queue before growth: two occur by chance near equilibrium."""
 
 FULL_GROWTH = 1.1
 FULL_ROUNDS = 3
-"""A link that did not deliver a tenth more after so many rounds of growth is full, whatever its delay says."""
+"""A link that delivers less than a tenth more after so many rounds of growth is full, whatever its delay."""
 
-GROW_AGAIN_S = 2.0
-"""How long after that growth is not tried again."""
+GROWTH_PAUSE_S = 2.0
+"""How long to wait after that before growing again."""
 
 RATE_BOUND = 1.2
-START_RATE_BOUND = 2.5
-"""The window never exceeds this many times what the measured rate needs; growing it must run ahead of the
-measurement."""
+STARTUP_RATE_BOUND = 2.5
+"""Upper bounds of the window relative to what the measured rate needs; growth has to run ahead of the measurement."""
 
 ACK_BATCH_S = 0.008
-"""About how long batched acknowledgements hold packets in the window beyond the round trip."""
+"""About how long batched acknowledgements keep packets in the window beyond the round trip."""
 
 SUSPECT_QUEUE_S = 0.015
-"""Queueing of this much is more than our own window explains."""
+"""More queueing than our own window explains."""
 
-SUSPECT_AGAIN_S = 0.3
-MOST_SUSPECT_AGAIN_S = 4.0
-"""Between two drains on suspicion, doubled each time one finds nothing."""
+SUSPECT_DRAIN_INTERVAL_S = 0.3
+MAX_SUSPECT_DRAIN_INTERVAL_S = 4.0
+"""Minimum time between two drains on suspicion, doubled each time one finds nothing."""
 
 
 class Phase(Enum):
     STARTUP = 1
     CRUISE = 2
     DRAIN = 3
-    """Waiting until little enough is in flight."""
+    """Waiting until few enough packets are in flight."""
     HOLD = 4
     """The queue is empty: waiting for the round trip of a packet sent now."""
 
 
-class AdaptiveWindow:
-    """The law of the module's docstring."""
+class DelayBasedController:
+    """The controller described in the module's docstring."""
 
     __slots__ = (
-        "_alone",
+        "_cwnd_before_drain",
+        "_drain_on_suspicion",
         "_drained_at",
         "_empty_rounds",
         "_full_capacity",
+        "_full_drain",
         "_full_rounds",
-        "_grow_from",
+        "_grow_after",
         "_growing",
-        "_held_least",
-        "_hold_from",
-        "_latest_four",
+        "_hold_from_number",
+        "_hold_min_rtt",
+        "_last_rtts",
         "_loss",
-        "_proved",
         "_rates",
-        "_round_ends",
-        "_saved",
-        "_suspect_every",
-        "_suspected",
-        "_suspicion",
-        "_to_the_bottom",
-        "_trip",
+        "_round_ends_at",
+        "_rtt",
+        "_suspect_interval_s",
+        "_suspect_rounds",
+        "_uncontended_acks",
         "_updated_at",
-        "_was_standing",
-        "packets",
+        "_verified_min_rtt",
+        "_windowed_rtt_before_drain",
+        "cwnd",
         "phase",
         "queue_share",
     )
 
-    def __init__(self, trip: RoundTrip) -> None:
-        self._trip = trip
+    def __init__(self, rtt: RttEstimator) -> None:
+        self._rtt = rtt
         self.queue_share = 1.0
-        self.packets = START_WINDOW
+        self.cwnd = INITIAL_CWND
         self.phase = Phase.STARTUP
-        self._latest_four: deque[float] = deque(maxlen=4)
+        self._last_rtts: deque[float] = deque(maxlen=4)
         self._rates: deque[tuple[float, float]] = deque()
-        self._alone = 0
-        self._proved = 0.0
-        self._to_the_bottom = False
-        self._round_ends = 0
+        self._uncontended_acks = 0
+        self._verified_min_rtt = 0.0
+        self._full_drain = False
+        self._round_ends_at = 0
         self._updated_at = 0.0
         self._drained_at = 0.0
         self._empty_rounds = 0
         self._full_capacity = 0.0
         self._full_rounds = 0
-        self._grow_from = 0.0
+        self._grow_after = 0.0
         self._growing = False
         self._loss = 0.0
-        self._saved = START_WINDOW
-        self._was_standing = 0.0
-        self._hold_from = 0
-        self._held_least = float("inf")
-        self._suspicion = False
-        self._suspected = 0
-        self._suspect_every = SUSPECT_AGAIN_S
+        self._cwnd_before_drain = INITIAL_CWND
+        self._windowed_rtt_before_drain = 0.0
+        self._hold_from_number = 0
+        self._hold_min_rtt = float("inf")
+        self._drain_on_suspicion = False
+        self._suspect_rounds = 0
+        self._suspect_interval_s = SUSPECT_DRAIN_INTERVAL_S
 
-    def capacity(self) -> float | None:
+    def capacity_packets_per_s(self) -> float | None:
         return self._rates[0][1] if self._rates else None
 
-    def presumable(self) -> bool:
-        # A queue that our window does not explain is work enough for the link; and a drain wants it empty.
-        return bool(self._rates) and self.phase in (Phase.STARTUP, Phase.CRUISE) and not self._queue_is_suspect()
+    def assume_delivery(self) -> bool:
+        # A queue that our window does not explain keeps the link busy anyway, and a drain wants the queue empty.
+        return bool(self._rates) and self.phase in (Phase.STARTUP, Phase.CRUISE) and not self._unexplained_queue()
 
-    def draining(self, now: float) -> bool:
-        return self.phase in (Phase.DRAIN, Phase.HOLD) and now - self._updated_at > self._was_standing
+    def drain_overdue(self, now: float) -> bool:
+        return self.phase in (Phase.DRAIN, Phase.HOLD) and now - self._updated_at > self._windowed_rtt_before_drain
 
-    def packets_per_s(self) -> float | None:
-        smoothed = self._trip.smoothed
-        if smoothed is None:
+    def pacing_packets_per_s(self) -> float | None:
+        smoothed_rtt = self._rtt.smoothed_rtt
+        if smoothed_rtt is None:
             return None
         if self.phase is Phase.STARTUP:
-            return 2.0 * self.packets / smoothed
-        rate = PACE_GAIN * self.packets / smoothed
-        capacity = self.capacity()
+            return 2.0 * self.cwnd / smoothed_rtt
+        rate = PACE_GAIN * self.cwnd / smoothed_rtt
+        capacity = self.capacity_packets_per_s()
         return (
             rate
             if capacity is None or self._growing
-            else min(rate, max(self._paced(capacity), LEAST_WINDOW / smoothed))
+            else min(rate, max(self._pacing_rate(capacity), MIN_CWND / smoothed_rtt))
         )
 
-    def _paced(self, capacity: float) -> float:
-        loss = min(self._loss, MOST_LOSS)
+    def _pacing_rate(self, capacity: float) -> float:
+        loss = min(self._loss, MAX_LOSS)
         return capacity * (CAPACITY_GAIN + LOSS_GAIN * loss) / (1 - loss)
 
-    def acknowledged(
+    def on_ack(
         self,
         count: int,
         largest: int,
@@ -225,95 +219,106 @@ class AdaptiveWindow:
         in_flight: int,
         rate: float | None,
         *,
-        limited: bool,
+        app_limited: bool,
         ahead: int,
         loss: float,
         now: float,
     ) -> None:
-        trip = self._trip
-        if trip.latest is None or trip.least is None or trip.standing is None:
+        rtt = self._rtt
+        if rtt.latest_rtt is None or rtt.min_rtt is None or rtt.windowed_rtt is None:
             return
         self._loss = loss
         if rate is not None:
-            self._saw_rate(rate, limited=limited, now=now)
-        self._latest_four.append(trip.latest)
-        self._alone = self._alone + 1 if ahead < LEAST_WINDOW - 1 else 0
-        if limited and self._alone >= 4 and min(self._latest_four) > 1.15 * trip.least + START_QUEUE_S:
-            # None of the four found more of ours on its way than a drain leaves: the path itself is longer now. (An
-            # application that pauses says nothing of that: a link that became slow still holds what it sent before.)
-            trip.forget_least(min(self._latest_four), now)
-            self._proved = trip.least
+            self._add_rate_sample(rate, app_limited=app_limited, now=now)
+        self._last_rtts.append(rtt.latest_rtt)
+        self._uncontended_acks = self._uncontended_acks + 1 if ahead < MIN_CWND - 1 else 0
+        if app_limited and self._uncontended_acks >= 4 and min(self._last_rtts) > 1.15 * rtt.min_rtt + STARTUP_QUEUE_S:
+            # None of the four had more of our packets ahead of it than a drain leaves: the path itself is longer now.
+            # (A pausing application alone proves nothing: a link that became slow still holds what was sent before.)
+            rtt.reset_min_rtt(min(self._last_rtts), now)
+            self._verified_min_rtt = rtt.min_rtt
         if self.phase is Phase.DRAIN:
-            if in_flight <= self.packets or largest >= self._round_ends:
+            if in_flight <= self.cwnd or largest >= self._round_ends_at:
                 # Everything sent before the drain has arrived, or so much that the rest is no queue.
                 self.phase = Phase.HOLD
-                self._hold_from = next_number
-                self._held_least = float("inf")
-            elif now - self._updated_at > max(1.0, 2 * self._was_standing):
+                self._hold_from_number = next_number
+                self._hold_min_rtt = float("inf")
+            elif now - self._updated_at > max(1.0, 2 * self._windowed_rtt_before_drain):
                 self._end_drain(now)
             return
         if self.phase is Phase.HOLD:
-            self._held_least = min(self._held_least, trip.latest)
-            if largest >= self._hold_from or trip.latest <= trip.least:
+            self._hold_min_rtt = min(self._hold_min_rtt, rtt.latest_rtt)
+            if largest >= self._hold_from_number or rtt.latest_rtt <= rtt.min_rtt:
                 self._end_drain(now)
-                self._round_ends = next_number
+                self._round_ends_at = next_number
             return
-        if self.phase is Phase.STARTUP and not limited and min(self._latest_four) - trip.least > START_QUEUE_S:
+        if self.phase is Phase.STARTUP and not app_limited and min(self._last_rtts) - rtt.min_rtt > STARTUP_QUEUE_S:
             self.phase = Phase.CRUISE
             self._drained_at = now
-            self.packets = max(LEAST_WINDOW, self.packets * trip.least / trip.standing)
-        if largest < self._round_ends or now - self._updated_at < max(trip.standing, self._least_update_s()):
+            self.cwnd = max(MIN_CWND, self.cwnd * rtt.min_rtt / rtt.windowed_rtt)
+        if largest < self._round_ends_at or now - self._updated_at < max(rtt.windowed_rtt, self._min_update_s()):
             return
-        self._round_ends = next_number
+        self._round_ends_at = next_number
         self._updated_at = now
-        if trip.latest <= trip.least * 1.02 + 0.0005 and self._is_proved():
-            # The empty path was seen just now: no drain is needed to see it.
+        if rtt.latest_rtt <= rtt.min_rtt * 1.02 + 0.0005 and self._min_rtt_is_verified():
+            # The empty path was just seen: no drain is needed.
             self._drained_at = now
-        self._update(limited=limited, now=now)
+        self._update(app_limited=app_limited, now=now)
 
-    def _least_update_s(self) -> float:
-        return LEAST_START_S if self.phase is Phase.STARTUP else LEAST_UPDATE_S
+    def _min_update_s(self) -> float:
+        return MIN_STARTUP_UPDATE_S if self.phase is Phase.STARTUP else MIN_UPDATE_S
 
-    def _queue_is_suspect(self) -> bool:
-        least, standing = self._trip.least, self._trip.standing
-        return least is not None and standing is not None and standing - least > SUSPECT_QUEUE_S + 0.25 * least
+    def _unexplained_queue(self) -> bool:
+        min_rtt, windowed_rtt = self._rtt.min_rtt, self._rtt.windowed_rtt
+        return (
+            min_rtt is not None
+            and windowed_rtt is not None
+            and windowed_rtt - min_rtt > SUSPECT_QUEUE_S + 0.25 * min_rtt
+        )
 
-    def _is_proved(self) -> bool:
-        """Whether the least round trip is the one seen when next to nothing of ours was on its way; otherwise it may
-        hold a queue that never ran empty."""
-        least = self._trip.least
-        return least is not None and abs(least - self._proved) <= 0.15 * self._proved + self._scatter_s()
+    def _min_rtt_is_verified(self) -> bool:
+        """Whether the minimum RTT was seen with next to nothing in flight; otherwise it may include a standing
+        queue."""
+        min_rtt = self._rtt.min_rtt
+        return (
+            min_rtt is not None
+            and abs(min_rtt - self._verified_min_rtt) <= 0.15 * self._verified_min_rtt + self._jitter_s()
+        )
 
-    def _scatter_s(self) -> float:
-        """What the packets that a drain leaves on their way may take, and a radio's scatter."""
-        return START_QUEUE_S / 3 + (LEAST_WINDOW - 1) / (self.capacity() or float("inf"))
+    def _jitter_s(self) -> float:
+        """Serialization time of the packets left in flight by a drain, plus a radio's jitter."""
+        return STARTUP_QUEUE_S / 3 + (MIN_CWND - 1) / (self.capacity_packets_per_s() or float("inf"))
 
-    def _update(self, *, limited: bool, now: float) -> None:
-        least, standing = self._trip.least, self._trip.standing
-        assert least is not None
-        assert standing is not None
+    def _update(self, *, app_limited: bool, now: float) -> None:
+        min_rtt, windowed_rtt = self._rtt.min_rtt, self._rtt.windowed_rtt
+        assert min_rtt is not None
+        assert windowed_rtt is not None
         if self.phase is Phase.STARTUP:
-            # It begins with little on its way.
-            self._proved = least
-            if not limited:
-                self._start_faster(least, standing, now)
+            # Startup begins with little in flight.
+            self._verified_min_rtt = min_rtt
+            if not app_limited:
+                self._grow_startup(min_rtt, windowed_rtt, now)
             return
         since_drain = now - self._drained_at
-        self._suspected = self._suspected + 1 if self._queue_is_suspect() else 0
-        if self._suspected >= 2 and since_drain > max(self._suspect_every, 4 * standing):
+        self._suspect_rounds = self._suspect_rounds + 1 if self._unexplained_queue() else 0
+        if self._suspect_rounds >= 2 and since_drain > max(self._suspect_interval_s, 4 * windowed_rtt):
             self._begin_drain(now, suspicion=True)
             return
-        every_round_trips = DRAIN_EVERY_ROUND_TRIPS if self._is_proved() else PROVE_EVERY_ROUND_TRIPS
-        if since_drain > max(DRAIN_EVERY_S, every_round_trips * least):
-            if not self._suspected and self._is_proved() and (limited or standing - least < QUEUE_S / 4):
+        every_round_trips = DRAIN_ROUND_TRIPS if self._min_rtt_is_verified() else UNVERIFIED_DRAIN_ROUND_TRIPS
+        if since_drain > max(DRAIN_INTERVAL_S, every_round_trips * min_rtt):
+            if (
+                not self._suspect_rounds
+                and self._min_rtt_is_verified()
+                and (app_limited or windowed_rtt - min_rtt < QUEUE_S / 4)
+            ):
                 self._drained_at = now
             else:
-                self._begin_drain(now, suspicion=self._suspected > 0)
+                self._begin_drain(now, suspicion=self._suspect_rounds > 0)
                 return
-        empty = standing - least < QUEUE_S / 4 and not limited and now >= self._grow_from
+        empty = windowed_rtt - min_rtt < QUEUE_S / 4 and not app_limited and now >= self._grow_after
         self._empty_rounds = self._empty_rounds + 1 if empty else 0
-        if self._empty_rounds >= GROW_AFTER_ROUNDS:
-            capacity = self.capacity() or 0.0
+        if self._empty_rounds >= GROWTH_AFTER_ROUNDS:
+            capacity = self.capacity_packets_per_s() or 0.0
             if not self._growing or capacity > FULL_GROWTH * self._full_capacity:
                 self._full_capacity, self._full_rounds = capacity, 0
             else:
@@ -321,26 +326,27 @@ class AdaptiveWindow:
             if self._full_rounds >= FULL_ROUNDS:
                 self._growing = False
                 self._empty_rounds = 0
-                self._grow_from = now + GROW_AGAIN_S
+                self._grow_after = now + GROWTH_PAUSE_S
                 return
-            self.packets = self._bounded(GROWTH * self.packets, least, standing)
+            self.cwnd = self._bounded(GROWTH * self.cwnd, min_rtt, windowed_rtt)
             self._growing = True
             return
         self._growing = False
-        wanted = 0.5 * self.packets + 0.5 * (self.packets * least / standing + self._queue(standing))
-        if wanted < self.packets or not limited:
-            self.packets = self._bounded(min(wanted, 2 * self.packets), least, standing)
+        target = 0.5 * self.cwnd + 0.5 * (self.cwnd * min_rtt / windowed_rtt + self._queue_packets(windowed_rtt))
+        if target < self.cwnd or not app_limited:
+            self.cwnd = self._bounded(min(target, 2 * self.cwnd), min_rtt, windowed_rtt)
 
-    def _start_again(self, packets: float) -> None:
-        """A route so much longer that what was measured on the one before does not tell how much it holds."""
+    def _restart(self, packets: float) -> None:
+        """Start up again on a route so much longer that the measured rate says nothing about its capacity."""
         self.phase = Phase.STARTUP
-        self.packets = min(MOST_WINDOW, max(START_WINDOW, packets))
+        self.cwnd = min(MAX_CWND, max(INITIAL_CWND, packets))
         self._rates.clear()
         self._full_capacity, self._full_rounds = 0.0, 0
 
-    def _start_faster(self, least: float, standing: float, now: float) -> None:
-        """Double, unless the link has not become faster by it for some round trips (its queue is too short to see)."""
-        capacity = self.capacity() or 0.0
+    def _grow_startup(self, min_rtt: float, windowed_rtt: float, now: float) -> None:
+        """Double the window, unless that has not made the link faster for some round trips (its queue is too short to
+        see)."""
+        capacity = self.capacity_packets_per_s() or 0.0
         if capacity > FULL_GROWTH * self._full_capacity:
             self._full_capacity = capacity
             self._full_rounds = 0
@@ -349,96 +355,96 @@ class AdaptiveWindow:
         if self._full_rounds >= FULL_ROUNDS:
             self.phase = Phase.CRUISE
             self._drained_at = now
-            self._grow_from = now + GROW_AGAIN_S
-            self.packets = self._bounded(self.packets, least, standing)
+            self._grow_after = now + GROWTH_PAUSE_S
+            self.cwnd = self._bounded(self.cwnd, min_rtt, windowed_rtt)
         else:
-            self.packets = max(self.packets, self._bounded(2 * self.packets, least, standing))
+            self.cwnd = max(self.cwnd, self._bounded(2 * self.cwnd, min_rtt, windowed_rtt))
 
-    def _queue(self, standing: float) -> float:
+    def _queue_packets(self, windowed_rtt: float) -> float:
         # Losses leave holes in the queue as well as in what arrives.
-        lost_s = LOSS_QUEUE_S * min(1.0, self._loss / LOSS_QUEUE_UP_TO)
-        return self._shared(self._queue_s() + lost_s, self.packets / standing)
+        lost_s = LOSS_QUEUE_S * min(1.0, self._loss / FULL_LOSS_QUEUE_AT)
+        return self._shared_queue(self._target_queue_s() + lost_s, self.cwnd / windowed_rtt)
 
-    def _queue_s(self) -> float:
-        least = self._trip.least
-        assert least is not None
-        return min(QUEUE_S, max(SHORT_QUEUE_S, QUEUE_PER_ROUND_TRIP * least))
+    def _target_queue_s(self) -> float:
+        min_rtt = self._rtt.min_rtt
+        assert min_rtt is not None
+        return min(QUEUE_S, max(MIN_QUEUE_S, QUEUE_PER_ROUND_TRIP * min_rtt))
 
-    def _shared(self, queue_s: float, packets_per_s: float) -> float:
-        """Packets of queue: `queue_s` at this rate and a least number, less of both where others send too."""
+    def _shared_queue(self, queue_s: float, packets_per_s: float) -> float:
+        """Queue in packets: `queue_s` at this rate, with a minimum; less of both if other nodes send too."""
         if self.queue_share == 1.0:
-            return max(LEAST_QUEUE_PACKETS, queue_s * packets_per_s)
-        relief = min(1.0, self._loss / SHARED_UP_TO_LOSS)
+            return max(MIN_QUEUE_PACKETS, queue_s * packets_per_s)
+        relief = min(1.0, self._loss / UNSHARED_FROM_LOSS)
         share = self.queue_share + (1.0 - self.queue_share) * relief
-        least = LEAST_SHARED_QUEUE_PACKETS * self.queue_share
-        least += (LEAST_QUEUE_PACKETS - least) * relief
-        return max(least, queue_s * share * packets_per_s)
+        min_packets = MIN_SHARED_QUEUE_PACKETS * self.queue_share
+        min_packets += (MIN_QUEUE_PACKETS - min_packets) * relief
+        return max(min_packets, queue_s * share * packets_per_s)
 
-    def _bounded(self, packets: float, least: float, standing: float) -> float:
-        capacity = self.capacity()
+    def _bounded(self, packets: float, min_rtt: float, windowed_rtt: float) -> float:
+        capacity = self.capacity_packets_per_s()
         if capacity is not None:
-            factor = RATE_BOUND if self.phase is Phase.CRUISE and not self._growing else START_RATE_BOUND
-            # What waits for a batched acknowledgement is on its way too, and what is lost takes part in the window.
-            pipe = capacity * (least + ACK_BATCH_S) / (1 - min(self._loss, MOST_LOSS))
-            packets = min(packets, max(START_WINDOW, factor * pipe + self._queue(standing)))
-        return min(MOST_WINDOW, max(LEAST_WINDOW, packets))
+            factor = RATE_BOUND if self.phase is Phase.CRUISE and not self._growing else STARTUP_RATE_BOUND
+            # Packets waiting for a batched acknowledgement are in flight too, and lost ones occupy the window.
+            pipe = capacity * (min_rtt + ACK_BATCH_S) / (1 - min(self._loss, MAX_LOSS))
+            packets = min(packets, max(INITIAL_CWND, factor * pipe + self._queue_packets(windowed_rtt)))
+        return min(MAX_CWND, max(MIN_CWND, packets))
 
     def _begin_drain(self, now: float, *, suspicion: bool) -> None:
-        least, standing = self._trip.least, self._trip.standing
-        assert least is not None
-        assert standing is not None
+        min_rtt, windowed_rtt = self._rtt.min_rtt, self._rtt.windowed_rtt
+        assert min_rtt is not None
+        assert windowed_rtt is not None
         self.phase = Phase.DRAIN
-        self._suspicion = suspicion
-        self._saved = self.packets
-        self._was_standing = standing
-        self._held_least = float("inf")
+        self._drain_on_suspicion = suspicion
+        self._cwnd_before_drain = self.cwnd
+        self._windowed_rtt_before_drain = windowed_rtt
+        self._hold_min_rtt = float("inf")
         self._updated_at = now
-        self._to_the_bottom = not self._is_proved()
-        drained = 0.0 if self._to_the_bottom else DRAIN_TO * self.packets * least / standing - DRAIN_PACKETS
-        self.packets = max(LEAST_WINDOW - 1, drained)
+        self._full_drain = not self._min_rtt_is_verified()
+        drained = 0.0 if self._full_drain else DRAIN_FRACTION * self.cwnd * min_rtt / windowed_rtt - DRAIN_PACKETS
+        self.cwnd = max(MIN_CWND - 1, drained)
 
     def _end_drain(self, now: float) -> None:
-        least = self._trip.least
-        assert least is not None
-        held = self._held_least
+        min_rtt = self._rtt.min_rtt
+        assert min_rtt is not None
+        hold_min_rtt = self._hold_min_rtt
         self.phase = Phase.CRUISE
         self._drained_at = self._updated_at = now
-        # The queue is empty because of the drain: no reason to grow for the next round trips.
-        self._grow_from = now + 3 * self._was_standing
-        self._suspected = 0
-        throughput = self._saved / self._was_standing
-        if self._to_the_bottom and held != float("inf"):
-            self._proved = held
+        # The drain emptied the queue: no reason to grow for the next round trips.
+        self._grow_after = now + 3 * self._windowed_rtt_before_drain
+        self._suspect_rounds = 0
+        throughput = self._cwnd_before_drain / self._windowed_rtt_before_drain
+        if self._full_drain and hold_min_rtt != float("inf"):
+            self._verified_min_rtt = hold_min_rtt
         if (
-            (self._suspicion or self._to_the_bottom)
-            and held > 1.15 * least + self._scatter_s()
-            and held != float("inf")
+            (self._drain_on_suspicion or self._full_drain)
+            and hold_min_rtt > 1.15 * min_rtt + self._jitter_s()
+            and hold_min_rtt != float("inf")
         ):
-            self._trip.forget_least(held, now)
-            self._suspect_every = SUSPECT_AGAIN_S
-            if held > (least + self._was_standing) / 2:
+            self._rtt.reset_min_rtt(hold_min_rtt, now)
+            self._suspect_interval_s = SUSPECT_DRAIN_INTERVAL_S
+            if hold_min_rtt > (min_rtt + self._windowed_rtt_before_drain) / 2:
                 # Still long although our queue is gone: the route, not the queue, is longer.
-                throughput = max(throughput, self.capacity() or 0.0)
-                if held > RATE_WINDOW_S / 3:
-                    self._start_again(2 * self._saved)
+                throughput = max(throughput, self.capacity_packets_per_s() or 0.0)
+                if hold_min_rtt > RATE_WINDOW_S / 3:
+                    self._restart(2 * self._cwnd_before_drain)
                     return
-        elif self._suspicion:
-            self._suspect_every = min(2 * self._suspect_every, MOST_SUSPECT_AGAIN_S)
+        elif self._drain_on_suspicion:
+            self._suspect_interval_s = min(2 * self._suspect_interval_s, MAX_SUSPECT_DRAIN_INTERVAL_S)
         else:
-            self.packets = self._saved
+            self.cwnd = self._cwnd_before_drain
             return
-        base = min(held, self._was_standing) if held != float("inf") else least
-        queue = self._shared(self._queue_s(), throughput)
-        # The rate may have changed with the route: no further ahead of what was measured than when starting.
-        most = min(MOST_WINDOW, START_RATE_BOUND * max(START_WINDOW, self._saved))
-        self.packets = min(most, max(LEAST_WINDOW, throughput * base + queue))
+        base = min(hold_min_rtt, self._windowed_rtt_before_drain) if hold_min_rtt != float("inf") else min_rtt
+        queue = self._shared_queue(self._target_queue_s(), throughput)
+        # The rate may have changed with the route: stay within the bound of startup.
+        max_cwnd = min(MAX_CWND, STARTUP_RATE_BOUND * max(INITIAL_CWND, self._cwnd_before_drain))
+        self.cwnd = min(max_cwnd, max(MIN_CWND, throughput * base + queue))
 
-    def _saw_rate(self, rate: float, *, limited: bool, now: float) -> None:
-        """Windowed maximum; a rate the application limited says nothing unless it is larger."""
+    def _add_rate_sample(self, rate: float, *, app_limited: bool, now: float) -> None:
+        """Add to the windowed maximum; an application-limited sample counts only if it is larger."""
         rates = self._rates
-        while rates and rates[0][0] < now - RATE_WINDOW_S and not (limited and len(rates) == 1):
+        while rates and rates[0][0] < now - RATE_WINDOW_S and not (app_limited and len(rates) == 1):
             rates.popleft()
-        if limited and (not rates or rate < rates[0][1]):
+        if app_limited and (not rates or rate < rates[0][1]):
             return
         while rates and rates[-1][1] <= rate:
             rates.pop()

@@ -1,80 +1,83 @@
-"""The round trip to one peer: a sample per acknowledgement -> smoothed, least and standing round trip.
+"""Round-trip time to one peer: a sample per acknowledgement -> smoothed, minimum and windowed RTT.
 
-*Least* is the path without queues (minimum over about 5 s), *standing* is what packets take now, free of single late
-acknowledgements (minimum over half a round trip, at least 20 ms). Smoothed and variation as RFC 6298.
+*Minimum* is the path without queues (over about 5 s). *Windowed* is the current round trip without single late
+acknowledgements (minimum over half a round trip, at least 20 ms). Smoothed RTT and variation follow RFC 6298.
 """
 
 from collections import deque
 
-LEAST_WINDOW_S = 5.0
-"""Longer hides a route that became longer for that time; shorter forgets the empty path between two drains."""
+MIN_RTT_WINDOW_S = 5.0
+"""A longer window hides for that time that a route became longer; a shorter one forgets the empty path between two
+drains."""
 
-LEAST_WINDOW_ROUND_TRIPS = 37.5
-"""The same on long paths, 2.5 drains of 15 round trips apart."""
+MIN_RTT_WINDOW_ROUND_TRIPS = 37.5
+"""The same on long paths: 2.5 drains that are 15 round trips apart."""
 
-STANDING_WINDOW_S = 0.020
-"""At least this much: fast links acknowledge in bursts of a scheduler's tick."""
+MIN_WINDOWED_RTT_S = 0.020
+"""Lower bound of the window: fast links acknowledge in bursts of a scheduler tick."""
 
-INITIAL_TIMEOUT_S = 0.25
-"""Until the first sample: the longest wait between probes of a silent peer."""
+INITIAL_PTO_S = 0.25
+"""Until the first sample: the longest probe interval."""
 
-SLOW_ROUND_TRIPS = 2.0
-"""Round trips that an answer is always waited for: to send all again before it can be acknowledged would keep a slow
-path as slow as it is."""
+MIN_PTO_ROUND_TRIPS = 2.0
+"""An acknowledgement is always awaited for so many round trips: retransmitting everything before it can arrive would
+keep a slow path slow."""
 
-MOST_SURPRISE_S = 2.0
-"""A round trip longer than this, and than twice what is usual, counts as that: a process or machine that stood still in
-the middle would otherwise be taken for a path on which a packet in some seconds is enough."""
+MAX_RTT_OUTLIER_S = 2.0
+"""A longer sample that is also more than twice the usual is clamped: a process or machine suspended in between would
+otherwise look like a path on which one packet every few seconds suffices."""
 
-TIMER_GRAIN_S = 0.005
-"""Added to timeouts: drivers and radios are late by this much without anything being lost."""
+TIMER_GRANULARITY_S = 0.005
+"""Added to timeouts: drivers and radios are late by this much without any loss."""
 
 
-class RoundTrip:
+class RttEstimator:
     """All times in seconds; None before the first sample."""
 
-    __slots__ = ("_least", "_recent", "latest", "least", "smoothed", "standing", "variation")
+    __slots__ = ("_min_samples", "_windowed_samples", "latest_rtt", "min_rtt", "rttvar", "smoothed_rtt", "windowed_rtt")
 
     def __init__(self) -> None:
-        self.smoothed: float | None = None
-        self.variation = 0.0
-        self.latest: float | None = None
-        self.least: float | None = None
-        self.standing: float | None = None
-        self._least: deque[tuple[float, float]] = deque()
-        self._recent: deque[tuple[float, float]] = deque()
+        self.smoothed_rtt: float | None = None
+        self.rttvar = 0.0
+        self.latest_rtt: float | None = None
+        self.min_rtt: float | None = None
+        self.windowed_rtt: float | None = None
+        self._min_samples: deque[tuple[float, float]] = deque()
+        self._windowed_samples: deque[tuple[float, float]] = deque()
 
     def sample(self, round_trip_s: float, now: float) -> None:
-        """One measured round trip, without the time the peer held its acknowledgement back."""
-        round_trip_s = min(round_trip_s, max(MOST_SURPRISE_S, 2 * (self.smoothed or 0.0)))
-        self.latest = round_trip_s
-        if self.smoothed is None:
-            self.smoothed = round_trip_s
-            self.variation = round_trip_s / 2
+        """Add a measured round trip, without the time the peer held its acknowledgement back."""
+        round_trip_s = min(round_trip_s, max(MAX_RTT_OUTLIER_S, 2 * (self.smoothed_rtt or 0.0)))
+        self.latest_rtt = round_trip_s
+        if self.smoothed_rtt is None:
+            self.smoothed_rtt = round_trip_s
+            self.rttvar = round_trip_s / 2
         else:
-            self.variation += (abs(self.smoothed - round_trip_s) - self.variation) / 4
-            self.smoothed += (round_trip_s - self.smoothed) / 8
-        least_window = max(LEAST_WINDOW_S, LEAST_WINDOW_ROUND_TRIPS * (self.least or 0.0))
-        self.least = _minimum(self._least, round_trip_s, now, least_window)
-        self.standing = _minimum(self._recent, round_trip_s, now, max(STANDING_WINDOW_S, self.smoothed / 2))
+            self.rttvar += (abs(self.smoothed_rtt - round_trip_s) - self.rttvar) / 4
+            self.smoothed_rtt += (round_trip_s - self.smoothed_rtt) / 8
+        min_window_s = max(MIN_RTT_WINDOW_S, MIN_RTT_WINDOW_ROUND_TRIPS * (self.min_rtt or 0.0))
+        self.min_rtt = _minimum(self._min_samples, round_trip_s, now, min_window_s)
+        self.windowed_rtt = _minimum(
+            self._windowed_samples, round_trip_s, now, max(MIN_WINDOWED_RTT_S, self.smoothed_rtt / 2)
+        )
 
-    def forget_least(self, round_trip_s: float, now: float) -> None:
-        """The path changed: its least round trip is now this."""
-        self._least.clear()
-        self._least.append((now, round_trip_s))
-        self.least = round_trip_s
+    def reset_min_rtt(self, round_trip_s: float, now: float) -> None:
+        """Replace the minimum RTT: the path changed."""
+        self._min_samples.clear()
+        self._min_samples.append((now, round_trip_s))
+        self.min_rtt = round_trip_s
 
-    def timeout(self, ack_delay_s: float, most_s: float = float("inf")) -> float:
-        """How long after the last progress the oldest packet or its acknowledgement must be lost; at most `most_s` on
-        a path that is not slow itself."""
-        if self.smoothed is None:
-            return min(most_s, INITIAL_TIMEOUT_S)
-        timeout_s = self.smoothed + max(4 * self.variation, TIMER_GRAIN_S) + ack_delay_s
-        return min(timeout_s, max(most_s, SLOW_ROUND_TRIPS * self.smoothed))
+    def pto_s(self, ack_delay_s: float, max_s: float = float("inf")) -> float:
+        """Probe timeout (RFC 9002, 6.2): time after the last progress in which the oldest packet or its acknowledgement
+        must have been lost; at most `max_s` on a path that is not itself slow."""
+        if self.smoothed_rtt is None:
+            return min(max_s, INITIAL_PTO_S)
+        timeout_s = self.smoothed_rtt + max(4 * self.rttvar, TIMER_GRANULARITY_S) + ack_delay_s
+        return min(timeout_s, max(max_s, MIN_PTO_ROUND_TRIPS * self.smoothed_rtt))
 
 
 def _minimum(samples: deque[tuple[float, float]], value: float, now: float, window_s: float) -> float:
-    """Add `value` to a sliding minimum; returns the minimum of the window. Amortized constant time."""
+    """Add `value` to a sliding minimum and return the minimum of the window. Amortized constant time."""
     while samples and samples[-1][1] >= value:
         samples.pop()
     samples.append((now, value))

@@ -1,14 +1,16 @@
-"""Acknowledgements that keep a fielded sender going, which resends nothing and lets three fragments be on their way.
+"""Acknowledgements that keep a legacy sender going, which never retransmits and keeps three fragments in flight.
 
-A fragment or an acknowledgement that is lost takes one of its three places for 10 s; then it drops everything it has
-queued. It ignores an acknowledgement of what is not on its way. So, besides the one for each fragment:
+A lost fragment or acknowledgement occupies one of its three slots for 10 s; then it drops its whole queue. It ignores
+acknowledgements of fragments that are not in flight. So, in addition to the acknowledgement of each fragment:
 
-1. Each is repeated once a little later, and once more where losses were seen lately.
-2. What must have been sent before a fragment that came, and is not here, is acknowledged too: it will not come again.
-   Fragments of a message come in order; messages in the order of their priorities, which are not on the wire.
-3. While fragments come, and with each of its heartbeats, so is what would come next: it may be on its way no more.
+1. Each is repeated once after a short time, and once more if there was recent loss.
+2. Fragments that must have been sent before one that arrived, and are missing, are acknowledged too: they will not be
+   sent again. Fragments of a message come in order; messages in the order of their priorities, which are not on the
+   wire.
+3. While fragments arrive, and with each heartbeat of the peer, the fragments expected next are acknowledged too: they
+   may have been lost in flight.
 
-What is acknowledged in this way is lost, as it was when it was lost; nothing behind it is.
+Fragments acknowledged this way stay lost, but nothing behind them is.
 """
 
 from collections import OrderedDict, deque
@@ -16,123 +18,123 @@ from collections import OrderedDict, deque
 from udp_mesh.wire.legacy import LAST_SEQUENCE, LegacyAck, LegacyPayload
 
 REPEAT_S = 0.04
-"""Until an acknowledgement is repeated: longer than a burst of losses."""
+"""Delay of the first repetition: longer than a burst of losses."""
 
 REPEAT_LOSSY_S = 0.4
-"""Until it is repeated again, where losses were seen within `LOSSY_FOR_S`."""
+"""Delay of the second repetition, sent if losses were seen within `LOSSY_FOR_S`."""
 
 LOSSY_FOR_S = 10.0
 
-LOOK_S = 0.05
-"""Between two looks at what would come next, while fragments come and for `LOOK_FOR_S` after the last."""
+PREDICT_INTERVAL_S = 0.05
+"""Interval of predicted acknowledgements while fragments arrive, and for `PREDICT_FOR_S` after the last one."""
 
-LOOK_FOR_S = 1.0
+PREDICT_FOR_S = 1.0
 
 WINDOW = 3
-"""Fragments that may be on their way: the fielded default."""
+"""Fragments in flight: the default of the legacy sender."""
 
-MOST_GAP = 16
-"""Fragments of one message acknowledged at once because a later one came: more than a window that was ever set."""
+MAX_GAP = 16
+"""Missing fragments of one message acknowledged when a later one arrives: more than any configured window."""
 
-MOST_BEHIND = 8
-"""Messages before the latest that may still have fragments on their way."""
+MAX_BEHIND = 8
+"""Messages before the latest that may still have fragments in flight."""
 
-MOST_REPEATS = 4096
-"""Repeats that wait: those of a second at 40 Mbit/s."""
+MAX_REPEATS = 4096
+"""Scheduled repetitions: those of one second at 40 Mbit/s."""
 
 
 class LegacyAcks:
-    """`wanted` returns what to acknowledge besides what just came; `next_at` is when `due` has more."""
+    """`on_fragment` returns what to acknowledge in addition to the fragment; `next_at` is when `due` returns more."""
 
-    __slots__ = ("_latest", "_looked_at", "_lossy_until", "_open", "_payload_at", "_repeats")
+    __slots__ = ("_incomplete", "_latest", "_lossy_until", "_payload_at", "_predicted_at", "_repeats")
 
     def __init__(self) -> None:
         self._latest: int | None = None
         """The latest message number."""
-        self._open: OrderedDict[int, tuple[int, int]] = OrderedDict()
-        """Message number -> the position expected next, and how many there are: the latest messages."""
+        self._incomplete: OrderedDict[int, tuple[int, int]] = OrderedDict()
+        """Message number -> (next expected position, number of fragments) of the latest messages."""
         self._repeats: deque[tuple[float, LegacyAck, bool]] = deque()
         self._payload_at = float("-inf")
-        self._looked_at = float("-inf")
+        self._predicted_at = float("-inf")
         self._lossy_until = float("-inf")
 
-    def came(self, piece: LegacyPayload, now: float) -> list[LegacyAck]:
-        """A fragment was acknowledged: what else shall be."""
-        if now >= self._payload_at + LOOK_FOR_S:
-            self._looked_at = now
+    def on_fragment(self, fragment: LegacyPayload, now: float) -> list[LegacyAck]:
+        """Process an acknowledged fragment; returns what else to acknowledge."""
+        if now >= self._payload_at + PREDICT_FOR_S:
+            self._predicted_at = now
         self._payload_at = now
-        self._repeat(LegacyAck(piece.sequence, piece.position), now)
+        self._repeat(LegacyAck(fragment.sequence, fragment.position), now)
         more: list[LegacyAck] = []
-        expected, total = self._open.get(piece.sequence, (0, piece.total))
-        if total != piece.total:
+        expected, total = self._incomplete.get(fragment.sequence, (0, fragment.total))
+        if total != fragment.total:
             # Its numbers have restarted.
             expected = 0
-        if piece.position > expected:
+        if fragment.position > expected:
             self._lossy_until = now + LOSSY_FOR_S
-            first = max(expected, piece.position - MOST_GAP)
-            more += [LegacyAck(piece.sequence, position) for position in range(first, piece.position)]
-        self._open[piece.sequence] = (max(expected, piece.position + 1), piece.total)
-        self._open.move_to_end(piece.sequence)
-        while len(self._open) > MOST_BEHIND:
-            self._open.popitem(last=False)
+            first = max(expected, fragment.position - MAX_GAP)
+            more += [LegacyAck(fragment.sequence, position) for position in range(first, fragment.position)]
+        self._incomplete[fragment.sequence] = (max(expected, fragment.position + 1), fragment.total)
+        self._incomplete.move_to_end(fragment.sequence)
+        while len(self._incomplete) > MAX_BEHIND:
+            self._incomplete.popitem(last=False)
         for ack in more:
             self._repeat(ack, now)
-        for sequence in self._skipped(piece.sequence):
-            # Perhaps they were only overtaken: their own answers leave first.
+        for sequence in self._skipped(fragment.sequence):
+            # They may only have been overtaken: their own acknowledgements go first.
             for ack in _first(sequence):
                 self._repeat(ack, now)
         return more
 
     def heartbeat(self) -> list[LegacyAck]:
-        """The peer says that it is there: what may be stuck is let go."""
-        return self._next()
+        """The peer sent a heartbeat: release what may be stuck."""
+        return self._predicted()
 
     def _skipped(self, sequence: int) -> list[int]:
-        """Messages before this one of which nothing came; `_latest` is brought up to date."""
+        """Messages before this one of which nothing arrived. Updates `_latest`."""
         latest = self._latest
-        ahead = MOST_BEHIND + 1 if latest is None else (sequence - latest) % LAST_SEQUENCE
+        ahead = MAX_BEHIND + 1 if latest is None else (sequence - latest) % LAST_SEQUENCE
         if ahead == 0 or ahead > LAST_SEQUENCE - 64:
-            # Of the latest, or of a less urgent one that waited.
+            # A fragment of the latest message, or of a less urgent one that waited.
             return []
         self._latest = sequence
-        # Where one of the two has just started, whatever came before may be on its way.
-        numbers = [_before(sequence, behind) for behind in range(1, min(ahead - 1, MOST_BEHIND) + 1)]
-        return [number for number in numbers if number not in self._open]
+        # If either side has just started, anything before may be in flight.
+        numbers = [_before(sequence, behind) for behind in range(1, min(ahead - 1, MAX_BEHIND) + 1)]
+        return [number for number in numbers if number not in self._incomplete]
 
     def due(self, now: float) -> list[LegacyAck]:
-        """What is to be acknowledged, again or at a guess, at this time."""
+        """Repeated and predicted acknowledgements due now."""
         acks: list[LegacyAck] = []
         while self._repeats and self._repeats[0][0] <= now:
             at, ack, again = self._repeats.popleft()
             acks.append(ack)
             if again and now < self._lossy_until:
-                self._later(at + REPEAT_LOSSY_S, ack, again=False)
-        if now < self._payload_at + LOOK_FOR_S and now >= self._looked_at + LOOK_S:
-            self._looked_at = now
-            acks += self._next()
+                self._schedule(at + REPEAT_LOSSY_S, ack, again=False)
+        if now < self._payload_at + PREDICT_FOR_S and now >= self._predicted_at + PREDICT_INTERVAL_S:
+            self._predicted_at = now
+            acks += self._predicted()
         return acks
 
     def next_at(self) -> float:
         at = self._repeats[0][0] if self._repeats else float("inf")
-        look = self._looked_at + LOOK_S
-        return min(at, look) if look < self._payload_at + LOOK_FOR_S else at
+        predict_at = self._predicted_at + PREDICT_INTERVAL_S
+        return min(at, predict_at) if predict_at < self._payload_at + PREDICT_FOR_S else at
 
-    def _next(self) -> list[LegacyAck]:
-        """What would come next of each message under way, and of those after the latest."""
+    def _predicted(self) -> list[LegacyAck]:
+        """The fragments expected next, of each incomplete message and of those after the latest."""
         if self._latest is None:
             return []
         acks: list[LegacyAck] = []
-        for sequence, (expected, total) in self._open.items():
+        for sequence, (expected, total) in self._incomplete.items():
             acks += [LegacyAck(sequence, position) for position in range(expected, min(total, expected + WINDOW))]
         for ahead in range(1, WINDOW + 1):
             acks += _first(_before(self._latest, -ahead))[: WINDOW + 1 - ahead]
         return acks
 
     def _repeat(self, ack: LegacyAck, now: float) -> None:
-        self._later(now + REPEAT_S, ack, again=True)
+        self._schedule(now + REPEAT_S, ack, again=True)
 
-    def _later(self, at: float, ack: LegacyAck, *, again: bool) -> None:
-        if len(self._repeats) >= MOST_REPEATS:
+    def _schedule(self, at: float, ack: LegacyAck, *, again: bool) -> None:
+        if len(self._repeats) >= MAX_REPEATS:
             self._repeats.popleft()
         place = len(self._repeats)
         while place and self._repeats[place - 1][0] > at:
@@ -141,7 +143,7 @@ class LegacyAcks:
 
 
 def _before(sequence: int, behind: int) -> int:
-    """The message number so many before this one; they run from 1 to `LAST_SEQUENCE`."""
+    """The message number `behind` places before this one; they run from 1 to `LAST_SEQUENCE`."""
     return (sequence - 1 - behind) % LAST_SEQUENCE + 1
 
 

@@ -1,11 +1,11 @@
-"""Peers that speak the fielded format, each named by configuration: both directions, priorities kept.
+"""Peers that speak the legacy format, each named in the configuration. Both directions, with priorities.
 
-A datagram of that format is taken only from a configured address, and only under the configured name: what it claims
-about itself is not authenticated. Heartbeats, offline after silence, queues and outcomes are as for other peers.
+A legacy datagram is accepted only from a configured address and under the configured name: what it claims about itself
+is not authenticated. Heartbeats, offline detection, queues and outcomes work as for other peers.
 
-A robot that moves over is noticed: once a node of our own format has proved itself under the configured name, it is
-that peer, whatever the configuration still says, and the fielded format is not spoken with it any more. What waits for
-it begins anew (`presence`). Broadcasts stay covered for as long as the configuration names any fielded peer.
+Upgrades are detected: once a node of our own format is verified under the configured name, it is that peer, whatever
+the configuration says, and the legacy format is no longer spoken with it. Pending messages restart (`peer_lifecycle`).
+Broadcasts stay encapsulated while the configuration names any legacy peer.
 """
 
 from udp_mesh.core.events import MessageReceived, PeerOffline, PeerOnline
@@ -14,19 +14,19 @@ from udp_mesh.core.legacy.acks import LegacyAcks
 from udp_mesh.core.legacy.reassembly import LegacyReassembly
 from udp_mesh.core.legacy.sender import LegacySender
 from udp_mesh.core.peers.session import Meters, Peer
-from udp_mesh.core.publish import release_outbox, report_ended, shelve
+from udp_mesh.core.publish import release_outbox, report_ended, store_in_outbox
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.settings import Address, LinkInfo, Neighbour, Settings
-from udp_mesh.core.state import ASLEEP_S, State
+from udp_mesh.core.state import SUSPENDED_S, State
 from udp_mesh.wire.errors import DecodeError
 from udp_mesh.wire.legacy import (
     Host,
     LegacyAck,
     LegacyPayload,
     PriorityMeshData,
-    cover,
     decode_legacy,
+    encapsulate,
     encode_legacy,
     is_ros_name,
     is_ros_type,
@@ -34,24 +34,24 @@ from udp_mesh.wire.legacy import (
 from udp_mesh.wire.limits import PRIORITY_LEVELS
 
 LEGACY_HEARTBEAT_S = 1.0
-"""The fielded period; its receivers report a peer offline after ten."""
+"""The legacy heartbeat period; legacy receivers report a peer offline after ten."""
 
-MISSED_S = 3.5
-"""Without a sign of life for this long a fielded program may have been restarted: it says a heartbeat a second."""
+RESTARTED_AFTER_S = 3.5
+"""After this long without a datagram a legacy program may have been restarted: it sends a heartbeat every second."""
 
 SETTLE_S = 10.0
-"""After its first heartbeat then, before what an outbox keeps leaves: the program acknowledges from the start, but what
-arrives before its reader has subscribed is lost there (on a slow computer that takes long)."""
+"""After its first heartbeat, how long outboxes wait before they send: the program acknowledges from the start, but what
+arrives before its reader has subscribed is lost (which takes long on a slow computer)."""
 
-MOST_TOPICS = 256
-"""Topics of one fielded peer: nothing it says is authenticated, and each may become a ROS topic here."""
+MAX_TOPICS = 256
+"""Topics of one legacy peer: nothing it sends is authenticated, and each may become a ROS topic here."""
 
 
 class LegacyPeer:
-    """One fielded peer."""
+    """One legacy peer."""
 
     __slots__ = (
-        "_moved",
+        "_upgraded",
         "acks",
         "address",
         "broadcasts",
@@ -72,28 +72,28 @@ class LegacyPeer:
         self.peer = peer
         self.address = neighbour.address
         self.link = neighbour.link or ""
-        self.sender = LegacySender(peer.outbound, settings.name, rng.getrandbits(15))
+        self.sender = LegacySender(peer.sender, settings.name, rng.getrandbits(15))
         self.unicasts = LegacyReassembly(settings.limits)
         self.broadcasts = LegacyReassembly(settings.limits)
         self.last_heard = float("-inf")
         self.acks = LegacyAcks()
         self.settled_at: float | None = None
-        """When what waits in outboxes may leave; None: it has."""
+        """When outboxes may send; None: they do already."""
         self.topics: set[str] = set()
         self.received_bytes = 0
-        self.meters = peer.fielded_meters = Meters(0.0)
-        self._moved = False
+        self.meters = peer.legacy_meters = Meters(0.0)
+        self._upgraded = False
 
-    def moved_over(self) -> bool:
-        """Whether a node of our own format speaks for it by now."""
-        if not self._moved and self.peer.session is not None:
-            self._moved = True
+    def is_upgraded(self) -> bool:
+        """Whether a node of our own format has taken its place."""
+        if not self._upgraded and self.peer.session is not None:
+            self._upgraded = True
             self.peer.legacy = self.peer.settling = False
-        return self._moved
+        return self._upgraded
 
 
 class LegacyPeers:
-    """All of them, by host address. `next_at` is when something is due."""
+    """All legacy peers by host address. `next_at` is when something is due."""
 
     __slots__ = ("_by_host", "_heartbeat_at", "_state")
 
@@ -104,43 +104,43 @@ class LegacyPeers:
         self.apply()
 
     def apply(self) -> None:
-        """Follow the settings' neighbours; peers that stay keep everything."""
-        wanted = {neighbour.address[0]: neighbour for neighbour in self._state.settings.neighbours if neighbour.legacy}
+        """Apply the settings' neighbors; peers that stay keep their state."""
+        desired = {neighbour.address[0]: neighbour for neighbour in self._state.settings.neighbours if neighbour.legacy}
         for host in list(self._by_host):
-            if host not in wanted or self._by_host[host].neighbour != wanted[host]:
+            if host not in desired or self._by_host[host].neighbour != desired[host]:
                 self._drop(self._by_host.pop(host))
-        for host, neighbour in wanted.items():
+        for host, neighbour in desired.items():
             if host not in self._by_host and neighbour.name is not None:
-                peer = self._state.roster.peer(neighbour.name, self._state.settings)
+                peer = self._state.peer_table.get_or_create(neighbour.name, self._state.settings)
                 if peer is not None:
                     peer.legacy = True
                     peer.lost = False
                     self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings, self._state.rng)
 
     def _drop(self, gone: LegacyPeer) -> None:
-        """It is not named any more; one that was never heard, and for which nothing waits, was never there."""
+        """Remove a peer no longer configured; forget it completely if it was never heard and nothing waits for it."""
         peer, state = gone.peer, self._state
         peer.legacy = peer.settling = False
-        peer.fielded_meters = None
-        heard = peer.session is not None or peer.fielded_way is not None
-        if not heard and not peer.outbound.open and not state.outboxes.holds(peer.name):
+        peer.legacy_meters = None
+        heard = peer.session is not None or peer.legacy_path is not None
+        if not heard and not peer.sender.pending and not state.outboxes.holds(peer.name):
             state.ready.pop(peer, None)
-            del state.roster.peers[peer.name]
+            del state.peer_table.peers[peer.name]
 
     def __len__(self) -> int:
         return len(self._by_host)
 
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
-        """One datagram without our mark: the fielded format from a configured address, or nothing of ours."""
-        counters = self._state.ledger.counters
+        """Process a datagram without our mark: the legacy format from a configured address, or foreign."""
+        counters = self._state.event_queue.counters
         legacy = self._by_host.get(source[0])
-        if legacy is None or legacy.moved_over() or source != legacy.neighbour.address:
-            # Fielded programs send from the port they listen on; another one on that computer is not believed.
+        if legacy is None or legacy.is_upgraded() or source != legacy.neighbour.address:
+            # Legacy programs send from the port they listen on; other ports of that computer are not trusted.
             counters.dropped_unauthenticated += 1
             return
         try:
             datagram = decode_legacy(data)
-            self._heard(legacy, link, source, now)
+            self._on_activity(legacy, link, source, now)
             legacy.received_bytes += len(data) + IP_UDP_BYTES
             match datagram:
                 case Host():
@@ -149,61 +149,63 @@ class LegacyPeers:
                     legacy.sender.acknowledge(sequence, position, now)
                     report_ended(self._state, legacy.peer, now)
                 case LegacyPayload():
-                    self._take(legacy, datagram, link, source, now)
+                    self._receive_fragment(legacy, datagram, link, source, now)
         except DecodeError:
             counters.dropped_malformed += 1
 
-    def _heard(self, legacy: LegacyPeer, link: str, source: Address, now: float) -> None:
-        if now - legacy.last_heard > MISSED_S:
+    def _on_activity(self, legacy: LegacyPeer, link: str, source: Address, now: float) -> None:
+        if now - legacy.last_heard > RESTARTED_AFTER_S:
             legacy.settled_at = now + SETTLE_S
             legacy.peer.settling = True
         legacy.last_heard = now
         legacy.link = link
         legacy.address = source
-        legacy.sender.heard()
+        legacy.sender.on_activity()
         peer = legacy.peer
-        peer.fielded_way = (source, link, now)
+        peer.legacy_path = (source, link, now)
         peer.lost = False
         if not peer.online:
             peer.online = True
             peer.online_since = now
-            self._state.ledger.tell(PeerOnline(peer.name, source, link))
+            self._state.event_queue.emit(PeerOnline(peer.name, source, link))
 
-    def _take(self, legacy: LegacyPeer, piece: LegacyPayload, link: str, source: Address, now: float) -> None:
-        reassembly = legacy.unicasts if piece.wants_ack else legacy.broadcasts
+    def _receive_fragment(
+        self, legacy: LegacyPeer, fragment: LegacyPayload, link: str, source: Address, now: float
+    ) -> None:
+        reassembly = legacy.unicasts if fragment.wants_ack else legacy.broadcasts
         message: PriorityMeshData | None = None
         keep = True
         too_large = reassembly.over_limit
         try:
-            keep, message = reassembly.add(piece, now)
+            keep, message = reassembly.add(fragment, now)
         finally:
-            self._state.ledger.counters.dropped_over_limit += reassembly.over_limit - too_large
-            if keep and piece.wants_ack:
-                more = legacy.acks.came(piece, now)
-                self._acknowledge(legacy, [LegacyAck(piece.sequence, piece.position), *more])
+            self._state.event_queue.counters.dropped_over_limit += reassembly.over_limit - too_large
+            if keep and fragment.wants_ack:
+                more = legacy.acks.on_fragment(fragment, now)
+                self._acknowledge(legacy, [LegacyAck(fragment.sequence, fragment.position), *more])
         if message is not None:
-            if not self._may_name(legacy, message):
-                self._state.ledger.counters.dropped_over_limit += 1
+            if not self._topic_allowed(legacy, message):
+                self._state.event_queue.counters.dropped_over_limit += 1
                 return
-            self._state.ledger.counters.messages_received += 1
+            self._state.event_queue.counters.messages_received += 1
             priority = min(message.priority, PRIORITY_LEVELS - 1)
-            self._state.ledger.tell(
+            self._state.event_queue.emit(
                 MessageReceived(
                     legacy.peer.name,
                     message.topic,
                     message.type_name,
                     message.data,
                     priority,
-                    not piece.wants_ack,
+                    not fragment.wants_ack,
                 )
             )
 
-    def _may_name(self, legacy: LegacyPeer, message: PriorityMeshData) -> bool:
-        """Whether a message's topic and type are names of ROS, and its topics not too many."""
+    def _topic_allowed(self, legacy: LegacyPeer, message: PriorityMeshData) -> bool:
+        """Whether a message's topic and type are valid ROS names, and its topics not too many."""
         if not is_ros_name(message.topic) or not is_ros_type(message.type_name):
             return False
         if message.topic not in legacy.topics:
-            if len(legacy.topics) >= MOST_TOPICS:
+            if len(legacy.topics) >= MAX_TOPICS:
                 return False
             legacy.topics.add(message.topic)
         return True
@@ -212,57 +214,57 @@ class LegacyPeers:
         for ack in acks:
             self._state.outgoing.append(Datagram(legacy.link, legacy.address, encode_legacy(ack), True))
 
-    def covered(self, out: list[Datagram]) -> list[Datagram]:
-        """The datagrams, those to all in a cover that fielded programs take for one of theirs."""
+    def encapsulate_broadcasts(self, out: list[Datagram]) -> list[Datagram]:
+        """Encapsulate broadcasts so that legacy programs ignore them."""
         to_all = {link.broadcast for link in self._state.links.values()} | {None}
         return [
-            datagram._replace(data=cover(datagram.data)) if datagram.destination in to_all else datagram
+            datagram._replace(data=encapsulate(datagram.data)) if datagram.destination in to_all else datagram
             for datagram in out
         ]
 
-    def leave(self, now: float, out: list[Datagram]) -> None:
-        """Fragments that may leave now."""
-        for legacy in self._fielded():
-            if legacy.link and (legacy.peer.outbound.open or legacy.sender.timer() is not None):
-                legacy.sender.leave(legacy.link, legacy.address, now, out)
+    def send(self, now: float, out: list[Datagram]) -> None:
+        """Send the fragments that may be sent now."""
+        for legacy in self._active():
+            if legacy.link and (legacy.peer.sender.pending or legacy.sender.timer() is not None):
+                legacy.sender.send(legacy.link, legacy.address, now, out)
                 report_ended(self._state, legacy.peer, now)
 
     def next_at(self) -> float:
-        """When `handle_timer` wants to be called."""
+        """When `handle_timer` is due."""
         if not self._by_host:
             return float("inf")
         at = self._heartbeat_at
-        for legacy in self._fielded():
+        for legacy in self._active():
             due = legacy.sender.timer()
             if legacy.link:
                 at = min(at, legacy.acks.next_at(), at if due is None else due)
         return at
 
     def handle_timer(self, now: float) -> None:
-        """Acknowledgements that are due; heartbeats, silences and purges, once a second."""
-        for legacy in self._fielded():
+        """Send acknowledgements that are due; once a second heartbeats, offline checks and purges."""
+        for legacy in self._active():
             if legacy.link:
                 self._acknowledge(legacy, legacy.acks.due(now))
         if not self._by_host or now < self._heartbeat_at:
             return
-        # This process did not run for so long: silence meanwhile was ours.
-        asleep_s = now - self._heartbeat_at if self._heartbeat_at != float("-inf") else 0.0
+        # This process was suspended for that long: the silence was ours.
+        suspended_s = now - self._heartbeat_at if self._heartbeat_at != float("-inf") else 0.0
         self._heartbeat_at = now + LEGACY_HEARTBEAT_S
         state = self._state
         rates = state.settings.rates
-        for legacy in self._fielded():
+        for legacy in self._active():
             peer = legacy.peer
-            if asleep_s > ASLEEP_S:
-                legacy.last_heard = min(now, legacy.last_heard + asleep_s)
+            if suspended_s > SUSPENDED_S:
+                legacy.last_heard = min(now, legacy.last_heard + suspended_s)
             quiet_s = now - legacy.last_heard
             if peer.online and quiet_s > rates.offline_s:
                 peer.online = False
                 peer.online_since = None
-                state.ledger.tell(PeerOffline(peer.name, left=False))
-                shelve(state, peer, now)
+                state.event_queue.emit(PeerOffline(peer.name, left=False))
+                store_in_outbox(state, peer, now)
             if not peer.online and not peer.lost and quiet_s > rates.peer_lost_s:
                 peer.lost = True
-                peer.outbound.finish_all(Outcome.PEER_LOST)
+                peer.sender.finish_all(Outcome.PEER_LOST)
                 report_ended(state, peer, now)
             legacy.unicasts.purge(now)
             legacy.broadcasts.purge(now)
@@ -271,18 +273,18 @@ class LegacyPeers:
                 peer.settling = False
             if peer.online and legacy.settled_at is None and state.outboxes.holds(peer.name):
                 release_outbox(state, peer, now)
-            legacy.meters.sent.feed(peer.outbound.sent_bytes, now)
-            legacy.meters.delivered.feed(peer.outbound.delivered_bytes, now)
+            legacy.meters.sent.feed(peer.sender.sent_bytes, now)
+            legacy.meters.delivered.feed(peer.sender.delivered_bytes, now)
             legacy.meters.received.feed(legacy.received_bytes, now)
             for link in self._links(legacy):
                 host = encode_legacy(Host(state.settings.name, link.address[0]))
                 state.outgoing.append(Datagram(link.name, legacy.neighbour.address, host, True))
 
-    def _fielded(self) -> list[LegacyPeer]:
-        return [legacy for legacy in self._by_host.values() if not legacy.moved_over()]
+    def _active(self) -> list[LegacyPeer]:
+        return [legacy for legacy in self._by_host.values() if not legacy.is_upgraded()]
 
     def _links(self, legacy: LegacyPeer) -> list[LinkInfo]:
-        # The fielded format has room for an IPv4 address only.
+        # The legacy format has room for an IPv4 address only.
         links = [link for link in self._state.links.values() if ":" not in link.address[0]]
         named = [link for link in links if link.name == (legacy.neighbour.link or legacy.link)]
         return named or links

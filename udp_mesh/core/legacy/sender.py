@@ -1,7 +1,7 @@
-"""Messages to one peer of the fielded format: pieces in priority order, a window of three, resent until acknowledged.
+"""Messages to one legacy peer: fragments in priority order, a window of three, retransmitted until acknowledged.
 
-The fielded receiver acknowledges every fragment at once; the fielded sender never resent one. Here a fragment is sent
-again when its acknowledgement is overdue by the measured round trip, and a silent peer is probed with single
+The legacy receiver acknowledges every fragment at once; the legacy sender never retransmits. This sender retransmits a
+fragment when its acknowledgement is overdue by the measured round trip, and probes an unresponsive peer with single
 fragments.
 """
 
@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.pending import Outcome
-from udp_mesh.core.sender.sender import PROBE_S, Outbound
+from udp_mesh.core.sender.sender import PROBE_INTERVAL_S, Sender
 from udp_mesh.core.settings import Address
 from udp_mesh.wire.legacy import (
     LAST_SEQUENCE as LAST_SEQUENCE,
@@ -28,179 +28,179 @@ from udp_mesh.wire.legacy import (
 from udp_mesh.wire.limits import MAX_LEGACY_FRAGMENT_BYTES, PRIORITY_LEVELS
 
 LEGACY_WINDOW = 3
-"""Fragments in flight to a fielded peer: its own choice, above which its radios were seen to interfere."""
+"""Fragments in flight to a legacy peer: the value it uses itself; with more, its radios were seen to interfere."""
 
-TRIES_BEFORE_SILENT = 3
-"""Tries of one fragment, with nothing acknowledged meanwhile, after which only single probes leave."""
+TRIES_BEFORE_UNRESPONSIVE = 3
+"""Attempts at one fragment, with nothing acknowledged meanwhile, after which only single probes are sent."""
 
-DOUBLINGS, DOUBLINGS_WHILE_ANSWERED = 3, 1
-"""How often the patience with one fragment doubles. Of a peer that acknowledges others some are lost, and with patience
-for that an urgent one would take most of a second; once it doubles all the same: the path may have become slower."""
+MAX_DOUBLINGS, MAX_DOUBLINGS_WHILE_ACKED = 3, 1
+"""How often the timeout of a fragment doubles. If the peer acknowledges others, some fragments are simply lost, and
+waiting longer would cost an urgent one most of a second. It still doubles once: the path may have become slower."""
 
-LEAST_PATIENCE_S = 0.025
-"""Before a fragment is sent again at the earliest: fielded programs answer when their interpreter gets to it."""
+MIN_TIMEOUT_S = 0.025
+"""Earliest retransmission: legacy programs answer when their interpreter is scheduled."""
 
-MOST_PATIENCE_S = 0.2
-"""What that grows to where both tries of a fragment are answered: then the second was needless, and a message of one
-fragment arrived twice over there, where no finished message is remembered."""
+MAX_TIMEOUT_S = 0.2
+"""Upper bound of that minimum, which grows if both transmissions of a fragment are acknowledged: the second was
+needless, and a one-fragment message was delivered twice, because finished messages are not remembered there."""
 
 RESENT_REMEMBERED = 64
-"""Fragments answered after a resend of which another answer may come."""
+"""Fragments acknowledged after a retransmission that may be acknowledged again."""
 
-PATIENCE_WANES = 0.995
-"""Per answer at the first try, back towards `LEAST_PATIENCE_S`: some hundred answers after it was needed."""
+TIMEOUT_DECAY = 0.995
+"""Decay towards `MIN_TIMEOUT_S` per acknowledgement of a first attempt: it takes some hundred of them."""
 
 
 @dataclass(slots=True)
-class _Leg:
-    """One fragment on its way."""
+class _SentFragment:
+    """One fragment in flight."""
 
-    message: Outgoing
+    message: OutgoingMessage
     position: int
     sent_at: float
     tries: int
-    answers: int
-    """Acknowledgements of any fragment that had come when it was sent last."""
+    acks: int
+    """Acknowledgements of any fragment received when it was last sent."""
     unanswered: int
-    """Its tries since the last of them."""
+    """Its attempts since the last of them."""
 
 
-def carries(type_name: str) -> bool:
-    """Whether a fielded robot can publish a message of this type: `pkg/Type`, or one not said. Anything else (a
-    bridge's own messages, ROS 2, Zenoh) ends the callback of its reader with a traceback."""
+def can_publish(type_name: str) -> bool:
+    """Whether a legacy robot can publish a message of this type: `pkg/Type`, or none given. Anything else (a bridge's
+    own messages, ROS 2, Zenoh) ends its reader's callback with a traceback."""
     name = type_name.partition(" ")[0]
     return not name or is_ros_type(name)
 
 
 class LegacySender:
-    """The sending half for one fielded peer; queues and outcomes are those of its `Outbound`."""
+    """The sending half for one legacy peer; queues and outcomes are those of its `Sender`."""
 
     __slots__ = (
-        "_answers",
+        "_acks",
         "_fragments",
-        "_legs",
+        "_in_flight",
+        "_min_timeout_s",
         "_own_name",
-        "_patience_s",
         "_resent",
         "_sequence",
         "_sequences",
         "_stamp",
-        "outbound",
-        "silent",
+        "sender",
+        "unresponsive",
     )
 
-    def __init__(self, outbound: Outbound, own_name: str, first_sequence: int) -> None:
-        """`first_sequence` is drawn for each run: the peer may still hold pieces of our last one (its defect 8)."""
-        self.outbound = outbound
-        self.silent = False
-        self._answers = 0
-        self._patience_s = LEAST_PATIENCE_S
+    def __init__(self, sender: Sender, own_name: str, first_sequence: int) -> None:
+        """`first_sequence` is random per run: the peer may still hold fragments of our previous run (its defect 8)."""
+        self.sender = sender
+        self.unresponsive = False
+        self._acks = 0
+        self._min_timeout_s = MIN_TIMEOUT_S
         self._resent: OrderedDict[tuple[int, int], None] = OrderedDict()
         self._own_name = own_name
         self._sequence = first_sequence % LAST_SEQUENCE
         self._stamp = 0
-        self._legs: dict[tuple[int, int], _Leg] = {}
-        self._sequences: dict[int, Outgoing] = {}
-        self._fragments: dict[Outgoing, tuple[int, list[bytes]]] = {}
+        self._in_flight: dict[tuple[int, int], _SentFragment] = {}
+        self._sequences: dict[int, OutgoingMessage] = {}
+        self._fragments: dict[OutgoingMessage, tuple[int, list[bytes]]] = {}
 
-    def leave(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
-        """What may leave now: overdue fragments first by age, then new ones, most urgent first."""
+    def send(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
+        """Send what may be sent now: overdue fragments first, then new ones, most urgent first."""
         self._forget_ended()
         self._resend(link, address, now, out)
-        outbound = self.outbound
-        scheduler = outbound.scheduler
+        sender = self.sender
+        scheduler = sender.scheduler
         for priority in range(PRIORITY_LEVELS):
-            urgent = priority <= outbound.rates.urgent_priority
-            window = LEGACY_WINDOW + (outbound.rates.urgent_excess_packets if urgent else 0)
-            while scheduler.waiting >> priority & 1 and not self.silent and len(self._legs) < window:
+            urgent = priority <= sender.rates.urgent_priority
+            window = LEGACY_WINDOW + (sender.rates.urgent_excess_packets if urgent else 0)
+            while scheduler.waiting >> priority & 1 and not self.unresponsive and len(self._in_flight) < window:
                 run = scheduler.peek(priority)
                 if run is None:
                     break
                 message = run.message
-                if not message.begun and not self._begin(message, now):
-                    outbound.finish(message, ExpiryReason.REFUSED)
+                if not message.started and not self._begin(message, now):
+                    sender.finish(message, ExpiryReason.REFUSED)
                     continue
                 run = scheduler.peek(priority)
                 assert run is not None
-                scheduler.take(run, 1)
+                scheduler.consume(run, 1)
                 self._send(message, run.position, 1, link, address, now, out)
                 if not message.reliable and run.position == message.fragments - 1 and message.missing == 0:
-                    outbound.finish(message, Outcome.SENT)
+                    sender.finish(message, Outcome.SENT)
 
     def acknowledge(self, sequence: int, position: int, now: float) -> None:
-        """The peer has this fragment; unknown ones are ignored."""
-        leg = self._legs.pop((sequence, position), None)
-        self.silent = False
-        self._answers += 1
-        if leg is None:
+        """Process an acknowledgement; unknown ones are ignored."""
+        sent = self._in_flight.pop((sequence, position), None)
+        self.unresponsive = False
+        self._acks += 1
+        if sent is None:
             if (sequence, position) in self._resent:
                 del self._resent[sequence, position]
-                self._patience_s = min(MOST_PATIENCE_S, 2 * self._patience_s)
+                self._min_timeout_s = min(MAX_TIMEOUT_S, 2 * self._min_timeout_s)
             return
-        if leg.tries > 1:
+        if sent.tries > 1:
             self._resent[sequence, position] = None
             if len(self._resent) > RESENT_REMEMBERED:
                 self._resent.popitem(last=False)
         else:
-            self._patience_s = max(LEAST_PATIENCE_S, PATIENCE_WANES * self._patience_s)
-            # Karn: which try a later acknowledgement answers is unknown.
-            self.outbound.trip.sample(max(1e-5, now - leg.sent_at), now)
-        message = leg.message
-        if not message.ended and message.arrive(position):
-            self.outbound.delivered_bytes += len(self._fragments[message][1][position])
+            self._min_timeout_s = max(MIN_TIMEOUT_S, TIMEOUT_DECAY * self._min_timeout_s)
+            # Karn's algorithm: after a retransmission the acknowledged attempt is unknown.
+            self.sender.rtt.sample(max(1e-5, now - sent.sent_at), now)
+        message = sent.message
+        if not message.ended and message.mark_arrived(position):
+            self.sender.delivered_bytes += len(self._fragments[message][1][position])
             if not message.missing:
-                self.outbound.finish(message, Outcome.DELIVERED)
-        self.outbound.delivered_packets += 1
-        self.outbound.delivered_at = now
+                self.sender.finish(message, Outcome.DELIVERED)
+        self.sender.delivered_packets += 1
+        self.sender.delivered_at = now
 
-    def heard(self) -> None:
-        """Anything from the peer ends its silence: everything on its way is due at once."""
-        if self.silent:
-            self.silent = False
-            for leg in self._legs.values():
-                leg.sent_at = float("-inf")
-                leg.tries = 1
-                leg.unanswered = 0
+    def on_activity(self) -> None:
+        """Something came from an unresponsive peer: everything in flight is due at once."""
+        if self.unresponsive:
+            self.unresponsive = False
+            for sent in self._in_flight.values():
+                sent.sent_at = float("-inf")
+                sent.tries = 1
+                sent.unanswered = 0
 
     def timer(self) -> float | None:
         """When the next fragment is overdue."""
-        if not self._legs:
+        if not self._in_flight:
             return None
-        return min(leg.sent_at + self._patience(leg) for leg in self._legs.values())
+        return min(sent.sent_at + self._timeout_s(sent) for sent in self._in_flight.values())
 
-    def _patience(self, leg: _Leg) -> float:
-        timeout = max(self._patience_s, self.outbound.trip.timeout(0.0))
-        doublings = min(leg.tries - 1, DOUBLINGS_WHILE_ANSWERED)
-        if leg.answers == self._answers:
-            doublings = max(doublings, min(leg.unanswered - 1, DOUBLINGS))
-        return min(PROBE_S, timeout * (1 << doublings))
+    def _timeout_s(self, sent: _SentFragment) -> float:
+        timeout = max(self._min_timeout_s, self.sender.rtt.pto_s(0.0))
+        doublings = min(sent.tries - 1, MAX_DOUBLINGS_WHILE_ACKED)
+        if sent.acks == self._acks:
+            doublings = max(doublings, min(sent.unanswered - 1, MAX_DOUBLINGS))
+        return min(PROBE_INTERVAL_S, timeout * (1 << doublings))
 
     def _resend(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
-        due = [entry for entry in self._legs.values() if now >= entry.sent_at + self._patience(entry)]
-        due.sort(key=lambda leg: leg.message.priority)
-        for leg in due:
-            if leg.unanswered >= TRIES_BEFORE_SILENT and leg.answers == self._answers:
-                self.silent = True
-            self._send(leg.message, leg.position, leg.tries + 1, link, address, now, out)
-            self.outbound.retransmitted += 1
-            if self.silent:
-                # One probe; the others wait until it is answered.
-                for other in self._legs.values():
-                    if other is not leg:
+        due = [entry for entry in self._in_flight.values() if now >= entry.sent_at + self._timeout_s(entry)]
+        due.sort(key=lambda sent: sent.message.priority)
+        for sent in due:
+            if sent.unanswered >= TRIES_BEFORE_UNRESPONSIVE and sent.acks == self._acks:
+                self.unresponsive = True
+            self._send(sent.message, sent.position, sent.tries + 1, link, address, now, out)
+            self.sender.retransmitted += 1
+            if self.unresponsive:
+                # One probe; the others wait until it is acknowledged.
+                for other in self._in_flight.values():
+                    if other is not sent:
                         other.sent_at = now
                 break
 
-    def _begin(self, message: Outgoing, now: float) -> bool:
-        """Serialize, cut and number; False if the format cannot carry it (it then ends as refused)."""
+    def _begin(self, message: OutgoingMessage, now: float) -> bool:
+        """Serialize, fragment and number the message. False if the format cannot carry it (it then ends as refused)."""
         accepted = message.accepted
-        if not carries(accepted.channel.type_name):
+        if not can_publish(accepted.channel.type_name):
             return False
         self._stamp = (self._stamp + 1) & 0xFFFFFFFF
         channel = accepted.channel
         seconds = int(now)
         data = PriorityMeshData(
             self._own_name,
-            # what our bridges add behind the type's name (its md5sum), a fielded robot would take for the type
+            # Our bridges append an md5sum to the type name; a legacy robot would take it for part of the type.
             channel.type_name.partition(" ")[0],
             message.priority,
             channel.name,
@@ -220,29 +220,36 @@ class LegacySender:
         return True
 
     def _next_sequence(self) -> int:
-        """The next number after the wrap not in use: a new message never meets an old one's pieces."""
+        """The next number not in use: a new message never meets an old one's fragments."""
         while True:
             self._sequence = self._sequence % LAST_SEQUENCE + 1
             if self._sequence not in self._sequences:
                 return self._sequence
 
     def _send(
-        self, message: Outgoing, position: int, tries: int, link: str, address: Address, now: float, out: list[Datagram]
+        self,
+        message: OutgoingMessage,
+        position: int,
+        tries: int,
+        link: str,
+        address: Address,
+        now: float,
+        out: list[Datagram],
     ) -> None:
         sequence, fragments = self._fragments[message]
-        before = self._legs.get((sequence, position))
-        unanswered = before.unanswered + 1 if before is not None and before.answers == self._answers else 1
-        self._legs[(sequence, position)] = _Leg(message, position, now, tries, self._answers, unanswered)
+        before = self._in_flight.get((sequence, position))
+        unanswered = before.unanswered + 1 if before is not None and before.acks == self._acks else 1
+        self._in_flight[(sequence, position)] = _SentFragment(message, position, now, tries, self._acks, unanswered)
         payload = LegacyPayload(sequence, position, len(fragments), fragments[position], wants_ack=True)
         data = encode_legacy(payload)
-        urgent = message.priority <= self.outbound.rates.urgent_priority
+        urgent = message.priority <= self.sender.rates.urgent_priority
         out.append(Datagram(link, address, data, urgent))
-        self.outbound.sent_packets += 1
-        self.outbound.sent_bytes += len(data) + 28
+        self.sender.sent_packets += 1
+        self.sender.sent_bytes += len(data) + 28
 
     def _forget_ended(self) -> None:
         for message in [message for message in self._fragments if message.ended]:
             sequence, fragments = self._fragments.pop(message)
             del self._sequences[sequence]
             for position in range(len(fragments)):
-                self._legs.pop((sequence, position), None)
+                self._in_flight.pop((sequence, position), None)

@@ -1,1 +1,1 @@
-"""Who is there: heartbeats in, sessions and peers out."""
+"""Peer discovery and identity: heartbeats in, sessions and peers out."""

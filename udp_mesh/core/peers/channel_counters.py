@@ -1,9 +1,9 @@
-"""What must outlive a session: how far the numbers of its channels have come, in either direction.
+"""Channel counters that must outlive a session, in both directions.
 
-A boot that was forgotten (silent for long, its name taken by another run) may come back. Numbers that began again would
-seal under nonces already used, and open recordings a second time. So what a session counted is kept, and a session
-made for the same boot goes on from there. Past `MOST_BOOTS` the oldest is dropped; sending to any boot not remembered
-then starts above every number ever dropped, so that no number is used twice however many boots there were.
+A boot that was forgotten (silent for long, or its name taken by another boot) may return. Restarting its packet numbers
+would reuse nonces and accept recorded datagrams again. So the counters of a session are saved, and a new session for
+the same boot continues from them. Beyond `MAX_BOOTS` the oldest record is dropped; numbers sent to any boot without a
+record then start above every dropped number, so that none is ever reused.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from udp_mesh.core.peers.session import Session
 from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.receiver.datagram_age import Freshness
 
-MOST_BOOTS = 1024
-"""Earlier runs of a fleet's nodes that one run meets; about 1 kB each. Only a key holder makes more."""
+MAX_BOOTS = 1024
+"""Boots of the fleet's nodes seen during one run, about 1 kB each. Only a key holder can create more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class _Record:
 
 
 class BootMemory:
-    """Records of forgotten sessions by boot id, the longest unseen first."""
+    """Counters of forgotten sessions by boot id, least recently seen first."""
 
     __slots__ = ("_records", "_send_floor")
 
@@ -40,36 +40,36 @@ class BootMemory:
     def __len__(self) -> int:
         return len(self._records)
 
-    def keep(self, session: Session) -> None:
-        """The session goes. One that was never proven, and to which nothing was sent, leaves nothing behind."""
-        number = session.way.channel.next_number
-        if not (session.proven or session.restored or number):
+    def save(self, session: Session) -> None:
+        """Save the counters of a session being dropped, unless it was never verified and nothing was sent to it."""
+        number = session.path.channel.next_number
+        if not (session.verified or session.restored or number):
             return
-        inbound = session.inbound
+        receiver = session.receiver
         self._records.pop(session.boot_id, None)
         self._records[session.boot_id] = _Record(
             session.name,
             number,
             session.next_wire_id,
             session.floors(),
-            (inbound.unicasts.finished, inbound.broadcasts.finished),
+            (receiver.unicasts.finished, receiver.broadcasts.finished),
             session.freshness,
         )
-        while len(self._records) > MOST_BOOTS:
+        while len(self._records) > MAX_BOOTS:
             dropped = self._records.pop(next(iter(self._records)))
             self._send_floor = max(self._send_floor, dropped.next_number)
 
     def restore(self, session: Session) -> None:
-        """A session made for a boot: it goes on where an earlier one for the same boot stopped."""
+        """Continue the counters of an earlier session for the same boot."""
         record = self._records.pop(session.boot_id, None)
-        channel = session.way.channel
+        channel = session.path.channel
         if record is None:
             channel.next_number = max(channel.next_number, self._send_floor)
             return
         channel.next_number = max(record.next_number, self._send_floor)
         session.next_wire_id = record.next_wire_id
         session.restore_floors(record.floors)
-        session.inbound.unicasts.finished, session.inbound.broadcasts.finished = record.finished
+        session.receiver.unicasts.finished, session.receiver.broadcasts.finished = record.finished
         session.freshness = record.freshness
         session.restored = True
         session.replaced = record.name == session.name

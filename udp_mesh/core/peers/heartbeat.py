@@ -1,9 +1,8 @@
-"""Heartbeats: when the next one leaves, what it says, and what one received means.
+"""Heartbeats: when the next one is sent and what it contains.
 
-A heartbeat leaves once per `heartbeat_s`, more seldom where traffic already proves every link, and more seldom the
-larger the team, so that what each node hears of discovery stays constant. A node heard for the first time is answered
-soon with a heartbeat that lists it: both then know that the link works both ways and that the other's heartbeats are
-no recordings.
+A heartbeat is sent every `heartbeat_s`; less often if traffic already proves every link, and less often the larger the
+team, so that the cost of discovery per node stays constant. A newly heard node is answered soon with a heartbeat that
+lists it: both then know that the link works both ways and that the other's heartbeats are not replayed.
 """
 
 from collections.abc import Iterable
@@ -21,84 +20,86 @@ from udp_mesh.wire.limits import MAX_HEARD
 
 OWN_FEATURES = Feature.ZLIB | Feature.REPAIR | Feature.TIMED
 
-ANSWER_WITHIN_S = 0.1
-"""A new node is answered within this, after a random part of it, so that a team does not answer all at once."""
+REPLY_WITHIN_S = 0.1
+"""A new node is answered within this time, after a random part of it, so that a team does not answer all at once."""
 
-LEAST_GAP_S = 0.2
-"""Between two heartbeats, whatever asks for one."""
+MIN_GAP_S = 0.2
+"""Minimum time between two heartbeats."""
 
-MEETING_HASTE = 5.0
-"""While a team meets, so many times more heartbeats are heard than later: 150 a second are 1 Mbit/s when full."""
+DISCOVERY_RATE_FACTOR = 5.0
+"""Factor on the heartbeat rate while a team is discovered: 150 full heartbeats a second are 1 Mbit/s."""
 
-MOST_TO_ANSWER = 2048
-"""New nodes that wait to be listed: a team of a thousand meets twice over; a key holder invents more than that."""
+MAX_PENDING_REPLIES = 2048
+"""New nodes waiting to be listed: enough for a team of a thousand twice over. A key holder can invent more."""
 
 JITTER = 0.1
-"""Part of the interval by which heartbeats vary, so that two nodes never stay in step."""
+"""Random fraction of the interval, so that two nodes never stay in step."""
 
 MISSED_HEARTBEATS = 3.5
-"""A peer is silent for at least so many of the intervals it announced before it counts as offline."""
+"""A peer is offline only after so many of its announced intervals without a heartbeat."""
 
 
-class Discovery:
-    """`next_at` is when the next heartbeat leaves."""
+class HeartbeatScheduler:
+    """`next_at` is when the next heartbeat is due."""
 
-    __slots__ = ("_heard_per_s", "_interval_s", "_last_at", "_listed_from", "_rng", "_to_answer", "next_at")
+    __slots__ = ("_heard_per_s", "_interval_s", "_last_at", "_next_listed", "_pending_replies", "_rng", "next_at")
 
     def __init__(self, rng: RandomSource, rates: Rates, now: float) -> None:
         self._rng = rng
         self._heard_per_s = rates.heartbeats_heard_per_s
         self._interval_s = 1.0
         self._last_at = float("-inf")
-        self._to_answer: dict[bytes, None] = {}
-        self._listed_from = 0
+        self._pending_replies: dict[bytes, None] = {}
+        self._next_listed = 0
         self.next_at = now
 
-    def answer(self, session: Session, team: int, now: float) -> None:
-        """A session heard for the first time (or still unproven): list it soon."""
-        self._to_answer[session.heard_tag] = None
-        if len(self._to_answer) > MOST_TO_ANSWER:
-            del self._to_answer[next(iter(self._to_answer))]
-        self.hurry(team, now)
+    def reply_to(self, session: Session, team: int, now: float) -> None:
+        """List a newly heard (or still unverified) session soon."""
+        self._pending_replies[session.heard_tag] = None
+        if len(self._pending_replies) > MAX_PENDING_REPLIES:
+            del self._pending_replies[next(iter(self._pending_replies))]
+        self.schedule_now(team, now)
 
-    def hurry(self, team: int, now: float) -> None:
-        """A heartbeat within `ANSWER_WITHIN_S`, if the last one is not too recent; later where `team` nodes do so."""
-        share_s = team / (MEETING_HASTE * self._heard_per_s)
-        soon = now + max(ANSWER_WITHIN_S, share_s) * (0.2 + 0.8 * self._rng.random())
-        self.next_at = min(self.next_at, max(self._last_at + max(LEAST_GAP_S, share_s), soon))
+    def schedule_now(self, team: int, now: float) -> None:
+        """Schedule a heartbeat within `REPLY_WITHIN_S`, unless the last one is too recent; later in a team of `team`
+        nodes."""
+        share_s = team / (DISCOVERY_RATE_FACTOR * self._heard_per_s)
+        soon = now + max(REPLY_WITHIN_S, share_s) * (0.2 + 0.8 * self._rng.random())
+        self.next_at = min(self.next_at, max(self._last_at + max(MIN_GAP_S, share_s), soon))
 
     def interval_s(self, settings: Settings, sessions: list[Session], now: float) -> float:
-        """Until the next heartbeat: sparse if every peer acknowledged something lately, and by the size of the team."""
+        """Time until the next heartbeat: sparse if every peer acknowledged something recently, and longer in a large
+        team."""
         rates = settings.rates
         online = [session for session in sessions if session.peer is not None and session.peer.online]
-        proven = bool(online) and all(
+        verified = bool(online) and all(
             session.peer is not None
-            and session.peer.engaged
-            and now - session.peer.outbound.delivered_at < rates.heartbeat_s
-            and session.peer.outbound.delivered_packets
+            and session.peer.has_sender
+            and now - session.peer.sender.delivered_at < rates.heartbeat_s
+            and session.peer.sender.delivered_packets
             for session in online
         )
-        base = rates.heartbeat_sparse_s if proven else rates.heartbeat_s
+        base = rates.heartbeat_sparse_s if verified else rates.heartbeat_s
         return max(base, len(online) / rates.heartbeats_heard_per_s)
 
-    def compose(
+    def build(
         self,
         settings: Settings,
         sessions: list[Session],
         waiting: tuple[Waiting, ...],
-        next_cast: int,
+        next_broadcast: int,
         sent_bytes_per_s: float,
         now: float,
     ) -> Heartbeat:
-        """The heartbeat to send now; the next one is due after its interval. `broadcast_number` is filled by `seal`."""
+        """Build the heartbeat to send now and schedule the next one. `encode_numbered` fills in `broadcast_number`."""
         self._heard_per_s = settings.rates.heartbeats_heard_per_s
         self._interval_s = self.interval_s(settings, sessions, now)
         self._last_at = now
         self.next_at = now + self._interval_s * (1 - JITTER * self._rng.random())
         heard = self._heard(sessions, settings.name, now)
-        if self._to_answer:
-            # More new nodes than one heartbeat can list: the others are not kept waiting for the next regular one.
-            self.hurry(len(sessions), now)
+        if self._pending_replies:
+            # More new nodes than one heartbeat can list: send another one soon instead of waiting for the regular one.
+            self.schedule_now(len(sessions), now)
         return Heartbeat(
             settings.name,
             VERSION,
@@ -108,55 +109,55 @@ class Discovery:
             min(65_535, sum(1 for session in sessions if session.peer is not None and session.peer.online)),
             min(0xFFFFFFFF, int(sent_bytes_per_s)),
             0,
-            next_cast,
+            next_broadcast,
             heard,
             waiting,
             clock_ms(now),
         )
 
     def _heard(self, sessions: list[Session], own_name: str, now: float) -> tuple[bytes, ...]:
-        """Tags of those to be answered first, then of the others in turn."""
-        tags = list(self._to_answer)[:MAX_HEARD]
+        """Tags of the nodes to answer first, then of the others in turn."""
+        tags = list(self._pending_replies)[:MAX_HEARD]
         for tag in tags:
-            del self._to_answer[tag]
-        # Who lost its name to another run is not listed: nothing it sends is taken, and it must know that.
-        taken = [one for one in sessions if one.current or not one.proven or one.name == own_name]
-        alive = [session for session in taken if now - session.last_heard < MISSED_HEARTBEATS * session.interval_s]
-        if alive:
-            start = self._listed_from % len(alive)
-            for session in alive[start:] + alive[:start]:
+            del self._pending_replies[tag]
+        # A boot whose name was taken by another is not listed: its messages are not accepted, and it must learn that.
+        listed = [one for one in sessions if one.is_current or not one.verified or one.name == own_name]
+        recent = [session for session in listed if now - session.last_heard < MISSED_HEARTBEATS * session.interval_s]
+        if recent:
+            start = self._next_listed % len(recent)
+            for session in recent[start:] + recent[:start]:
                 if len(tags) >= MAX_HEARD:
                     break
                 if session.heard_tag not in tags:
                     tags.append(session.heard_tag)
-                self._listed_from += 1
+                self._next_listed += 1
         return tuple(tags)
 
 
-def numbered(beat: Heartbeat, channel: SendChannel) -> bytes:
-    """The encoded heartbeat with the number of the packet that will carry it."""
+def encode_numbered(beat: Heartbeat, channel: SendChannel) -> bytes:
+    """Encode the heartbeat with the number of the packet that will carry it."""
     return encode([replace(beat, broadcast_number=channel.next_number)])
 
 
-def announce(
+def heartbeat_datagrams(
     beat: Heartbeat, channel: SendChannel, links: Iterable[LinkInfo], neighbours: tuple[Neighbour, ...]
 ) -> list[Datagram]:
-    """The heartbeat on every link: one datagram to all where there is broadcast, one per neighbour where not."""
+    """The heartbeat for every link: one datagram to the broadcast address, or one per configured neighbor."""
     out: list[Datagram] = []
     links = list(links)
     for link in links:
-        near = [neighbour for neighbour in neighbours if not neighbour.legacy and leads(neighbour, link, links)]
+        near = [neighbour for neighbour in neighbours if not neighbour.legacy and uses_link(neighbour, link, links)]
         if link.kind is LinkKind.NEIGHBOURS and not near:
             continue
-        _, data = channel.seal_long(numbered(beat, channel))
+        _, data = channel.seal_long(encode_numbered(beat, channel))
         if link.kind is LinkKind.BROADCAST:
             out.append(Datagram(link.name, link.broadcast, data, True))
         out.extend(Datagram(link.name, neighbour.address, data, True) for neighbour in near)
     return out
 
 
-def leads(neighbour: Neighbour, link: LinkInfo, links: list[LinkInfo]) -> bool:
-    """Whether the neighbour is reached over this link."""
+def uses_link(neighbour: Neighbour, link: LinkInfo, links: list[LinkInfo]) -> bool:
+    """Whether the neighbor is reached over this link."""
     if neighbour.link is not None:
         return neighbour.link == link.name
     if any(other.kind is LinkKind.NEIGHBOURS for other in links):

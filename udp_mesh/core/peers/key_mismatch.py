@@ -1,7 +1,8 @@
-"""Datagrams of other keys: which are reported. One allowance over all addresses, since addresses are free.
+"""Rate-limit reports of datagrams sealed with unknown keys. All addresses share one token bucket: they can be forged.
 
-An address is reported once a minute, any of them `AT_ONCE` times in a row and then once per `EVERY_S`. The number of
-datagrams not reported meanwhile comes with the next event, at the latest `EVERY_S` after the last of them.
+An address is reported at most once a minute; all addresses together `BURST` times in a row, then once per
+`REFILL_INTERVAL_S`. Datagrams not reported are counted in the next event, which follows at most `REFILL_INTERVAL_S`
+after the last of them.
 """
 
 from collections import OrderedDict
@@ -9,49 +10,49 @@ from collections import OrderedDict
 from udp_mesh.core.events import KeyMismatch
 from udp_mesh.core.settings import Address
 
-AGAIN_S = 60.0
-"""The same address is reported once in this time."""
+REPORT_INTERVAL_S = 60.0
+"""Minimum time between two reports of the same address."""
 
-AT_ONCE = 8
-"""Addresses reported in a row: a team that missed a rotation is seen at a glance."""
+BURST = 8
+"""Addresses reported in a row, so that a team that missed a key rotation is reported completely."""
 
-EVERY_S = 10.0
-"""Then one event per so many seconds: a flood of 20,000 a second fills no log."""
+REFILL_INTERVAL_S = 10.0
+"""After that, one event per interval: a flood of 20,000 datagrams a second fills no log."""
 
-REMEMBERED = 256
-"""Addresses whose unknown key was reported: a flood of them must not grow memory."""
+MAX_REMEMBERED = 256
+"""Reported addresses remembered; bounds memory during a flood."""
 
 
-class Mismatches:
-    """What of unknown keys is reported; `None` where nothing is to be said now."""
+class KeyMismatchLimiter:
+    """Decides which datagrams of unknown keys are reported; returns None if none is to be reported now."""
 
-    __slots__ = ("_at", "_last", "_left", "_reported", "more")
+    __slots__ = ("_at", "_last", "_reported", "_tokens", "more")
 
     def __init__(self) -> None:
         self._reported: OrderedDict[Address, float] = OrderedDict()
-        self._left = float(AT_ONCE)
+        self._tokens = float(BURST)
         self._at = float("-inf")
         self._last: tuple[Address, str] | None = None
         self.more = 0
         """Datagrams from addresses not reported yet."""
 
-    def seen(self, source: Address, link: str, now: float) -> KeyMismatch | None:
-        """A datagram of an unknown key came."""
-        if now - self._reported.get(source, float("-inf")) < AGAIN_S:
+    def on_mismatch(self, source: Address, link: str, now: float) -> KeyMismatch | None:
+        """Process a datagram sealed with an unknown key."""
+        if now - self._reported.get(source, float("-inf")) < REPORT_INTERVAL_S:
             return None
-        if not self._take(now):
+        if not self._take_token(now):
             self.more += 1
             self._last = (source, link)
             return None
         self._reported[source] = now
         self._reported.move_to_end(source)
-        while len(self._reported) > REMEMBERED:
+        while len(self._reported) > MAX_REMEMBERED:
             self._reported.popitem(last=False)
         return self._event(source, link)
 
-    def rest(self, now: float) -> KeyMismatch | None:
-        """To be called now and then: what was not reported yet."""
-        if self._last is None or not self._take(now):
+    def flush(self, now: float) -> KeyMismatch | None:
+        """Report what was not reported yet. Call periodically."""
+        if self._last is None or not self._take_token(now):
             return None
         source, link = self._last
         self.more -= 1
@@ -62,11 +63,11 @@ class Mismatches:
         self.more, self._last = 0, None
         return event
 
-    def _take(self, now: float) -> bool:
+    def _take_token(self, now: float) -> bool:
         if self._at != float("-inf"):
-            self._left = min(AT_ONCE, self._left + max(0.0, now - self._at) / EVERY_S)
+            self._tokens = min(BURST, self._tokens + max(0.0, now - self._at) / REFILL_INTERVAL_S)
         self._at = now
-        if self._left < 1:
+        if self._tokens < 1:
             return False
-        self._left -= 1
+        self._tokens -= 1
         return True

@@ -1,40 +1,40 @@
-"""Who is there: sessions by boot id, peers by name, and which session a short header's tag may mean.
+"""Sessions by boot id, peers by name, and the channels that a short header's tag may mean.
 
-A boot heard for the first time is a stranger until it is proven; strangers are few and the oldest goes first. A proven
-session becomes its name's session: the first one, a restart, or a conflict.
+A newly heard boot is unverified until it proves that it hears us. Unverified sessions are few, and the oldest is
+dropped first. A verified session becomes the current one of its name: the first one, a restart, or a conflict.
 """
 
 from enum import Enum
 
 from udp_mesh.core.peers.channel_counters import BootMemory
 from udp_mesh.core.peers.session import Peer, Session
-from udp_mesh.core.receiver.memory_limit import Memory
+from udp_mesh.core.receiver.memory_limit import MemoryBudget
 from udp_mesh.core.settings import Settings
 from udp_mesh.crypto import Key, ReceiveChannel
 
-RETIRED_REMEMBERED = 16
-"""Earlier boots of a name that are still heard, to notice conflicts; of those before only what they counted is kept."""
+MAX_RETIRED = 16
+"""Retired boots of a name still kept, to detect conflicts; of older ones only the counters are kept."""
 
 
-class Arrival(Enum):
-    """What a session's proof means for its name."""
+class VerifyResult(Enum):
+    """What the verification of a session means for its name."""
 
     NEW = 1
     RESTARTED = 2
     OWN_NAME = 3
     RETIRED = 4
-    """An earlier run of the name speaks again: a conflict while the later one is there, else it is served again."""
+    """A retired boot of the name: a conflict while the current one is online; otherwise it becomes current again."""
     FULL = 5
 
 
-class Roster:
-    """`tags` maps a short header's tag to the channels it may mean, unicast and broadcast apart."""
+class PeerTable:
+    """`data_tags` and `broadcast_tags` map a short header's tag to the channels it may mean."""
 
     __slots__ = (
-        "_aside",
         "_boots",
         "_limits",
-        "_strangers",
+        "_non_current",
+        "_unverified",
         "broadcast_tags",
         "data_tags",
         "memory",
@@ -50,11 +50,11 @@ class Roster:
         self._limits = settings.limits
         self.sessions: dict[bytes, Session] = {}
         self.peers: dict[str, Peer] = {}
-        self._strangers: dict[bytes, None] = {}
-        self._aside: dict[bytes, Session] = {}
-        """Sessions that are no peer's, by boot id."""
+        self._unverified: dict[bytes, None] = {}
+        self._non_current: dict[bytes, Session] = {}
+        """Sessions that are not the current one of any peer, by boot id."""
         self._boots = BootMemory()
-        self.memory = Memory(settings.limits.partial_bytes)
+        self.memory = MemoryBudget(settings.limits.partial_bytes)
         self.data_tags: dict[int, list[tuple[ReceiveChannel, Session]]] = {}
         self.broadcast_tags: dict[int, list[tuple[ReceiveChannel, Session]]] = {}
 
@@ -62,66 +62,66 @@ class Roster:
         self._limits = settings.limits
         self.memory.set_limit(settings.limits.partial_bytes)
 
-    def peer(self, name: str, settings: Settings) -> Peer | None:
-        """The peer of a name, made when first asked for; None when there are too many."""
+    def get_or_create(self, name: str, settings: Settings) -> Peer | None:
+        """The peer of a name, created if needed. None if there are too many."""
         peer = self.peers.get(name)
         if peer is None and len(self.peers) < self._limits.peers:
             peer = self.peers[name] = Peer(name, settings)
         return peer
 
-    def stranger(self, name: str, boot_id: bytes, keys: tuple[Key, ...], settings: Settings) -> Session:
-        """A session for a boot heard for the first time."""
-        while len(self._strangers) >= self._limits.strangers:
-            self.forget(self.sessions[next(iter(self._strangers))])
+    def add_unverified(self, name: str, boot_id: bytes, keys: tuple[Key, ...], settings: Settings) -> Session:
+        """Add a session for a newly heard boot."""
+        while len(self._unverified) >= self._limits.strangers:
+            self.forget(self.sessions[next(iter(self._unverified))])
         session = Session(name, boot_id, self.own_boot, keys, settings, self.memory)
         self._boots.restore(session)
-        self.sessions[boot_id] = self._aside[boot_id] = session
-        self._strangers[boot_id] = None
+        self.sessions[boot_id] = self._non_current[boot_id] = session
+        self._unverified[boot_id] = None
         self._enter_tags(session)
         return session
 
-    def prove(self, session: Session, settings: Settings) -> tuple[Arrival, Peer | None]:
-        """The session is alive. NEW and RESTARTED make it its peer's session; `Peer.session` still holds the old
-        one."""
-        session.proven = True
+    def verify(self, session: Session, settings: Settings) -> tuple[VerifyResult, Peer | None]:
+        """Mark the session as verified. After NEW and RESTARTED the caller makes it its peer's session; `Peer.session`
+        still is the old one."""
+        session.verified = True
         if session.name == self.own_name:
-            # It stays among the strangers, who are few: a key holder could invent such boots without end.
-            return Arrival.OWN_NAME, None
-        self._strangers.pop(session.boot_id, None)
-        peer = self.peer(session.name, settings)
+            # It stays among the unverified sessions, which are few: a key holder could invent such boots without end.
+            return VerifyResult.OWN_NAME, None
+        self._unverified.pop(session.boot_id, None)
+        peer = self.get_or_create(session.name, settings)
         if peer is None:
             self.forget(session)
-            return Arrival.FULL, None
+            return VerifyResult.FULL, None
         if session.replaced and peer.session is not None:
             session.peer = peer
-            return Arrival.RETIRED, peer
-        return (Arrival.NEW if peer.session is None else Arrival.RESTARTED), peer
+            return VerifyResult.RETIRED, peer
+        return (VerifyResult.NEW if peer.session is None else VerifyResult.RESTARTED), peer
 
     def replace(self, peer: Peer, session: Session) -> None:
-        """The session is its peer's from now on; the earlier one is retired but still heard, to notice conflicts."""
+        """Make the session the current one of its peer. The earlier one is retired but kept, to detect conflicts."""
         old = peer.session
         if old is not None:
             peer.retired[old.boot_id] = None
             old.replaced = True
-            if len(peer.retired) > RETIRED_REMEMBERED:
+            if len(peer.retired) > MAX_RETIRED:
                 oldest = next(iter(peer.retired))
                 del peer.retired[oldest]
                 if oldest in self.sessions:
                     self.forget(self.sessions[oldest])
             if old.boot_id in self.sessions:
-                self._aside[old.boot_id] = old
+                self._non_current[old.boot_id] = old
         peer.retired.pop(session.boot_id, None)
         peer.session = session
         session.peer = peer
-        self._aside.pop(session.boot_id, None)
+        self._non_current.pop(session.boot_id, None)
 
     def forget(self, session: Session) -> None:
-        """Drop a session and its channels; what these counted is kept."""
-        self._boots.keep(session)
-        session.inbound.close()
+        """Drop a session and its channels; its counters are saved."""
+        self._boots.save(session)
+        session.receiver.close()
         self.sessions.pop(session.boot_id, None)
-        self._strangers.pop(session.boot_id, None)
-        self._aside.pop(session.boot_id, None)
+        self._unverified.pop(session.boot_id, None)
+        self._non_current.pop(session.boot_id, None)
         for table, channels in (
             (self.data_tags, session.data_channels),
             (self.broadcast_tags, session.broadcast_channels),
@@ -134,7 +134,7 @@ class Roster:
                     table.pop(channel.tag, None)
 
     def set_keys(self, keys: tuple[Key, ...]) -> None:
-        """New live keys for every session."""
+        """Apply new live keys to every session."""
         self.data_tags.clear()
         self.broadcast_tags.clear()
         for session in self.sessions.values():
@@ -142,8 +142,8 @@ class Roster:
             self._enter_tags(session)
 
     def not_current(self) -> list[Session]:
-        """Strangers, and runs of a name that another one replaced."""
-        return list(self._aside.values())
+        """Unverified sessions, and boots replaced by another one of the same name."""
+        return list(self._non_current.values())
 
     def online(self) -> list[Peer]:
         return [peer for peer in self.peers.values() if peer.online]

@@ -1,17 +1,17 @@
-"""One run of one peer, told from others by its boot id: channels, the way to it, what is owed to it.
+"""One boot of one peer, identified by its boot id: channels, path and pending control frames.
 
-heard (a heartbeat, perhaps replayed) -> *proven* (it showed that it hears this run of ours) -> replaced by the peer's
-next run, or gone. Nothing but its heartbeat is believed before it is proven.
+heard (a heartbeat, perhaps replayed) -> *verified* (it proved that it hears our current boot) -> replaced by the peer's
+next boot, or dropped. Before verification only its heartbeat is believed.
 """
 
 from typing import NamedTuple
 
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, Freshness
-from udp_mesh.core.receiver.memory_limit import Memory
-from udp_mesh.core.receiver.receiver import Inbound
-from udp_mesh.core.sender.packetizer import Way
-from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.receiver.memory_limit import MemoryBudget
+from udp_mesh.core.receiver.receiver import Receiver
+from udp_mesh.core.sender.packetizer import Path
+from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address, Settings
 from udp_mesh.crypto import TO_ALL, Key, ReceiveChannel, SendChannel
 from udp_mesh.wire.frames import Ack, Feature, Frame, Heartbeat, Waiting
@@ -19,30 +19,30 @@ from udp_mesh.wire.limits import HEARD_TAG_BYTES, MAX_HEARD
 
 
 class Challenge(NamedTuple):
-    """A ping that proves a path once its pong comes from where it went."""
+    """A ping that validates a path when its pong comes from the same address."""
 
     link: str
     address: Address
-    asked_at: float
+    sent_at: float
     in_use: bool
-    """It went to the address in use."""
+    """It was sent to the current address."""
 
 
-ANSWER_WITHIN_S = 60.0
-"""Pongs are waited for this long: a path may be as slow as that."""
+CHALLENGE_TIMEOUT_S = 60.0
+"""How long a pong is awaited: a path may be that slow."""
 
 STALE_PATH_S = 2.0
-"""A path not heard for this long is left for one that is: two heartbeats."""
+"""A path not heard for this long (two heartbeats) is replaced by one that is."""
 
-FLOORS_REMEMBERED = 64
-"""Keys taken away of which a session remembers how far their numbers had come: years of rotations."""
+MAX_REMEMBERED_FLOORS = 64
+"""Removed keys whose counters a session remembers: years of rotations."""
 
-OWED_FRAMES = 64
-"""Small frames (pongs, repairs asked for, refusals) waiting to leave to one peer; more is a flood of questions."""
+MAX_PENDING_CONTROL = 64
+"""Small frames (pongs, repair requests, refusals) waiting for one peer; more of them indicates a flood."""
 
 
 class Meters:
-    """Bytes per second of one session."""
+    """Byte rates of one session."""
 
     __slots__ = ("delivered", "received", "sent")
 
@@ -53,81 +53,81 @@ class Meters:
 
 
 class Peer:
-    """A name: what is on its way to it, whichever run of it listens.
+    """A name: what is being sent to it, whichever of its boots receives.
 
-    `outbound` is made when first asked for, and `engaged` is True from then on: in a large team most nodes send to few.
+    `sender` is created on first access, and `has_sender` is True from then on: in a large team most nodes send to few.
     """
 
     __slots__ = (
         "_settings",
         "conflict_reported_at",
-        "engaged",
-        "fielded_meters",
-        "fielded_way",
+        "due_at",
+        "has_sender",
         "held_until",
         "left",
         "legacy",
+        "legacy_meters",
+        "legacy_path",
         "lost",
         "name",
         "online",
         "online_since",
-        "outbound",
         "retired",
+        "sender",
         "session",
         "settling",
         "timer_at",
-        "wants_at",
     )
 
-    outbound: Outbound
+    sender: Sender
 
     def __init__(self, name: str, settings: Settings) -> None:
         self.name = name
         self._settings = settings
-        self.engaged = False
+        self.has_sender = False
         self.session: Session | None = None
         self.online = False
         self.left = False
         self.legacy = False
-        self.fielded_way: tuple[Address, str, float] | None = None
-        """Address and link from which a fielded program was heard last, and when."""
-        self.fielded_meters: Meters | None = None
-        """Where it speaks the fielded format: no session of it has any."""
+        self.legacy_path: tuple[Address, str, float] | None = None
+        """Address and link from which a legacy program was last heard, and when."""
+        self.legacy_meters: Meters | None = None
+        """Set while it speaks the legacy format; then there is no session with meters."""
         self.settling = False
-        """A fielded program that has just started: what outboxes keep for it does not leave yet."""
+        """A legacy program that has just started: outboxes do not send to it yet."""
         self.lost = True
-        """Silent for `peer_lost_s`, or never heard: nothing waits for it but in an outbox."""
+        """Silent for `peer_lost_s`, or never heard: messages wait for it only in an outbox."""
         self.online_since: float | None = None
         self.conflict_reported_at = float("-inf")
         self.retired: dict[bytes, None] = {}
-        """Earlier boot ids: never believed again."""
+        """Earlier boot ids, which are no longer accepted."""
         self.timer_at = float("inf")
-        """Where this peer stands in the node's timer queue: at `wants_at`, or earlier until it comes to the front."""
-        self.wants_at = float("inf")
-        """When this peer wants attention."""
+        """Position in the node's timer queue: `due_at`, or earlier until the entry reaches the front."""
+        self.due_at = float("inf")
+        """When this peer's timer is due."""
         self.held_until: dict[int, float] = {}
-        """Priority -> until when the time it is held back for other robots is booked."""
+        """Priority -> until when its hold-back for other robots is already counted."""
 
-    def __getattr__(self, name: str) -> Outbound:
-        # Only called for a slot not yet set: nothing is paid for this once the sending half is there.
-        if name != "outbound":
+    def __getattr__(self, name: str) -> Sender:
+        # Only called while the slot is unset, so access costs nothing once the sender exists.
+        if name != "sender":
             raise AttributeError(name)
-        self.engaged = True
-        self.outbound = Outbound(self._settings)
-        return self.outbound
+        self.has_sender = True
+        self.sender = Sender(self._settings)
+        return self.sender
 
-    def book_held(self, levels: int, now: float, until: float) -> None:
-        """Levels of the mask wait here and are held back for other robots' urgent messages until then."""
-        for priority, book in enumerate(self.outbound.levels):
+    def record_held(self, levels: int, now: float, until: float) -> None:
+        """Count how long the waiting levels of the mask are held back for other robots' urgent messages."""
+        for priority, level in enumerate(self.sender.levels):
             if levels >> priority & 1:
-                book.held_s += max(0.0, until - max(now, self.held_until.get(priority, now)))
+                level.held_s += max(0.0, until - max(now, self.held_until.get(priority, now)))
                 self.held_until[priority] = until
 
     def apply(self, settings: Settings) -> None:
-        """New settings; nothing on its way is touched."""
+        """Apply new settings; nothing in flight is touched."""
         self._settings = settings
-        if self.engaged:
-            self.outbound.apply(settings)
+        if self.has_sender:
+            self.sender.apply(settings)
 
 
 class Session:
@@ -140,11 +140,9 @@ class Session:
         "broadcast_channels",
         "challenged_at",
         "challenges",
-        "contested",
         "data_channels",
         "features",
         "freshness",
-        "inbound",
         "interval_s",
         "introduced_at",
         "knows_us",
@@ -153,19 +151,21 @@ class Session:
         "met_at",
         "meters",
         "name",
+        "name_conflict",
         "next_wire_id",
-        "owed",
+        "one_way_since",
+        "path",
         "peer",
         "peer_receives",
         "peer_sends",
-        "proven",
+        "pending_control",
         "received_bytes",
+        "receiver",
         "replaced",
         "restored",
         "timed",
-        "unheard_since",
+        "verified",
         "versions",
-        "way",
     )
 
     def __init__(
@@ -175,51 +175,51 @@ class Session:
         own_boot: bytes,
         keys: tuple[Key, ...],
         settings: Settings,
-        memory: Memory | None = None,
+        memory: MemoryBudget | None = None,
     ) -> None:
-        """`memory` is that of all peers (None: only this session's own limits hold)."""
+        """`memory` is the budget of all peers (None: only this session's own limits apply)."""
         self.name = name
         self.boot_id = boot_id
         self.peer: Peer | None = None
-        self.proven = False
+        self.verified = False
         self.knows_us = False
         """It listed us as heard, or answered us: introductions need no name any more."""
         self.met_at: float | None = None
         """When its first heartbeat was heard."""
         self.lists_us = False
-        """Its heartbeats to all have listed us: from one that no longer does something follows."""
-        self.unheard_since: float | None = None
-        """Since when they list us no more and it acknowledges nothing: only its way to us works."""
-        self.contested = False
-        """It went on speaking after another run took its name: two nodes share that."""
+        """Its broadcast heartbeats have listed us, so one that no longer does is significant."""
+        self.one_way_since: float | None = None
+        """Since when its heartbeats no longer list us and it acknowledges nothing: only its direction to us works."""
+        self.name_conflict = False
+        """Still heard after another boot took its name: two nodes share the name."""
         self.next_wire_id = 0
-        """Of the messages to it, when another run took its name."""
+        """Next wire id of messages to it, saved when another boot took its name."""
         self.introduced_at = float("-inf")
         self.last_heard = float("-inf")
         self.meters = Meters(0.0)
         self.received_bytes = 0
         self.peer_sends = (0, float("-inf"))
-        """Bytes per second that the peer says it sends to everybody, and when it said so."""
+        """Bytes per second that the peer reports sending to all nodes, and when it did."""
         self.peer_receives = (0, float("-inf"))
-        """Bytes per second from here that the peer says arrive, and when it said so."""
+        """Bytes per second from us that the peer reports receiving, and when it did."""
         self.interval_s = settings.rates.heartbeat_s
         self.versions = (1, 1)
         self.features = 0
-        self.inbound = Inbound(settings.rates, settings.limits, memory or Memory(1 << 62))
-        self.way = Way(SendChannel(keys[0], own_boot, boot_id))
-        self.owed: list[Frame] = []
+        self.receiver = Receiver(settings.rates, settings.limits, memory or MemoryBudget(1 << 62))
+        self.path = Path(SendChannel(keys[0], own_boot, boot_id))
+        self.pending_control: list[Frame] = []
         self.freshness = Freshness()
         self.timed = False
-        """It dates what it sends."""
+        """It timestamps what it sends."""
         self.challenges: dict[int, Challenge] = {}
-        """Pings whose pongs prove a path, by token (`paths`)."""
+        """Path challenges without an answer yet, by token (see `path_validation`)."""
         self.challenged_at = float("-inf")
         self.replaced = False
-        """Another run has had its name since."""
+        """Another boot has taken its name since."""
         self.restored = False
-        """An earlier session for the same boot was forgotten meanwhile."""
+        """An earlier session for the same boot was dropped and its counters were restored."""
         self._key_floors: dict[tuple[bytes, bytes], int] = {}
-        """(key id, receiver) of keys taken away -> the number from which on datagrams are new."""
+        """(key id, receiver) of removed keys -> the number from which on datagrams are new."""
         self._forgotten_floor = 0
         self.data_channels: list[ReceiveChannel] = []
         self.broadcast_channels: list[ReceiveChannel] = []
@@ -230,24 +230,24 @@ class Session:
         return self.boot_id[:HEARD_TAG_BYTES]
 
     def set_keys(self, own_boot: bytes, keys: tuple[Key, ...]) -> None:
-        """The live keys: channels of keys that stay keep their replay windows; packet numbers go on across keys."""
+        """Set the live keys. Channels of kept keys keep their replay windows; packet numbers continue across keys."""
         self.data_channels = self._receive_channels(self.data_channels, own_boot, keys)
         self.broadcast_channels = self._receive_channels(self.broadcast_channels, TO_ALL, keys)
-        channel = self.way.channel
+        channel = self.path.channel
         if channel.key != keys[0]:
-            self.way.channel = SendChannel(keys[0], own_boot, self.boot_id)
-            self.way.channel.next_number = channel.next_number
+            self.path.channel = SendChannel(keys[0], own_boot, self.boot_id)
+            self.path.channel.next_number = channel.next_number
 
     def _receive_channels(
         self, before: list[ReceiveChannel], receiver: bytes, keys: tuple[Key, ...]
     ) -> list[ReceiveChannel]:
-        """A key that comes back finds its numbers where they were: what was sealed with it before is a recording."""
+        """A key that returns continues its numbers: what was sealed with it before is a replay."""
         known = {channel.key: channel for channel in before}
         floors = self._key_floors
         for channel in before:
             if channel.key not in keys:
                 floors[channel.key.key_id, channel.receiver_boot] = channel.window.next_new
-        while len(floors) > FLOORS_REMEMBERED:
+        while len(floors) > MAX_REMEMBERED_FLOORS:
             self._forgotten_floor = max(self._forgotten_floor, floors.pop(next(iter(floors))))
         channels = []
         for key in keys:
@@ -259,7 +259,7 @@ class Session:
         return channels
 
     def floors(self) -> dict[tuple[bytes, bytes], int]:
-        """(key id, receiver) -> the number from which on datagrams are new, of every key there ever was."""
+        """(key id, receiver) -> the number from which on datagrams are new, for every key ever used."""
         found = dict(self._key_floors)
         for channels in (self.data_channels, self.broadcast_channels):
             for channel in channels:
@@ -267,20 +267,20 @@ class Session:
         return found
 
     def restore_floors(self, floors: dict[tuple[bytes, bytes], int]) -> None:
-        """What `floors` said of this boot's earlier session."""
+        """Restore the `floors` of this boot's earlier session."""
         self._key_floors = dict(floors)
         for channels in (self.data_channels, self.broadcast_channels):
             for channel in channels:
                 channel.window.raise_floor(floors.get((channel.key.key_id, channel.receiver_boot), 0))
 
     def is_fresh(self, now: float) -> bool:
-        """Whether something came lately that was no recording."""
+        """Whether something that cannot be a replay came recently."""
         return now - self.freshness.fresh_at <= ACCEPT_AGE_S
 
     def age_windows(self, now: float) -> None:
-        """What was not received for long counts as seen; questions not answered for long are forgotten."""
-        for token, question in list(self.challenges.items()):
-            if now - question.asked_at > ANSWER_WITHIN_S:
+        """Advance the replay windows and drop unanswered challenges."""
+        for token, challenge in list(self.challenges.items()):
+            if now - challenge.sent_at > CHALLENGE_TIMEOUT_S:
                 del self.challenges[token]
         for channel in self.data_channels:
             channel.window.age(now)
@@ -288,44 +288,44 @@ class Session:
             channel.window.age(now)
 
     @property
-    def current(self) -> bool:
-        """Whether it is the one that its name means."""
+    def is_current(self) -> bool:
+        """Whether it is the current session of its name."""
         return self.peer is not None and self.peer.session is self
 
-    def hears_us(self) -> None:
-        """It lists us, or acknowledged what left lately."""
+    def confirm_two_way(self) -> None:
+        """It listed us, or acknowledged something recent."""
         self.knows_us = True
-        self.unheard_since = None
+        self.one_way_since = None
 
-    def take_list(self, heard: tuple[bytes, ...], own_tag: bytes, now: float) -> None:
-        """What a heartbeat to all says of whether we are heard; a full list may have had no room for us."""
+    def on_heard_list(self, heard: tuple[bytes, ...], own_tag: bytes, now: float) -> None:
+        """Process the list of a broadcast heartbeat. A full list may have had no room for us."""
         if own_tag in heard:
             self.lists_us = True
-            self.hears_us()
-        elif self.lists_us and self.unheard_since is None and len(heard) < MAX_HEARD:
-            self.unheard_since = now
+            self.confirm_two_way()
+        elif self.lists_us and self.one_way_since is None and len(heard) < MAX_HEARD:
+            self.one_way_since = now
 
-    def owe(self, frame: Frame) -> None:
-        """A small frame leaves with the next datagrams."""
-        if len(self.owed) < OWED_FRAMES:
-            self.owed.append(frame)
+    def queue_control(self, frame: Frame) -> None:
+        """Queue a small frame for the next datagrams."""
+        if len(self.pending_control) < MAX_PENDING_CONTROL:
+            self.pending_control.append(frame)
 
-    def take_ack(self, now: float, waiting: tuple[Waiting, ...]) -> Ack | None:
-        """The acknowledgement to send now, if there is anything to acknowledge; it then counts as sent."""
-        acks = self.inbound.acks
+    def build_ack(self, now: float, waiting: tuple[Waiting, ...]) -> Ack | None:
+        """The acknowledgement to send now, if there is one. It then counts as sent."""
+        acks = self.receiver.acks
         if acks.largest < 0:
             return None
         delay_us = min((1 << 24) - 1, int(max(0.0, now - acks.arrived_at) * 1e6))
-        acks.sent()
+        acks.on_ack_sent()
         arriving = min(0xFFFFFFFF, int(self.meters.received.per_s(now)))
         return Ack(acks.largest, acks.received >> 1, delay_us, arriving, waiting)
 
-    def learn(self, beat: Heartbeat, now: float) -> None:
-        """What a heartbeat says about its sender."""
+    def update_from(self, beat: Heartbeat, now: float) -> None:
+        """Record what a heartbeat says about its sender."""
         if self.met_at is None:
             self.met_at = now
         self.peer_sends = (beat.send_rate, now)
         self.interval_s = beat.interval_ms / 1000
         self.versions = (beat.min_version, beat.max_version)
         self.features = beat.features
-        self.timed = self.way.timed = bool(beat.features & Feature.TIMED)
+        self.timed = self.path.timed = bool(beat.features & Feature.TIMED)

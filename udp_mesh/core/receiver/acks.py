@@ -1,34 +1,34 @@
-"""What the receiving side of one peer owes: packet numbers in -> an acknowledgement now, soon, or not yet.
+"""Acknowledgement state of one peer: packet numbers in -> an acknowledgement now, soon, or not yet.
 
-An acknowledgement names the largest packet number and a 256-bit bitmap below it. It leaves after a number of packets
-or a delay, whichever is first; at once when the packet asks for it.
+An acknowledgement carries the largest packet number and a 256-bit bitmap below it. It is sent after a number of packets
+or a delay, whichever comes first, or at once if a packet requests it.
 """
 
 from udp_mesh.wire.limits import ACK_BITMAP_BITS
 
 _ALL = (1 << (ACK_BITMAP_BITS + 1)) - 1
 
-MOST_PENDING = ACK_BITMAP_BITS // 4
-"""Packets after which an acknowledgement is due whatever the policy: each packet then stands in four of them."""
+MAX_PENDING = ACK_BITMAP_BITS // 4
+"""An acknowledgement is due after this many packets in any case, so that each packet appears in four of them."""
 
 
 class AckState:
     """`received` has bit 0 for `largest` itself and bit i for `largest - i`."""
 
-    __slots__ = ("arrived_at", "due_at", "largest", "now_wanted", "pending", "received")
+    __slots__ = ("arrived_at", "due_at", "largest", "pending", "received", "send_now")
 
     def __init__(self) -> None:
         self.largest = -1
         self.received = 0
         self.pending = 0
-        """Packets that want an acknowledgement, since the last one was sent."""
+        """Packets that request an acknowledgement, since the last one was sent."""
         self.arrived_at = 0.0
         """When `largest` arrived."""
         self.due_at: float | None = None
-        self.now_wanted = False
+        self.send_now = False
 
-    def saw(self, number: int, now: float) -> None:
-        """Any packet (each number once: the replay window stands before)."""
+    def on_packet(self, number: int, now: float) -> None:
+        """Record a packet (each number once: the replay window comes first)."""
         ahead = number - self.largest
         if ahead == 1:
             self.received = (self.received << 1 | 1) & _ALL
@@ -41,8 +41,8 @@ class AckState:
         elif -ahead <= ACK_BITMAP_BITS:
             self.received |= 1 << -ahead
 
-    def sent(self) -> None:
-        """An acknowledgement leaves."""
+    def on_ack_sent(self) -> None:
+        """Record that an acknowledgement was sent."""
         self.pending = 0
         self.due_at = None
-        self.now_wanted = False
+        self.send_now = False

@@ -1,24 +1,24 @@
-"""One bound over what all peers together make this node keep: a key holder invents names, each with its own limits.
+"""One memory budget for unfinished messages of all peers: a key holder can invent names, each with its own limits.
 
-The first half of it is anybody's. In the second half a peer may hold no more than an equal part, so that who came early
-and took much leaves room for the others; past the whole no peer gets more.
+The first half is available to any peer. In the second half each peer may hold at most an equal share, so that early
+heavy users leave room for others. Beyond the total no peer gets more.
 """
 
 PARTIAL_BYTES = 600
-"""Of an unfinished message besides its pieces: measured, objects and dictionary entries."""
+"""Overhead of an unfinished message without its fragments: measured, objects and dictionary entries."""
 
 TOPIC_BYTES = 400
-"""Of a topic's number besides its two names."""
+"""Overhead of a topic without its two names."""
 
-MOST_RANGES = 1 << 18
+MAX_TOTAL_RANGES = 1 << 18
 """Ranges of finished message numbers of all peers: 20 MB. Honest peers have a few each."""
 
-RANGES_LEFT = 16
-"""Ranges that a peer keeps even then: as many as are reordered or given up at a time."""
+MIN_RANGES_PER_PEER = 16
+"""Ranges that a peer always keeps: as many as are reordered or abandoned at a time."""
 
 
-class Memory:
-    """Counts; who keeps something says so with `take` and `give_back`."""
+class MemoryBudget:
+    """Only counts; holders call `reserve` and `release`."""
 
     __slots__ = ("_half", "bytes", "holders", "limit", "ranges")
 
@@ -41,16 +41,16 @@ class Memory:
         return total <= self.limit and own + size <= self._half // max(1, self.holders)
 
     def too_many_ranges(self, own: int) -> bool:
-        """Whether a peer with so many ranges must make do with fewer."""
-        return self.ranges > MOST_RANGES and own > RANGES_LEFT
+        """Whether a peer with so many ranges must drop some."""
+        return self.ranges > MAX_TOTAL_RANGES and own > MIN_RANGES_PER_PEER
 
 
 class Account:
-    """What one peer holds of it."""
+    """The share of one peer."""
 
     __slots__ = ("_memory", "bytes", "ranges")
 
-    def __init__(self, memory: Memory) -> None:
+    def __init__(self, memory: MemoryBudget) -> None:
         self._memory = memory
         self.bytes = 0
         self.ranges = 0
@@ -58,13 +58,13 @@ class Account:
     def has_room(self, size: int) -> bool:
         return self._memory.has_room(size, self.bytes)
 
-    def take(self, size: int) -> None:
+    def reserve(self, size: int) -> None:
         if not self.bytes and size:
             self._memory.holders += 1
         self.bytes += size
         self._memory.bytes += size
 
-    def give_back(self, size: int) -> None:
+    def release(self, size: int) -> None:
         self.bytes -= size
         self._memory.bytes -= size
         if not self.bytes and size:
@@ -78,8 +78,8 @@ class Account:
         return self._memory.too_many_ranges(own)
 
     def close(self) -> None:
-        """The peer is forgotten, and all that is kept for it."""
-        self.give_back(self.bytes)
+        """Release everything held for a dropped peer."""
+        self.release(self.bytes)
         self.count_ranges(-self.ranges)
-        # What is still being inflated ends on its own account.
-        self._memory = Memory(1 << 62)
+        # Messages still being inflated finish without a shared limit.
+        self._memory = MemoryBudget(1 << 62)

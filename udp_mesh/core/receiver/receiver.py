@@ -1,18 +1,18 @@
-"""The receiving half of a session: opened datagrams in -> whole messages and what is owed to the sender out.
+"""The receiving half of a session: opened datagrams in -> complete messages, acknowledgements and refusals out.
 
-1. `take` reads a datagram's fragments; a plain full fragment takes the fast path without building a frame.
-2. Pieces go to the reassembly of the channel they are numbered in (the sender's unicast or its broadcasts).
-3. A datagram all of whose pieces were kept is acknowledged; one with a refused piece is not, so that it comes again.
+1. `receive_fragment` processes a fragment; a plain full fragment takes the fast path without building a frame.
+2. Fragments go to the reassembly of the channel they are numbered in (the sender's unicasts or its broadcasts).
+3. A datagram is acknowledged only if all of its fragments were accepted; otherwise it is retransmitted.
 """
 
 import struct
 from collections import deque
 from typing import NamedTuple
 
-from udp_mesh.core.compression import Unpacking
-from udp_mesh.core.receiver.acks import MOST_PENDING, AckState
-from udp_mesh.core.receiver.memory_limit import TOPIC_BYTES, Account, Memory
-from udp_mesh.core.receiver.reassembly import Reassembly, Verdict, Whole
+from udp_mesh.core.compression import Decompression
+from udp_mesh.core.receiver.acks import MAX_PENDING, AckState
+from udp_mesh.core.receiver.memory_limit import TOPIC_BYTES, Account, MemoryBudget
+from udp_mesh.core.receiver.reassembly import CompleteMessage, FragmentStatus, Reassembly
 from udp_mesh.core.sender.sent_packets import REORDER_PACKETS
 from udp_mesh.core.settings import Limits, Rates
 from udp_mesh.wire.codec import FRAGMENT, FRAGMENT_ACK_NOW, FRAGMENT_BYTES, FRAGMENT_WIDE, FRAGMENT_WIDE_BYTES
@@ -22,12 +22,12 @@ _NARROW = struct.Struct(">BIH")
 _WIDE = struct.Struct(">BII")
 _PLAIN_MASK = 0xFF & ~FRAGMENT_ACK_NOW
 
-REFUSED_REMEMBERED = 256
-"""Messages of one peer refused for good, remembered so that each of their pieces is refused again."""
+MAX_REFUSED_REMEMBERED = 256
+"""Refused messages of one peer remembered, so that each of their fragments is refused again."""
 
 
-class Arrived(NamedTuple):
-    """A whole message, ready for the application."""
+class ReceivedMessage(NamedTuple):
+    """A complete message for the application."""
 
     topic: str
     type_name: str
@@ -35,36 +35,36 @@ class Arrived(NamedTuple):
     priority: int
     to_all: bool
     from_broadcast: int | None
-    """Its broadcast number, where it is numbered so."""
+    """Its broadcast number, if it has one."""
 
 
 def _topic_bytes(names: tuple[str, str]) -> int:
     return TOPIC_BYTES + sum(len(name) for name in names)
 
 
-class Inbound:
-    """`arrived` and `refusals` are fetched and cleared by the session."""
+class Receiver:
+    """The session fetches and clears `completed` and `refusals`."""
 
     __slots__ = (
         "_account",
-        "_gap_ends",
+        "_gap_ack_at",
         "_limits",
         "_rates",
         "_refused",
         "acks",
-        "arrived",
         "broadcasts",
+        "completed",
         "duplicates",
         "expired",
         "fragments",
+        "inflating",
         "over_limit",
         "refusals",
         "topics",
         "unicasts",
-        "unpacking",
     )
 
-    def __init__(self, rates: Rates, limits: Limits, memory: Memory) -> None:
+    def __init__(self, rates: Rates, limits: Limits, memory: MemoryBudget) -> None:
         self._rates = rates
         self._limits = limits
         self.acks = AckState()
@@ -72,33 +72,33 @@ class Inbound:
         self.unicasts = Reassembly(limits, self._account)
         self.broadcasts = Reassembly(limits, self._account)
         self.topics: dict[int, tuple[str, str]] = {}
-        self.arrived: list[Arrived] = []
+        self.completed: list[ReceivedMessage] = []
         self.refusals: list[Refused] = []
-        self.unpacking: deque[tuple[Unpacking, Arrived]] = deque()
-        """Whole messages still being inflated, with what is told of them but for the payload."""
+        self.inflating: deque[tuple[Decompression, ReceivedMessage]] = deque()
+        """Complete messages still being inflated, with everything but their payload."""
         self.duplicates = 0
         self.expired = 0
-        """Pieces of messages whose senders have given them up by now."""
+        """Fragments of messages that their senders have given up by now."""
         self.fragments = 0
         self.over_limit = 0
         self._refused: dict[tuple[bool, int], RefuseReason] = {}
-        self._gap_ends: int | None = None
+        self._gap_ack_at: int | None = None
 
     @property
     def partial_bytes(self) -> int:
         return self.unicasts.bytes + self.broadcasts.bytes
 
     @property
-    def unpacking_bytes(self) -> int:
-        return sum([unpacking.held_bytes for unpacking, _ in self.unpacking])
+    def inflating_bytes(self) -> int:
+        return sum([inflating.held_bytes for inflating, _ in self.inflating])
 
     def apply(self, rates: Rates, limits: Limits) -> None:
         self._rates, self._limits = rates, limits
         self.unicasts.set_limits(limits)
         self.broadcasts.set_limits(limits)
 
-    def take_plain(self, frames: bytes, number: int, now: float) -> bool:
-        """The fast path: one fragment without a head that fills its datagram. False if this is something else."""
+    def receive_plain(self, frames: bytes, number: int, now: float) -> bool:
+        """The fast path: one fragment without a head that fills its datagram. False for anything else."""
         first = frames[0]
         kind = first & _PLAIN_MASK
         if kind == FRAGMENT and len(frames) > FRAGMENT_BYTES:
@@ -114,11 +114,11 @@ class Inbound:
         if not self.unicasts.add_plain(message_id, position, payload):
             return False
         self.fragments += 1
-        self.accepted(number, now, ack_now=first != kind)
+        self.on_accepted(number, now, ack_now=first != kind)
         return True
 
-    def announce(self, frame: TopicAnnounce) -> None:
-        """Learn a topic's number; bounded, since only a faulty peer announces without end."""
+    def on_topic_announce(self, frame: TopicAnnounce) -> None:
+        """Store a topic's number. Bounded, because a faulty peer may announce topics without end."""
         names = (frame.name, frame.type_name)
         known = self.topics.get(frame.topic_id)
         if known == names:
@@ -127,16 +127,16 @@ class Inbound:
         if (known is None and len(self.topics) >= self._limits.topics_per_peer) or not self._account.has_room(size):
             self.over_limit += 1
             return
-        self._account.take(size - (0 if known is None else _topic_bytes(known)))
+        self._account.reserve(size - (0 if known is None else _topic_bytes(known)))
         self.topics[frame.topic_id] = names
 
     def close(self) -> None:
-        """The peer is forgotten: what is kept for it no longer counts."""
+        """Release what is held for a dropped peer."""
         self._account.close()
 
-    def take(self, fragment: Fragment, now: float, *, broadcast: bool, late_s: float = 0.0) -> bool:
-        """Take in one piece, `late_s` longer on its way than others; False if it was refused, so that its datagram must
-        not be acknowledged."""
+    def receive_fragment(self, fragment: Fragment, now: float, *, broadcast: bool, late_s: float = 0.0) -> bool:
+        """Process one fragment that was delayed by `late_s`. False if it was refused, so that its datagram must not be
+        acknowledged."""
         by_broadcast = broadcast or fragment.broadcast_id
         self.fragments += 1
         key = (by_broadcast, fragment.message_id)
@@ -145,98 +145,98 @@ class Inbound:
             return False
         reassembly = self.broadcasts if by_broadcast else self.unicasts
         result = reassembly.add(fragment, now, late_s)
-        if isinstance(result, Whole):
-            return self._hand_over(result, by_broadcast)
+        if isinstance(result, CompleteMessage):
+            return self._deliver(result, by_broadcast)
         match result:
-            case Verdict.KEPT:
+            case FragmentStatus.KEPT:
                 return True
-            case Verdict.DUPLICATE:
+            case FragmentStatus.DUPLICATE:
                 self.duplicates += 1
                 return True
-            case Verdict.FULL:
+            case FragmentStatus.FULL:
                 self.over_limit += 1
                 return False
-            case Verdict.EXPIRED:
+            case FragmentStatus.EXPIRED:
                 self.expired += 1
                 return False
-            case Verdict.FORGOTTEN:
+            case FragmentStatus.FORGOTTEN:
                 self._refuse(key, RefuseReason.FORGOTTEN)
                 return False
-            case Verdict.TOO_LARGE:
+            case FragmentStatus.TOO_LARGE:
                 self.over_limit += 1
                 self._refuse_for_good(key, RefuseReason.TOO_LARGE)
                 return False
-            case Verdict.CORRUPT:
+            case FragmentStatus.CORRUPT:
                 self._refuse_for_good(key, RefuseReason.CORRUPT)
                 return False
 
-    def accepted(self, number: int, now: float, *, ack_now: bool) -> None:
-        """A datagram that wants an acknowledgement was taken in whole."""
+    def on_accepted(self, number: int, now: float, *, ack_now: bool) -> None:
+        """Record that a datagram that requests an acknowledgement was accepted."""
         acks = self.acks
         if number > acks.largest + 1:
-            # A gap: the sender can call it a loss once it knows of three later packets, so tell it then.
-            if self._gap_ends is None:
-                self._gap_ends = number + REORDER_PACKETS - 1
+            # A gap: the sender can declare a loss once three later packets arrived, so acknowledge then.
+            if self._gap_ack_at is None:
+                self._gap_ack_at = number + REORDER_PACKETS - 1
             ack_now = ack_now or acks.largest < 0
-        acks.saw(number, now)
+        acks.on_packet(number, now)
         acks.pending += 1
-        if self._gap_ends is not None and number >= self._gap_ends:
+        if self._gap_ack_at is not None and number >= self._gap_ack_at:
             ack_now = True
         if ack_now or acks.pending >= self._rates.ack_every_packets:
-            acks.now_wanted = True
-            self._gap_ends = None
+            acks.send_now = True
+            self._gap_ack_at = None
         elif acks.due_at is None:
             acks.due_at = now + self._rates.ack_delay_s
 
-    def overdue(self) -> bool:
-        """So many packets are pending that an acknowledgement must be cut before more arrive."""
-        return self.acks.pending >= MOST_PENDING
+    def ack_overdue(self) -> bool:
+        """Whether so many packets are pending that an acknowledgement must be built before more arrive."""
+        return self.acks.pending >= MAX_PENDING
 
-    def _hand_over(self, whole: Whole, by_broadcast: bool) -> bool:
-        head = whole.head
-        key = (by_broadcast, whole.message_id)
+    def _deliver(self, complete: CompleteMessage, by_broadcast: bool) -> bool:
+        head = complete.head
+        key = (by_broadcast, complete.message_id)
         topic = self.topics.get(head.topic_id)
         if topic is None:
             self._refuse(key, RefuseReason.FORGOTTEN)
             return False
-        number = whole.message_id if by_broadcast else None
+        number = complete.message_id if by_broadcast else None
         to_all = by_broadcast or bool(head.flags & MessageFlag.TO_ALL)
-        arrived = Arrived(*topic, whole.body, head.priority, to_all, number)
+        received = ReceivedMessage(*topic, complete.body, head.priority, to_all, number)
         if not head.flags & MessageFlag.COMPRESSED:
-            self.arrived.append(arrived)
+            self.completed.append(received)
             return True
-        unpacking = Unpacking(whole.body, self._limits.message_bytes)
-        if not unpacking.step():
-            size = len(whole.body)
+        inflating = Decompression(complete.body, self._limits.message_bytes)
+        if not inflating.step():
+            size = len(complete.body)
             if (
-                self.unpacking_bytes + unpacking.held_bytes > self._limits.partial_bytes_per_peer
+                self.inflating_bytes + inflating.held_bytes > self._limits.partial_bytes_per_peer
                 or not self._account.has_room(size)
             ):
                 self.over_limit += 1
                 self._refuse_for_good(key, RefuseReason.TOO_LARGE)
                 return False
-            self._account.take(size)
-            self.unpacking.append((unpacking, arrived))
+            self._account.reserve(size)
+            self.inflating.append((inflating, received))
             return True
-        if unpacking.payload is None:
+        if inflating.payload is None:
             self._refuse_for_good(key, RefuseReason.CORRUPT)
             return False
-        self.arrived.append(arrived._replace(payload=unpacking.payload))
+        self.completed.append(received._replace(payload=inflating.payload))
         return True
 
-    def unpack(self) -> bool:
-        """Inflate some more of the first message that waits for it; False where it turned out to be corrupt.
+    def inflate_step(self) -> bool:
+        """Inflate more of the first waiting message. False if it turned out to be corrupt.
 
-        Its pieces were acknowledged already: only a faulty peer compresses what cannot be inflated.
+        Its fragments are already acknowledged: only a faulty peer sends what cannot be inflated.
         """
-        unpacking, arrived = self.unpacking[0]
-        if not unpacking.step():
+        inflating, received = self.inflating[0]
+        if not inflating.step():
             return True
-        self.unpacking.popleft()
-        self._account.give_back(len(arrived.payload))
-        if unpacking.payload is None:
+        self.inflating.popleft()
+        self._account.release(len(received.payload))
+        if inflating.payload is None:
             return False
-        self.arrived.append(arrived._replace(payload=unpacking.payload))
+        self.completed.append(received._replace(payload=inflating.payload))
         return True
 
     def _refuse(self, key: tuple[bool, int], reason: RefuseReason) -> None:
@@ -246,7 +246,7 @@ class Inbound:
             self.refusals.append(refusal)
 
     def _refuse_for_good(self, key: tuple[bool, int], reason: RefuseReason) -> None:
-        if len(self._refused) >= REFUSED_REMEMBERED:
+        if len(self._refused) >= MAX_REFUSED_REMEMBERED:
             del self._refused[next(iter(self._refused))]
         self._refused[key] = reason
         self._refuse(key, reason)

@@ -1,18 +1,18 @@
-"""Whether an opened datagram may be a recording: its date, what came lately beside it, and answers to our questions.
+"""Checks whether an opened datagram may be replayed: by its timestamp, by recent traffic, and by answers to challenges.
 
-1. A dated datagram is as late as its sender's clock says (`freshness`).
-2. One without a date (a piece in the middle of a message) is taken for as fresh as what came lately from its sender;
-   where that becomes long ago, the sender is asked.
-3. What is too late is dropped, and its sender asked (`paths`): an answer proves that it is there, and sets its clock
-   right. Questions are answered however late they are.
+1. A datagram with a timestamp is as late as its sender's clock says (`datagram_age`).
+2. One without a timestamp (a fragment in the middle of a message) counts as fresh while its sender sent something fresh
+   recently; after that the sender is challenged.
+3. A datagram that is too late is dropped and its sender challenged (`path_validation`): the answer proves that it is
+   there and corrects its clock. Pings are answered however late they are.
 """
 
 from collections.abc import Sequence
 
-from udp_mesh.core.peer_lifecycle import path_proven
-from udp_mesh.core.peers.path_validation import answered, challenge, send_on_path
+from udp_mesh.core.peer_lifecycle import on_path_validated
+from udp_mesh.core.peers.path_validation import match_response, send_on_path, validate_path
 from udp_mesh.core.peers.session import Session
-from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, ASK_AFTER_S
+from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, CHALLENGE_AFTER_S
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
 from udp_mesh.wire.codec import FRAGMENT, SENT_BYTES, Type, decode
@@ -23,28 +23,28 @@ from udp_mesh.wire.frames import Frame, Heartbeat, Ping, Pong, Sent
 def data_lateness_s(
     state: State, session: Session, frames: bytes, link: str, source: Address, now: float
 ) -> float | None:
-    """Seconds for which a datagram in the channel between two boots was held back; None: it must not be taken."""
-    clock = date_of(frames)
-    if session.challenges and _answers(state, session, _small_frames(frames), clock, link, source, now):
+    """Seconds by which a datagram between two boots was delayed. None: drop it."""
+    clock = timestamp_of(frames)
+    if session.challenges and _has_response(state, session, _small_frames(frames), clock, link, source, now):
         return 0.0
     if not session.timed:
         return 0.0
     if clock is not None:
-        late_s = session.freshness.judge(clock, now)
+        late_s = session.freshness.lateness_s(clock, now)
         if late_s <= ACCEPT_AGE_S:
             return late_s
     else:
-        silent_s = now - session.freshness.fresh_at
-        if silent_s > ASK_AFTER_S:
-            challenge(state, session, link, source, now)
-        if silent_s <= ACCEPT_AGE_S:
+        undated_s = now - session.freshness.fresh_at
+        if undated_s > CHALLENGE_AFTER_S:
+            validate_path(state, session, link, source, now)
+        if undated_s <= ACCEPT_AGE_S:
             return 0.0
-    stale(state, session, _small_frames(frames), link, source, now)
+    drop_stale(state, session, _small_frames(frames), link, source, now)
     return None
 
 
 def _small_frames(frames: bytes) -> list[Frame]:
-    """The frames of a datagram that may hold a ping or a pong; none where they are malformed (counted later)."""
+    """The frames of a datagram that may hold a ping or a pong; none if they are malformed (counted later)."""
     if frames[0] >= FRAGMENT:
         return []
     try:
@@ -56,50 +56,51 @@ def _small_frames(frames: bytes) -> list[Frame]:
 def long_lateness_s(
     state: State, session: Session, frames: Sequence[Frame], link: str, source: Address, now: float
 ) -> float | None:
-    """The same of a hello or an introduction; without a date, as earlier versions send it, it is taken."""
+    """The same for a HELLO or an INTRODUCTION; without a timestamp, as from earlier versions, it is accepted."""
     clock = None
     for frame in frames:
         if isinstance(frame, Sent) or (isinstance(frame, Heartbeat) and frame.clock_ms is not None):
             clock = frame.clock_ms
-    if _answers(state, session, frames, clock, link, source, now):
+    if _has_response(state, session, frames, clock, link, source, now):
         return 0.0
-    late_s = 0.0 if clock is None else session.freshness.judge(clock, now)
+    late_s = 0.0 if clock is None else session.freshness.lateness_s(clock, now)
     if late_s <= ACCEPT_AGE_S:
         return late_s
-    stale(state, session, frames, link, source, now)
+    drop_stale(state, session, frames, link, source, now)
     return None
 
 
 def broadcast_lateness_s(
     state: State, session: Session, frames: bytes, link: str, source: Address, now: float
 ) -> float | None:
-    """The same of a message to all; without a date, as it is where some node takes none, its number alone decides: the
+    """The same for a broadcast. Without a timestamp, which some peers do not accept, only its number decides:
     heartbeats are numbered in the same channel."""
-    clock = date_of(frames)
-    late_s = 0.0 if clock is None else session.freshness.judge(clock, now)
+    clock = timestamp_of(frames)
+    late_s = 0.0 if clock is None else session.freshness.lateness_s(clock, now)
     if late_s <= ACCEPT_AGE_S:
         return late_s
-    stale(state, session, (), link, source, now)
+    drop_stale(state, session, (), link, source, now)
     return None
 
 
-def date_of(frames: bytes) -> int | None:
-    """The clock in the first frame of a datagram, where its date stands."""
+def timestamp_of(frames: bytes) -> int | None:
+    """The timestamp at the front of a datagram, if it has one."""
     if frames[0] != Type.SENT or len(frames) < SENT_BYTES:
         return None
     return int.from_bytes(frames[1:SENT_BYTES], "big")
 
 
-def stale(state: State, session: Session, frames: Sequence[Frame], link: str, source: Address, now: float) -> None:
-    """A recording; or its sender's clock stood still (its computer slept), and then its answer says so."""
-    state.ledger.counters.dropped_stale += 1
+def drop_stale(state: State, session: Session, frames: Sequence[Frame], link: str, source: Address, now: float) -> None:
+    """Drop a replayed datagram, or one whose sender's clock stood still (its computer was suspended): the answer to the
+    challenge shows which."""
+    state.event_queue.counters.dropped_stale += 1
     for frame in frames:
         if isinstance(frame, Ping) and session.peer is not None:
             send_on_path(state, session, Pong(frame.token, 0), link, source, now)
-    challenge(state, session, link, source, now)
+    validate_path(state, session, link, source, now)
 
 
-def _answers(
+def _has_response(
     state: State,
     session: Session,
     frames: Sequence[Frame],
@@ -108,12 +109,12 @@ def _answers(
     source: Address,
     now: float,
 ) -> bool:
-    """Whether one of the frames answers a question of ours from where that went: then all of them are fresh."""
+    """Whether a frame answers a challenge from the challenged address: then all of the frames are fresh."""
     for frame in frames:
         if isinstance(frame, Pong):
-            question = answered(session, frame, link, source, now)
-            if question is not None:
-                session.freshness.prove(now, clock)
-                path_proven(state, session, question, now)
+            challenge = match_response(session, frame, link, source, now)
+            if challenge is not None:
+                session.freshness.confirm(now, clock)
+                on_path_validated(state, session, challenge, now)
                 return True
     return False

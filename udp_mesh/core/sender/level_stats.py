@@ -1,25 +1,25 @@
-"""What is open on each priority level towards one peer, and how the levels fare.
+"""Statistics of the messages pending for one peer, per priority level.
 
-A message enters its level when accepted, may move when its topic's priority changes, and leaves when it ends.
-`book_served` tells the levels which of them just sent: less urgent ones that wait meanwhile starve, and for how long
-is part of the statistics.
+A message is added to its level when accepted, may move when its topic's priority changes, and is removed when it ends.
+`record_served` notes which levels just sent: less urgent levels that wait meanwhile starve, and the statistics say for
+how long.
 """
 
 from collections import deque
 from collections.abc import Iterable, Iterator
 
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.wire.limits import PRIORITY_LEVELS
 
 
-class LevelBook:
-    """What is open on one priority level, and how the level fares."""
+class LevelStats:
+    """The pending messages and starvation of one priority level."""
 
     __slots__ = ("bytes", "held_s", "messages", "order", "starved_reported", "starved_s", "starved_since")
 
     def __init__(self) -> None:
-        self.order: deque[Outgoing] = deque()
-        """Messages in the order accepted; ended ones are dropped from its front when somebody looks."""
+        self.order: deque[OutgoingMessage] = deque()
+        """Messages in the order accepted; ended ones are dropped from the front on access."""
         self.messages = 0
         self.bytes = 0
         self.starved_s = 0.0
@@ -27,52 +27,53 @@ class LevelBook:
         self.starved_reported = False
         self.held_s = 0.0
 
-    def oldest(self) -> Outgoing | None:
+    def oldest(self) -> OutgoingMessage | None:
         order = self.order
         while order and order[0].ended:
             order.popleft()
         return order[0] if order else None
 
 
-class Levels:
-    """One `LevelBook` per priority; `queued_bytes` is the sum of what is open on all of them."""
+class PriorityLevels:
+    """One `LevelStats` per priority. `queued_bytes` is the total pending on all levels."""
 
-    __slots__ = ("_books", "queued_bytes")
+    __slots__ = ("_levels", "queued_bytes")
 
     def __init__(self) -> None:
-        self._books = [LevelBook() for _ in range(PRIORITY_LEVELS)]
+        self._levels = [LevelStats() for _ in range(PRIORITY_LEVELS)]
         self.queued_bytes = 0
 
-    def __getitem__(self, priority: int) -> LevelBook:
-        return self._books[priority]
+    def __getitem__(self, priority: int) -> LevelStats:
+        return self._levels[priority]
 
-    def __iter__(self) -> Iterator[LevelBook]:
-        return iter(self._books)
+    def __iter__(self) -> Iterator[LevelStats]:
+        return iter(self._levels)
 
-    def enter(self, message: Outgoing) -> None:
-        """A message was accepted."""
+    def add(self, message: OutgoingMessage) -> None:
+        """Count an accepted message."""
         self._count(message, 1)
-        self.stand_last(message)
+        self.append(message)
 
-    def stand_last(self, message: Outgoing) -> None:
-        """The message is the youngest of its level (again: it begins anew under another object)."""
-        book = self._books[message.priority]
-        book.order.append(message)
-        if len(book.order) > 64 + 2 * book.messages:
-            book.order = deque(waiting for waiting in book.order if not waiting.ended)
+    def append(self, message: OutgoingMessage) -> None:
+        """Append the message to its level (again, if it restarts as another object)."""
+        level = self._levels[message.priority]
+        level.order.append(message)
+        if len(level.order) > 64 + 2 * level.messages:
+            level.order = deque(waiting for waiting in level.order if not waiting.ended)
 
-    def leave(self, message: Outgoing) -> None:
-        """A message ended."""
+    def remove(self, message: OutgoingMessage) -> None:
+        """Stop counting a message that ended."""
         self._count(message, -1)
 
-    def _count(self, message: Outgoing, sign: int) -> None:
-        book = self._books[message.priority]
-        book.messages += sign
-        book.bytes += sign * len(message.body)
+    def _count(self, message: OutgoingMessage, sign: int) -> None:
+        level = self._levels[message.priority]
+        level.messages += sign
+        level.bytes += sign * len(message.body)
         self.queued_bytes += sign * len(message.body)
 
-    def rearrange(self, messages: Iterable[Outgoing]) -> bool:
-        """Give each open message (all of them, in the order accepted) its topic's present priority; False: all had."""
+    def reprioritize(self, messages: Iterable[OutgoingMessage]) -> bool:
+        """Move each pending message (all of them, in the order accepted) to its topic's current priority. False if none
+        moved."""
         everything = list(messages)
         if all(message.priority == message.accepted.channel.topic.priority for message in everything):
             return False
@@ -82,32 +83,32 @@ class Levels:
                 self._count(message, -1)
                 message.priority = priority
                 self._count(message, 1)
-        for priority, book in enumerate(self._books):
-            book.order = deque(message for message in everything if message.priority == priority)
+        for priority, level in enumerate(self._levels):
+            level.order = deque(message for message in everything if message.priority == priority)
         return True
 
-    def book_served(self, served: int, waiting: int, now: float) -> None:
-        """Levels of the mask `served` sent something; less urgent ones of the mask `waiting` did not."""
+    def record_served(self, served: int, waiting: int, now: float) -> None:
+        """Levels in the mask `served` sent something; less urgent ones in the mask `waiting` did not."""
         lowest = served & -served
         mask = waiting & ~(lowest - 1) | served
         while mask:
             bit = mask & -mask
             mask ^= bit
-            book = self._books[bit.bit_length() - 1]
+            level = self._levels[bit.bit_length() - 1]
             if bit & served:
-                if book.starved_since is not None:
-                    book.starved_s += now - book.starved_since
-                    book.starved_since = None
-                    book.starved_reported = False
-            elif book.starved_since is None:
-                book.starved_since = now
+                if level.starved_since is not None:
+                    level.starved_s += now - level.starved_since
+                    level.starved_since = None
+                    level.starved_reported = False
+            elif level.starved_since is None:
+                level.starved_since = now
 
     def oldest_ages(self, last_priority: int, now: float) -> list[tuple[int, float]]:
-        """(priority, age of its oldest open message in s) of levels up to `last_priority`."""
+        """(priority, age in s of the oldest pending message) of the levels up to `last_priority`."""
         ages = []
         for priority in range(last_priority + 1):
-            book = self._books[priority]
-            oldest = book.oldest() if book.messages else None
+            level = self._levels[priority]
+            oldest = level.oldest() if level.messages else None
             if oldest is not None:
                 ages.append((priority, now - oldest.queued_at))
         return ages

@@ -1,4 +1,4 @@
-"""One message on its way to one peer: its bytes, which pieces left, which arrived, and how it must end."""
+"""One message for one peer: its bytes, which fragments were sent and acknowledged, and how it is treated."""
 
 from dataclasses import dataclass
 
@@ -6,15 +6,15 @@ from udp_mesh.core.events import MessageId
 from udp_mesh.core.settings import Topic
 from udp_mesh.wire.frames import MessageFlag
 
-SMALL_FRAGMENTS = 3
-"""Up to this many fragments an urgent message is worth sending twice, and a newer one may replace it even when
-begun."""
+MAX_SMALL_FRAGMENTS = 3
+"""An urgent message of at most this many fragments is worth sending twice, and a newer message may replace it after its
+first fragment was sent."""
 
 
-class Channel:
-    """A topic as this node announces it: its number on the air, its type, and its settings of the moment.
+class TopicChannel:
+    """A topic as this node announces it: its number on the wire, its type and its current settings.
 
-    Replacing `topic` is how a run-time change reaches messages already accepted.
+    Replacing `topic` applies changed settings to messages already accepted.
     """
 
     __slots__ = ("name", "number", "topic", "type_name")
@@ -27,28 +27,28 @@ class Channel:
 
 
 @dataclass(frozen=True, slots=True)
-class Accepted:
-    """What `Node.send` took on, shared by the copies to every destination."""
+class AcceptedMessage:
+    """A message accepted by `Node.send`, shared by the copies for every destination."""
 
     message_id: MessageId
-    channel: Channel
+    channel: TopicChannel
     payload: bytes
-    """The bytes given to `send`."""
+    """The bytes passed to `send`."""
     body: bytes
-    """The bytes that travel (compressed or not)."""
+    """The bytes on the wire (compressed or not)."""
     flags: MessageFlag
     accepted_at: float
     deadline: float | None
     broadcast_number: int | None = None
-    """The broadcast message id this is a repair of."""
+    """The broadcast message id that this message repairs."""
 
     def life_ms(self, now: float) -> int | None:
-        """What remains of its life, for its head; None: it has no deadline."""
+        """Remaining lifetime for the message head. None: no deadline."""
         return None if self.deadline is None else max(1, int((self.deadline - now) * 1000))
 
 
-class Outgoing:
-    """The copy for one peer. `wire_id` is None until its first fragment leaves."""
+class OutgoingMessage:
+    """The copy for one peer. `wire_id` is None until its first fragment is sent."""
 
     __slots__ = (
         "accepted",
@@ -65,11 +65,10 @@ class Outgoing:
         "reliable",
         "store_key",
         "superseded",
-        "twice",
         "wire_id",
     )
 
-    def __init__(self, accepted: Accepted, priority: int, *, reliable: bool) -> None:
+    def __init__(self, accepted: AcceptedMessage, priority: int, *, reliable: bool) -> None:
         self.accepted = accepted
         self.body = accepted.body
         self.priority = priority
@@ -78,20 +77,19 @@ class Outgoing:
         self.store_key: int | None = None
         self.ended = False
         self.superseded = False
-        """A newer one replaced it: what is lost of it is not sent again."""
-        self.twice = False
+        """Replaced by a newer message: its lost fragments are not retransmitted."""
         self.wire_id: int | None = None
         self.fragment_bytes = 0
         self.first_bytes = 0
         self.fragments = 1
         self.next_position = 0
         self.missing = 1
-        """Fragments not known to have arrived."""
+        """Fragments not yet acknowledged."""
         self.arrived = bytearray()
-        """1 per position that arrived; as long as the message has fragments once it has begun."""
+        """1 per acknowledged position. Has one byte per fragment once the message has started."""
 
     def begin(self, wire_id: int, fragment_bytes: int, first_bytes: int) -> None:
-        """Cut it into fragments and give it its number. The first carries less, for the head's sake."""
+        """Assign the wire id and fragment sizes. The first fragment carries less, because of the head."""
         self.wire_id = wire_id
         self.fragment_bytes = fragment_bytes
         self.first_bytes = min(first_bytes, len(self.body))
@@ -106,16 +104,15 @@ class Outgoing:
         start = self.first_bytes + (position - 1) * self.fragment_bytes
         return start, min(start + self.fragment_bytes, len(self.body))
 
-    def anew(self) -> "Outgoing":
-        """The same message with nothing of it sent: the peer lost what it had. This one must be marked ended."""
-        copy = Outgoing(self.accepted, self.priority, reliable=self.reliable)
+    def restarted(self) -> "OutgoingMessage":
+        """The same message with nothing sent: the peer lost what it had. The caller marks this one ended."""
+        copy = OutgoingMessage(self.accepted, self.priority, reliable=self.reliable)
         copy.store_key = self.store_key
         return copy
 
-    def resumed(self) -> "Outgoing":
-        """The same message under its number, with what of it is known to have arrived. This one must be marked
-        ended."""
-        copy = Outgoing(self.accepted, self.accepted.channel.topic.priority, reliable=self.reliable)
+    def resumed(self) -> "OutgoingMessage":
+        """The same message under the same wire id, with its acknowledged fragments. The caller marks this one ended."""
+        copy = OutgoingMessage(self.accepted, self.accepted.channel.topic.priority, reliable=self.reliable)
         copy.store_key = self.store_key
         assert self.wire_id is not None
         copy.begin(self.wire_id, self.fragment_bytes, self.first_bytes)
@@ -123,24 +120,18 @@ class Outgoing:
         return copy
 
     @property
-    def begun(self) -> bool:
+    def started(self) -> bool:
         return self.wire_id is not None
 
     @property
     def small(self) -> bool:
-        """Few fragments; known once it has begun."""
-        return self.fragments <= SMALL_FRAGMENTS
+        """Few fragments. Known once the message has started."""
+        return self.fragments <= MAX_SMALL_FRAGMENTS
 
-    def arrive(self, position: int) -> bool:
-        """A fragment arrived; True if that was news."""
+    def mark_arrived(self, position: int) -> bool:
+        """Record an acknowledged fragment. True if it was not acknowledged before."""
         if self.arrived[position]:
             return False
         self.arrived[position] = 1
         self.missing -= 1
         return True
-
-    def unacknowledged_bytes(self) -> int:
-        """Payload still to arrive, about."""
-        if not self.begun:
-            return len(self.body)
-        return min(len(self.body), self.missing * self.fragment_bytes)

@@ -1,8 +1,9 @@
-"""What leaves for one peer, decided at the last moment: level -> pieces -> frames -> sealed datagrams.
+"""Builds the datagrams for one peer at the last moment: level -> fragments -> frames -> sealed datagrams.
 
-`leave_level` sends from one priority level until it is empty, or the window, the pacing or the room ends. A run of full
-fragments of one message takes the fast path: one pack, one seal and one record per fragment. Everything else (first and
-last fragments, small messages, pieces sent again) is built frame by frame, small pieces together in one datagram.
+`send_level` sends from one priority level until it is empty or the window, pacing or batch size is exhausted. A run of
+full fragments of one message takes the fast path: one pack, one seal and one record per fragment. Everything else
+(first and last fragments, small messages, retransmissions) is built frame by frame, with small fragments sharing a
+datagram.
 """
 
 import struct
@@ -10,13 +11,13 @@ import struct
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.receiver.datagram_age import clock_ms
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.pending import Outcome
-from udp_mesh.core.sender.rate_limit import Gate
+from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.scheduler import Run
-from udp_mesh.core.sender.send_quota import ack_spacing, look_again, permitted, urgent_may_wait_until, window_room
-from udp_mesh.core.sender.sender import Outbound
-from udp_mesh.core.sender.sent_packets import Mark, Packet
+from udp_mesh.core.sender.send_quota import ack_spacing, cwnd_room, next_send_at, send_quota, urgent_wait_until
+from udp_mesh.core.sender.sender import Sender
+from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot
 from udp_mesh.core.settings import Address
 from udp_mesh.crypto import LONG_OVERHEAD_BYTES, SHORT_OVERHEAD_BYTES, SendChannel
 from udp_mesh.wire.codec import (
@@ -37,18 +38,18 @@ IP_UDP_BYTES = 28
 """IPv4 and UDP headers."""
 
 IP6_EXTRA_BYTES = 20
-"""IPv6 headers are larger by this."""
+"""Additional size of an IPv6 header."""
 
-LEAST_ROOM_BYTES = 64
-"""Less room than this in a datagram is not worth looking for another small message."""
+MIN_ROOM_BYTES = 64
+"""With less room than this in a datagram, no further small message is added."""
 
 PING_BYTES = 9
-IDS_BYTES = 4
+DELIVERED_BYTES = 4
 ID_BYTES = 4
-"""Of a PING; of a DELIVERED without its message ids, and of each of these."""
+"""Sizes of a PING, of a DELIVERED without its message ids, and of one message id."""
 
 NO_MESSAGE_ID = 0xFFFF_FFFF
-"""Messages are numbered from 0 on: none comes to this one in the life of a boot."""
+"""Messages are numbered from 0; no boot lives long enough to use this number."""
 
 _NARROW = struct.Struct(">BIH")
 _WIDE = struct.Struct(">BII")
@@ -56,61 +57,62 @@ _NARROW_POSITIONS = 65_536
 
 
 def header_bytes(address: Address) -> int:
-    """IP and UDP headers of a datagram to or from this address."""
+    """Size of the IP and UDP headers of a datagram to or from this address."""
     return IP_UDP_BYTES + (IP6_EXTRA_BYTES if ":" in address[0] else 0)
 
 
 def datagram_room(address: Address, mtu: int, fragment_bytes: int) -> int:
-    """Bytes of frames in a datagram that an IP packet of `mtu` bytes carries, and with it a full fragment."""
+    """Bytes of frames that fit a datagram in an IP packet of `mtu` bytes, at most those of one full fragment."""
     return min(mtu - header_bytes(address) - LONG_OVERHEAD_BYTES, fragment_bytes + FRAGMENT_WIDE_BYTES)
 
 
-class Way:
-    """How datagrams reach the peer now: link, address, sealing, sizes."""
+class Path:
+    """The path to the peer: link, address, sealing and sizes."""
 
     __slots__ = ("address", "channel", "confirmed", "fragment_bytes", "heard_at", "link", "mtu", "room_bytes", "timed")
 
     def __init__(self, channel: SendChannel) -> None:
         self.channel = channel
         self.confirmed = False
-        """The peer has answered in this channel: the short header does."""
+        """The peer has answered in this channel, so the short header suffices."""
         self.link = ""
         self.address: Address = ("", 0)
         self.heard_at = float("-inf")
         """When the peer was last heard from this address."""
         self.mtu = 0
-        """Bytes of the largest IP packet."""
+        """Largest IP packet in bytes."""
         self.room_bytes = 0
-        """Frames of one datagram at most: small pieces that share one make it no larger than a full fragment does."""
+        """Largest size of a datagram's frames. Small fragments that share a datagram make it no larger than a full
+        fragment does."""
         self.fragment_bytes = 0
         """Payload of a full fragment."""
         self.timed = False
-        """The peer takes dated datagrams and heads that say how long their message may live."""
+        """The peer accepts timestamped datagrams and message heads with a remaining lifetime."""
 
-    def lead(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
-        """Datagrams go this way from now on; messages already begun keep their fragments where these still fit."""
+    def switch_to(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
+        """Use this path from now on. Messages already started keep their fragments if these still fit."""
         self.link, self.address, self.mtu = link, address, mtu
         self.room_bytes = datagram_room(address, mtu, fragment_bytes)
         self.fragment_bytes = self.room_bytes - FRAGMENT_WIDE_BYTES
 
-    def dated(self, frames: list[Frame], now: float) -> list[Frame]:
-        """The frames, behind the time where the peer takes that.
+    def with_timestamp(self, frames: list[Frame], now: float) -> list[Frame]:
+        """The frames, preceded by a timestamp if the peer accepts it.
 
-        It is no part of `room_bytes`: the long header, for which that leaves room, is larger than the short one by more
-        than the date and a remaining life. In a datagram with a long header both are left out where they do not fit.
+        The timestamp is not part of `room_bytes`, which leaves room for the long header: that is larger than the short
+        one by more than a timestamp and a remaining lifetime. With a long header, both are omitted if they do not fit.
         """
         return [Sent(clock_ms(now)), *frames] if self.timed else frames
 
     def encode(self, frames: list[Frame], now: float) -> bytes:
-        """As `dated`, in bytes that fit the way."""
-        encoded = encode(self.dated(frames, now))
+        """The encoded frames, with a timestamp if it fits the path."""
+        encoded = encode(self.with_timestamp(frames, now))
         return encoded if self.confirmed or len(encoded) <= self.room_bytes else encode(frames)
 
     def seal(self, frames: bytes) -> tuple[int, bytes]:
         return self.channel.seal(frames) if self.confirmed else self.channel.seal_long(frames)
 
     def seal_run(self, run: list[bytes]) -> list[bytes]:
-        """Datagrams with the channel's next numbers."""
+        """Seal datagrams under the channel's next numbers."""
         if self.confirmed:
             return self.channel.seal_run(run)
         return [self.channel.seal_long(frames)[1] for frames in run]
@@ -120,116 +122,116 @@ class Way:
         return SHORT_OVERHEAD_BYTES if self.confirmed else LONG_OVERHEAD_BYTES
 
 
-def leave_level(
-    outbound: Outbound,
-    way: Way,
+def send_level(
+    sender: Sender,
+    path: Path,
     priority: int,
     now: float,
     out: list[Datagram],
     room_bytes: int,
-    gates: dict[str, Gate],
+    rate_limits: dict[str, TokenBucket],
 ) -> int:
-    """Let what waits on one level leave, at most about `room_bytes`; returns the bytes that left."""
-    urgent_level = priority <= outbound.rates.urgent_priority
-    level_pace = outbound.window.packets_per_s()
+    """Send what waits on one level, at most about `room_bytes`. Returns the bytes sent."""
+    urgent_level = priority <= sender.rates.urgent_priority
+    level_pace = sender.congestion.pacing_packets_per_s()
     used = 0
-    mark = outbound.mark(now, urgent=urgent_level)
+    snapshot = sender.snapshot(now, urgent=urgent_level)
     while used < room_bytes:
-        run = outbound.scheduler.peek(priority)
+        run = sender.scheduler.peek(priority)
         if run is None:
             break
         urgent = urgent_level and not run.stale
         pace = None if urgent else level_pace
-        room = window_room(outbound, now)
-        most = permitted(outbound, room, now, pace, urgent=urgent)
-        if most <= 0:
-            outbound.limited = False
+        room = cwnd_room(sender, now)
+        quota = send_quota(sender, room, now, pace, urgent=urgent)
+        if quota <= 0:
+            sender.app_limited = False
             if urgent:
-                if outbound.silent_since is None:
-                    outbound.wake_at = min(outbound.wake_at, urgent_may_wait_until(outbound))
-            elif (again := look_again(outbound, room, now, pace)) is not None:
-                outbound.wake_at = min(outbound.wake_at, again)
+                if sender.unresponsive_since is None:
+                    sender.wake_at = min(sender.wake_at, urgent_wait_until(sender))
+            elif (next_at := next_send_at(sender, room, now, pace)) is not None:
+                sender.wake_at = min(sender.wake_at, next_at)
             break
         message = run.message
-        if message.superseded and run.again:
-            outbound.finish(message, ExpiryReason.SUPERSEDED)
+        if message.superseded and run.retransmit:
+            sender.finish(message, ExpiryReason.SUPERSEDED)
             continue
-        gate = gates.get(message.accepted.channel.name) if gates else None
-        if gate is not None and not gate.open(now):
-            outbound.scheduler.drop_head(run)
-            gate.parked.append((outbound, run))
+        bucket = rate_limits.get(message.accepted.channel.name) if rate_limits else None
+        if bucket is not None and not bucket.has_tokens(now):
+            sender.scheduler.park_head(run)
+            bucket.parked.append((sender, run))
             continue
-        if not message.begun:
-            _begin(outbound, way, message)
-            run = Run(message, 0, message.fragments, again=False)
+        if not message.started:
+            _begin(sender, path, message)
+            run = Run(message, 0, message.fragments, retransmit=False)
         before = used
-        is_plain = gate is None and message.accepted.broadcast_number is None
-        if run.position and run.length > 2 and most > 1 and is_plain:
-            count = min(run.length - 1, most, 1 + (room_bytes - used) // message.fragment_bytes)
-            used += _leave_run(outbound, way, run, count, mark, out)
+        is_plain = bucket is None and message.accepted.broadcast_number is None
+        if run.position and run.length > 2 and quota > 1 and is_plain:
+            count = min(run.length - 1, quota, 1 + (room_bytes - used) // message.fragment_bytes)
+            used += _send_run(sender, path, run, count, snapshot, out)
         else:
             count = 1
-            used += _leave_one(outbound, way, run, urgent, mark, out)
-        if gate is not None:
-            gate.spend(used - before)
-        if outbound.probe_credit:
-            outbound.probe_credit = max(0, outbound.probe_credit - count)
+            used += _send_datagram(sender, path, run, urgent, snapshot, out)
+        if bucket is not None:
+            bucket.consume(used - before)
+        if sender.probe_credit:
+            sender.probe_credit = max(0, sender.probe_credit - count)
         if urgent:
-            outbound.urgent_left_at = now
+            sender.urgent_sent_at = now
         else:
-            outbound.pacer.spend(count, now, pace)
+            sender.pacer.on_sent(count, now, pace)
     return used
 
 
-def leave_copies(outbound: Outbound, way: Way, now: float, out: list[Datagram]) -> None:
-    """Second copies of small urgent messages whose time has come and that were not acknowledged meanwhile."""
-    for message, position in outbound.copies.due(now, outbound.overdue_s()):
-        if outbound.silent_since is not None:
+def send_copies(sender: Sender, path: Path, now: float, out: list[Datagram]) -> None:
+    """Send the redundant copies that are due and not acknowledged meanwhile."""
+    for message, position in sender.copies.pop_due(now, sender.urgent_timeout_s()):
+        if sender.unresponsive_since is not None:
             continue
-        run = Run(message, position, 1, again=True)
-        _leave(
-            outbound,
-            way,
+        run = Run(message, position, 1, retransmit=True)
+        _seal_datagram(
+            sender,
+            path,
             [(message, position)],
-            [*_frames(outbound, way, run, now, ack_now=True)],
-            outbound.mark(now, urgent=True),
+            [*_frames(sender, path, run, now, ack_now=True)],
+            sender.snapshot(now, urgent=True),
             out,
         )
 
 
-def leave_large_ping(outbound: Outbound, way: Way, token: int, frames_bytes: int) -> Datagram:
-    """A ping in a datagram that is no smaller than one with `frames_bytes` of frames, and larger by 7 B at most.
+def build_mtu_probe(sender: Sender, path: Path, token: int, frames_bytes: int) -> Datagram:
+    """A ping padded to at least `frames_bytes` of frames, and at most 7 B more.
 
-    What fills it are words of a message that no peer ever sends: that we have it whole.
+    The padding is DELIVERED frames for a message id that is never used.
     """
     frames: list[Frame] = [Ping(token)]
     missing = frames_bytes - PING_BYTES
     while missing > 0:
-        ids = min(MAX_IDS, max(1, -(-(missing - IDS_BYTES) // ID_BYTES)))
+        ids = min(MAX_IDS, max(1, -(-(missing - DELIVERED_BYTES) // ID_BYTES)))
         frames.append(Delivered((NO_MESSAGE_ID,) * ids))
-        missing -= IDS_BYTES + ID_BYTES * ids
-    number, data = way.seal(encode(frames))
-    outbound.flight.add(number, None)
-    return Datagram(way.link, way.address, data, True)
+        missing -= DELIVERED_BYTES + ID_BYTES * ids
+    number, data = path.seal(encode(frames))
+    sender.in_flight.add(number, None)
+    return Datagram(path.link, path.address, data, True)
 
 
-def _begin(outbound: Outbound, way: Way, message: Outgoing) -> None:
+def _begin(sender: Sender, path: Path, message: OutgoingMessage) -> None:
     channel = message.accepted.channel
-    first = way.fragment_bytes - HEAD_BYTES
-    if channel.number not in outbound.announced:
+    first = path.fragment_bytes - HEAD_BYTES
+    if channel.number not in sender.announced:
         first -= 5 + len(channel.name.encode()) + len(channel.type_name.encode())
         first -= LENGTH_BYTES
-    cast_number = message.accepted.broadcast_number
-    if cast_number is not None:
-        # the copy of a lost cast keeps its number, or the receiver would take it for another message
-        message.begin(cast_number, way.fragment_bytes, max(1, first))
+    broadcast_number = message.accepted.broadcast_number
+    if broadcast_number is not None:
+        # The repair of a lost broadcast keeps its number; otherwise the receiver would take it for another message.
+        message.begin(broadcast_number, path.fragment_bytes, max(1, first))
         return
-    message.begin(outbound.next_wire_id, way.fragment_bytes, max(1, first))
-    outbound.next_wire_id += 1
+    message.begin(sender.next_wire_id, path.fragment_bytes, max(1, first))
+    sender.next_wire_id += 1
 
 
-def _leave_run(outbound: Outbound, way: Way, run: Run, count: int, mark: Mark, out: list[Datagram]) -> int:
-    """The fast path: `count` full fragments in a row, none of them its message's first or last."""
+def _send_run(sender: Sender, path: Path, run: Run, count: int, snapshot: SendSnapshot, out: list[Datagram]) -> int:
+    """The fast path: send `count` consecutive full fragments, excluding a message's first and last."""
     message, position = run.message, run.position
     wire_id = message.wire_id
     assert wire_id is not None
@@ -237,8 +239,8 @@ def _leave_run(outbound: Outbound, way: Way, run: Run, count: int, mark: Mark, o
     offset = message.first_bytes + (position - 1) * size
     body = memoryview(message.body)
     frames = []
-    spacing = ack_spacing(outbound)
-    since = outbound.since_ack_wanted
+    spacing = ack_spacing(sender)
+    since = sender.since_ack_requested
     wide = position + count > _NARROW_POSITIONS
     pack = _WIDE.pack if wide else _NARROW.pack
     plain = FRAGMENT | FRAGMENT_WIDE if wide else FRAGMENT
@@ -253,119 +255,123 @@ def _leave_run(outbound: Outbound, way: Way, run: Run, count: int, mark: Mark, o
             first |= FRAGMENT_ACK_NOW
         frames.append(pack(first, wire_id, place) + body[offset : offset + size])
         offset += size
-    out.extend(Datagram.run(way.link, way.address, way.seal_run(frames)))
-    outbound.flight.add_run(mark, message, range(position, position + count))
-    outbound.since_ack_wanted = since
-    sent_bytes = count * (size + FRAGMENT_BYTES + way.overhead_bytes)
-    outbound.sent_packets += count
-    outbound.sent_bytes += sent_bytes + IP_UDP_BYTES * count
-    outbound.scheduler.take(run, count)
+    out.extend(Datagram.run(path.link, path.address, path.seal_run(frames)))
+    sender.in_flight.add_run(snapshot, message, range(position, position + count))
+    sender.since_ack_requested = since
+    sent_bytes = count * (size + FRAGMENT_BYTES + path.overhead_bytes)
+    sender.sent_packets += count
+    sender.sent_bytes += sent_bytes + IP_UDP_BYTES * count
+    sender.scheduler.consume(run, count)
     return sent_bytes
 
 
-def _leave_one(outbound: Outbound, way: Way, run: Run, urgent: bool, mark: Mark, out: list[Datagram]) -> int:
-    """One datagram with the piece of `run` and, if there is room, small pieces behind it on the same level."""
-    now = mark.sent_at
+def _send_datagram(
+    sender: Sender, path: Path, run: Run, urgent: bool, snapshot: SendSnapshot, out: list[Datagram]
+) -> int:
+    """Send one datagram with the fragment of `run` and, if there is room, the next small fragments of the same
+    level."""
+    now = snapshot.sent_at
     message = run.message
-    pieces: list[tuple[Outgoing, int]] = []
+    fragments: list[tuple[OutgoingMessage, int]] = []
     frames: list[Frame] = []
-    room = way.room_bytes
+    room = path.room_bytes
     priority = message.priority
-    scheduler = outbound.scheduler
-    again = 0
-    spacing = ack_spacing(outbound)
-    outbound.since_ack_wanted += 1
+    scheduler = sender.scheduler
+    retransmitted = 0
+    spacing = ack_spacing(sender)
+    sender.since_ack_requested += 1
     next_run: Run | None = run
     while next_run is not None:
         message = next_run.message
-        if next_run.again and (message, next_run.position) in pieces:
-            # Several copies of it were lost: one datagram needs no more than one.
-            scheduler.take(next_run, 1)
-            next_run = _next_small(outbound, way, priority, room)
+        if next_run.retransmit and (message, next_run.position) in fragments:
+            # Several copies of it were lost; one datagram needs only one.
+            scheduler.consume(next_run, 1)
+            next_run = _next_small(sender, path, priority, room)
             continue
-        size = _piece_bytes(outbound, way, next_run)
+        size = _fragment_frame_bytes(sender, path, next_run)
         if frames and (size > room or len(frames) >= MAX_FRAMES_PER_DATAGRAM - 3):
             break
-        again += next_run.again
-        pieces.append((message, next_run.position))
-        scheduler.take(next_run, 1)
+        retransmitted += next_run.retransmit
+        fragments.append((message, next_run.position))
+        scheduler.consume(next_run, 1)
         last = next_run.position == message.fragments - 1
-        ack_now = urgent or outbound.since_ack_wanted >= spacing or (last and scheduler.nothing_waits(priority))
-        frames.extend(_frames(outbound, way, next_run, now, ack_now=ack_now))
+        ack_now = urgent or sender.since_ack_requested >= spacing or (last and scheduler.is_idle(priority))
+        frames.extend(_frames(sender, path, next_run, now, ack_now=ack_now))
         if ack_now:
-            outbound.since_ack_wanted = 0
+            sender.since_ack_requested = 0
         room -= size
-        if urgent and message.small and not next_run.again:
-            outbound.copy_later(message, next_run.position, now)
+        if urgent and message.small and not next_run.retransmit:
+            sender.schedule_copies(message, next_run.position, now)
         if not message.reliable and last:
-            outbound.finish(message, Outcome.SENT)
-        if room < LEAST_ROOM_BYTES:
+            sender.finish(message, Outcome.SENT)
+        if room < MIN_ROOM_BYTES:
             break
-        next_run = _next_small(outbound, way, priority, room)
-    outbound.retransmitted += again
-    return _leave(outbound, way, pieces, frames, mark, out, urgent=urgent)
+        next_run = _next_small(sender, path, priority, room)
+    sender.retransmitted += retransmitted
+    return _seal_datagram(sender, path, fragments, frames, snapshot, out, urgent=urgent)
 
 
-def _leave(
-    outbound: Outbound,
-    way: Way,
-    pieces: list[tuple[Outgoing, int]],
+def _seal_datagram(
+    sender: Sender,
+    path: Path,
+    fragments: list[tuple[OutgoingMessage, int]],
     frames: list[Frame],
-    mark: Mark,
+    snapshot: SendSnapshot,
     out: list[Datagram],
     *,
     urgent: bool = True,
 ) -> int:
-    number, data = way.seal(way.encode(frames, mark.sent_at))
-    (message, position), *more = pieces
-    outbound.flight.add(number, Packet(mark, message, position, tuple(more)))
-    out.append(Datagram(way.link, way.address, data, urgent))
-    outbound.sent_packets += 1
-    outbound.sent_bytes += len(data) + IP_UDP_BYTES
+    number, data = path.seal(path.encode(frames, snapshot.sent_at))
+    (message, position), *more = fragments
+    sender.in_flight.add(number, Packet(snapshot, message, position, tuple(more)))
+    out.append(Datagram(path.link, path.address, data, urgent))
+    sender.sent_packets += 1
+    sender.sent_bytes += len(data) + IP_UDP_BYTES
     return len(data)
 
 
-def _next_small(outbound: Outbound, way: Way, priority: int, room: int) -> Run | None:
-    """The next piece of the level if it is small enough to ride along (ruling out what only the main loop decides)."""
-    run = outbound.scheduler.peek(priority)
+def _next_small(sender: Sender, path: Path, priority: int, room: int) -> Run | None:
+    """The next fragment of the level if it is small enough to share the datagram and needs no decision of the main
+    loop."""
+    run = sender.scheduler.peek(priority)
     if run is None or run.message.superseded or run.message.accepted.channel.topic.rate_limit_bytes_per_s is not None:
         return None
-    if not run.message.begun:
+    if not run.message.started:
         if len(run.message.body) > room:
             return None
-        _begin(outbound, way, run.message)
-        run = Run(run.message, 0, run.message.fragments, again=False)
-    return run if _piece_bytes(outbound, way, run) <= room else None
+        _begin(sender, path, run.message)
+        run = Run(run.message, 0, run.message.fragments, retransmit=False)
+    return run if _fragment_frame_bytes(sender, path, run) <= room else None
 
 
-def _piece_bytes(outbound: Outbound, way: Way, run: Run) -> int:
-    """Bytes of the frames that carry one piece."""
+def _fragment_frame_bytes(sender: Sender, path: Path, run: Run) -> int:
+    """Size of the frames that carry one fragment."""
     message = run.message
     start, end = message.span(run.position)
     size = end - start + FRAGMENT_WIDE_BYTES + LENGTH_BYTES
     if run.position == 0:
-        size += HEAD_BYTES + (LIFE_BYTES if _says_life(way, message) else 0)
+        size += HEAD_BYTES + (LIFE_BYTES if _sends_life(path, message) else 0)
         channel = message.accepted.channel
-        if channel.number not in outbound.announced:
+        if channel.number not in sender.announced:
             size += 5 + len(channel.name.encode()) + len(channel.type_name.encode())
     return size
 
 
-def _says_life(way: Way, message: Outgoing) -> bool:
-    return way.timed and way.confirmed and message.accepted.deadline is not None
+def _sends_life(path: Path, message: OutgoingMessage) -> bool:
+    return path.timed and path.confirmed and message.accepted.deadline is not None
 
 
-def _frames(outbound: Outbound, way: Way, run: Run, now: float, *, ack_now: bool) -> list[Frame]:
-    """The piece as a fragment, with head and, until the peer knows it, the topic's name in front of the first."""
+def _frames(sender: Sender, path: Path, run: Run, now: float, *, ack_now: bool) -> list[Frame]:
+    """The frames of one fragment: the first carries the head and, until the peer knows the topic, its announcement."""
     message, position = run.message, run.position
     accepted = message.accepted
     wire_id = message.wire_id
     assert wire_id is not None
-    is_cast = accepted.broadcast_number is not None
+    is_broadcast = accepted.broadcast_number is not None
     start, end = message.span(position)
     payload = memoryview(message.body)[start:end]
     if position:
-        return [Fragment(wire_id, position, payload, None, ack_now, is_cast)]
+        return [Fragment(wire_id, position, payload, None, ack_now, is_broadcast)]
     head = MessageHead(
         len(message.body),
         message.fragments,
@@ -373,10 +379,10 @@ def _frames(outbound: Outbound, way: Way, run: Run, now: float, *, ack_now: bool
         message.priority,
         accepted.flags,
         max(0, int((now - accepted.accepted_at) * 1000)),
-        accepted.life_ms(now) if _says_life(way, message) else None,
+        accepted.life_ms(now) if _sends_life(path, message) else None,
     )
-    fragment = Fragment(wire_id, 0, payload, head, ack_now, is_cast)
+    fragment = Fragment(wire_id, 0, payload, head, ack_now, is_broadcast)
     channel = accepted.channel
-    if channel.number in outbound.announced:
+    if channel.number in sender.announced:
         return [fragment]
     return [TopicAnnounce(channel.number, channel.name, channel.type_name), fragment]

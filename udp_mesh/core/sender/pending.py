@@ -1,6 +1,6 @@
-"""The messages of one peer that have no outcome yet: taken on -> replaced, expired, begun anew -> ended, once each.
+"""The messages for one peer that have no outcome yet: accepted -> replaced, expired or restarted -> ended, once each.
 
-What becomes of their pieces on the way is `outbound`'s part.
+`sender` handles their fragments in flight.
 """
 
 from collections.abc import Iterable
@@ -9,67 +9,68 @@ from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
 from udp_mesh.core.events import ExpiryReason
-from udp_mesh.core.sender.level_stats import Levels
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.level_stats import PriorityLevels
+from udp_mesh.core.sender.message import OutgoingMessage
 
 
 class Outcome(Enum):
-    """How a message ended, besides expiring."""
+    """How a message ended, other than by expiring."""
 
     DELIVERED = 1
     SENT = 2
-    """Best effort: it left, no outcome is reported."""
+    """Best effort: sent; no outcome is reported."""
     PEER_LOST = 3
 
 
 class Ended(NamedTuple):
-    message: Outgoing
+    message: OutgoingMessage
     outcome: Outcome | ExpiryReason
 
 
-class OpenMessages:
-    """`ended` and `cancelled` are fetched and cleared by the session."""
+class PendingMessages:
+    """The session fetches and clears `ended` and `cancelled`."""
 
     def __init__(self) -> None:
-        self.open: dict[Outgoing, None] = {}
+        self.pending: dict[OutgoingMessage, None] = {}
         """Messages without an outcome, in the order accepted."""
-        self.levels = Levels()
+        self.levels = PriorityLevels()
         self.ended: list[Ended] = []
         self.cancelled: list[int] = []
-        """Wire ids given up after they had begun: the peer may forget them."""
-        self._deadlines: list[tuple[float, int, Outgoing]] = []
+        """Wire ids abandoned after their first fragment was sent: the peer may discard them."""
+        self._deadlines: list[tuple[float, int, OutgoingMessage]] = []
         self._deadline_serial = 0
-        self._kept: dict[str, list[Outgoing]] = {}
-        """Open messages of topics that keep only the last few."""
+        self._kept: dict[str, list[OutgoingMessage]] = {}
+        """Pending messages of topics with `keep_last`."""
 
-    def take_on(self, message: Outgoing) -> None:
-        """One more; older ones that its topic does not keep end, or end as what becomes of their pieces."""
-        self.open[message] = None
-        self.levels.enter(message)
+    def add(self, message: OutgoingMessage) -> None:
+        """Add a message. Older ones beyond its topic's `keep_last` end now, or when their sent fragments are
+        acknowledged or lost."""
+        self.pending[message] = None
+        self.levels.add(message)
         self._note_deadline(message)
         keep_last = message.accepted.channel.topic.keep_last
         if keep_last is not None:
             self._replace_older(message, keep_last)
 
-    def _note_deadline(self, message: Outgoing) -> None:
+    def _note_deadline(self, message: OutgoingMessage) -> None:
         if message.accepted.deadline is not None:
             self._deadline_serial += 1
             heappush(self._deadlines, (message.accepted.deadline, self._deadline_serial, message))
-            if len(self._deadlines) > 64 + 2 * len(self.open):
-                # What ended long before its deadline must not stay in memory until then.
+            if len(self._deadlines) > 64 + 2 * len(self.pending):
+                # Free messages that ended long before their deadline.
                 self._deadlines = [entry for entry in self._deadlines if not entry[2].ended]
                 heapify(self._deadlines)
 
-    def _replace_older(self, message: Outgoing, keep_last: int) -> None:
+    def _replace_older(self, message: OutgoingMessage, keep_last: int) -> None:
         kept = self._kept.get(message.accepted.channel.topic.name, [])
-        alive = [older for older in kept if not older.ended and not older.superseded]
-        alive.append(message)
-        self._kept[message.accepted.channel.topic.name] = alive
-        for older in alive[: max(0, len(alive) - keep_last)]:
-            if not older.begun:
+        recent = [older for older in kept if not older.ended and not older.superseded]
+        recent.append(message)
+        self._kept[message.accepted.channel.topic.name] = recent
+        for older in recent[: max(0, len(recent) - keep_last)]:
+            if not older.started:
                 self.finish(older, ExpiryReason.SUPERSEDED)
             elif older.small:
-                # Its pieces may be arriving right now: it ends as what becomes of them.
+                # Its fragments may be arriving right now; their fate decides how it ends.
                 older.superseded = True
 
     def next_deadline(self) -> float | None:
@@ -77,61 +78,63 @@ class OpenMessages:
         return self._deadlines[0][0] if self._deadlines else None
 
     def expire(self, now: float) -> None:
-        """Deadlines that have come."""
+        """End messages whose deadline has passed."""
         while self._deadlines and self._deadlines[0][0] <= now:
             self.finish(heappop(self._deadlines)[2], ExpiryReason.DEADLINE)
 
-    def begin_anew(self, message: Outgoing) -> Outgoing:
-        """The message under another object, nothing of which has left; it is the youngest of its level."""
+    def restart_message(self, message: OutgoingMessage) -> OutgoingMessage:
+        """Replace the message by a copy of which nothing was sent, placed last on its level."""
         message.ended = True
-        self.open.pop(message, None)
-        copy = message.anew()
-        self.open[copy] = None
-        self.levels.stand_last(copy)
+        self.pending.pop(message, None)
+        copy = message.restarted()
+        self.pending[copy] = None
+        self.levels.append(copy)
         self._note_deadline(copy)
         kept = self._kept.get(copy.accepted.channel.topic.name)
         if kept is not None:
             kept.append(copy)
         return copy
 
-    def finish(self, message: Outgoing, outcome: Outcome | ExpiryReason) -> None:
-        """The one outcome of a message; later ones are ignored."""
+    def finish(self, message: OutgoingMessage, outcome: Outcome | ExpiryReason) -> None:
+        """Set the outcome of a message. Later outcomes are ignored."""
         if message.ended:
             return
         self._remove(message)
-        if message.begun and outcome is not Outcome.DELIVERED and outcome is not Outcome.SENT:
+        if message.started and outcome is not Outcome.DELIVERED and outcome is not Outcome.SENT:
             self.cancel(message)
         self.ended.append(Ended(message, outcome))
 
     def finish_all(self, outcome: Outcome | ExpiryReason) -> None:
-        for message in list(self.open):
+        for message in list(self.pending):
             self.finish(message, outcome)
 
-    def withdraw(self, message: Outgoing, *, to_resume: bool = False) -> None:
-        """The message leaves without an outcome: an outbox keeps it, `to_resume` it under its number."""
+    def withdraw(self, message: OutgoingMessage, *, to_resume: bool = False) -> None:
+        """Remove a message without an outcome because an outbox keeps it; with `to_resume`, it keeps its wire id."""
         if not message.ended:
             self._remove(message)
-            if message.begun and not to_resume:
+            if message.started and not to_resume:
                 self.cancel(message)
 
-    def _remove(self, message: Outgoing) -> None:
+    def _remove(self, message: OutgoingMessage) -> None:
         message.ended = True
-        del self.open[message]
-        self.levels.leave(message)
+        del self.pending[message]
+        self.levels.remove(message)
 
-    def cancel(self, message: Outgoing) -> None:
-        """The peer is told to forget what it has of this one."""
+    def cancel(self, message: OutgoingMessage) -> None:
+        """Tell the peer to discard what it has of this message."""
         if message.wire_id is not None and message.accepted.broadcast_number is None:
             self.cancelled.append(message.wire_id)
 
-    def by_wire_id(self, wire_id: int) -> Outgoing | None:
-        """The open message of this number (copies of casts are numbered apart); a search, for rare answers."""
-        own = (message for message in self.open if message.accepted.broadcast_number is None)
+    def by_wire_id(self, wire_id: int) -> OutgoingMessage | None:
+        """The pending message with this wire id (broadcast repairs are numbered separately). A linear search, for rare
+        frames."""
+        own = (message for message in self.pending if message.accepted.broadcast_number is None)
         return next((message for message in own if message.wire_id == wire_id), None)
 
-    def told_delivered(self, wire_ids: Iterable[int]) -> None:
-        """The peer says it has these whole, whatever it acknowledged; a search, for peers of another make."""
+    def on_delivered(self, wire_ids: Iterable[int]) -> None:
+        """The peer reports these messages as complete, whatever it acknowledged. A linear search, for other
+        implementations."""
         known = set(wire_ids)
-        for message in list(self.open):
+        for message in list(self.pending):
             if message.wire_id in known and message.accepted.broadcast_number is None:
                 self.finish(message, Outcome.DELIVERED)

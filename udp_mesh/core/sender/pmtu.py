@@ -1,12 +1,12 @@
-"""Whether large datagrams vanish on a path that carries small ones: packets lost and arrived in -> a narrower path.
+"""Path MTU black hole detection (RFC 8899): packets lost and acknowledged in -> a smaller path MTU.
 
-Some tunnel or mesh on the way may carry less than our own interface, and say nothing of it (RFC 8899 calls that a black
-hole). A large datagram is one that the next narrower path would not carry.
-1. A round is a small datagram that arrived some time after the last one while large ones kept being lost.
-2. After a few rounds in which nothing arrived that is as large as the least that was lost, the loss of small ones,
-   measured meanwhile, says how likely it is that the large ones vanished by chance. Where that is next to nothing the
-   path is taken for narrower.
-3. From then on pings as large as what was given up ask, ever more seldom, whether the path carries it after all.
+A tunnel or mesh on the path may carry less than our own interface without reporting it. A datagram is large if the next
+smaller MTU would not carry it.
+
+1. A round ends when a small datagram arrives after large ones were lost, some time after the previous round.
+2. After several rounds without an arrival as large as the smallest loss, the loss rate of small datagrams, measured
+   meanwhile, gives the probability that the large ones were lost by chance. If it is negligible, the MTU is reduced.
+3. From then on pings of the larger size probe, ever less often, whether the path carries it after all.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,251 +18,252 @@ ETHERNET_MTU = 1500
 """RFC 894."""
 
 NARROWER_MTUS = (ETHERNET_MTU, 1280, 576)
-"""What to try next, in bytes of IP packet: Ethernet's behind larger ones, the least that IPv6 links carry
-(RFC 8200, 5), and the least that every IPv4 host takes (RFC 1122, 3.3.2)."""
+"""MTUs to try next, in bytes of IP packet: Ethernet, the IPv6 minimum (RFC 8200, 5), and what every IPv4 host accepts
+(RFC 1122, 3.3.2)."""
 
 ROUNDS = 4
 ROUND_S = 0.3
 LOST_PER_ROUND = 2
-"""At least eight large datagrams in more than a second."""
+"""At least eight large datagrams within more than a second."""
 
-CHANCE = 1e-6
-"""Less likely than this, at the loss of small ones, so many large ones in a row are not lost by chance."""
+MAX_CHANCE = 1e-6
+"""At the loss rate of small datagrams, a run of large losses less likely than this is not chance."""
 
-APART_S = 0.1
-"""Large datagrams that left closer together count as one: what loses one of them often loses the others as well."""
+LOSS_SPACING_S = 0.1
+"""Losses of large datagrams sent closer together count as one: what loses one of them often loses the others too."""
 
-MOST_AT_A_STRETCH = 8
-"""And no more of them between two small ones that arrived, but for two with each small one lost: a cut loses both."""
+MAX_LARGE_LOST_BETWEEN = 8
+"""Maximum large losses counted between two small arrivals, plus two per small loss: an outage loses both."""
 
-MOST_SMALL_AT_A_STRETCH = 32
-"""Small ones lost between two that arrived: a cut says nothing more however long it lasts."""
+MAX_SMALL_LOST_BETWEEN = 32
+"""Maximum small losses counted between two arrivals: an outage adds no more however long it lasts."""
 
-MEMORY = 64
-"""Small datagrams over which their loss is remembered from one doubt to the next: of a few all may arrive by chance."""
+LOSS_MEMORY_PACKETS = 64
+"""Small datagrams over which their loss rate is remembered between suspicions: of only a few, all may arrive by
+chance."""
 
-DOUBT_S = 2.5
-"""And no large datagram acknowledged for so long since the first round: on a path whose round trip has just become a
-second or two their acknowledgements are still to come, and what is cut anew although it arrived arrives twice."""
+SUSPECT_S = 2.5
+"""The minimum time from the first round without a large acknowledgement. If the round trip has just grown to a second
+or two, acknowledgements are still on their way, and fragments cut again would arrive twice."""
 
 PROBES_PER_SMALL = LOST_PER_ROUND + 1
-"""Of the probes of a silent peer one in so many is small: a round takes the others."""
+"""Of the probes of an unresponsive peer, one in so many is small; a round uses the others."""
 
-ASK_AFTER_S = 10.0
-ASK_AT_MOST_EVERY_S = 600.0
-"""The larger size is asked for after the first, then after twice as long each time, at last with RFC 8899's
-PMTU_RAISE_TIMER. A mistake costs a tenth of the rate until then; a path that is narrow, three pings each
-time."""
+PROBE_AFTER_S = 10.0
+MAX_PROBE_INTERVAL_S = 600.0
+"""The larger size is first probed after the former time, which doubles up to the latter (RFC 8899's PMTU_RAISE_TIMER).
+Until then a mistake costs a tenth of the rate; a path that is narrow costs three pings each time."""
 
-ASKED_TIMES = 3
-"""Pings of a size per time that would be answered (RFC 8899's MAX_PROBES) if as many got through as the loss says: one
-alone proves little."""
+MAX_PROBES = 3
+"""Pings per attempt that would be answered at the current loss rate (RFC 8899's MAX_PROBES): one alone proves
+little."""
 
-LEAST_ARRIVING = 0.3
-"""Of pings and answers each, whatever the loss: 33 per time at most."""
+MIN_ARRIVING = 0.3
+"""Assumed minimum delivery rate of pings and of answers: at most 33 pings per attempt."""
 
-LARGE_AT_FIRST_BYTES = 1200
-"""Until the first look at the way, some half second: about what frames take on the narrowest of IPv6 links."""
+INITIAL_LARGE_BYTES = 1200
+"""Used until the path is first checked, for about half a second: roughly the frames that fit the IPv6 minimum MTU."""
 
 _INFINITY = float("inf")
 
 
-class PathSize:
-    """What is known about one peer's path. `narrowed_at` is when it was last taken for narrower."""
+class PathMtu:
+    """Path MTU state of one peer. `narrowed_at` is when the MTU was last reduced."""
 
     __slots__ = (
-        "_between",
-        "_between_small",
         "_counted_at",
-        "_doubted_at",
-        "_in_a_row",
-        "_least_lost",
-        "_lost",
+        "_large_lost",
+        "_large_lost_between",
+        "_large_lost_in_a_row",
+        "_past_small",
+        "_past_small_lost",
         "_probes",
-        "_remembered",
-        "_remembered_lost",
         "_round_at",
         "_rounds",
         "_small",
         "_small_lost",
-        "asking",
+        "_small_lost_between",
+        "_smallest_lost",
+        "_suspect_since",
         "large_bytes",
         "narrowed_at",
+        "probe",
     )
 
     def __init__(self) -> None:
-        self.large_bytes: float = LARGE_AT_FIRST_BYTES
-        """Frames of a datagram that is not large, at most; where nothing narrower is to be tried all are small."""
-        self._lost = 0
+        self.large_bytes: float = INITIAL_LARGE_BYTES
+        """Largest size of frames in a datagram that is not large; infinite if there is no smaller MTU to try."""
+        self._large_lost = 0
         """Large datagrams lost in this round."""
-        self._least_lost = _INFINITY
-        """Frames of the smallest of them since the doubt began."""
+        self._smallest_lost = _INFINITY
+        """Frame size of the smallest large loss since the suspicion began."""
         self._rounds = 0
         self._round_at = 0.0
-        self._doubted_at = 0.0
-        self._in_a_row = 0
-        """Large datagrams lost since the doubt began, apart from each other."""
+        self._suspect_since = 0.0
+        self._large_lost_in_a_row = 0
+        """Large datagrams lost since the suspicion began, not counting those sent close together."""
         self._counted_at = float("-inf")
-        """When the last of those left."""
+        """When the last counted one was sent."""
         self._small = self._small_lost = 0
-        """Small datagrams since the doubt began."""
-        self._between = self._between_small = 0
-        """Of both, the lost ones since a small one arrived."""
-        self._remembered = self._remembered_lost = 0.0
-        """Small datagrams of earlier doubts."""
+        """Small datagrams since the suspicion began."""
+        self._large_lost_between = self._small_lost_between = 0
+        """Large and small losses since a small datagram arrived."""
+        self._past_small = self._past_small_lost = 0.0
+        """Small datagrams of earlier suspicions."""
         self._probes = 0
         self.narrowed_at: float | None = None
-        self.asking = Asking()
+        self.probe = PmtuProbe()
 
     @property
-    def in_doubt(self) -> bool:
-        """Large datagrams were lost and none arrived since."""
-        return self._lost > 0 or self._rounds > 0
+    def suspect(self) -> bool:
+        """Large datagrams were lost and none has arrived since."""
+        return self._large_lost > 0 or self._rounds > 0
 
-    # Doubt
+    # Detection
 
-    def lost(self, packets: Iterable[Packet]) -> None:
+    def on_lost(self, packets: Iterable[Packet]) -> None:
         for packet in packets:
             size = _frames_bytes(packet)
             if size > self.large_bytes:
-                self._lost += 1
-                self._least_lost = min(self._least_lost, size)
-                left_at = packet.mark.sent_at
-                most = MOST_AT_A_STRETCH + LOST_PER_ROUND * self._between_small
-                if left_at >= self._counted_at + APART_S and self._between < most:
+                self._large_lost += 1
+                self._smallest_lost = min(self._smallest_lost, size)
+                left_at = packet.snapshot.sent_at
+                max_lost = MAX_LARGE_LOST_BETWEEN + LOST_PER_ROUND * self._small_lost_between
+                if left_at >= self._counted_at + LOSS_SPACING_S and self._large_lost_between < max_lost:
                     self._counted_at = left_at
-                    self._between += 1
-                    self._in_a_row += 1
-            elif self.in_doubt:
-                self._small_is_lost()
+                    self._large_lost_between += 1
+                    self._large_lost_in_a_row += 1
+            elif self.suspect:
+                self._on_small_lost()
 
-    def arrived(self, packets: Sequence[Packet], called_lost: int, now: float) -> None:
-        """Only to be told while `in_doubt`; so many of them were called lost before."""
-        least = self._least_lost
-        if any(_frames_bytes(packet) >= least for packet in packets):
+    def on_acked(self, packets: Sequence[Packet], called_lost: int, now: float) -> None:
+        """Record acknowledged packets while `suspect`; `called_lost` of them had been declared lost."""
+        smallest = self._smallest_lost
+        if any(_frames_bytes(packet) >= smallest for packet in packets):
             self.reset()
         else:
-            self._small_arrived(len(packets), called_lost, now)
+            self._on_small_acked(len(packets), called_lost, now)
 
-    def ask_small(self) -> bool:
-        """Whether the next probe of a silent peer shall be small."""
+    def next_probe_is_small(self) -> bool:
+        """Whether the next probe of an unresponsive peer is small."""
         self._probes += 1
-        return self.in_doubt and not self._probes % PROBES_PER_SMALL
+        return self.suspect and not self._probes % PROBES_PER_SMALL
 
-    def asked_small(self) -> None:
-        """A small ping left: lost, unless it is answered."""
-        if self.in_doubt:
-            self._small_is_lost()
+    def on_small_probe_sent(self) -> None:
+        """Count a small ping as lost until it is answered."""
+        if self.suspect:
+            self._on_small_lost()
 
-    def answered(self, token: int, now: float) -> None:
-        """A ping was answered."""
-        if not self.asking.answered(token) and self.in_doubt:
-            self._small_arrived(1, 1, now)
+    def on_pong(self, token: int, now: float) -> None:
+        """Record the answer to a ping."""
+        if not self.probe.on_pong(token) and self.suspect:
+            self._on_small_acked(1, 1, now)
 
-    def _small_is_lost(self) -> None:
-        if self._between_small < MOST_SMALL_AT_A_STRETCH:
-            self._between_small += 1
+    def _on_small_lost(self) -> None:
+        if self._small_lost_between < MAX_SMALL_LOST_BETWEEN:
+            self._small_lost_between += 1
             self._small += 1
             self._small_lost += 1
 
-    def _small_arrived(self, count: int, called_lost: int, now: float) -> None:
+    def _on_small_acked(self, count: int, called_lost: int, now: float) -> None:
         called_lost = min(called_lost, self._small_lost)
         self._small_lost -= called_lost
         self._small += count - called_lost
-        self._between = self._between_small = 0
-        if self._lost >= LOST_PER_ROUND and now - self._round_at >= ROUND_S:
+        self._large_lost_between = self._small_lost_between = 0
+        if self._large_lost >= LOST_PER_ROUND and now - self._round_at >= ROUND_S:
             if not self._rounds:
-                self._doubted_at = now
+                self._suspect_since = now
             self._rounds += 1
-            self._lost = 0
+            self._large_lost = 0
             self._round_at = now
 
-    def too_narrow(self, now: float) -> bool:
-        """Large datagrams do not get through."""
-        if self._rounds < ROUNDS or now - self._doubted_at < DOUBT_S:
+    def is_black_hole(self, now: float) -> bool:
+        """Whether large datagrams do not get through."""
+        if self._rounds < ROUNDS or now - self._suspect_since < SUSPECT_S:
             return False
         small_loss = max(
             (self._small_lost + 1) / (self._small + 2),
-            (self._remembered_lost + self._small_lost + 1) / (self._remembered + self._small + 2),
+            (self._past_small_lost + self._small_lost + 1) / (self._past_small + self._small + 2),
         )
-        return bool(small_loss**self._in_a_row < CHANCE)
+        return bool(small_loss**self._large_lost_in_a_row < MAX_CHANCE)
 
     def reset(self) -> None:
-        """A large datagram arrived, or their size is another from now on."""
-        self._remembered += self._small
-        self._remembered_lost += self._small_lost
-        if self._remembered > MEMORY:
-            self._remembered_lost *= MEMORY / self._remembered
-            self._remembered = MEMORY
-        self._lost = self._rounds = self._in_a_row = self._small = self._small_lost = 0
-        self._between = self._between_small = 0
-        self._least_lost = _INFINITY
+        """Start over: a large datagram arrived, or the sizes changed."""
+        self._past_small += self._small
+        self._past_small_lost += self._small_lost
+        if self._past_small > LOSS_MEMORY_PACKETS:
+            self._past_small_lost *= LOSS_MEMORY_PACKETS / self._past_small
+            self._past_small = LOSS_MEMORY_PACKETS
+        self._large_lost = self._rounds = self._large_lost_in_a_row = self._small = self._small_lost = 0
+        self._large_lost_between = self._small_lost_between = 0
+        self._smallest_lost = _INFINITY
 
-    # Narrowed
+    # Reduction
 
-    def narrowed(self, now: float) -> None:
-        """The path is taken for narrower from now on."""
+    def on_narrowed(self, now: float) -> None:
+        """Record that the MTU was reduced."""
         self.reset()
-        self.asking.begin(now)
+        self.probe.start(now)
         self.narrowed_at = now
 
 
-class Asking:
-    """When to ask whether a path carries more than it is given, and what was answered."""
+class PmtuProbe:
+    """Schedules pings that probe a larger MTU and records the answers."""
 
-    __slots__ = ("_at", "_begun_at", "_pause_s", "_times", "_tokens", "carries")
+    __slots__ = ("_interval_s", "_next_at", "_sent_probes", "_started_at", "_tokens", "confirmed_mtu")
 
     def __init__(self) -> None:
-        self._begun_at = float("-inf")
-        self._at = float("inf")
-        self._pause_s = ASK_AFTER_S
-        self._times = 0
+        self._started_at = float("-inf")
+        self._next_at = float("inf")
+        self._interval_s = PROBE_AFTER_S
+        self._sent_probes = 0
         self._tokens: dict[int, int] = {}
-        """Of pings that may still be answered -> the MTU they fill."""
-        self.carries = 0
-        """The largest MTU for which one was answered."""
+        """Token of a ping that may still be answered -> the MTU it fills."""
+        self.confirmed_mtu = 0
+        """The largest MTU for which a ping was answered."""
 
-    def begin(self, now: float) -> None:
-        """The path is taken for narrow from now on. Where a ping was answered not long ago that proved little."""
-        if now - self._begun_at > 2 * ASK_AT_MOST_EVERY_S:
-            self._pause_s = ASK_AFTER_S
-        elif self.carries:
-            self._pause_s = min(2 * self._pause_s, ASK_AT_MOST_EVERY_S)
-        self._begun_at = now
-        self.carries = 0
+    def start(self, now: float) -> None:
+        """Start probing after a reduction. If the previous confirmation was recent, it proved little: probe less
+        often."""
+        if now - self._started_at > 2 * MAX_PROBE_INTERVAL_S:
+            self._interval_s = PROBE_AFTER_S
+        elif self.confirmed_mtu:
+            self._interval_s = min(2 * self._interval_s, MAX_PROBE_INTERVAL_S)
+        self._started_at = now
+        self.confirmed_mtu = 0
         self._tokens.clear()
-        self._wait(now)
+        self._schedule(now)
 
-    def _wait(self, now: float) -> None:
-        self._at = now + self._pause_s
-        self._times = 0
+    def _schedule(self, now: float) -> None:
+        self._next_at = now + self._interval_s
+        self._sent_probes = 0
 
     def due(self, now: float, loss: float) -> bool:
-        """Whether to ask now; to be called some times a second at most, and only while the peer answers. `loss` is that
-        of datagrams to the peer."""
-        if now < self._at:
+        """Whether to probe now. Call a few times a second, and only while the peer answers. `loss` is the loss rate
+        towards the peer."""
+        if now < self._next_at:
             return False
-        if not self._times:
+        if not self._sent_probes:
             self._tokens.clear()
-        self._times += 1
-        if self._times >= ASKED_TIMES / max(LEAST_ARRIVING, 1 - loss) ** 2:
-            self._pause_s = min(2 * self._pause_s, ASK_AT_MOST_EVERY_S)
-            self._wait(now)
+        self._sent_probes += 1
+        if self._sent_probes >= MAX_PROBES / max(MIN_ARRIVING, 1 - loss) ** 2:
+            self._interval_s = min(2 * self._interval_s, MAX_PROBE_INTERVAL_S)
+            self._schedule(now)
         return True
 
-    def asked(self, token: int, mtu: int) -> None:
+    def on_probe_sent(self, token: int, mtu: int) -> None:
         self._tokens[token] = mtu
 
-    def answered(self, token: int) -> bool:
-        """Whether it was one of these pings."""
+    def on_pong(self, token: int) -> bool:
+        """Whether it was the answer to one of these pings."""
         mtu = self._tokens.pop(token, None)
         if mtu is not None:
-            self.carries = max(self.carries, mtu)
+            self.confirmed_mtu = max(self.confirmed_mtu, mtu)
         return mtu is not None
 
 
 def _frames_bytes(packet: Packet) -> int:
-    """About what the packet's frames take: a topic's name is left out."""
+    """Approximate size of the packet's frames, without topic announcements."""
     _, message, position, more = packet
     start, end = message.span(position)
     size = FRAGMENT_BYTES + end - start + (0 if position else HEAD_BYTES)

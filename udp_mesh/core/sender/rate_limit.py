@@ -1,14 +1,13 @@
-"""A topic's rate limit: bytes leave when the bucket holds them; until then the topic's messages are parked."""
+"""A topic's rate limit as a token bucket: while it is empty, the topic's messages are parked."""
 
 from udp_mesh.core.sender.scheduler import Run
-from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.sender.sender import Sender
 
 BURST_S = 0.1
-"""The bucket holds this much time: short enough that a limit of one second's mean is kept, long enough for a
-message."""
+"""Capacity of the bucket: short enough to keep the limit over one second, long enough for a message."""
 
 
-class Gate:
+class TokenBucket:
     """One topic's bucket, shared by all destinations. It may go into debt by one datagram."""
 
     __slots__ = ("_at", "_bytes", "bytes_per_s", "parked")
@@ -17,30 +16,30 @@ class Gate:
         self.bytes_per_s = bytes_per_s
         self._bytes = bytes_per_s * BURST_S
         self._at = now
-        self.parked: list[tuple[Outbound, Run]] = []
-        """What waits for the bucket: messages, or single pieces to be sent again."""
+        self.parked: list[tuple[Sender, Run]] = []
+        """What waits for tokens: messages, or single fragments to be retransmitted."""
 
-    def open(self, now: float) -> bool:
-        """Whether a datagram may leave now."""
+    def has_tokens(self, now: float) -> bool:
+        """Whether a datagram may be sent now."""
         self._bytes = min(self.bytes_per_s * BURST_S, self._bytes + (now - self._at) * self.bytes_per_s)
         self._at = now
         return self._bytes > 0
 
-    def spend(self, count: int) -> None:
-        """`count` bytes left."""
+    def consume(self, count: int) -> None:
+        """Record that `count` bytes were sent."""
         self._bytes -= count
 
-    def opens_at(self) -> float:
+    def ready_at(self) -> float:
         """When the bucket is out of debt."""
         return self._at + max(0.0, 1.0 - self._bytes) / self.bytes_per_s
 
-    def release(self) -> None:
-        """Put everything parked back in front of its level, in its order."""
+    def unpark(self) -> None:
+        """Return everything parked to the front of its level, in order."""
         parked, self.parked = self.parked, []
-        for outbound, run in reversed(parked):
+        for sender, run in reversed(parked):
             if run.message.ended:
                 continue
-            if run.again:
-                outbound.scheduler.push_again(run.message, run.position)
+            if run.retransmit:
+                sender.scheduler.push_retransmit(run.message, run.position)
             else:
-                outbound.scheduler.push(run.message, first=True)
+                sender.scheduler.push(run.message, first=True)

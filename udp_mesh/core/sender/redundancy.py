@@ -1,73 +1,82 @@
-"""Second copies of small urgent pieces: left over a lossy way -> again soon, and again when the answer is overdue.
+"""Redundant copies of small urgent fragments on a lossy path: sent -> copied soon, and again if the acknowledgement is
+overdue.
 
-1. `later` is told of each small urgent piece that left for the first time, and notes when its copies are due.
-2. `due` hands out what is due; what is still unanswered by then is noted once more, a few times.
+1. `schedule` records when the copies of a fragment sent for the first time are due.
+2. `pop_due` returns what is due; a fragment still unacknowledged then is scheduled again, a few times.
 
-On a way that loses little nothing is copied; from `twice_loss` on one copy leaves soon, and `EARLY` adds to it as more
-is lost: 20 % loss takes all of three sendings in one case of 125, all of four in one of 625.
+On a path with little loss nothing is copied. From `twice_loss` on, one copy is sent soon, and `EARLY_COPIES` adds more
+as loss grows: 20 % loss takes all of three transmissions in one case of 125, all of four in one of 625.
 """
 
 from heapq import heappop, heappush
 
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.message import OutgoingMessage
 
 OVERDUE_ROUND_TRIPS = 1.1
-"""Round trips after which the answer to an urgent piece, asked for at once, is overdue."""
+"""Round trips after which the acknowledgement of an urgent fragment, requested at once, is overdue."""
 
-OVERDUE_TIMES = 6
-"""So often an overdue answer brings another copy; then the peer is nearly silent, and probes do."""
+MAX_OVERDUE_COPIES = 6
+"""Copies sent for overdue acknowledgements; after that the peer is nearly unresponsive and is probed instead."""
 
-EARLY = ((0.1, 3), (0.15, 6))
-"""From each loss on one more sending leaves, so many gaps after the first: what is lost is often lost together, so they
-lie ever further apart."""
+EARLY_COPIES = ((0.1, 3), (0.15, 6))
+"""(loss, gaps): from this loss rate on, one more copy is sent so many gaps after the first. Losses come in bursts, so
+the gaps grow."""
 
 
-class Copies:
-    """The copies noted for one peer."""
+class RedundantCopies:
+    """The copies scheduled for one peer."""
 
     __slots__ = ("_heap", "_serial")
 
     def __init__(self) -> None:
-        self._heap: list[tuple[float, int, Outgoing, int, int]] = []
-        """(when, serial, message, position, how often it may be noted again)."""
+        self._heap: list[tuple[float, int, OutgoingMessage, int, int]] = []
+        """(when, serial, message, position, how often it may be scheduled again)."""
         self._serial = 0
 
     def __bool__(self) -> bool:
         return bool(self._heap)
 
     def next_at(self) -> float:
-        """When the next is due; only meaningful while there are any."""
+        """When the next copy is due. Call only if there are any."""
         return self._heap[0][0]
 
-    def later(
-        self, message: Outgoing, position: int, now: float, *, gap_s: float, twice: bool, loss: float, overdue_s: float
+    def schedule(
+        self,
+        message: OutgoingMessage,
+        position: int,
+        now: float,
+        *,
+        gap_s: float,
+        twice: bool,
+        loss: float,
+        urgent_timeout_s: float,
     ) -> None:
-        """The piece left just now for the first time."""
+        """Schedule copies of a fragment just sent for the first time."""
         if not twice:
             return
-        self._note(now + gap_s, message, position, 0)
-        for least_loss, gaps in EARLY:
-            if loss >= least_loss:
-                self._note(now + gaps * gap_s, message, position, 0)
+        self._push(now + gap_s, message, position, 0)
+        for min_loss, gaps in EARLY_COPIES:
+            if loss >= min_loss:
+                self._push(now + gaps * gap_s, message, position, 0)
         if message.reliable:
-            self._note(now + overdue_s, message, position, OVERDUE_TIMES - 1)
+            self._push(now + urgent_timeout_s, message, position, MAX_OVERDUE_COPIES - 1)
 
-    def due(self, now: float, overdue_s: float) -> list[tuple[Outgoing, int]]:
-        """Pieces to be sent again now, unless they have arrived."""
-        pieces = []
+    def pop_due(self, now: float, urgent_timeout_s: float) -> list[tuple[OutgoingMessage, int]]:
+        """Fragments to copy now, unless acknowledged."""
+        fragments = []
         while self._heap and self._heap[0][0] <= now:
             _, _, message, position, times = heappop(self._heap)
-            # Best effort ends when it leaves, and nobody tells whether it arrived.
+            # A best-effort message ends when sent; whether it arrived is unknown.
             if message.reliable and (message.ended or message.arrived[position]):
                 continue
-            pieces.append((message, position))
+            fragments.append((message, position))
             if times:
-                self._note(now + overdue_s, message, position, times - 1)
-        return pieces
+                self._push(now + urgent_timeout_s, message, position, times - 1)
+        return fragments
 
     def clear(self) -> None:
         self._heap.clear()
 
-    def _note(self, at: float, message: Outgoing, position: int, times: int) -> None:
+    def _push(self, at: float, message: OutgoingMessage, position: int, times: int) -> None:
         self._serial += 1
         heappush(self._heap, (at, self._serial, message, position, times))

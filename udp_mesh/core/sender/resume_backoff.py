@@ -1,33 +1,33 @@
-"""When a burst may leave to a silent peer that is heard: signs of life in -> whether a burst is worth it.
+"""Limits bursts to an unresponsive peer that is heard but acknowledges nothing.
 
-The first sign of life is answered at once. While nothing is acknowledged the next bursts wait, each twice as long as
-the one before: the way there may be cut, or be one whose queue takes seconds, and more of the same would keep it full.
+The first sign of life triggers a burst at once. While nothing is acknowledged, the interval to the next burst doubles:
+the forward path may be down, or have a queue of seconds that more bursts would keep full.
 """
 
-RETURN_BURST_PACKETS = 10
-"""What leaves at once when a silent peer is heard without acknowledging (the way to it may still be cut)."""
+RESUME_BURST_PACKETS = 10
+"""Packets sent at once when an unresponsive peer is heard without acknowledging (the path to it may still be down)."""
 
-BURST_AGAIN_S = 0.1
-MOST_BURST_AGAIN_S = 3.2
+MIN_RESUME_INTERVAL_S = 0.1
+MAX_RESUME_INTERVAL_S = 3.2
 
 
-class Bursts:
-    """Those of one silence after another."""
+class ResumeBackoff:
+    """The burst interval while a peer is unresponsive."""
 
-    __slots__ = ("_again_s", "_at")
+    __slots__ = ("_at", "_interval_s")
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """The silence is over."""
+        """The peer responds again."""
         self._at = float("-inf")
-        self._again_s = BURST_AGAIN_S
+        self._interval_s = MIN_RESUME_INTERVAL_S
 
     def due(self, now: float) -> bool:
-        """Whether one may leave now; it then counts as left."""
+        """Whether a burst may be sent now; it then counts as sent."""
         if now < self._at:
             return False
-        self._at = now + self._again_s
-        self._again_s = min(MOST_BURST_AGAIN_S, 2 * self._again_s)
+        self._at = now + self._interval_s
+        self._interval_s = min(MAX_RESUME_INTERVAL_S, 2 * self._interval_s)
         return True

@@ -1,43 +1,44 @@
-"""Strict priority to one peer: messages wait by level, and the most urgent piece is chosen when a datagram leaves.
+"""Strict priority queueing for one peer: messages wait by level, and the most urgent fragment is chosen when a datagram
+is built.
 
-Within a level pieces to be sent again go first, then messages in the order accepted. After a silence of the peer the
-urgent levels put what waited then behind what comes fresh (`set_aside`): nothing stale stands ahead of fresh.
+Within a level, retransmissions go first, then messages in the order accepted. After the peer was unresponsive,
+`demote_stale` puts what waited on urgent levels behind new messages.
 """
 
 from collections import deque
 from typing import NamedTuple
 
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.message import OutgoingMessage
 
 
 class Run(NamedTuple):
-    """Pieces of one message ready to leave: `length` positions from `position` on.
+    """Fragments of one message ready to send: `length` positions starting at `position`.
 
-    `again`: it left before. `stale`: it was set aside and has no claim to be urgent any more.
+    `retransmit`: it was sent before. `stale`: it was demoted and is no longer treated as urgent.
     """
 
-    message: Outgoing
+    message: OutgoingMessage
     position: int
     length: int
-    again: bool
+    retransmit: bool
     stale: bool = False
 
 
 class _Level:
-    __slots__ = ("again", "fresh", "stale_again", "stale_fresh")
+    __slots__ = ("fresh", "retransmit", "stale_fresh", "stale_retransmits")
 
     def __init__(self) -> None:
-        self.again: deque[tuple[Outgoing, int]] = deque()
-        self.fresh: deque[Outgoing] = deque()
-        self.stale_again: deque[tuple[Outgoing, int]] = deque()
-        self.stale_fresh: deque[Outgoing] = deque()
+        self.retransmit: deque[tuple[OutgoingMessage, int]] = deque()
+        self.fresh: deque[OutgoingMessage] = deque()
+        self.stale_retransmits: deque[tuple[OutgoingMessage, int]] = deque()
+        self.stale_fresh: deque[OutgoingMessage] = deque()
 
     def empty(self) -> bool:
-        return not (self.again or self.fresh or self.stale_again or self.stale_fresh)
+        return not (self.retransmit or self.fresh or self.stale_retransmits or self.stale_fresh)
 
 
 class _Levels(dict[int, _Level]):
-    """By priority, made when first used: most peers use few levels, and a node may have a thousand peers."""
+    """By priority, created on first use: most peers use few levels, and a node may have a thousand peers."""
 
     def __missing__(self, priority: int) -> _Level:
         level = self[priority] = _Level()
@@ -53,8 +54,8 @@ class Scheduler:
         self._levels = _Levels()
         self.waiting = 0
 
-    def push(self, message: Outgoing, *, first: bool = False) -> None:
-        """All of the message (what of it has not left) waits; `first` puts it ahead of its level."""
+    def push(self, message: OutgoingMessage, *, first: bool = False) -> None:
+        """Queue the unsent part of a message; `first` puts it at the front of its level."""
         fresh = self._levels[message.priority].fresh
         if first:
             fresh.appendleft(message)
@@ -62,79 +63,78 @@ class Scheduler:
             fresh.append(message)
         self.waiting |= 1 << message.priority
 
-    def push_again(self, message: Outgoing, position: int) -> None:
-        """One piece of the message was lost and waits anew."""
-        self._levels[message.priority].again.append((message, position))
+    def push_retransmit(self, message: OutgoingMessage, position: int) -> None:
+        """Queue a lost fragment for retransmission."""
+        self._levels[message.priority].retransmit.append((message, position))
         self.waiting |= 1 << message.priority
 
-    def nothing_waits(self, priority: int) -> bool:
-        """Whether every level is empty; `priority` is the one just taken from, whose bit may not show it yet."""
+    def is_idle(self, priority: int) -> bool:
+        """Whether every level is empty. The bit of `priority`, the level just consumed from, may not be cleared yet."""
         return not self.waiting & ~(1 << priority) and self._levels[priority].empty()
 
     def peek(self, priority: int) -> Run | None:
-        """What leaves next on this level; None (and the level's bit cleared) when nothing does."""
+        """What is sent next on this level. None, with the level's bit cleared, if it is empty."""
         level = self._levels[priority]
-        for again, fresh in ((level.again, level.fresh), (level.stale_again, level.stale_fresh)):
-            while again:
-                message, position = again[0]
+        for retransmit, fresh in ((level.retransmit, level.fresh), (level.stale_retransmits, level.stale_fresh)):
+            while retransmit:
+                message, position = retransmit[0]
                 if message.ended or message.arrived[position]:
-                    again.popleft()
+                    retransmit.popleft()
                     continue
-                return Run(message, position, 1, again=True, stale=fresh is level.stale_fresh)
+                return Run(message, position, 1, retransmit=True, stale=fresh is level.stale_fresh)
             while fresh:
                 message = fresh[0]
-                left = message.fragments - message.next_position if message.begun else 1
+                left = message.fragments - message.next_position if message.started else 1
                 if message.ended or left <= 0:
                     fresh.popleft()
                     continue
-                return Run(message, message.next_position, left, again=False, stale=fresh is level.stale_fresh)
+                return Run(message, message.next_position, left, retransmit=False, stale=fresh is level.stale_fresh)
         self.waiting &= ~(1 << priority)
         return None
 
-    def take(self, run: Run, count: int) -> None:
-        """The first `count` pieces of the run just peeked leave."""
+    def consume(self, run: Run, count: int) -> None:
+        """Remove the first `count` fragments of the run just peeked."""
         level = self._levels[run.message.priority]
-        if run.again:
-            (level.again or level.stale_again).popleft()
+        if run.retransmit:
+            (level.retransmit or level.stale_retransmits).popleft()
             return
         message = run.message
         message.next_position += count
         if message.next_position >= message.fragments:
             (level.fresh if level.fresh and level.fresh[0] is message else level.stale_fresh).popleft()
 
-    def drop_head(self, run: Run) -> None:
-        """The message of the run just peeked leaves this scheduler whole (a rate limit parks it)."""
+    def park_head(self, run: Run) -> None:
+        """Remove the message of the run just peeked (a rate limit parks it)."""
         level = self._levels[run.message.priority]
-        if run.again:
-            (level.again or level.stale_again).popleft()
+        if run.retransmit:
+            (level.retransmit or level.stale_retransmits).popleft()
         elif level.fresh and level.fresh[0] is run.message:
             level.fresh.popleft()
         else:
             level.stale_fresh.popleft()
 
-    def set_aside(self, last_priority: int) -> None:
-        """What waits on levels up to `last_priority` is stale from now on: fresh messages overtake it."""
+    def demote_stale(self, last_priority: int) -> None:
+        """Mark what waits on levels up to `last_priority` as stale: new messages overtake it."""
         for priority, level in self._levels.items():
             if priority > last_priority:
                 continue
-            if level.again:
-                level.stale_again.extend(level.again)
-                level.again.clear()
+            if level.retransmit:
+                level.stale_retransmits.extend(level.retransmit)
+                level.retransmit.clear()
             if level.fresh:
                 level.stale_fresh.extend(level.fresh)
                 level.fresh.clear()
 
-    def rebuild(self, messages: list[Outgoing], *, pieces: bool) -> None:
-        """Start anew with these messages in this order; with `pieces`, pieces that wait to be sent again keep
-        waiting."""
+    def rebuild(self, messages: list[OutgoingMessage], *, keep_fragments: bool) -> None:
+        """Rebuild the queues from these messages in this order; `keep_fragments` keeps queued retransmissions."""
         kept = []
-        if pieces:
+        if keep_fragments:
             for _, level in sorted(self._levels.items()):
-                kept.extend([*level.again, *level.stale_again])
+                kept.extend([*level.retransmit, *level.stale_retransmits])
         self._levels = _Levels()
         self.waiting = 0
         for message in messages:
-            if not message.begun or message.next_position < message.fragments:
+            if not message.started or message.next_position < message.fragments:
                 self.push(message)
         for message, position in kept:
-            self.push_again(message, position)
+            self.push_retransmit(message, position)

@@ -1,102 +1,104 @@
-"""Everything on its way to one peer: accepted -> scheduled -> in flight -> delivered, expired or peer lost.
+"""The messages for one peer: accepted -> scheduled -> in flight -> delivered, expired or peer lost.
 
-1. `accept` takes a message on; `departure` pulls pieces when datagrams leave and books them here.
-2. `acknowledge` books what arrived, measures round trip, rate and loss, and puts lost pieces back by priority.
-3. `handle_timer` probes when acknowledgements stay away: first one packet; then the peer is *silent*, everything
-   on its way is waiting again, and single probes leave: window and rate model stay as they were.
-4. `heard` ends the silence; `restart` begins anew with a peer that forgot everything.
-Which messages are open, and the one outcome of each, is the book of `open_messages`.
+1. `accept` queues a message. `packetizer` takes fragments from the scheduler when datagrams are built and records them.
+2. `acknowledge` records arrivals, measures round trip, rate and loss, and requeues lost fragments by priority.
+3. `handle_timer` declares packets lost when acknowledgements stay away. After some more time the peer is
+   *unresponsive*: everything in flight is requeued and only probes are sent, while the window and rate model stay
+   unchanged.
+4. `on_activity` resumes sending; `restart` starts over with a peer that lost its state.
+
+`pending` holds the messages without an outcome.
 """
 
 from collections.abc import Iterable
 
-from udp_mesh.core.congestion.controller import FixedWindow, Window
-from udp_mesh.core.congestion.delay_based import AdaptiveWindow
+from udp_mesh.core.congestion.controller import CongestionController, FixedWindow
+from udp_mesh.core.congestion.delay_based import DelayBasedController
 from udp_mesh.core.congestion.pacer import Pacer
-from udp_mesh.core.congestion.rtt import INITIAL_TIMEOUT_S, RoundTrip
+from udp_mesh.core.congestion.rtt import INITIAL_PTO_S, RttEstimator
 from udp_mesh.core.events import ExpiryReason
-from udp_mesh.core.sender.message import Outgoing
-from udp_mesh.core.sender.pending import OpenMessages, Outcome
-from udp_mesh.core.sender.pmtu import PathSize
-from udp_mesh.core.sender.redundancy import OVERDUE_ROUND_TRIPS, Copies
-from udp_mesh.core.sender.resume_backoff import RETURN_BURST_PACKETS, Bursts
+from udp_mesh.core.sender.message import OutgoingMessage
+from udp_mesh.core.sender.pending import Outcome, PendingMessages
+from udp_mesh.core.sender.pmtu import PathMtu
+from udp_mesh.core.sender.redundancy import OVERDUE_ROUND_TRIPS, RedundantCopies
+from udp_mesh.core.sender.resume_backoff import RESUME_BURST_PACKETS, ResumeBackoff
 from udp_mesh.core.sender.scheduler import Scheduler
-from udp_mesh.core.sender.sent_packets import Flight, Mark, Packet
+from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot, SentPackets
 from udp_mesh.core.settings import Rates, Settings
 from udp_mesh.wire.frames import Ack
 
-PROBE_SOON_S = 0.025
-"""Between probes in the first second of a silence: most cuts of a moving robot are that short."""
+FAST_PROBE_INTERVAL_S = 0.025
+"""Probe interval in the first second: most outages of a moving robot are that short."""
 
-PROBE_S = 0.25
-"""Between probes later on: at most this much is lost when the link returns; four packets a second to a dead peer."""
+PROBE_INTERVAL_S = 0.25
+"""Probe interval later: the time lost when the link returns, at four packets a second to a dead peer."""
 
-PROBE_SOON_FOR_S = 1.0
+FAST_PROBE_FOR_S = 1.0
 
-SILENT_AFTER_TIMEOUTS = 3
-SILENT_AFTER_S = 0.25
-"""Without any acknowledgement for both of these the peer is silent. Until then packets are replaced as they time out,
-at the pace of the window: a burst of losses then costs little more than its own length."""
+UNRESPONSIVE_AFTER_PTOS = 3
+UNRESPONSIVE_AFTER_S = 0.25
+"""Without an acknowledgement for both of these the peer is unresponsive. Until then timed-out packets are replaced at
+the pace of the window: a burst of losses costs little more than its own length."""
 
-QUIET_S = 0.02
-"""Acknowledgements must stay away at least this long before packets time out: twice what they are held back."""
+MIN_ACK_GAP_S = 0.02
+"""Minimum time without acknowledgements before packets time out: twice what the peer holds them back."""
 
-EXPIRE_EVERY_S = 0.005
-"""Between two looks for packets that timed out."""
+EXPIRE_INTERVAL_S = 0.005
+"""Between two checks for timed-out packets."""
 
 LOSS_MEMORY_PACKETS = 256
 """Packets over which loss is smoothed."""
 
 
-OTHERS_TELL_S = 1.0
-"""So long the round trip of packets that are not urgent is the one that counts."""
+NON_URGENT_RTT_VALID_S = 1.0
+"""While a round trip sample of a packet that is not urgent is younger than this, urgent ones do not count."""
 
 
-class Outbound(OpenMessages):
+class Sender(PendingMessages):
     """The sending half of a session. Times in seconds."""
 
     def __init__(self, settings: Settings) -> None:
         super().__init__()
-        self.trip = RoundTrip()
-        self.urgent_trip = RoundTrip()
-        """Of urgent packets alone: in a radio's queues they pass others (wifi's access categories)."""
-        self._other_sampled_at = float("-inf")
-        self.window: Window = AdaptiveWindow(self.trip)
+        self.rtt = RttEstimator()
+        self.urgent_rtt = RttEstimator()
+        """Of urgent packets only: in a radio's queues they overtake others (Wi-Fi access categories)."""
+        self._non_urgent_sampled_at = float("-inf")
+        self.congestion: CongestionController = DelayBasedController(self.rtt)
         self.pacer = Pacer(settings.rates.pace_quantum_s)
-        self.flight = Flight()
+        self.in_flight = SentPackets()
         self.scheduler = Scheduler()
         self.rates: Rates = settings.rates
         self.announced: set[int] = set()
-        """Numbers of topics that the peer knows by name."""
+        """Numbers of the topics that the peer knows by name."""
         self.next_wire_id = 0
         self.epoch = 0
-        """Counts the runs of the peer: wire ids of earlier ones mean nothing to this one."""
-        self.copies = Copies()
+        """Counts the peer's boots: wire ids of an earlier one mean nothing to the current one."""
+        self.copies = RedundantCopies()
         self.served = 0
-        """Mask of levels from which something left in this round."""
+        """Mask of the levels that sent something in this round."""
         self.wake_at = float("inf")
-        """When pacing lets the next quantum leave."""
-        self.silent_since: float | None = None
-        self.struggling = False
-        """Acknowledgements stay away: packets are taken for lost by their age."""
-        self.overdue: list[Packet] = []
-        """Packets that timed out and are neither known to have arrived nor sent again."""
+        """When pacing permits the next quantum."""
+        self.unresponsive_since: float | None = None
+        self.timing_out = False
+        """Acknowledgements stay away: packets are declared lost by their age."""
+        self.timed_out: list[Packet] = []
+        """Packets that timed out and are neither acknowledged nor retransmitted."""
         self.expired_at = float("-inf")
-        self.urgent_left_at = float("-inf")
+        self.urgent_sent_at = float("-inf")
         self.probe_credit = 0
         self.probed_at = float("-inf")
-        self._bursts = Bursts()
-        self.path_size = PathSize()
+        self._resume_backoff = ResumeBackoff()
+        self.pmtu = PathMtu()
         self.last_progress = 0.0
-        self.other_progress = 0.0
-        """When the last packet that was not urgent arrived."""
-        self.limited = True
-        """The application, not window or pacing, decides how much leaves."""
-        self.since_ack_wanted = 0
-        """Packets sent since the last one that asked for an acknowledgement at once."""
+        self.non_urgent_progress = 0.0
+        """When the last packet that was not urgent was acknowledged."""
+        self.app_limited = True
+        """The application, not window or pacing, limits how much is sent."""
+        self.since_ack_requested = 0
+        """Packets sent since the last one that requested an immediate acknowledgement."""
         self.loss = 0.0
         self.send_twice = False
-        """Loss was seen and has not been gone for long: small urgent messages leave twice."""
+        """Loss was seen recently: small urgent messages are sent twice."""
         self.delivered_packets = 0
         self.delivered_at = 0.0
         self.delivered_sent_at = 0.0
@@ -107,84 +109,84 @@ class Outbound(OpenMessages):
         self.apply(settings)
 
     def apply(self, settings: Settings) -> None:
-        """New settings; nothing on its way is touched."""
+        """Apply new settings; nothing in flight is touched."""
         self.rates = settings.rates
         self.pacer = Pacer(settings.rates.pace_quantum_s)
         if isinstance(settings.window, int):
-            self.window = FixedWindow(settings.window)
-        elif not isinstance(self.window, AdaptiveWindow):
-            self.window = AdaptiveWindow(self.trip)
+            self.congestion = FixedWindow(settings.window)
+        elif not isinstance(self.congestion, DelayBasedController):
+            self.congestion = DelayBasedController(self.rtt)
 
     # Accepting
 
-    def accept(self, message: Outgoing, now: float) -> None:
-        """Take a message on: it waits on its level."""
-        self.take_on(message)
-        if not self.flight.outstanding and self.silent_since is None:
+    def accept(self, message: OutgoingMessage, now: float) -> None:
+        """Accept a message and queue it on its level."""
+        self.add(message)
+        if not self.in_flight.outstanding and self.unresponsive_since is None:
             self.last_progress = now
-        if self.silent_since is not None and message.priority <= self.rates.urgent_priority:
-            # A fresh urgent message is itself the best probe: what waited until now stands behind it.
+        if self.unresponsive_since is not None and message.priority <= self.rates.urgent_priority:
+            # A new urgent message is the best probe; what waited until now goes behind it.
             self.allow_probe(now)
         self.scheduler.push(message)
 
     # Acknowledgements
 
     def acknowledge(self, ack: Ack, now: float) -> None:
-        """Book an acknowledgement of the peer."""
-        flight = self.flight
+        """Process an acknowledgement from the peer."""
+        in_flight = self.in_flight
         received = ack.received << 1 | 1
-        # Sparse traffic has too few successors to lose packets otherwise.
-        timed_out = flight.confirm_timed_out(ack.largest, received) if ack.largest < flight.next_number else 0
-        spurious = flight.spurious
-        acknowledged, lost, newest = flight.acknowledge(ack.largest, received)
+        # Sparse traffic has too few later packets to detect loss otherwise.
+        timed_out = in_flight.confirm_timed_out(ack.largest, received) if ack.largest < in_flight.next_number else 0
+        spurious = in_flight.spurious
+        acknowledged, lost, newest = in_flight.acknowledge(ack.largest, received)
         if acknowledged:
-            # What was acknowledged late, all at once, says nothing about the rate of the link.
-            after_silence = self.struggling or self.silent_since is not None
+            # Packets acknowledged late and all at once say nothing about the rate of the link.
+            after_silence = self.timing_out or self.unresponsive_since is not None
             self.last_progress = now
-            if not all(packet.mark.urgent for packet in acknowledged):
-                self.other_progress = now
-            self.struggling = False
-            if self.silent_since is not None:
-                self._end_silence()
-            if self.path_size.in_doubt:
-                self.path_size.arrived(acknowledged, flight.spurious - spurious, now)
-            self._book_arrivals(acknowledged)
-            if self.overdue:
-                self._settle_overdue()
+            if not all(packet.snapshot.urgent for packet in acknowledged):
+                self.non_urgent_progress = now
+            self.timing_out = False
+            if self.unresponsive_since is not None:
+                self._on_responsive()
+            if self.pmtu.suspect:
+                self.pmtu.on_acked(acknowledged, in_flight.spurious - spurious, now)
+            self._record_arrivals(acknowledged)
+            if self.timed_out:
+                self._requeue_timed_out()
             rate: float | None = None
             largest = -1
             ahead = 0
             count = len(acknowledged)
             self.delivered_packets += count
             if newest is not None:
-                mark = newest.mark
-                if self._sample(max(1e-5, now - mark.sent_at - ack.delay_us * 1e-6), now, urgent=mark.urgent):
+                snapshot = newest.snapshot
+                if self._sample(max(1e-5, now - snapshot.sent_at - ack.delay_us * 1e-6), now, urgent=snapshot.urgent):
                     largest = ack.largest
-                elapsed = max(now - mark.delivered_at, mark.sent_at - mark.delivered_sent_at)
+                elapsed = max(now - snapshot.delivered_at, snapshot.sent_at - snapshot.delivered_sent_at)
                 if elapsed > 0 and not after_silence:
-                    rate = (self.delivered_packets - mark.delivered) / elapsed
-                self.delivered_sent_at = mark.sent_at
-                ahead = mark.ahead_of(ack.largest)
+                    rate = (self.delivered_packets - snapshot.delivered) / elapsed
+                self.delivered_sent_at = snapshot.sent_at
+                ahead = snapshot.packets_ahead_of(ack.largest)
             self.delivered_at = now
-            limited = newest is None or newest.mark.limited
-            in_flight = flight.outstanding
-            if self.window.draining(now) and not flight.others_outstanding():
-                # The few urgent ones that leave during a drain are no queue.
-                in_flight = 0
-            self.window.acknowledged(
+            app_limited = newest is None or newest.snapshot.app_limited
+            outstanding = in_flight.outstanding
+            if self.congestion.drain_overdue(now) and not in_flight.non_urgent_outstanding():
+                # The few urgent packets sent during a drain do not form a queue.
+                outstanding = 0
+            self.congestion.on_ack(
                 count,
                 largest,
-                flight.next_number,
-                in_flight,
+                in_flight.next_number,
+                outstanding,
                 rate,
-                limited=limited,
+                app_limited=app_limited,
                 ahead=ahead,
                 loss=self.loss,
                 now=now,
             )
         if lost:
-            self.path_size.lost(lost)
-            self._put_back(lost)
+            self.pmtu.on_lost(lost)
+            self._requeue(lost)
         lost_packets = len(lost) + timed_out
         total = len(acknowledged) + lost_packets
         if total:
@@ -195,17 +197,17 @@ class Outbound(OpenMessages):
             self.loss += (lost_packets - self.loss * total) / max(total, LOSS_MEMORY_PACKETS)
 
     def _sample(self, round_trip_s: float, now: float, *, urgent: bool) -> bool:
-        """Whether this round trip tells of the queue by which the window goes."""
+        """Add a round trip sample. True if it counts for the congestion window."""
         if urgent:
-            self.urgent_trip.sample(round_trip_s, now)
-            if now < self._other_sampled_at + OTHERS_TELL_S:
+            self.urgent_rtt.sample(round_trip_s, now)
+            if now < self._non_urgent_sampled_at + NON_URGENT_RTT_VALID_S:
                 return False
         else:
-            self._other_sampled_at = now
-        self.trip.sample(round_trip_s, now)
+            self._non_urgent_sampled_at = now
+        self.rtt.sample(round_trip_s, now)
         return True
 
-    def _book_arrivals(self, packets: Iterable[Packet]) -> None:
+    def _record_arrivals(self, packets: Iterable[Packet]) -> None:
         for packet in packets:
             _, message, position, more = packet
             if not position:
@@ -219,52 +221,52 @@ class Outbound(OpenMessages):
             for message, position in more:
                 if not position:
                     self.announced.add(message.accepted.channel.number)
-                if not message.ended and message.arrive(position):
+                if not message.ended and message.mark_arrived(position):
                     self.delivered_bytes += len(message.body)
                     if not message.missing:
                         self.finish(message, Outcome.DELIVERED)
 
-    def _put_back(self, packets: Iterable[Packet]) -> None:
-        """Lost pieces of reliable messages wait again on their level."""
+    def _requeue(self, packets: Iterable[Packet]) -> None:
+        """Requeue the lost fragments of reliable messages on their level."""
         for packet in packets:
-            self._put_back_piece(packet.message, packet.position)
+            self._requeue_fragment(packet.message, packet.position)
             for message, position in packet.more:
-                self._put_back_piece(message, position)
+                self._requeue_fragment(message, position)
 
-    def _put_back_piece(self, message: Outgoing, position: int) -> None:
+    def _requeue_fragment(self, message: OutgoingMessage, position: int) -> None:
         if message.ended or not message.reliable or message.arrived[position]:
             return
         if message.superseded:
             self.finish(message, ExpiryReason.SUPERSEDED)
         else:
-            self.scheduler.push_again(message, position)
+            self.scheduler.push_retransmit(message, position)
 
-    def copy_later(self, message: Outgoing, position: int, now: float) -> None:
-        """A small urgent piece left for the first time."""
-        self.copies.later(
+    def schedule_copies(self, message: OutgoingMessage, position: int, now: float) -> None:
+        """Schedule redundant copies of a small urgent fragment sent for the first time."""
+        self.copies.schedule(
             message,
             position,
             now,
             gap_s=self.rates.twice_gap_s,
             twice=self.send_twice,
             loss=self.loss,
-            overdue_s=self.overdue_s(),
+            urgent_timeout_s=self.urgent_timeout_s(),
         )
 
-    def overdue_s(self) -> float:
-        """How long the answer to an urgent piece may take."""
-        smoothed = self.urgent_trip.smoothed or self.trip.smoothed
-        return INITIAL_TIMEOUT_S if smoothed is None else OVERDUE_ROUND_TRIPS * smoothed + self.rates.twice_gap_s
+    def urgent_timeout_s(self) -> float:
+        """Time after which the acknowledgement of an urgent fragment is overdue."""
+        smoothed_rtt = self.urgent_rtt.smoothed_rtt or self.rtt.smoothed_rtt
+        return INITIAL_PTO_S if smoothed_rtt is None else OVERDUE_ROUND_TRIPS * smoothed_rtt + self.rates.twice_gap_s
 
-    # Silence
+    # Unresponsive peer
 
     def timer(self) -> float | None:
-        """When `handle_timer` wants to be called for probes, deadlines or second copies. Late answers do no harm."""
+        """When `handle_timer` is due for probes, deadlines or redundant copies. Calling it late is harmless."""
         at: float | None = None
-        if self.silent_since is not None:
-            if self.open or self.flight.outstanding:
-                at = self.probed_at + self._probe_every(self.silent_since)
-        elif self.flight.outstanding:
+        if self.unresponsive_since is not None:
+            if self.pending or self.in_flight.outstanding:
+                at = self.probed_at + self._probe_interval_s(self.unresponsive_since)
+        elif self.in_flight.outstanding:
             at = self._expiry_at()
         deadline = self.next_deadline()
         if deadline is not None and (at is None or deadline < at):
@@ -275,154 +277,156 @@ class Outbound(OpenMessages):
             at = self.copies.next_at()
         return at
 
-    def timeout(self) -> float:
-        """Silence after which the oldest packet counts as lost."""
-        return self.trip.timeout(self.rates.ack_delay_s, PROBE_S)
+    def pto_s(self) -> float:
+        """Probe timeout: time without progress after which the oldest packet counts as lost."""
+        return self.rtt.pto_s(self.rates.ack_delay_s, PROBE_INTERVAL_S)
 
     def handle_timer(self, now: float) -> None:
         self.expire(now)
         if self.wake_at <= now:
             self.wake_at = float("inf")
-        if self.silent_since is not None:
-            if now >= self.probed_at + self._probe_every(self.silent_since) and (self.open or self.flight.outstanding):
+        if self.unresponsive_since is not None:
+            awaited = self.pending or self.in_flight.outstanding
+            if awaited and now >= self.probed_at + self._probe_interval_s(self.unresponsive_since):
                 self.allow_probe(now)
-        elif self.flight.outstanding:
-            timeout = self.timeout()
-            if now >= self.last_progress + max(SILENT_AFTER_TIMEOUTS * timeout, SILENT_AFTER_S):
-                self.silent_since = now
+        elif self.in_flight.outstanding:
+            timeout = self.pto_s()
+            if now >= self.last_progress + max(UNRESPONSIVE_AFTER_PTOS * timeout, UNRESPONSIVE_AFTER_S):
+                self.unresponsive_since = now
                 self.allow_probe(now)
             elif now >= self._expiry_at():
                 self.expired_at = now
-                self._expire(now - timeout)
+                self._declare_timed_out(now - timeout)
 
     def _expiry_at(self) -> float:
-        """When to look for packets whose acknowledgement is overdue."""
-        oldest = self.flight.oldest()
+        """When to check for packets whose acknowledgement is overdue."""
+        oldest = self.in_flight.oldest()
         if oldest is None:
             return float("inf")
-        timeout = self.timeout()
-        # Urgent packets overtake others in radios: that they arrive says nothing about one that all others follow.
-        progress = self.last_progress if oldest.urgent else self.other_progress
-        quiet = progress + max(QUIET_S, timeout / 2)
-        return max(quiet, oldest.sent_at + timeout, self.expired_at + EXPIRE_EVERY_S)
+        timeout = self.pto_s()
+        # Urgent packets overtake others in radios, so their acknowledgement is no progress for a packet that is not
+        # urgent.
+        progress = self.last_progress if oldest.urgent else self.non_urgent_progress
+        quiet = progress + max(MIN_ACK_GAP_S, timeout / 2)
+        return max(quiet, oldest.sent_at + timeout, self.expired_at + EXPIRE_INTERVAL_S)
 
-    def _expire(self, sent_before: float) -> None:
-        """Packets sent until then are no longer counted as on their way, so that others may leave.
+    def _declare_timed_out(self, sent_before: float) -> None:
+        """Declare packets sent before then lost, so that others may be sent.
 
-        Whether they, or only their acknowledgements, were lost the next acknowledgement will tell: until then urgent
-        pieces are sent again, others only if nothing else waits.
+        The next acknowledgement shows whether they or only their acknowledgements were lost. Until then urgent
+        fragments are retransmitted; others only if nothing else waits.
         """
-        self.struggling = True
-        for packet in self.flight.lose_before(sent_before):
+        self.timing_out = True
+        for packet in self.in_flight.declare_lost_before(sent_before):
             if packet.message.priority <= self.rates.urgent_priority:
-                self._put_back((packet,))
+                self._requeue((packet,))
             else:
-                self.overdue.append(packet)
-            self.path_size.lost((packet,))
-        if self.overdue and not self.scheduler.waiting:
-            self._settle_overdue()
+                self.timed_out.append(packet)
+            self.pmtu.on_lost((packet,))
+        if self.timed_out and not self.scheduler.waiting:
+            self._requeue_timed_out()
 
-    def _settle_overdue(self) -> None:
-        overdue, self.overdue = self.overdue, []
-        self._put_back(overdue)
+    def _requeue_timed_out(self) -> None:
+        timed_out, self.timed_out = self.timed_out, []
+        self._requeue(timed_out)
 
-    def _probe_every(self, silent_since: float) -> float:
-        return PROBE_SOON_S if self.probed_at - silent_since < PROBE_SOON_FOR_S else PROBE_S
+    def _probe_interval_s(self, unresponsive_since: float) -> float:
+        return FAST_PROBE_INTERVAL_S if self.probed_at - unresponsive_since < FAST_PROBE_FOR_S else PROBE_INTERVAL_S
 
     def allow_probe(self, now: float) -> None:
-        """The most urgent waiting piece may leave although the peer is silent; not more often than `PROBE_SOON_S`."""
-        if now < self.probed_at + PROBE_SOON_S * 0.99:
+        """Let the most urgent fragment probe an unresponsive peer, at most once per `FAST_PROBE_INTERVAL_S`."""
+        if now < self.probed_at + FAST_PROBE_INTERVAL_S * 0.99:
             return
         self.probed_at = now
         self.probe_credit = 1
-        self._set_aside()
+        self._demote_in_flight()
 
-    def probes_small(self, now: float) -> bool:
-        """Whether the probe just allowed shall be a ping: nothing waits, or full pieces may be too large for the path
-        (then one probe in a few, once the silence is no short cut)."""
-        if self.silent_since is None or not self.probe_credit:
+    def consume_small_probe(self, now: float) -> bool:
+        """Whether the probe just allowed is to be a ping: nothing waits, or full fragments may be too large for the
+        path (then one probe in a few, once the peer has been unresponsive for longer)."""
+        if self.unresponsive_since is None or not self.probe_credit:
             return False
         if self.scheduler.waiting:
-            long_since = now - self.silent_since > PROBE_SOON_FOR_S
-            if not (long_since and self.path_size.ask_small()):
+            long_since = now - self.unresponsive_since > FAST_PROBE_FOR_S
+            if not (long_since and self.pmtu.next_probe_is_small()):
                 return False
             self.probe_credit = 0
-        self.path_size.asked_small()
+        self.pmtu.on_small_probe_sent()
         return True
 
-    def _set_aside(self) -> None:
-        """Everything on its way waits again, urgent messages behind those still to come."""
-        self._settle_overdue()
-        given_up = self.flight.give_up()
-        self.path_size.lost(given_up)
-        self._put_back(given_up)
-        self.scheduler.set_aside(self.rates.urgent_priority)
+    def _demote_in_flight(self) -> None:
+        """Requeue everything in flight; urgent messages go behind new ones."""
+        self._requeue_timed_out()
+        given_up = self.in_flight.abandon_all()
+        self.pmtu.on_lost(given_up)
+        self._requeue(given_up)
+        self.scheduler.demote_stale(self.rates.urgent_priority)
 
-    def heard(self, now: float) -> None:
-        """Something authentic came from the peer. After a silence a first burst leaves, the rest when it is
-        acknowledged."""
-        if self.silent_since is None or now < self.probed_at + PROBE_SOON_S * 0.99:
+    def on_activity(self, now: float) -> None:
+        """Record that an authentic datagram arrived. To an unresponsive peer a first burst is sent; the rest waits for
+        an acknowledgement."""
+        if self.unresponsive_since is None or now < self.probed_at + FAST_PROBE_INTERVAL_S * 0.99:
             return
-        if self._bursts.due(now):
+        if self._resume_backoff.due(now):
             self.allow_probe(now)
-            self.probe_credit = min(RETURN_BURST_PACKETS, int(self.window.packets))
+            self.probe_credit = min(RESUME_BURST_PACKETS, int(self.congestion.cwnd))
 
-    def _end_silence(self) -> None:
-        self.silent_since = None
-        self._bursts.reset()
+    def _on_responsive(self) -> None:
+        self.unresponsive_since = None
+        self._resume_backoff.reset()
         self.probe_credit = 0
-        self.scheduler.set_aside(self.rates.urgent_priority)
+        self.scheduler.demote_stale(self.rates.urgent_priority)
 
     def reprioritize(self) -> None:
-        """Topics changed their priorities: what waits moves to its new level."""
-        if self.levels.rearrange(self.open):
-            self.scheduler.rebuild(list(self.open), pieces=True)
+        """Move waiting messages to their topics' new levels."""
+        if self.levels.reprioritize(self.pending):
+            self.scheduler.rebuild(list(self.pending), keep_fragments=True)
 
-    # Anew
+    # Restart
 
     def restart(self, now: float) -> None:
-        """The peer runs anew (or must be told anew): every open message begins again under new numbers."""
-        self.flight.restart(0)
-        self.overdue.clear()
+        """Restart every pending message under a new number: the peer restarted, or its state is unknown."""
+        self.in_flight.restart(0)
+        self.timed_out.clear()
         self.announced.clear()
         self.copies.clear()
         self.cancelled.clear()
         self.next_wire_id = 0
         self.epoch += 1
-        self.silent_since = None
-        self.struggling = False
+        self.unresponsive_since = None
+        self.timing_out = False
         self.probe_credit = 0
         self.last_progress = now
-        messages = list(self.open)
-        self.open.clear()
+        messages = list(self.pending)
+        self.pending.clear()
         for message in messages:
-            self.begin_anew(message)
-        self.scheduler.rebuild(list(self.open), pieces=False)
+            self.restart_message(message)
+        self.scheduler.rebuild(list(self.pending), keep_fragments=False)
 
-    def send_anew(self, message: Outgoing) -> None:
-        """The peer forgot the pieces it had of this one."""
+    def resend_from_start(self, message: OutgoingMessage) -> None:
+        """Restart a message whose fragments the peer discarded."""
         self.announced.discard(message.accepted.channel.number)
-        self.scheduler.push(self.begin_anew(message))
+        self.scheduler.push(self.restart_message(message))
 
-    def resume(self, message: Outgoing, now: float) -> None:
-        """Take a withdrawn message on again where it stopped."""
+    def resume(self, message: OutgoingMessage, now: float) -> None:
+        """Resume a withdrawn message where it stopped."""
         copy = message.resumed()
         self.accept(copy, now)
         for position in range(copy.next_position):
             if not copy.arrived[position]:
-                self.scheduler.push_again(copy, position)
+                self.scheduler.push_retransmit(copy, position)
 
-    def mark(self, now: float, *, urgent: bool = False) -> Mark:
-        """The state in which the packets of one burst leave."""
-        if not self.flight.outstanding and not self.struggling and self.silent_since is None:
+    def snapshot(self, now: float, *, urgent: bool = False) -> SendSnapshot:
+        """The state in which one burst of packets is sent."""
+        if not self.in_flight.outstanding and not self.timing_out and self.unresponsive_since is None:
             self.delivered_at = self.delivered_sent_at = self.last_progress = now
-        return Mark(
+        return SendSnapshot(
             now,
             self.delivered_packets,
             self.delivered_at,
             self.delivered_sent_at,
-            self.limited,
+            self.app_limited,
             urgent,
-            self.flight.next_number,
-            self.flight.outstanding,
+            self.in_flight.next_number,
+            self.in_flight.outstanding,
         )

@@ -1,9 +1,9 @@
-"""The packets on their way to one peer: sent -> acknowledged or lost.
+"""The packets in flight to one peer: sent -> acknowledged or lost.
 
-Packet numbers grow by one and are never used twice, so the packets stand in a queue by number and an acknowledgement's
-bitmap walks it from the front: mostly a run of ones that is taken off in one go. A packet is lost when
-`reorder_packets` later ones arrived; one that arrives after all teaches a larger number. Urgent packets overtake others
-in a radio's queues (wifi's access categories), so their arrival says nothing about less urgent ones sent before them.
+Packet numbers grow by one and are never reused, so packets form a queue by number, and an acknowledgement's bitmap is
+applied from its front: usually a run of ones. A packet is lost when `reorder_packets` later ones arrived; if it arrives
+after all, that threshold grows. Urgent packets overtake others in a radio's queues (Wi-Fi access categories), so their
+arrival says nothing about less urgent ones sent before them.
 """
 
 from collections import OrderedDict, deque
@@ -11,20 +11,20 @@ from functools import partial
 from itertools import repeat
 from typing import NamedTuple
 
-from udp_mesh.core.sender.message import Outgoing
+from udp_mesh.core.sender.message import OutgoingMessage
 
 REORDER_PACKETS = 3
-"""RFC 9002, 6.1.1: fewer calls reordering a loss, more waits longer."""
+"""kPacketThreshold of RFC 9002, 6.1.1: a lower value takes reordering for loss, a higher one delays detection."""
 
-MOST_REORDER_PACKETS = 64
-"""What learned reordering may reach."""
+MAX_REORDER_PACKETS = 64
+"""Upper bound of the learned reordering threshold."""
 
-REMEMBERED_LOST = 256
-"""Packets called lost that an acknowledgement may still correct: those its bitmap covers."""
+MAX_REMEMBERED_LOST = 256
+"""Lost packets that a later acknowledgement may correct: those its bitmap covers."""
 
 
-class Mark(NamedTuple):
-    """The state in which a burst of packets was sent, shared by all of them; for round trip and rate samples."""
+class SendSnapshot(NamedTuple):
+    """The state in which a burst of packets was sent, shared by all of them, for round trip and rate samples."""
 
     sent_at: float
     delivered: int
@@ -32,30 +32,30 @@ class Mark(NamedTuple):
     delivered_at: float
     """When the last of those was acknowledged."""
     delivered_sent_at: float
-    """When the last of those had been sent."""
-    limited: bool
-    """The application, not the window, decided how much was sent."""
+    """When the last of those was sent."""
+    app_limited: bool
+    """The application, not the window, limited how much was sent."""
     urgent: bool = False
     first: int = 0
     """Number of the burst's first packet."""
     outstanding: int = 0
-    """Packets that were on their way when it left."""
+    """Packets in flight when it was sent."""
 
-    def ahead_of(self, number: int) -> int:
-        """Packets of ours that were on their way when packet `number` of the burst left."""
+    def packets_ahead_of(self, number: int) -> int:
+        """Packets in flight when packet `number` of the burst was sent."""
         return self.outstanding + number - self.first
 
 
 class Packet(NamedTuple):
-    """One packet on its way, and the pieces of messages in it."""
+    """One packet in flight and the fragments in it."""
 
-    mark: Mark
-    message: Outgoing
+    snapshot: SendSnapshot
+    message: OutgoingMessage
     position: int
-    more: tuple[tuple[Outgoing, int], ...] = ()
+    more: tuple[tuple[OutgoingMessage, int], ...] = ()
 
 
-class Flight:
+class SentPackets:
     """`outstanding` counts the packets neither acknowledged nor lost."""
 
     __slots__ = (
@@ -74,24 +74,25 @@ class Flight:
         """Number of the packet at the front of the queue."""
         self._packets: deque[Packet | None] = deque()
         self._largest_other = -1
-        """Largest number of a packet that was not urgent and arrived."""
+        """Largest acknowledged number of a packet that was not urgent."""
         self.outstanding = 0
         self.reorder_packets = REORDER_PACKETS
         self._lost: OrderedDict[int, tuple[Packet, bool]] = OrderedDict()
         self._timed_out: list[int] = []
-        """Numbers of urgent packets called lost by their age, of which no acknowledgement has told yet."""
+        """Numbers of urgent packets declared lost by age and not yet covered by an acknowledgement."""
         self.spurious = 0
 
     @property
     def next_number(self) -> int:
         return self.base + len(self._packets)
 
-    def others_outstanding(self) -> int:
+    def non_urgent_outstanding(self) -> int:
         """How many of `outstanding` are not urgent. Walks the queue."""
-        return sum(packet is not None and not packet.mark.urgent for packet in self._packets)
+        return sum(packet is not None and not packet.snapshot.urgent for packet in self._packets)
 
     def add(self, number: int, packet: Packet | None) -> None:
-        """A packet left; None for one that asks for no acknowledgement. Every number of the channel comes, in order."""
+        """Record a sent packet; None for one that requests no acknowledgement. Called for every number of the channel,
+        in order."""
         packets = self._packets
         if packet is not None:
             self.outstanding += 1
@@ -100,18 +101,19 @@ class Flight:
             return
         packets.append(packet)
 
-    def add_run(self, mark: Mark, message: Outgoing, positions: range) -> None:
-        """As `add` for a packet of each piece, which have the next numbers; without a call in Python for each."""
+    def add_run(self, snapshot: SendSnapshot, message: OutgoingMessage, positions: range) -> None:
+        """Record one packet per fragment under the next numbers, without a Python call for each."""
         self.outstanding += len(positions)
         self._packets.extend(
-            map(partial(tuple.__new__, Packet), zip(repeat(mark), repeat(message), positions, repeat(())))
+            map(partial(tuple.__new__, Packet), zip(repeat(snapshot), repeat(message), positions, repeat(())))
         )
 
     def acknowledge(self, largest: int, received: int) -> tuple[list[Packet], list[Packet], Packet | None]:
-        """Packets newly acknowledged, packets now lost, and packet `largest` if this is the first word of it.
+        """Returns the newly acknowledged packets, the packets now lost, and packet `largest` if it was not acknowledged
+        before.
 
-        `received` as in `AckState`. An acknowledgement of what was never sent says nothing. One of a packet called lost
-        too early is the first word of it, too: without it a path that became slow would never be measured.
+        `received` is as in `AckState`. An acknowledgement of a number never sent is ignored. A packet declared lost too
+        early is returned as `largest` too: otherwise a path that became slow would never be measured.
         """
         packets = self._packets
         base = self.base
@@ -121,7 +123,7 @@ class Flight:
         late: Packet | None = None
         if self._lost and largest < self.next_number:
             late = self._lost[largest][0] if largest in self._lost else None
-            self._correct(largest, received, acknowledged)
+            self._undo_loss(largest, received, acknowledged)
         if count <= 0 or count > len(packets):
             return acknowledged, lost, late
         newest = packets[count - 1]
@@ -139,7 +141,7 @@ class Flight:
         reorder = self.reorder_packets
         for behind in range(count):
             packet = packets[count - 1 - behind]
-            if packet is not None and received >> behind & 1 and not packet.mark.urgent:
+            if packet is not None and received >> behind & 1 and not packet.snapshot.urgent:
                 self._largest_other = max(self._largest_other, largest - behind)
                 break
         ahead = largest - self._largest_other
@@ -149,7 +151,7 @@ class Flight:
             if packet is not None:
                 if received >> behind & 1:
                     acknowledged.append(packet)
-                elif behind >= (reorder if packet.mark.urgent else reorder + ahead):
+                elif behind >= (reorder if packet.snapshot.urgent else reorder + ahead):
                     lost.append(packet)
                     self._remember(largest - behind, packet, overtaken=True)
                 else:
@@ -157,7 +159,7 @@ class Flight:
             packets.popleft()
             count -= 1
         self.base = largest + 1 - count
-        # What stands behind a packet that may still come: at most the reordering distance.
+        # Packets behind one that may still arrive: at most the reordering threshold.
         for behind in range(count):
             packet = packets[count - 1 - behind]
             if packet is not None and received >> behind & 1:
@@ -167,28 +169,29 @@ class Flight:
         return acknowledged, lost, newest
 
     def confirm_timed_out(self, largest: int, received: int) -> int:
-        """How many urgent packets that timed out were lost indeed, as this acknowledgement tells."""
-        told = largest - self.reorder_packets
+        """How many timed-out urgent packets this acknowledgement shows to be really lost."""
+        conclusive = largest - self.reorder_packets
         lost = 0
-        while self._timed_out and self._timed_out[0] <= told:
+        while self._timed_out and self._timed_out[0] <= conclusive:
             lost += not received >> (largest - self._timed_out.pop(0)) & 1
         return lost
 
-    def give_up(self) -> list[Packet]:
-        """Everything on its way counts as lost (the peer is silent); an acknowledgement may still correct that."""
+    def abandon_all(self) -> list[Packet]:
+        """Declare everything in flight lost because the peer is unresponsive; a later acknowledgement may correct
+        that."""
         lost = [packet for packet in self._packets if packet is not None]
         for number, packet in enumerate(self._packets, self.base):
             if packet is not None:
                 self._remember(number, packet, overtaken=False)
         self.base += len(self._packets)
         self._packets.clear()
-        # A silence is a cut, which says nothing of the loss on the way.
+        # An outage says nothing about the loss rate of the path.
         self._timed_out.clear()
         self.outstanding = 0
         return lost
 
     def restart(self, number: int) -> list[Packet]:
-        """The peer runs anew: nothing of this was received. Returns what was on its way."""
+        """Discard everything in flight: the peer restarted and received none of it. Returns those packets."""
         lost = [packet for packet in self._packets if packet is not None]
         self._packets.clear()
         self._lost.clear()
@@ -198,27 +201,27 @@ class Flight:
         self.outstanding = 0
         return lost
 
-    def oldest(self) -> Mark | None:
-        """The mark of the first packet still on its way."""
+    def oldest(self) -> SendSnapshot | None:
+        """The snapshot of the oldest packet in flight."""
         packets = self._packets
         while packets and packets[0] is None:
             packets.popleft()
             self.base += 1
         front = packets[0] if packets else None
-        return front.mark if front is not None else None
+        return front.snapshot if front is not None else None
 
-    def lose_before(self, sent_before: float) -> list[Packet]:
-        """Packets sent before that time count as lost."""
+    def declare_lost_before(self, sent_before: float) -> list[Packet]:
+        """Declare packets sent before that time lost."""
         packets = self._packets
         lost = []
         while packets:
             packet = packets[0]
             if packet is not None:
-                if packet.mark.sent_at > sent_before + 1e-9:
+                if packet.snapshot.sent_at > sent_before + 1e-9:
                     break
                 lost.append(packet)
                 self._remember(self.base, packet, overtaken=False)
-                if packet.mark.urgent:
+                if packet.snapshot.urgent:
                     self._timed_out.append(self.base)
             packets.popleft()
             self.base += 1
@@ -227,14 +230,14 @@ class Flight:
 
     def _remember(self, number: int, packet: Packet, *, overtaken: bool) -> None:
         self._lost[number] = (packet, overtaken)
-        if len(self._lost) > REMEMBERED_LOST:
+        if len(self._lost) > MAX_REMEMBERED_LOST:
             self._lost.popitem(last=False)
 
-    def _correct(self, largest: int, received: int, acknowledged: list[Packet]) -> None:
+    def _undo_loss(self, largest: int, received: int, acknowledged: list[Packet]) -> None:
         late = [number for number in self._lost if number <= largest and received >> (largest - number) & 1]
         for number in late:
             packet, overtaken = self._lost.pop(number)
             acknowledged.append(packet)
             self.spurious += 1
             if overtaken:
-                self.reorder_packets = min(MOST_REORDER_PACKETS, self.reorder_packets + 1)
+                self.reorder_packets = min(MAX_REORDER_PACKETS, self.reorder_packets + 1)

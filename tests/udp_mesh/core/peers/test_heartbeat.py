@@ -1,4 +1,4 @@
-"""Discovery costs a large team a bounded share of its channel, and a node no more than it uses."""
+"""Discovery costs a large team a bounded share of its channel, and a node only what it uses."""
 
 import itertools
 import random
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.udp_mesh.core.pair import KEY, World, settings
 from udp_mesh.core import peer_lifecycle
 from udp_mesh.core.events import PeerOffline, PeerOnline
-from udp_mesh.core.peers.heartbeat import ANSWER_WITHIN_S, LEAST_GAP_S, MEETING_HASTE, Discovery
+from udp_mesh.core.peers.heartbeat import DISCOVERY_RATE_FACTOR, MIN_GAP_S, REPLY_WITHIN_S, HeartbeatScheduler
 from udp_mesh.core.peers.session import Session
 from udp_mesh.core.settings import Rates, Topic
 
@@ -25,29 +25,29 @@ def _session(config_name: str = "b") -> Session:
 def test_whatever_asks_for_heartbeats_a_node_sends_no_more_than_its_share(
     team: int, waits: list[float], seed: int
 ) -> None:
-    discovery, now = Discovery(random.Random(seed), RATES, 0.0), 0.0
-    share_s = team / (MEETING_HASTE * RATES.heartbeats_heard_per_s)
+    heartbeats, now = HeartbeatScheduler(random.Random(seed), RATES, 0.0), 0.0
+    share_s = team / (DISCOVERY_RATE_FACTOR * RATES.heartbeats_heard_per_s)
     sent: list[float] = []
     for wait in waits:
         now += wait
-        while discovery.next_at <= now:
-            sent.append(discovery.next_at)
-            discovery.compose(settings("a"), [], (), 0, 0.0, discovery.next_at)
-        discovery.answer(_session(), team, now)
+        while heartbeats.next_at <= now:
+            sent.append(heartbeats.next_at)
+            heartbeats.build(settings("a"), [], (), 0, 0.0, heartbeats.next_at)
+        heartbeats.reply_to(_session(), team, now)
     gaps = [later - earlier for earlier, later in itertools.pairwise(sent)]
-    # a sparser heartbeat of its own may fall in between two answers
-    assert all(gap >= min(max(LEAST_GAP_S, share_s), 0.9 * RATES.heartbeat_s) - 1e-9 for gap in gaps)
+    # One of its own sparse heartbeats may fall between two answers.
+    assert all(gap >= min(max(MIN_GAP_S, share_s), 0.9 * RATES.heartbeat_s) - 1e-9 for gap in gaps)
 
 
 @given(st.integers(0, 1 << 30))
 def test_a_new_node_is_answered_at_once_in_a_small_team_and_not_by_all_at_once_in_a_large_one(seed: int) -> None:
     rng = random.Random(seed)
-    small, large = (Discovery(rng, RATES, 0.0) for _ in range(2))
-    for discovery in (small, large):
-        discovery.compose(settings("a"), [], (), 0, 0.0, 0.0)
-    small.answer(_session(), 10, 0.9)
-    large.answer(_session(), 1000, 0.1)
-    assert small.next_at <= 0.9 + ANSWER_WITHIN_S
+    small, large = (HeartbeatScheduler(rng, RATES, 0.0) for _ in range(2))
+    for heartbeats in (small, large):
+        heartbeats.build(settings("a"), [], (), 0, 0.0, 0.0)
+    small.reply_to(_session(), 10, 0.9)
+    large.reply_to(_session(), 1000, 0.1)
+    assert small.next_at <= 0.9 + REPLY_WITHIN_S
     assert large.next_at >= 0.9
 
 
@@ -55,16 +55,16 @@ def test_peers_to_whom_nothing_is_sent_have_no_sending_half() -> None:
     world = World(seed=3)
     for name in ("a", "b", "c"):
         world.add(settings(name, Topic("map")))
-    assert world.run(5.0, until=lambda: all(len(world.told(name, PeerOnline)) == 2 for name in world.nodes))
+    assert world.run(5.0, until=lambda: all(len(world.events_of(name, PeerOnline)) == 2 for name in world.nodes))
     world.run(3.0)
-    assert [peer.name for peer in world.nodes["a"]._state.roster.peers.values() if peer.engaged] == []
+    assert [peer.name for peer in world.nodes["a"]._state.peer_table.peers.values() if peer.has_sender] == []
     conditions = world.nodes["a"].conditions(world.now)
     assert [(peer.name, peer.online, peer.round_trip_s) for peer in conditions.peers] == [
         ("b", True, None),
         ("c", True, None),
     ]
     world.send("a", "map", bytes(1000), "b")
-    assert [peer.name for peer in world.nodes["a"]._state.roster.peers.values() if peer.engaged] == ["b"]
+    assert [peer.name for peer in world.nodes["a"]._state.peer_table.peers.values() if peer.has_sender] == ["b"]
 
 
 def test_settings_changed_before_anything_was_sent_hold_for_what_is_sent_later() -> None:
@@ -78,14 +78,14 @@ def test_settings_changed_before_anything_was_sent_hold_for_what_is_sent_later()
 
 
 def test_every_silent_peer_goes_offline_although_a_round_looks_at_few(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(peer_lifecycle, "LOOKED_AT_PER_ROUND", 1)
+    monkeypatch.setattr(peer_lifecycle, "IDLE_PEERS_PER_ROUND", 1)
     world = World(seed=4)
     for name in "abcdef":
         world.add(settings(name))
-    assert world.run(5.0, until=lambda: len(world.told("a", PeerOnline)) == 5)
+    assert world.run(5.0, until=lambda: len(world.events_of("a", PeerOnline)) == 5)
     for name in "bcdef":
         del world.nodes[name]
-    assert world.run(20.0, until=lambda: len(world.told("a", PeerOffline)) == 5)
+    assert world.run(20.0, until=lambda: len(world.events_of("a", PeerOffline)) == 5)
 
 
 def test_nodes_tell_each_other_what_they_send_and_what_arrives() -> None:
@@ -98,7 +98,7 @@ def test_nodes_tell_each_other_what_they_send_and_what_arrives() -> None:
         world.run(0.1)
     sending = world.nodes["a"].conditions(world.now)
     to_b = next(peer for peer in sending.peers if peer.name == "b")
-    # 10 kB ten times a second, with headers
+    # 10 kB ten times a second, with headers.
     assert 0.8e6 < sending.sent_bits_per_s < 1.0e6
     assert to_b.arrived_bits_per_s is not None
     assert 0.8e6 < to_b.arrived_bits_per_s < 1.0e6
@@ -111,13 +111,13 @@ def test_nodes_tell_each_other_what_they_send_and_what_arrives() -> None:
 
 
 def test_new_nodes_that_one_heartbeat_cannot_list_are_listed_soon() -> None:
-    discovery = Discovery(random.Random(1), RATES, 0.0)
+    heartbeats = HeartbeatScheduler(random.Random(1), RATES, 0.0)
     rng, listed, now = random.Random(2), set[bytes](), 0.0
     strangers = [Session("b", rng.randbytes(16), bytes(16), (KEY,), settings("b")) for _ in range(300)]
     for session in strangers:
-        discovery.answer(session, len(strangers), now)
+        heartbeats.reply_to(session, len(strangers), now)
     while len(listed) < len(strangers):
-        now = discovery.next_at
-        listed.update(discovery.compose(settings("a"), strangers, (), 0, 0.0, now).heard)
-    # four heartbeats at the pace of a meeting, not of a regular round of ten seconds
-    assert now < 5 * len(strangers) / (MEETING_HASTE * RATES.heartbeats_heard_per_s)
+        now = heartbeats.next_at
+        listed.update(heartbeats.build(settings("a"), strangers, (), 0, 0.0, now).heard)
+    # Four heartbeats at the pace of discovery, not of a regular interval of ten seconds.
+    assert now < 5 * len(strangers) / (DISCOVERY_RATE_FACTOR * RATES.heartbeats_heard_per_s)

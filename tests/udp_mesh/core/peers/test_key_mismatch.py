@@ -1,10 +1,10 @@
-"""Hellos of unknown keys are reported, but a flood of them makes few events."""
+"""Hellos with unknown keys are reported, but a flood of them causes few events."""
 
 import random
 
 from tests.udp_mesh.core.pair import pair
 from udp_mesh.core.events import KeyMismatch
-from udp_mesh.core.peers.key_mismatch import AT_ONCE, EVERY_S
+from udp_mesh.core.peers.key_mismatch import BURST, REFILL_INTERVAL_S
 from udp_mesh.crypto import TO_ALL, Key, SendChannel
 from udp_mesh.wire.codec import encode
 from udp_mesh.wire.frames import Ping
@@ -19,19 +19,19 @@ def test_a_flood_of_unknown_keys_is_told_of_in_a_few_events_that_count_all() -> 
         data = stranger.seal_long(encode([Ping(number)]))[1]
         both.b.receive(data, "mesh", (f"10.1.{number >> 8 & 255}.{number & 255}", 8700), both.now)
         both.now += 8.0 / flood
-    told = [event for event in both.events(both.b) if isinstance(event, KeyMismatch)]
-    assert AT_ONCE <= len(told) <= AT_ONCE + 2
-    both.now += EVERY_S
+    events = [event for event in both.events(both.b) if isinstance(event, KeyMismatch)]
+    assert BURST <= len(events) <= BURST + 2
+    both.now += REFILL_INTERVAL_S
     both.roundtrip(times=3, step_s=1.0)
-    told += [event for event in both.events(both.b) if isinstance(event, KeyMismatch)]
-    assert sum(1 + event.more for event in told) == flood
+    events += [event for event in both.events(both.b) if isinstance(event, KeyMismatch)]
+    assert sum(1 + event.more for event in events) == flood
     assert both.b.conditions(both.now).counters.dropped_unauthenticated >= flood
 
 
 def test_a_team_that_missed_a_rotation_is_told_of_robot_by_robot() -> None:
     both = pair()
-    for host in range(AT_ONCE):
+    for host in range(BURST):
         other = SendChannel(Key(bytes(range(9, 41))), bytes([host]) * 16, TO_ALL)
         both.b.receive(other.seal_long(encode([Ping(1)]))[1], "mesh", (f"10.0.0.{100 + host}", 8700), both.now)
-    told = [event for event in both.events(both.b) if isinstance(event, KeyMismatch)]
-    assert [event.more for event in told] == [0] * AT_ONCE
+    events = [event for event in both.events(both.b) if isinstance(event, KeyMismatch)]
+    assert [event.more for event in events] == [0] * BURST

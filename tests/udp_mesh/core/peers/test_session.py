@@ -1,4 +1,4 @@
-"""Sessions: meeting, restarts, moving, clashing names, keys, versions, replays, links that come and go."""
+"""Sessions: discovery, restarts, migration, name conflicts, keys, versions, replays, links that come and go."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def test_two_nodes_meet_within_three_exchanges() -> None:
     assert [type(event) for event in both.events(both.b)] == [PeerOnline]
 
 
-def told_of(versions: tuple[int, int], *, times: int, apart_s: float) -> list[Event]:
-    """What a node tells that hears a newcomer of these wire versions so many times."""
+def events_of(versions: tuple[int, int], *, times: int, apart_s: float) -> list[Event]:
+    """The events of a node that hears a new node of these wire versions that many times."""
     both = pair()
     boot_id = random.Random(5).randbytes(16)
     channel = SendChannel(KEY, boot_id, TO_ALL)
@@ -55,9 +55,9 @@ def told_of(versions: tuple[int, int], *, times: int, apart_s: float) -> list[Ev
 
 
 def test_a_node_of_later_versions_too_is_met_and_one_of_later_ones_alone_is_told_of_once_a_minute() -> None:
-    assert PeerOnline in map(type, told_of((1, 2), times=3, apart_s=1.0))
-    assert told_of((2, 3), times=50, apart_s=1.0) == [Incompatible("new", ("10.0.0.9", 8700), (2, 3))]
-    assert len(told_of((2, 3), times=5, apart_s=61.0)) == 5
+    assert PeerOnline in map(type, events_of((1, 2), times=3, apart_s=1.0))
+    assert events_of((2, 3), times=50, apart_s=1.0) == [Incompatible("new", ("10.0.0.9", 8700), (2, 3))]
+    assert len(events_of((2, 3), times=5, apart_s=61.0)) == 5
 
 
 def test_a_recorded_heartbeat_brings_nobody_online() -> None:
@@ -86,7 +86,7 @@ def test_everything_recorded_from_an_earlier_run_is_worthless_to_the_next() -> N
     for datagram in recorded:
         both.b.receive(datagram.data, "mesh", A, both.now)
     assert both.events(both.b) == []
-    # Nor once the two have met: what was broadcast before that stays a recording.
+    # Nor after the two have met: what was broadcast before stays a replay.
     for _ in range(300):
         both.roundtrip()
     both.events(both.b)
@@ -113,9 +113,9 @@ def test_a_restart_is_noticed_at_once_and_told() -> None:
     world.run(3.0)
     world.add(settings("b"))
     restarted = world.now
-    assert world.run(5.0, until=lambda: bool(world.told("a", PeerRestarted)))
+    assert world.run(5.0, until=lambda: bool(world.events_of("a", PeerRestarted)))
     assert world.now - restarted < 0.5
-    assert not world.told("a", PeerOffline)
+    assert not world.events_of("a", PeerOffline)
 
 
 def test_silence_takes_a_peer_offline_and_a_bye_at_once() -> None:
@@ -126,12 +126,12 @@ def test_silence_takes_a_peer_offline_and_a_bye_at_once() -> None:
     for (source, sink), pipe in world.pipes.items():
         pipe.up = "b" not in (source, sink)
     world.run(9.0)
-    assert not world.told("a", PeerOffline)
+    assert not world.events_of("a", PeerOffline)
     world.run(3.0)
-    assert world.told("a", PeerOffline) == [PeerOffline("b", left=False)]
+    assert world.events_of("a", PeerOffline) == [PeerOffline("b", left=False)]
     world.nodes["c"].close(world.now)
     world.run(0.1)
-    assert world.told("a", PeerOffline)[1:] == [PeerOffline("c", left=True)]
+    assert world.events_of("a", PeerOffline)[1:] == [PeerOffline("c", left=True)]
 
 
 def test_a_peer_that_moves_is_followed_and_its_messages_arrive_there() -> None:
@@ -142,11 +142,11 @@ def test_a_peer_that_moves_is_followed_and_its_messages_arrive_there() -> None:
     world.addresses["b"] = ("10.0.0.99", 8700)
     world.nodes["b"].link_up(LinkInfo("mesh", LinkKind.BROADCAST, ("10.0.0.99", 8700), BROADCAST), world.now)
     world.send("a", "any", b"find me", "b")
-    assert world.run(6.0, until=lambda: bool(world.told("a", MessageDelivered)))
-    (moved,) = world.told("a", PeerAddressChanged)
+    assert world.run(6.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
+    (moved,) = world.events_of("a", PeerAddressChanged)
     assert isinstance(moved, PeerAddressChanged)
     assert moved.new == ("10.0.0.99", 8700)
-    assert not world.told("a", PeerOffline)
+    assert not world.events_of("a", PeerOffline)
 
 
 def test_a_node_with_another_key_is_reported_and_not_met() -> None:
@@ -248,4 +248,4 @@ def test_heartbeats_heard_per_second_stay_bounded_as_a_team_grows() -> None:
     world.run(10.0)
     sent = sum(node.conditions(world.now).counters.heartbeats_sent - before[name] for name, node in world.nodes.items())
     assert sent / 10.0 < 1.3 * 4.0
-    assert not world.told("n0", PeerOffline)
+    assert not world.events_of("n0", PeerOffline)

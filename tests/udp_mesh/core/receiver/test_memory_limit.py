@@ -1,4 +1,4 @@
-"""One bound over all peers: names are free to a key holder, memory is not."""
+"""One bound for all peers: a key holder invents names freely, but not memory."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import random
 
 from tests.udp_mesh.core.pair import KEY, Pair, pair
 from udp_mesh.core.events import MessageReceived
-from udp_mesh.core.receiver.memory_limit import RANGES_LEFT, Account, Memory
+from udp_mesh.core.receiver.memory_limit import MIN_RANGES_PER_PEER, Account, MemoryBudget
 from udp_mesh.core.settings import Limits
 from udp_mesh.crypto import SendChannel
 from udp_mesh.wire.codec import encode
@@ -43,7 +43,7 @@ def test_many_names_together_hold_no_more_than_one_bound_and_leave_room_for_a_pe
             insider.say(channel, Fragment(number % 40, 1 + number, bytes(1300)))
     held = both.b.conditions(both.now).partial_bytes
     assert TOTAL // 3 < held <= TOTAL
-    assert both.b._state.roster.memory.bytes <= TOTAL
+    assert both.b._state.peer_table.memory.bytes <= TOTAL
     for node, other in ((both.a, "b"), (both.b, "a")):
         node.send("any", bytes(30_000), destination=other, now=both.now)
     both.roundtrip(times=60)
@@ -60,9 +60,9 @@ def test_topic_names_and_tiny_messages_count_too() -> None:
                 TopicAnnounce(number, "t" * 250 + str(number)),
                 Fragment(number, 0, b"x", MessageHead(9, 5, 1, 0, 1)),
             )
-    memory = both.b._state.roster.memory
+    memory = both.b._state.peer_table.memory
     assert TOTAL // 3 < memory.bytes <= TOTAL
-    kept = sum(len(session.inbound.topics) for session in both.b._state.roster.sessions.values())
+    kept = sum(len(session.receiver.topics) for session in both.b._state.peer_table.sessions.values())
     assert kept < 8 * 1000
 
 
@@ -72,12 +72,12 @@ def test_what_a_forgotten_peer_held_is_free_again() -> None:
     for number in range(200):
         for channel in insider.channels:
             insider.say(channel, Fragment(number % 40, 1 + number, bytes(1300)))
-    roster = both.b._state.roster
-    for session in list(roster.sessions.values()):
+    peer_table = both.b._state.peer_table
+    for session in list(peer_table.sessions.values()):
         if session.name.startswith("ghost"):
-            roster.forget(session)
-    assert roster.memory.bytes < 10_000
-    assert roster.memory.holders <= 1
+            peer_table.forget(session)
+    assert peer_table.memory.bytes < 10_000
+    assert peer_table.memory.holders <= 1
 
 
 def test_whole_messages_give_back_what_their_pieces_took() -> None:
@@ -86,25 +86,25 @@ def test_whole_messages_give_back_what_their_pieces_took() -> None:
         both.a.send("any", bytes(300_000), destination="b", now=both.now)
         both.roundtrip(times=200, step_s=0.005)
     assert len([event for event in both.events(both.b) if isinstance(event, MessageReceived)]) == 5
-    assert both.b._state.roster.memory.bytes < 2000
+    assert both.b._state.peer_table.memory.bytes < 2000
 
 
 def test_past_the_half_a_peer_gets_an_equal_part_and_past_the_whole_nobody_gets_any() -> None:
-    memory = Memory(1000)
+    memory = MemoryBudget(1000)
     greedy, late = Account(memory), Account(memory)
     while greedy.has_room(10):
-        greedy.take(10)
+        greedy.reserve(10)
     assert greedy.bytes == 500
-    late.take(10)
+    late.reserve(10)
     while late.has_room(10):
-        late.take(10)
+        late.reserve(10)
     assert late.bytes == 250
     assert not greedy.has_room(1)
-    crowd = [Account(memory) for _ in range(100)]
-    for one in crowd:
+    channel_share = [Account(memory) for _ in range(100)]
+    for one in channel_share:
         while one.has_room(1):
-            one.take(1)
+            one.reserve(1)
     assert memory.bytes <= 1000
     late.count_ranges(1 << 20)
-    assert late.too_many_ranges(RANGES_LEFT + 1)
-    assert not late.too_many_ranges(RANGES_LEFT)
+    assert late.too_many_ranges(MIN_RANGES_PER_PEER + 1)
+    assert not late.too_many_ranges(MIN_RANGES_PER_PEER)

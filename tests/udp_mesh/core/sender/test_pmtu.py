@@ -1,4 +1,4 @@
-"""A path that swallows large datagrams in silence is found out; loss of any other kind is not taken for one."""
+"""A path that silently drops large datagrams is detected; loss of any other kind is not mistaken for that."""
 
 import random
 from collections.abc import Callable
@@ -10,9 +10,9 @@ import pytest
 from tests.udp_mesh.core.pair import BROADCAST, IP_UDP_BYTES, Pipe, World, settings
 from udp_mesh.core.events import MessageDelivered, MessageId, MessageReceived, PathNarrowed, PeerOnline
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.sender.message import Accepted, Channel, Outgoing
-from udp_mesh.core.sender.pmtu import ASK_AT_MOST_EVERY_S, ASKED_TIMES, PathSize
-from udp_mesh.core.sender.sent_packets import Mark, Packet
+from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
+from udp_mesh.core.sender.pmtu import MAX_PROBE_INTERVAL_S, MAX_PROBES, PathMtu
+from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot
 from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
 from udp_mesh.wire.frames import MessageFlag
 
@@ -21,7 +21,7 @@ TOPICS = (Topic("status", priority=0), Topic("map"), Topic("seen", reliable=Fals
 
 @dataclass
 class Narrow(Pipe):
-    """Loses every IP packet above `mtu` and says nothing."""
+    """Silently drops every IP packet above `mtu`."""
 
     mtu: int = 1500
 
@@ -45,25 +45,25 @@ def met(
     for name in ("a", "b"):
         node = world.add(settings(name, *TOPICS, fragment_bytes=fragment_bytes))
         node.link_up(LinkInfo("mesh", LinkKind.BROADCAST, world.addresses[name], BROADCAST, mtu=link_mtu), world.now)
-    for way in world.pipes:
-        world.pipes[way] = Narrow(mtu=mtu, loss=loss, delay_s=delay_s)
+    for path in world.pipes:
+        world.pipes[path] = Narrow(mtu=mtu, loss=loss, delay_s=delay_s)
     assert world.run(20.0, until=partial(knows, world))
     return world
 
 
 def become(world: World, mtu: int) -> None:
-    """Every path carries so much from now on."""
-    for way in world.pipes.values():
-        assert isinstance(way, Narrow)
-        way.mtu = mtu
+    """Set the MTU of every path."""
+    for path in world.pipes.values():
+        assert isinstance(path, Narrow)
+        path.mtu = mtu
 
 
 def narrow(world: World) -> list[int]:
-    return [event.mtu for event in world.told("a", PathNarrowed) if isinstance(event, PathNarrowed)]
+    return [event.mtu for event in world.events_of("a", PathNarrowed) if isinstance(event, PathNarrowed)]
 
 
 def knows(world: World) -> bool:
-    return bool(world.told("a", PeerOnline) and world.told("b", PeerOnline))
+    return bool(world.events_of("a", PeerOnline) and world.events_of("b", PeerOnline))
 
 
 def found_narrow(world: World) -> bool:
@@ -71,7 +71,9 @@ def found_narrow(world: World) -> bool:
 
 
 def topics(world: World, name: str, kind: type[MessageDelivered] | type[MessageReceived]) -> list[str]:
-    return [event.topic for event in world.told(name, kind) if isinstance(event, MessageDelivered | MessageReceived)]
+    return [
+        event.topic for event in world.events_of(name, kind) if isinstance(event, MessageDelivered | MessageReceived)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -97,7 +99,7 @@ def test_a_large_message_crosses_a_path_that_is_narrower_than_its_link(
 
 
 def largest_of(world: World) -> list[int]:
-    """The largest IP packet that leaves a from now on."""
+    """The largest IP packet that a sends from now on."""
     largest = [0]
 
     def look(name: str, datagram: Datagram, _: float) -> None:
@@ -129,7 +131,7 @@ def test_small_messages_that_share_datagrams_cross_a_narrow_path(size_bytes: int
 
 
 def test_messages_that_share_datagrams_do_not_make_them_larger_than_a_full_fragment() -> None:
-    # The loopback, and some tunnels, say that they carry 64 KiB.
+    # The loopback, and some tunnels, claim an MTU of 64 KiB.
     world = met(1500, 0.1, link_mtu=65_535)
     largest = largest_of(world)
     for _ in range(300):
@@ -145,7 +147,7 @@ def test_messages_that_share_datagrams_do_not_make_them_larger_than_a_full_fragm
         (9000, 8192, 1500, [1500]),
         (65_535, 8192, 1500, [1500]),
         (65_535, 8192, 1300, [1500, 1280]),
-        # Its fragments fit 1280 bytes anyhow.
+        # Its fragments fit 1280 bytes anyway.
         (1500, 1000, 900, [576]),
     ],
 )
@@ -175,20 +177,20 @@ def test_a_message_to_all_is_no_larger_than_ethernet_s_packets_whatever_the_link
 def test_a_path_that_is_wide_again_carries_full_fragments_after_some_time() -> None:
     world = met(1280)
     world.send("a", "map", bytes(100_000), "b")
-    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
     become(world, 1500)
     world.run(12.0)
     before = world.pipes[("a", "b")].carried
     world.send("a", "map", bytes(100_000), "b")
-    assert world.run(20.0, until=lambda: len(world.told("a", MessageDelivered)) == 2)
-    # 72 full fragments; 84 would be the smaller ones
+    assert world.run(20.0, until=lambda: len(world.events_of("a", MessageDelivered)) == 2)
+    # 72 full fragments; 84 would be the smaller ones.
     assert world.pipes[("a", "b")].carried - before < 80
 
 
 def test_a_path_that_is_less_narrow_than_it_was_carries_what_it_can() -> None:
     world = met(900)
     world.send("a", "map", bytes(100_000), "b")
-    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
     become(world, 1400)
     world.run(60.0)
     world.pipes["a", "b"].dropped = 0
@@ -202,7 +204,7 @@ def test_a_path_that_is_less_narrow_than_it_was_carries_what_it_can() -> None:
 def test_a_path_that_stays_narrow_is_asked_ever_more_seldom_and_loses_nothing_but_pings() -> None:
     world = met(1400)
     world.send("a", "map", bytes(100_000), "b")
-    assert world.run(20.0, until=lambda: bool(world.told("a", MessageDelivered)))
+    assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
     start = world.now
     large: list[float] = []
 
@@ -217,10 +219,10 @@ def test_a_path_that_stays_narrow_is_asked_ever_more_seldom_and_loses_nothing_bu
         world.at(world.now + 20.0, publish)
 
     publish()
-    world.run(2 * ASK_AT_MOST_EVERY_S + 50.0)
-    # 10, 20, 40 .. 320, 600 s after the one before
-    assert [round(at / 10) * 10 for at in large[::ASKED_TIMES]] == [10, 30, 70, 150, 310, 630, 1240]
-    assert len(large) == 7 * ASKED_TIMES
+    world.run(2 * MAX_PROBE_INTERVAL_S + 50.0)
+    # 10, 20, 40 .. 320, 600 s after the previous one.
+    assert [round(at / 10) * 10 for at in large[::MAX_PROBES]] == [10, 30, 70, 150, 310, 630, 1240]
+    assert len(large) == 7 * MAX_PROBES
     assert narrow(world) == [1280]
 
 
@@ -230,9 +232,9 @@ def test_a_path_taken_for_narrow_by_mistake_is_wide_again_within_minutes_however
         world = met(1280, seed=seed)
         world.send("a", "map", bytes(20_000), "b")
         assert world.run(20.0, until=partial(found_narrow, world))
-        for way in world.pipes.values():
-            assert isinstance(way, Narrow)
-            way.mtu, way.loss = 1500, loss
+        for path in world.pipes.values():
+            assert isinstance(path, Narrow)
+            path.mtu, path.loss = 1500, loss
         largest = largest_of(world)
         for _ in range(200):
             world.send("a", "status", bytes(100), "b")
@@ -244,19 +246,19 @@ def test_a_path_taken_for_narrow_by_mistake_is_wide_again_within_minutes_however
 
 
 def test_a_path_that_carries_large_pings_and_nothing_else_is_asked_ever_more_seldom_too() -> None:
-    size = PathSize()
+    size = PathMtu()
     now = 0.0
     asked: list[float] = []
     while now < 1200.0:
         if size.narrowed_at is None:
-            size.narrowed(now)
-        assert size.asking.carries == 0
-        while not size.asking.due(now, 0.0):
+            size.on_narrowed(now)
+        assert size.probe.confirmed_mtu == 0
+        while not size.probe.due(now, 0.0):
             now += 0.5
         asked.append(now)
-        size.asking.asked(1, 1500)
-        size.answered(1, now)
-        assert size.asking.carries == 1500
+        size.probe.on_probe_sent(1, 1500)
+        size.on_pong(1, now)
+        assert size.probe.confirmed_mtu == 1500
         # Wide again, and narrow soon after.
         now += 5.0
         size.narrowed_at = None
@@ -265,30 +267,32 @@ def test_a_path_that_carries_large_pings_and_nothing_else_is_asked_ever_more_sel
 
 def packet(size_bytes: int, now: float) -> Packet:
     body = bytes(size_bytes)
-    accepted = Accepted(MessageId(1), Channel(0, Topic("t"), "t", ""), body, body, MessageFlag.RELIABLE, now, None)
-    message = Outgoing(accepted, 8, reliable=True)
+    accepted = AcceptedMessage(
+        MessageId(1), TopicChannel(0, Topic("t"), "t", ""), body, body, MessageFlag.RELIABLE, now, None
+    )
+    message = OutgoingMessage(accepted, 8, reliable=True)
     message.begin(1, 1400, 1400)
-    return Packet(Mark(now, 0, now, now, limited=False), message, 0)
+    return Packet(SendSnapshot(now, 0, now, now, app_limited=False), message, 0)
 
 
 def narrowings(hours: float, arrives: Callable[[float], bool], *, large_arrive: bool = True) -> int:
-    """How often a silent peer, probed four times a second, is taken for behind a narrow path."""
-    size = PathSize()
+    """How often the path to an unresponsive peer, probed four times a second, is wrongly narrowed."""
+    size = PathMtu()
     large, small = packet(1350, 0.0), packet(100, 0.0)
     count = 0
     for step in range(int(hours * 3600 * 4)):
         now = step / 4
-        if size.ask_small():
-            size.asked_small()
+        if size.next_probe_is_small():
+            size.on_small_probe_sent()
             if arrives(now):
-                size.answered(0, now)
+                size.on_pong(0, now)
         elif not (arrives(now) and large_arrive):
-            size.lost([large._replace(mark=small.mark._replace(sent_at=now))])
-        elif size.in_doubt:
-            size.arrived([large], 0, now)
-        if size.too_narrow(now):
+            size.on_lost([large._replace(snapshot=small.snapshot._replace(sent_at=now))])
+        elif size.suspect:
+            size.on_acked([large], 0, now)
+        if size.is_black_hole(now):
             count += 1
-            size.narrowed(now)
+            size.on_narrowed(now)
     return count
 
 
@@ -316,14 +320,14 @@ def test_hours_of_cuts_are_not_taken_for_a_narrow_path(cut_s: float, share: floa
 
 def test_no_mistake_comes_of_a_path_that_loses_much_from_one_moment_to_the_next() -> None:
     rng = random.Random(9)
-    # A minute of each, again and again.
+    # A minute of each, repeatedly.
     assert narrowings(10.0, lambda now: rng.random() >= (0.0 if now % 120 < 60 else 0.84)) == 0
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2, 0.36])
 def test_a_silent_peer_behind_a_narrow_path_is_known_for_one_within_seconds(loss: float) -> None:
     rng = random.Random(10)
-    # Every narrowing begins a new doubt: on an average they are so far apart.
+    # Every reduction starts a new suspicion: the average distance between them.
     assert 3600 / narrowings(1.0, lambda _: rng.random() >= loss, large_arrive=False) < 10.0
 
 
@@ -334,8 +338,8 @@ def test_a_long_path_that_loses_most_is_not_taken_for_narrow(round_trip_s: float
         for name in ("a", "b"):
             world.add(settings(name, *TOPICS))
         assert world.run(20.0, until=partial(knows, world))
-        for way in world.pipes.values():
-            way.rate_bits_per_s, way.delay_s, way.loss = 1e6, round_trip_s / 2, loss
+        for path in world.pipes.values():
+            path.rate_bits_per_s, path.delay_s, path.loss = 1e6, round_trip_s / 2, loss
         for tenth in range(300):
             world.send("a", "status", bytes(100), "b")
             world.send("b", "status", bytes(100), "a")
@@ -351,8 +355,8 @@ def test_loss_and_cuts_of_any_size_are_not_taken_for_a_narrow_path(loss: float) 
     rng = random.Random(2)
 
     def cut_or_heal() -> None:
-        for way in world.pipes.values():
-            way.up = not way.up
+        for path in world.pipes.values():
+            path.up = not path.up
         world.at(world.now + rng.uniform(0.05, 1.5), cut_or_heal)
 
     def publish() -> None:
@@ -367,8 +371,8 @@ def test_loss_and_cuts_of_any_size_are_not_taken_for_a_narrow_path(loss: float) 
     assert narrow(world) == []
 
 
-def under_way(world: World) -> list[int]:
-    """Sizes of the datagrams that leave a from now on, as IP packets."""
+def in_flight(world: World) -> list[int]:
+    """Sizes, as IP packets, of the datagrams that a sends from now on."""
     sizes: list[int] = []
     world.tap = lambda name, datagram, _: sizes.append(len(datagram.data) + IP_UDP_BYTES) if name == "a" else None
     world.send("a", "map", bytes(500_000), "b")
@@ -380,7 +384,7 @@ def under_way(world: World) -> list[int]:
 
 def test_what_had_begun_fits_a_link_that_became_narrower() -> None:
     world = met(1500)
-    sizes = under_way(world)
+    sizes = in_flight(world)
     link = LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a"], BROADCAST, mtu=700)
     world.nodes["a"].link_up(link, world.now)
     assert world.run(20.0, until=lambda: bool(topics(world, "a", MessageDelivered)))
@@ -392,7 +396,7 @@ def test_what_had_left_whole_when_the_link_became_narrower_arrives_once() -> Non
     world = met(1500)
     for _ in range(20):
         world.send("a", "map", bytes(3_000), "b")
-        # all of it is on its way, and nothing is acknowledged
+        # All of it is in flight, and nothing is acknowledged.
         world.run(0.012)
         link = LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a"], BROADCAST, mtu=700)
         world.nodes["a"].link_up(link, world.now)
@@ -442,8 +446,8 @@ def test_a_path_that_becomes_long_and_lossy_is_not_taken_for_narrow_nor_does_any
 
     publish()
     world.run(3.0)
-    for way in world.pipes.values():
-        way.delay_s, way.loss = 1.0, loss
+    for path in world.pipes.values():
+        path.delay_s, path.loss = 1.0, loss
     assert world.run(60.0, until=lambda: len(topics(world, "a", MessageDelivered)) == 110)
     world.run(5.0)
     assert narrow(world) == []

@@ -1,4 +1,4 @@
-"""Small urgent pieces leave again: soon where the way loses much, and whenever their answer is overdue."""
+"""Small urgent fragments are sent again: soon on a lossy path, and whenever their acknowledgement is overdue."""
 
 from __future__ import annotations
 
@@ -6,57 +6,59 @@ import pytest
 
 from tests.udp_mesh.core.test_links import Run
 from udp_mesh.core.events import MessageId
-from udp_mesh.core.sender.message import Accepted, Channel, Outgoing
-from udp_mesh.core.sender.redundancy import EARLY, OVERDUE_TIMES, Copies
+from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
+from udp_mesh.core.sender.redundancy import EARLY_COPIES, MAX_OVERDUE_COPIES, RedundantCopies
 from udp_mesh.core.settings import Topic
 from udp_mesh.wire.frames import MessageFlag
 
 GAP_S, OVERDUE_S = 0.003, 0.025
-EARLY_S = [GAP_S, *(gaps * GAP_S for _, gaps in EARLY)]
+EARLY_S = [GAP_S, *(gaps * GAP_S for _, gaps in EARLY_COPIES)]
 
 
-def piece(*, reliable: bool = True) -> Outgoing:
+def fragment(*, reliable: bool = True) -> OutgoingMessage:
     topic = Topic("stop", priority=0, reliable=reliable)
-    accepted = Accepted(MessageId(1), Channel(0, topic, topic.name, ""), b"x", b"x", MessageFlag(0), 0.0, None)
-    message = Outgoing(accepted, 0, reliable=reliable)
+    accepted = AcceptedMessage(
+        MessageId(1), TopicChannel(0, topic, topic.name, ""), b"x", b"x", MessageFlag(0), 0.0, None
+    )
+    message = OutgoingMessage(accepted, 0, reliable=reliable)
     message.begin(0, 1400, 1400)
     return message
 
 
-def sendings(message: Outgoing, *, twice: bool, loss: float, answered_at: float = float("inf")) -> list[float]:
-    """When copies of a piece leave that was sent at 0."""
-    copies = Copies()
-    copies.later(message, 0, 0.0, gap_s=GAP_S, twice=twice, loss=loss, overdue_s=OVERDUE_S)
+def sendings(message: OutgoingMessage, *, twice: bool, loss: float, answered_at: float = float("inf")) -> list[float]:
+    """When copies of a fragment sent at 0 are due."""
+    copies = RedundantCopies()
+    copies.schedule(message, 0, 0.0, gap_s=GAP_S, twice=twice, loss=loss, urgent_timeout_s=OVERDUE_S)
     times = []
     while copies:
         at = copies.next_at()
         if at >= answered_at:
             message.arrived[0] = 1
-        times += [at for _ in copies.due(at, OVERDUE_S)]
+        times += [at for _ in copies.pop_due(at, OVERDUE_S)]
     return times
 
 
 def test_the_more_is_lost_the_more_copies_leave_before_an_answer_can_come() -> None:
     early = [
-        sum(at < OVERDUE_S for at in sendings(piece(), twice=twice, loss=loss))
+        sum(at < OVERDUE_S for at in sendings(fragment(), twice=twice, loss=loss))
         for twice, loss in ((False, 0.0), (True, 0.05), (True, 0.1), (True, 0.2))
     ]
     assert early == [0, 1, 2, 3]
-    assert sendings(piece(), twice=False, loss=0.0) == []
-    assert sendings(piece(), twice=True, loss=0.2)[:3] == pytest.approx(EARLY_S)
+    assert sendings(fragment(), twice=False, loss=0.0) == []
+    assert sendings(fragment(), twice=True, loss=0.2)[:3] == pytest.approx(EARLY_S)
 
 
 def test_an_overdue_answer_brings_another_copy_a_bounded_number_of_times() -> None:
-    later = [at for at in sendings(piece(), twice=True, loss=0.05) if at > GAP_S]
-    assert later == pytest.approx([n * OVERDUE_S for n in range(1, OVERDUE_TIMES + 1)])
+    later = [at for at in sendings(fragment(), twice=True, loss=0.05) if at > GAP_S]
+    assert later == pytest.approx([n * OVERDUE_S for n in range(1, MAX_OVERDUE_COPIES + 1)])
 
 
 def test_an_answer_ends_it() -> None:
-    assert sendings(piece(), twice=True, loss=0.2, answered_at=0.02) == pytest.approx(EARLY_S)
+    assert sendings(fragment(), twice=True, loss=0.2, answered_at=0.02) == pytest.approx(EARLY_S)
 
 
 def test_best_effort_is_copied_early_only_since_nobody_answers_for_it() -> None:
-    message = piece(reliable=False)
+    message = fragment(reliable=False)
     message.ended = True
     assert sendings(message, twice=True, loss=0.2) == pytest.approx(EARLY_S)
 
@@ -65,10 +67,10 @@ def test_the_window_does_not_go_by_urgent_packets_that_pass_the_others() -> None
     run = Run(urgent=True)
     run.start()
     run.world.run(3.0)
-    outbound = run.world.nodes["a"]._state.roster.peers["b"].outbound
-    smoothed = outbound.trip.smoothed
-    assert not outbound._sample(0.001, run.world.now, urgent=True)
-    assert outbound.trip.smoothed == smoothed
-    assert outbound._sample(0.030, run.world.now, urgent=False)
-    # where nothing else is sent urgent packets are all there is to measure
-    assert outbound._sample(0.001, run.world.now + 10.0, urgent=True)
+    sender = run.world.nodes["a"]._state.peer_table.peers["b"].sender
+    smoothed = sender.rtt.smoothed_rtt
+    assert not sender._sample(0.001, run.world.now, urgent=True)
+    assert sender.rtt.smoothed_rtt == smoothed
+    assert sender._sample(0.030, run.world.now, urgent=False)
+    # With no other traffic, urgent packets are all there is to measure.
+    assert sender._sample(0.001, run.world.now + 10.0, urgent=True)

@@ -1,4 +1,4 @@
-"""Strict priority, decided per fragment when a datagram leaves."""
+"""Strict priority, decided per fragment when a datagram is built."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -6,17 +6,17 @@ from hypothesis import strategies as st
 from tests.udp_mesh.core.pair import World, pair, settings
 from udp_mesh.core.events import MessageId, MessageReceived, TopicStarved
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.sender.message import Accepted, Channel, Outgoing
+from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
 from udp_mesh.core.sender.scheduler import Scheduler
 from udp_mesh.core.settings import Topic
 from udp_mesh.wire.frames import MessageFlag
 
 
-def outgoing(priority: int, fragments: int) -> Outgoing:
-    channel = Channel(0, Topic("t", priority=priority), "t", "")
+def outgoing(priority: int, fragments: int) -> OutgoingMessage:
+    channel = TopicChannel(0, Topic("t", priority=priority), "t", "")
     body = bytes(10 * fragments)
-    message = Outgoing(
-        Accepted(MessageId(1), channel, body, body, MessageFlag.RELIABLE, 0.0, None), priority, reliable=True
+    message = OutgoingMessage(
+        AcceptedMessage(MessageId(1), channel, body, body, MessageFlag.RELIABLE, 0.0, None), priority, reliable=True
     )
     message.begin(1, 10, 10)
     return message
@@ -39,9 +39,9 @@ def test_no_lower_priority_leaves_while_a_higher_one_waits_and_every_piece_leave
 ) -> None:
     scheduler = Scheduler()
     waiting: list[tuple[int, int]] = []
-    """(priority, serial of the message) of every piece that waits: the obvious slow version."""
-    messages: list[Outgoing] = []
-    left: list[tuple[Outgoing, int]] = []
+    """(priority, serial of the message) of every waiting fragment: the simple slow model."""
+    messages: list[OutgoingMessage] = []
+    left: list[tuple[OutgoingMessage, int]] = []
 
     def take(most: int) -> None:
         if not scheduler.waiting:
@@ -51,7 +51,7 @@ def test_no_lower_priority_leaves_while_a_higher_one_waits_and_every_piece_leave
         if run is None:
             return
         count = min(most, run.length)
-        scheduler.take(run, count)
+        scheduler.consume(run, count)
         for position in range(run.position, run.position + count):
             assert run.message.priority == min(level for level, _ in waiting)
             waiting.remove((run.message.priority, messages.index(run.message)))
@@ -67,10 +67,10 @@ def test_no_lower_priority_leaves_while_a_higher_one_waits_and_every_piece_leave
             take(number)
         elif what == "lose" and left:
             message, position = left.pop(number % len(left))
-            scheduler.push_again(message, position)
+            scheduler.push_retransmit(message, position)
             waiting.append((message.priority, messages.index(message)))
         elif what == "aside":
-            scheduler.set_aside(number)
+            scheduler.demote_stale(number)
     while scheduler.waiting:
         take(3)
     assert not waiting
@@ -81,11 +81,11 @@ def test_fresh_urgent_messages_overtake_those_set_aside() -> None:
     scheduler = Scheduler()
     stale, fresh = outgoing(0, 1), outgoing(0, 1)
     scheduler.push(stale)
-    scheduler.set_aside(3)
+    scheduler.demote_stale(3)
     scheduler.push(fresh)
     order = []
     while (run := scheduler.peek(0)) is not None:
-        scheduler.take(run, 1)
+        scheduler.consume(run, 1)
         order.append(run.message)
     assert order == [fresh, stale]
 
@@ -126,8 +126,8 @@ def test_a_level_that_never_gets_its_turn_is_reported() -> None:
         world.send("a", "hog", bytes(1_000_000), "b")
     world.send("a", "starving", b"please", "b")
     world.run(8.0)
-    told = world.told("a", TopicStarved)
-    assert [event.topic for event in told if isinstance(event, TopicStarved)] == ["starving"]
+    events = world.events_of("a", TopicStarved)
+    assert [event.topic for event in events if isinstance(event, TopicStarved)] == ["starving"]
     queues = {queue.priority: queue for queue in world.nodes["a"].conditions(world.now).peers[0].queues}
     assert queues[12].starved_s > 5
     assert queues[5].starved_s == 0

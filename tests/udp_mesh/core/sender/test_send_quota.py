@@ -1,62 +1,63 @@
-"""How many packets may leave: while acknowledgements are late the link is presumed to go on, for a bounded time."""
+"""How many packets may be sent: while acknowledgements are late the link is assumed to keep delivering, for a bounded
+time."""
 
 from __future__ import annotations
 
 import pytest
 
 from tests.udp_mesh.core.test_links import Run
-from udp_mesh.core.sender.send_quota import PRESUMED_FOR_S, ack_spacing, permitted, window_room
-from udp_mesh.core.sender.sender import Outbound
+from udp_mesh.core.sender.send_quota import ASSUMED_DELIVERY_S, ack_spacing, cwnd_room, send_quota
+from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Settings
 
 
-def busy_outbound(**link: object) -> tuple[Outbound, float]:
-    """The sending half that has filled its link for a while, and the time of its last acknowledgement."""
+def busy_outbound(**link: object) -> tuple[Sender, float]:
+    """A sender that has filled its link for a while, and the time of its last acknowledgement."""
     run = Run(urgent=False)
     run.link(**link)
     run.start()
     run.world.run(3.0)
-    outbound = run.world.nodes["a"]._state.roster.peers["b"].outbound
-    return outbound, outbound.last_progress
+    sender = run.world.nodes["a"]._state.peer_table.peers["b"].sender
+    return sender, sender.last_progress
 
 
-def room(outbound: Outbound, now: float) -> int:
-    return permitted(outbound, window_room(outbound, now), now, None, urgent=True)
+def room(sender: Sender, now: float) -> int:
+    return send_quota(sender, cwnd_room(sender, now), now, None, urgent=True)
 
 
 def test_late_acknowledgements_do_not_stop_the_link() -> None:
-    outbound, heard = busy_outbound()
-    capacity = outbound.window.capacity()
+    sender, heard = busy_outbound()
+    capacity = sender.congestion.capacity_packets_per_s()
     assert capacity is not None
-    later = room(outbound, heard + 0.025) - room(outbound, heard)
+    later = room(sender, heard + 0.025) - room(sender, heard)
     assert 0.010 * capacity <= later <= 0.025 * capacity
 
 
 def test_what_is_presumed_is_bounded() -> None:
-    outbound, heard = busy_outbound()
-    capacity = outbound.window.capacity()
+    sender, heard = busy_outbound()
+    capacity = sender.congestion.capacity_packets_per_s()
     assert capacity is not None
-    assert room(outbound, heard + 10.0) - room(outbound, heard) <= PRESUMED_FOR_S * capacity + 1
+    assert room(sender, heard + 10.0) - room(sender, heard) <= ASSUMED_DELIVERY_S * capacity + 1
 
 
 def test_nothing_is_presumed_of_a_link_whose_queue_is_not_ours() -> None:
-    outbound, heard = busy_outbound()
-    least = outbound.trip.least
-    assert least is not None
+    sender, heard = busy_outbound()
+    min_rtt = sender.rtt.min_rtt
+    assert min_rtt is not None
     for step in range(40):
-        outbound.trip.sample(least + 0.1, heard + 0.005 * step)
-    assert room(outbound, heard + 0.06) == room(outbound, heard)
+        sender.rtt.sample(min_rtt + 0.1, heard + 0.005 * step)
+    assert room(sender, heard + 0.06) == room(sender, heard)
 
 
 def test_a_fixed_window_stays_what_it_is() -> None:
-    outbound = Outbound(Settings("a", unkeyed=True, window=3))
-    assert room(outbound, 100.0) == 3 + outbound.rates.urgent_excess_packets
+    sender = Sender(Settings("a", unkeyed=True, window=3))
+    assert room(sender, 100.0) == 3 + sender.rates.urgent_excess_packets
 
 
 @pytest.mark.parametrize(("loss", "fewest", "most"), [(0.0, 4, 7), (0.2, 2, 3)])
 def test_a_lossy_way_back_is_asked_more_often(loss: float, fewest: int, most: int) -> None:
-    outbound, _ = busy_outbound(loss=loss)
-    assert fewest <= ack_spacing(outbound) <= most
+    sender, _ = busy_outbound(loss=loss)
+    assert fewest <= ack_spacing(sender) <= most
 
 
 def test_bursts_that_swallow_whole_trains_of_acknowledgements_cost_little() -> None:
@@ -66,7 +67,7 @@ def test_bursts_that_swallow_whole_trains_of_acknowledgements_cost_little() -> N
             state = [False]
 
             def lost(rng: object, _: float, state: list[bool] = state) -> bool:
-                # Gilbert and Elliott's chain per frame: bursts of ten frames, a fifth of all.
+                # Gilbert-Elliott loss per frame: bursts of ten frames, a fifth of all.
                 state[0] = rng.random() >= 0.1 if state[0] else rng.random() < 0.025  # type: ignore[attr-defined]
                 return state[0]
 
