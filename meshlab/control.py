@@ -102,7 +102,7 @@ class Operations:
         """The answer to one request; what went wrong is one, too."""
         asked = request.get("op")
         try:
-            return await self.carry_out(request, descriptors)
+            return await self.dispatch(request, descriptors)
         except MeshctlError as error:
             return {"error": str(error), "hint": error.hint}
         except Exception as error:
@@ -113,7 +113,7 @@ class Operations:
                 "hint": "its log has more",
             }
 
-    async def carry_out(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
+    async def dispatch(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
         """What the request asks for. Raises MeshctlError for what the fleet refuses, anything for a fault of ours."""
         if request["op"] == "exec":
             return await self.execute(request["node"], request["command"], descriptors)
@@ -124,9 +124,9 @@ class Operations:
 
     def status(self) -> dict[str, Any]:
         fleet = self._fleet
-        reached = fleet.ether.reached()
+        reached = fleet.link_state.reachable()
         doors: dict[str, list[str]] = {}
-        for host, door in fleet.doors.wanted().items():
+        for host, door in fleet.port_forwarder.reachable().items():
             doors.setdefault(door.node, []).append(host)
         nodes = [
             {
@@ -140,19 +140,25 @@ class Operations:
                 "plugged": state.plugged,
                 "in_mesh": name in reached,
                 "reached_at": sorted(doors.get(name, [])),
-                "breaks": state.breaks,
+                "breaks": state.faults,
             }
             for name, state in fleet.nodes.items()
         ]
         links = [
             {"between": [link.a, link.b], "up": link.up, "tq": link.tq_to(link.b), "delay_ms": link.delay_ms,
              "loss": link.loss, "loss_back": link.loss_to(link.a), "rate_kbps": link.rate_kbps}
-            for link in fleet.ether.links()
+            for link in fleet.link_state.links()
         ]  # fmt: skip
-        return {"fleet": fleet.spec.name, "pid": os.getpid(), "port": fleet.doors.port, "nodes": nodes, "links": links}
+        return {
+            "fleet": fleet.spec.name,
+            "pid": os.getpid(),
+            "port": fleet.port_forwarder.port,
+            "nodes": nodes,
+            "links": links,
+        }
 
     def node(self, node: str) -> dict[str, Any]:
-        state = self._fleet.hurt.find(node)
+        state = self._fleet.faults.node(node)
         return {
             "power": state.power.value,
             "reason": state.reason,
@@ -164,43 +170,43 @@ class Operations:
 
     def console(self, node: str, lines: int) -> dict[str, Any]:
         """The last lines of what its boot scripts printed, of all boots; it works for a node without power, too."""
-        file = self._fleet.hurt.find(node).home / "console.log"
+        file = self._fleet.faults.node(node).home / "console.log"
         text = file.read_text(encoding="utf-8", errors="replace") if file.exists() else ""
         return {"text": "\n".join(text.splitlines()[-lines:])}
 
     async def execute(self, node: str, command: str, descriptors: list[int]) -> dict[str, Any]:
-        self._fleet.hurt.find(node)
-        event, _ = await self._fleet.ask_for({"do": "exec", "node": node, "command": command}, descriptors)
+        self._fleet.faults.node(node)
+        event, _ = await self._fleet.request({"do": "exec", "node": node, "command": command}, descriptors)
         return {"status": event["status"], "reason": event.get("reason", "")}
 
     async def power_cut(self, node: str, unsynced: str, back: bool) -> None:
-        await self._fleet.hurt.power_cut(self._fleet.hurt.find(node), unsynced, back=back)
+        await self._fleet.faults.power_cut(self._fleet.faults.node(node), unsynced, back=back)
 
     def power_on(self, node: str) -> None:
-        self._fleet.power_on(self._fleet.hurt.find(node).spec.name)
+        self._fleet.power_on(self._fleet.faults.node(node).spec.name)
 
     async def do_break(self, where: str, what: str) -> None:
-        await self._fleet.hurt.do(where, what)
+        await self._fleet.faults.inject(where, what)
 
     async def mend(self, where: str) -> None:
-        await self._fleet.hurt.mend(where)
+        await self._fleet.faults.repair(where)
 
     def link(self, a: str, b: str, changes: dict[str, Any]) -> None:
-        self._fleet.ether.set_link(a, b, changes)
+        self._fleet.link_state.set_link(a, b, changes)
 
     def links(self, part: list[dict[str, Any]], is_last: bool) -> None:
         """Who hears whom from now on, in parts because a request has its limit (`standing.stand_on`)."""
-        self._fleet.ether.coming += [LinkSpec(**link) for link in part]
+        self._fleet.link_state.pending_links += [LinkSpec(**link) for link in part]
         if is_last:
-            links, self._fleet.ether.coming = self._fleet.ether.coming, []
-            self._fleet.ether.set_ground(links)
+            links, self._fleet.link_state.pending_links = self._fleet.link_state.pending_links, []
+            self._fleet.link_state.set_base_links(links)
 
     def plug(self, node: str, plugged: bool) -> None:
-        self._fleet.hurt.find(node).plugged = plugged
-        self._fleet.ether.changed()
+        self._fleet.faults.node(node).plugged = plugged
+        self._fleet.link_state.changed()
 
     async def record_steps(self, node: str) -> None:
-        await self._fleet.hurt.count_steps(self._fleet.hurt.find(node))
+        await self._fleet.faults.count_steps(self._fleet.faults.node(node))
 
     def down(self) -> None:
         self._fleet.stopping.set()

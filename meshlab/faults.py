@@ -12,7 +12,7 @@ from enum import Enum
 from meshctl.errors import InputError
 
 
-class Break(Enum):
+class Fault(Enum):
     """The value is the word on the command line."""
 
     CUT = "power-cut"
@@ -31,61 +31,61 @@ class Break(Enum):
     SSH_HANG = "ssh-hang"
 
 
-BREAKS: dict[Break, str] = {
-    Break.CUT: "power cut and back at once; what was not synced is lost (@STEP: when it comes to that command)",
-    Break.CUT_KEPT: "the same, but the kernel had just written everything",
-    Break.CUT_TORN: "the same, but files not synced are there and empty",
-    Break.OFF: "power cut, and it stays off until mended",
-    Break.SEVER: "every link of the node goes down (@STEP: when it comes to that command)",
-    Break.LINK_DOWN: "the link, or every link of the node, goes down",
-    Break.SLOW: "the link, or every link of the node: 300 ms, 5 % loss, 256 kbit/s",
-    Break.FULL_FLASH: "no space left in flash but 8 KiB",
-    Break.FULL_MEMORY: "/tmp full and 2 MiB of memory left",
-    Break.WRONG_BOARD: "the node says it is another board (from its next boot on)",
-    Break.HOST_KEY: "the SSH host keys are other ones, and stay so",
-    Break.FOREIGN_DELTA: "somebody left an uncommitted UCI change",
-    Break.CLOCK: "the clock is ten years back",
-    Break.SSH_HANG: "SSH connections are accepted and then nothing happens",
+FAULTS: dict[Fault, str] = {
+    Fault.CUT: "power cut and back at once; what was not synced is lost (@STEP: when it comes to that command)",
+    Fault.CUT_KEPT: "the same, but the kernel had just written everything",
+    Fault.CUT_TORN: "the same, but files not synced are there and empty",
+    Fault.OFF: "power cut, and it stays off until mended",
+    Fault.SEVER: "every link of the node goes down (@STEP: when it comes to that command)",
+    Fault.LINK_DOWN: "the link, or every link of the node, goes down",
+    Fault.SLOW: "the link, or every link of the node: 300 ms, 5 % loss, 256 kbit/s",
+    Fault.FULL_FLASH: "no space left in flash but 8 KiB",
+    Fault.FULL_MEMORY: "/tmp full and 2 MiB of memory left",
+    Fault.WRONG_BOARD: "the node says it is another board (from its next boot on)",
+    Fault.HOST_KEY: "the SSH host keys are other ones, and stay so",
+    Fault.FOREIGN_DELTA: "somebody left an uncommitted UCI change",
+    Fault.CLOCK: "the clock is ten years back",
+    Fault.SSH_HANG: "SSH connections are accepted and then nothing happens",
 }
-STEPPED = frozenset({Break.CUT, Break.SEVER})
+STEP_FAULTS = frozenset({Fault.CUT, Fault.SEVER})
 # what a link takes, too
-OF_LINKS = frozenset({Break.LINK_DOWN, Break.SLOW})
+LINK_FAULTS = frozenset({Fault.LINK_DOWN, Fault.SLOW})
 SLOW_DELAY_MS = 300.0
 SLOW_LOSS = 0.05
 SLOW_RATE_KBPS = 256
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class FaultRequest:
     """`step` is empty for at once."""
 
-    what: Break
+    fault: Fault
     step: str = ""
 
 
-def told(order: Order) -> str:
+def describe(request: FaultRequest) -> str:
     """What happens now, or what will and when, for whoever ordered it."""
-    text = BREAKS[order.what].partition(" (@STEP")[0]
-    if not order.step:
+    text = FAULTS[request.fault].partition(" (@STEP")[0]
+    if not request.step:
         return text
-    if order.step == "flash":
+    if request.step == "flash":
         return f"{text}; in the middle of its next flash"
     return f"{text}; " + (
-        f"at command {order.step} that it runs from now on"
-        if order.step.isdecimal()
-        else f"before the first command whose words hold {order.step!r}"
+        f"at command {request.step} that it runs from now on"
+        if request.step.isdecimal()
+        else f"before the first command whose words hold {request.step!r}"
     )
 
 
-def parse(text: str) -> Order:
+def parse(text: str) -> FaultRequest:
     """`power-cut@7` -> Order. Raises InputError naming the words there are."""
     word, _, step = text.partition("@")
     try:
-        what = Break(word)
+        what = Fault(word)
     except ValueError:
         raise InputError(
-            f"no break is called {word!r}", hint="there are: " + ", ".join(one.value for one in Break)
+            f"no break is called {word!r}", hint="there are: " + ", ".join(one.value for one in Fault)
         ) from None
-    if step and what not in STEPPED:
+    if step and what not in STEP_FAULTS:
         raise InputError(f"{word} happens at once and takes no @STEP")
-    return Order(what, step)
+    return FaultRequest(what, step)

@@ -203,7 +203,7 @@ class VirtualFleet:
             process.wait()
             raise
         self._process = process
-        weakref.finalize(self, _let_go, process)
+        weakref.finalize(self, _detach, process)
         return self
 
     def _check_programs(self) -> None:
@@ -216,7 +216,7 @@ class VirtualFleet:
             if process.poll() is not None:
                 words = failure.read_text(encoding="utf-8").splitlines() if failure.exists() else []
                 reason = words[0] if words else f"its process ended with status {process.returncode}"
-                hint = words[1] if len(words) > 1 and words[1] else self._last_words()
+                hint = words[1] if len(words) > 1 and words[1] else self._log_tail()
                 raise LabError(f"the virtual fleet did not start: {reason}", hint=hint)
             if not (self.directory / "supervisor.pid").exists() or not is_running(self.directory):
                 return False
@@ -232,7 +232,7 @@ class VirtualFleet:
 
         wait_for(booted, f"{len(self.spec.nodes)} nodes to boot; see {self.directory / 'log'}", wait_s)
 
-    def _last_words(self) -> str:
+    def _log_tail(self) -> str:
         lines = (self.directory / "log").read_text(encoding="utf-8", errors="replace").splitlines()
         return "\n".join(lines[-_LOG_LINES:])
 
@@ -241,7 +241,7 @@ class VirtualFleet:
 
         Returns quietly when no fleet runs there.
         """
-        if end(self.directory) and self._process is not None:
+        if stop_fleet(self.directory) and self._process is not None:
             self._process.wait()
 
     # -- nodes, addresses, links --
@@ -276,11 +276,11 @@ class VirtualFleet:
         """`VirtualNode.bench` of the node called `name`."""
         return self.node(name).bench
 
-    def break_(self, where: str, what: str) -> None:
+    def inject_fault(self, where: str, what: str) -> None:
         """`where` is a node or a link (`b01-b02`), `what` one of `breaks.BREAKS` (`power-cut@7`, `full-flash`, ...)."""
         self.ask("do_break", where=where, what=what)
 
-    def mend(self, where: str = "") -> None:
+    def repair(self, where: str = "") -> None:
         """Undo every break (of one node or link): links up, power on, flash freed, bricked nodes recovered."""
         self.ask("mend", where=where)
 
@@ -311,7 +311,7 @@ class VirtualFleet:
         self.down()
 
 
-def end(directory: Path) -> str:
+def stop_fleet(directory: Path) -> str:
     """End the fleet that runs in `directory`, whatever version started it; its name, or nothing when none runs."""
     try:
         status = request(directory, {"op": "status"})
@@ -339,7 +339,7 @@ def wait_for(condition: Callable[[], bool], what: str, wait_s: float) -> None:
         time.sleep(_POLL_S)
 
 
-def _let_go(process: subprocess.Popen[bytes]) -> None:
+def _detach(process: subprocess.Popen[bytes]) -> None:
     """The supervisor outlives whoever started it: Popen need not warn about that."""
     if process.returncode is None:
         process.returncode = 0

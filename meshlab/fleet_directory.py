@@ -25,7 +25,7 @@ _MARK_TEXT = "`meshctl lab up` made this directory, and replaces the fleet and t
 # the digests of the inventory's copy as it was made, to recognize edits
 _DIGESTS = "inventory.digests.json"
 # the earlier copy, until the new one stands in its place
-_BEFORE = "before"
+_PREVIOUS = "before"
 _FOLDERS = ("rom", "nodes", "mnt")
 _FILES = ("bell", "failure", "control.sock", "supervisor.pid", "log", "ground.json")
 
@@ -89,26 +89,26 @@ def replace_inventory(folder: Path, directory: Path, *, without: Iterable[str] =
         inside = {name for name in names if Path(place, name).resolve() == own}
         return inside | (set(without) if place == top else set())
 
-    fresh = Path(tempfile.mkdtemp(prefix=f".{INVENTORY}.", dir=directory))
+    staging = Path(tempfile.mkdtemp(prefix=f".{INVENTORY}.", dir=directory))
     try:
-        shutil.copytree(folder, fresh / INVENTORY, ignore=left_out)
-        kept = _set_aside(target, fresh, is_source=folder.resolve() == target.resolve())
-        (fresh / INVENTORY).rename(target)
+        shutil.copytree(folder, staging / INVENTORY, ignore=left_out)
+        kept = _keep_edited_copy(target, staging, is_source=folder.resolve() == target.resolve())
+        (staging / INVENTORY).rename(target)
     except (OSError, shutil.Error) as error:
-        if not target.exists() and (fresh / _BEFORE).exists():
-            (fresh / _BEFORE).rename(target)
+        if not target.exists() and (staging / _PREVIOUS).exists():
+            (staging / _PREVIOUS).rename(target)
         raise InputError(f"{folder} cannot be copied to {target}: {error}") from error
     finally:
-        shutil.rmtree(fresh, ignore_errors=True)
+        shutil.rmtree(staging, ignore_errors=True)
     return kept
 
 
-def _set_aside(target: Path, bin_: Path, *, is_source: bool) -> Path | None:
+def _keep_edited_copy(target: Path, staging: Path, *, is_source: bool) -> Path | None:
     """Take away the earlier copy: into `bin_`, or when it was edited and is not copied again, to a name of its own."""
     if not target.exists() and not target.is_symlink():
         return None
-    if is_source or digests(target) == _noted(target.parent):
-        target.rename(bin_ / _BEFORE)
+    if is_source or digests(target) == _recorded_digests(target.parent):
+        target.rename(staging / _PREVIOUS)
         return None
     stem = f"{target.name}.kept-{time.strftime('%Y%m%dT%H%M%S')}"
     free = (target.with_name(stem + ending) for ending in ("", *(f"-{number}" for number in range(2, 1000))))
@@ -117,13 +117,13 @@ def _set_aside(target: Path, bin_: Path, *, is_source: bool) -> Path | None:
     return kept
 
 
-def note_inventory(directory: Path) -> None:
+def record_digests(directory: Path) -> None:
     """Remember how the copy is now, to recognize edits later."""
     text = json.dumps(digests(directory / INVENTORY), indent=1)
     (directory / _DIGESTS).write_text(text, encoding="utf-8")
 
 
-def _noted(directory: Path) -> dict[str, str] | None:
+def _recorded_digests(directory: Path) -> dict[str, str] | None:
     try:
         found: dict[str, str] = json.loads((directory / _DIGESTS).read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -9,7 +9,7 @@ from meshctl.model import Fleet, Node, Robot, Role
 from meshlab.spec import MESH_PACKAGES, FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
 
 # up to here a fleet's default shape is a chain
-_CHAIN_NODES = 12
+_MAX_CHAIN_NODES = 12
 # locally administered, so that no real device has it: two bytes of fleet-wide prefix, then the node, then the radio
 _MAC = "02:4d:{:02x}:{:02x}:00:{:02x}"
 
@@ -37,7 +37,7 @@ def spec_of(
 def default_links(names: Sequence[str]) -> list[LinkSpec]:
     """A chain with a weaker link past every second node; for more than a team, a tree, every node having three behind
     it: batman-adv's quality is used up after some thirty hops."""
-    if len(names) > _CHAIN_NODES:
+    if len(names) > _MAX_CHAIN_NODES:
         return [LinkSpec(names[(number - 1) // 3], name, tq=250) for number, name in enumerate(names) if number]
     chain = [LinkSpec(a, b, tq=250, signal_dbm=-58) for a, b in pairwise(names)]
     past = [LinkSpec(a, b, tq=120, signal_dbm=-79) for a, b in list(zip(names, names[2:], strict=False))[::2]]

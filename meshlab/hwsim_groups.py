@@ -39,7 +39,7 @@ def assign(nodes: Sequence[str], edges: Iterable[tuple[str, str]]) -> dict[str, 
             for other in joined[name]:
                 masks[name] |= 1 << _pair_bit(place[name], place[other])
         return masks
-    cliques = cover(nodes, joined)
+    cliques = clique_cover(nodes, joined)
     if len(cliques) > GROUP_BITS:
         edge_count = sum(map(len, joined.values())) // 2
         raise InputError(
@@ -52,7 +52,7 @@ def assign(nodes: Sequence[str], edges: Iterable[tuple[str, str]]) -> dict[str, 
     return masks
 
 
-def cover(nodes: Sequence[str], joined: Mapping[str, set[str]]) -> list[list[str]]:
+def clique_cover(nodes: Sequence[str], joined: Mapping[str, set[str]]) -> list[list[str]]:
     """Cliques that hold every edge of the graph at least once, and no pair that is not an edge; sorted by `nodes`.
 
     Each clique grows from the first edge not yet covered, by the node that adds most of those.
@@ -76,7 +76,7 @@ def cover(nodes: Sequence[str], joined: Mapping[str, set[str]]) -> list[list[str
     return cliques
 
 
-def steps(old: Mapping[str, int], new: Mapping[str, int]) -> list[tuple[str, int]]:
+def transition(old: Mapping[str, int], new: Mapping[str, int]) -> list[tuple[str, int]]:
     """The masks to write, in order, to get from `old` to `new` one radio at a time.
 
     First each radio keeps the bits it has in both, which joins no pair that was not joined; then each takes its new

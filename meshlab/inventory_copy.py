@@ -30,7 +30,7 @@ _KNOWN_HOSTS = "known_hosts"
 
 
 @dataclass(frozen=True, slots=True)
-class Copy:
+class InventoryCopy:
     """The copied inventory's path, what it says, its login key, and the links file's content (None: no file).
 
     `kept` is where an earlier copy with edits was moved to, None when there was none.
@@ -43,7 +43,7 @@ class Copy:
     kept: Path | None = None
 
 
-def prepare(source: Path, directory: Path, *, environ: Mapping[str, str] = os.environ) -> Copy:
+def copy_inventory(source: Path, directory: Path, *, environ: Mapping[str, str] = os.environ) -> InventoryCopy:
     """Copy the inventory `source` (a file or a directory) into `directory`; a key that is there is kept.
 
     `source` may be the earlier copy. Raises InvalidInput with the diagnostics of an inventory that has errors, LabError
@@ -64,10 +64,10 @@ def prepare(source: Path, directory: Path, *, environ: Mapping[str, str] = os.en
     if fleet.operators.known_hosts != _KNOWN_HOSTS:
         editor.set(("operators", "known_hosts"), _KNOWN_HOSTS)
     save(editor.changes())
-    fleet_directory.note_inventory(directory)
+    fleet_directory.record_digests(directory)
     links = target / LINKS_FILE
-    heard = list(links_of(propagation_file.load(links))) if links.exists() else None
-    return Copy(copied, load_fleet(copied, environ=environ), key_file, heard, kept)
+    link_specs = list(links_of(propagation_file.load(links))) if links.exists() else None
+    return InventoryCopy(copied, load_fleet(copied, environ=environ), key_file, link_specs, kept)
 
 
 def _key_pair(path: Path) -> str:

@@ -26,7 +26,7 @@ _ATTEMPTS = 7
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class WirelessInterface:
     """One radio interface that is up: everything that must be equal for two of them to hear each other, and its MAC.
 
     `soft` is the batman-adv interface it belongs to, `-` for none.
@@ -49,10 +49,10 @@ class Cell:
     def medium(self) -> tuple[str, int, str, str, str, str]:
         return (self.mode, self.frequency_mhz, self.ssid, self.bssid.lower(), self.algorithm, self.key)
 
-    def hears(self, other: Cell) -> bool:
+    def hears(self, other: WirelessInterface) -> bool:
         return self.medium == other.medium
 
-    def routes_with(self, other: Cell) -> bool:
+    def routes_with(self, other: WirelessInterface) -> bool:
         """Both feed a batman-adv of the same routing algorithm; IV and V do not understand each other."""
         return self.soft != "-" and other.soft != "-" and self.routing == other.routing
 
@@ -73,10 +73,10 @@ class Address:
 
 
 @dataclass(frozen=True, slots=True)
-class Effective:
+class EffectiveState:
     """What a node really does at this moment, as its netifd stand-in wrote it."""
 
-    cells: tuple[Cell, ...] = ()
+    interfaces: tuple[WirelessInterface, ...] = ()
     addresses: tuple[Address, ...] = ()
 
     def holds(self, address: str, *, over: str) -> bool:
@@ -98,15 +98,15 @@ class Effective:
 class Edge:
     """A cell that hears another, `peer` of `node`; `tq` (0..255) is the quality of sending there, 0 when it is deaf."""
 
-    own: Cell
-    peer: Cell
+    own: WirelessInterface
+    peer: WirelessInterface
     node: str
     link: LinkSpec
     tq: int
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class Route:
     """The best way from one node to another: TQ at its end, first hop, the links on it, and each hop with who sends."""
 
     tq: int
@@ -115,23 +115,25 @@ class Path:
     hops: tuple[tuple[str, Edge], ...] = ()
 
 
-def parse_effective(text: str) -> Effective:
+def parse_effective(text: str) -> EffectiveState:
     """The content of air/effective: `cell` and `addr` lines, tab-separated (node_root/lab/netifd.awk, admitted.awk)."""
-    cells, addresses = [], []
+    interfaces, addresses = [], []
     for line in text.splitlines():
         match line.split("\t"):
             case ["cell", _, interface, mode, frequency, ssid, bssid, algorithm, key, mac, soft, routing, *index]:
                 number = int(index[0]) if index else 0
-                cells.append(
-                    Cell(interface, mode, int(frequency), ssid, bssid, algorithm, key, mac, soft, routing, number)
+                interfaces.append(
+                    WirelessInterface(
+                        interface, mode, int(frequency), ssid, bssid, algorithm, key, mac, soft, routing, number
+                    )
                 )
             case ["addr", interface, _, address, prefix, over_mesh, over_wire, *admitted]:
                 flags = over_mesh == "1", over_wire == "1", admitted != ["0"]
                 addresses.append(Address(interface, address, int(prefix), *flags))
-    return Effective(tuple(cells), tuple(addresses))
+    return EffectiveState(tuple(interfaces), tuple(addresses))
 
 
-def edges(nodes: Mapping[str, Effective], links: Iterable[LinkSpec]) -> dict[str, list[Edge]]:
+def edges(nodes: Mapping[str, EffectiveState], links: Iterable[LinkSpec]) -> dict[str, list[Edge]]:
     """Whom each node hears: over links that are up, in a cell they share, unless the link loses everything."""
     found: dict[str, list[Edge]] = {name: [] for name in nodes}
     for link in links:
@@ -143,16 +145,16 @@ def edges(nodes: Mapping[str, Effective], links: Iterable[LinkSpec]) -> dict[str
             tq = link.tq_to(other)
             found[own].extend(
                 Edge(cell, peer, other, link, tq)
-                for cell in nodes[own].cells
-                for peer in nodes[other].cells
+                for cell in nodes[own].interfaces
+                for peer in nodes[other].interfaces
                 if cell.hears(peer)
             )
     return found
 
 
-def paths(graph: Mapping[str, list[Edge]], start: str) -> dict[str, Path]:
+def best_routes(graph: Mapping[str, list[Edge]], start: str) -> dict[str, Route]:
     """The best batman-adv path from `start` to every node it reaches."""
-    best: dict[str, Path] = {}
+    best: dict[str, Route] = {}
     count = itertools.count()
     queue: list[tuple[int, int, str, int, tuple[tuple[str, Edge], ...]]] = [(-TQ_MAX, 0, start, next(count), ())]
     settled: set[str] = set()
@@ -162,7 +164,7 @@ def paths(graph: Mapping[str, list[Edge]], start: str) -> dict[str, Path]:
             continue
         settled.add(name)
         if hops:
-            best[name] = Path(-negative, hops[0][1], tuple(edge.link for _, edge in hops), hops)
+            best[name] = Route(-negative, hops[0][1], tuple(edge.link for _, edge in hops), hops)
         for edge in graph.get(name, ()):
             if edge.node in settled or not edge.own.routes_with(edge.peer):
                 continue
@@ -176,7 +178,7 @@ def paths(graph: Mapping[str, list[Edge]], start: str) -> dict[str, Path]:
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class StationRow:
     """One line of a station table, for `heard`: since when (Unix time, s), and since when it is silent (0: heard)."""
 
     interface: str
@@ -187,12 +189,12 @@ class Known:
     silent_since_s: int
 
 
-def heard(
+def heard_text(
     name: str,
-    nodes: Mapping[str, Effective],
+    nodes: Mapping[str, EffectiveState],
     graph: Mapping[str, list[Edge]],
-    ways: Mapping[str, Path],
-    stations: Iterable[Known] | None = None,
+    routes: Mapping[str, Route],
+    stations: Iterable[StationRow] | None = None,
     passes: Callable[[str, Edge], bool] = lambda name, edge: True,
 ) -> str:
     """The file air/heard of one node: S stations, N batman neighbours, O originators (read by the stand-ins).
@@ -203,7 +205,7 @@ def heard(
     """
     if stations is None:
         stations = (
-            Known(edge.own.interface, edge.peer.mac, edge.link.signal_at(name), edge.tq, 0, 0)
+            StationRow(edge.own.interface, edge.peer.mac, edge.link.signal_at(name), edge.tq, 0, 0)
             for edge in graph.get(name, ())
         )
     lines = []
@@ -216,17 +218,17 @@ def heard(
     for edge in graph.get(name, ()):
         own, peer = edge.own, edge.peer
         if own.routes_with(peer):
-            arrives = _arrives([(name, edge)], passes)
+            arrives = _delivered_per_mille([(name, edge)], passes)
             lines.append(f"N\t{own.interface}\t{peer.mac}\t{_age_ms(name, peer.mac)}\t{edge.tq}\t{arrives}")
-    for target, path in sorted(ways.items()):
+    for target, path in sorted(routes.items()):
         own, hop = path.first.own, path.first.peer.mac
-        mac = next(cell.mac for cell in nodes[target].cells if cell.soft != "-")
-        arrives = _arrives(path.hops, passes)
+        mac = next(cell.mac for cell in nodes[target].interfaces if cell.soft != "-")
+        arrives = _delivered_per_mille(path.hops, passes)
         lines.append(f"O\t{own.interface}\t{mac}\t{hop}\t{path.tq}\t{_age_ms(name, mac)}\t1\t{arrives}")
     return "".join(f"{line}\n" for line in lines)
 
 
-def _arrives(hops: Iterable[tuple[str, Edge]], passes: Callable[[str, Edge], bool]) -> int:
+def _delivered_per_mille(hops: Iterable[tuple[str, Edge]], passes: Callable[[str, Edge], bool]) -> int:
     """Of 1000 frames to the station at the end of the hops and their answers, how many come back."""
     share = 1.0
     for name, edge in hops:

@@ -32,7 +32,7 @@ _FIRST_PORT, _LAST_PORT = 20022, 20999
 
 
 @dataclass(frozen=True, slots=True)
-class Door:
+class ForwardedPort:
     """Where a connection to `host` leads; `bench`: through the LAN port alone."""
 
     host: str
@@ -41,15 +41,15 @@ class Door:
     bench: bool
 
 
-class Doors:
+class PortForwarder:
     """Keeps the listening sockets in step with what is reachable."""
 
     def __init__(self, fleet: Supervisor) -> None:
         self._fleet = fleet
-        self._listening: dict[Door, tuple[socket.socket, asyncio.Task[None]]] = {}
+        self._listening: dict[ForwardedPort, tuple[socket.socket, asyncio.Task[None]]] = {}
         self._tunnels: set[asyncio.Task[None]] = set()
         self.port = fleet.spec.port
-        self._claim: socket.socket | None = None
+        self._port_lock: socket.socket | None = None
         # the same dice in every fleet: losses are part of the scenario
         self._dice = random.Random(1)
 
@@ -58,7 +58,7 @@ class Doors:
 
         Raises LabError when it is taken (or all are).
         """
-        self._claim, self.port = claim_port(self.port)
+        self._port_lock, self.port = claim_port(self.port)
 
     async def close(self) -> None:
         for listener, task in self._listening.values():
@@ -68,18 +68,20 @@ class Doors:
         for task in self._tunnels:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        if self._claim is not None:
-            self._claim.close()
+        if self._port_lock is not None:
+            self._port_lock.close()
 
-    def wanted(self) -> dict[str, Door]:
+    def reachable(self) -> dict[str, ForwardedPort]:
         """What is reachable now, by loopback address. Of several nodes with one address the first in order answers."""
-        doors: dict[str, Door] = {}
+        ports: dict[str, ForwardedPort] = {}
         for name, state in self._fleet.nodes.items():
             if not state.is_running:
                 continue
-            if self._fleet.ether.wire(name, FACTORY_ADDRESS) is not None and state.effective.admits(FACTORY_ADDRESS):
-                door = Door(bench_of(state.number), name, FACTORY_ADDRESS, bench=True)
-                doors[door.host] = door
+            if self._fleet.link_state.bench_shape(name, FACTORY_ADDRESS) is not None and state.effective.admits(
+                FACTORY_ADDRESS
+            ):
+                port = ForwardedPort(bench_of(state.number), name, FACTORY_ADDRESS, bench=True)
+                ports[port.host] = port
             for address in state.effective.addresses:
                 # many factory devices on one bench: each is told apart by its own port only
                 if address.address == FACTORY_ADDRESS and state.spec.medium is not Medium.BASE:
@@ -87,18 +89,18 @@ class Doors:
                 if not address.admitted:
                     continue
                 host = loopback_of(address.address)
-                if host not in doors and self._fleet.ether.way(name, address.address) is not None:
-                    doors[host] = Door(host, name, address.address, bench=False)
-        return doors
+                if host not in ports and self._fleet.link_state.path_shape(name, address.address) is not None:
+                    ports[host] = ForwardedPort(host, name, address.address, bench=False)
+        return ports
 
     def refresh(self) -> None:
         """Open and close sockets until they are what `wanted` says."""
-        wanted = set(self.wanted().values())
-        for door in self._listening.keys() - wanted:
+        reachable = set(self.reachable().values())
+        for door in self._listening.keys() - reachable:
             listener, task = self._listening.pop(door)
             task.cancel()
             listener.close()
-        for door in wanted - self._listening.keys():
+        for door in reachable - self._listening.keys():
             listener = socket.socket()
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
@@ -111,26 +113,26 @@ class Doors:
             listener.setblocking(False)
             self._listening[door] = (listener, asyncio.ensure_future(self._accept(door, listener)))
 
-    async def _accept(self, door: Door, listener: socket.socket) -> None:
+    async def _accept(self, port: ForwardedPort, listener: socket.socket) -> None:
         loop = asyncio.get_running_loop()
         while True:
             client, _ = await loop.sock_accept(listener)
             client.setblocking(False)
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            task = asyncio.ensure_future(self._serve(door, client))
+            task = asyncio.ensure_future(self._serve(port, client))
             self._tunnels.add(task)
             task.add_done_callback(self._tunnels.discard)
 
-    async def _serve(self, door: Door, client: socket.socket) -> None:
+    async def _serve(self, port: ForwardedPort, client: socket.socket) -> None:
         loop = asyncio.get_running_loop()
-        state = self._fleet.nodes[door.node]
+        state = self._fleet.nodes[port.node]
         boots = state.boots
         if state.hung:
             await self._hang(client)
             return
-        answer, descriptors = await self._fleet.ask_for({"do": "dial", "node": door.node})
+        answer, descriptors = await self._fleet.request({"do": "dial", "node": port.node})
         if not descriptors:
-            log.info("dial-failed node=%s reason=%s", door.node, answer.get("error"))
+            log.info("dial-failed node=%s reason=%s", port.node, answer.get("error"))
             reset(client)
             client.close()
             return
@@ -138,16 +140,18 @@ class Doors:
         node.setblocking(False)
         node.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
-            await loop.sock_connect(node, (door.address, _SSH_PORT))
+            await loop.sock_connect(node, (port.address, _SSH_PORT))
         except OSError as error:
-            log.info("refused node=%s reason=%s", door.node, errno.errorcode.get(error.errno or 0))
+            log.info("refused node=%s reason=%s", port.node, errno.errorcode.get(error.errno or 0))
             reset(client)
             client.close()
             node.close()
             return
-        way = self._fleet.ether.wire if door.bench else self._fleet.ether.way
-        shape: Callable[[], Shape | None] = lambda: None if state.hung else way(door.node, door.address)  # noqa: E731
-        await Tunnel(client, node, shape, self._fleet.ether.condition, lambda: state.boots == boots, self._dice).run()
+        path_shape = self._fleet.link_state.bench_shape if port.bench else self._fleet.link_state.path_shape
+        shape: Callable[[], Shape | None] = lambda: None if state.hung else path_shape(port.node, port.address)  # noqa: E731
+        await Tunnel(
+            client, node, shape, self._fleet.link_state.condition, lambda: state.boots == boots, self._dice
+        ).run()
 
     async def _hang(self, client: socket.socket) -> None:
         """Keep the connection and answer nothing until the other side gives up."""

@@ -25,7 +25,7 @@ DEAF_LOSS = 0.9
 # losses are told in hundredths: who moves a little need not be configured anew
 _LOSS_DIGITS = 2
 # antennas do not stand inside each other; also where the path-loss model begins
-_NEAREST_M = 1.0
+_MIN_DISTANCE_M = 1.0
 _LIGHT_M_S = 299_792_458.0
 
 
@@ -39,7 +39,7 @@ class Wall:
 
 
 @dataclass(frozen=True, slots=True)
-class Air:
+class PathLossModel:
     """How strength falls with distance, and loss grows as strength falls.
 
     `exponent` is 2 in free space, 1.6-1.8 along a corridor, 2.7-5 outdoors, 4-6 through buildings (Rappaport, Wireless
@@ -57,7 +57,7 @@ class Air:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class NodePosition:
     """Where a node stands, and what it sends with (None: as `Air` says)."""
 
     at: Point
@@ -65,73 +65,73 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class RadioEnvironment:
     """`places` by node name; `links` are those given by hand, each pair at most once."""
 
-    places: Mapping[str, Place] = field(default_factory=lambda: MappingProxyType({}))
+    positions: Mapping[str, NodePosition] = field(default_factory=lambda: MappingProxyType({}))
     walls: tuple[Wall, ...] = ()
-    air: Air = Air()
+    path_loss: PathLossModel = PathLossModel()
     links: tuple[LinkSpec, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
         """Every node that is mentioned, sorted."""
-        return tuple(sorted({*self.places, *(name for link in self.links for name in link.ends)}))
+        return tuple(sorted({*self.positions, *(name for link in self.links for name in link.ends)}))
 
-    def moved(self, name: str, to: Point) -> Ground:
+    def with_moved(self, name: str, to: Point) -> RadioEnvironment:
         """The same ground with a node elsewhere. Raises InputError for a node that has no place."""
-        if name not in self.places:
-            places = ", ".join(self.places)
+        if name not in self.positions:
+            places = ", ".join(self.positions)
             raise InputError(
                 f"{name} has no place on this ground, so it cannot move",
                 hint=f"these have: {places}" if places else "`meshctl lab ground FILE` with `nodes:` gives places",
             )
-        return replace(self, places={**self.places, name: replace(self.places[name], at=to)})
+        return replace(self, positions={**self.positions, name: replace(self.positions[name], at=to)})
 
 
-def received_dbm(air: Air, distance_m: float, tx_power_dbm: float, walls_db: float = 0.0) -> float:
+def received_dbm(model: PathLossModel, distance_m: float, tx_power_dbm: float, walls_db: float = 0.0) -> float:
     """How strong a radio hears another: both antennas' gain, free space for the first metre, then the exponent.
 
     Source: the log-distance model, Rappaport, Wireless Communications, section 4.9.1.
     """
-    first_metre_db = 20 * math.log10(4 * math.pi * air.frequency_mhz * 1e6 / _LIGHT_M_S)
-    beyond_db = 10 * air.exponent * math.log10(max(distance_m, _NEAREST_M))
-    return tx_power_dbm + 2 * air.antenna_gain_dbi - first_metre_db - beyond_db - walls_db
+    first_metre_db = 20 * math.log10(4 * math.pi * model.frequency_mhz * 1e6 / _LIGHT_M_S)
+    beyond_db = 10 * model.exponent * math.log10(max(distance_m, _MIN_DISTANCE_M))
+    return tx_power_dbm + 2 * model.antenna_gain_dbi - first_metre_db - beyond_db - walls_db
 
 
-def frame_loss(air: Air, strength_dbm: float) -> float:
+def frame_loss(model: PathLossModel, strength_dbm: float) -> float:
     """The share (0..1) of frames lost at this strength: a tenth at the sensitivity; in hundredths, 1.0 for deafness."""
-    margin = (strength_dbm - air.sensitivity_dbm) / air.fading_db
+    margin = (strength_dbm - model.sensitivity_dbm) / model.fading_db
     # beyond this the share is 0 or 1 to more digits than are told
     loss = 1.0 / (1.0 + 9.0 * math.exp(max(-50.0, min(50.0, margin))))
     return 1.0 if loss >= DEAF_LOSS else round(loss, _LOSS_DIGITS)
 
 
-def walls_between(walls: tuple[Wall, ...], a: Point, b: Point) -> float:
+def wall_loss_db(walls: tuple[Wall, ...], a: Point, b: Point) -> float:
     """What the walls on the straight line between two places take away, in dB."""
     return sum(wall.loss_db for wall in walls if _cross(a, b, wall.a, wall.b))
 
 
-def links_of(ground: Ground) -> tuple[LinkSpec, ...]:
+def links_of(environment: RadioEnvironment) -> tuple[LinkSpec, ...]:
     """Who hears whom: every pair of which at least one hears the other, by name; and the links given by hand."""
-    by_hand = {link.ends for link in ground.links}
+    explicit = {link.ends for link in environment.links}
     found = [
         link
-        for a, b in combinations(sorted(ground.places), 2)
-        if frozenset((a, b)) not in by_hand and (link := _link(ground, a, b)) is not None
+        for a, b in combinations(sorted(environment.positions), 2)
+        if frozenset((a, b)) not in explicit and (link := _link(environment, a, b)) is not None
     ]
-    return (*found, *ground.links)
+    return (*found, *environment.links)
 
 
-def _link(ground: Ground, a: str, b: str) -> LinkSpec | None:
-    first, second, air = ground.places[a], ground.places[b], ground.air
+def _link(environment: RadioEnvironment, a: str, b: str) -> LinkSpec | None:
+    first, second, model = environment.positions[a], environment.positions[b], environment.path_loss
     distance_m = math.dist(first.at, second.at)
-    walls_db = walls_between(ground.walls, first.at, second.at)
+    walls_db = wall_loss_db(environment.walls, first.at, second.at)
     strengths = [
-        received_dbm(air, distance_m, air.tx_power_dbm if own is None else own, walls_db)
+        received_dbm(model, distance_m, model.tx_power_dbm if own is None else own, walls_db)
         for own in (first.tx_power_dbm, second.tx_power_dbm)
     ]
-    there, back = (frame_loss(air, strength) for strength in strengths)
+    there, back = (frame_loss(model, strength) for strength in strengths)
     if there >= 1.0 and back >= 1.0:
         return None
     return LinkSpec(

@@ -15,14 +15,14 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from meshlab.propagation import Air, Ground, Place, Wall
+from meshlab.propagation import NodePosition, PathLossModel, RadioEnvironment, Wall
 from meshlab.quality import TQ_MAX
 from meshlab.spec import LinkSpec
-from meshlab.yaml_entries import Entry, entry_of, read
+from meshlab.yaml_entries import YamlEntry, parse_text, read
 
 _LINK_KEYS = tuple(item.name for item in fields(LinkSpec) if item.name not in ("a", "b"))
 # least and most that make sense for each of `Air`'s numbers
-_AIR_BOUNDS = {
+_PATH_LOSS_BOUNDS = {
     "tx_power_dbm": (-20.0, 60.0),
     "antenna_gain_dbi": (-20.0, 40.0),
     "frequency_mhz": (100.0, 100_000.0),
@@ -32,27 +32,27 @@ _AIR_BOUNDS = {
 }
 
 
-def load(path: Path) -> Ground:
+def load(path: Path) -> RadioEnvironment:
     """Read a ground. Raises InvalidInput with every problem found, each with file, line and column."""
-    return _ground_of(read(path))
+    return _environment(read(path))
 
 
-def parse(text: str, file: str) -> Ground:
+def parse(text: str, file: str) -> RadioEnvironment:
     """As `load`, from the file's text; `file` is the name that problems show."""
-    return _ground_of(entry_of(text, file))
+    return _environment(parse_text(text, file))
 
 
-def _ground_of(root: Entry) -> Ground:
-    ground = ground_in(root.mapping(("nodes", "walls", "air", "links")))
+def _environment(root: YamlEntry) -> RadioEnvironment:
+    environment = environment_in(root.mapping(("nodes", "walls", "air", "links")))
     if not root.is_there:
         root.problem("a mapping")
     root.finish()
-    return ground
+    return environment
 
 
-def ground_in(keys: dict[str, Entry]) -> Ground:
+def environment_in(keys: dict[str, YamlEntry]) -> RadioEnvironment:
     """The ground that the entries `nodes`, `walls`, `air` and `links` describe; problems are noted in them."""
-    places = {name: _place(entry) for name, entry in keys["nodes"].mapping().items()}
+    positions = {name: _position(entry) for name, entry in keys["nodes"].mapping().items()}
     links: dict[frozenset[str], LinkSpec] = {}
     for entry in keys["links"].items():
         link = _link(entry)
@@ -60,35 +60,39 @@ def ground_in(keys: dict[str, Entry]) -> Ground:
             entry.problem("each pair once", f"{link.a}-{link.b} again")
         elif link is not None:
             links[link.ends] = link
-    return Ground(places, tuple(_wall(entry) for entry in keys["walls"].items()), _air(keys["air"]), (*links.values(),))
+    return RadioEnvironment(
+        positions, tuple(_wall(entry) for entry in keys["walls"].items()), _path_loss(keys["air"]), (*links.values(),)
+    )
 
 
-def _place(entry: Entry) -> Place:
+def _position(entry: YamlEntry) -> NodePosition:
     """`[x, y]`, or `{at: [x, y], tx_power_dbm: 33}`."""
     if entry.is_list:
-        return Place(entry.point())
+        return NodePosition(entry.point())
     keys = entry.mapping(("at", "tx_power_dbm"), required=("at",))
     power = keys["tx_power_dbm"]
-    least, most = _AIR_BOUNDS["tx_power_dbm"]
-    return Place(
+    least, most = _PATH_LOSS_BOUNDS["tx_power_dbm"]
+    return NodePosition(
         keys["at"].point() if keys["at"].is_there else (0.0, 0.0),
         power.number(0.0, least, most) if power.is_there else None,
     )
 
 
-def _wall(entry: Entry) -> Wall:
+def _wall(entry: YamlEntry) -> Wall:
     keys = entry.mapping(("a", "b", "loss_db"), required=("a", "b"))
     ends = [keys[end].point() if keys[end].is_there else (0.0, 0.0) for end in ("a", "b")]
     return Wall(ends[0], ends[1], keys["loss_db"].number(Wall(ends[0], ends[1]).loss_db, 0.0, 1000.0))
 
 
-def _air(entry: Entry) -> Air:
-    keys = entry.mapping(tuple(_AIR_BOUNDS))
-    standard = asdict(Air())
-    return Air(**{name: keys[name].number(standard[name], *bounds) for name, bounds in _AIR_BOUNDS.items()})
+def _path_loss(entry: YamlEntry) -> PathLossModel:
+    keys = entry.mapping(tuple(_PATH_LOSS_BOUNDS))
+    standard = asdict(PathLossModel())
+    return PathLossModel(
+        **{name: keys[name].number(standard[name], *bounds) for name, bounds in _PATH_LOSS_BOUNDS.items()}
+    )
 
 
-def _link(entry: Entry) -> LinkSpec | None:
+def _link(entry: YamlEntry) -> LinkSpec | None:
     keys = entry.mapping(("between", *_LINK_KEYS), required=("between",))
     ends = [item.text() for item in keys["between"].items()]
     if len(ends) != 2 or ends[0] == ends[1] or not all(ends):
@@ -111,20 +115,20 @@ def _link(entry: Entry) -> LinkSpec | None:
     )
 
 
-def dump(ground: Ground) -> str:
+def dump(environment: RadioEnvironment) -> str:
     """The ground as text that `parse` reads as the same ground; JSON, which is YAML as well."""
 
     def given(value: Any) -> dict[str, Any]:
         return {key: item for key, item in asdict(value).items() if item is not None}
 
     links = []
-    for link in ground.links:
+    for link in environment.links:
         keys = given(link)
         links.append({"between": [keys.pop("a"), keys.pop("b")], **keys})
     content = {
-        "nodes": {name: given(place) for name, place in ground.places.items()},
-        "walls": [asdict(wall) for wall in ground.walls],
-        "air": asdict(ground.air),
+        "nodes": {name: given(place) for name, place in environment.positions.items()},
+        "walls": [asdict(wall) for wall in environment.walls],
+        "air": asdict(environment.path_loss),
         "links": links,
     }
     return json.dumps(content, indent=1) + "\n"

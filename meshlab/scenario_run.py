@@ -11,18 +11,18 @@ from typing import Protocol
 
 from meshlab import placement
 from meshlab.fleet import VirtualFleet
-from meshlab.propagation import Ground, links_of
-from meshlab.scenario import Event, Happening, Mission, agenda, scene
+from meshlab.propagation import RadioEnvironment, links_of
+from meshlab.scenario import Event, EventKind, Scenario, snapshot, timeline
 
 # links follow the robots at most so often in real time: a fast replay takes bigger steps
-_LEAST_STEP_S = 0.2
+_MIN_STEP_S = 0.2
 # Mission time without power after which nobody knows a node's radio any more when it is back: an ad-hoc cell of Linux
 # forgets within a minute, and a board takes most of that to boot, which a node of the lab does not. Before that its
 # neighbours go on with the numbers it had, and are half deaf to it (docs/lab.md).
-FORGOTTEN_S = 20.0
+STATION_EXPIRY_S = 20.0
 
 
-class Stage(Protocol):
+class ScenarioTarget(Protocol):
     """What a mission needs of a fleet."""
 
     @property
@@ -30,21 +30,21 @@ class Stage(Protocol):
         """The fleet's nodes."""
         ...
 
-    def stand_on(self, ground: Ground) -> None:
+    def set_environment(self, environment: RadioEnvironment) -> None:
         """From now on who hears whom is as this ground has it."""
         ...
 
-    def switch(self, name: str, on: bool) -> None:
+    def set_power(self, name: str, on: bool) -> None:
         """A node's power switch; no matter when it is in that position already."""
         ...
 
-    def forget(self, name: str) -> None:
+    def flush_stations(self, name: str) -> None:
         """Nobody knows the node's radio any more: so long has it been away, as time passes in the mission."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
-class FleetStage:
+class FleetTarget:
     """A running fleet as a stage."""
 
     fleet: VirtualFleet
@@ -53,21 +53,21 @@ class FleetStage:
     def names(self) -> tuple[str, ...]:
         return self.fleet.spec.names
 
-    def stand_on(self, ground: Ground) -> None:
-        placement.stand_on(self.fleet, ground)
+    def set_environment(self, environment: RadioEnvironment) -> None:
+        placement.set_environment(self.fleet, environment)
 
-    def switch(self, name: str, on: bool) -> None:
-        placement.switch(self.fleet, name, on)
+    def set_power(self, name: str, on: bool) -> None:
+        placement.set_power(self.fleet, name, on)
 
-    def forget(self, name: str) -> None:
-        placement.forget(self.fleet, name)
+    def flush_stations(self, name: str) -> None:
+        placement.flush_stations(self.fleet, name)
 
 
 def play(
-    mission: Mission,
-    stage: Stage,
+    scenario: Scenario,
+    target: ScenarioTarget,
     *,
-    tell: Callable[[Event], None],
+    on_event: Callable[[Event], None],
     clock: Callable[[], float],
     wait: Callable[[float], None],
     speed: float = 1.0,
@@ -79,60 +79,60 @@ def play(
     in order. Returns None at the mission's end; when a KeyboardInterrupt came, the mission time at which it stopped:
     everything then stays as it is, and can be taken up from there.
     """
-    there = frozenset(stage.names)
-    events = [event for event in agenda(mission) if event.at_s > start_s]
-    off_s = _off_since(mission, start_s)
+    present = frozenset(target.names)
+    events = [event for event in timeline(scenario) if event.at_s > start_s]
+    off_s = _off_since(scenario, start_s)
     now_s = start_s
     try:
-        _put(mission, stage, start_s, there)
-        links = links_of(scene(mission, start_s).ground)
-        begun = clock()
+        _apply_snapshot(scenario, target, start_s, present)
+        links = links_of(snapshot(scenario, start_s).environment)
+        started = clock()
         while events:
-            wait(max(_LEAST_STEP_S, mission.step_s / speed))
+            wait(max(_MIN_STEP_S, scenario.step_s / speed))
             # never past the end: the last step puts everybody where the mission leaves them
-            now_s = min(mission.duration_s, start_s + (clock() - begun) * speed)
-            now = scene(mission, now_s)
-            if links_of(now.ground) != links:
-                links = links_of(now.ground)
-                stage.stand_on(now.ground)
+            now_s = min(scenario.duration_s, start_s + (clock() - started) * speed)
+            now = snapshot(scenario, now_s)
+            if links_of(now.environment) != links:
+                links = links_of(now.environment)
+                target.set_environment(now.environment)
             while events and events[0].at_s <= now_s:
                 event = events.pop(0)
-                tell(event)
-                if event.who in there:
-                    _do(event, stage, off_s)
+                on_event(event)
+                if event.node in present:
+                    _apply_event(event, target, off_s)
     except KeyboardInterrupt:
         return now_s
     return None
 
 
-def _off_since(mission: Mission, t: float) -> dict[str, float]:
+def _off_since(scenario: Scenario, t: float) -> dict[str, float]:
     """Who has no power at `t`, and since when; whoever is carried has been away since long before."""
-    off_s = {name: float("-inf") for name in mission.beacons}
-    for event in agenda(mission):
-        if event.at_s <= t and event.what is Happening.OFF:
-            off_s[event.who] = event.at_s
-        elif event.at_s <= t and event.what in (Happening.DROPPED, Happening.ON):
-            off_s.pop(event.who, None)
+    off_s = {name: float("-inf") for name in scenario.beacons}
+    for event in timeline(scenario):
+        if event.at_s <= t and event.kind is EventKind.OFF:
+            off_s[event.node] = event.at_s
+        elif event.at_s <= t and event.kind in (EventKind.DROPPED, EventKind.ON):
+            off_s.pop(event.node, None)
     return off_s
 
 
-def _put(mission: Mission, stage: Stage, t: float, there: frozenset[str]) -> None:
+def _apply_snapshot(scenario: Scenario, target: ScenarioTarget, t: float, present: frozenset[str]) -> None:
     """Everybody's place and power as the mission has it at `t`, whatever they were before."""
-    now = scene(mission, t)
-    stage.stand_on(now.ground)
-    for name in mission.names:
-        if name in there:
-            stage.switch(name, name in now.powered)
+    now = snapshot(scenario, t)
+    target.set_environment(now.environment)
+    for name in scenario.names:
+        if name in present:
+            target.set_power(name, name in now.powered)
 
 
-def _do(event: Event, stage: Stage, off_s: dict[str, float]) -> None:
-    match event.what:
-        case Happening.DROPPED | Happening.ON:
-            if event.at_s - off_s.pop(event.who, event.at_s) >= FORGOTTEN_S:
-                stage.forget(event.who)
-            stage.switch(event.who, True)
-        case Happening.OFF:
-            off_s[event.who] = event.at_s
-            stage.switch(event.who, False)
+def _apply_event(event: Event, target: ScenarioTarget, off_s: dict[str, float]) -> None:
+    match event.kind:
+        case EventKind.DROPPED | EventKind.ON:
+            if event.at_s - off_s.pop(event.node, event.at_s) >= STATION_EXPIRY_S:
+                target.flush_stations(event.node)
+            target.set_power(event.node, True)
+        case EventKind.OFF:
+            off_s[event.node] = event.at_s
+            target.set_power(event.node, False)
         case _:
             pass

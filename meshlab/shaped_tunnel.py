@@ -62,8 +62,8 @@ class Tunnel:
     async def run(self) -> None:
         """Returns when the connection is over; closes both sockets."""
         tasks = [
-            asyncio.ensure_future(self._carry(self._client, self._node, from_node=False)),
-            asyncio.ensure_future(self._carry(self._node, self._client, from_node=True)),
+            asyncio.ensure_future(self._forward(self._client, self._node, from_node=False)),
+            asyncio.ensure_future(self._forward(self._node, self._client, from_node=True)),
         ]
         try:
             await asyncio.gather(*tasks)
@@ -76,7 +76,7 @@ class Tunnel:
             self._client.close()
             self._node.close()
 
-    async def _carry(self, source: socket.socket, target: socket.socket, *, from_node: bool) -> None:
+    async def _forward(self, source: socket.socket, target: socket.socket, *, from_node: bool) -> None:
         loop = asyncio.get_running_loop()
         flying: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(_IN_FLIGHT_CHUNKS)
 

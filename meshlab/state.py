@@ -8,7 +8,7 @@ from enum import Enum
 from pathlib import Path
 
 from meshctl.model import Release
-from meshlab.mesh_model import Effective
+from meshlab.mesh_model import EffectiveState
 from meshlab.releases import firmware_text
 from meshlab.spec import NodeSpec
 
@@ -40,18 +40,18 @@ class NodeState:
     boots: int = 0
     boot_id: str = ""
     reason: str = ""
-    effective: Effective = field(default_factory=Effective)
+    effective: EffectiveState = field(default_factory=EffectiveState)
     hung: bool = False
     cut_at_flash: bool = False
     wrong_board: bool = False
-    breaks: list[str] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
 
     @property
     def is_running(self) -> bool:
         return self.power in (Power.BOOTING, Power.UP, Power.FLASHING)
 
 
-def write_facts(state: NodeState, radios_mac: str, seed: int = 0) -> None:
+def write_board(state: NodeState, radios_mac: str, seed: int = 0) -> None:
     """What the node is told about its own board, in files that its stand-ins source. Replaced atomically.
 
     `seed` decides what is left to chance on the node: how long its services take.

@@ -23,7 +23,7 @@ DEAF_S = 600.0
 
 
 @dataclass(frozen=True, slots=True)
-class Radio:
+class InterfaceInstance:
     """One interface from its making to its end: the node, its boot, and the kernel's number of the interface."""
 
     node: str
@@ -33,11 +33,11 @@ class Radio:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class StationEntry:
     """A line of `holder`'s station table: who is behind `mac`, since when (s), and since when silent (None: heard)."""
 
-    holder: Radio
-    peer: Radio
+    holder: InterfaceInstance
+    peer: InterfaceInstance
     mac: str
     signal_dbm: int
     tq: int
@@ -45,27 +45,27 @@ class Entry:
     silent_since_s: float | None = None
 
 
-class Stations:
+class StationTables:
     """The station tables of a fleet. `now_s` is any clock, the same in all calls."""
 
     def __init__(self) -> None:
-        self._entries: dict[tuple[str, str, str], Entry] = {}
+        self._entries: dict[tuple[str, str, str], StationEntry] = {}
         # (sender, receiver): until when the receiver drops what the sender sends to it alone
-        self._deaf: dict[tuple[Radio, Radio], float] = {}
+        self._deaf_until_s: dict[tuple[InterfaceInstance, InterfaceInstance], float] = {}
 
     def update(self, graph: Mapping[str, Sequence[Edge]], boots: Mapping[str, int], now_s: float) -> None:
         """`graph` is who hears whom now, `boots` the count of boots of each node that runs."""
         heard = set()
         for name, edges in graph.items():
             for edge in edges:
-                own, peer = radio_of(name, boots, edge), peer_of(boots, edge)
+                own, peer = own_instance(name, boots, edge), peer_instance(boots, edge)
                 place = (name, edge.own.interface, edge.peer.mac)
                 heard.add(place)
                 known = self._entries.get(place)
                 if known is None or known.holder != own:
-                    known = Entry(own, peer, edge.peer.mac, 0, 0, now_s)
+                    known = StationEntry(own, peer, edge.peer.mac, 0, 0, now_s)
                 elif known.peer != peer:
-                    self._deaf[peer, own] = now_s + DEAF_S
+                    self._deaf_until_s[peer, own] = now_s + DEAF_S
                 signal_dbm = edge.link.signal_at(name)
                 self._entries[place] = replace(known, peer=peer, signal_dbm=signal_dbm, tq=edge.tq, silent_since_s=None)
         for place, entry in list(self._entries.items()):
@@ -75,10 +75,10 @@ class Stations:
                 self._entries[place] = replace(entry, silent_since_s=now_s)
             elif entry.silent_since_s is not None and now_s - entry.silent_since_s >= EXPIRY_S:
                 del self._entries[place]
-                self._deaf.pop((entry.peer, entry.holder), None)
-        self._deaf = {
+                self._deaf_until_s.pop((entry.peer, entry.holder), None)
+        self._deaf_until_s = {
             pair: until_s
-            for pair, until_s in self._deaf.items()
+            for pair, until_s in self._deaf_until_s.items()
             if until_s > now_s and all(boots.get(radio.node) == radio.boot for radio in pair)
         }
 
@@ -87,34 +87,34 @@ class Stations:
         entry = self._entries.pop((node, interface, mac), None)
         if entry is None or entry.silent_since_s is not None:
             return
-        if self._deaf.pop((entry.peer, entry.holder), None) is None:
+        if self._deaf_until_s.pop((entry.peer, entry.holder), None) is None:
             # nothing was wrong: now the other one drops what comes from here
-            self._deaf[entry.holder, entry.peer] = now_s + DEAF_S
+            self._deaf_until_s[entry.holder, entry.peer] = now_s + DEAF_S
 
-    def forget_silent(self, node: str) -> None:
+    def remove_node(self, node: str) -> None:
         """The node was away for longer than stations are remembered: nobody has it in a table any more."""
         self._entries = {place: entry for place, entry in self._entries.items() if entry.peer.node != node}
 
-    def of(self, node: str) -> list[Entry]:
+    def entries_of(self, node: str) -> list[StationEntry]:
         """The lines of the node's tables."""
         return [entry for (name, _, _), entry in self._entries.items() if name == node]
 
     def passes(self, name: str, boots: Mapping[str, int], edge: Edge) -> bool:
         """Whether frames to one station pass over an edge, both ways."""
-        if not self._deaf:
+        if not self._deaf_until_s:
             return True
-        own, peer = radio_of(name, boots, edge), peer_of(boots, edge)
-        return (own, peer) not in self._deaf and (peer, own) not in self._deaf
+        own, peer = own_instance(name, boots, edge), peer_instance(boots, edge)
+        return (own, peer) not in self._deaf_until_s and (peer, own) not in self._deaf_until_s
 
     def next_change_s(self) -> float | None:
         """When something ends by itself, unless something happens before."""
         ends = [entry.silent_since_s + EXPIRY_S for entry in self._entries.values() if entry.silent_since_s is not None]
-        return min([*ends, *self._deaf.values()], default=None)
+        return min([*ends, *self._deaf_until_s.values()], default=None)
 
 
-def radio_of(name: str, boots: Mapping[str, int], edge: Edge) -> Radio:
-    return Radio(name, boots.get(name, 0), edge.own.interface, edge.own.index)
+def own_instance(name: str, boots: Mapping[str, int], edge: Edge) -> InterfaceInstance:
+    return InterfaceInstance(name, boots.get(name, 0), edge.own.interface, edge.own.index)
 
 
-def peer_of(boots: Mapping[str, int], edge: Edge) -> Radio:
-    return Radio(edge.node, boots.get(edge.node, 0), edge.peer.interface, edge.peer.index)
+def peer_instance(boots: Mapping[str, int], edge: Edge) -> InterfaceInstance:
+    return InterfaceInstance(edge.node, boots.get(edge.node, 0), edge.peer.interface, edge.peer.index)

@@ -24,13 +24,13 @@ from meshlab import rootfs
 from meshlab.container import Container, prepare
 from meshlab.control import Control, Operations
 from meshlab.errors import LabError
-from meshlab.fault_injection import Hurt
-from meshlab.link_state import Ether
+from meshlab.fault_injection import FaultInjection
+from meshlab.link_state import LinkState
 from meshlab.mesh_model import parse_effective
-from meshlab.node_runner import MESSAGE_BYTES, Warden
-from meshlab.port_forwarder import Doors
+from meshlab.node_runner import MESSAGE_BYTES, NodeRunner
+from meshlab.port_forwarder import PortForwarder
 from meshlab.spec import FleetSpec, Medium, load
-from meshlab.state import NodeState, Power, label_mac, write_facts, write_firmware
+from meshlab.state import NodeState, Power, label_mac, write_board, write_firmware
 
 log = logging.getLogger("meshlab")
 # more at once only makes each of them slower
@@ -40,26 +40,26 @@ _BOOTING_AT_ONCE = 4 * (os.cpu_count() or 1)
 class Supervisor:
     """All nodes of one fleet. Not thread-safe: everything runs in one event loop."""
 
-    def __init__(self, spec: FleetSpec, directory: Path, warden: socket.socket, *, deny_setgroups: bool) -> None:
+    def __init__(self, spec: FleetSpec, directory: Path, runner: socket.socket, *, deny_setgroups: bool) -> None:
         self.spec = spec
         self.directory = directory
         self.nodes: dict[str, NodeState] = {}
         self.stopping = asyncio.Event()
-        self._warden = warden
+        self._runner = runner
         self._deny_setgroups = deny_setgroups
         self._waiting: list[str] = []
         self._requests: dict[int, asyncio.Future[tuple[dict[str, Any], list[int]]]] = {}
         self._serial = 0
-        self.ether = self._make_ether()
-        self.doors = self._make_doors()
-        self.hurt = Hurt(self)
+        self.link_state = self._make_link_state()
+        self.port_forwarder = self._make_port_forwarder()
+        self.faults = FaultInjection(self)
         self.operations = self._make_operations()
 
-    def _make_ether(self) -> Ether:
-        return Ether(self)
+    def _make_link_state(self) -> LinkState:
+        return LinkState(self)
 
-    def _make_doors(self) -> Doors:
-        return Doors(self)
+    def _make_port_forwarder(self) -> PortForwarder:
+        return PortForwarder(self)
 
     def _make_operations(self) -> Operations:
         return Operations(self)
@@ -69,13 +69,13 @@ class Supervisor:
     async def run(self) -> None:
         """Boot every node, serve until `stopping` is set."""
         loop = asyncio.get_running_loop()
-        self._warden.setblocking(False)
-        loop.add_reader(self._warden, self._warden_event)
+        self._runner.setblocking(False)
+        loop.add_reader(self._runner, self._on_runner_event)
         bell = os.open(self.directory / "bell", os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
-        loop.add_reader(bell, self._bell, bell)
+        loop.add_reader(bell, self._on_bell, bell)
         for ending in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(ending, self.stopping.set)
-        self.doors.open()
+        self.port_forwarder.open()
         for number, node in enumerate(self.spec.nodes):
             self._make(number)
             self.power_on(node.name)
@@ -85,8 +85,8 @@ class Supervisor:
             await self.stopping.wait()
         finally:
             control.close()
-            await self.doors.close()
-            loop.remove_reader(self._warden)
+            await self.port_forwarder.close()
+            loop.remove_reader(self._runner)
             loop.remove_reader(bell)
             os.close(bell)
 
@@ -120,8 +120,8 @@ class Supervisor:
             return
         if state.is_running:
             # connections stall from here on; that its processes end is no farewell
-            self._is_gone(state, Power.OFF)
-            self.ask({"do": "kill", "node": name})
+            self._mark_down(state, Power.OFF)
+            self.send({"do": "kill", "node": name})
         elif back:
             self.power_on(name)
 
@@ -136,14 +136,14 @@ class Supervisor:
     def _boot(self, state: NodeState) -> None:
         container = self.container(state)
         (state.home / "air" / "effective").unlink(missing_ok=True)
-        write_facts(state, label_mac(state.spec, state.number), self.spec.seed)
+        write_board(state, label_mac(state.spec, state.number), self.spec.seed)
         prepare(container)
         state.power = Power.BOOTING
         state.reason = ""
         state.boots += 1
         # set at once, so that nobody starts it twice; the warden tells the real one
         state.pid = -1
-        self.ask(
+        self.send(
             {
                 "do": "boot",
                 "node": state.spec.name,
@@ -159,24 +159,24 @@ class Supervisor:
             state.spec.name, self.directory, state.spec.overlay_kib, state.spec.memory_kib, self._deny_setgroups
         )
 
-    def _is_gone(self, state: NodeState, power: Power) -> None:
+    def _mark_down(self, state: NodeState, power: Power) -> None:
         state.power = power
         state.boot_id = ""
         state.effective = parse_effective("")
-        self.ether.changed()
+        self.link_state.changed()
 
     # -- the warden --
 
-    def ask(self, request: dict[str, Any], descriptors: Sequence[int] = ()) -> None:
+    def send(self, request: dict[str, Any], descriptors: Sequence[int] = ()) -> None:
         """Send one request without an answer of its own."""
         # the warden answers quickly; a full buffer only means that it is a few requests behind
-        self._warden.setblocking(True)
+        self._runner.setblocking(True)
         try:
-            socket.send_fds(self._warden, [json.dumps(request).encode()], list(descriptors))
+            socket.send_fds(self._runner, [json.dumps(request).encode()], list(descriptors))
         finally:
-            self._warden.setblocking(False)
+            self._runner.setblocking(False)
 
-    async def ask_for(
+    async def request(
         self, request: dict[str, Any], descriptors: Sequence[int] = ()
     ) -> tuple[dict[str, Any], list[int]]:
         """Send one request and wait for the event with its id."""
@@ -185,13 +185,13 @@ class Supervisor:
         future: asyncio.Future[tuple[dict[str, Any], list[int]]] = asyncio.get_running_loop().create_future()
         self._requests[serial] = future
         try:
-            self.ask({**request, "id": serial}, descriptors)
+            self.send({**request, "id": serial}, descriptors)
             return await future
         finally:
             self._requests.pop(serial, None)
 
-    def _warden_event(self) -> None:
-        message, descriptors, _, _ = socket.recv_fds(self._warden, MESSAGE_BYTES, 1)
+    def _on_runner_event(self) -> None:
+        message, descriptors, _, _ = socket.recv_fds(self._runner, MESSAGE_BYTES, 1)
         if not message:
             log.error("warden-ended")
             self.stopping.set()
@@ -214,7 +214,7 @@ class Supervisor:
         power = state.power
         if power in (Power.BOOTING, Power.UP, Power.FLASHING):
             log.info("node-ended node=%s status=%d reason=%s", state.spec.name, status, reason)
-            self._is_gone(state, Power.OFF)
+            self._mark_down(state, Power.OFF)
         if reason:
             state.power, state.reason = Power.FAILED, reason
         elif power is Power.DEAD or status in (_DEAD, _POWER_OFF):
@@ -226,7 +226,7 @@ class Supervisor:
 
     # -- the bell --
 
-    def _bell(self, bell: int) -> None:
+    def _on_bell(self, bell: int) -> None:
         with contextlib.suppress(BlockingIOError):
             for line in os.read(bell, 65536).decode("utf-8", "replace").splitlines():
                 word, _, rest = line.partition(" ")
@@ -234,12 +234,12 @@ class Supervisor:
                 if name not in self.nodes:
                     continue
                 try:
-                    self._rung(word, self.nodes[name], detail)
+                    self._on_message(word, self.nodes[name], detail)
                 except (OSError, ValueError, LabError):
                     # the lines behind it are other nodes'
                     log.exception("bell-failed line=%s", line)
 
-    def _rung(self, word: str, state: NodeState, detail: str) -> None:
+    def _on_message(self, word: str, state: NodeState, detail: str) -> None:
         match word:
             case "up" if state.power is Power.BOOTING:
                 state.power = Power.UP
@@ -250,13 +250,13 @@ class Supervisor:
                 self._read_effective(state)
             case "forgot" if len(detail.split()) == 2:
                 interface, mac = detail.split()
-                self.ether.station_deleted(state.spec.name, interface, mac)
+                self.link_state.station_deleted(state.spec.name, interface, mac)
             case "dead":
-                self._is_gone(state, Power.DEAD)
+                self._mark_down(state, Power.DEAD)
             case "cut" if state.is_running:
                 self.power_off(state.spec.name, back=True)
             case "sever":
-                self.hurt.sever(state)
+                self.faults.sever(state)
             case "flashing" if state.is_running:
                 state.power = Power.FLASHING
                 if state.cut_at_flash:
@@ -272,7 +272,7 @@ class Supervisor:
         effective = parse_effective(text)
         if effective != state.effective:
             state.effective = effective
-            self.ether.changed()
+            self.link_state.changed()
 
 
 # exit status of a node's process 1 (node_root/lab/init)
@@ -285,13 +285,13 @@ def main(arguments: Sequence[str]) -> int:
     directory = Path(arguments[1]).resolve()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
     try:
-        deny_setgroups = _take_privileges()
+        deny_setgroups = _acquire_privileges()
         rootfs.build(directory / "rom")
         (directory / "mnt").mkdir(exist_ok=True)
         os.mkfifo(directory / "bell", 0o622)
         (directory / "bell").chmod(0o622)
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        fork_warden(lambda: Warden(theirs), theirs, close=ours)
+        fork_node_runner(lambda: NodeRunner(theirs), theirs, close=ours)
         spec = load((directory / "spec.json").read_text(encoding="utf-8"))
         supervise: Callable[[], Any] = Supervisor(spec, directory, ours, deny_setgroups=deny_setgroups).run
         (directory / "supervisor.pid").write_text(f"{os.getpid()}\n", encoding="ascii")
@@ -303,7 +303,7 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _take_privileges() -> bool:
+def _acquire_privileges() -> bool:
     """Root of a new user namespace where the kernel lets us, else root itself; whether setgroups is denied."""
     if not ns.machine_is_known():
         raise LabError("the virtual fleet knows the system calls of x86_64 and aarch64 only")
@@ -323,7 +323,7 @@ def _take_privileges() -> bool:
     return False
 
 
-def fork_warden(make: Callable[[], Warden], channel: socket.socket, *, close: socket.socket) -> None:
+def fork_node_runner(make: Callable[[], NodeRunner], channel: socket.socket, *, close: socket.socket) -> None:
     """Let the warden, whose end of the pair is `channel`, serve in a process of its own."""
     if os.fork() != 0:
         channel.close()

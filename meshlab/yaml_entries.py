@@ -17,7 +17,7 @@ from meshctl.inventory.source import Source, read_source
 from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, describe, position
 
 
-class Entry:
+class YamlEntry:
     """One place in the file, or the absence of one: then every reader gives its default."""
 
     def __init__(self, tree: Tree | None, path: str, problems: list[Diagnostic]) -> None:
@@ -44,7 +44,7 @@ class Entry:
         if self._problems:
             raise InvalidInput(self._problems)
 
-    def mapping(self, known: tuple[str, ...] | None = None, required: tuple[str, ...] = ()) -> dict[str, Entry]:
+    def mapping(self, known: tuple[str, ...] | None = None, required: tuple[str, ...] = ()) -> dict[str, YamlEntry]:
         """The entries by key; for `known` keys (None: any) an absent entry each, so that it can be asked as well."""
         if not isinstance(self.tree, MappingNode):
             if self.is_there or required:
@@ -61,11 +61,11 @@ class Entry:
                 self._note(codes.MISSING_KEY, position(self.tree), f"the key {key}", "no such key")
         return entries
 
-    def items(self) -> Iterator[Entry]:
+    def items(self) -> Iterator[YamlEntry]:
         """The entries of a list."""
         if isinstance(self.tree, SequenceNode):
             for number, item in enumerate(self.tree.items):
-                yield Entry(item, f"{self.path}[{number}]", self._problems)
+                yield YamlEntry(item, f"{self.path}[{number}]", self._problems)
         elif self.is_there:
             self.problem("a list")
 
@@ -123,8 +123,8 @@ class Entry:
         values = [item.number(0.0) for item in self.items()]
         return values if len(self._problems) == before else []
 
-    def _below(self, tree: Tree | None, key: str) -> Entry:
-        entry = Entry(tree, f"{self.path}.{key}" if self.path else key, self._problems)
+    def _below(self, tree: Tree | None, key: str) -> YamlEntry:
+        entry = YamlEntry(tree, f"{self.path}.{key}" if self.path else key, self._problems)
         entry._where = tree or self._where
         return entry
 
@@ -153,17 +153,17 @@ def share_of(text: str) -> float | None:
     return value if 0.0 <= value <= 1.0 else None
 
 
-def read(path: Path) -> Entry:
+def read(path: Path) -> YamlEntry:
     """The file's root. Raises InvalidInput when it cannot be read or is not YAML."""
     source = read_source(path)
     if isinstance(source, Diagnostic):
         raise InvalidInput([source])
-    return entry_of(source.text, str(path))
+    return parse_text(source.text, str(path))
 
 
-def entry_of(text: str, file: str) -> Entry:
+def parse_text(text: str, file: str) -> YamlEntry:
     """The root of a file's text. Raises InvalidInput when it is not YAML."""
     composed = compose(Source(file, text))
     if composed.root is None:
         raise InvalidInput(composed.diagnostics)
-    return Entry(composed.root, "", list(composed.diagnostics))
+    return YamlEntry(composed.root, "", list(composed.diagnostics))

@@ -17,12 +17,12 @@ from meshctl.resources import shipped
 from meshlab.cli import links
 from meshlab.console import run_shell
 from meshlab.errors import LabError
-from meshlab.faults import BREAKS, parse, told
-from meshlab.fleet import VirtualFleet, end
+from meshlab.faults import FAULTS, describe, parse
+from meshlab.fleet import VirtualFleet, stop_fleet
 from meshlab.from_inventory import spec_of
 from meshlab.images import firmware_image
-from meshlab.inventory_copy import prepare
-from meshlab.qemu.fleet import RealFleet
+from meshlab.inventory_copy import copy_inventory
+from meshlab.qemu.fleet import QemuFleet
 from meshlab.releases import facts
 
 app = typer.Typer(help="A virtual fleet on this machine.", no_args_is_help=True)
@@ -57,11 +57,11 @@ def up(
     if inventory is not None and chosen is not None:
         raise InputError("expected one inventory, found an argument and --inventory")
     place = lab_directory(directory)
-    copy = prepare(inventory or chosen or shipped("inventory") / "lab", place)
+    copy = copy_inventory(inventory or chosen or shipped("inventory") / "lab", place)
     spec = spec_of(copy.fleet, links=copy.links, nodes=nodes, port=port)
     if real:
         echo("starting a machine with real radios; its image is made at the first start")
-        fleet: VirtualFleet = RealFleet(spec, place).up(wait_s=_REAL_START_S + _REAL_BOOT_S * len(spec.nodes))
+        fleet: VirtualFleet = QemuFleet(spec, place).up(wait_s=_REAL_START_S + _REAL_BOOT_S * len(spec.nodes))
     else:
         fleet = VirtualFleet(spec, place).up(wait_s=_START_S + _BOOT_S * len(spec.nodes))
     echo(f"{len(spec.nodes)} nodes of {spec.name} are up, each at 192.168.1.1 on its own bench port")
@@ -80,7 +80,7 @@ def down(directory: LabDirectory = None) -> None:
     Example: meshctl lab down
     """
     place = lab_directory(directory)
-    name = end(place)
+    name = stop_fleet(place)
     if not name:
         raise LabError(f"no virtual fleet runs in {place}", hint="meshctl lab up starts one")
     echo(f"{name} is down")
@@ -125,7 +125,7 @@ def shell(
 _BREAK_HELP = "\n\n".join(
     (
         "Break something, now or at a step; `meshctl lab mend` undoes it.",
-        *(f"{one.value}: {text}" for one, text in BREAKS.items()),
+        *(f"{one.value}: {text}" for one, text in FAULTS.items()),
         "Example: meshctl lab break b03 'power-cut@reload_config'",
         "Example: meshctl lab break b01-b02 link-down",
     )
@@ -139,8 +139,8 @@ def break_(
     directory: LabDirectory = None,
 ) -> None:
     order = parse(what)
-    VirtualFleet.attach(lab_directory(directory)).break_(where, what)
-    echo(f"{where}: {told(order)}")
+    VirtualFleet.attach(lab_directory(directory)).inject_fault(where, what)
+    echo(f"{where}: {describe(order)}")
 
 
 @app.command("mend")
@@ -152,7 +152,7 @@ def mend(
 
     Example: meshctl lab mend b03
     """
-    VirtualFleet.attach(lab_directory(directory)).mend(where)
+    VirtualFleet.attach(lab_directory(directory)).repair(where)
     echo(f"{where or 'everything'}: mended")
 
 

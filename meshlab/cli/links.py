@@ -14,9 +14,9 @@ from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshlab import placement, propagation_file, scenario_file
 from meshlab.fleet import VirtualFleet
-from meshlab.propagation import Ground, links_of
-from meshlab.scenario import Event, Happening
-from meshlab.scenario_run import FleetStage, play
+from meshlab.propagation import RadioEnvironment, links_of
+from meshlab.scenario import Event, EventKind
+from meshlab.scenario_run import FleetTarget, play
 from meshlab.spec import LinkSpec
 from meshlab.yaml_entries import share_of
 
@@ -66,17 +66,17 @@ def link(
     fleet.link(a, b, **changes)
     for now in fleet.status()["links"]:
         if set(now["between"]) == {a, b}:
-            echo(_set(now))
+            echo(_changed_line(now))
 
 
-def _set(now: dict[str, Any]) -> str:
+def _changed_line(now: dict[str, Any]) -> str:
     """`b01 - b02: loses 30% there, 5% back, 20 ms later, at most 256 kbit/s`"""
     a, b = now["between"]
     if not now["up"]:
         return f"{a} - {b}: down"
     delay = f", {now['delay_ms']:g} ms later" if now["delay_ms"] else ""
     rate = f", at most {now['rate_kbps']} kbit/s" if now["rate_kbps"] else ""
-    return f"{a} - {b}: loses {_lost(now['loss'], now['loss_back'])}{delay}{rate}"
+    return f"{a} - {b}: loses {_loss_text(now['loss'], now['loss_back'])}{delay}{rate}"
 
 
 def move(
@@ -91,9 +91,9 @@ def move(
     """
     fleet = VirtualFleet.attach(lab_directory(directory))
     placement.move(fleet, node, (x, y))
-    for one in links_of(placement.ground_of(fleet)):
+    for one in links_of(placement.current_environment(fleet)):
         if node in one.ends and one.ends <= set(fleet.spec.names):
-            echo(_described(one.seen_from(node)))
+            echo(_link_line(one.seen_from(node)))
 
 
 def ground(
@@ -110,12 +110,12 @@ def ground(
         wanted = propagation_file.load(file)
         if not set(wanted.names) & set(fleet.spec.names):
             raise InputError(f"{file}: expected nodes of this fleet ({', '.join(fleet.spec.names)}), found none")
-        placement.stand_on(fleet, wanted)
-    now = placement.ground_of(fleet)
+        placement.set_environment(fleet, wanted)
+    now = placement.current_environment(fleet)
     if as_json:
         echo(propagation_file.dump(now), nl=False)
         return
-    _show(now, fleet.spec.names)
+    _print_environment(now, fleet.spec.names)
 
 
 def mission(
@@ -138,9 +138,9 @@ def mission(
     absent = sorted(set(wanted.names) - set(fleet.spec.names))
     if absent:
         echo(f"not in this fleet: {', '.join(absent)}", err=True)
-    say = _tell_json if as_json else _tell
+    say = _print_event_json if as_json else _print_event
     stopped_s = play(
-        wanted, FleetStage(fleet), tell=say, clock=time.monotonic, wait=time.sleep, speed=speed, start_s=start_s
+        wanted, FleetTarget(fleet), on_event=say, clock=time.monotonic, wait=time.sleep, speed=speed, start_s=start_s
     )
     if stopped_s is not None:
         echo(f"stopped at {stopped_s:.1f} s; everything stays as it is", err=True)
@@ -148,52 +148,52 @@ def mission(
         raise typer.Exit(int(ExitCode.INTERRUPTED))
 
 
-def _show(now: Ground, names: tuple[str, ...]) -> None:
+def _print_environment(now: RadioEnvironment, names: tuple[str, ...]) -> None:
     for name in names:
-        place = now.places.get(name)
+        place = now.positions.get(name)
         echo(f"{name} at {place.at[0]:g}, {place.at[1]:g} m" if place else f"{name} has no place")
     for one in links_of(now):
         if one.ends <= set(names):
-            echo(_described(one))
+            echo(_link_line(one))
 
 
-def _described(one: LinkSpec) -> str:
+def _link_line(one: LinkSpec) -> str:
     """`b01 - b02: loses 3% there, 5% back; quality 247 and 242 of 255`"""
     if not one.up:
         return f"{one.a} - {one.b}: down"
     there, back = one.loss_to(one.b), one.loss_to(one.a)
-    lost, qualities = _lost(there, back), f"{one.tq_to(one.b)} there, {one.tq_to(one.a)} back"
+    lost, qualities = _loss_text(there, back), f"{one.tq_to(one.b)} there, {one.tq_to(one.a)} back"
     return f"{one.a} - {one.b}: loses {lost}; quality {qualities}, of 255"
 
 
-def _lost(there: float, back: float) -> str:
+def _loss_text(there: float, back: float) -> str:
     return f"{there:.0%}" if there == back else f"{there:.0%} there, {back:.0%} back"
 
 
-_SAID = {
-    Happening.ARRIVES: "{who} arrives at {place}",
-    Happening.DROPPED: "{other} drops {who} at {place}",
-    Happening.OFF: "{who} goes off",
-    Happening.ON: "{who} comes on",
-    Happening.LINK_UP: "{who} and {other} hear each other",
-    Happening.LINK_DOWN: "{who} and {other} no longer hear each other",
-    Happening.CUT_OFF: "{who} is cut off from the base",
-    Happening.REACHED: "{who} reaches the base",
-    Happening.END: "the mission ends",
+_EVENT_TEXT = {
+    EventKind.ARRIVES: "{who} arrives at {place}",
+    EventKind.DROPPED: "{other} drops {who} at {place}",
+    EventKind.OFF: "{who} goes off",
+    EventKind.ON: "{who} comes on",
+    EventKind.LINK_UP: "{who} and {other} hear each other",
+    EventKind.LINK_DOWN: "{who} and {other} no longer hear each other",
+    EventKind.CUT_OFF: "{who} is cut off from the base",
+    EventKind.REACHED: "{who} reaches the base",
+    EventKind.END: "the mission ends",
 }
 
 
-def _tell(event: Event) -> None:
-    place = "" if event.place is None else f"{event.place[0]:g}, {event.place[1]:g} m"
-    echo(f"{event.at_s:8.1f} s  " + _SAID[event.what].format(who=event.who, other=event.other, place=place))
+def _print_event(event: Event) -> None:
+    place = "" if event.position is None else f"{event.position[0]:g}, {event.position[1]:g} m"
+    echo(f"{event.at_s:8.1f} s  " + _EVENT_TEXT[event.kind].format(who=event.node, other=event.peer, place=place))
 
 
-def _tell_json(event: Event) -> None:
+def _print_event_json(event: Event) -> None:
     content = {
         "at_s": event.at_s,
-        "event": event.what.value,
-        "node": event.who,
-        "other": event.other or None,
-        "place_m": event.place,
+        "event": event.kind.value,
+        "node": event.node,
+        "other": event.peer or None,
+        "place_m": event.position,
     }
     echo_json(json.dumps({key: value for key, value in content.items() if value is not None}))

@@ -41,7 +41,7 @@ _UNNEEDED = (
     "libgdbm", "libnumber-compare", "libpam", "libperl", "libsemanage", "libsepol", "libtext-glob", "media-types",
     "passwd", "perl", "readline-common", "tar_", "usrmerge",
 )  # fmt: skip
-_LEFT_OUT = (
+_EXCLUDED = (
     "usr/share/bash-completion", "usr/share/bug", "usr/share/dbus-1", "usr/share/doc", "usr/share/doc-base",
     "usr/share/info", "usr/share/lintian", "usr/share/locale", "usr/share/man", "usr/share/perl*",
     "usr/lib/systemd", "lib/systemd", "usr/lib/x86_64-linux-gnu/gconv", "usr/lib/x86_64-linux-gnu/perl-base",
@@ -56,7 +56,7 @@ _HINT = (
 
 
 @dataclass(frozen=True, slots=True)
-class Resolved:
+class ResolvedPackages:
     """File names of the packages in apt's archive cache; `kernel` is the name of the kernel's package."""
 
     archives: tuple[str, ...]
@@ -98,7 +98,7 @@ def update(apt: Apt) -> None:
         apt.get(apt.work, "-qq", "update")
 
 
-def resolve(apt: Apt) -> Resolved:
+def resolve(apt: Apt) -> ResolvedPackages:
     """What `PACKAGES` and the kernel mean today. Raises LabError when apt has no lists of Debian's."""
     empty = apt.work / "empty"
     (empty / "partial").mkdir(parents=True, exist_ok=True)
@@ -108,10 +108,10 @@ def resolve(apt: Apt) -> Resolved:
     kernels = [line.split()[-1] for line in depends.splitlines() if "Depends: linux-image-" in line]
     if not kernels:
         raise LabError(f"apt knows no kernel behind {KERNEL_META}", hint=_HINT)
-    return Resolved(tuple(name for name in archives if not name.startswith(_UNNEEDED)), kernels[0])
+    return ResolvedPackages(tuple(name for name in archives if not name.startswith(_UNNEEDED)), kernels[0])
 
 
-def download(resolved: Resolved, apt: Apt, cache: Path) -> None:
+def download(resolved: ResolvedPackages, apt: Apt, cache: Path) -> None:
     """Put the packages that are not there yet into the directory `cache`."""
     (cache / "partial").mkdir(parents=True, exist_ok=True)
     apt.get(cache, "-qq", "-y", "--no-install-recommends", "--download-only", "install", *PACKAGES)
@@ -119,17 +119,17 @@ def download(resolved: Resolved, apt: Apt, cache: Path) -> None:
         apt.get(cache, "-qq", "download", resolved.kernel, folder=cache)
 
 
-def unpack(resolved: Resolved, cache: Path, root: Path) -> None:
+def unpack(resolved: ResolvedPackages, cache: Path, root: Path) -> None:
     """Lay the packages' files into the new directory `root`, without what a machine without users does not read."""
     root.mkdir(parents=True)
     for name in resolved.archives:
         _unpack_one(cache / name, root)
-    for pattern in _LEFT_OUT:
+    for pattern in _EXCLUDED:
         for path in root.glob(pattern):
             shutil.rmtree(path)
 
 
-def unpack_kernel(resolved: Resolved, cache: Path, target: Path) -> None:
+def unpack_kernel(resolved: ResolvedPackages, cache: Path, target: Path) -> None:
     """Lay the kernel's package into `target`: boot/vmlinuz-*, lib/modules/*."""
     target.mkdir(parents=True)
     _unpack_one(next(iter(sorted(cache.glob(f"{resolved.kernel}_*.deb")))), target)

@@ -6,7 +6,7 @@ from meshlab.fleet import VirtualFleet
 from meshlab.qemu.qemu import find_qemu
 
 
-class RealFleet(VirtualFleet):
+class QemuFleet(VirtualFleet):
     """`VirtualFleet` with the kernel's own radios, mesh and bridges.
 
     Files of nodes are in the machine: `VirtualNode.flash_path` and `console_log` have nothing on this side, `exec` and

@@ -17,24 +17,27 @@ from typing import Any
 
 from meshlab.errors import LabError
 from meshlab.qemu import guest_protocol
-from meshlab.qemu.port_forwarder import RealDoors
+from meshlab.qemu.port_forwarder import QemuPortForwarder
 
 log = logging.getLogger("meshlab.qemu.guest_agent")
 _CHUNK_BYTES = 1 << 16
 # a terminal passes on what was written to it a little later
 _TERMINAL_DRAIN_S = 0.05
-_FAREWELL_S = 5.0
+_CLOSE_WAIT_S = 5.0
 
 
-class Agent:
+class GuestAgent:
     """Serves connections whose first line holds `token`; `answer` is the fleet's (`control.Answer`)."""
 
     def __init__(
-        self, token: str, answer: Callable[[dict[str, Any], list[int]], Awaitable[dict[str, Any]]], doors: RealDoors
+        self,
+        token: str,
+        answer: Callable[[dict[str, Any], list[int]], Awaitable[dict[str, Any]]],
+        port_forwarder: QemuPortForwarder,
     ) -> None:
         self._token = token
         self._answer = answer
-        self._doors = doors
+        self._port_forwarder = port_forwarder
         self._server: asyncio.Server | None = None
         self._serving: set[asyncio.Task[None]] = set()
 
@@ -75,21 +78,21 @@ class Agent:
 
     async def _watch(self, writer: asyncio.StreamWriter) -> None:
         while True:
-            changed = self._doors.changed
-            doors = {host: door.node for host, door in self._doors.wanted().items()}
+            changed = self._port_forwarder.changed
+            doors = {host: door.node for host, door in self._port_forwarder.reachable().items()}
             writer.write(guest_protocol.line({"doors": doors}))
             await writer.drain()
             await changed.wait()
 
     async def _dial(self, host: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._doors.is_hung(host):
+        if self._port_forwarder.is_hung(host):
             # accepted, and then nothing until the other side gives up
             writer.write(guest_protocol.line({}))
             while await reader.read(_CHUNK_BYTES):
                 pass
             return
         try:
-            made = await self._doors.dial(host)
+            made = await self._port_forwarder.dial(host)
         except (OSError, LabError) as error:
             log.info("dial-failed host=%s reason=%s", host, error or type(error).__name__)
             writer.write(guest_protocol.line({"error": str(error) or type(error).__name__}))
@@ -103,7 +106,7 @@ class Agent:
             try:
                 # whichever ends first, the other one gets a while: a node without power says no farewell
                 await asyncio.wait((there, back), return_when=asyncio.FIRST_COMPLETED)
-                await asyncio.wait((there, back), timeout=_FAREWELL_S)
+                await asyncio.wait((there, back), timeout=_CLOSE_WAIT_S)
             finally:
                 there.cancel()
                 back.cancel()
@@ -116,9 +119,11 @@ class Agent:
     async def _execute(self, first: dict[str, Any], reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         streams = _Terminal(first["terminal"]) if first["terminal"] else _Pipes()
         loop = asyncio.get_running_loop()
-        tasks = [asyncio.ensure_future(_feed(reader, streams))]
+        tasks = [asyncio.ensure_future(_stream_input(reader, streams))]
         ended = asyncio.Event()
-        waiting = [loop.create_task(_tell(number, source, writer, ended)) for number, source in streams.outputs]
+        waiting = [
+            loop.create_task(_stream_output(number, source, writer, ended)) for number, source in streams.outputs
+        ]
         try:
             answer = await self._answer(first["request"], list(streams.theirs))
             streams.close_theirs()
@@ -183,7 +188,7 @@ async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
         writer.write_eof()
 
 
-async def _feed(reader: asyncio.StreamReader, streams: _Pipes) -> None:
+async def _stream_input(reader: asyncio.StreamReader, streams: _Pipes) -> None:
     """Input frames into a process; an empty one ends them."""
     loop = asyncio.get_running_loop()
     while True:
@@ -202,7 +207,7 @@ def _write_all(descriptor: int, content: bytes) -> None:
             content = content[os.write(descriptor, content) :]
 
 
-async def _tell(number: int, descriptor: int, writer: asyncio.StreamWriter, ended: asyncio.Event) -> None:
+async def _stream_output(number: int, descriptor: int, writer: asyncio.StreamWriter, ended: asyncio.Event) -> None:
     """A process's output as frames, until it is closed. One that stays behind may keep it open for ever and go on: so
     once the process has `ended`, what a pipe holds at most is read, as far as it is there."""
     loop = asyncio.get_running_loop()

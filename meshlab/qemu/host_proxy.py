@@ -28,8 +28,8 @@ from meshlab.control import Control
 from meshlab.errors import LabError
 from meshlab.port_forwarder import claim_port
 from meshlab.qemu import guest_protocol, initramfs
-from meshlab.qemu.qemu import TCG, Machine, accelerator_here, find_qemu
-from meshlab.qemu.remote_exec import carry_process
+from meshlab.qemu.qemu import TCG, Machine, cached_accelerator, find_qemu
+from meshlab.qemu.remote_exec import run_process
 from meshlab.shaped_tunnel import reset
 from meshlab.spec import load
 
@@ -39,11 +39,11 @@ _CHUNK_BYTES = 1 << 16
 _POLL_S = 0.5
 # from QEMU's first instruction until the supervisor is there: under emulation, on a machine with much else to do
 _START_S = 180.0
-_TRIES = 2
+_ATTEMPTS = 2
 _ANSWER_S = 60.0
 
 
-class Relay:
+class HostProxy:
     """Carries requests and connections to the machine until `stopping`."""
 
     def __init__(self, directory: Path, machine: Machine, token: str, port: int) -> None:
@@ -60,7 +60,7 @@ class Relay:
         loop = asyncio.get_running_loop()
         for ending in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(ending, self.stopping.set)
-        claim, self.port = claim_port(self._wanted_port)
+        port_lock, self.port = claim_port(self._wanted_port)
         control = Control(self._directory, self.answer)
         control.open()
         watching = asyncio.ensure_future(self._watch())
@@ -74,12 +74,12 @@ class Relay:
             control.close()
             for task in (watching, *self._tunnels):
                 task.cancel()
-            self._open({})
+            self._update_listeners({})
             await asyncio.gather(watching, *self._tunnels, return_exceptions=True)
-            claim.close()
+            port_lock.close()
 
     def _machine_ended(self) -> None:
-        log.error("machine-ended\n%s", self._machine.last_words())
+        log.error("machine-ended\n%s", self._machine.console_tail())
         self.stopping.set()
 
     # -- requests --
@@ -91,7 +91,7 @@ class Relay:
             return {}
         try:
             if descriptors:
-                return await carry_process(self._connect, request, descriptors)
+                return await run_process(self._connect, request, descriptors)
             reader, writer = await self._connect("request", request=request)
             try:
                 answer: dict[str, Any] = json.loads(await reader.readline())
@@ -118,12 +118,12 @@ class Relay:
                 reader, writer = await self._connect("watch")
                 try:
                     while line := await reader.readline():
-                        self._open(json.loads(line)["doors"])
+                        self._update_listeners(json.loads(line)["doors"])
                 finally:
                     writer.close()
             await asyncio.sleep(_POLL_S)
 
-    def _open(self, doors: dict[str, str]) -> None:
+    def _update_listeners(self, doors: dict[str, str]) -> None:
         for host in self._listening.keys() - doors.keys():
             listener, task = self._listening.pop(host)
             task.cancel()
@@ -188,31 +188,31 @@ def start(directory: Path, spec_text: str, token: str) -> Machine:
     """The fleet's machine, ready. Raises LabError when it does not start twice in a row; its consoles are kept."""
     find_qemu()
     cache = initramfs.cache_folder()
-    base = initramfs.base(cache)
-    initrd = initramfs.product(base, spec_text, token, directory)
+    base = initramfs.base_image(cache)
+    initrd = initramfs.build_initrd(base, spec_text, token, directory)
     spec = load(spec_text)
     radios = sum(len(node.radios) for node in spec.nodes)
-    how = accelerator_here(base.kernel, cache)
-    log.info("accelerator words=%s", " ".join(how.words))
+    how = cached_accelerator(base.kernel, cache)
+    log.info("accelerator words=%s", " ".join(how.options))
     machine = Machine(directory, base.kernel, initrd, radios=radios, nodes=len(spec.nodes))
-    for attempt in range(1, _TRIES + 1):
+    for attempt in range(1, _ATTEMPTS + 1):
         try:
             machine.start(how, _START_S)
-            _wait_answer(machine, token)
+            _check_reachable(machine, token)
             break
         except LabError as error:
             machine.stop()
             log.error("start-failed attempt=%d reason=%s\n%s", attempt, error, error.hint)
             kept = machine.console.rename(directory / f"console.failed-{attempt}") if machine.console.exists() else None
-            if attempt == _TRIES:
-                raise LabError(f"{error} ({_TRIES} times); consoles are kept: {kept}", hint=error.hint) from error
+            if attempt == _ATTEMPTS:
+                raise LabError(f"{error} ({_ATTEMPTS} times); consoles are kept: {kept}", hint=error.hint) from error
             # what a short boot did not show, a long one may
             how = TCG
     initrd.unlink()
     return machine
 
 
-def _wait_answer(machine: Machine, token: str) -> None:
+def _check_reachable(machine: Machine, token: str) -> None:
     """A machine that says it is ready must be reached, too. Raises LabError when it is not."""
     try:
         with socket.create_connection(("127.0.0.1", machine.port), timeout=_ANSWER_S) as connection:
@@ -222,7 +222,7 @@ def _wait_answer(machine: Machine, token: str) -> None:
             reason = "it closed the connection"
     except OSError as error:
         reason = str(error)
-    raise LabError(f"the machine is ready and does not answer: {reason}", hint=machine.last_words())
+    raise LabError(f"the machine is ready and does not answer: {reason}", hint=machine.console_tail())
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -235,7 +235,7 @@ def main(arguments: Sequence[str]) -> int:
         machine = start(directory, spec_text, token)
         try:
             (directory / "supervisor.pid").write_text(f"{os.getpid()}\n", encoding="ascii")
-            asyncio.run(Relay(directory, machine, token, load(spec_text).port).run())
+            asyncio.run(HostProxy(directory, machine, token, load(spec_text).port).run())
         finally:
             machine.stop()
     except (LabError, OSError) as error:

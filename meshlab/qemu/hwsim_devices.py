@@ -31,7 +31,7 @@ _GROUPS = Path("/sys/kernel/debug/ieee80211")
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class NodeHardware:
     """Where a node's hardware is: its number, its radios' names in the kernel, its cable, its LAN."""
 
     name: str
@@ -46,7 +46,7 @@ class Place:
         return f"cable{self.number}"
 
 
-def places(spec: FleetSpec) -> dict[str, Place]:
+def node_hardware(spec: FleetSpec) -> dict[str, NodeHardware]:
     """Every node's place; radios are counted through in the order of the nodes."""
     lans = {name: lan for lan in spec.lans for name in lan.nodes}
     found = {}
@@ -55,16 +55,16 @@ def places(spec: FleetSpec) -> dict[str, Place]:
         phys = tuple(f"phy{phy + place}" for place in range(len(node.radios)))
         phy += len(phys)
         mac = label_mac(node, number)
-        found[node.name] = Place(node.name, number, mac, phys, node.lan_ports, lans.get(node.name))
+        found[node.name] = NodeHardware(node.name, number, mac, phys, node.lan_ports, lans.get(node.name))
     return found
 
 
-def switch_of(lan: LanSpec, spec: FleetSpec) -> str:
+def switch_name(lan: LanSpec, spec: FleetSpec) -> str:
     """The kernel's name of a LAN's switch; robots' names are too long for it."""
     return f"switch{spec.lans.index(lan)}"
 
 
-def computer_of(lan: LanSpec) -> str:
+def computer_namespace(lan: LanSpec) -> str:
     """The name of the namespace that is a LAN's computer."""
     return f"pc.{lan.name}"
 
@@ -79,7 +79,7 @@ def prepare(spec: FleetSpec, country: str = "US") -> None:
     """Make what stands before any node has power: switches, robots' computers, the machine's own address."""
     batch = ["link set lo up"]
     for lan in spec.lans:
-        switch, space = switch_of(lan, spec), computer_of(lan)
+        switch, space = switch_name(lan, spec), computer_namespace(lan)
         batch += [
             f"netns add {space}",
             f"link add {switch} type bridge stp_state 0 mcast_snooping 0",
@@ -89,7 +89,7 @@ def prepare(spec: FleetSpec, country: str = "US") -> None:
     ip(batch)
     for lan in spec.lans:
         address = [f"addr add {lan.computer} dev eth0"] if lan.computer else []
-        ip(["link set lo up", "link set eth0 up", *address], space=computer_of(lan))
+        ip(["link set lo up", "link set eth0 up", *address], space=computer_namespace(lan))
     # an address of one bench cable is not told on another
     Path("/proc/sys/net/ipv4/conf/all/arp_ignore").write_text("1\n", encoding="ascii")
     run(("iw", "reg", "set", country))
@@ -98,25 +98,25 @@ def prepare(spec: FleetSpec, country: str = "US") -> None:
         run(("iw", "dev", interface.name, "del"))
 
 
-def put_devices(place: Place, pid: int) -> None:
+def attach_devices(hardware: NodeHardware, pid: int) -> None:
     """Give the new namespace of process `pid` its LAN ports and radios. Raises LabError when they do not come free."""
-    first, *others = place.lan_ports or ("eth0",)
-    batch = [f"link add {place.cable} type veth peer name {first} address {place.mac} netns {pid}"]
+    first, *others = hardware.lan_ports or ("eth0",)
+    batch = [f"link add {hardware.cable} type veth peer name {first} address {hardware.mac} netns {pid}"]
     for count, port in enumerate(others):
-        batch.append(f"link add {place.cable}.{count} type veth peer name {port} address {place.mac} netns {pid}")
+        batch.append(f"link add {hardware.cable}.{count} type veth peer name {port} address {hardware.mac} netns {pid}")
     deadline = time.monotonic() + _RADIOS_BACK_S
-    while any(not (_PHYS / phy).exists() for phy in place.phys) or _cables(place):
+    while any(not (_PHYS / phy).exists() for phy in hardware.phys) or _cables(hardware):
         if time.monotonic() > deadline:
-            raise LabError(f"the radios of {place.name} did not come back within {_RADIOS_BACK_S:g} s")
+            raise LabError(f"the radios of {hardware.name} did not come back within {_RADIOS_BACK_S:g} s")
         time.sleep(_POLL_S)
     ip(batch)
-    for phy in place.phys:
+    for phy in hardware.phys:
         for interface in (_PHYS / phy / "device" / "net").glob("*"):
             run(("iw", "dev", interface.name, "del"))
         run(("iw", "phy", phy, "set", "netns", str(pid)))
 
 
-def take_devices(place: Place, network: int) -> None:
+def detach_devices(hardware: NodeHardware, network: int) -> None:
     """Take radios and cables out of the network (a descriptor) of a node that has ended; they are here on return.
 
     The kernel would return them too, but in the background and after everything else that a dead network leaves: seen
@@ -125,33 +125,44 @@ def take_devices(place: Place, network: int) -> None:
     home = str(os.getpid())
     # by number: names are looked up in /sys, which shows this network's radios alone
     steps: list[tuple[Sequence[str], int]] = [
-        (("iw", f"phy#{phy.removeprefix('phy')}", "set", "netns", home), network) for phy in place.phys
+        (("iw", f"phy#{phy.removeprefix('phy')}", "set", "netns", home), network) for phy in hardware.phys
     ]
     # a veth ends with its peer
-    steps += [(("ip", "link", "del", path.name), -1) for path in _cables(place)]
+    steps += [(("ip", "link", "del", path.name), -1) for path in _cables(hardware)]
     for words, where in steps:
         try:
             run(words, network=where)
         except LabError as error:
-            log.warning("device-not-taken node=%s reason=%s", place.name, error)
+            log.warning("device-not-taken node=%s reason=%s", hardware.name, error)
 
 
-def _cables(place: Place) -> list[Path]:
+def _cables(hardware: NodeHardware) -> list[Path]:
     """The machine's ends of the node's cables that exist now."""
-    names = [place.cable, *(f"{place.cable}.{count}" for count in range(len(place.lan_ports) - 1))]
+    names = [hardware.cable, *(f"{hardware.cable}.{count}" for count in range(len(hardware.lan_ports) - 1))]
     return [path for path in map(Path("/sys/class/net").joinpath, names) if path.exists()]
 
 
-def lay_cable(place: Place, spec: FleetSpec, *, on_bench: bool) -> None:
+def connect_cable(hardware: NodeHardware, spec: FleetSpec, *, on_bench: bool) -> None:
     """Let a running node's cable end on the bench, in its robot's switch, or nowhere."""
-    if not (Path("/sys/class/net") / place.cable).exists():
+    if not (Path("/sys/class/net") / hardware.cable).exists():
         return
     if on_bench:
-        ip([f"link set {place.cable} nomaster", f"link set {place.cable} up"])
-    elif place.lan is not None:
-        ip([f"addr flush dev {place.cable}", f"link set {place.cable} master {switch_of(place.lan, spec)} up"])
+        ip([f"link set {hardware.cable} nomaster", f"link set {hardware.cable} up"])
+    elif hardware.lan is not None:
+        ip(
+            [
+                f"addr flush dev {hardware.cable}",
+                f"link set {hardware.cable} master {switch_name(hardware.lan, spec)} up",
+            ]
+        )
     else:
-        ip([f"addr flush dev {place.cable}", f"link set {place.cable} nomaster", f"link set {place.cable} down"])
+        ip(
+            [
+                f"addr flush dev {hardware.cable}",
+                f"link set {hardware.cable} nomaster",
+                f"link set {hardware.cable} down",
+            ]
+        )
 
 
 def operator_address(node: IPv4Interface, number: int) -> IPv4Interface:

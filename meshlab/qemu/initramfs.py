@@ -39,7 +39,7 @@ _FOLDERS = ("proc", "sys", "dev", "run", "tmp", "mnt", "root", "etc", "sbin", "b
 
 
 @dataclass(frozen=True, slots=True)
-class Base:
+class BaseImage:
     """The cached part: `root` are the unpacked files that `archive` holds."""
 
     kernel: Path
@@ -52,42 +52,42 @@ def cache_folder(environ: Mapping[str, str] = os.environ) -> Path:
     return Path(environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "meshctl" / "lab-real"
 
 
-def base(cache: Path) -> Base:
+def base_image(cache: Path) -> BaseImage:
     """The base, built if it is not in `cache`. Raises LabError when it cannot be built here."""
     if platform.machine() != "x86_64":
         raise LabError(f"the machine of real radios is an x86_64 one; this is {platform.machine()}")
     cache.mkdir(parents=True, exist_ok=True)
-    place = cache / _recipe()
-    with _alone(cache):
+    place = cache / _recipe_digest()
+    with _locked(cache):
         if not place.exists():
             _build_base(cache, place)
-    return Base(place / "vmlinuz", place / "base.cpio", place / "root")
+    return BaseImage(place / "vmlinuz", place / "base.cpio", place / "root")
 
 
-def product(base_: Base, spec_text: str, token: str, work: Path) -> Path:
+def build_initrd(image: BaseImage, spec_text: str, token: str, work: Path) -> Path:
     """The whole initial RAM disk as a file in `work`: the base's archive and what belongs to this fleet behind it."""
     tree = work / "product"
     shutil.rmtree(tree, ignore_errors=True)
-    _lay_code(tree / CODE_FOLDER)
-    _compile(base_.root, tree / CODE_FOLDER)
+    _install_code(tree / CODE_FOLDER)
+    _compile(image.root, tree / CODE_FOLDER)
     fleet = tree / FLEET_FOLDER
     fleet.mkdir()
-    rootfs.build(fleet / "rom", sysroot=base_.root, more=_HERE / "node_root", library_folders=_LIBRARY_FOLDERS)
-    _lay_programs(base_.root, fleet / "rom")
+    rootfs.build(fleet / "rom", sysroot=image.root, more=_HERE / "node_root", library_folders=_LIBRARY_FOLDERS)
+    _install_programs(image.root, fleet / "rom")
     (fleet / "spec.json").write_text(spec_text, encoding="utf-8")
     (fleet / "token").write_text(token, encoding="ascii")
     shutil.copy2(_HERE / "machine_root" / "init", tree / "init")
     (tree / "init").chmod(0o755)
     initrd = work / "initrd"
     with initrd.open("wb") as out:
-        with base_.archive.open("rb") as first:
+        with image.archive.open("rb") as first:
             shutil.copyfileobj(first, out, 1 << 20)
         cpio.write(tree, out)
     shutil.rmtree(tree)
     return initrd
 
 
-def _recipe() -> str:
+def _recipe_digest() -> str:
     """A name for what a base is made of: another recipe makes another base."""
     text = "".join(inspect.getsource(module) for module in (apt, kernel_modules, cpio)) + inspect.getsource(_build_base)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -104,8 +104,8 @@ def _build_base(cache: Path, place: Path) -> None:
         apt.unpack_kernel(resolved, cache / "archives", work / "kernel")
         root, made = work / "root", work / "made"
         made.mkdir()
-        _lay_modules(next((work / "kernel" / "lib" / "modules").iterdir()), root)
-        _lay_folders(root)
+        _install_modules(next((work / "kernel" / "lib" / "modules").iterdir()), root)
+        _make_folders(root)
         _compile(root, next((root / "usr" / "lib").glob("python3.*")))
         _compile(root, root / "usr" / "lib" / "python3" / "dist-packages")
         shutil.copy2(next((work / "kernel" / "boot").glob("vmlinuz-*")), made / "vmlinuz")
@@ -115,7 +115,7 @@ def _build_base(cache: Path, place: Path) -> None:
         made.rename(place)
 
 
-def _lay_modules(modules: Path, root: Path) -> None:
+def _install_modules(modules: Path, root: Path) -> None:
     target = root / "lib" / "modules"
     target.mkdir(parents=True, exist_ok=True)
     names = []
@@ -125,7 +125,7 @@ def _lay_modules(modules: Path, root: Path) -> None:
     (target / "order").write_text("".join(f"{name}\n" for name in names), encoding="ascii")
 
 
-def _lay_folders(root: Path) -> None:
+def _make_folders(root: Path) -> None:
     for folder in _FOLDERS:
         (root / folder).mkdir(parents=True, exist_ok=True)
     for name, content in (("passwd", "root::0:0:root:/root:/bin/sh\n"), ("group", "root:x:0:\n")):
@@ -142,7 +142,7 @@ def _lay_folders(root: Path) -> None:
         (root / "bin" / "busybox").symlink_to("../usr/bin/busybox")
 
 
-def _lay_code(target: Path) -> None:
+def _install_code(target: Path) -> None:
     package = target / "meshctl"
     package.mkdir(parents=True)
     ignored = shutil.ignore_patterns("__pycache__", "node_root", "machine_root")
@@ -155,7 +155,7 @@ def _lay_code(target: Path) -> None:
             shutil.copy2(source, package / name)
 
 
-def _lay_programs(root: Path, rom_folder: Path) -> None:
+def _install_programs(root: Path, rom_folder: Path) -> None:
     """Debian's programs for the nodes, and the libraries that they and the ROM's need."""
     kernel = rom_folder / "lab" / "kernel"
     kernel.mkdir(exist_ok=True)
@@ -201,7 +201,7 @@ def _loader(root: Path) -> tuple[str, str, str]:
 
 
 @contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def _locked(folder: Path) -> Iterator[None]:
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from meshlab import hwsim_groups
 from meshlab.errors import LabError
-from meshlab.link_state import Ether
+from meshlab.link_state import LinkState
 from meshlab.qemu import hwsim_devices, traffic_control
 from meshlab.quality import loss_of
 from meshlab.shaped_tunnel import Shape
@@ -25,25 +25,25 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("meshlab.qemu.link_state")
 # so soon after the last change; many changes at once are one
-_SOON_S = 0.02
+_SETTLE_S = 0.02
 # after something could not be applied to a node that goes on running
-_AGAIN_S = 1.0
+_RETRY_S = 1.0
 
 
-class RealEther(Ether):
+class QemuLinkState(LinkState):
     """`places` tells where each node's hardware is."""
 
-    def __init__(self, fleet: Supervisor, places: dict[str, hwsim_devices.Place]) -> None:
+    def __init__(self, fleet: Supervisor, hardware: dict[str, hwsim_devices.NodeHardware]) -> None:
         super().__init__(fleet)
-        self._places = places
+        self._hardware = hardware
         self._groups: dict[str, int] = {}
-        self._laid: dict[str, tuple[int, bool]] = {}
-        self._lossy: dict[str, tuple[int, str]] = {}
-        self._soon_s = _SOON_S
+        self._cabled: dict[str, tuple[int, bool]] = {}
+        self._impaired: dict[str, tuple[int, str]] = {}
+        self._settle_s = _SETTLE_S
 
     # -- what holds now --
 
-    def _cut(self) -> None:
+    def _remove_lost_routes(self) -> None:
         """A node without power is silent at once; the kernel takes its interfaces apart a little later."""
         off = [name for name, state in self._fleet.nodes.items() if not state.is_running and self._groups.get(name)]
         if off:
@@ -57,32 +57,32 @@ class RealEther(Ether):
         self.set_groups(hwsim_groups.assign(list(self._fleet.nodes), edges))
         for state in self._fleet.nodes.values():
             try:
-                self._lay_cable(state)
-                self._lose(state)
+                self._connect_cable(state)
+                self._impair_node(state)
             except LabError as error:
                 # a node that ends in this moment takes its devices with it, one that configures them makes them again
                 log.warning("not-applied node=%s reason=%s", state.spec.name, error)
                 if state.is_running:
-                    asyncio.get_running_loop().call_later(_AGAIN_S, self.changed)
-        self._tell()
+                    asyncio.get_running_loop().call_later(_RETRY_S, self.changed)
+        self._notify()
 
     def set_groups(self, masks: dict[str, int]) -> None:
         """Give nodes' radios their masks, in an order in which nobody hears whom it should not."""
-        for name, mask in hwsim_groups.steps(self._groups, masks):
-            for phy in self._places[name].phys:
+        for name, mask in hwsim_groups.transition(self._groups, masks):
+            for phy in self._hardware[name].phys:
                 hwsim_devices.set_group(phy, mask)
             self._groups[name] = mask
 
-    def _lay_cable(self, state: NodeState) -> None:
+    def _connect_cable(self, state: NodeState) -> None:
         if state.pid <= 0:
             return
         on_bench = state.plugged and not self._is_base(state)
         wanted = (state.boots, on_bench)
-        if self._laid.get(state.spec.name) != wanted:
-            hwsim_devices.lay_cable(self._places[state.spec.name], self._fleet.spec, on_bench=on_bench)
-            self._laid[state.spec.name] = wanted
+        if self._cabled.get(state.spec.name) != wanted:
+            hwsim_devices.connect_cable(self._hardware[state.spec.name], self._fleet.spec, on_bench=on_bench)
+            self._cabled[state.spec.name] = wanted
 
-    def _lose(self, state: NodeState) -> None:
+    def _impair_node(self, state: NodeState) -> None:
         """What this node's radios do not hear of what they could hear."""
         if state.pid <= 0:
             return
@@ -94,46 +94,49 @@ class RealEther(Ether):
             other = link.b if name == link.a else link.a
             # a quality given by hand is what losses of that size make of a link
             loss = max(link.loss_to(name), loss_of(link.tq))
-            fate = traffic_control.Fate(loss, link.delay_ms, link.rate_kbps)
-            if not fate.is_nothing:
-                heard.update({cell.mac: fate for cell in self._fleet.nodes[other].effective.cells})
-        self.lose(state, heard)
+            impairment = traffic_control.Impairment(loss, link.delay_ms, link.rate_kbps)
+            if not impairment.is_none:
+                heard.update({cell.mac: impairment for cell in self._fleet.nodes[other].effective.interfaces})
+        self.impair(state, heard)
 
-    def lose(self, state: NodeState, heard: dict[str, traffic_control.Fate]) -> None:
+    def impair(self, state: NodeState, heard: dict[str, traffic_control.Impairment]) -> None:
         """Make it so on every radio interface of the node that is up."""
-        batch = "".join(traffic_control.batch(cell.interface, heard) for cell in state.effective.cells)
+        batch = "".join(traffic_control.batch(cell.interface, heard) for cell in state.effective.interfaces)
         wanted = (state.boots, batch)
-        if self._lossy.get(state.spec.name, (state.boots, "")) == wanted:
+        if self._impaired.get(state.spec.name, (state.boots, "")) == wanted:
             return
-        for cell in state.effective.cells:
+        for cell in state.effective.interfaces:
             traffic_control.clear(state.pid, cell.interface)
             if heard:
-                traffic_control.put(state.pid, cell.interface, traffic_control.batch(cell.interface, heard))
-        self._lossy[state.spec.name] = wanted
+                traffic_control.apply(state.pid, cell.interface, traffic_control.batch(cell.interface, heard))
+        self._impaired[state.spec.name] = wanted
 
-    def forget(self, name: str) -> None:
+    def reset_impairments(self, name: str) -> None:
         """The node has configured its interfaces anew: what was done to them is gone."""
-        self._lossy[name] = (self._fleet.nodes[name].boots, "?")
+        self._impaired[name] = (self._fleet.nodes[name].boots, "?")
 
     # -- the way to the operator --
 
-    def way(self, name: str, address: str) -> Shape | None:
+    def path_shape(self, name: str, address: str) -> Shape | None:
         """Whether a door may stand there; where it leads, the kernel finds out when somebody enters."""
         state = self._fleet.nodes[name]
         if not state.is_running:
             return None
-        if self.wire(name, address) is not None:
+        if self.bench_shape(name, address) is not None:
             return Shape()
         return Shape() if state.effective.holds(address, over="mesh") else None
 
-    def reached(self) -> set[str]:
+    def reachable(self) -> set[str]:
         """The nodes that the base's batman-adv has a route to at this moment."""
         of_mac = {
-            cell.mac: name for name, state in self._fleet.nodes.items() for cell in state.effective.cells if state.pid
+            cell.mac: name
+            for name, state in self._fleet.nodes.items()
+            for cell in state.effective.interfaces
+            if state.pid
         }
         found: set[str] = set()
         for state in self._fleet.nodes.values():
-            if self._is_base(state) and state.pid > 0 and state.effective.cells:
+            if self._is_base(state) and state.pid > 0 and state.effective.interfaces:
                 found.add(state.spec.name)
                 found.update(of_mac[mac] for mac in traffic_control.originators(state.pid) if mac in of_mac)
         return found

@@ -33,7 +33,7 @@ _LAST_LINES = 25
 # Debian's kernel clears every page it gives out, and asks AppArmor, auditing and memory accounting about every process:
 # under emulation that is a good part of what starting one costs, and nodes start thousands. And a program that lies at
 # other addresses each time is translated each time: at the same ones dash takes 19 ms and not 99, iw 60 and not 144
-_WITHOUT = "init_on_alloc=0 apparmor=0 audit=0 cgroup_disable=memory transparent_hugepage=never norandmaps"
+_KERNEL_OPTIONS = "init_on_alloc=0 apparmor=0 audit=0 cgroup_disable=memory transparent_hugepage=never norandmaps"
 _STOP_S = 10.0
 
 
@@ -41,7 +41,7 @@ _STOP_S = 10.0
 class Accelerator:
     """QEMU's words for how the machine's processor is run, and whether that is fast."""
 
-    words: tuple[str, ...]
+    options: tuple[str, ...]
     is_fast: bool
 
 
@@ -59,7 +59,7 @@ def find_qemu() -> None:
         )
 
 
-def accelerator_here(kernel: Path, cache: Path) -> Accelerator:
+def cached_accelerator(kernel: Path, cache: Path) -> Accelerator:
     """`accelerator`, found out once per boot of this machine and kept in `cache`."""
     note = cache / "accelerator"
     boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
@@ -67,12 +67,12 @@ def accelerator_here(kernel: Path, cache: Path) -> Accelerator:
         known, word = note.read_text(encoding="ascii").split()
         if known == boot:
             return KVM if word == "kvm" else TCG
-    how = accelerator(kernel)
+    how = probe_accelerator(kernel)
     note.write_text(f"{boot} {'kvm' if how is KVM else 'tcg'}\n", encoding="ascii")
     return how
 
 
-def accelerator(kernel: Path, device: Path = Path("/dev/kvm")) -> Accelerator:
+def probe_accelerator(kernel: Path, device: Path = Path("/dev/kvm")) -> Accelerator:
     """KVM if it is there and a kernel says something on it in time; else software emulation."""
     try:
         device.open("r+b", buffering=0).close()
@@ -81,7 +81,7 @@ def accelerator(kernel: Path, device: Path = Path("/dev/kvm")) -> Accelerator:
     with tempfile.TemporaryDirectory(prefix="meshctl-probe-") as folder:
         console = Path(folder) / "console"
         words = (
-            QEMU, "-M", "q35", *KVM.words, "-m", "256", "-nodefaults", "-display", "none", "-no-reboot",
+            QEMU, "-M", "q35", *KVM.options, "-m", "256", "-nodefaults", "-display", "none", "-no-reboot",
             "-kernel", str(kernel), "-append", "console=ttyS0 panic=-1", "-serial", f"file:{console}",
         )  # fmt: skip
         silence = subprocess.DEVNULL
@@ -89,15 +89,15 @@ def accelerator(kernel: Path, device: Path = Path("/dev/kvm")) -> Accelerator:
             try:
                 deadline = time.monotonic() + _PROBE_S
                 while probe.poll() is None and time.monotonic() < deadline:
-                    if _speaks(console):
+                    if _kernel_started(console):
                         return KVM
                     time.sleep(_POLL_S)
             finally:
                 probe.kill()
-        return KVM if _speaks(console) else TCG
+        return KVM if _kernel_started(console) else TCG
 
 
-def _speaks(console: Path) -> bool:
+def _kernel_started(console: Path) -> bool:
     return console.exists() and b"Linux version" in console.read_bytes()
 
 
@@ -143,11 +143,11 @@ class Machine:
     def _words(self, how: Accelerator, monitor: int) -> tuple[str, ...]:
         line = (
             "console=ttyS0 quiet panic=-1 mitigations=off nokaslr random.trust_cpu=on no_timer_check tsc=reliable "
-            f"{_WITHOUT} lab.radios={self._radios}"
+            f"{_KERNEL_OPTIONS} lab.radios={self._radios}"
         )
         network = f"user,id=host,restrict=on,net={NETWORK},host={GATEWAY},hostfwd=tcp:127.0.0.1:0-{ADDRESS}:{PORT}"
         return (
-            QEMU, "-M", "q35", *how.words, "-smp", str(_PROCESSORS), "-m", str(self._memory_mib),
+            QEMU, "-M", "q35", *how.options, "-smp", str(_PROCESSORS), "-m", str(self._memory_mib),
             "-nodefaults", "-display", "none", "-no-reboot",
             "-kernel", str(self._kernel), "-initrd", str(self._initrd), "-append", line,
             "-netdev", network, "-device", "virtio-net-pci,netdev=host,romfile=", "-device", "virtio-rng-pci",
@@ -157,14 +157,14 @@ class Machine:
 
     def _wait_ready(self, wait_s: float) -> None:
         deadline = time.monotonic() + wait_s
-        while READY not in self.last_words(lines=10_000):
+        while READY not in self.console_tail(lines=10_000):
             if self._process is None or self._process.poll() is not None:
-                raise LabError("the machine ended while it started", hint=self.last_words())
+                raise LabError("the machine ended while it started", hint=self.console_tail())
             if time.monotonic() > deadline:
-                raise LabError(f"the machine was not ready within {wait_s:g} s", hint=self.last_words())
+                raise LabError(f"the machine was not ready within {wait_s:g} s", hint=self.console_tail())
             time.sleep(_POLL_S)
 
-    def last_words(self, lines: int = _LAST_LINES) -> str:
+    def console_tail(self, lines: int = _LAST_LINES) -> str:
         """The end of its console."""
         if not self.console.exists():
             return ""

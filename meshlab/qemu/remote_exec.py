@@ -21,14 +21,14 @@ from meshlab.qemu import guest_protocol
 Connect = Callable[..., Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWriter]]]
 
 
-async def carry_process(connect: Connect, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
+async def run_process(connect: Connect, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
     """Run the process that `request` asks for; its answer. Raises OSError when the machine goes away."""
     source, out, err = descriptors
     size = _terminal_size(source)
     reader, writer = await connect("exec", request=request, terminal=size)
     loop = asyncio.get_running_loop()
     wake, wake_end = os.pipe()
-    feeding = loop.run_in_executor(None, _feed, source, wake, loop, writer)
+    feeding = loop.run_in_executor(None, _stream_input, source, wake, loop, writer)
     try:
         while True:
             stream, length = guest_protocol.header(await reader.readexactly(guest_protocol.HEADER_BYTES))
@@ -55,7 +55,7 @@ def _terminal_size(descriptor: int) -> list[int] | None:
     return [rows or 24, columns or 80]
 
 
-def _feed(source: int, wake: int, loop: asyncio.AbstractEventLoop, writer: asyncio.StreamWriter) -> None:
+def _stream_input(source: int, wake: int, loop: asyncio.AbstractEventLoop, writer: asyncio.StreamWriter) -> None:
     """Copy `source` into the machine until it ends or `wake` is closed on its other side."""
 
     def send(content: bytes) -> None:

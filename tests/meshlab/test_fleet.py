@@ -106,11 +106,11 @@ def test_a_port_that_is_taken_is_named(tmp_path: Path) -> None:
 
 def test_unknown_nodes_links_and_breaks_are_named(fleet: VirtualFleet) -> None:
     with pytest.raises(InputError, match="no node named nobody"):
-        fleet.break_("nobody", "power-cut")
+        fleet.inject_fault("nobody", "power-cut")
     with pytest.raises(InputError, match="no break is called"):
-        fleet.break_("near", "explode")
+        fleet.inject_fault("near", "explode")
     with pytest.raises(InputError, match="is for nodes"):
-        fleet.break_("base-near", "full-flash")
+        fleet.inject_fault("base-near", "full-flash")
     with pytest.raises(InputError, match="colour"):
         fleet.link("base", "near", colour="red")
 
