@@ -14,15 +14,16 @@ import re
 import socket
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from meshctl.errors import MeshctlError
+from meshlab.fault_injection import FaultInjection
+from meshlab.fleet_state import FleetState, NodeControl
+from meshlab.link_state import LinkState
 from meshlab.node_runner import MESSAGE_BYTES
+from meshlab.port_forwarder import PortForwarder
 from meshlab.spec import LinkSpec
 from meshlab.state import NodeState
-
-if TYPE_CHECKING:
-    from meshlab.supervisor import Supervisor
 
 log = logging.getLogger("meshlab.control")
 _NAME = "control.sock"
@@ -95,8 +96,19 @@ class Control:
 class Operations:
     """What a client may ask for; every public method but `answer` is an operation and returns a JSON object or None."""
 
-    def __init__(self, fleet: Supervisor) -> None:
+    def __init__(
+        self,
+        fleet: FleetState,
+        link_state: LinkState,
+        port_forwarder: PortForwarder,
+        faults: FaultInjection,
+        control: NodeControl,
+    ) -> None:
         self._fleet = fleet
+        self._link_state = link_state
+        self._port_forwarder = port_forwarder
+        self._faults = faults
+        self._control = control
 
     async def answer(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
         """The answer to one request; what went wrong is one, too."""
@@ -124,10 +136,10 @@ class Operations:
 
     def status(self) -> dict[str, Any]:
         fleet = self._fleet
-        reached = fleet.link_state.reachable()
-        doors: dict[str, list[str]] = {}
-        for host, door in fleet.port_forwarder.reachable().items():
-            doors.setdefault(door.node, []).append(host)
+        in_mesh = self._link_state.reachable()
+        hosts: dict[str, list[str]] = {}
+        for host, port in self._port_forwarder.reachable().items():
+            hosts.setdefault(port.node, []).append(host)
         nodes = [
             {
                 "name": name,
@@ -138,8 +150,8 @@ class Operations:
                 "release": _release(state),
                 "address": _address(state.effective.addresses),
                 "plugged": state.plugged,
-                "in_mesh": name in reached,
-                "reached_at": sorted(doors.get(name, [])),
+                "in_mesh": name in in_mesh,
+                "reached_at": sorted(hosts.get(name, [])),
                 "breaks": state.faults,
             }
             for name, state in fleet.nodes.items()
@@ -147,18 +159,18 @@ class Operations:
         links = [
             {"between": [link.a, link.b], "up": link.up, "tq": link.tq_to(link.b), "delay_ms": link.delay_ms,
              "loss": link.loss, "loss_back": link.loss_to(link.a), "rate_kbps": link.rate_kbps}
-            for link in fleet.link_state.links()
+            for link in self._link_state.links()
         ]  # fmt: skip
         return {
             "fleet": fleet.spec.name,
             "pid": os.getpid(),
-            "port": fleet.port_forwarder.port,
+            "port": self._port_forwarder.port,
             "nodes": nodes,
             "links": links,
         }
 
     def node(self, node: str) -> dict[str, Any]:
-        state = self._fleet.faults.node(node)
+        state = self._fleet.node(node)
         return {
             "power": state.power.value,
             "reason": state.reason,
@@ -170,46 +182,46 @@ class Operations:
 
     def console(self, node: str, lines: int) -> dict[str, Any]:
         """The last lines of what its boot scripts printed, of all boots; it works for a node without power, too."""
-        file = self._fleet.faults.node(node).home / "console.log"
+        file = self._fleet.node(node).home / "console.log"
         text = file.read_text(encoding="utf-8", errors="replace") if file.exists() else ""
         return {"text": "\n".join(text.splitlines()[-lines:])}
 
     async def execute(self, node: str, command: str, descriptors: list[int]) -> dict[str, Any]:
-        self._fleet.faults.node(node)
-        event, _ = await self._fleet.request({"do": "exec", "node": node, "command": command}, descriptors)
+        self._fleet.node(node)
+        event, _ = await self._control.request({"do": "exec", "node": node, "command": command}, descriptors)
         return {"status": event["status"], "reason": event.get("reason", "")}
 
     async def power_cut(self, node: str, unsynced: str, back: bool) -> None:
-        await self._fleet.faults.power_cut(self._fleet.faults.node(node), unsynced, back=back)
+        await self._faults.power_cut(self._fleet.node(node), unsynced, back=back)
 
     def power_on(self, node: str) -> None:
-        self._fleet.power_on(self._fleet.faults.node(node).spec.name)
+        self._control.power_on(self._fleet.node(node).spec.name)
 
     async def do_break(self, where: str, what: str) -> None:
-        await self._fleet.faults.inject(where, what)
+        await self._faults.inject(where, what)
 
     async def mend(self, where: str) -> None:
-        await self._fleet.faults.repair(where)
+        await self._faults.repair(where)
 
     def link(self, a: str, b: str, changes: dict[str, Any]) -> None:
-        self._fleet.link_state.set_link(a, b, changes)
+        self._link_state.set_link(a, b, changes)
 
     def links(self, part: list[dict[str, Any]], is_last: bool) -> None:
         """Who hears whom from now on, in parts because a request has its limit (`standing.stand_on`)."""
-        self._fleet.link_state.pending_links += [LinkSpec(**link) for link in part]
+        self._link_state.pending_links += [LinkSpec(**link) for link in part]
         if is_last:
-            links, self._fleet.link_state.pending_links = self._fleet.link_state.pending_links, []
-            self._fleet.link_state.set_base_links(links)
+            links, self._link_state.pending_links = self._link_state.pending_links, []
+            self._link_state.set_base_links(links)
 
     def plug(self, node: str, plugged: bool) -> None:
-        self._fleet.faults.node(node).plugged = plugged
-        self._fleet.link_state.changed()
+        self._fleet.node(node).plugged = plugged
+        self._link_state.changed()
 
     async def record_steps(self, node: str) -> None:
-        await self._fleet.faults.count_steps(self._fleet.faults.node(node))
+        await self._faults.count_steps(self._fleet.node(node))
 
     def down(self) -> None:
-        self._fleet.stopping.set()
+        self._control.stop()
 
 
 def _release(state: NodeState) -> str:

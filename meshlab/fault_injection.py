@@ -5,17 +5,16 @@ from __future__ import annotations
 import asyncio
 import os
 import shlex
-from typing import TYPE_CHECKING, assert_never
+from typing import assert_never
 
 from meshctl.errors import InputError
 from meshlab.container import write_meminfo
 from meshlab.errors import LabError
 from meshlab.faults import LINK_FAULTS, SLOW_DELAY_MS, SLOW_LOSS, SLOW_RATE_KBPS, Fault, FaultRequest, parse
+from meshlab.fleet_state import FleetState, NodeControl
+from meshlab.link_state import LinkState
 from meshlab.spec import Medium
 from meshlab.state import NodeState, Power, write_firmware
-
-if TYPE_CHECKING:
-    from meshlab.supervisor import Supervisor
 
 _FREE_FLASH_KIB = 8
 _FREE_MEMORY_KIB = 2048
@@ -30,16 +29,10 @@ _SLOW = {"delay_ms": SLOW_DELAY_MS, "loss": SLOW_LOSS, "rate_kbps": SLOW_RATE_KB
 class FaultInjection:
     """Raises InputError for words it does not know, LabError when the node is not in a state for it."""
 
-    def __init__(self, fleet: Supervisor) -> None:
+    def __init__(self, fleet: FleetState, link_state: LinkState, control: NodeControl) -> None:
         self._fleet = fleet
-
-    def node(self, name: str) -> NodeState:
-        try:
-            return self._fleet.nodes[name]
-        except KeyError:
-            raise InputError(
-                f"no node named {name} in this fleet", hint=f"nodes: {', '.join(self._fleet.nodes)}"
-            ) from None
+        self._link_state = link_state
+        self._control = control
 
     def _link_ends(self, where: str) -> tuple[str, str] | None:
         """`b01-b02` as two nodes; None when it names a node. Node names may hold dashes themselves."""
@@ -49,7 +42,7 @@ class FaultInjection:
             a, b = where[:place], where[place + 1 :]
             if a in self._fleet.nodes and b in self._fleet.nodes:
                 return a, b
-        self.node(where)
+        self._fleet.node(where)
         return None
 
     async def inject(self, where: str, what: str) -> None:
@@ -61,9 +54,9 @@ class FaultInjection:
                 raise InputError(
                     f"{request.fault.value} is for nodes; links take {', '.join(b.value for b in LINK_FAULTS)}"
                 )
-            self._fleet.link_state.set_link(*link, {"up": False} if request.fault is Fault.LINK_DOWN else dict(_SLOW))
+            self._link_state.set_link(*link, {"up": False} if request.fault is Fault.LINK_DOWN else dict(_SLOW))
             return
-        state = self.node(where)
+        state = self._fleet.node(where)
         if what not in state.faults:
             state.faults.append(what)
         await self._inject_node(state, request)
@@ -88,8 +81,8 @@ class FaultInjection:
             case Fault.SEVER | Fault.LINK_DOWN:
                 self._cut_links(state)
             case Fault.SLOW:
-                self._fleet.link_state.slowed[name] = dict(_SLOW)
-                self._fleet.link_state.changed()
+                self._link_state.slowed[name] = dict(_SLOW)
+                self._link_state.changed()
             case Fault.FULL_FLASH:
                 await self._fill(state, _FILLERS[0], "/overlay", _FREE_FLASH_KIB)
             case Fault.FULL_MEMORY:
@@ -113,20 +106,20 @@ class FaultInjection:
         """Undo the breaks of one node or link, or of all; a node whose firmware is dead gets its factory image."""
         link = self._link_ends(where) if where else None
         if link is not None:
-            self._fleet.link_state.restore(frozenset(link))
+            self._link_state.restore(frozenset(link))
             return
         if not where:
-            self._fleet.link_state.restore()
-        for state in [self.node(where)] if where else list(self._fleet.nodes.values()):
+            self._link_state.restore()
+        for state in [self._fleet.node(where)] if where else list(self._fleet.nodes.values()):
             await self._repair_node(state)
 
     async def _repair_node(self, state: NodeState) -> None:
         name = state.spec.name
         state.faults.clear()
-        if name in self._fleet.link_state.severed:
-            self._fleet.link_state.severed.remove(name)
+        if name in self._link_state.severed:
+            self._link_state.severed.remove(name)
             state.plugged = state.spec.medium is not Medium.NONE
-        self._fleet.link_state.slowed.pop(name, None)
+        self._link_state.slowed.pop(name, None)
         state.hung = state.cut_at_flash = state.wrong_board = False
         (state.home / "clock").unlink(missing_ok=True)
         if state.is_running:
@@ -143,8 +136,8 @@ class FaultInjection:
             write_firmware(state.home, state.spec.release, state.spec.packages, state.spec.target)
             (state.home / "flash" / "current").unlink(missing_ok=True)
             state.power = Power.OFF
-        self._fleet.power_on(name)
-        self._fleet.link_state.changed()
+        self._control.power_on(name)
+        self._link_state.changed()
 
     # -- power --
 
@@ -156,7 +149,7 @@ class FaultInjection:
             await self.run(state, "sh /rom/lab/tear", may_be_off=True)
         elif unsynced != "lost":
             raise InputError(f"what was not synced is lost, kept or torn, not {unsynced!r}")
-        self._fleet.power_off(state.spec.name, back=back)
+        self._control.power_off(state.spec.name, back=back)
 
     def sever(self, state: NodeState) -> None:
         """A step that was to sever the node's links has come; the node waits for the word to go on."""
@@ -169,9 +162,9 @@ class FaultInjection:
         os.close(go)
 
     def _cut_links(self, state: NodeState) -> None:
-        self._fleet.link_state.severed.add(state.spec.name)
+        self._link_state.severed.add(state.spec.name)
         state.plugged = False
-        self._fleet.link_state.changed()
+        self._link_state.changed()
 
     # -- on the node --
 
@@ -205,7 +198,7 @@ class FaultInjection:
         output, output_end = os.pipe2(os.O_CLOEXEC)
         try:
             request = {"do": "exec", "node": state.spec.name, "command": command}
-            event, _ = await self._fleet.request(request, (null, null, output_end))
+            event, _ = await self._control.request(request, (null, null, output_end))
             os.close(output_end)
             output_end = -1
             os.set_blocking(output, False)

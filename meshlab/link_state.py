@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from meshctl.errors import InputError
 from meshlab import mesh_model
+from meshlab.fleet_state import FleetState
 from meshlab.shaped_tunnel import Shape
 from meshlab.spec import LinkSpec, Medium, changed_link
 from meshlab.station_tables import StationTables
-
-if TYPE_CHECKING:
-    from meshlab.supervisor import Supervisor
 
 # recomputing all tables of a big fleet takes a while; at most this share of the time is spent on it
 _BUSY_SHARE = 0.2
@@ -25,8 +23,10 @@ _BUSY_SHARE = 0.2
 class LinkState:
     """`changed()` says that a node or a link is different; the tables follow after the fleet's convergence time."""
 
-    def __init__(self, fleet: Supervisor) -> None:
+    def __init__(self, fleet: FleetState) -> None:
         self._fleet = fleet
+        # called after every change of what is reachable
+        self.on_change: Callable[[], None] = lambda: None
         # who hears whom by the fleet's spec or its ground, and over it the links that somebody set one by one
         self._base_links = {link.ends: link for link in fleet.spec.links}
         self._overrides: dict[frozenset[str], LinkSpec] = {}
@@ -216,7 +216,7 @@ class LinkState:
         self._notify()
 
     def _notify(self) -> None:
-        self._fleet.port_forwarder.refresh()
+        self.on_change()
 
         async def notify() -> None:
             async with self.condition:

@@ -12,17 +12,14 @@ import errno
 import logging
 import random
 import socket
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from meshlab.addresses import FACTORY_ADDRESS, bench_of, loopback_of
 from meshlab.errors import LabError
+from meshlab.fleet_state import FleetState, NodeControl
+from meshlab.link_state import LinkState
 from meshlab.shaped_tunnel import Shape, Tunnel, reset
 from meshlab.spec import Medium
-
-if TYPE_CHECKING:
-    from meshlab.supervisor import Supervisor
 
 log = logging.getLogger("meshlab.port_forwarder")
 _SSH_PORT = 22
@@ -44,8 +41,10 @@ class ForwardedPort:
 class PortForwarder:
     """Keeps the listening sockets in step with what is reachable."""
 
-    def __init__(self, fleet: Supervisor) -> None:
+    def __init__(self, fleet: FleetState, link_state: LinkState, control: NodeControl) -> None:
         self._fleet = fleet
+        self._link_state = link_state
+        self._control = control
         self._listening: dict[ForwardedPort, tuple[socket.socket, asyncio.Task[None]]] = {}
         self._tunnels: set[asyncio.Task[None]] = set()
         self.port = fleet.spec.port
@@ -77,9 +76,8 @@ class PortForwarder:
         for name, state in self._fleet.nodes.items():
             if not state.is_running:
                 continue
-            if self._fleet.link_state.bench_shape(name, FACTORY_ADDRESS) is not None and state.effective.admits(
-                FACTORY_ADDRESS
-            ):
+            on_bench = self._link_state.bench_shape(name, FACTORY_ADDRESS) is not None
+            if on_bench and state.effective.admits(FACTORY_ADDRESS):
                 port = ForwardedPort(bench_of(state.number), name, FACTORY_ADDRESS, bench=True)
                 ports[port.host] = port
             for address in state.effective.addresses:
@@ -89,29 +87,29 @@ class PortForwarder:
                 if not address.admitted:
                     continue
                 host = loopback_of(address.address)
-                if host not in ports and self._fleet.link_state.path_shape(name, address.address) is not None:
+                if host not in ports and self._link_state.path_shape(name, address.address) is not None:
                     ports[host] = ForwardedPort(host, name, address.address, bench=False)
         return ports
 
     def refresh(self) -> None:
         """Open and close sockets until they are what `wanted` says."""
         reachable = set(self.reachable().values())
-        for door in self._listening.keys() - reachable:
-            listener, task = self._listening.pop(door)
+        for port in self._listening.keys() - reachable:
+            listener, task = self._listening.pop(port)
             task.cancel()
             listener.close()
-        for door in reachable - self._listening.keys():
+        for port in reachable - self._listening.keys():
             listener = socket.socket()
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
-                listener.bind((door.host, self.port))
+                listener.bind((port.host, self.port))
             except OSError as error:
                 listener.close()
-                log.error("door-taken host=%s port=%d error=%s", door.host, self.port, error)
+                log.error("door-taken host=%s port=%d error=%s", port.host, self.port, error)
                 continue
             listener.listen(_BACKLOG)
             listener.setblocking(False)
-            self._listening[door] = (listener, asyncio.ensure_future(self._accept(door, listener)))
+            self._listening[port] = (listener, asyncio.ensure_future(self._accept(port, listener)))
 
     async def _accept(self, port: ForwardedPort, listener: socket.socket) -> None:
         loop = asyncio.get_running_loop()
@@ -130,7 +128,7 @@ class PortForwarder:
         if state.hung:
             await self._hang(client)
             return
-        answer, descriptors = await self._fleet.request({"do": "dial", "node": port.node})
+        answer, descriptors = await self._control.request({"do": "dial", "node": port.node})
         if not descriptors:
             log.info("dial-failed node=%s reason=%s", port.node, answer.get("error"))
             reset(client)
@@ -147,11 +145,12 @@ class PortForwarder:
             client.close()
             node.close()
             return
-        path_shape = self._fleet.link_state.bench_shape if port.bench else self._fleet.link_state.path_shape
-        shape: Callable[[], Shape | None] = lambda: None if state.hung else path_shape(port.node, port.address)  # noqa: E731
-        await Tunnel(
-            client, node, shape, self._fleet.link_state.condition, lambda: state.boots == boots, self._dice
-        ).run()
+        path_shape = self._link_state.bench_shape if port.bench else self._link_state.path_shape
+
+        def shape() -> Shape | None:
+            return None if state.hung else path_shape(port.node, port.address)
+
+        await Tunnel(client, node, shape, self._link_state.condition, lambda: state.boots == boots, self._dice).run()
 
     async def _hang(self, client: socket.socket) -> None:
         """Keep the connection and answer nothing until the other side gives up."""

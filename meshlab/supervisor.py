@@ -21,10 +21,11 @@ from typing import Any
 
 from meshlab import namespaces as ns
 from meshlab import rootfs
-from meshlab.container import Container, prepare
+from meshlab.container import prepare
 from meshlab.control import Control, Operations
 from meshlab.errors import LabError
 from meshlab.fault_injection import FaultInjection
+from meshlab.fleet_state import FleetState
 from meshlab.link_state import LinkState
 from meshlab.mesh_model import parse_effective
 from meshlab.node_runner import MESSAGE_BYTES, NodeRunner
@@ -43,26 +44,26 @@ class Supervisor:
     def __init__(self, spec: FleetSpec, directory: Path, runner: socket.socket, *, deny_setgroups: bool) -> None:
         self.spec = spec
         self.directory = directory
-        self.nodes: dict[str, NodeState] = {}
+        self.fleet = FleetState(spec, directory, deny_setgroups=deny_setgroups)
         self.stopping = asyncio.Event()
         self._runner = runner
-        self._deny_setgroups = deny_setgroups
         self._waiting: list[str] = []
         self._requests: dict[int, asyncio.Future[tuple[dict[str, Any], list[int]]]] = {}
         self._serial = 0
         self.link_state = self._make_link_state()
         self.port_forwarder = self._make_port_forwarder()
-        self.faults = FaultInjection(self)
+        self.link_state.on_change = self.port_forwarder.refresh
+        self.faults = FaultInjection(self.fleet, self.link_state, self)
         self.operations = self._make_operations()
 
     def _make_link_state(self) -> LinkState:
-        return LinkState(self)
+        return LinkState(self.fleet)
 
     def _make_port_forwarder(self) -> PortForwarder:
-        return PortForwarder(self)
+        return PortForwarder(self.fleet, self.link_state, self)
 
     def _make_operations(self) -> Operations:
-        return Operations(self)
+        return Operations(self.fleet, self.link_state, self.port_forwarder, self.faults, self)
 
     # -- life --
 
@@ -94,16 +95,20 @@ class Supervisor:
         node = self.spec.nodes[number]
         home = self.directory / "nodes" / node.name
         state = NodeState(node, number, home, plugged=node.medium is not Medium.NONE)
-        self.nodes[node.name] = state
+        self.fleet.nodes[node.name] = state
         for folder in ("flash", "air"):
             (home / folder).mkdir(parents=True, exist_ok=True)
         (home / "air" / "heard").write_text("", encoding="ascii")
         if not (home / "firmware" / "env").exists():
             write_firmware(home, node.release, node.packages, node.target)
 
+    def stop(self) -> None:
+        """End the fleet: `run` returns."""
+        self.stopping.set()
+
     def power_on(self, name: str) -> None:
         """Boot a node that is off, as soon as not too many others are booting."""
-        state = self.nodes[name]
+        state = self.fleet.nodes[name]
         state.want_on = True
         if state.is_running or name in self._waiting:
             return
@@ -112,7 +117,7 @@ class Supervisor:
 
     def power_off(self, name: str, *, back: bool) -> None:
         """Take a node's power away at this moment; `back` gives it again."""
-        state = self.nodes[name]
+        state = self.fleet.nodes[name]
         state.want_on = back
         if name in self._waiting:
             if not back:
@@ -126,15 +131,15 @@ class Supervisor:
             self.power_on(name)
 
     def _boot_next(self) -> None:
-        while self._waiting and sum(s.power is Power.BOOTING for s in self.nodes.values()) < _BOOTING_AT_ONCE:
-            name = next((one for one in self._waiting if not self.nodes[one].pid), None)
+        while self._waiting and sum(s.power is Power.BOOTING for s in self.fleet.nodes.values()) < _BOOTING_AT_ONCE:
+            name = next((one for one in self._waiting if not self.fleet.nodes[one].pid), None)
             if name is None:
                 return
             self._waiting.remove(name)
-            self._boot(self.nodes[name])
+            self._boot(self.fleet.nodes[name])
 
     def _boot(self, state: NodeState) -> None:
-        container = self.container(state)
+        container = self.fleet.container(state)
         (state.home / "air" / "effective").unlink(missing_ok=True)
         write_board(state, label_mac(state.spec, state.number), self.spec.seed)
         prepare(container)
@@ -150,13 +155,8 @@ class Supervisor:
                 "fleet": str(self.directory),
                 "overlay_kib": container.overlay_kib,
                 "memory_kib": container.memory_kib,
-                "deny_setgroups": self._deny_setgroups,
+                "deny_setgroups": self.fleet.deny_setgroups,
             }
-        )
-
-    def container(self, state: NodeState) -> Container:
-        return Container(
-            state.spec.name, self.directory, state.spec.overlay_kib, state.spec.memory_kib, self._deny_setgroups
         )
 
     def _mark_down(self, state: NodeState, power: Power) -> None:
@@ -205,9 +205,9 @@ class Supervisor:
             else:
                 future.set_result((event, descriptors))
         elif event["event"] == "started":
-            self.nodes[event["node"]].pid = event["pid"]
+            self.fleet.nodes[event["node"]].pid = event["pid"]
         elif event["event"] == "exit":
-            self._exited(self.nodes[event["node"]], event["status"], event["reason"])
+            self._exited(self.fleet.nodes[event["node"]], event["status"], event["reason"])
 
     def _exited(self, state: NodeState, status: int, reason: str) -> None:
         state.pid = 0
@@ -231,10 +231,10 @@ class Supervisor:
             for line in os.read(bell, 65536).decode("utf-8", "replace").splitlines():
                 word, _, rest = line.partition(" ")
                 name, _, detail = rest.partition(" ")
-                if name not in self.nodes:
+                if name not in self.fleet.nodes:
                     continue
                 try:
-                    self._on_message(word, self.nodes[name], detail)
+                    self._on_message(word, self.fleet.nodes[name], detail)
                 except (OSError, ValueError, LabError):
                     # the lines behind it are other nodes'
                     log.exception("bell-failed line=%s", line)

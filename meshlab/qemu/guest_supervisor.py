@@ -48,11 +48,11 @@ class QemuSupervisor(Supervisor):
         super().__init__(spec, directory, runner, deny_setgroups=False)
 
     def _make_link_state(self) -> LinkState:
-        self.qemu_link_state = QemuLinkState(self, self.hardware)
+        self.qemu_link_state = QemuLinkState(self.fleet, self.hardware)
         return self.qemu_link_state
 
     def _make_port_forwarder(self) -> PortForwarder:
-        self.qemu_port_forwarder = QemuPortForwarder(self, self.hardware)
+        self.qemu_port_forwarder = QemuPortForwarder(self.fleet, self.link_state, self, self.hardware)
         return self.qemu_port_forwarder
 
     def _make_operations(self) -> Operations:
@@ -77,9 +77,12 @@ class QemuSupervisor(Supervisor):
 class QemuOperations(Operations):
     """What a fleet of real radios can be asked for besides."""
 
-    def __init__(self, fleet: QemuSupervisor) -> None:
-        super().__init__(fleet)
-        self._supervisor = fleet
+    def __init__(self, supervisor: QemuSupervisor) -> None:
+        super().__init__(
+            supervisor.fleet, supervisor.link_state, supervisor.port_forwarder, supervisor.faults, supervisor
+        )
+        self._hardware = supervisor.hardware
+        self._qemu_link_state = supervisor.qemu_link_state
 
     async def dispatch(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
         if request["op"] == "machine":
@@ -92,20 +95,20 @@ class QemuOperations(Operations):
         return {"status": await process.wait()}
 
     def radios(self) -> dict[str, Any]:
-        return {"radios": {name: list(place.phys) for name, place in self._supervisor.hardware.items()}}
+        return {"radios": {name: list(hardware.phys) for name, hardware in self._hardware.items()}}
 
     def set_groups(self, masks: dict[str, int]) -> None:
         for name in masks:
-            self._supervisor.faults.node(name)
-        self._supervisor.qemu_link_state.set_groups(masks)
+            self._fleet.node(name)
+        self._qemu_link_state.set_groups(masks)
 
     def set_loss(self, losses: list[tuple[str, str, float]]) -> None:
         impairments: dict[str, dict[str, Impairment]] = {}
         for sender, receiver, loss in losses:
-            cells = self._supervisor.faults.node(sender).effective.interfaces
+            cells = self._fleet.node(sender).effective.interfaces
             impairments.setdefault(receiver, {}).update({cell.mac: Impairment(loss) for cell in cells})
         for receiver, heard in impairments.items():
-            self._supervisor.qemu_link_state.impair(self._supervisor.faults.node(receiver), heard)
+            self._qemu_link_state.impair(self._fleet.node(receiver), heard)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING
 
 from meshlab import hwsim_groups
 from meshlab.errors import LabError
+from meshlab.fleet_state import FleetState
 from meshlab.link_state import LinkState
 from meshlab.qemu import hwsim_devices, traffic_control
 from meshlab.quality import loss_of
@@ -20,12 +20,7 @@ from meshlab.shaped_tunnel import Shape
 from meshlab.spec import Medium
 from meshlab.state import NodeState
 
-if TYPE_CHECKING:
-    from meshlab.supervisor import Supervisor
-
 log = logging.getLogger("meshlab.qemu.link_state")
-# so soon after the last change; many changes at once are one
-_SETTLE_S = 0.02
 # after something could not be applied to a node that goes on running
 _RETRY_S = 1.0
 
@@ -33,13 +28,12 @@ _RETRY_S = 1.0
 class QemuLinkState(LinkState):
     """`places` tells where each node's hardware is."""
 
-    def __init__(self, fleet: Supervisor, hardware: dict[str, hwsim_devices.NodeHardware]) -> None:
+    def __init__(self, fleet: FleetState, hardware: dict[str, hwsim_devices.NodeHardware]) -> None:
         super().__init__(fleet)
         self._hardware = hardware
         self._groups: dict[str, int] = {}
         self._cabled: dict[str, tuple[int, bool]] = {}
         self._impaired: dict[str, tuple[int, str]] = {}
-        self._settle_s = _SETTLE_S
 
     # -- what holds now --
 

@@ -12,16 +12,14 @@ import os
 import socket
 from ipaddress import IPv4Interface
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from meshlab import namespaces as ns
 from meshlab.errors import LabError
+from meshlab.fleet_state import FleetState, NodeControl
+from meshlab.link_state import LinkState
 from meshlab.port_forwarder import ForwardedPort, PortForwarder
 from meshlab.qemu import hwsim_devices
 from meshlab.spec import Medium
-
-if TYPE_CHECKING:
-    from meshlab.supervisor import Supervisor
 
 _SSH_PORT = 22
 # the kernel gives up an address that nobody answers for after 3 s, a lost SYN is repeated after 1, 3 and 7
@@ -32,8 +30,14 @@ _FACTORY_PREFIX = 24
 class QemuPortForwarder(PortForwarder):
     """`changed` is notified when other doors stand than before."""
 
-    def __init__(self, fleet: Supervisor, hardware: dict[str, hwsim_devices.NodeHardware]) -> None:
-        super().__init__(fleet)
+    def __init__(
+        self,
+        fleet: FleetState,
+        link_state: LinkState,
+        control: NodeControl,
+        hardware: dict[str, hwsim_devices.NodeHardware],
+    ) -> None:
+        super().__init__(fleet, link_state, control)
         self._hardware = hardware
         self._reachable: dict[str, ForwardedPort] = {}
         self.changed = asyncio.Event()
@@ -102,7 +106,7 @@ class QemuPortForwarder(PortForwarder):
         state = self._fleet.nodes[port.node]
         prefix = next((a.prefix for a in state.effective.addresses if a.address == port.address), _FACTORY_PREFIX)
         address = IPv4Interface(f"{port.address}/{prefix}")
-        by_wire = self._fleet.link_state.bench_shape(port.node, port.address) is not None
+        by_wire = self._link_state.bench_shape(port.node, port.address) is not None
         if by_wire and state.spec.medium is not Medium.BASE:
             hardware = self._hardware[port.node]
             _add_address(hardware.cable, hwsim_devices.operator_address(address, hardware.number))
