@@ -29,10 +29,10 @@ from benchmarks.page import fill
 from benchmarks.reconvergence_udp_mesh import airtime_us
 from meshctl.errors import MeshctlError
 from meshctl.model import Fleet
+from meshlab.fleet import QemuFleet
 from meshlab.from_inventory import spec_of
 from meshlab.inventory_copy import copy_inventory
 from meshlab.qemu import control
-from meshlab.qemu.fleet import QemuFleet
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "arp_airtime.jsonl"

@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from meshctl.device.connection import Completed
+from meshlab.fleet import QemuFleet
 from meshlab.qemu import control
-from meshlab.qemu.fleet import QemuFleet
 from meshlab.spec import FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
 
 PROGRAMS = Path(__file__).with_name("in_machine")

@@ -25,6 +25,7 @@ from meshlab import fleet_directory, rootfs
 from meshlab.addresses import bench_of, loopback_of
 from meshlab.client import is_running, request
 from meshlab.errors import LabError
+from meshlab.qemu.qemu import find_qemu
 from meshlab.spec import FleetSpec, Medium, dump, load
 from meshlab.state import Power
 
@@ -309,6 +310,19 @@ class VirtualFleet:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.down()
+
+
+class QemuFleet(VirtualFleet):
+    """`VirtualFleet` with the kernel's own radios, mesh and bridges.
+
+    Files of nodes are in the machine: `VirtualNode.flash_path` and `console_log` have nothing on this side, `exec` and
+    `console` read them.
+    """
+
+    SUPERVISOR = "meshlab.qemu.host_proxy"
+
+    def _check_programs(self) -> None:
+        find_qemu()
 
 
 def stop_fleet(directory: Path) -> str:

@@ -18,11 +18,10 @@ from meshlab.cli import links
 from meshlab.console import run_shell
 from meshlab.errors import LabError
 from meshlab.faults import FAULTS, describe, parse
-from meshlab.fleet import VirtualFleet, stop_fleet
+from meshlab.fleet import QemuFleet, VirtualFleet, stop_fleet
 from meshlab.from_inventory import spec_of
 from meshlab.images import firmware_image
 from meshlab.inventory_copy import copy_inventory
-from meshlab.qemu.fleet import QemuFleet
 from meshlab.releases import facts
 
 app = typer.Typer(help="A virtual fleet on this machine.", no_args_is_help=True)

@@ -17,6 +17,14 @@ import json
 import struct
 from typing import Any
 
+# the machine's address on QEMU's user network: TEST-NET-1 (RFC 5737), which no fleet uses
+ADDRESS = "192.0.2.15"
+GATEWAY = "192.0.2.2"
+NETWORK = "192.0.2.0/24"
+PORT = 7000
+# printed on the console when the supervisor listens
+READY = "lab: ready"
+
 # no frame is larger, and no line: answers of big fleets hold a few hundred bytes per node
 FRAME_BYTES = 1 << 16
 LINE_BYTES = 1 << 20

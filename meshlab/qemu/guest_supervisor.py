@@ -24,6 +24,7 @@ from meshlab.node_runner import NodeRunner
 from meshlab.port_forwarder import PortForwarder
 from meshlab.qemu import hwsim_devices
 from meshlab.qemu.guest_agent import GuestAgent
+from meshlab.qemu.guest_protocol import ADDRESS, PORT, READY
 from meshlab.qemu.link_state import QemuLinkState
 from meshlab.qemu.port_forwarder import QemuPortForwarder
 from meshlab.qemu.traffic_control import Impairment
@@ -32,12 +33,6 @@ from meshlab.state import NodeState
 from meshlab.supervisor import Supervisor, fork_node_runner
 
 log = logging.getLogger("meshlab.qemu")
-# TEST-NET-1 (RFC 5737): no fleet has it, and nothing leaves the machine
-ADDRESS = "192.0.2.15"
-GATEWAY = "192.0.2.2"
-NETWORK = "192.0.2.0/24"
-PORT = 7000
-READY = "lab: ready"
 
 
 class QemuSupervisor(Supervisor):

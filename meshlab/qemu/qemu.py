@@ -18,7 +18,7 @@ from pathlib import Path
 
 from meshlab import namespaces as ns
 from meshlab.errors import LabError
-from meshlab.qemu.guest_supervisor import ADDRESS, GATEWAY, NETWORK, PORT, READY
+from meshlab.qemu.guest_protocol import ADDRESS, GATEWAY, NETWORK, PORT, READY
 
 QEMU = "qemu-system-x86_64"
 _POLL_S = 0.1

@@ -22,11 +22,10 @@ from typing import Any, ClassVar, TypeVar
 import pytest
 
 from meshctl.topology import with_alternates
-from meshlab.fleet import VirtualNode
+from meshlab.fleet import QemuFleet, VirtualNode
 from meshlab.from_inventory import spec_of
 from meshlab.inventory_copy import copy_inventory
 from meshlab.qemu import control
-from meshlab.qemu.fleet import QemuFleet
 from meshlab.spec import FleetSpec
 from tests import waiting
 from tests.conftest import TRIED_AGAIN
