@@ -1,12 +1,15 @@
-"""Debian's packages for the machine: resolved and downloaded by apt, unpacked by dpkg-deb, installed nowhere.
+"""Debian packages for the machine: resolved and downloaded by apt, unpacked by dpkg-deb, never installed on the host.
 
-`update` fetches apt's lists where the host has none of Debian's (`debian.sources`); `resolve` asks apt against an empty
-dpkg status, so that what is installed on this machine does not count; `download` fetches what the cache lacks; `unpack`
-lays the files into a directory. No step needs root.
+`sources` -> `update` -> `resolve` -> `download` -> `unpack`, none of which needs root. The machine uses packages of
+Debian 12 (bookworm) only, so that it is the same everywhere. On a bookworm host apt uses the host's own sources; on any
+other host (Ubuntu, another Debian) it uses a list in the lab's cache, verified with Debian's archive keyring. `resolve`
+runs against an empty dpkg status, so packages installed on the host do not count.
 """
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -15,6 +18,13 @@ from pathlib import Path
 
 from meshlab.errors import LabError
 
+CODENAME = "bookworm"
+OS_RELEASE = Path("/etc/os-release")
+# Debian's package debian-archive-keyring, which Ubuntu has, too
+KEYRING = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
+MIRROR = "http://deb.debian.org/debian"
+# names another mirror, for networks that reach Debian through one of their own
+MIRROR_VARIABLE = "MESHCTL_LAB_DEBIAN"
 # drivers, 802.11 and bridges: the kernel of cloud images has no mac80211_hwsim
 KERNEL_META = "linux-image-amd64"
 PACKAGES = (
@@ -65,7 +75,7 @@ class ResolvedPackages:
 
 @dataclass(frozen=True, slots=True)
 class Apt:
-    """apt as this module calls it: `work` is a directory of the caller's, `sources` are `debian.sources`."""
+    """apt as this module calls it: `work` is a directory of the caller's, `sources` what `sources()` returned."""
 
     work: Path
     sources: Mapping[str, str]
@@ -90,6 +100,44 @@ class Apt:
             "APT::Sandbox::User": "",
         }
         return tuple(word for name, value in options.items() for word in ("-o", f"{name}={value}"))
+
+
+def codename(os_release: str) -> str:
+    """What /etc/os-release calls this version of the distribution; empty when it does not say."""
+    found = re.search(r'^VERSION_CODENAME="?([^"\n]*)"?$', os_release, re.MULTILINE)
+    return found[1] if found else ""
+
+
+def distribution(os_release: str) -> str:
+    """The distribution's name for people, such as `Ubuntu 24.04.1 LTS`."""
+    found = re.search(r'^PRETTY_NAME="?([^"\n]*)"?$', os_release, re.MULTILINE)
+    return found[1] if found else "this distribution"
+
+
+def sources(cache: Path, environ: Mapping[str, str] = os.environ, os_release: Path = OS_RELEASE) -> dict[str, str]:
+    """apt's options that lead it to bookworm's packages: none where the host's own sources do; else `Dir::*` of a list
+    in `cache`, which `apt-get update` has to fill. Raises LabError when apt could not verify what it fetches."""
+    text = os_release.read_text(encoding="utf-8") if os_release.exists() else ""
+    mirror = environ.get(MIRROR_VARIABLE, "")
+    if codename(text) == CODENAME and not mirror:
+        return {}
+    if not KEYRING.exists():
+        raise LabError(
+            f"the lab's machine is made of Debian's packages ({CODENAME}), and {distribution(text)} has no {KEYRING}",
+            hint="scripts/setup-lab installs it: apt install debian-archive-keyring",
+        )
+    lists = cache / "lists"
+    (lists / "partial").mkdir(parents=True, exist_ok=True)
+    listed = cache / "sources.list"
+    listed.write_text(f"deb [arch=amd64 signed-by={KEYRING}] {mirror or MIRROR} {CODENAME} main\n", encoding="ascii")
+    return {
+        "Dir::Etc::sourcelist": str(listed),
+        "Dir::Etc::sourceparts": "-",
+        # of the host's preferences, none is about these packages
+        "Dir::Etc::preferences": "-",
+        "Dir::Etc::preferencesparts": "-",
+        "Dir::State::lists": str(lists),
+    }
 
 
 def update(apt: Apt) -> None:

@@ -23,7 +23,7 @@ from pathlib import Path
 import meshctl
 from meshlab import rootfs
 from meshlab.errors import LabError
-from meshlab.qemu import apt, cpio, debian_packages, kernel_modules
+from meshlab.qemu import apt, cpio, kernel_modules
 
 _HERE = Path(__file__).resolve().parent
 _PACKAGE = Path(meshctl.__file__).resolve().parent
@@ -96,7 +96,7 @@ def _recipe_digest() -> str:
 def _build_base(cache: Path, place: Path) -> None:
     with tempfile.TemporaryDirectory(prefix="building-", dir=cache) as folder:
         work = Path(folder)
-        tools = apt.Apt(work, debian_packages.sources(cache))
+        tools = apt.Apt(work, apt.sources(cache))
         apt.update(tools)
         resolved = apt.resolve(tools)
         apt.download(resolved, tools, cache / "archives")
