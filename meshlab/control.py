@@ -1,6 +1,6 @@
-"""The supervisor's socket: one JSON request per datagram, one JSON answer; descriptors ride beside `exec`.
+"""The supervisor's control socket: one JSON request per datagram, one JSON reply; `exec` also passes descriptors.
 
-The operations are the methods of `Operations` by name; `fleet` holds the other end.
+The methods of `Operations` are the operations, by name; `client` is the other end.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _NAME = "control.sock"
 
 
 def address_of(directory: Path, descriptor: int) -> str:
-    """The socket's path through the open directory, because a socket's own path may not exceed 107 bytes."""
+    """The socket's path through an open directory descriptor: a socket path is limited to 107 bytes."""
     return f"/proc/self/fd/{descriptor}/{_NAME}"
 
 
@@ -38,7 +38,7 @@ Answer = Callable[[dict[str, Any], list[int]], Awaitable[dict[str, Any]]]
 
 
 class Control:
-    """Listens in the fleet's directory; `answer` gets each request with the descriptors beside it."""
+    """Listens in the fleet's directory; `answer` gets each request and its descriptors."""
 
     def __init__(self, directory: Path, answer: Answer) -> None:
         self._directory = directory
@@ -94,7 +94,7 @@ class Control:
 
 
 class Operations:
-    """What a client may ask for; every public method but `answer` is an operation and returns a JSON object or None."""
+    """The requests of a client: each public method except `answer` and `dispatch` returns a JSON object or None."""
 
     def __init__(
         self,
@@ -111,22 +111,22 @@ class Operations:
         self._control = control
 
     async def answer(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
-        """The answer to one request; what went wrong is one, too."""
+        """The reply to one request; a failure is a reply with `error` and `hint`."""
         asked = request.get("op")
         try:
             return await self.dispatch(request, descriptors)
         except MeshctlError as error:
             return {"error": str(error), "hint": error.hint}
         except Exception as error:
-            # a fault of the lab's own: whoever asked hears of it, the log has the whole, and the fleet goes on
+            # a bug in the lab: report it to the client, log the traceback, and keep the fleet running
             log.exception("request-failed op=%s", asked)
             return {
                 "error": f"the lab failed at {asked!r}: {type(error).__name__}: {error}",
-                "hint": "its log has more",
+                "hint": "see `log` in the fleet's directory",
             }
 
     async def dispatch(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
-        """What the request asks for. Raises MeshctlError for what the fleet refuses, anything for a fault of ours."""
+        """Run the requested operation. Raises MeshctlError when the fleet rejects it, any exception for a bug."""
         if request["op"] == "exec":
             return await self.execute(request["node"], request["command"], descriptors)
         result = getattr(self, request.pop("op"))(**request)
@@ -181,7 +181,7 @@ class Operations:
         }
 
     def console(self, node: str, lines: int) -> dict[str, Any]:
-        """The last lines of what its boot scripts printed, of all boots; it works for a node without power, too."""
+        """The last lines its boot scripts printed, over all boots; works for a node without power, too."""
         file = self._fleet.node(node).home / "console.log"
         text = file.read_text(encoding="utf-8", errors="replace") if file.exists() else ""
         return {"text": "\n".join(text.splitlines()[-lines:])}
@@ -207,7 +207,7 @@ class Operations:
         self._link_state.set_link(a, b, changes)
 
     def links(self, part: list[dict[str, Any]], is_last: bool) -> None:
-        """Who hears whom from now on, in parts because a request has its limit (`standing.stand_on`)."""
+        """Replace the fleet's links, sent in parts because a request is limited (`placement.set_environment`)."""
         self._link_state.pending_links += [LinkSpec(**link) for link in part]
         if is_last:
             links, self._link_state.pending_links = self._link_state.pending_links, []
@@ -225,7 +225,7 @@ class Operations:
 
 
 def _release(state: NodeState) -> str:
-    """What is in its flash chip, which a flash changes."""
+    """The release in the node's flash chip."""
     text = (state.home / "firmware" / "env").read_text(encoding="utf-8", errors="replace")
     found = re.search(r"^VERSION='([^']*)'", text, re.MULTILINE)
     return found[1] if found else "-"

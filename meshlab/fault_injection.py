@@ -1,4 +1,4 @@
-"""Breaking and mending a running fleet: what the words of `breaks` do."""
+"""Fault injection: apply the faults of `faults` to a running fleet, and repair them."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from meshlab.state import NodeState, Power, write_firmware
 _FREE_FLASH_KIB = 8
 _FREE_MEMORY_KIB = 2048
 _TEN_YEARS_S = 10 * 365 * 86400
-# fillers are files, so that whoever looks finds what takes the space
+# fillers are plain files, so that `du` on the node shows what uses the space
 _FILLERS = ("/root/lab-filler", "/tmp/lab-filler")
-# commands that poll: counted, they would make the number of a step depend on the machine's speed
+# polling commands: counting them would make step numbers depend on the host's speed
 _UNCOUNTED = ("sleep", "ash", "sh", "busybox")
 _SLOW = {"delay_ms": SLOW_DELAY_MS, "loss": SLOW_LOSS, "rate_kbps": SLOW_RATE_KBPS}
 
 
 class FaultInjection:
-    """Raises InputError for words it does not know, LabError when the node is not in a state for it."""
+    """Raises InputError for an unknown node, link or fault, LabError when the node cannot take the fault now."""
 
     def __init__(self, fleet: FleetState, link_state: LinkState, control: NodeControl) -> None:
         self._fleet = fleet
@@ -35,7 +35,7 @@ class FaultInjection:
         self._control = control
 
     def _link_ends(self, where: str) -> tuple[str, str] | None:
-        """`b01-b02` as two nodes; None when it names a node. Node names may hold dashes themselves."""
+        """`b01-b02` as two nodes; None when it names a node. Node names may contain dashes."""
         if where in self._fleet.nodes:
             return None
         for place in (at for at, char in enumerate(where) if char == "-"):
@@ -46,13 +46,13 @@ class FaultInjection:
         return None
 
     async def inject(self, where: str, what: str) -> None:
-        """`meshctl lab break WHERE WHAT`."""
+        """Inject a fault into a node or a link: `meshctl lab break WHERE WHAT`."""
         request = parse(what)
         link = self._link_ends(where)
         if link is not None:
             if request.fault not in LINK_FAULTS:
                 raise InputError(
-                    f"{request.fault.value} is for nodes; links take {', '.join(b.value for b in LINK_FAULTS)}"
+                    f"{request.fault.value} is for nodes; links take {', '.join(fault.value for fault in LINK_FAULTS)}"
                 )
             self._link_state.set_link(*link, {"up": False} if request.fault is Fault.LINK_DOWN else dict(_SLOW))
             return
@@ -103,7 +103,7 @@ class FaultInjection:
                 assert_never(request.what)
 
     async def repair(self, where: str) -> None:
-        """Undo the breaks of one node or link, or of all; a node whose firmware is dead gets its factory image."""
+        """Repair one node or link, or all; a node whose firmware is dead gets its factory image."""
         link = self._link_ends(where) if where else None
         if link is not None:
             self._link_state.restore(frozenset(link))
@@ -125,14 +125,14 @@ class FaultInjection:
         if state.is_running:
             write_meminfo(self._fleet.container(state), available_kib=state.spec.memory_kib * 3 // 5)
             board = shlex.quote(state.spec.board)
-            # synced only where the flash was filled: mending is not to save what somebody is working on
+            # sync only where the flash was filled: a repair must not persist other unsynced changes
             await self.run(
                 state,
                 f"PATH=/bin:/sbin; rm -f {_FILLERS[1]} /tmp/lab/fatal; uci -q revert system; "
                 f"[ ! -e {_FILLERS[0]} ] || {{ rm -f {_FILLERS[0]}; sync; }}; echo {board} >/tmp/sysinfo/board_name",
             )
         elif state.power is Power.DEAD:
-            # what a technician does with TFTP and a cable
+            # as TFTP recovery at the bench would
             write_firmware(state.home, state.spec.release, state.spec.packages, state.spec.target)
             (state.home / "flash" / "current").unlink(missing_ok=True)
             state.power = Power.OFF
@@ -142,17 +142,17 @@ class FaultInjection:
     # -- power --
 
     async def power_cut(self, state: NodeState, unsynced: str, *, back: bool) -> None:
-        """Take the power away; what was not synced is `lost`, `kept` or `torn`."""
+        """Cut the power; unsynced data is `lost`, `kept` or `torn`."""
         if unsynced == "kept":
             await self.run(state, "sync", may_be_off=True)
         elif unsynced == "torn":
             await self.run(state, "sh /rom/lab/tear", may_be_off=True)
         elif unsynced != "lost":
-            raise InputError(f"what was not synced is lost, kept or torn, not {unsynced!r}")
+            raise InputError(f"unsynced: expected lost, kept or torn, found {unsynced!r}")
         self._control.power_off(state.spec.name, back=back)
 
     def sever(self, state: NodeState) -> None:
-        """A step that was to sever the node's links has come; the node waits for the word to go on."""
+        """The node reached the step at which its links go down, and waits for `go`."""
         self._cut_links(state)
         try:
             go = os.open(f"/proc/{state.pid}/root/tmp/lab/go", os.O_RDWR | os.O_NONBLOCK)
@@ -169,7 +169,7 @@ class FaultInjection:
     # -- on the node --
 
     async def count_steps(self, state: NodeState, *, fatal: str = "") -> None:
-        """Count the node's external commands from now on; `fatal` is `cut N`, `cut WORDS`, `sever N` or nothing."""
+        """Count the node's external commands from now on; `fatal` is `cut N`, `cut TEXT`, `sever N` or empty."""
         skipped = " ".join(_UNCOUNTED)
         await self.run(
             state,

@@ -1,4 +1,4 @@
-"""The links of a running fleet, and what follows from them: each node's tables, and the path to the operator."""
+"""Link state of a running fleet: links -> mesh graph -> each node's tables and the operator's path to each node."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from meshlab.shaped_tunnel import Shape
 from meshlab.spec import LinkSpec, Medium, changed_link
 from meshlab.station_tables import StationTables
 
-# recomputing all tables of a big fleet takes a while; at most this share of the time is spent on it
+# recomputing all tables of a big fleet is slow; at most this share of the time is spent on it
 _BUSY_SHARE = 0.2
 
 
 class LinkState:
-    """`changed()` says that a node or a link is different; the tables follow after the fleet's convergence time."""
+    """`changed()` reports that a node or a link changed; the tables follow after the fleet's convergence time."""
 
     def __init__(self, fleet: FleetState) -> None:
         self._fleet = fleet
         # called after every change of what is reachable
         self.on_change: Callable[[], None] = lambda: None
-        # who hears whom by the fleet's spec or its ground, and over it the links that somebody set one by one
+        # links from the fleet's spec or its radio environment, and links that were set one by one and override them
         self._base_links = {link.ends: link for link in fleet.spec.links}
         self._overrides: dict[frozenset[str], LinkSpec] = {}
-        # parts of a ground that is being told
+        # the parts received so far of a new set of links
         self.pending_links: list[LinkSpec] = []
-        # what `sever`, `link-down` and `slow` do to all links of a node
+        # nodes with a `sever`, `link-down` or `slow` fault on all their links
         self.severed: set[str] = set()
         self.slowed: dict[str, dict[str, Any]] = {}
         self._written: dict[str, str] = {}
@@ -40,9 +40,9 @@ class LinkState:
         self._base_routes: dict[str, mesh_model.Route] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._stations = StationTables()
-        # of the nodes that run: which boot it is
+        # the current boot of each running node
         self._boots: dict[str, int] = {}
-        # the boots in which nodes were last on the air
+        # the boot in which each node last had a neighbor
         self._on_air: dict[str, int] = {}
         self._expiry: asyncio.TimerHandle | None = None
         self._last_cost_s = 0.0
@@ -50,14 +50,14 @@ class LinkState:
         self._notices: set[asyncio.Task[None]] = set()
 
     def changed(self) -> None:
-        """Paths are cut at once; tables, and paths that are new, come after the convergence time."""
+        """Lost paths go down now; tables and new paths follow after the convergence time."""
         self._remove_lost_routes()
         if self._timer is None:
             wait = max(self._fleet.spec.convergence_s, self._last_cost_s / _BUSY_SHARE)
             self._timer = asyncio.get_running_loop().call_later(wait, self._converge)
 
     def links(self) -> list[LinkSpec]:
-        """Every link as it is now, with what was done to its ends."""
+        """Every link as it is now, with the faults of its ends."""
         return [self._with_faults(link) for link in {**self._base_links, **self._overrides}.values()]
 
     def _with_faults(self, link: LinkSpec) -> LinkSpec:
@@ -68,17 +68,17 @@ class LinkState:
         return link
 
     def set_base_links(self, links: Iterable[LinkSpec]) -> None:
-        """Everything that holds from now on, but for what was set by hand; links to nodes not in the fleet are not."""
+        """Replace all links except overrides. Links to nodes outside the fleet are ignored."""
         base_links = {link.ends: link for link in links if link.ends <= self._fleet.nodes.keys()}
         if base_links != self._base_links:
             self._base_links = base_links
             self.changed()
 
     def set_link(self, a: str, b: str, changes: dict[str, Any]) -> None:
-        """Change a link's fields, as seen from `a`, or make the link; it holds until `restore`, whatever the ground.
+        """Override a link's fields, as seen from `a`, or add the link; it stays until `restore`.
 
-        A new `loss` counts in both directions unless `loss_back` is among the changes, and decides `tq` unless that is.
-        Raises InputError for an unknown node or field.
+        A new `loss` applies to both directions unless `changes` has `loss_back`, and determines `tq` unless `changes`
+        has `tq`. Raises InputError for an unknown node or field.
         """
         ends = frozenset((a, b))
         for name in ends:
@@ -92,7 +92,7 @@ class LinkState:
         self.changed()
 
     def restore(self, ends: frozenset[str] | None = None) -> None:
-        """One link (or all, and all nodes' links) as the fleet's spec or ground has it."""
+        """Remove the override of one link, or all overrides and faults."""
         if ends is None:
             self._overrides.clear()
             self.severed.clear()
@@ -101,10 +101,10 @@ class LinkState:
             self._overrides.pop(ends, None)
         self.changed()
 
-    # -- the way to the operator --
+    # -- the operator's path --
 
     def path_shape(self, name: str, address: str) -> Shape | None:
-        """What lies between the operator and a node's `address` now; None when nothing does."""
+        """The shape of the operator's path to a node's `address`; None when there is no path."""
         state = self._fleet.nodes[name]
         if not state.is_running:
             return None
@@ -118,21 +118,21 @@ class LinkState:
         rates = [link.rate_kbps for link in path.links if link.rate_kbps is not None]
         arrives = 1.0
         for link in path.links:
-            # a connection waits for what is lost on its way as for the answers to it
+            # TCP waits for lost segments and for lost acknowledgements alike
             arrives *= 1 - max(link.loss_to(link.a), link.loss_to(link.b))
         return Shape(
             sum(link.delay_ms for link in path.links) / 1000, 1 - arrives, min(rates) * 125.0 if rates else None
         )
 
     def bench_shape(self, name: str, address: str) -> Shape | None:
-        """The same through the node's bench port alone."""
+        """The shape of the path over the node's bench port; None when there is none."""
         state = self._fleet.nodes[name]
         if state.is_running and state.plugged and state.effective.holds(address, over="wire"):
             return Shape()
         return None
 
     def reachable(self) -> set[str]:
-        """The nodes that a mesh path from the base leads to."""
+        """The nodes with a mesh path from the base."""
         return set(self._base_routes)
 
     # -- station tables --
@@ -191,7 +191,7 @@ class LinkState:
         return found
 
     def _remove_lost_routes(self) -> None:
-        """Take away what no longer stands; what is new waits for `_converge`."""
+        """Drop the routes that no longer exist; new ones wait for `_converge`."""
         self._count_boots()
         now = self._routes_from_base(mesh_model.edges(self._nodes(), self.links()))
         self._base_routes = {name: path for name, path in now.items() if name in self._base_routes}

@@ -1,8 +1,7 @@
-"""The process that owns the nodes' namespaces: it starts nodes, ends them, and opens sockets and shells inside them.
+"""The process that owns the nodes' namespaces: it starts and kills nodes, and opens sockets and shells inside them.
 
-It is apart from the supervisor because it must be single-threaded and because a process without privileges that
-entered a node's network namespace cannot go back to the host's. One message per datagram on a socket pair, JSON with
-descriptors beside it:
+It is separate from the supervisor because it must be single-threaded and because an unprivileged process that entered
+a node's network namespace cannot return to the host's. Messages are JSON datagrams with descriptors on a socket pair:
 
     {"do": "boot", "node": N, ...}          -> {"event": "exit", "node": N, "how": H} when the node's process 1 ends
     {"do": "kill", "node": N}
@@ -10,7 +9,7 @@ descriptors beside it:
     {"do": "exec", "id": I, "node": N, "command": C} with stdin, stdout, stderr
                                             -> {"event": "done", "id": I, "status": S}
 
-All nodes die with this process, and it dies with the supervisor.
+All nodes end with this process, and it ends with the supervisor.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from meshlab import namespaces as ns
 from meshlab.container import FLAGS, Container, become_node
 from meshlab.errors import LabError
 
-# JSON of one request or event; commands of `lab shell NODE -- ...` are the longest
+# the longest request or event; the longest are commands of `lab shell NODE -- ...`
 MESSAGE_BYTES = 1 << 17
 _SPACES = (("mnt", ns.CLONE_NEWNS), ("net", ns.CLONE_NEWNET), ("uts", ns.CLONE_NEWUTS), ("ipc", ns.CLONE_NEWIPC))
 _SHELL_ENVIRONMENT = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root", "TERM": "vt102", "USER": "root"}
@@ -50,8 +49,8 @@ class _RunningNode:
 class NodeRunner:
     """Serves requests on `channel` until the supervisor closes it.
 
-    `put_devices` gives a new node (its process number) its network devices before its process 1 begins; `take_devices`
-    takes them back when the node (its name, its network namespace as a descriptor) has just ended.
+    `attach_devices` moves a node's network devices to its new namespace (by pid) before its process 1 starts;
+    `detach_devices` takes them back from the namespace (a descriptor) of a node that ended.
     """
 
     def __init__(
@@ -96,7 +95,7 @@ class NodeRunner:
             case "exec":
                 self._exec(request, descriptors)
 
-    # -- a node's life --
+    # -- boot and exit --
 
     def _boot(self, request: dict[str, Any]) -> None:
         container = Container(
@@ -133,7 +132,7 @@ class NodeRunner:
                 self._attach_devices(container, pid)
             os.write(gate, b"\n")
         except LabError as error:
-            # a gate that closes unopened ends the node
+            # a gate that closes without a byte ends the node
             os.write(report, str(error).encode())
 
     def _ended(self, name: str, report: int) -> None:
@@ -147,7 +146,7 @@ class NodeRunner:
             os.close(descriptor)
         self._send_event({"event": "exit", "node": name, "status": os.waitstatus_to_exitcode(status), "reason": reason})
 
-    # -- reaching into a node --
+    # -- entering a node --
 
     def _dial(self, request: dict[str, Any]) -> None:
         running = self._nodes.get(request["node"])
@@ -185,17 +184,17 @@ def _readable(descriptor: int) -> bool:
 
 
 def _close_all_except(kept: Sequence[int]) -> None:
-    """Close what the warden had open. A shell may stay for hours, and a descriptor of another node's network would keep
-    that network for as long."""
+    """Close the runner's descriptors. A shell may run for hours, and a descriptor of another node's network namespace
+    would keep that namespace alive."""
     for descriptor in map(int, os.listdir("/proc/self/fd")):
         if descriptor > 2 and descriptor not in kept:
-            # one of them was that of the listing
+            # one of them belonged to the listing
             with contextlib.suppress(OSError):
                 os.close(descriptor)
 
 
 def _enter_and_run(node: _RunningNode, command: str, descriptors: Sequence[int]) -> None:
-    """In a forked child: enter the node, run `command` in its shell, pass on its exit status."""
+    """In a forked child: enter the node, run `command` in its shell, return its exit status."""
     try:
         ns.die_with_parent()
         _close_all_except(descriptors)
@@ -213,7 +212,7 @@ def _enter_and_run(node: _RunningNode, command: str, descriptors: Sequence[int])
         for descriptor, flag in spaces:
             ns.setns(descriptor, flag)
         if node.deny_setgroups:
-            # it may restart the SSH server
+            # the command may restart the SSH server
             ns.accept_setgroups()
         os.chdir("/")
         os.setsid()

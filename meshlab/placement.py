@@ -1,8 +1,7 @@
-"""The ground under a running fleet: told to the fleet, kept in its directory, changed by one at a time.
+"""The radio environment of a running fleet, kept as `ground.json` in its directory; a lock serializes changes.
 
-`ground_of` reads it, `stand_on` replaces it, `move` changes one node's place, `switch` is a node's power switch and
-`forget` has the others forget its radio: what a mission needs of a fleet. Works for every fleet that
-`VirtualFleet.attach` finds.
+`current_environment` reads it, `set_environment` replaces it, `move` changes one node's position. `set_power` and
+`flush_stations` do the rest of what a scenario does to a fleet. Works for every fleet that `VirtualFleet.attach` finds.
 """
 
 from __future__ import annotations
@@ -21,35 +20,35 @@ from meshlab.state import Power
 
 _FILE_NAME = "ground.json"
 _LOCK_NAME = "ground.lock"
-# of some 250 bytes each, so that a request stays below the 128 KiB of one (`warden.MESSAGE_BYTES`)
+# some 250 bytes each, so that a request stays below 128 KiB (`node_runner.MESSAGE_BYTES`)
 _LINKS_PER_REQUEST = 300
 _PARALLEL_FLUSHES = 8
 
 
 def current_environment(fleet: VirtualFleet) -> RadioEnvironment:
-    """What the fleet stands on now; the links it was started with when nobody told it anything else."""
+    """The fleet's radio environment; until one is set, the links it was started with."""
     path = fleet.directory / _FILE_NAME
     return propagation_file.load(path) if path.exists() else RadioEnvironment(links=fleet.spec.links)
 
 
 def set_environment(fleet: VirtualFleet, environment: RadioEnvironment) -> None:
-    """From now on who hears whom is as `ground` has it, but for links that were set one by one.
+    """Replace the fleet's links by those of `environment`, except links that were set one by one.
 
-    Nodes that the fleet has not do not count; nodes without a place or a link hear nobody.
+    Nodes outside the fleet are ignored; nodes without a position or a link hear no one.
     """
     with _locked(fleet):
         _apply(fleet, environment)
 
 
 def move(fleet: VirtualFleet, name: str, to: Point) -> None:
-    """A node is elsewhere now. Raises InputError for a node that has no place on the fleet's ground."""
+    """Move a node. Raises InputError for a node without a position."""
     fleet.spec.node(name)
     with _locked(fleet):
         _apply(fleet, current_environment(fleet).with_moved(name, to))
 
 
 def set_power(fleet: VirtualFleet, name: str, on: bool) -> None:
-    """A node's power switch: off as after an orderly end, everything in its flash; on without waiting for its boot."""
+    """Switch a node off, with everything synced, or on, without waiting for its boot."""
     if on:
         fleet.ask("power_on", node=name)
     elif fleet.node(name).power is not Power.OFF:
@@ -57,14 +56,14 @@ def set_power(fleet: VirtualFleet, name: str, on: bool) -> None:
 
 
 def flush_stations(fleet: VirtualFleet, name: str) -> None:
-    """Have every other node that is up forget the radios of `name`, as the kernel does by itself within a minute."""
+    """Delete the stations of `name` on every other node that is up, as the kernel does by itself within a minute."""
     stations = "; ".join(
         f'iw dev "$dev" station del {radio.mac} 2>/dev/null' for radio in fleet.spec.node(name).radios if radio.mac
     )
     script = f"for dev in $(iw dev | sed -n 's/^[[:space:]]*Interface //p'); do {stations or ':'}; done; true"
 
     def flush(node: VirtualNode) -> None:
-        # one that goes off or is not up yet knows nobody
+        # a node that is going off or not up yet has no stations
         with contextlib.suppress(LabError):
             if node.name != name and node.is_up():
                 node.exec(script)
@@ -87,7 +86,7 @@ def _apply(fleet: VirtualFleet, environment: RadioEnvironment) -> None:
 
 @contextlib.contextmanager
 def _locked(fleet: VirtualFleet) -> Iterator[None]:
-    """Wait until nobody else changes this fleet's ground, and keep others waiting."""
+    """Hold the lock on the fleet's radio environment."""
     with (fleet.directory / _LOCK_NAME).open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

@@ -1,8 +1,7 @@
-"""The operator's way in: one listening socket on 127/8 for each address that is reachable at this moment.
+"""Forward ports from 127/8 to the nodes' SSH servers: one listening socket per address that is reachable now.
 
-A socket is closed as soon as its address is not reachable, so connecting there is refused; connections that are open
-then stall, as they do in the field. It is closed, too, while the firewall that the node has loaded lets nobody in; that
-leaves open connections alone.
+When an address becomes unreachable its socket closes, so new connections are refused, and established ones stall, as in
+the field. The socket also closes while the node's firewall rejects SSH; established connections are not affected then.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ from meshlab.spec import Medium
 log = logging.getLogger("meshlab.port_forwarder")
 _SSH_PORT = 22
 _BACKLOG = 16
-# ports tried for a fleet that asked for none
+# tried in order when the fleet's spec has no port
 _FIRST_PORT, _LAST_PORT = 20022, 20999
 
 
 @dataclass(frozen=True, slots=True)
 class ForwardedPort:
-    """Where a connection to `host` leads; `bench`: through the LAN port alone."""
+    """A connection to `host` is forwarded to `address` of `node`; `bench`: over its LAN port only."""
 
     host: str
     node: str
@@ -39,7 +38,7 @@ class ForwardedPort:
 
 
 class PortForwarder:
-    """Keeps the listening sockets in step with what is reachable."""
+    """Keeps one listening socket open for each reachable address."""
 
     def __init__(self, fleet: FleetState, link_state: LinkState, control: NodeControl) -> None:
         self._fleet = fleet
@@ -49,14 +48,11 @@ class PortForwarder:
         self._tunnels: set[asyncio.Task[None]] = set()
         self.port = fleet.spec.port
         self._port_lock: socket.socket | None = None
-        # the same dice in every fleet: losses are part of the scenario
+        # a fixed seed, so that losses are the same in every run
         self._dice = random.Random(1)
 
     def open(self) -> None:
-        """Settle on a port; it is held on 127.255.255.254 for as long as the fleet runs.
-
-        Raises LabError when it is taken (or all are).
-        """
+        """Choose a port and hold it on 127.255.255.254 while the fleet runs. Raises LabError when it is in use."""
         self._port_lock, self.port = claim_port(self.port)
 
     async def close(self) -> None:
@@ -71,7 +67,7 @@ class PortForwarder:
             self._port_lock.close()
 
     def reachable(self) -> dict[str, ForwardedPort]:
-        """What is reachable now, by loopback address. Of several nodes with one address the first in order answers."""
+        """The ports reachable now, by loopback address. If nodes share an address, the first in order gets it."""
         ports: dict[str, ForwardedPort] = {}
         for name, state in self._fleet.nodes.items():
             if not state.is_running:
@@ -81,7 +77,7 @@ class PortForwarder:
                 port = ForwardedPort(bench_of(state.number), name, FACTORY_ADDRESS, bench=True)
                 ports[port.host] = port
             for address in state.effective.addresses:
-                # many factory devices on one bench: each is told apart by its own port only
+                # factory devices share this address: on the bench each is reached over its own LAN port only
                 if address.address == FACTORY_ADDRESS and state.spec.medium is not Medium.BASE:
                     continue
                 if not address.admitted:
@@ -92,7 +88,7 @@ class PortForwarder:
         return ports
 
     def refresh(self) -> None:
-        """Open and close sockets until they are what `wanted` says."""
+        """Open and close sockets to match `reachable`."""
         reachable = set(self.reachable().values())
         for port in self._listening.keys() - reachable:
             listener, task = self._listening.pop(port)
@@ -105,7 +101,7 @@ class PortForwarder:
                 listener.bind((port.host, self.port))
             except OSError as error:
                 listener.close()
-                log.error("door-taken host=%s port=%d error=%s", port.host, self.port, error)
+                log.error("port-in-use host=%s port=%d error=%s", port.host, self.port, error)
                 continue
             listener.listen(_BACKLOG)
             listener.setblocking(False)
@@ -153,7 +149,7 @@ class PortForwarder:
         await Tunnel(client, node, shape, self._link_state.condition, lambda: state.boots == boots, self._dice).run()
 
     async def _hang(self, client: socket.socket) -> None:
-        """Keep the connection and answer nothing until the other side gives up."""
+        """Keep the connection open and send nothing until the client closes it."""
         loop = asyncio.get_running_loop()
         try:
             while await loop.sock_recv(client, 4096):
@@ -165,7 +161,10 @@ class PortForwarder:
 
 
 def claim_port(wanted: int) -> tuple[socket.socket, int]:
-    """A fleet's port, `wanted` or (0) a free one, and what holds it. Raises LabError when it is taken (or all are)."""
+    """A socket that holds the fleet's port, and the port: `wanted`, or a free one for 0.
+
+    Raises LabError when the port (or every port of the range) is in use.
+    """
     for port in (wanted,) if wanted else range(_FIRST_PORT, _LAST_PORT + 1):
         claim = socket.socket()
         try:
@@ -176,4 +175,11 @@ def claim_port(wanted: int) -> tuple[socket.socket, int]:
             claim.close()
             continue
         return claim, port
-    raise LabError(f"port {wanted or f'{_FIRST_PORT}-{_LAST_PORT}'} on 127.255.255.254 is taken by another fleet")
+    if wanted:
+        raise LabError(
+            f"port {wanted} on 127.255.255.254 is in use", hint="another fleet may run; choose another --port"
+        )
+    raise LabError(
+        f"ports {_FIRST_PORT} to {_LAST_PORT} on 127.255.255.254 are all in use",
+        hint="stop another fleet, or choose --port",
+    )

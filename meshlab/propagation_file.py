@@ -1,11 +1,11 @@
-"""A ground as a YAML file: `load` and `parse` read it, `dump` writes one that reads back as the same ground.
+"""A radio environment as a YAML file: `load` and `parse` read it, `dump` writes it so that it reads back equal.
 
-    nodes: {base: [0, 0], b01: {at: [80, 0], tx_power_dbm: 33}}      # metres
+    nodes: {base: [0, 0], b01: {at: [80, 0], tx_power_dbm: 33}}      # meters
     walls: [{a: [40, 10], b: [200, 10], loss_db: 40}]
-    air: {exponent: 3.5}                                             # `ground.Air` has the keys and what they mean
-    links: [{between: [base, b01], loss: 30%, loss_back: 5%}]        # `spec.LinkSpec` has the keys
+    air: {exponent: 3.5}                                             # keys: `propagation.PathLossModel`
+    links: [{between: [base, b01], loss: 30%, loss_back: 5%}]        # keys: `spec.LinkSpec`
 
-A link given by hand holds wherever its nodes are. docs/lab-ground.md explains all of it.
+An explicit link does not depend on its nodes' positions. docs/lab-ground.md describes the format.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from meshlab.spec import LinkSpec
 from meshlab.yaml_entries import YamlEntry, parse_text, read
 
 _LINK_KEYS = tuple(item.name for item in fields(LinkSpec) if item.name not in ("a", "b"))
-# least and most that make sense for each of `Air`'s numbers
+# the plausible range of each number of `PathLossModel`
 _PATH_LOSS_BOUNDS = {
     "tx_power_dbm": (-20.0, 60.0),
     "antenna_gain_dbi": (-20.0, 40.0),
@@ -33,12 +33,12 @@ _PATH_LOSS_BOUNDS = {
 
 
 def load(path: Path) -> RadioEnvironment:
-    """Read a ground. Raises InvalidInput with every problem found, each with file, line and column."""
+    """Read a radio environment. Raises InvalidInput with every problem found, each with file, line and column."""
     return _environment(read(path))
 
 
 def parse(text: str, file: str) -> RadioEnvironment:
-    """As `load`, from the file's text; `file` is the name that problems show."""
+    """Like `load`, from the file's text; `file` is the file name in problems."""
     return _environment(parse_text(text, file))
 
 
@@ -51,7 +51,7 @@ def _environment(root: YamlEntry) -> RadioEnvironment:
 
 
 def environment_in(keys: dict[str, YamlEntry]) -> RadioEnvironment:
-    """The ground that the entries `nodes`, `walls`, `air` and `links` describe; problems are noted in them."""
+    """The radio environment of the entries `nodes`, `walls`, `air` and `links`, which collect the problems."""
     positions = {name: _position(entry) for name, entry in keys["nodes"].mapping().items()}
     links: dict[frozenset[str], LinkSpec] = {}
     for entry in keys["links"].items():
@@ -71,10 +71,10 @@ def _position(entry: YamlEntry) -> NodePosition:
         return NodePosition(entry.point())
     keys = entry.mapping(("at", "tx_power_dbm"), required=("at",))
     power = keys["tx_power_dbm"]
-    least, most = _PATH_LOSS_BOUNDS["tx_power_dbm"]
+    minimum, maximum = _PATH_LOSS_BOUNDS["tx_power_dbm"]
     return NodePosition(
         keys["at"].point() if keys["at"].is_there else (0.0, 0.0),
-        power.number(0.0, least, most) if power.is_there else None,
+        power.number(0.0, minimum, maximum) if power.is_there else None,
     )
 
 
@@ -104,19 +104,19 @@ def _link(entry: YamlEntry) -> LinkSpec | None:
     return LinkSpec(
         ends[0],
         ends[1],
-        tq=keys["tq"].whole(standard.tq, 0, TQ_MAX),
-        signal_dbm=keys["signal_dbm"].whole(standard.signal_dbm, -120, 30),
+        tq=keys["tq"].integer(standard.tq, 0, TQ_MAX),
+        signal_dbm=keys["signal_dbm"].integer(standard.signal_dbm, -120, 30),
         delay_ms=keys["delay_ms"].number(standard.delay_ms, 0.0, 60_000.0),
         loss=keys["loss"].share(standard.loss),
-        rate_kbps=rate.whole(1, 1, 10_000_000) if rate.is_there else None,
+        rate_kbps=rate.integer(1, 1, 10_000_000) if rate.is_there else None,
         up=keys["up"].flag(standard.up),
         loss_back=loss_back.share(0.0) if loss_back.is_there else None,
-        signal_back_dbm=signal_back.whole(0, -120, 30) if signal_back.is_there else None,
+        signal_back_dbm=signal_back.integer(0, -120, 30) if signal_back.is_there else None,
     )
 
 
 def dump(environment: RadioEnvironment) -> str:
-    """The ground as text that `parse` reads as the same ground; JSON, which is YAML as well."""
+    """The environment as text that `parse` reads back equal; JSON, which is YAML, too."""
 
     def given(value: Any) -> dict[str, Any]:
         return {key: item for key, item in asdict(value).items() if item is not None}

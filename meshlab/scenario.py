@@ -1,8 +1,8 @@
-"""A mission: robots that drive along way points over a ground and drop the beacons they carry. Values and time alone.
+"""A scenario: robots drive along waypoints and deploy the beacons they carry. Pure.
 
-`scene(mission, t)` is the fleet at mission time `t`: the ground with everybody in place, and who has power.
-`agenda(mission)` is everything that happens, in order: arrivals, drops, radios that go off and on, links that come and
-go, and who loses and regains the base. `mission_file` reads missions, `mission_run` plays them on a fleet.
+`snapshot(scenario, t)` is the fleet at scenario time `t`: the positions of all nodes, and which nodes have power.
+`timeline(scenario)` is the sequence of all events: arrivals, deployments, power changes, links that come and go, nodes
+that lose and regain the base. `scenario_file` reads scenarios, `scenario_run` plays them on a fleet.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from meshlab.propagation import NodePosition, Point, RadioEnvironment, links_of
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """A path over the ground: at `times_s[i]` the robot is at `points[i]`, in between on the straight line."""
+    """At `times_s[i]` the robot is at `points[i]`; in between it moves on the straight line."""
 
     times_s: tuple[float, ...]
     points: tuple[Point, ...]
 
     def at(self, t: float) -> Point:
-        """Before the first time it stands at the first point, after the last at the last."""
+        """The position at time `t`: the first point before the first time, the last point after the last."""
         index = bisect_right(self.times_s, t)
         if index == 0:
             return self.points[0]
@@ -40,7 +40,7 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True)
 class Deployment:
-    """A beacon rides with `by`, without power, until it is dropped and switched on at `at_s`."""
+    """A beacon moves with `carrier`, without power, until it is deployed and powered on at `at_s`."""
 
     carrier: str
     at_s: float
@@ -48,7 +48,7 @@ class Deployment:
 
 @dataclass(frozen=True, slots=True)
 class PowerEvent:
-    """A node's radio goes off or on at `at_s`."""
+    """A node is powered on or off at `at_s`."""
 
     at_s: float
     node: str
@@ -57,9 +57,9 @@ class PowerEvent:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """`robots` drive, `beacons` are carried and dropped, both by node name; everybody else stands where `ground` says.
+    """`robots` move and `beacons` are deployed, by node name; the others stay where `environment` has them.
 
-    `step_s` is how often the fleet's links follow the robots, in mission time; `base` is where the operator sits.
+    `step_s` is the interval at which the links follow the robots, in scenario time; the operator is at `base`.
     """
 
     name: str
@@ -73,20 +73,20 @@ class Scenario:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Every node that takes part, sorted."""
+        """Every node of the scenario, sorted."""
         return tuple(sorted({self.base, *self.environment.names, *self.robots, *self.beacons}))
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """The fleet at one moment: everybody in place, and the nodes that have power."""
+    """The fleet at one moment: all positions, and the nodes with power."""
 
     environment: RadioEnvironment
     powered: frozenset[str]
 
 
 class EventKind(Enum):
-    """The value is the word in the output; `Event.other` is the node at the other end, or the beacon's robot."""
+    """The value is the name in the output; `Event.peer` is the node at the other end, or the beacon's carrier."""
 
     ARRIVES = "arrives"
     DROPPED = "dropped"
@@ -101,7 +101,7 @@ class EventKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happens to `who` at mission time `at_s`; `place` where that says something."""
+    """An event of `node` at scenario time `at_s`; `position` for arrivals and deployments."""
 
     at_s: float
     kind: EventKind
@@ -111,7 +111,7 @@ class Event:
 
 
 def snapshot(scenario: Scenario, t: float) -> Snapshot:
-    """Everybody's place and power at mission time `t`."""
+    """The positions and power of all nodes at scenario time `t`."""
     positions = dict(scenario.environment.positions)
 
     def put(name: str, at: Point) -> None:
@@ -141,7 +141,7 @@ def _is_carried(scenario: Scenario, name: str, t: float) -> bool:
 
 
 def timeline(scenario: Scenario) -> tuple[Event, ...]:
-    """Everything that happens from 0 to the mission's end, by time; links and reach are looked at every `step_s`."""
+    """All events from 0 to the scenario's end, by time; links and reachability are sampled every `step_s`."""
     planned = sorted(_planned(scenario), key=lambda event: event.at_s)
     events: list[Event] = []
     connected: frozenset[tuple[str, str]] | None = None
@@ -155,7 +155,7 @@ def timeline(scenario: Scenario) -> tuple[Event, ...]:
             events += [Event(t, EventKind.LINK_UP, *pair) for pair in sorted(pairs - connected)]
             events += [Event(t, EventKind.LINK_DOWN, *pair) for pair in sorted(connected - pairs)]
             events += [Event(t, EventKind.REACHED, name) for name in sorted(reachable - reachable_before)]
-            # who has no power is told as off, not as cut off
+            # a node without power is off, not cut off
             events += [
                 Event(t, EventKind.CUT_OFF, name) for name in sorted((reachable_before - reachable) & now.powered)
             ]
@@ -164,7 +164,7 @@ def timeline(scenario: Scenario) -> tuple[Event, ...]:
 
 
 def _planned(scenario: Scenario) -> Iterator[Event]:
-    """What the mission's file says will happen, within its duration."""
+    """The events that the scenario specifies, within its duration."""
     for name, robot in scenario.robots.items():
         for at_s, place in zip(robot.times_s, robot.points, strict=True):
             if 0 < at_s <= scenario.duration_s:
@@ -184,14 +184,14 @@ def _planned(scenario: Scenario) -> Iterator[Event]:
 
 
 def _sample_times(scenario: Scenario, planned: Sequence[Event]) -> list[float]:
-    """When to look: at every step, and whenever something is planned."""
+    """The times to sample: every step, and every planned event."""
     count = int(scenario.duration_s / scenario.step_s)
     steps = (number * scenario.step_s for number in range(count + 1))
     return sorted({*steps, *(event.at_s for event in planned), scenario.duration_s})
 
 
 def _connected_pairs(now: Snapshot) -> frozenset[tuple[str, str]]:
-    """Who can talk to whom: both have power and neither is deaf to the other."""
+    """The pairs of nodes that have power and hear each other in both directions."""
     return frozenset(
         (min(link.ends), max(link.ends))
         for link in links_of(now.environment)
@@ -200,8 +200,8 @@ def _connected_pairs(now: Snapshot) -> frozenset[tuple[str, str]]:
 
 
 def trajectory(waypoints: Sequence[tuple[float, Point]]) -> Trajectory:
-    """A course through (seconds, place) pairs; raises ValueError unless there is one and the times rise."""
+    """A trajectory through (seconds, point) pairs. Raises ValueError unless there is one and times increase."""
     times = tuple(time_s for time_s, _ in waypoints)
     if not times or any(later <= earlier for earlier, later in itertools.pairwise(times)):
-        raise ValueError("way points: expected at least one, with rising times")
+        raise ValueError("waypoints: expected at least one, with increasing times")
     return Trajectory(times, tuple(point for _, point in waypoints))

@@ -1,4 +1,4 @@
-"""A mission as a YAML file: a ground (the keys of `ground_file`, or a file of its own) and what happens on it.
+"""A scenario as a YAML file: a radio environment (the keys of `propagation_file`, or a separate file) and events.
 
     ground: ground.yaml                      # beside this file; or nodes, walls, air, links here
     base: base                               # default: base
@@ -10,7 +10,7 @@
     incidents:
       - {at_s: 200, what: "off", who: b01}
 
-docs/lab-ground.md explains all of it.
+docs/lab-ground.md describes the format.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from meshlab.yaml_entries import YamlEntry, parse_text, read
 
 _ENVIRONMENT_KEYS = ("nodes", "walls", "air", "links")
 _KEYS = ("name", "base", "ground", *_ENVIRONMENT_KEYS, "duration_s", "step_s", "robots", "beacons", "incidents")
-# a day; a mission that is longer has a slip of the pen
+# one day; a longer scenario is most likely a typo
 _MAX_DURATION_S = 86_400.0
 
 
 def load(path: Path) -> Scenario:
-    """Read a mission and its ground. Raises InvalidInput with every problem found, each with file, line and column."""
+    """Read a scenario and its radio environment. Raises InvalidInput with every problem, each with its position."""
     return _scenario(read(path), path)
 
 
 def parse(text: str, path: Path) -> Scenario:
-    """As `load`, from the file's text; `path` is the name that problems show and the place its `ground` lies beside."""
+    """Like `load`, from the file's text; `path` is the file name in problems, and `ground` is relative to it."""
     return _scenario(parse_text(text, str(path)), path)
 
 
@@ -43,11 +43,11 @@ def _scenario(root: YamlEntry, path: Path) -> Scenario:
     keys = root.mapping(_KEYS, required=("duration_s", "robots"))
     environment = _environment(keys, path)
     robots = {name: _trajectory(entry) for name, entry in keys["robots"].mapping().items()}
-    standing = {name for name in environment.positions if name not in robots}
+    stationary = {name for name in environment.positions if name not in robots}
     beacons = {
         name: drop
         for name, entry in keys["beacons"].mapping().items()
-        if (drop := _deployment(name, entry, (*robots, *sorted(standing)))) is not None
+        if (drop := _deployment(name, entry, (*robots, *sorted(stationary)))) is not None
     }
     for name in sorted(robots.keys() & beacons.keys()):
         keys["beacons"].problem("nodes that are not robots", name)
@@ -70,7 +70,7 @@ def _scenario(root: YamlEntry, path: Path) -> Scenario:
 
 
 def _environment(keys: dict[str, YamlEntry], path: Path) -> RadioEnvironment:
-    """The file that `ground` names; what this file says of nodes, walls, air and links is added or wins."""
+    """The file that `ground` names, extended and overridden by this file's nodes, walls, air and links."""
     own = propagation_file.environment_in(keys)
     if not keys["ground"].is_there:
         return own
@@ -94,7 +94,7 @@ def _trajectory(entry: YamlEntry) -> Trajectory:
         return trajectory(points)
     except ValueError as error:
         if keys["path"].is_there and all(rows):
-            keys["path"].problem("[[seconds, x, y], ...] with rising times", str(error))
+            keys["path"].problem("[[seconds, x, y], ...] with increasing times", str(error))
         return Trajectory((0.0,), ((0.0, 0.0),))
 
 

@@ -1,6 +1,6 @@
-"""Playing a mission on a running fleet: each step puts everybody in place, each event is told and done when it is due.
+"""Play a scenario on a running fleet: each step updates the links, each event is reported and applied when it is due.
 
-`play` takes the clock, the waiting and the fleet as arguments; `stage_of` makes a running fleet such a stage.
+`play` takes the clock, the wait function and the target as arguments; `FleetTarget` is a running fleet as the target.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from meshlab.fleet import VirtualFleet
 from meshlab.propagation import RadioEnvironment, links_of
 from meshlab.scenario import Event, EventKind, Scenario, snapshot, timeline
 
-# links follow the robots at most so often in real time: a fast replay takes bigger steps
+# the shortest step in real time: a fast replay takes longer steps in scenario time
 _MIN_STEP_S = 0.2
-# Mission time without power after which nobody knows a node's radio any more when it is back: an ad-hoc cell of Linux
-# forgets within a minute, and a board takes most of that to boot, which a node of the lab does not. Before that its
-# neighbours go on with the numbers it had, and are half deaf to it (docs/lab.md).
+# Scenario time without power after which a node's neighbors have dropped its station entries when it is back. Linux
+# drops an ad-hoc station within a minute, most of which a real board takes to boot; a node of the lab boots in seconds.
+# After a shorter time, neighbors keep the old sequence numbers and drop its unicast frames (docs/lab.md).
 STATION_EXPIRY_S = 20.0
 
 
 class ScenarioTarget(Protocol):
-    """What a mission needs of a fleet."""
+    """What a scenario needs from a fleet."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -31,21 +31,21 @@ class ScenarioTarget(Protocol):
         ...
 
     def set_environment(self, environment: RadioEnvironment) -> None:
-        """From now on who hears whom is as this ground has it."""
+        """Replace the fleet's links by those of `environment`."""
         ...
 
     def set_power(self, name: str, on: bool) -> None:
-        """A node's power switch; no matter when it is in that position already."""
+        """Power a node on or off; does nothing when it is already."""
         ...
 
     def flush_stations(self, name: str) -> None:
-        """Nobody knows the node's radio any more: so long has it been away, as time passes in the mission."""
+        """Delete the node's station entries on all other nodes: it was off for longer than these last."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class FleetTarget:
-    """A running fleet as a stage."""
+    """A running fleet as the target."""
 
     fleet: VirtualFleet
 
@@ -73,11 +73,11 @@ def play(
     speed: float = 1.0,
     start_s: float = 0.0,
 ) -> float | None:
-    """Play the mission from `start_s` on, `speed` times as fast as `clock` goes; nodes the fleet has not do nothing.
+    """Play the scenario from `start_s` on at `speed` times the speed of `clock`; nodes outside the fleet are skipped.
 
-    At the start everybody is put in place, and carried beacons are switched off. `tell` gets every event from there on,
-    in order. Returns None at the mission's end; when a KeyboardInterrupt came, the mission time at which it stopped:
-    everything then stays as it is, and can be taken up from there.
+    At the start all nodes are placed, and carried beacons are powered off. `on_event` gets every later event in order.
+    Returns None at the scenario's end. A KeyboardInterrupt stops it: the fleet stays as it is, and the scenario time
+    is returned, from which it can be continued.
     """
     present = frozenset(target.names)
     events = [event for event in timeline(scenario) if event.at_s > start_s]
@@ -89,7 +89,7 @@ def play(
         started = clock()
         while events:
             wait(max(_MIN_STEP_S, scenario.step_s / speed))
-            # never past the end: the last step puts everybody where the mission leaves them
+            # never past the end: the last step applies the final positions
             now_s = min(scenario.duration_s, start_s + (clock() - started) * speed)
             now = snapshot(scenario, now_s)
             if links_of(now.environment) != links:
@@ -106,7 +106,7 @@ def play(
 
 
 def _off_since(scenario: Scenario, t: float) -> dict[str, float]:
-    """Who has no power at `t`, and since when; whoever is carried has been away since long before."""
+    """The nodes without power at `t`, and since when; a carried beacon has been off since before the start."""
     off_s = {name: float("-inf") for name in scenario.beacons}
     for event in timeline(scenario):
         if event.at_s <= t and event.kind is EventKind.OFF:
@@ -117,7 +117,7 @@ def _off_since(scenario: Scenario, t: float) -> dict[str, float]:
 
 
 def _apply_snapshot(scenario: Scenario, target: ScenarioTarget, t: float, present: frozenset[str]) -> None:
-    """Everybody's place and power as the mission has it at `t`, whatever they were before."""
+    """Apply all positions and power states at `t`, whatever they were before."""
     now = snapshot(scenario, t)
     target.set_environment(now.environment)
     for name in scenario.names:

@@ -1,8 +1,8 @@
-"""The process behind a running fleet: power, air, and the operator's way in.
+"""The process of a running fleet: it boots the nodes, keeps their link state and forwards the operator's connections.
 
 It starts as `python -m meshlab.supervisor DIRECTORY`, becomes root of a user namespace if it is not root, forks the
-warden, and then serves four things from one loop: events of the warden (nodes that ended), the bell (a pipe on which
-nodes say that they are up or have changed), connections of the operator, and requests on `control.sock`.
+node runner, and then serves one event loop: events of the node runner (nodes that ended), the bell (a pipe on which
+nodes report that they are up or have changed), connections of the operator, and requests on `control.sock`.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from meshlab.spec import FleetSpec, Medium, load
 from meshlab.state import NodeState, Power, label_mac, write_board, write_firmware
 
 log = logging.getLogger("meshlab")
-# more at once only makes each of them slower
+# more parallel boots only make each of them slower
 _BOOTING_AT_ONCE = 4 * (os.cpu_count() or 1)
 
 
 class Supervisor:
-    """All nodes of one fleet. Not thread-safe: everything runs in one event loop."""
+    """Owns the state of one fleet (`NodeControl`). Not thread-safe: everything runs in one event loop."""
 
     def __init__(self, spec: FleetSpec, directory: Path, runner: socket.socket, *, deny_setgroups: bool) -> None:
         self.spec = spec
@@ -65,10 +65,10 @@ class Supervisor:
     def _make_operations(self) -> Operations:
         return Operations(self.fleet, self.link_state, self.port_forwarder, self.faults, self)
 
-    # -- life --
+    # -- start and power --
 
     async def run(self) -> None:
-        """Boot every node, serve until `stopping` is set."""
+        """Boot every node and serve until `stop`."""
         loop = asyncio.get_running_loop()
         self._runner.setblocking(False)
         loop.add_reader(self._runner, self._on_runner_event)
@@ -107,7 +107,7 @@ class Supervisor:
         self.stopping.set()
 
     def power_on(self, name: str) -> None:
-        """Boot a node that is off, as soon as not too many others are booting."""
+        """Boot a node that is off, once fewer than `_BOOTING_AT_ONCE` others are booting."""
         state = self.fleet.nodes[name]
         state.want_on = True
         if state.is_running or name in self._waiting:
@@ -116,7 +116,7 @@ class Supervisor:
         self._boot_next()
 
     def power_off(self, name: str, *, back: bool) -> None:
-        """Take a node's power away at this moment; `back` gives it again."""
+        """Cut a node's power; `back` restores it immediately."""
         state = self.fleet.nodes[name]
         state.want_on = back
         if name in self._waiting:
@@ -124,7 +124,7 @@ class Supervisor:
                 self._waiting.remove(name)
             return
         if state.is_running:
-            # connections stall from here on; that its processes end is no farewell
+            # connections stall from here on, before the exit of its processes could close them
             self._mark_down(state, Power.OFF)
             self.send({"do": "kill", "node": name})
         elif back:
@@ -146,7 +146,7 @@ class Supervisor:
         state.power = Power.BOOTING
         state.reason = ""
         state.boots += 1
-        # set at once, so that nobody starts it twice; the warden tells the real one
+        # set now, so that the node is not started twice; the node runner reports the real pid
         state.pid = -1
         self.send(
             {
@@ -165,11 +165,11 @@ class Supervisor:
         state.effective = parse_effective("")
         self.link_state.changed()
 
-    # -- the warden --
+    # -- the node runner --
 
     def send(self, request: dict[str, Any], descriptors: Sequence[int] = ()) -> None:
-        """Send one request without an answer of its own."""
-        # the warden answers quickly; a full buffer only means that it is a few requests behind
+        """Send a request that has no reply."""
+        # blocking is fine: a full buffer only means that the node runner is a few requests behind
         self._runner.setblocking(True)
         try:
             socket.send_fds(self._runner, [json.dumps(request).encode()], list(descriptors))
@@ -179,7 +179,7 @@ class Supervisor:
     async def request(
         self, request: dict[str, Any], descriptors: Sequence[int] = ()
     ) -> tuple[dict[str, Any], list[int]]:
-        """Send one request and wait for the event with its id."""
+        """Send a request and wait for the event with its id."""
         self._serial += 1
         serial = self._serial
         future: asyncio.Future[tuple[dict[str, Any], list[int]]] = asyncio.get_running_loop().create_future()
@@ -193,7 +193,7 @@ class Supervisor:
     def _on_runner_event(self) -> None:
         message, descriptors, _, _ = socket.recv_fds(self._runner, MESSAGE_BYTES, 1)
         if not message:
-            log.error("warden-ended")
+            log.error("node-runner-ended")
             self.stopping.set()
             return
         event = json.loads(message)
@@ -236,7 +236,7 @@ class Supervisor:
                 try:
                     self._on_message(word, self.fleet.nodes[name], detail)
                 except (OSError, ValueError, LabError):
-                    # the lines behind it are other nodes'
+                    # the following lines may be from other nodes
                     log.exception("bell-failed line=%s", line)
 
     def _on_message(self, word: str, state: NodeState, detail: str) -> None:
@@ -281,7 +281,7 @@ _DEAD = 20
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Become the supervisor of the fleet in DIRECTORY; its spec.json is there already. Errors go to `failure`."""
+    """Run the supervisor of the fleet in DIRECTORY, which has its spec.json. Errors are written to `failure`."""
     directory = Path(arguments[1]).resolve()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
     try:
@@ -304,19 +304,20 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _acquire_privileges() -> bool:
-    """Root of a new user namespace where the kernel lets us, else root itself; whether setgroups is denied."""
+    """Become root of a new user namespace if the kernel allows it, else require root. Returns whether setgroups is
+    denied."""
     if not ns.machine_is_known():
-        raise LabError("the virtual fleet knows the system calls of x86_64 and aarch64 only")
-    wanted = os.environ.get("MESHCTL_LAB_PRIVILEGES", "")
-    if wanted != "root":
+        raise LabError("the virtual fleet runs on x86_64 and aarch64 only")
+    privileges = os.environ.get("MESHCTL_LAB_PRIVILEGES", "")
+    if privileges != "root":
         try:
             ns.enter_user_namespace()
         except OSError as error:
-            if wanted == "user" or os.geteuid() != 0:
+            if privileges == "user" or os.geteuid() != 0:
                 raise LabError(
-                    f"the kernel lets this user make no user namespaces ({error})",
+                    f"the kernel does not allow this user to create user namespaces ({error})",
                     hint="run as root, or allow them: sysctl kernel.unprivileged_userns_clone=1 (Debian), "
-                    "kernel.apparmor_restrict_unprivileged_userns=0 (Ubuntu); containers need --privileged",
+                    "kernel.apparmor_restrict_unprivileged_userns=0 (Ubuntu); in a container, run it with --privileged",
                 ) from error
         else:
             return True
@@ -324,7 +325,7 @@ def _acquire_privileges() -> bool:
 
 
 def fork_node_runner(make: Callable[[], NodeRunner], channel: socket.socket, *, close: socket.socket) -> None:
-    """Let the warden, whose end of the pair is `channel`, serve in a process of its own."""
+    """Fork a process that runs the node runner on `channel`; `close` is the parent's end of the socket pair."""
     if os.fork() != 0:
         channel.close()
         return
@@ -334,7 +335,7 @@ def fork_node_runner(make: Callable[[], NodeRunner], channel: socket.socket, *, 
     try:
         make().serve()
     except BaseException:
-        log.exception("warden-failed")
+        log.exception("node-runner-failed")
         os._exit(1)
     os._exit(0)
 

@@ -115,8 +115,8 @@ def test_a_ground_is_loaded_shown_and_refused_when_it_is_another_s(grounded: Vir
     file.write_text("nodes: {base: [0, 0], near: [60, 0], far: [120, 0], other: [0, 9]}\n", encoding="utf-8")
     shown = lab(grounded, "ground", str(file))
     assert "near at 60, 0 m" in shown
-    assert "base - near: loses 0%" in shown
-    assert "box has no place" in shown
+    assert "base - near: loss 0%" in shown
+    assert "box has no position" in shown
     assert "other" not in shown
     assert json.loads(lab(grounded, "ground", "--json"))["nodes"]["far"] == {"at": [120, 0]}
     file.write_text("nodes: {x: [0, 0]}\n", encoding="utf-8")
@@ -131,7 +131,7 @@ def test_words_that_say_nothing_are_refused_with_what_was_expected(grounded: Vir
     )
     assert "needs --loss" in lab(grounded, "link", "base", "near", "--one-way", "--down", status=2)
     assert "nothing to change" in lab(grounded, "link", "base", "near", status=2)
-    assert "far has no place" in lab(grounded, "move", "far", "0", "0", status=2)
+    assert "cannot move far: it has no position" in lab(grounded, "move", "far", "0", "0", status=2)
     with pytest.raises(InputError, match="no node named nobody"):
         placement.move(grounded, "nobody", (0, 0))
 
@@ -176,7 +176,7 @@ def test_a_mission_that_is_interrupted_says_where_to_go_on(grounded: VirtualFlee
         _, said = playing.communicate(timeout=60)
     assert playing.returncode == 130
     assert "everything stays as it is" in said
-    assert f"go on with: meshctl lab mission {file} --from " in said
+    assert f"continue with: meshctl lab mission {file} --from " in said
     assert placement.current_environment(grounded).positions["far"].at[0] < 100
 
 

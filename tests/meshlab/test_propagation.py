@@ -89,7 +89,7 @@ def test_a_link_by_hand_holds_wherever_its_nodes_are(ground: RadioEnvironment) -
 @given(grounds, points)
 def test_who_moves_changes_no_link_of_others(ground: RadioEnvironment, to: tuple[float, float]) -> None:
     if "n0" not in ground.positions:
-        with pytest.raises(InputError, match="n0 has no place"):
+        with pytest.raises(InputError, match="n0: it has no position"):
             ground.with_moved("n0", to)
         return
     before = [link for link in links_of(ground) if "n0" not in link.ends]
@@ -154,7 +154,7 @@ def test_a_ground_survives_its_file(ground: RadioEnvironment) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("nodes: {a: [0]}", "ground.yaml:1:12: nodes.a: expected [x, y] in metres, found a list of 1 [INV021]"),
+        ("nodes: {a: [0]}", "ground.yaml:1:12: nodes.a: expected [x, y] in meters, found a list of 1 [INV021]"),
         (
             "nodes:\n  a: {at: [0, x]}",
             "ground.yaml:2:15: nodes.a.at[1]: expected a number from -1e+06 to 1e+06, found 'x'",
@@ -168,7 +168,7 @@ def test_a_ground_survives_its_file(ground: RadioEnvironment) -> None:
         ("links: [{between: [a, a]}]", "ground.yaml:1:19: links[0].between: expected two different nodes"),
         ("links: [{between: [a, b], loss: 130%}]", "expected a share from 0 to 1, or 0% to 100%, found '130%'"),
         ("links: [{between: [a, b], up: maybe}]", "expected one of true, false, found 'maybe'"),
-        ("links: [{between: [a, b], tq: 2.5}]", "expected a whole number from 0 to 255, found '2.5'"),
+        ("links: [{between: [a, b], tq: 2.5}]", "expected an integer from 0 to 255, found '2.5'"),
         ("place: {}", "ground.yaml:1:1: expected one of nodes, walls, air, links, found 'place'"),
         ("[1, 2]", "ground.yaml:1:1: expected a mapping, found a list of 2"),
         ("nodes: {a: [0, 0}", "ground.yaml:1:17: not valid YAML"),

@@ -66,7 +66,7 @@ def test_a_course_goes_through_its_points_and_stands_at_its_ends(
 
 @pytest.mark.parametrize("way_points", [[], [(1.0, (0.0, 0.0)), (1.0, (1.0, 0.0))]])
 def test_a_course_needs_rising_times(way_points: list[tuple[float, tuple[float, float]]]) -> None:
-    with pytest.raises(ValueError, match="rising times"):
+    with pytest.raises(ValueError, match="increasing times"):
         trajectory(way_points)
 
 
@@ -165,7 +165,7 @@ GOOD = "nodes: {base: [0, 0]}\nduration_s: 9\nrobots: {r: {path: [[0, 0, 0]]}}\n
         (GOOD + "base: x", "mission.yaml:4:7: base: expected one of base, r, found 'x'"),
         (GOOD + "ground: nowhere.yaml", "nowhere.yaml: cannot be read"),
         (GOOD + "step_s: 0", "step_s: expected a number from 0.1"),
-        ("duration_s: 9\nnodes: {base: [0, 0]}\nrobots: {r: {path: [[1, 0, 0], [1, 2, 2]]}}", "with rising times"),
+        ("duration_s: 9\nnodes: {base: [0, 0]}\nrobots: {r: {path: [[1, 0, 0], [1, 2, 2]]}}", "with increasing times"),
         ("duration_s: 9\nnodes: {base: [0, 0]}\nrobots: {r: {path: [[1, 0]]}}", "path[0]: expected [seconds, x, y]"),
     ],
 )
