@@ -1,4 +1,4 @@
-"""The machine's end of the channel to the host: requests, processes, doors (`channel` has the words)."""
+"""The machine's end of `guest_protocol`: requests, processes and forwarded ports."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from meshlab.qemu.port_forwarder import QemuPortForwarder
 
 log = logging.getLogger("meshlab.qemu.guest_agent")
 _CHUNK_BYTES = 1 << 16
-# a terminal passes on what was written to it a little later
+# a terminal passes on output with a delay
 _TERMINAL_DRAIN_S = 0.05
 _CLOSE_WAIT_S = 5.0
 
 
 class GuestAgent:
-    """Serves connections whose first line holds `token`; `answer` is the fleet's (`control.Answer`)."""
+    """Serves connections whose first line has `token`; `answer` handles the fleet's requests (`control.Answer`)."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class GuestAgent:
             self._server.close()
 
     def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        # a connection that is over must not take the task that serves it along
+        # keep a reference: the event loop holds tasks only weakly
         task = asyncio.ensure_future(self._serve(reader, writer))
         self._serving.add(task)
         task.add_done_callback(self._serving.discard)
@@ -74,19 +74,19 @@ class GuestAgent:
         finally:
             writer.close()
 
-    # -- doors --
+    # -- forwarded ports --
 
     async def _watch(self, writer: asyncio.StreamWriter) -> None:
         while True:
             changed = self._port_forwarder.changed
-            doors = {host: door.node for host, door in self._port_forwarder.reachable().items()}
-            writer.write(guest_protocol.line({"doors": doors}))
+            ports = {host: port.node for host, port in self._port_forwarder.reachable().items()}
+            writer.write(guest_protocol.line({"doors": ports}))
             await writer.drain()
             await changed.wait()
 
     async def _dial(self, host: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if self._port_forwarder.is_hung(host):
-            # accepted, and then nothing until the other side gives up
+            # accept, and send nothing until the client closes
             writer.write(guest_protocol.line({}))
             while await reader.read(_CHUNK_BYTES):
                 pass
@@ -104,7 +104,7 @@ class GuestAgent:
             there = asyncio.ensure_future(_copy(reader, node_writer))
             back = asyncio.ensure_future(_copy(node_reader, writer))
             try:
-                # whichever ends first, the other one gets a while: a node without power says no farewell
+                # after one direction ends, wait only a while for the other: a node without power never closes
                 await asyncio.wait((there, back), return_when=asyncio.FIRST_COMPLETED)
                 await asyncio.wait((there, back), timeout=_CLOSE_WAIT_S)
             finally:
@@ -139,7 +139,7 @@ class GuestAgent:
 
 
 class _Pipes:
-    """Three pipes: what a process gets, and our ends of them. Every descriptor is closed once."""
+    """Pipes for a process's stdin, stdout and stderr, and our ends of them. Every descriptor is closed once."""
 
     def __init__(self) -> None:
         read, self.input = os.pipe()
@@ -150,7 +150,7 @@ class _Pipes:
         self._ours = {self.input, out, err}
 
     def end_input(self) -> None:
-        """Tell the process that nothing more comes."""
+        """Close the process's stdin."""
         self._ours.discard(self.input)
         os.close(self.input)
 
@@ -166,7 +166,7 @@ class _Pipes:
 
 
 class _Terminal(_Pipes):
-    """One terminal for all three, of so many rows and columns."""
+    """One terminal for all three streams, of the given rows and columns."""
 
     def __init__(self, size: list[int]) -> None:
         ours, theirs = pty.openpty()
@@ -177,7 +177,7 @@ class _Terminal(_Pipes):
         self._ours = {ours}
 
     def end_input(self) -> None:
-        """A terminal has no end of input of its own; it ends with the process."""
+        """A terminal's input ends with the process."""
 
 
 async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -189,7 +189,7 @@ async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
 
 
 async def _stream_input(reader: asyncio.StreamReader, streams: _Pipes) -> None:
-    """Input frames into a process; an empty one ends them."""
+    """Write input frames to a process until an empty one closes its stdin."""
     loop = asyncio.get_running_loop()
     while True:
         _, length = guest_protocol.header(await reader.readexactly(guest_protocol.HEADER_BYTES))
@@ -197,7 +197,7 @@ async def _stream_input(reader: asyncio.StreamReader, streams: _Pipes) -> None:
         if not content:
             streams.end_input()
             return
-        # a pipe that is full waits in a thread of its own
+        # in a thread: writing to a full pipe blocks
         await loop.run_in_executor(None, _write_all, streams.input, content)
 
 
@@ -208,8 +208,8 @@ def _write_all(descriptor: int, content: bytes) -> None:
 
 
 async def _stream_output(number: int, descriptor: int, writer: asyncio.StreamWriter, ended: asyncio.Event) -> None:
-    """A process's output as frames, until it is closed. One that stays behind may keep it open for ever and go on: so
-    once the process has `ended`, what a pipe holds at most is read, as far as it is there."""
+    """Send a process's output as frames until it is closed. A background child may keep it open forever, so once the
+    process has `ended`, at most one pipe buffer of the available output is read."""
     loop = asyncio.get_running_loop()
     os.set_blocking(descriptor, False)
     ready = asyncio.Event()
@@ -219,7 +219,7 @@ async def _stream_output(number: int, descriptor: int, writer: asyncio.StreamWri
     try:
         while left > 0:
             await ready.wait()
-            # asked before reading: what comes later is not the ended process's
+            # checked before reading: later output is not the ended process's
             has_ended = ended.is_set()
             try:
                 content = os.read(descriptor, _CHUNK_BYTES)
@@ -229,7 +229,7 @@ async def _stream_output(number: int, descriptor: int, writer: asyncio.StreamWri
                 ready.clear()
                 continue
             except OSError:
-                # EIO: a terminal whose other side is gone
+                # EIO: the terminal's other end is closed
                 return
             if not content:
                 return

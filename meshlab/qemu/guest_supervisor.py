@@ -1,8 +1,8 @@
-"""The process behind the fleet on the machine's side, and process 1 there: the virtual fleet's supervisor and runner,
-with the kernel's radios for air and the host for a way in.
+"""The fleet's process inside the machine, and its process 1: the virtual fleet's supervisor and node runner, with the
+kernel's radios as links and ports that the host forwards.
 
-It starts as `python -m meshlab.qemu.guest_supervisor DIRECTORY`, where the image has put the ROM, the spec and the
-token. When it ends, the kernel panics and the machine with it: the host's process sees that.
+It starts as `python -m meshlab.qemu.guest_supervisor DIRECTORY`; the image has the ROM, the spec and the token there.
+When it ends, the kernel panics and the machine stops, which the host's process notices.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ log = logging.getLogger("meshlab.qemu")
 
 
 class QemuSupervisor(Supervisor):
-    """A supervisor whose air, cables and doors are the kernel's."""
+    """A supervisor whose links, cables and connections are the kernel's."""
 
     def __init__(self, spec: FleetSpec, directory: Path, runner: socket.socket) -> None:
         self.hardware = hwsim_devices.node_hardware(spec)
@@ -70,7 +70,7 @@ class QemuSupervisor(Supervisor):
 
 
 class QemuOperations(Operations):
-    """What a fleet of real radios can be asked for besides."""
+    """The additional operations of a QEMU fleet."""
 
     def __init__(self, supervisor: QemuSupervisor) -> None:
         super().__init__(
@@ -107,7 +107,7 @@ class QemuOperations(Operations):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Become the supervisor of the fleet in DIRECTORY."""
+    """Run the supervisor of the fleet in DIRECTORY."""
     directory = Path(arguments[1])
     logging.basicConfig(level=logging.INFO, format="%(relativeCreated)d %(name)s %(message)s")
     spec = load((directory / "spec.json").read_text(encoding="utf-8"))

@@ -1,7 +1,7 @@
-"""The machine's image: Debian's kernel, and an archive of files in two parts.
+"""The machine's image: Debian's kernel, and an initramfs in two parts.
 
-`base` (cached; rebuilt when this package's recipe changes): packages, kernel modules, compiled Python.
-`product` (at every start, in well under a second of CPU): the nodes' ROM, this package's code, the fleet's spec.
+`base_image` (cached; rebuilt when its recipe changes): packages, kernel modules, compiled Python.
+`build_initrd` (at every start, under a second of CPU): the base, the nodes' ROM, this package's code, the fleet's spec.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from meshlab.qemu import apt, cpio, kernel_modules
 
 _HERE = Path(__file__).resolve().parent
 _PACKAGE = Path(meshctl.__file__).resolve().parent
-# of this package, what runs in the machine
+# the parts of meshctl that run in the machine
 _CODE = ("__init__.py", "diagnostics.py", "errors.py", "model")
 CODE_FOLDER = "opt/lab"
 FLEET_FOLDER = "lab"
-# what the nodes' stand-ins run on real devices; each is a program of Debian's
+# Debian's programs that the nodes' stand-ins run on real devices
 _NODE_PROGRAMS = ("iw", "batctl", "ip", "wpa_supplicant", "iperf3", "tcpdump")
 _PROGRAM_FOLDERS = ("usr/sbin", "sbin", "usr/bin", "bin")
 _LIBRARY_FOLDERS = ("lib/x86_64-linux-gnu", "usr/lib/x86_64-linux-gnu", "lib64")
@@ -40,7 +40,7 @@ _FOLDERS = ("proc", "sys", "dev", "run", "tmp", "mnt", "root", "etc", "sbin", "b
 
 @dataclass(frozen=True, slots=True)
 class BaseImage:
-    """The cached part: `root` are the unpacked files that `archive` holds."""
+    """The cached part: `archive` has the files below `root`."""
 
     kernel: Path
     archive: Path
@@ -53,9 +53,11 @@ def cache_folder(environ: Mapping[str, str] = os.environ) -> Path:
 
 
 def base_image(cache: Path) -> BaseImage:
-    """The base, built if it is not in `cache`. Raises LabError when it cannot be built here."""
+    """The base, built if `cache` does not have it. Raises LabError when it cannot be built on this host."""
     if platform.machine() != "x86_64":
-        raise LabError(f"the machine of real radios is an x86_64 one; this is {platform.machine()}")
+        raise LabError(
+            f"--real needs an x86_64 host, found {platform.machine()}", hint="run `meshctl lab up` without --real"
+        )
     cache.mkdir(parents=True, exist_ok=True)
     place = cache / _recipe_digest()
     with _locked(cache):
@@ -65,7 +67,7 @@ def base_image(cache: Path) -> BaseImage:
 
 
 def build_initrd(image: BaseImage, spec_text: str, token: str, work: Path) -> Path:
-    """The whole initial RAM disk as a file in `work`: the base's archive and what belongs to this fleet behind it."""
+    """Write the initramfs to a file in `work`: the base's archive followed by the files of this fleet."""
     tree = work / "product"
     shutil.rmtree(tree, ignore_errors=True)
     _install_code(tree / CODE_FOLDER)
@@ -88,7 +90,7 @@ def build_initrd(image: BaseImage, spec_text: str, token: str, work: Path) -> Pa
 
 
 def _recipe_digest() -> str:
-    """A name for what a base is made of: another recipe makes another base."""
+    """The cache key of a base: a digest of the code that builds it."""
     text = "".join(inspect.getsource(module) for module in (apt, kernel_modules, cpio)) + inspect.getsource(_build_base)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -135,7 +137,7 @@ def _make_folders(root: Path) -> None:
         if not (firmware / name).exists():
             (firmware / name).unlink(missing_ok=True)
             (firmware / name).symlink_to(f"{name}-debian")
-    # dash: busybox' own shell prefers its applets over iproute2
+    # dash: busybox's shell prefers its applets over iproute2
     (root / "bin" / "sh").unlink(missing_ok=True)
     (root / "bin" / "sh").symlink_to("dash")
     if not (root / "bin" / "busybox").exists():
@@ -156,7 +158,7 @@ def _install_code(target: Path) -> None:
 
 
 def _install_programs(root: Path, rom_folder: Path) -> None:
-    """Debian's programs for the nodes, and the libraries that they and the ROM's need."""
+    """Copy Debian's programs for the nodes, and the libraries of these and of the ROM's programs."""
     kernel = rom_folder / "lab" / "kernel"
     kernel.mkdir(exist_ok=True)
     for name in _NODE_PROGRAMS:
@@ -170,7 +172,7 @@ def _install_programs(root: Path, rom_folder: Path) -> None:
 
 
 def _libraries(root: Path, program: Path) -> list[Path]:
-    """The libraries in `root` that a program needs, and the loader."""
+    """The program's libraries in `root`, and the loader."""
     loader = _loader(root)
     listed = subprocess.run((*loader, "--list", program), capture_output=True, text=True, check=False).stdout
     return [Path(path) for path in re.findall(r"=> (/\S+) \(0x", listed)] + [Path(loader[0])]
@@ -179,23 +181,23 @@ def _libraries(root: Path, program: Path) -> list[Path]:
 def _program(root: Path, name: str) -> Path:
     found = next((root / folder / name for folder in _PROGRAM_FOLDERS if (root / folder / name).is_file()), None)
     if found is None:
-        raise LabError(f"{name} is not among the packages of the lab's machine")
+        raise LabError(f"no package of the lab's machine contains {name}")
     return found
 
 
 def _compile(root: Path, folder: Path) -> None:
-    """Compile Python files with the machine's own Python: under emulation that would take most of the start."""
+    """Compile Python files with the machine's Python on the host: under emulation it would take most of the start."""
     python = sorted((root / "usr" / "bin").glob("python3.*"))[0]
     options = ("-m", "compileall", "-q", "--invalidation-mode", "unchecked-hash", folder)
     environment = {"PYTHONHOME": str(root / "usr"), "PATH": "/usr/bin:/bin"}
     words = (*_loader(root), python, *options)
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise LabError(f"Python files in {folder} cannot be compiled: {done.stderr.strip() or done.stdout.strip()}")
+        raise LabError(f"cannot compile the Python files in {folder}: {done.stderr.strip() or done.stdout.strip()}")
 
 
 def _loader(root: Path) -> tuple[str, str, str]:
-    """How a program of `root` is started on this machine, with the libraries of `root`."""
+    """The command prefix that runs a program of `root` on the host with the libraries of `root`."""
     libraries = ":".join(str(root / name) for name in _LIBRARY_FOLDERS)
     return str(root / "lib64" / "ld-linux-x86-64.so.2"), "--library-path", libraries
 

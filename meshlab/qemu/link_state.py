@@ -1,8 +1,8 @@
-"""The air of a fleet of real radios: links -> hwsim's groups, and what is lost on its way, in the kernel.
+"""Link state of a QEMU fleet: links -> hwsim groups and traffic control in the kernel.
 
-A link that is up, or a node that gets power, changes the groups; losses, delays and rates become traffic control on the
-node that hears (`losses`). Nobody computes tables or paths here: batman-adv does. Cables are laid here, too, because
-`changed()` is also how the supervisor says that a node was plugged in or pulled out.
+Links and power changes set the hwsim groups; losses, delays and rates become traffic control on the receiving node
+(`traffic_control`). Tables and routes are batman-adv's own. Cables are connected here, too, because `changed()` also
+reports that a node was plugged in or unplugged.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from meshlab.spec import Medium
 from meshlab.state import NodeState
 
 log = logging.getLogger("meshlab.qemu.link_state")
-# after something could not be applied to a node that goes on running
+# after a change could not be applied to a running node
 _RETRY_S = 1.0
 
 
 class QemuLinkState(LinkState):
-    """`places` tells where each node's hardware is."""
+    """`hardware` has each node's devices in the machine."""
 
     def __init__(self, fleet: FleetState, hardware: dict[str, hwsim_devices.NodeHardware]) -> None:
         super().__init__(fleet)
@@ -35,10 +35,10 @@ class QemuLinkState(LinkState):
         self._cabled: dict[str, tuple[int, bool]] = {}
         self._impaired: dict[str, tuple[int, str]] = {}
 
-    # -- what holds now --
+    # -- groups, cables and impairments --
 
     def _remove_lost_routes(self) -> None:
-        """A node without power is silent at once; the kernel takes its interfaces apart a little later."""
+        """Silence a node without power now; the kernel removes its interfaces a little later."""
         off = [name for name, state in self._fleet.nodes.items() if not state.is_running and self._groups.get(name)]
         if off:
             self.set_groups(dict.fromkeys(off, 0))
@@ -54,14 +54,14 @@ class QemuLinkState(LinkState):
                 self._connect_cable(state)
                 self._impair_node(state)
             except LabError as error:
-                # a node that ends in this moment takes its devices with it, one that configures them makes them again
+                # a node that is ending removes its devices; one that is reconfiguring recreates them
                 log.warning("not-applied node=%s reason=%s", state.spec.name, error)
                 if state.is_running:
                     asyncio.get_running_loop().call_later(_RETRY_S, self.changed)
         self._notify()
 
     def set_groups(self, masks: dict[str, int]) -> None:
-        """Give nodes' radios their masks, in an order in which nobody hears whom it should not."""
+        """Write radios' group masks in an order that links no other radios meanwhile."""
         for name, mask in hwsim_groups.transition(self._groups, masks):
             for phy in self._hardware[name].phys:
                 hwsim_devices.set_group(phy, mask)
@@ -71,13 +71,13 @@ class QemuLinkState(LinkState):
         if state.pid <= 0:
             return
         on_bench = state.plugged and not self._is_base(state)
-        wanted = (state.boots, on_bench)
-        if self._cabled.get(state.spec.name) != wanted:
+        cabled = (state.boots, on_bench)
+        if self._cabled.get(state.spec.name) != cabled:
             hwsim_devices.connect_cable(self._hardware[state.spec.name], self._fleet.spec, on_bench=on_bench)
-            self._cabled[state.spec.name] = wanted
+            self._cabled[state.spec.name] = cabled
 
     def _impair_node(self, state: NodeState) -> None:
-        """What this node's radios do not hear of what they could hear."""
+        """Set the impairments of everything that this node's radios receive."""
         if state.pid <= 0:
             return
         name = state.spec.name
@@ -86,7 +86,7 @@ class QemuLinkState(LinkState):
             if name not in link.ends or not link.up:
                 continue
             other = link.b if name == link.a else link.a
-            # a quality given by hand is what losses of that size make of a link
+            # a TQ limit is implemented as the loss that leads to it
             loss = max(link.loss_to(name), loss_of(link.tq))
             impairment = traffic_control.Impairment(loss, link.delay_ms, link.rate_kbps)
             if not impairment.is_none:
@@ -94,25 +94,25 @@ class QemuLinkState(LinkState):
         self.impair(state, heard)
 
     def impair(self, state: NodeState, heard: dict[str, traffic_control.Impairment]) -> None:
-        """Make it so on every radio interface of the node that is up."""
+        """Apply impairments, by the sender's MAC, on every radio interface of the node that is up."""
         batch = "".join(traffic_control.batch(cell.interface, heard) for cell in state.effective.interfaces)
-        wanted = (state.boots, batch)
-        if self._impaired.get(state.spec.name, (state.boots, "")) == wanted:
+        impaired = (state.boots, batch)
+        if self._impaired.get(state.spec.name, (state.boots, "")) == impaired:
             return
         for cell in state.effective.interfaces:
             traffic_control.clear(state.pid, cell.interface)
             if heard:
                 traffic_control.apply(state.pid, cell.interface, traffic_control.batch(cell.interface, heard))
-        self._impaired[state.spec.name] = wanted
+        self._impaired[state.spec.name] = impaired
 
     def reset_impairments(self, name: str) -> None:
-        """The node has configured its interfaces anew: what was done to them is gone."""
+        """The node has reconfigured its interfaces, which removed their traffic control."""
         self._impaired[name] = (self._fleet.nodes[name].boots, "?")
 
-    # -- the way to the operator --
+    # -- the operator's path --
 
     def path_shape(self, name: str, address: str) -> Shape | None:
-        """Whether a door may stand there; where it leads, the kernel finds out when somebody enters."""
+        """An unrestricted shape if the address may be reachable; the kernel decides when a connection is made."""
         state = self._fleet.nodes[name]
         if not state.is_running:
             return None
@@ -121,7 +121,7 @@ class QemuLinkState(LinkState):
         return Shape() if state.effective.holds(address, over="mesh") else None
 
     def reachable(self) -> set[str]:
-        """The nodes that the base's batman-adv has a route to at this moment."""
+        """The nodes to which the base's batman-adv has a route."""
         of_mac = {
             cell.mac: name
             for name, state in self._fleet.nodes.items()

@@ -1,7 +1,7 @@
-"""The operator's way in, on the machine's side: which doors stand, and a socket from where the operator is.
+"""Port forwarding inside the machine: the reachable ports, and connections to them.
 
-The host listens and asks for a door (`relay`); whether the node behind it answers, the kernel finds out: on the bench
-over the node's own cable, else from the computer at the base's LAN, through the mesh.
+The host listens and requests a connection (`host_proxy`); it is made over the node's own cable on the bench, else from
+the computer on the base's LAN, through the mesh.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from meshlab.qemu import hwsim_devices
 from meshlab.spec import Medium
 
 _SSH_PORT = 22
-# the kernel gives up an address that nobody answers for after 3 s, a lost SYN is repeated after 1, 3 and 7
+# the kernel gives up unanswered ARP after 3 s, and retransmits a lost SYN after 1, 3 and 7 s
 _DIAL_S = 10.0
 _FACTORY_PREFIX = 24
 
 
 class QemuPortForwarder(PortForwarder):
-    """`changed` is notified when other doors stand than before."""
+    """`changed` is set when the reachable ports have changed, and replaced by a new event."""
 
     def __init__(
         self,
@@ -44,14 +44,14 @@ class QemuPortForwarder(PortForwarder):
         self._computers: dict[str, int] = {}
 
     def open(self) -> None:
-        """Nothing listens here."""
+        """Nothing listens in the machine."""
 
     async def close(self) -> None:
         for descriptor in self._computers.values():
             os.close(descriptor)
 
     def refresh(self) -> None:
-        """Tell who waits for `changed`, if something did."""
+        """Set `changed` if the reachable ports have changed."""
         reachable = self.reachable()
         if reachable != self._reachable:
             self._reachable = reachable
@@ -59,13 +59,13 @@ class QemuPortForwarder(PortForwarder):
             self.changed = asyncio.Event()
 
     async def dial(self, host: str) -> socket.socket:
-        """A connection to the SSH server behind the door at `host`. Raises OSError or LabError when nobody answers."""
+        """Connect to the SSH server that `host` is forwarded to. Raises OSError or LabError when it does not answer."""
         port = self._reachable.get(host)
         if port is None:
-            raise LabError(f"nothing is reached at {host}")
+            raise LabError(f"{host} is not reachable")
         state = self._fleet.nodes[port.node]
         if state.hung:
-            raise TimeoutError(f"{port.node} accepts connections and says nothing")
+            raise TimeoutError(f"{port.node} accepts connections but does not answer")
         made = self._socket(port)
         made.setblocking(False)
         made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -78,8 +78,8 @@ class QemuPortForwarder(PortForwarder):
         return made
 
     async def _connected(self, made: socket.socket, host: str, port: ForwardedPort) -> None:
-        """Returns when the socket is connected. Raises LabError as soon as the door leads elsewhere: a node that has
-        given up an address does not refuse what still comes for it."""
+        """Wait until the socket is connected. Raises LabError as soon as the port's target changes: a node that gave up
+        an address does not reject packets to it."""
         connecting = asyncio.ensure_future(asyncio.get_running_loop().sock_connect(made, (port.address, _SSH_PORT)))
         moving = asyncio.ensure_future(self._moved(host, port))
         try:
@@ -90,7 +90,7 @@ class QemuPortForwarder(PortForwarder):
         finally:
             connecting.cancel()
             moving.cancel()
-            # the socket must not be closed before its waiting has ended
+            # the socket must not be closed while it is being waited for
             await asyncio.gather(connecting, moving, return_exceptions=True)
 
     async def _moved(self, host: str, port: ForwardedPort) -> None:
@@ -102,7 +102,7 @@ class QemuPortForwarder(PortForwarder):
         return port is not None and self._fleet.nodes[port.node].hung
 
     def _socket(self, port: ForwardedPort) -> socket.socket:
-        """A socket from where the operator reaches this door: a bench cable, or the base's LAN."""
+        """A socket on the operator's side of this port: on the bench cable, or on the base's LAN."""
         state = self._fleet.nodes[port.node]
         prefix = next((a.prefix for a in state.effective.addresses if a.address == port.address), _FACTORY_PREFIX)
         address = IPv4Interface(f"{port.address}/{prefix}")
@@ -115,7 +115,7 @@ class QemuPortForwarder(PortForwarder):
             return made
         lan = hwsim_devices.operator_lan(self._fleet.spec)
         if lan is None:
-            raise LabError("no base stands in this fleet's mesh: nodes are reached on the bench alone")
+            raise LabError("the fleet has no base: its nodes are reachable on the bench only")
         space = hwsim_devices.computer_namespace(lan)
         if not lan.computer or IPv4Interface(lan.computer).network != address.network:
             _add_address("eth0", hwsim_devices.operator_address(address, 0), space=space)
@@ -126,7 +126,7 @@ class QemuPortForwarder(PortForwarder):
             self._computers[space] = os.open(Path("/run/netns") / space, os.O_RDONLY | os.O_CLOEXEC)
         home = os.open("/proc/self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
         try:
-            # the loop's own thread: nothing runs between the two
+            # synchronous, so that nothing else runs in the other namespace
             ns.setns(self._computers[space], ns.CLONE_NEWNET)
             try:
                 return socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -138,5 +138,5 @@ class QemuPortForwarder(PortForwarder):
 
 def _add_address(device: str, address: IPv4Interface, *, space: str = "") -> None:
     with contextlib.suppress(LabError):
-        # it may be there already
+        # the address may already be set
         hwsim_devices.ip([f"addr add {address} dev {device}"], space=space)

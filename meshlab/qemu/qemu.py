@@ -1,7 +1,7 @@
-"""One QEMU machine: started within bounds, its console kept, ended for certain.
+"""One QEMU machine: started with a timeout, its console kept, its process always ended.
 
-`accelerator` decides by a short boot whether /dev/kvm really works here; `Machine.start` boots the image and waits for
-the words of `guest.READY` on its console.
+`probe_accelerator` decides by a short boot whether /dev/kvm works on this host; `Machine.start` boots the image and
+waits for `guest_protocol.READY` on the console.
 """
 
 from __future__ import annotations
@@ -22,45 +22,45 @@ from meshlab.qemu.guest_protocol import ADDRESS, GATEWAY, NETWORK, PORT, READY
 
 QEMU = "qemu-system-x86_64"
 _POLL_S = 0.1
-# a kernel that runs on working hardware says its first words within a second
+# on working hardware a kernel prints its first line within a second
 _PROBE_S = 15.0
 _MEMORY_MIB = 640
 _MEMORY_PER_NODE_MIB = 40
 _PROCESSORS = 2
-# translated code: more costs memory, less costs translating again
+# TCG's translation cache: a smaller one retranslates more
 _TRANSLATED_MIB = 192
 _LAST_LINES = 25
-# Debian's kernel clears every page it gives out, and asks AppArmor, auditing and memory accounting about every process:
-# under emulation that is a good part of what starting one costs, and nodes start thousands. And a program that lies at
-# other addresses each time is translated each time: at the same ones dash takes 19 ms and not 99, iw 60 and not 144
+# Debian's kernel clears every allocated page, and runs AppArmor, audit and memory accounting for every process: under
+# emulation these take a good part of a process's start, and nodes start thousands. Address randomization makes TCG
+# translate each program again at every start: without it dash takes 19 ms instead of 99, iw 60 instead of 144
 _KERNEL_OPTIONS = "init_on_alloc=0 apparmor=0 audit=0 cgroup_disable=memory transparent_hugepage=never norandmaps"
 _STOP_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Accelerator:
-    """QEMU's words for how the machine's processor is run, and whether that is fast."""
+    """QEMU's options for the accelerator and CPU, and whether it is hardware virtualization."""
 
     options: tuple[str, ...]
     is_fast: bool
 
 
 KVM = Accelerator(("-accel", "kvm", "-cpu", "host"), is_fast=True)
-# qemu64 is translated faster than models that offer more
+# TCG translates qemu64 faster than richer CPU models
 TCG = Accelerator(("-accel", f"tcg,thread=multi,tb-size={_TRANSLATED_MIB}", "-cpu", "qemu64"), is_fast=False)
 
 
 def find_qemu() -> None:
-    """Raises LabError naming the way to install it."""
+    """Raises LabError when QEMU is not installed."""
     if shutil.which(QEMU) is None:
         raise LabError(
-            f"the machine of real radios needs {QEMU}, which is not installed",
-            hint="scripts/setup-lab installs it: apt install qemu-system-x86",
+            f"`meshctl lab up --real` needs {QEMU}, which is not installed",
+            hint="run scripts/setup-lab, or `apt install qemu-system-x86`",
         )
 
 
 def cached_accelerator(kernel: Path, cache: Path) -> Accelerator:
-    """`accelerator`, found out once per boot of this machine and kept in `cache`."""
+    """`probe_accelerator`, run once per boot of the host and kept in `cache`."""
     note = cache / "accelerator"
     boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     with contextlib.suppress(OSError, ValueError):
@@ -73,7 +73,7 @@ def cached_accelerator(kernel: Path, cache: Path) -> Accelerator:
 
 
 def probe_accelerator(kernel: Path, device: Path = Path("/dev/kvm")) -> Accelerator:
-    """KVM if it is there and a kernel says something on it in time; else software emulation."""
+    """KVM if it exists and a kernel boots on it in time; else software emulation."""
     try:
         device.open("r+b", buffering=0).close()
     except OSError:
@@ -102,7 +102,7 @@ def _kernel_started(console: Path) -> bool:
 
 
 class Machine:
-    """A machine whose files lie in `directory`: console, and the monitor's socket."""
+    """A machine with its console and QEMU's log in `directory`."""
 
     def __init__(self, directory: Path, kernel: Path, initrd: Path, *, radios: int, nodes: int) -> None:
         self.console = directory / "console"
@@ -115,9 +115,9 @@ class Machine:
         self.port = 0
 
     def start(self, how: Accelerator, wait_s: float) -> None:
-        """Boot it; returns when its supervisor is ready and `port` on 127.0.0.1 leads there.
+        """Boot it; returns when its supervisor is ready and `port` on 127.0.0.1 is forwarded to it.
 
-        Raises LabError with the console's last lines when it ends or says nothing in time; it is stopped then.
+        Raises LabError with the console's last lines when it ends or is not ready within `wait_s`; it is stopped then.
         """
         self.console.unlink(missing_ok=True)
         ours, theirs = socket.socketpair()
@@ -129,7 +129,7 @@ class Machine:
                     stdout=complaints,
                     stderr=complaints,
                     pass_fds=(theirs.fileno(),),
-                    # called in a process with one thread
+                    # safe: this process has one thread
                     preexec_fn=ns.die_with_parent,
                 )
             theirs.close()
@@ -165,7 +165,7 @@ class Machine:
             time.sleep(_POLL_S)
 
     def console_tail(self, lines: int = _LAST_LINES) -> str:
-        """The end of its console."""
+        """The last lines of its console."""
         if not self.console.exists():
             return ""
         text = self.console.read_text(encoding="utf-8", errors="replace").replace("\r", "")
@@ -173,13 +173,13 @@ class Machine:
 
     @property
     def pid(self) -> int:
-        """QEMU's process. Raises LabError when it does not run."""
+        """QEMU's process id. Raises LabError when it is not running."""
         if self._process is None:
-            raise LabError("the machine does not run")
+            raise LabError("the machine is not running")
         return self._process.pid
 
     def stop(self) -> None:
-        """End it; nothing of it is left when this returns."""
+        """Stop it; the process has ended when this returns."""
         process, self._process = self._process, None
         if process is None:
             return
@@ -192,7 +192,7 @@ class Machine:
 
 
 def _forwarded_port(monitor: socket.socket) -> int:
-    """The free port that QEMU took for the forward, as its monitor tells."""
+    """The host port that QEMU chose for the forward, from its monitor."""
     monitor.settimeout(_PROBE_S)
     said = b""
     try:
@@ -203,7 +203,7 @@ def _forwarded_port(monitor: socket.socket) -> int:
                 return int(match[1])
             more = monitor.recv(4096)
             if not more:
-                raise LabError("QEMU ended at once", hint="its words are in qemu.log, beside the console")
+                raise LabError("QEMU ended immediately", hint="see qemu.log in the fleet's directory")
             said += more
     except OSError as error:
         raise LabError(f"QEMU's monitor did not answer: {error}") from error

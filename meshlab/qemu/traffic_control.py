@@ -1,8 +1,8 @@
-"""What a receiver does not hear: traffic control on its radio's ingress, by the sender's MAC address.
+"""Link impairments as traffic control on the ingress of the receiving radio, by the sender's MAC address.
 
-Frames from each sender pass through an intermediate device (`ifb`) with a class of their own, and netem there loses,
-delays and slows them. 802.11 repeats a unicast frame that nobody acknowledged and a broadcast never, so unicast frames
-are lost with the probability that every attempt is: hwsim itself loses nothing.
+Frames of each sender pass through a class of an intermediate device (`ifb`), where netem drops, delays and slows them.
+802.11 retransmits unacknowledged unicast frames but never broadcasts, so a unicast frame is dropped with the
+probability that every attempt is lost: hwsim itself loses nothing.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from dataclasses import dataclass
 from meshlab.errors import LabError
 from meshlab.qemu.hwsim_devices import run
 
-# attempts of a rate-control series for one unicast frame: mac80211 asks for up to seven (dot11ShortRetryLimit)
+# transmissions of a unicast frame: mac80211 makes up to seven (dot11ShortRetryLimit)
 _ATTEMPTS = 7
-# so much that the class itself never slows anything
+# so high that the class itself never limits the rate
 _CLASS_RATE = "10gbit"
-# below it netem's own loss rounds to nothing
+# netem rounds a smaller loss to 0
 _MIN_LOSS = 1e-6
 _QUEUE_PACKETS = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class Impairment:
-    """`loss` 0..1 of frames at one attempt; `delay_ms` one way; `rate_kbps` None: unlimited."""
+    """`loss` 0..1 per transmission; `delay_ms` one way; `rate_kbps` None: unlimited."""
 
     loss: float = 0.0
     delay_ms: float = 0.0
@@ -38,12 +38,12 @@ class Impairment:
 
 
 def ifb_name(interface: str) -> str:
-    """The intermediate device of a radio interface; the kernel takes 15 characters."""
+    """The intermediate device of a radio interface; names are limited to 15 characters."""
     return f"air-{interface}"[:15]
 
 
 def batch(interface: str, heard: Mapping[str, Impairment]) -> str:
-    """`tc -batch` lines for one interface on which frames from these MAC addresses are lost; empty for none."""
+    """`tc -batch` lines for one interface that impair frames from these MAC addresses; empty for none."""
     if not heard:
         return ""
     device = ifb_name(interface)
@@ -80,21 +80,21 @@ def _class(device: str, number: int, impairment: Impairment, loss: float) -> lis
 
 
 def clear(pid: int, interface: str) -> None:
-    """Take away what `put` did to an interface of the node (its process 1); quiet when there is nothing."""
+    """Undo `apply` on an interface of the node (its process 1); does nothing if there is nothing to undo."""
     for words in (("tc", "qdisc", "del", "dev", interface, "ingress"), ("ip", "link", "del", ifb_name(interface))):
         with contextlib.suppress(LabError):
             run(words, node=pid)
 
 
 def apply(pid: int, interface: str, lines: str) -> None:
-    """Apply `batch`'s lines in the network of the node. Raises LabError."""
+    """Apply the lines of `batch` in the node's network namespace. Raises LabError."""
     device = ifb_name(interface)
     run(("ip", "-batch", "-"), stdin=f"link add dev {device} type ifb\nlink set {device} up\n", node=pid)
     run(("tc", "-batch", "-"), stdin=lines, node=pid)
 
 
 def originators(pid: int) -> list[str]:
-    """The MAC addresses that the batman-adv of a node (its process 1) has a route to; none while it has no mesh."""
+    """The MAC addresses to which the batman-adv of a node (its process 1) has a route; empty without a mesh."""
     try:
         known = json.loads(run(("batctl", "meshif", "bat0", "originators_json"), node=pid))
     except (LabError, json.JSONDecodeError):

@@ -175,7 +175,7 @@ def test_a_mission_that_is_interrupted_says_where_to_go_on(grounded: VirtualFlee
         playing.send_signal(signal.SIGINT)
         _, said = playing.communicate(timeout=60)
     assert playing.returncode == 130
-    assert "everything stays as it is" in said
+    assert "the fleet stays as it is" in said
     assert f"continue with: meshctl lab mission {file} --from " in said
     assert placement.current_environment(grounded).positions["far"].at[0] < 100
 
