@@ -39,15 +39,14 @@ _STOP_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Accelerator:
-    """QEMU's options for the accelerator and CPU, and whether it is hardware virtualization."""
+    """QEMU's options for the accelerator and CPU."""
 
     options: tuple[str, ...]
-    is_fast: bool
 
 
-KVM = Accelerator(("-accel", "kvm", "-cpu", "host"), is_fast=True)
+KVM = Accelerator(("-accel", "kvm", "-cpu", "host"))
 # TCG translates qemu64 faster than richer CPU models
-TCG = Accelerator(("-accel", f"tcg,thread=multi,tb-size={_TRANSLATED_MIB}", "-cpu", "qemu64"), is_fast=False)
+TCG = Accelerator(("-accel", f"tcg,thread=multi,tb-size={_TRANSLATED_MIB}", "-cpu", "qemu64"))
 
 
 def find_qemu() -> None:
