@@ -29,10 +29,10 @@ from benchmarks.page import fill
 from benchmarks.reconvergence_udp_mesh import airtime_us
 from meshctl.errors import MeshctlError
 from meshctl.model import Fleet
+from meshlab.fleet import QemuFleet
 from meshlab.from_inventory import spec_of
-from meshlab.inventory_copy import prepare
+from meshlab.inventory_copy import copy_inventory
 from meshlab.qemu import control
-from meshlab.qemu.fleet import RealFleet
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "arp_airtime.jsonl"
@@ -94,12 +94,12 @@ def measure(results: Path, runs: int) -> None:
 @contextmanager
 def bench(place: Path) -> Iterator[Bench]:
     """The example fleet, taken in and carried into the field."""
-    copy = prepare(ROOT / "inventory" / "lab", place / "lab")
+    copy = copy_inventory(ROOT / "inventory" / "lab", place / "lab")
     # a change is proven within seconds; on a starved host the emulated one takes minutes
     file = copy.inventory / "fleet.yaml"
     text = file.read_text(encoding="utf-8")
     file.write_text(text.replace("confirm_window_s: 90", f"confirm_window_s: {_WINDOW_S}"), encoding="utf-8")
-    fleet = RealFleet(spec_of(copy.fleet, links=copy.links), place / "lab").up(wait_s=_START_S)
+    fleet = QemuFleet(spec_of(copy.fleet, links=copy.links), place / "lab").up(wait_s=_START_S)
     try:
         made = Bench(fleet, copy.fleet, copy.inventory, place / "state")
         made.take_in()
@@ -111,7 +111,7 @@ def bench(place: Path) -> Iterator[Bench]:
 class Bench:
     """The running fleet, seen from the operator's computer."""
 
-    def __init__(self, fleet: RealFleet, inventory: Fleet, path: Path, state: Path) -> None:
+    def __init__(self, fleet: QemuFleet, inventory: Fleet, path: Path, state: Path) -> None:
         self._fleet = fleet
         self._inventory = inventory
         self._path = path
@@ -158,7 +158,7 @@ class Bench:
     def play(self, scene: str) -> dict[str, Any]:
         """What was on the air: `overheard`, lists of kind, rate, bytes and count, and the number of `requests`."""
         if scene == "one gone":
-            self._fleet.break_(GONE, "off")
+            self._fleet.inject_fault(GONE, "off")
         self._everywhere("ip neigh flush all", but=GONE if scene == "one gone" else "")
         for robot in self._inventory.robots:
             self._machine(f"ip netns exec pc.{robot} ip neigh flush all")
@@ -172,7 +172,7 @@ class Bench:
             text = self._overheard()
         finally:
             if scene == "one gone":
-                self._fleet.mend(GONE)
+                self._fleet.repair(GONE)
                 self._settle()
         _, *lines, last = text.splitlines()
         overheard = [

@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from meshctl.device.connection import Completed
+from meshlab.fleet import QemuFleet
 from meshlab.qemu import control
-from meshlab.qemu.fleet import RealFleet
 from meshlab.spec import FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
 
 PROGRAMS = Path(__file__).with_name("in_machine")
@@ -150,7 +150,7 @@ def _mac(name: str) -> str:
 @contextmanager
 def bench(directory: Path) -> Iterator[Bench]:
     """The fleet, with telemetry ready to flow as soon as a mesh lets it."""
-    fleet = RealFleet(spec(), directory).up(wait_s=_START_S)
+    fleet = QemuFleet(spec(), directory).up(wait_s=_START_S)
     try:
         made = Bench(fleet)
         made.put_programs()
@@ -163,7 +163,7 @@ def bench(directory: Path) -> Iterator[Bench]:
 class Bench:
     """The running fleet with daemons on both computers. Nothing waits longer than until `ends_s` (monotonic)."""
 
-    def __init__(self, fleet: RealFleet) -> None:
+    def __init__(self, fleet: QemuFleet) -> None:
         self._fleet = fleet
         self.ends_s = float("inf")
         self._configured_s = 0.0
@@ -260,12 +260,12 @@ class Bench:
         if not relay:
             raise NoPauseError("far had no relay towards base")
         before = self._now_s()
-        self._fleet.break_(relay, "sever")
+        self._fleet.inject_fault(relay, "sever")
         try:
             self._until(lambda: self._pause_since(before) is not None, "telemetry over the other relay", _PAUSE_S)
             pause_s = self._pause_since(before)
         finally:
-            self._fleet.mend(relay)
+            self._fleet.repair(relay)
         if not pause_s:
             raise NoPauseError(f"telemetry did not pause when {relay} fell silent")
         return pause_s

@@ -1,5 +1,5 @@
-"""A virtual fleet on one Linux machine: OpenWrt-like nodes in namespaces, and the air between them.
+"""A virtual fleet on one Linux machine: OpenWrt-like nodes in namespaces, and the links between them.
 
-`spec` says what there is (nodes, links, releases), `fleet.VirtualFleet` brings it up and down, `breaks` hurts it.
-docs/lab.md tells how it works and where it differs from real radios.
+`spec` describes nodes, links and releases; `fleet.VirtualFleet` starts and stops the fleet; `faults` injects faults.
+docs/lab.md explains how it works and how it differs from real radios.
 """

@@ -18,15 +18,15 @@ from meshlab.node_runner import MESSAGE_BYTES
 def request(
     directory: Path, message: dict[str, Any], descriptors: Sequence[int] = (), *, timeout_s: float | None = 60.0
 ) -> dict[str, Any]:
-    """Send one request and return the answer.
+    """Send one request and return the reply.
 
-    Raises LabError when no fleet runs in `directory`, the fleet ends meanwhile or `timeout_s` passes; InputError for
-    what the fleet refused.
+    Raises LabError when no fleet runs in `directory`, the fleet ends meanwhile or `timeout_s` passes; InputError when
+    the fleet rejects the request.
     """
     try:
         folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
-        raise LabError(f"no virtual fleet in {directory}", hint="meshctl lab up starts one") from error
+        raise LabError(f"no virtual fleet in {directory}", hint="run `meshctl lab up` to start one") from error
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
             connection.settimeout(timeout_s)
@@ -36,11 +36,11 @@ def request(
     except TimeoutError as error:
         raise LabError(f"the fleet in {directory} did not answer {message['op']} within {timeout_s:g} s") from error
     except OSError as error:
-        raise LabError(f"no virtual fleet runs in {directory}", hint="meshctl lab up starts one") from error
+        raise LabError(f"no virtual fleet runs in {directory}", hint="run `meshctl lab up` to start one") from error
     finally:
         os.close(folder)
     if not answer:
-        raise LabError(f"the fleet in {directory} has just ended")
+        raise LabError(f"the fleet in {directory} ended before it answered {message['op']}")
     result: dict[str, Any] = json.loads(answer)
     if "error" in result:
         raise InputError(result["error"], hint=result.get("hint", ""))
@@ -48,7 +48,7 @@ def request(
 
 
 def is_running(directory: Path) -> bool:
-    """Whether a supervisor answers there."""
+    """Whether a supervisor answers in `directory`."""
     try:
         request(directory, {"op": "status"})
     except LabError:

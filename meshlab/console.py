@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 def run_shell(fleet: VirtualFleet, node: str, command: str) -> int:
-    """Run `command` (empty: an interactive shell) on a node with this process's own stdin, stdout and stderr.
+    """Run `command` (empty: an interactive shell) on a node with this process's stdin, stdout and stderr.
 
-    Returns its exit status. On a terminal the node gets one of its own, relayed here, so that Ctrl-C goes to the node.
+    Returns its exit status. On a terminal the node gets its own pseudo-terminal, so that Ctrl-C goes to the node.
     """
     if command or not sys.stdin.isatty():
         answer = fleet.ask_with((0, 1, 2), None, "exec", node=node, command=command)
@@ -51,7 +51,7 @@ def run_shell(fleet: VirtualFleet, node: str, command: str) -> int:
 
 
 def _relay(terminal: int) -> None:
-    """Copy keys to the node's terminal and its output back, until the shell there has ended."""
+    """Copy input to the node's terminal and its output back until the shell ends."""
     while True:
         ready, _, _ = select.select([0, terminal], [], [])
         try:
@@ -66,7 +66,7 @@ def _relay(terminal: int) -> None:
                     return
                 os.write(terminal, keys)
         except OSError:
-            # EIO: the last process on the other side is gone
+            # EIO: the last process on the terminal has ended
             return
 
 

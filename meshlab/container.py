@@ -1,12 +1,12 @@
-"""What the kernel gives one node: its own root, processes, network, host name and uptime.
+"""A node as a container: its own root file system, processes, network, host name and uptime.
 
-`become_node` runs in a process that was just cloned into new namespaces, turns it into the node's process 1 and never
-returns. What the node finds under /lab/node on its own file system is the fleet directory's `nodes/NAME`:
+`become_node` runs in a process just cloned into new namespaces, turns it into the node's process 1 and never returns.
+The node sees the fleet directory's `nodes/NAME` as /lab/node:
 
-    flash/      what survives power cuts (`current` points at the valid copy of /etc, /root, /usr, /lib)
-    firmware/   what is written in its flash chip: release, packages
-    board       what its board is: name, MAC addresses, radios
-    air/        what its radios do (written by the node) and hear (written by the fleet)
+    flash/      content that survives a power cut (`current` points at the valid copy of /etc, /root, /usr, /lib)
+    firmware/   content of the flash chip: release, packages
+    board       board name, MAC addresses, radios
+    air/        state of its radios (written by the node) and what they receive (written by the fleet)
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from meshlab.rootfs import library_folders
 
 FLAGS = ns.CLONE_NEWNS | ns.CLONE_NEWPID | ns.CLONE_NEWNET | ns.CLONE_NEWUTS | ns.CLONE_NEWIPC
 _DEVICES = ("null", "zero", "full", "random", "urandom", "tty")
-# /tmp takes at most half of the memory, as the kernel's tmpfs does by default
+# /tmp is limited to half of the memory, the default of the kernel's tmpfs
 _TMP_SHARE = 2
 _ENVIRONMENT = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/", "TERM": "vt102"}
 
 
 @dataclass(frozen=True, slots=True)
 class Container:
-    """Sizes in KiB; `fleet` is the fleet's directory. `deny_setgroups` is true inside an unprivileged namespace."""
+    """`fleet` is the fleet's directory. `deny_setgroups`: it runs in an unprivileged user namespace."""
 
     name: str
     fleet: Path
     overlay_kib: int
     memory_kib: int
     deny_setgroups: bool
-    # its devices are the kernel's own (a machine with radios), where they otherwise are files in /sys
+    # its network devices are real ones of the kernel; otherwise they are files in /sys
     real_devices: bool = False
 
     @property
@@ -50,7 +50,7 @@ class Container:
 
 
 def prepare(container: Container) -> None:
-    """Make the directories and the files that differ with every boot: a new boot id and the memory's size."""
+    """Create the node's directories and the files that change with every boot: boot id and meminfo."""
     for folder in ("flash", "firmware", "air", "proc"):
         (container.home / folder).mkdir(parents=True, exist_ok=True)
     container.mount_point.mkdir(parents=True, exist_ok=True)
@@ -59,7 +59,7 @@ def prepare(container: Container) -> None:
 
 
 def write_meminfo(container: Container, *, available_kib: int) -> None:
-    """Set what /proc/meminfo tells; the kernel tells every container the host's memory."""
+    """Set the node's /proc/meminfo; the kernel's own shows the host's memory to every container."""
     total = container.memory_kib
     lines = (
         ("MemTotal", total),
@@ -70,14 +70,14 @@ def write_meminfo(container: Container, *, available_kib: int) -> None:
         ("Shmem", total // 100),
     )
     text = "".join(f"{f'{key}:':<16}{value:>8} kB\n" for key, value in lines)
-    # in place: the file is bind-mounted into the node, and a new file would not be seen there
+    # written in place: the file is bind-mounted into the node, which would not see a new file
     (container.home / "proc" / "meminfo").write_text(text, encoding="ascii")
 
 
 def become_node(container: Container, report: int, gate: int | None = None) -> None:
     """Turn this process into the node; on failure write the reason to the descriptor `report` and exit.
 
-    It waits until something arrives on `gate`: its devices are being put in.
+    First waits for a byte on `gate`, which is written when the node's devices are attached.
     """
     try:
         ns.die_with_parent()
@@ -102,11 +102,11 @@ def _restore_signals() -> None:
 
 
 def _own_uptime() -> None:
-    """Start the node's clocks of uptime at zero. Kernels before 5.6 cannot: then it has the host's uptime."""
+    """Start the node's uptime clocks at zero. Kernels before 5.6 have no time namespaces: the host's uptime stays."""
     if not os.path.exists("/proc/self/timens_offsets"):
         return
     ns.unshare(ns.CLONE_NEWTIME)
-    # to the nanosecond: a node must never seem to have booted before it was switched on
+    # to the nanosecond: a node must never appear to have booted before it was powered on
     monotonic, boottime = (
         divmod(-time.clock_gettime_ns(clock), 10**9) for clock in (time.CLOCK_MONOTONIC, time.CLOCK_BOOTTIME)
     )
@@ -124,7 +124,7 @@ def _mounts(container: Container) -> None:
     for link, target in (("bin", "rom/bin"), ("sbin", "rom/sbin"), ("var", "tmp")):
         (root / link).symlink_to(target)
     for folder in library_folders(rom):
-        # /lib and /usr/lib are the node's own; whatever else holds libraries is taken as it is
+        # /lib and /usr/lib are the node's own; other library folders are linked from the ROM
         if folder not in ("lib", "usr/lib") and not (root / folder).exists():
             (root / folder).parent.mkdir(parents=True, exist_ok=True)
             (root / folder).symlink_to(f"/rom/{folder}")
@@ -147,7 +147,7 @@ def _mounts(container: Container) -> None:
 
 
 def _real_devices(root: Path) -> None:
-    """The kernel's own view of the node's network devices; radios are at the paths of the board (lab/phys)."""
+    """Mount the kernel's sysfs for the node's network devices; lab/phys puts radios at the board's paths."""
     (root / "lab" / "sysfs").mkdir()
     ns.mount("sysfs", f"{root}/lab/sysfs", "sysfs")
     (root / "sys" / "class").mkdir()

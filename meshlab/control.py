@@ -1,6 +1,6 @@
-"""The supervisor's socket: one JSON request per datagram, one JSON answer; descriptors ride beside `exec`.
+"""The supervisor's control socket: one JSON request per datagram, one JSON reply; `exec` also passes descriptors.
 
-The operations are the methods of `Operations` by name; `fleet` holds the other end.
+The methods of `Operations` are the operations, by name; `client` is the other end.
 """
 
 from __future__ import annotations
@@ -14,22 +14,23 @@ import re
 import socket
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from meshctl.errors import MeshctlError
+from meshlab.fault_injection import FaultInjection
+from meshlab.fleet_state import FleetState, NodeControl
+from meshlab.link_state import LinkState
 from meshlab.node_runner import MESSAGE_BYTES
+from meshlab.port_forwarder import PortForwarder
 from meshlab.spec import LinkSpec
 from meshlab.state import NodeState
-
-if TYPE_CHECKING:
-    from meshlab.supervisor import Supervisor
 
 log = logging.getLogger("meshlab.control")
 _NAME = "control.sock"
 
 
 def address_of(directory: Path, descriptor: int) -> str:
-    """The socket's path through the open directory, because a socket's own path may not exceed 107 bytes."""
+    """The socket's path through an open directory descriptor: a socket path is limited to 107 bytes."""
     return f"/proc/self/fd/{descriptor}/{_NAME}"
 
 
@@ -37,7 +38,7 @@ Answer = Callable[[dict[str, Any], list[int]], Awaitable[dict[str, Any]]]
 
 
 class Control:
-    """Listens in the fleet's directory; `answer` gets each request with the descriptors beside it."""
+    """Listens in the fleet's directory; `answer` gets each request and its descriptors."""
 
     def __init__(self, directory: Path, answer: Answer) -> None:
         self._directory = directory
@@ -93,28 +94,39 @@ class Control:
 
 
 class Operations:
-    """What a client may ask for; every public method but `answer` is an operation and returns a JSON object or None."""
+    """The requests of a client: each public method except `answer` and `dispatch` returns a JSON object or None."""
 
-    def __init__(self, fleet: Supervisor) -> None:
+    def __init__(
+        self,
+        fleet: FleetState,
+        link_state: LinkState,
+        port_forwarder: PortForwarder,
+        faults: FaultInjection,
+        control: NodeControl,
+    ) -> None:
         self._fleet = fleet
+        self._link_state = link_state
+        self._port_forwarder = port_forwarder
+        self._faults = faults
+        self._control = control
 
     async def answer(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
-        """The answer to one request; what went wrong is one, too."""
+        """The reply to one request; a failure is a reply with `error` and `hint`."""
         asked = request.get("op")
         try:
-            return await self.carry_out(request, descriptors)
+            return await self.dispatch(request, descriptors)
         except MeshctlError as error:
             return {"error": str(error), "hint": error.hint}
         except Exception as error:
-            # a fault of the lab's own: whoever asked hears of it, the log has the whole, and the fleet goes on
+            # a bug in the lab: report it to the client, log the traceback, and keep the fleet running
             log.exception("request-failed op=%s", asked)
             return {
                 "error": f"the lab failed at {asked!r}: {type(error).__name__}: {error}",
-                "hint": "its log has more",
+                "hint": "see `log` in the fleet's directory",
             }
 
-    async def carry_out(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
-        """What the request asks for. Raises MeshctlError for what the fleet refuses, anything for a fault of ours."""
+    async def dispatch(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
+        """Run the requested operation. Raises MeshctlError when the fleet rejects it, any exception for a bug."""
         if request["op"] == "exec":
             return await self.execute(request["node"], request["command"], descriptors)
         result = getattr(self, request.pop("op"))(**request)
@@ -124,10 +136,10 @@ class Operations:
 
     def status(self) -> dict[str, Any]:
         fleet = self._fleet
-        reached = fleet.ether.reached()
-        doors: dict[str, list[str]] = {}
-        for host, door in fleet.doors.wanted().items():
-            doors.setdefault(door.node, []).append(host)
+        in_mesh = self._link_state.reachable()
+        hosts: dict[str, list[str]] = {}
+        for host, port in self._port_forwarder.reachable().items():
+            hosts.setdefault(port.node, []).append(host)
         nodes = [
             {
                 "name": name,
@@ -138,21 +150,27 @@ class Operations:
                 "release": _release(state),
                 "address": _address(state.effective.addresses),
                 "plugged": state.plugged,
-                "in_mesh": name in reached,
-                "reached_at": sorted(doors.get(name, [])),
-                "breaks": state.breaks,
+                "in_mesh": name in in_mesh,
+                "reached_at": sorted(hosts.get(name, [])),
+                "breaks": state.faults,
             }
             for name, state in fleet.nodes.items()
         ]
         links = [
             {"between": [link.a, link.b], "up": link.up, "tq": link.tq_to(link.b), "delay_ms": link.delay_ms,
              "loss": link.loss, "loss_back": link.loss_to(link.a), "rate_kbps": link.rate_kbps}
-            for link in fleet.ether.links()
+            for link in self._link_state.links()
         ]  # fmt: skip
-        return {"fleet": fleet.spec.name, "pid": os.getpid(), "port": fleet.doors.port, "nodes": nodes, "links": links}
+        return {
+            "fleet": fleet.spec.name,
+            "pid": os.getpid(),
+            "port": self._port_forwarder.port,
+            "nodes": nodes,
+            "links": links,
+        }
 
     def node(self, node: str) -> dict[str, Any]:
-        state = self._fleet.hurt.find(node)
+        state = self._fleet.node(node)
         return {
             "power": state.power.value,
             "reason": state.reason,
@@ -163,51 +181,51 @@ class Operations:
         }
 
     def console(self, node: str, lines: int) -> dict[str, Any]:
-        """The last lines of what its boot scripts printed, of all boots; it works for a node without power, too."""
-        file = self._fleet.hurt.find(node).home / "console.log"
+        """The last lines its boot scripts printed, over all boots; works for a node without power, too."""
+        file = self._fleet.node(node).home / "console.log"
         text = file.read_text(encoding="utf-8", errors="replace") if file.exists() else ""
         return {"text": "\n".join(text.splitlines()[-lines:])}
 
     async def execute(self, node: str, command: str, descriptors: list[int]) -> dict[str, Any]:
-        self._fleet.hurt.find(node)
-        event, _ = await self._fleet.ask_for({"do": "exec", "node": node, "command": command}, descriptors)
+        self._fleet.node(node)
+        event, _ = await self._control.request({"do": "exec", "node": node, "command": command}, descriptors)
         return {"status": event["status"], "reason": event.get("reason", "")}
 
     async def power_cut(self, node: str, unsynced: str, back: bool) -> None:
-        await self._fleet.hurt.power_cut(self._fleet.hurt.find(node), unsynced, back=back)
+        await self._faults.power_cut(self._fleet.node(node), unsynced, back=back)
 
     def power_on(self, node: str) -> None:
-        self._fleet.power_on(self._fleet.hurt.find(node).spec.name)
+        self._control.power_on(self._fleet.node(node).spec.name)
 
     async def do_break(self, where: str, what: str) -> None:
-        await self._fleet.hurt.do(where, what)
+        await self._faults.inject(where, what)
 
     async def mend(self, where: str) -> None:
-        await self._fleet.hurt.mend(where)
+        await self._faults.repair(where)
 
     def link(self, a: str, b: str, changes: dict[str, Any]) -> None:
-        self._fleet.ether.set_link(a, b, changes)
+        self._link_state.set_link(a, b, changes)
 
     def links(self, part: list[dict[str, Any]], is_last: bool) -> None:
-        """Who hears whom from now on, in parts because a request has its limit (`standing.stand_on`)."""
-        self._fleet.ether.coming += [LinkSpec(**link) for link in part]
+        """Replace the fleet's links, sent in parts because a request is limited (`placement.set_environment`)."""
+        self._link_state.pending_links += [LinkSpec(**link) for link in part]
         if is_last:
-            links, self._fleet.ether.coming = self._fleet.ether.coming, []
-            self._fleet.ether.set_ground(links)
+            links, self._link_state.pending_links = self._link_state.pending_links, []
+            self._link_state.set_base_links(links)
 
     def plug(self, node: str, plugged: bool) -> None:
-        self._fleet.hurt.find(node).plugged = plugged
-        self._fleet.ether.changed()
+        self._fleet.node(node).plugged = plugged
+        self._link_state.changed()
 
     async def record_steps(self, node: str) -> None:
-        await self._fleet.hurt.count_steps(self._fleet.hurt.find(node))
+        await self._faults.count_steps(self._fleet.node(node))
 
     def down(self) -> None:
-        self._fleet.stopping.set()
+        self._control.stop()
 
 
 def _release(state: NodeState) -> str:
-    """What is in its flash chip, which a flash changes."""
+    """The release in the node's flash chip."""
     text = (state.home / "firmware" / "env").read_text(encoding="utf-8", errors="replace")
     found = re.search(r"^VERSION='([^']*)'", text, re.MULTILINE)
     return found[1] if found else "-"

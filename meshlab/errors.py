@@ -1,4 +1,4 @@
-"""What can go wrong with a virtual fleet; never with a node's own behaviour."""
+"""Errors of the lab itself, never of a node's software."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ from meshctl.errors import MeshctlError
 
 
 class LabError(MeshctlError):
-    """The virtual fleet cannot start, is not there, or was asked for something it has not."""
+    """The virtual fleet cannot start, is not running, or does not have what was requested."""

@@ -1,7 +1,7 @@
-"""What can be done to a virtual fleet: the words of `meshctl lab break`, parsed.
+"""The faults that `meshctl lab break WHERE WHAT` injects, and the parser of WHAT.
 
-`WHERE` is a node or a link (`b01-b02`); `WHAT` is one of `BREAKS`, some with `@STEP`: the n-th external command the
-node runs from now on, or the first whose words hold a text (`cut@uci commit`), or `flash` for the middle of a flash.
+WHERE is a node or a link (`b01-b02`). WHAT is one of `FAULTS`, some with `@STEP`: the n-th external command the node
+runs from now on, the first command that contains a text (`power-cut@uci commit`), or `flash` for the middle of a flash.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from enum import Enum
 from meshctl.errors import InputError
 
 
-class Break(Enum):
-    """The value is the word on the command line."""
+class Fault(Enum):
+    """The value is the name on the command line."""
 
     CUT = "power-cut"
     CUT_KEPT = "power-cut-kept"
@@ -31,61 +31,61 @@ class Break(Enum):
     SSH_HANG = "ssh-hang"
 
 
-BREAKS: dict[Break, str] = {
-    Break.CUT: "power cut and back at once; what was not synced is lost (@STEP: when it comes to that command)",
-    Break.CUT_KEPT: "the same, but the kernel had just written everything",
-    Break.CUT_TORN: "the same, but files not synced are there and empty",
-    Break.OFF: "power cut, and it stays off until mended",
-    Break.SEVER: "every link of the node goes down (@STEP: when it comes to that command)",
-    Break.LINK_DOWN: "the link, or every link of the node, goes down",
-    Break.SLOW: "the link, or every link of the node: 300 ms, 5 % loss, 256 kbit/s",
-    Break.FULL_FLASH: "no space left in flash but 8 KiB",
-    Break.FULL_MEMORY: "/tmp full and 2 MiB of memory left",
-    Break.WRONG_BOARD: "the node says it is another board (from its next boot on)",
-    Break.HOST_KEY: "the SSH host keys are other ones, and stay so",
-    Break.FOREIGN_DELTA: "somebody left an uncommitted UCI change",
-    Break.CLOCK: "the clock is ten years back",
-    Break.SSH_HANG: "SSH connections are accepted and then nothing happens",
+FAULTS: dict[Fault, str] = {
+    Fault.CUT: "power cut and immediate restart; unsynced data is lost (@STEP: when the node reaches that command)",
+    Fault.CUT_KEPT: "power cut and immediate restart; all data was synced just before",
+    Fault.CUT_TORN: "power cut and immediate restart; unsynced files exist but are empty",
+    Fault.OFF: "power cut; the node stays off until repaired",
+    Fault.SEVER: "every link of the node goes down (@STEP: when the node reaches that command)",
+    Fault.LINK_DOWN: "the link, or every link of the node, goes down",
+    Fault.SLOW: "the link, or every link of the node: 300 ms, 5 % loss, 256 kbit/s",
+    Fault.FULL_FLASH: "only 8 KiB left in flash",
+    Fault.FULL_MEMORY: "/tmp is full and 2 MiB of memory are left",
+    Fault.WRONG_BOARD: "the node reports another board name, also after a reboot",
+    Fault.HOST_KEY: "new SSH host keys replace the old ones",
+    Fault.FOREIGN_DELTA: "the node has an uncommitted UCI change",
+    Fault.CLOCK: "the clock is ten years behind",
+    Fault.SSH_HANG: "SSH connections are accepted but never answered",
 }
-STEPPED = frozenset({Break.CUT, Break.SEVER})
-# what a link takes, too
-OF_LINKS = frozenset({Break.LINK_DOWN, Break.SLOW})
+STEP_FAULTS = frozenset({Fault.CUT, Fault.SEVER})
+# faults that a link can have, too
+LINK_FAULTS = frozenset({Fault.LINK_DOWN, Fault.SLOW})
 SLOW_DELAY_MS = 300.0
 SLOW_LOSS = 0.05
 SLOW_RATE_KBPS = 256
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
-    """`step` is empty for at once."""
+class FaultRequest:
+    """An empty `step` means now."""
 
-    what: Break
+    fault: Fault
     step: str = ""
 
 
-def told(order: Order) -> str:
-    """What happens now, or what will and when, for whoever ordered it."""
-    text = BREAKS[order.what].partition(" (@STEP")[0]
-    if not order.step:
+def describe(request: FaultRequest) -> str:
+    """The fault in words, and when it takes effect."""
+    text = FAULTS[request.fault].partition(" (@STEP")[0]
+    if not request.step:
         return text
-    if order.step == "flash":
-        return f"{text}; in the middle of its next flash"
+    if request.step == "flash":
+        return f"{text}; in the middle of the node's next flash"
     return f"{text}; " + (
-        f"at command {order.step} that it runs from now on"
-        if order.step.isdecimal()
-        else f"before the first command whose words hold {order.step!r}"
+        f"at command {request.step} from now on"
+        if request.step.isdecimal()
+        else f"before the first command that contains {request.step!r}"
     )
 
 
-def parse(text: str) -> Order:
-    """`power-cut@7` -> Order. Raises InputError naming the words there are."""
+def parse(text: str) -> FaultRequest:
+    """`power-cut@7` -> FaultRequest. Raises InputError that lists the known faults."""
     word, _, step = text.partition("@")
     try:
-        what = Break(word)
+        what = Fault(word)
     except ValueError:
         raise InputError(
-            f"no break is called {word!r}", hint="there are: " + ", ".join(one.value for one in Break)
+            f"unknown fault {word!r}", hint="known faults: " + ", ".join(one.value for one in Fault)
         ) from None
-    if step and what not in STEPPED:
-        raise InputError(f"{word} happens at once and takes no @STEP")
-    return Order(what, step)
+    if step and what not in STEP_FAULTS:
+        raise InputError(f"{word} takes effect immediately and takes no @STEP")
+    return FaultRequest(what, step)

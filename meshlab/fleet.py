@@ -1,8 +1,8 @@
-"""The Python face of a virtual fleet: start it, reach into its nodes, hurt it, end it.
+"""The Python API of a virtual fleet: start it, access its nodes, inject faults, stop it.
 
-`VirtualFleet(spec, directory).up()` starts the fleet's supervisor as a process of its own and waits until every node
-has booted; everything else is one request over the supervisor's socket. `VirtualFleet.attach(directory)` finds a
-fleet that another process started.
+`VirtualFleet(spec, directory).up()` starts the fleet's supervisor as a separate process and waits until every node has
+booted; everything else is one request over the supervisor's socket. `VirtualFleet.attach(directory)` returns a fleet
+that another process started.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ from meshlab import fleet_directory, rootfs
 from meshlab.addresses import bench_of, loopback_of
 from meshlab.client import is_running, request
 from meshlab.errors import LabError
+from meshlab.qemu.qemu import find_qemu
 from meshlab.spec import FleetSpec, Medium, dump, load
 from meshlab.state import Power
 
-# how often a waiting caller asks again
+# how often a waiting caller polls
 _POLL_S = 0.05
 _LOG_LINES = 15
-# then its supervisor, and all nodes with it, is ended by force
+# after this the supervisor, and all nodes with it, is killed
 _DOWN_S = 30.0
 
 
 class VirtualNode:
-    """One node of a running fleet, seen from outside: its power switch, its console, its flash."""
+    """One node of a running fleet from outside: its power switch, console and flash."""
 
     def __init__(self, fleet: VirtualFleet, name: str) -> None:
         self._fleet = fleet
@@ -48,7 +49,7 @@ class VirtualNode:
 
     @property
     def address(self) -> str | None:
-        """Its LAN's IPv4 address at this moment (`10.42.0.11`); None while it is off or has none."""
+        """Its current LAN IPv4 address (`10.42.0.11`); None while it is off or has none."""
         address: str | None = self._state()["address"]
         return address
 
@@ -63,7 +64,7 @@ class VirtualNode:
 
     @property
     def flash_path(self) -> Path:
-        """The directory that is its flash, what survives a power cut: `flash_path / "etc/config/network"`.
+        """The directory with its flash content, which survives a power cut: `flash_path / "etc/config/network"`.
 
         Valid until the node's next `sync`, which makes a new copy.
         """
@@ -71,22 +72,22 @@ class VirtualNode:
 
     @property
     def console_log(self) -> Path:
-        """What its boot scripts printed, of all boots."""
+        """The output of its boot scripts, over all boots."""
         return self._fleet.directory / "nodes" / self.name / "console.log"
 
     def console(self, lines: int = 40) -> str:
-        """The last lines of its console: each boot, each boot script's start, and what they printed."""
+        """The last lines of its console: each boot, each boot script and its output."""
         return str(self._fleet.ask("console", node=self.name, lines=lines)["text"])
 
     @property
     def bench(self) -> Endpoint:
-        """Its LAN port on the bench: answers while the node is plugged in there and has the address 192.168.1.1."""
+        """Its LAN port on the bench; answers while the node is plugged in and has the address 192.168.1.1."""
         return Endpoint(bench_of(self._state()["number"]), self._fleet.port, identity=self.name)
 
     def exec(self, command: str, *, stdin: bytes = b"", timeout_s: float = 60.0) -> Completed:
-        """Run a shell command on its serial console, which works without network or SSH server.
+        """Run a shell command on its serial console, which needs neither network nor SSH.
 
-        Raises LabError when the node is off, the fleet is gone or `timeout_s` passes.
+        Raises LabError when the node is off, the fleet has ended or `timeout_s` passes.
         """
         with tempfile.TemporaryFile() as source, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
             source.write(stdin)
@@ -100,26 +101,28 @@ class VirtualNode:
             return Completed(out.read(), err.read(), answer["status"])
 
     def reboot(self, *, wait_s: float = 60.0) -> None:
-        """An orderly reboot (`reboot` on the node); returns when it is up again."""
+        """Run `reboot` on the node; returns when it is up again."""
         boots = self._state()["boots"]
         self.exec("reboot")
         self.wait_up(after_boots=boots, wait_s=wait_s)
 
     def power_cut(self, *, unsynced: str = "lost", back: bool = True, wait_s: float = 60.0) -> None:
-        """Take its power away at once; what was written and not synced is `lost`, `kept`, or `torn` (files there but
-        empty). `back` gives power again and waits until it is up (or proves not to start)."""
+        """Cut its power; unsynced data is `lost`, `kept`, or `torn` (files exist but are empty).
+
+        `back` restores the power and waits until the node is up (or its firmware fails to start).
+        """
         boots = self._state()["boots"]
         self._fleet.ask("power_cut", node=self.name, unsynced=unsynced, back=back)
         if back:
             self.wait_up(after_boots=boots, wait_s=wait_s)
 
     def power_on(self, *, wait_s: float = 60.0) -> None:
-        """Give it power again; returns when it is up (or proves not to start)."""
+        """Restore its power; returns when it is up (or its firmware fails to start)."""
         self._fleet.ask("power_on", node=self.name)
         self.wait_up(wait_s=wait_s)
 
     def wait_up(self, *, after_boots: int = 0, wait_s: float = 60.0) -> None:
-        """Wait until it is up (or its firmware proves not to start) and has booted more often than `after_boots`.
+        """Wait until it is up (or its firmware fails to start) and has booted more than `after_boots` times.
 
         Raises LabError with the reason when this machine cannot start it.
         """
@@ -139,19 +142,19 @@ class VirtualNode:
 
     @property
     def is_base(self) -> bool:
-        """Whether the operator sits at its LAN."""
+        """Whether the operator's machine is on its LAN."""
         return self.spec.medium is Medium.BASE
 
     def plug(self, plugged: bool = True) -> None:
-        """Plug its LAN port into the operator's machine, or pull it out: then only the mesh leads there."""
+        """Connect its LAN port to the operator's machine, or disconnect it: then only the mesh reaches the node."""
         self._fleet.ask("plug", node=self.name, plugged=plugged)
 
     def record_steps(self) -> None:
-        """From now on write down each external command it runs, for `steps()`. `sleep` and shells are not counted."""
+        """Record each external command it runs from now on, for `steps()`. `sleep` and shells are not counted."""
         self._fleet.ask("record_steps", node=self.name)
 
     def steps(self) -> tuple[str, ...]:
-        """The external commands since `record_steps()`, in order; the n-th (from 1) is what `power-cut@n` strikes."""
+        """The external commands since `record_steps()`, in order; `power-cut@n` cuts at the n-th (from 1)."""
         return tuple(
             self.exec("/rom/lab/genuine/busybox cat /tmp/lab/steps.log")
             .check(f"{self.name}: read its steps")
@@ -160,9 +163,9 @@ class VirtualNode:
 
 
 class VirtualFleet:
-    """A fleet in `directory` (made if needed). Use as a context manager, or call `up()` and `down()`."""
+    """A fleet in `directory` (created if needed). Use as a context manager, or call `up()` and `down()`."""
 
-    # the module whose process stands behind the running fleet
+    # the module that runs as the fleet's process
     SUPERVISOR = "meshlab.supervisor"
 
     def __init__(self, spec: FleetSpec, directory: Path) -> None:
@@ -173,7 +176,7 @@ class VirtualFleet:
 
     @classmethod
     def attach(cls, directory: Path) -> Self:
-        """The fleet that runs in `directory`; raises LabError when none does."""
+        """The fleet that runs in `directory`. Raises LabError when none does."""
         request(directory, {"op": "status"})
         return cls(load((directory / "spec.json").read_text(encoding="utf-8")), directory)
 
@@ -203,7 +206,7 @@ class VirtualFleet:
             process.wait()
             raise
         self._process = process
-        weakref.finalize(self, _let_go, process)
+        weakref.finalize(self, _detach, process)
         return self
 
     def _check_programs(self) -> None:
@@ -214,9 +217,9 @@ class VirtualFleet:
         def booted() -> bool:
             failure = self.directory / "failure"
             if process.poll() is not None:
-                words = failure.read_text(encoding="utf-8").splitlines() if failure.exists() else []
-                reason = words[0] if words else f"its process ended with status {process.returncode}"
-                hint = words[1] if len(words) > 1 and words[1] else self._last_words()
+                lines = failure.read_text(encoding="utf-8").splitlines() if failure.exists() else []
+                reason = lines[0] if lines else f"its process ended with status {process.returncode}"
+                hint = lines[1] if len(lines) > 1 and lines[1] else self._log_tail()
                 raise LabError(f"the virtual fleet did not start: {reason}", hint=hint)
             if not (self.directory / "supervisor.pid").exists() or not is_running(self.directory):
                 return False
@@ -225,29 +228,29 @@ class VirtualFleet:
                 if node["power"] == Power.FAILED.value:
                     raise LabError(
                         f"this machine cannot start {node['name']}: {node['reason']}",
-                        hint="MESHCTL_LAB_PRIVILEGES=root (as root) or =user chooses the other way of isolation; "
-                        "containers need --privileged",
+                        hint="set MESHCTL_LAB_PRIVILEGES to root (as root) or user to isolate nodes the other way; "
+                        "inside a container, run it with --privileged",
                     )
             return all(node["power"] in (Power.UP.value, Power.DEAD.value) for node in nodes)
 
         wait_for(booted, f"{len(self.spec.nodes)} nodes to boot; see {self.directory / 'log'}", wait_s)
 
-    def _last_words(self) -> str:
+    def _log_tail(self) -> str:
         lines = (self.directory / "log").read_text(encoding="utf-8", errors="replace").splitlines()
         return "\n".join(lines[-_LOG_LINES:])
 
     def down(self) -> None:
-        """End it: every process, mount and namespace is gone when this returns. `directory` stays, for a look.
+        """Stop it: every process, mount and namespace is gone when this returns. `directory` stays for inspection.
 
-        Returns quietly when no fleet runs there.
+        Does nothing when no fleet runs there.
         """
-        if end(self.directory) and self._process is not None:
+        if stop_fleet(self.directory) and self._process is not None:
             self._process.wait()
 
     # -- nodes, addresses, links --
 
     def node(self, name: str) -> VirtualNode:
-        """Raises InputError for a name the fleet does not have."""
+        """The node called `name`. Raises InputError for an unknown name."""
         return VirtualNode(self, name)
 
     @property
@@ -256,15 +259,15 @@ class VirtualFleet:
 
     @property
     def port(self) -> int:
-        """The TCP port that all its loopback addresses listen on."""
+        """The TCP port of all its loopback addresses."""
         if not self._port:
             self._port = int(self.ask("status")["port"])
         return self._port
 
     def endpoint(self, address: str, *, identity: str = "") -> Endpoint:
-        """Where on this machine a node's address is reached: 10.42.0.11 -> 127.42.0.11, port `port`.
+        """The endpoint on this machine of a node's address: 10.42.0.11 -> 127.42.0.11, port `port`.
 
-        It refuses connections unless a node holds that address and a path from the base to it exists at that moment.
+        It refuses connections unless a node has that address and the base has a path to it.
         """
         return Endpoint(loopback_of(address), self.port, identity=identity)
 
@@ -276,20 +279,20 @@ class VirtualFleet:
         """`VirtualNode.bench` of the node called `name`."""
         return self.node(name).bench
 
-    def break_(self, where: str, what: str) -> None:
-        """`where` is a node or a link (`b01-b02`), `what` one of `breaks.BREAKS` (`power-cut@7`, `full-flash`, ...)."""
+    def inject_fault(self, where: str, what: str) -> None:
+        """`where` is a node or a link (`b01-b02`), `what` one of `faults.FAULTS` (`power-cut@7`, `full-flash`, ...)."""
         self.ask("do_break", where=where, what=what)
 
-    def mend(self, where: str = "") -> None:
-        """Undo every break (of one node or link): links up, power on, flash freed, bricked nodes recovered."""
+    def repair(self, where: str = "") -> None:
+        """Repair everything (or one node or link): links up, power on, flash freed, bricked nodes recovered."""
         self.ask("mend", where=where)
 
     def link(self, a: str, b: str, **changes: Any) -> None:
-        """Change a link's fields as seen from `a` (`spec.changed_link`), or make a link; `mend` undoes it."""
+        """Change a link's fields as seen from `a` (`spec.changed_link`), or add a link; `repair` undoes it."""
         self.ask("link", a=a, b=b, changes=changes)
 
     def status(self) -> dict[str, Any]:
-        """What `meshctl lab status --json` prints: fleet, pid, port, and per node power, address, mesh, breaks."""
+        """The content of `meshctl lab status --json`: fleet, pid, port, and per node power, address, mesh, faults."""
         return self.ask("status")
 
     def ask(self, operation: str, **words: Any) -> dict[str, Any]:
@@ -299,7 +302,7 @@ class VirtualFleet:
     def ask_with(
         self, descriptors: tuple[int, ...], timeout_s: float | None, operation: str, **words: Any
     ) -> dict[str, Any]:
-        """The same with descriptors for a process on a node."""
+        """A request that passes descriptors for a process on a node."""
         return request(self.directory, {"op": operation, **words}, descriptors, timeout_s=timeout_s)
 
     def __enter__(self) -> Self:
@@ -311,8 +314,21 @@ class VirtualFleet:
         self.down()
 
 
-def end(directory: Path) -> str:
-    """End the fleet that runs in `directory`, whatever version started it; its name, or nothing when none runs."""
+class QemuFleet(VirtualFleet):
+    """A fleet in a QEMU machine, with the kernel's own radios, mesh and bridges.
+
+    The nodes' files are inside the machine: `VirtualNode.flash_path` and `console_log` do not exist on the host; use
+    `exec` and `console` instead.
+    """
+
+    SUPERVISOR = "meshlab.qemu.host_proxy"
+
+    def _check_programs(self) -> None:
+        find_qemu()
+
+
+def stop_fleet(directory: Path) -> str:
+    """Stop the fleet that runs in `directory`, whatever version started it; returns its name, or "" when none runs."""
     try:
         status = request(directory, {"op": "status"})
     except LabError:
@@ -331,7 +347,7 @@ def end(directory: Path) -> str:
 
 
 def wait_for(condition: Callable[[], bool], what: str, wait_s: float) -> None:
-    """Poll until `condition()`; raises LabError naming `what` was waited for."""
+    """Poll until `condition()`. Raises LabError that names `what` after `wait_s`."""
     deadline = time.monotonic() + wait_s
     while not condition():
         if time.monotonic() > deadline:
@@ -339,8 +355,8 @@ def wait_for(condition: Callable[[], bool], what: str, wait_s: float) -> None:
         time.sleep(_POLL_S)
 
 
-def _let_go(process: subprocess.Popen[bytes]) -> None:
-    """The supervisor outlives whoever started it: Popen need not warn about that."""
+def _detach(process: subprocess.Popen[bytes]) -> None:
+    """Suppress Popen's warning: the supervisor outlives the process that started it."""
     if process.returncode is None:
         process.returncode = 0
 

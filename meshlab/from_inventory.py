@@ -1,4 +1,4 @@
-"""From an inventory to its virtual twin: nodes as factory devices, links as a graph."""
+"""Make a fleet spec from an inventory: its nodes as factory-fresh devices, and links between them."""
 
 from __future__ import annotations
 
@@ -8,36 +8,36 @@ from itertools import pairwise
 from meshctl.model import Fleet, Node, Robot, Role
 from meshlab.spec import MESH_PACKAGES, FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
 
-# up to here a fleet's default shape is a chain
-_CHAIN_NODES = 12
-# locally administered, so that no real device has it: two bytes of fleet-wide prefix, then the node, then the radio
+# the default topology is a chain up to this size, a tree above
+_MAX_CHAIN_NODES = 12
+# locally administered, so that no real device has it: two bytes of prefix, two for the node, two for the radio
 _MAC = "02:4d:{:02x}:{:02x}:00:{:02x}"
 
 
 def spec_of(
     fleet: Fleet, *, links: Sequence[LinkSpec] | None = None, nodes: int | None = None, port: int = 0
 ) -> FleetSpec:
-    """The virtual twin of an inventory: its first `nodes` managed nodes (all by default), fresh from the box.
+    """The spec of a fleet with the inventory's first `nodes` managed nodes (default: all), factory-fresh.
 
-    Every node stands on the bench; a node with the role `base` is the one the operator sits at. `links` None:
+    Every node is on the bench; the operator's machine is on the LAN of the node with the role `base`. `links` None:
     `default_links` in the inventory's order.
     """
     chosen = tuple(fleet.managed())[:nodes]
     names = [node.name for node in chosen]
-    wanted = default_links(names) if links is None else [one for one in links if one.a in names and one.b in names]
+    used = default_links(names) if links is None else [one for one in links if one.a in names and one.b in names]
     return FleetSpec(
         name=fleet.name,
         nodes=tuple(_node_spec(node, number) for number, node in enumerate(chosen)),
-        links=tuple(wanted),
+        links=tuple(used),
         port=port,
         lans=tuple(_lan_spec(robot, names) for robot in fleet.robots.values() if set(robot.nodes) & set(names)),
     )
 
 
 def default_links(names: Sequence[str]) -> list[LinkSpec]:
-    """A chain with a weaker link past every second node; for more than a team, a tree, every node having three behind
-    it: batman-adv's quality is used up after some thirty hops."""
-    if len(names) > _CHAIN_NODES:
+    """A chain with a weaker link past every second node; for big fleets, a tree with three children per node, because
+    batman-adv's TQ reaches 0 after some thirty hops."""
+    if len(names) > _MAX_CHAIN_NODES:
         return [LinkSpec(names[(number - 1) // 3], name, tq=250) for number, name in enumerate(names) if number]
     chain = [LinkSpec(a, b, tq=250, signal_dbm=-58) for a, b in pairwise(names)]
     past = [LinkSpec(a, b, tq=120, signal_dbm=-79) for a, b in list(zip(names, names[2:], strict=False))[::2]]

@@ -1,11 +1,11 @@
-"""Who hears whom -> a 64-bit mask per radio for mac80211_hwsim, whose radios hear each other where masks share a bit.
+"""Link graph -> a 64-bit group mask per radio for mac80211_hwsim: radios hear each other if their masks share a bit.
 
-`assign` gives masks for a graph; `steps` orders the writing of new masks so that no two radios ever hear each other
-that are joined neither before nor after.
+`assign` computes the masks of a graph; `transition` orders the writes from old masks to new ones so that no two radios
+hear each other meanwhile unless they are linked before or after.
 
-A bit is a clique: all radios that have it hear each other. Up to 11 nodes, every pair has a bit of its own, the same
-whatever the graph, so that a changed link touches two masks and no other link. For more nodes the graph's edges are
-covered by cliques, greedily (a minimal cover is NP-hard: Kou, Stockmeyer and Wong, CACM 21(2), 1978).
+A bit is a clique: all radios that have it hear each other. Up to 11 nodes, every pair has its own bit, independent of
+the graph, so that changing a link touches two masks and no other link. For more nodes the graph's edges are covered by
+cliques, greedily (a minimal cover is NP-hard: Kou, Stockmeyer and Wong, CACM 21(2), 1978).
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ _PAIRED_NODES = 11
 
 
 def assign(nodes: Sequence[str], edges: Iterable[tuple[str, str]]) -> dict[str, int]:
-    """A mask for each of `nodes` so that two masks overlap exactly where `edges` join them; 0 for who hears nobody.
+    """A mask for each of `nodes`: two masks overlap if and only if `edges` join the nodes; 0 for an isolated node.
 
-    Raises InputError when 64 bits are not enough, saying how many are needed, and ValueError for an unknown node.
+    Raises InputError when more than 64 groups are needed, ValueError for an unknown node.
     """
     place = {name: number for number, name in enumerate(nodes)}
     joined: dict[str, set[str]] = {name: set() for name in nodes}
@@ -39,12 +39,12 @@ def assign(nodes: Sequence[str], edges: Iterable[tuple[str, str]]) -> dict[str, 
             for other in joined[name]:
                 masks[name] |= 1 << _pair_bit(place[name], place[other])
         return masks
-    cliques = cover(nodes, joined)
+    cliques = clique_cover(nodes, joined)
     if len(cliques) > GROUP_BITS:
         edge_count = sum(map(len, joined.values())) // 2
         raise InputError(
             f"{len(nodes)} radios and {edge_count} links need {len(cliques)} groups, hwsim has {GROUP_BITS}",
-            hint="fewer nodes, a sparser graph, or nodes that stand together in clusters need fewer",
+            hint="use fewer nodes, fewer links, or nodes in denser clusters",
         )
     for bit, clique in enumerate(cliques):
         for name in clique:
@@ -52,10 +52,10 @@ def assign(nodes: Sequence[str], edges: Iterable[tuple[str, str]]) -> dict[str, 
     return masks
 
 
-def cover(nodes: Sequence[str], joined: Mapping[str, set[str]]) -> list[list[str]]:
-    """Cliques that hold every edge of the graph at least once, and no pair that is not an edge; sorted by `nodes`.
+def clique_cover(nodes: Sequence[str], joined: Mapping[str, set[str]]) -> list[list[str]]:
+    """Cliques that cover every edge of the graph, each sorted in the order of `nodes`.
 
-    Each clique grows from the first edge not yet covered, by the node that adds most of those.
+    Each clique starts at the first uncovered edge and grows by the node that adds most uncovered edges.
     """
     place = {name: number for number, name in enumerate(nodes)}
     left = {name: set(joined[name]) for name in nodes}
@@ -76,11 +76,11 @@ def cover(nodes: Sequence[str], joined: Mapping[str, set[str]]) -> list[list[str
     return cliques
 
 
-def steps(old: Mapping[str, int], new: Mapping[str, int]) -> list[tuple[str, int]]:
+def transition(old: Mapping[str, int], new: Mapping[str, int]) -> list[tuple[str, int]]:
     """The masks to write, in order, to get from `old` to `new` one radio at a time.
 
-    First each radio keeps the bits it has in both, which joins no pair that was not joined; then each takes its new
-    ones, which joins no pair that is not to be.
+    First each radio is reduced to the bits it has in both, which links no new pair; then each gets its new bits, which
+    links only pairs of the new graph.
     """
     narrowed = [(name, old.get(name, 0) & mask) for name, mask in new.items() if old.get(name, 0) & ~mask]
     final = [(name, mask) for name, mask in new.items() if mask != old.get(name, 0) & mask]

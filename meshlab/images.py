@@ -1,7 +1,7 @@
-"""Firmware images and package files for virtual nodes: small, but checked on the node as real ones are.
+"""Firmware images and package files for virtual nodes: small, but validated on the node like real ones.
 
-An image is the text that a virtual flash chip holds, padded, and fwtool's metadata trailer behind it
-(docs/facts/openwrt-facts.md section 2): host-side checks and `sysupgrade -T` read it as any other.
+An image is the text of a virtual flash chip, padded, followed by fwtool's metadata trailer
+(docs/facts/openwrt-facts.md section 2), so that host-side checks and `sysupgrade -T` read it like any other.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def firmware_image(
     size_bytes: int = 256 * 1024,
     revision: str | None = None,
 ) -> bytes:
-    """An image of `release` for `board` (`vendor,model`), of at least `size_bytes`, with what a mesh needs and `extra`
-    baked in."""
+    """An image of `release` for `board` (`vendor,model`), at least `size_bytes` long, with the mesh packages and
+    `extra` built in."""
     text = firmware_text(release, (*MESH_PACKAGES, *extra), target)
     if revision is not None:
         text = text.replace(facts(release).revision, revision)
@@ -62,7 +62,7 @@ def opkg_package(
 
 
 def apk_package(name: str, version: str, files: Mapping[str, str], *, depends: tuple[str, ...] = ()) -> bytes:
-    """A package file as the virtual nodes' apk takes it: a gzipped tar with .PKGINFO (apk 3's own format is binary)."""
+    """A package file for the virtual nodes' apk: a gzipped tar with .PKGINFO (apk 3's own format is binary)."""
     info = f"pkgname = {name}\npkgver = {version}\n" + "".join(f"depend = {need}\n" for need in depends)
     return _tar({".PKGINFO": info.encode()} | {path.lstrip("/"): text.encode() for path, text in files.items()})
 

@@ -1,8 +1,8 @@
-"""A copy of an inventory for its virtual twin: the same fleet, with a login key made for this fleet alone.
+"""A copy of an inventory for a virtual fleet, with a login key for this fleet only.
 
-The user's inventory stays as it is. `prepare` claims DIRECTORY for the lab, copies the inventory's files into
-`DIRECTORY/inventory`, makes a key pair in `DIRECTORY/keys`, and writes the public key and the key file's path into the
-copy. Host keys stay with the copy: the fleet's own known_hosts is neither copied nor written.
+The user's inventory is not changed. `copy_inventory` claims DIRECTORY for the lab, copies the inventory's files into
+`DIRECTORY/inventory`, generates a key pair in `DIRECTORY/keys`, and writes the public key and the key file's path into
+the copy. The copy has its own known_hosts: the original's is neither copied nor written.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from meshlab import fleet_directory, propagation_file
 from meshlab.propagation import links_of
 from meshlab.spec import LinkSpec
 
-# beside fleet.yaml, if the fleet's own shape matters
+# beside fleet.yaml, optional: the links of the virtual fleet
 LINKS_FILE = "links.yaml"
-# beside the copy, whatever the fleet's own file is: virtual nodes' host keys must not get among real ones
+# beside the copy, whatever file the original uses: host keys of virtual nodes must not mix with real ones
 _KNOWN_HOSTS = "known_hosts"
 
 
 @dataclass(frozen=True, slots=True)
-class Copy:
-    """The copied inventory's path, what it says, its login key, and the links file's content (None: no file).
+class InventoryCopy:
+    """The copied inventory's path, its fleet, its login key, and the content of the links file (None: no file).
 
-    `kept` is where an earlier copy with edits was moved to, None when there was none.
+    `kept` is the new path of an earlier copy with edits, None when there was none.
     """
 
     inventory: Path
@@ -43,12 +43,11 @@ class Copy:
     kept: Path | None = None
 
 
-def prepare(source: Path, directory: Path, *, environ: Mapping[str, str] = os.environ) -> Copy:
-    """Copy the inventory `source` (a file or a directory) into `directory`; a key that is there is kept.
+def copy_inventory(source: Path, directory: Path, *, environ: Mapping[str, str] = os.environ) -> InventoryCopy:
+    """Copy the inventory `source` (a file or a directory) into `directory`; an existing key pair is reused.
 
-    `source` may be the earlier copy. Raises InvalidInput with the diagnostics of an inventory that has errors, LabError
-    when `directory` has other contents or a fleet runs there, InputError when files cannot be copied. Nothing is
-    replaced then.
+    `source` may be the earlier copy. Raises InvalidInput for an inventory with errors, LabError when `directory` has
+    other contents or a running fleet, InputError when copying fails; nothing is replaced then.
     """
     fleet = load_fleet(source, environ=environ)
     folder = source if source.is_dir() else source.parent
@@ -64,14 +63,14 @@ def prepare(source: Path, directory: Path, *, environ: Mapping[str, str] = os.en
     if fleet.operators.known_hosts != _KNOWN_HOSTS:
         editor.set(("operators", "known_hosts"), _KNOWN_HOSTS)
     save(editor.changes())
-    fleet_directory.note_inventory(directory)
+    fleet_directory.record_digests(directory)
     links = target / LINKS_FILE
-    heard = list(links_of(propagation_file.load(links))) if links.exists() else None
-    return Copy(copied, load_fleet(copied, environ=environ), key_file, heard, kept)
+    link_specs = list(links_of(propagation_file.load(links))) if links.exists() else None
+    return InventoryCopy(copied, load_fleet(copied, environ=environ), key_file, link_specs, kept)
 
 
 def _key_pair(path: Path) -> str:
-    """The public key's line; the pair is made when it is not there."""
+    """The public key's line; the pair is generated if missing."""
     public_path = path.with_name(path.name + ".pub")
     if not (path.exists() and public_path.exists()):
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

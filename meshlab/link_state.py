@@ -1,48 +1,48 @@
-"""The links of a running fleet, and what follows from them: each node's tables, and the path to the operator."""
+"""Link state of a running fleet: links -> mesh graph -> each node's tables and the operator's path to each node."""
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from meshctl.errors import InputError
 from meshlab import mesh_model
+from meshlab.fleet_state import FleetState
 from meshlab.shaped_tunnel import Shape
 from meshlab.spec import LinkSpec, Medium, changed_link
-from meshlab.station_tables import Stations
+from meshlab.station_tables import StationTables
 
-if TYPE_CHECKING:
-    from meshlab.supervisor import Supervisor
-
-# recomputing all tables of a big fleet takes a while; at most this share of the time is spent on it
+# recomputing all tables of a big fleet is slow; at most this share of the time is spent on it
 _BUSY_SHARE = 0.2
 
 
-class Ether:
-    """`changed()` says that a node or a link is different; the tables follow after the fleet's convergence time."""
+class LinkState:
+    """`changed()` reports that a node or a link changed; the tables follow after the fleet's convergence time."""
 
-    def __init__(self, fleet: Supervisor) -> None:
+    def __init__(self, fleet: FleetState) -> None:
         self._fleet = fleet
-        # who hears whom by the fleet's spec or its ground, and over it the links that somebody set one by one
-        self._ground = {link.ends: link for link in fleet.spec.links}
-        self._by_hand: dict[frozenset[str], LinkSpec] = {}
-        # parts of a ground that is being told
-        self.coming: list[LinkSpec] = []
-        # what `sever`, `link-down` and `slow` do to all links of a node
+        # called after every change of what is reachable
+        self.on_change: Callable[[], None] = lambda: None
+        # links from the fleet's spec or its radio environment, and links that were set one by one and override them
+        self._base_links = {link.ends: link for link in fleet.spec.links}
+        self._overrides: dict[frozenset[str], LinkSpec] = {}
+        # the parts received so far of a new set of links
+        self.pending_links: list[LinkSpec] = []
+        # nodes with a `sever`, `link-down` or `slow` fault on all their links
         self.severed: set[str] = set()
         self.slowed: dict[str, dict[str, Any]] = {}
         self._written: dict[str, str] = {}
         self._graph: dict[str, list[mesh_model.Edge]] = {}
-        self._from_base: dict[str, mesh_model.Path] = {}
+        self._base_routes: dict[str, mesh_model.Route] = {}
         self._timer: asyncio.TimerHandle | None = None
-        self._stations = Stations()
-        # of the nodes that run: which boot it is
+        self._stations = StationTables()
+        # the current boot of each running node
         self._boots: dict[str, int] = {}
-        # the boots in which nodes were last on the air
+        # the boot in which each node last had a neighbor
         self._on_air: dict[str, int] = {}
         self._expiry: asyncio.TimerHandle | None = None
         self._last_cost_s = 0.0
@@ -50,67 +50,67 @@ class Ether:
         self._notices: set[asyncio.Task[None]] = set()
 
     def changed(self) -> None:
-        """Paths are cut at once; tables, and paths that are new, come after the convergence time."""
-        self._cut()
+        """Lost paths go down now; tables and new paths follow after the convergence time."""
+        self._remove_lost_routes()
         if self._timer is None:
             wait = max(self._fleet.spec.convergence_s, self._last_cost_s / _BUSY_SHARE)
             self._timer = asyncio.get_running_loop().call_later(wait, self._converge)
 
     def links(self) -> list[LinkSpec]:
-        """Every link as it is now, with what was done to its ends."""
-        return [self._hurt(link) for link in {**self._ground, **self._by_hand}.values()]
+        """Every link as it is now, with the faults of its ends."""
+        return [self._with_faults(link) for link in {**self._base_links, **self._overrides}.values()]
 
-    def _hurt(self, link: LinkSpec) -> LinkSpec:
+    def _with_faults(self, link: LinkSpec) -> LinkSpec:
         if link.ends & self.severed:
             link = replace(link, up=False)
         for name in link.ends & self.slowed.keys():
             link = replace(link, **self.slowed[name])
         return link
 
-    def set_ground(self, links: Iterable[LinkSpec]) -> None:
-        """Everything that holds from now on, but for what was set by hand; links to nodes not in the fleet are not."""
-        ground = {link.ends: link for link in links if link.ends <= self._fleet.nodes.keys()}
-        if ground != self._ground:
-            self._ground = ground
+    def set_base_links(self, links: Iterable[LinkSpec]) -> None:
+        """Replace all links except overrides. Links to nodes outside the fleet are ignored."""
+        base_links = {link.ends: link for link in links if link.ends <= self._fleet.nodes.keys()}
+        if base_links != self._base_links:
+            self._base_links = base_links
             self.changed()
 
     def set_link(self, a: str, b: str, changes: dict[str, Any]) -> None:
-        """Change a link's fields, as seen from `a`, or make the link; it holds until `restore`, whatever the ground.
+        """Override a link's fields, as seen from `a`, or add the link; it stays until `restore`.
 
-        A new `loss` counts in both directions unless `loss_back` is among the changes, and decides `tq` unless that is.
-        Raises InputError for an unknown node or field.
+        A new `loss` applies to both directions unless `changes` has `loss_back`, and determines `tq` unless `changes`
+        has `tq`. Raises InputError for an unknown node or field.
         """
         ends = frozenset((a, b))
         for name in ends:
             if name not in self._fleet.nodes:
                 raise InputError(f"no node named {name} in this fleet")
-        known = self._by_hand.get(ends) or self._ground.get(ends) or LinkSpec(a, b)
+        known = self._overrides.get(ends) or self._base_links.get(ends) or LinkSpec(a, b)
         try:
-            self._by_hand[ends] = changed_link(known.seen_from(a), changes)
+            self._overrides[ends] = changed_link(known.seen_from(a), changes)
         except TypeError as error:
             raise InputError(f"link {a}-{b}: {error}") from error
         self.changed()
 
     def restore(self, ends: frozenset[str] | None = None) -> None:
-        """One link (or all, and all nodes' links) as the fleet's spec or ground has it."""
+        """Remove the override of one link, or all overrides and faults."""
         if ends is None:
-            self._by_hand.clear()
+            self._overrides.clear()
             self.severed.clear()
             self.slowed.clear()
         else:
-            self._by_hand.pop(ends, None)
+            self._overrides.pop(ends, None)
         self.changed()
 
-    # -- the way to the operator --
+    # -- the operator's path --
 
-    def way(self, name: str, address: str) -> Shape | None:
-        """What lies between the operator and a node's `address` now; None when nothing does."""
+    def path_shape(self, name: str, address: str) -> Shape | None:
+        """The shape of the operator's path to a node's `address`; None when there is no path."""
         state = self._fleet.nodes[name]
         if not state.is_running:
             return None
         if state.plugged and state.effective.holds(address, over="wire"):
             return Shape()
-        path = self._from_base.get(name)
+        path = self._base_routes.get(name)
         if path is None or not state.effective.holds(address, over="mesh"):
             return None
         if not all(self._passes(sender, edge) for sender, edge in path.hops):
@@ -118,22 +118,22 @@ class Ether:
         rates = [link.rate_kbps for link in path.links if link.rate_kbps is not None]
         arrives = 1.0
         for link in path.links:
-            # a connection waits for what is lost on its way as for the answers to it
+            # TCP waits for lost segments and for lost acknowledgements alike
             arrives *= 1 - max(link.loss_to(link.a), link.loss_to(link.b))
         return Shape(
             sum(link.delay_ms for link in path.links) / 1000, 1 - arrives, min(rates) * 125.0 if rates else None
         )
 
-    def wire(self, name: str, address: str) -> Shape | None:
-        """The same through the node's bench port alone."""
+    def bench_shape(self, name: str, address: str) -> Shape | None:
+        """The shape of the path over the node's bench port; None when there is none."""
         state = self._fleet.nodes[name]
         if state.is_running and state.plugged and state.effective.holds(address, over="wire"):
             return Shape()
         return None
 
-    def reached(self) -> set[str]:
-        """The nodes that a mesh path from the base leads to."""
-        return set(self._from_base)
+    def reachable(self) -> set[str]:
+        """The nodes with a mesh path from the base."""
+        return set(self._base_routes)
 
     # -- station tables --
 
@@ -151,7 +151,7 @@ class Ether:
     def _update_stations(self) -> None:
         for name, boot in self._boots.items():
             if self._on_air.get(name, boot) != boot and not self._fleet.spec.quick_boot:
-                self._stations.forget_silent(name)
+                self._stations.remove_node(name)
             if self._graph.get(name):
                 self._on_air[name] = boot
         self._stations.update(self._graph, self._boots, time.time())
@@ -163,9 +163,9 @@ class Ether:
             wait_s = max(1.0, due_s - time.time() + 0.1)
             self._expiry = asyncio.get_running_loop().call_later(wait_s, self.changed)
 
-    def _known_to(self, name: str) -> list[mesh_model.Known]:
+    def _station_rows(self, name: str) -> list[mesh_model.StationRow]:
         return [
-            mesh_model.Known(
+            mesh_model.StationRow(
                 entry.holder.interface,
                 entry.mac,
                 entry.signal_dbm,
@@ -173,50 +173,50 @@ class Ether:
                 int(entry.since_s),
                 int(entry.silent_since_s or 0),
             )
-            for entry in self._stations.of(name)
+            for entry in self._stations.entries_of(name)
         ]
 
     # -- computing --
 
-    def _nodes(self) -> dict[str, mesh_model.Effective]:
-        return {name: state.effective for name, state in self._fleet.nodes.items() if state.effective.cells}
+    def _nodes(self) -> dict[str, mesh_model.EffectiveState]:
+        return {name: state.effective for name, state in self._fleet.nodes.items() if state.effective.interfaces}
 
-    def _paths_from_base(self, graph: dict[str, list[mesh_model.Edge]]) -> dict[str, mesh_model.Path]:
-        found: dict[str, mesh_model.Path] = {}
+    def _routes_from_base(self, graph: dict[str, list[mesh_model.Edge]]) -> dict[str, mesh_model.Route]:
+        found: dict[str, mesh_model.Route] = {}
         for name, state in self._fleet.nodes.items():
             if state.spec.medium is Medium.BASE and state.plugged and state.effective.bridges_lan_and_mesh:
-                for target, path in mesh_model.paths(graph, name).items():
+                for target, path in mesh_model.best_routes(graph, name).items():
                     if target not in found or path.tq > found[target].tq:
                         found[target] = path
         return found
 
-    def _cut(self) -> None:
-        """Take away what no longer stands; what is new waits for `_converge`."""
+    def _remove_lost_routes(self) -> None:
+        """Drop the routes that no longer exist; new ones wait for `_converge`."""
         self._count_boots()
-        now = self._paths_from_base(mesh_model.edges(self._nodes(), self.links()))
-        self._from_base = {name: path for name, path in now.items() if name in self._from_base}
-        self._tell()
+        now = self._routes_from_base(mesh_model.edges(self._nodes(), self.links()))
+        self._base_routes = {name: path for name, path in now.items() if name in self._base_routes}
+        self._notify()
 
     def _converge(self) -> None:
         loop = asyncio.get_running_loop()
-        begun = loop.time()
+        started = loop.time()
         self._timer = None
         self._count_boots()
         nodes = self._nodes()
         self._graph = mesh_model.edges(nodes, self.links())
-        self._from_base = self._paths_from_base(self._graph)
+        self._base_routes = self._routes_from_base(self._graph)
         self._update_stations()
         for name, state in self._fleet.nodes.items():
-            ways = mesh_model.paths(self._graph, name) if name in nodes else {}
-            text = mesh_model.heard(name, nodes, self._graph, ways, self._known_to(name), self._passes)
+            routes = mesh_model.best_routes(self._graph, name) if name in nodes else {}
+            text = mesh_model.heard_text(name, nodes, self._graph, routes, self._station_rows(name), self._passes)
             if self._written.get(name) != text:
                 self._written[name] = text
                 _replace(state.home / "air" / "heard", text)
-        self._last_cost_s = loop.time() - begun
-        self._tell()
+        self._last_cost_s = loop.time() - started
+        self._notify()
 
-    def _tell(self) -> None:
-        self._fleet.doors.refresh()
+    def _notify(self) -> None:
+        self.on_change()
 
         async def notify() -> None:
             async with self.condition:

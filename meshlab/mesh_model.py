@@ -1,9 +1,9 @@
-"""Who hears whom: what the nodes' radios send, turned into neighbours, paths and what each node's batman-adv knows.
+"""The mesh model: the state of the nodes' radios -> neighbors, routes, and the tables of each node's batman-adv.
 
-effective text per node -> Effective -> edges (both radios up, same cell, link there) -> best paths -> `heard` text
+air/effective of each node -> EffectiveState -> edges (both interfaces up, same cell, link up) -> routes -> air/heard
 
-Pure: the supervisor reads and writes the files, and asks again whenever one of them or a link changes. A path's
-quality is the product of its links' TQ, less a hop penalty, as BATMAN_IV has it; the same figures serve BATMAN_V.
+Pure: the supervisor reads and writes the files, and recomputes whenever one of them or a link changes. A route's
+quality is the product of its links' TQ, less a hop penalty, as in BATMAN_IV; BATMAN_V gets the same figures.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from meshlab.spec import LinkSpec
 HOP_PENALTY = 30
 # the highest rate of two streams in 20 MHz with short guard interval, MCS 15
 _BEST_RATE_MBIT_S = 144.4
-# of a frame to one station (docs/lab.md, "Who hears whom")
+# transmissions of a unicast frame (docs/lab.md, "Links")
 _ATTEMPTS = 7
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
-    """One radio interface that is up: everything that must be equal for two of them to hear each other, and its MAC.
+class WirelessInterface:
+    """A wireless interface that is up: the settings that two of them must share to hear each other, and its MAC.
 
     `soft` is the batman-adv interface it belongs to, `-` for none.
     """
@@ -42,26 +42,26 @@ class Cell:
     mac: str
     soft: str
     routing: str
-    # the kernel's number of the interface: another one, when it was made anew
+    # the kernel's interface index: it changes when the interface is recreated
     index: int = 0
 
     @property
     def medium(self) -> tuple[str, int, str, str, str, str]:
         return (self.mode, self.frequency_mhz, self.ssid, self.bssid.lower(), self.algorithm, self.key)
 
-    def hears(self, other: Cell) -> bool:
+    def hears(self, other: WirelessInterface) -> bool:
         return self.medium == other.medium
 
-    def routes_with(self, other: Cell) -> bool:
-        """Both feed a batman-adv of the same routing algorithm; IV and V do not understand each other."""
+    def routes_with(self, other: WirelessInterface) -> bool:
+        """Whether both belong to a batman-adv interface with the same routing algorithm; IV and V are incompatible."""
         return self.soft != "-" and other.soft != "-" and self.routing == other.routing
 
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """An IPv4 address a node has; whether its device is bridged with the mesh, and with a LAN port.
+    """An IPv4 address of a node; whether its device is bridged with the mesh, and with a LAN port.
 
-    `admitted`: the firewall that is loaded lets new SSH connections in there; open ones it leaves alone.
+    `admitted`: the loaded firewall accepts new SSH connections on it; established ones are not affected.
     """
 
     interface: str
@@ -73,20 +73,20 @@ class Address:
 
 
 @dataclass(frozen=True, slots=True)
-class Effective:
-    """What a node really does at this moment, as its netifd stand-in wrote it."""
+class EffectiveState:
+    """A node's current interfaces and addresses, as its netifd stand-in wrote them."""
 
-    cells: tuple[Cell, ...] = ()
+    interfaces: tuple[WirelessInterface, ...] = ()
     addresses: tuple[Address, ...] = ()
 
     def holds(self, address: str, *, over: str) -> bool:
-        """Whether it answers at `address` to packets that come over the `mesh` or a `wire`."""
+        """Whether the node answers at `address` to packets that arrive over the `mesh` or a `wire`."""
         return any(
             one.address == address and (one.over_mesh if over == "mesh" else one.over_wire) for one in self.addresses
         )
 
     def admits(self, address: str) -> bool:
-        """Whether the firewall lets a new SSH connection to `address` in."""
+        """Whether the firewall accepts a new SSH connection to `address`."""
         return any(one.address == address and one.admitted for one in self.addresses)
 
     @property
@@ -96,18 +96,18 @@ class Effective:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A cell that hears another, `peer` of `node`; `tq` (0..255) is the quality of sending there, 0 when it is deaf."""
+    """`own` hears `peer` of `node`; `tq` (0..255) is the quality of sending to it, 0 when it hears nothing."""
 
-    own: Cell
-    peer: Cell
+    own: WirelessInterface
+    peer: WirelessInterface
     node: str
     link: LinkSpec
     tq: int
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
-    """The best way from one node to another: TQ at its end, first hop, the links on it, and each hop with who sends."""
+class Route:
+    """The best route from one node to another: end-to-end TQ, first hop, its links, and each hop with its sender."""
 
     tq: int
     first: Edge
@@ -115,24 +115,26 @@ class Path:
     hops: tuple[tuple[str, Edge], ...] = ()
 
 
-def parse_effective(text: str) -> Effective:
-    """The content of air/effective: `cell` and `addr` lines, tab-separated (node_root/lab/netifd.awk, admitted.awk)."""
-    cells, addresses = [], []
+def parse_effective(text: str) -> EffectiveState:
+    """Parse air/effective: `cell` and `addr` lines, tab-separated (node_root/lab/netifd.awk, admitted.awk)."""
+    interfaces, addresses = [], []
     for line in text.splitlines():
         match line.split("\t"):
             case ["cell", _, interface, mode, frequency, ssid, bssid, algorithm, key, mac, soft, routing, *index]:
                 number = int(index[0]) if index else 0
-                cells.append(
-                    Cell(interface, mode, int(frequency), ssid, bssid, algorithm, key, mac, soft, routing, number)
+                interfaces.append(
+                    WirelessInterface(
+                        interface, mode, int(frequency), ssid, bssid, algorithm, key, mac, soft, routing, number
+                    )
                 )
             case ["addr", interface, _, address, prefix, over_mesh, over_wire, *admitted]:
                 flags = over_mesh == "1", over_wire == "1", admitted != ["0"]
                 addresses.append(Address(interface, address, int(prefix), *flags))
-    return Effective(tuple(cells), tuple(addresses))
+    return EffectiveState(tuple(interfaces), tuple(addresses))
 
 
-def edges(nodes: Mapping[str, Effective], links: Iterable[LinkSpec]) -> dict[str, list[Edge]]:
-    """Whom each node hears: over links that are up, in a cell they share, unless the link loses everything."""
+def edges(nodes: Mapping[str, EffectiveState], links: Iterable[LinkSpec]) -> dict[str, list[Edge]]:
+    """The edges of each node: over links that are up, between interfaces of one cell, unless the loss is 100 %."""
     found: dict[str, list[Edge]] = {name: [] for name in nodes}
     for link in links:
         if not link.up or link.a not in nodes or link.b not in nodes:
@@ -143,16 +145,16 @@ def edges(nodes: Mapping[str, Effective], links: Iterable[LinkSpec]) -> dict[str
             tq = link.tq_to(other)
             found[own].extend(
                 Edge(cell, peer, other, link, tq)
-                for cell in nodes[own].cells
-                for peer in nodes[other].cells
+                for cell in nodes[own].interfaces
+                for peer in nodes[other].interfaces
                 if cell.hears(peer)
             )
     return found
 
 
-def paths(graph: Mapping[str, list[Edge]], start: str) -> dict[str, Path]:
-    """The best batman-adv path from `start` to every node it reaches."""
-    best: dict[str, Path] = {}
+def best_routes(graph: Mapping[str, list[Edge]], start: str) -> dict[str, Route]:
+    """The best batman-adv route from `start` to every reachable node."""
+    best: dict[str, Route] = {}
     count = itertools.count()
     queue: list[tuple[int, int, str, int, tuple[tuple[str, Edge], ...]]] = [(-TQ_MAX, 0, start, next(count), ())]
     settled: set[str] = set()
@@ -162,7 +164,7 @@ def paths(graph: Mapping[str, list[Edge]], start: str) -> dict[str, Path]:
             continue
         settled.add(name)
         if hops:
-            best[name] = Path(-negative, hops[0][1], tuple(edge.link for _, edge in hops), hops)
+            best[name] = Route(-negative, hops[0][1], tuple(edge.link for _, edge in hops), hops)
         for edge in graph.get(name, ()):
             if edge.node in settled or not edge.own.routes_with(edge.peer):
                 continue
@@ -170,14 +172,14 @@ def paths(graph: Mapping[str, list[Edge]], start: str) -> dict[str, Path]:
             if hops:
                 tq = tq * (TQ_MAX - HOP_PENALTY) // TQ_MAX
             if tq > 0:
-                # equal paths: fewer hops first, then the name, then who was found first, so that tables do not flap
+                # ties: fewer hops, then the name, then the first found, so that tables do not flap
                 heapq.heappush(queue, (-tq, len(hops) + 1, edge.node, next(count), (*hops, (name, edge))))
     return best
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
-    """One line of a station table, for `heard`: since when (Unix time, s), and since when it is silent (0: heard)."""
+class StationRow:
+    """One row of a station table: since when (Unix time, s), and since when the station is silent (0: it is heard)."""
 
     interface: str
     mac: str
@@ -187,23 +189,23 @@ class Known:
     silent_since_s: int
 
 
-def heard(
+def heard_text(
     name: str,
-    nodes: Mapping[str, Effective],
+    nodes: Mapping[str, EffectiveState],
     graph: Mapping[str, list[Edge]],
-    ways: Mapping[str, Path],
-    stations: Iterable[Known] | None = None,
+    routes: Mapping[str, Route],
+    stations: Iterable[StationRow] | None = None,
     passes: Callable[[str, Edge], bool] = lambda name, edge: True,
 ) -> str:
-    """The file air/heard of one node: S stations, N batman neighbours, O originators (read by the stand-ins).
+    """The file air/heard of one node: S stations, N batman neighbors, O originators (read by the stand-ins).
 
     S interface mac signal_dbm age_ms rate_mbit_s since silent_since; N interface mac age_ms tq arrives;
-    O interface mac next_hop tq age_ms best arrives. `arrives` is how many of 1000 frames to that station alone do,
-    there and back; batman-adv's own broadcasts tell nothing of it. `stations`: the node's table, None: who is heard.
+    O interface mac next_hop tq age_ms best arrives. `arrives` is how many of 1000 unicast frames and their replies get
+    through, which batman-adv's broadcasts do not show. `stations`: the node's station table; None: every edge's peer.
     """
     if stations is None:
         stations = (
-            Known(edge.own.interface, edge.peer.mac, edge.link.signal_at(name), edge.tq, 0, 0)
+            StationRow(edge.own.interface, edge.peer.mac, edge.link.signal_at(name), edge.tq, 0, 0)
             for edge in graph.get(name, ())
         )
     lines = []
@@ -216,23 +218,23 @@ def heard(
     for edge in graph.get(name, ()):
         own, peer = edge.own, edge.peer
         if own.routes_with(peer):
-            arrives = _arrives([(name, edge)], passes)
+            arrives = _delivered_per_mille([(name, edge)], passes)
             lines.append(f"N\t{own.interface}\t{peer.mac}\t{_age_ms(name, peer.mac)}\t{edge.tq}\t{arrives}")
-    for target, path in sorted(ways.items()):
+    for target, path in sorted(routes.items()):
         own, hop = path.first.own, path.first.peer.mac
-        mac = next(cell.mac for cell in nodes[target].cells if cell.soft != "-")
-        arrives = _arrives(path.hops, passes)
+        mac = next(cell.mac for cell in nodes[target].interfaces if cell.soft != "-")
+        arrives = _delivered_per_mille(path.hops, passes)
         lines.append(f"O\t{own.interface}\t{mac}\t{hop}\t{path.tq}\t{_age_ms(name, mac)}\t1\t{arrives}")
     return "".join(f"{line}\n" for line in lines)
 
 
-def _arrives(hops: Iterable[tuple[str, Edge]], passes: Callable[[str, Edge], bool]) -> int:
-    """Of 1000 frames to the station at the end of the hops and their answers, how many come back."""
+def _delivered_per_mille(hops: Iterable[tuple[str, Edge]], passes: Callable[[str, Edge], bool]) -> int:
+    """How many of 1000 unicast frames over the hops are answered."""
     share = 1.0
     for name, edge in hops:
         if not passes(name, edge):
             return 0
-        # 802.11 repeats a frame to one station up to seven times
+        # 802.11 transmits a unicast frame up to seven times
         if edge.link.loss or edge.link.loss_back:
             for end in (edge.link.a, edge.link.b):
                 share *= 1 - edge.link.loss_to(end) ** _ATTEMPTS
@@ -240,5 +242,5 @@ def _arrives(hops: Iterable[tuple[str, Edge]], passes: Callable[[str, Edge], boo
 
 
 def _age_ms(name: str, mac: str) -> int:
-    # below one originator interval, and the same at every reading: nothing here depends on it
+    # below one originator interval, and stable: nothing depends on it
     return 20 + zlib.crc32(f"{name}{mac}".encode()) % 900

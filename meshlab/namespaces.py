@@ -1,8 +1,8 @@
-"""The kernel's calls that Python does not offer: namespaces, mounts, and a filter for one system call.
+"""System calls that Python does not offer: namespaces, mounts, and a seccomp filter.
 
-A fleet needs them in this order: `enter_user_namespace` (when not root), `clone` into new namespaces for each node,
-`mount`/`bind`/`pivot_root` inside it, `accept_setgroups`, and `setns` to reach into a running node. Every function
-raises OSError with the kernel's errno. Numbers are from the kernel's uapi headers.
+A fleet uses them in this order: `enter_user_namespace` (when not root), `clone` into new namespaces for each node,
+`mount`/`bind`/`pivot_root` inside it, `accept_setgroups`, and `setns` to enter a running node. Every function raises
+OSError with the kernel's errno. Numbers are from the kernel's uapi headers.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 class _Machine(NamedTuple):
-    """System call numbers and the audit architecture of one kind of machine."""
+    """System call numbers and the audit architecture of one machine type."""
 
     clone: int
     pivot_root: int
@@ -67,7 +67,7 @@ def machine_is_known() -> bool:
 
 
 def enter_user_namespace() -> None:
-    """Become root of a new user namespace that knows the caller's own user and group alone.
+    """Become root of a new user namespace that maps only the caller's user and group.
 
     The caller must be single-threaded. The kernel then refuses setgroups (see `accept_setgroups`).
     """
@@ -79,10 +79,10 @@ def enter_user_namespace() -> None:
 
 
 def clone(flags: int) -> int:
-    """Fork into new namespaces; 0 in the child, the child's pid in the parent (as seen by the parent).
+    """Fork into new namespaces; returns 0 in the child, the child's pid in the parent.
 
-    A fork by hand: os.fork cannot take flags, and unshare(CLONE_NEWPID) works once per process only. The caller must be
-    single-threaded, and the child should do little before it calls exec.
+    os.fork takes no flags, and unshare(CLONE_NEWPID) works only once per process. The caller must be single-threaded,
+    and the child should do little before it calls exec.
     """
     pid = _libc.syscall(_MACHINES[platform.machine()].clone, ctypes.c_ulong(flags | signal.SIGCHLD), 0, 0, 0, 0)
     return _check(pid, "clone")
@@ -93,7 +93,7 @@ def unshare(flags: int) -> None:
 
 
 def setns(descriptor: int, kind: int) -> None:
-    """Enter the namespace behind `descriptor` (of /proc/PID/ns/*); `kind` is its CLONE_NEW* flag."""
+    """Enter the namespace of `descriptor` (a file of /proc/PID/ns); `kind` is its CLONE_NEW* flag."""
     _check(_libc.setns(descriptor, kind), "setns")
 
 
@@ -105,19 +105,19 @@ def mount(source: str, target: str, fs_type: str, flags: int = 0, options: str =
 
 
 def bind(source: str, target: str, *, read_only: bool = False) -> None:
-    """Make `source` visible at `target`. Flags that an outer mount namespace locked are kept, as the kernel asks."""
+    """Bind-mount `source` at `target`. A remount keeps the flags that an outer mount namespace locked."""
     mount(source, target, "", MS_BIND)
     if read_only:
         mount("", target, "", MS_BIND | MS_REMOUNT | MS_RDONLY | _locked_flags(target))
 
 
 def make_private() -> None:
-    """Let no mount of this mount namespace reach another one."""
+    """Stop mounts of this mount namespace from propagating to others."""
     mount("none", "/", "", MS_REC | MS_PRIVATE)
 
 
 def pivot_root(new_root: str) -> None:
-    """Make `new_root` (a mount point) the root of this mount namespace and forget the old one."""
+    """Make `new_root` (a mount point) the root of this mount namespace and unmount the old one."""
     os.chdir(new_root)
     number = _MACHINES[platform.machine()].pivot_root
     _check(_libc.syscall(number, b".", b"."), "pivot_root")
@@ -127,15 +127,15 @@ def pivot_root(new_root: str) -> None:
 
 
 def die_with_parent() -> None:
-    """Have the kernel kill this process when the thread that made it ends (prctl(2), PR_SET_PDEATHSIG)."""
+    """Have the kernel kill this process when its parent thread ends (prctl(2), PR_SET_PDEATHSIG)."""
     _check(_libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0), "prctl(PR_SET_PDEATHSIG)")
 
 
 def accept_setgroups() -> None:
-    """Let setgroups(2) succeed without effect from here on, for this process and all it starts.
+    """Make setgroups(2) succeed without effect for this process and its children.
 
-    A user namespace made without privilege must deny setgroups, and dropbear calls it at every login; with one user
-    and one group in the namespace there is nothing it could change.
+    An unprivileged user namespace must deny setgroups, but dropbear calls it at every login; with one user and one
+    group in the namespace there is nothing to change.
     """
     machine = _MACHINES[platform.machine()]
     load, jump_if_equal, give = 0x20, 0x15, 0x06
@@ -152,7 +152,7 @@ def accept_setgroups() -> None:
     buffer = ctypes.create_string_buffer(code, len(code))
     header = ctypes.create_string_buffer(struct.pack("HxxxxxxP", len(program), ctypes.addressof(buffer)))
     if _libc.prctl(_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, ctypes.byref(header), 0, 0) != 0:
-        # without CAP_SYS_ADMIN the kernel asks for no_new_privs first
+        # without CAP_SYS_ADMIN the kernel requires no_new_privs
         _check(_libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0), "prctl(PR_SET_NO_NEW_PRIVS)")
         _check(_libc.prctl(_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, ctypes.byref(header), 0, 0), "seccomp")
 

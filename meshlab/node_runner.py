@@ -1,8 +1,7 @@
-"""The process that owns the nodes' namespaces: it starts nodes, ends them, and opens sockets and shells inside them.
+"""The process that owns the nodes' namespaces: it starts and kills nodes, and opens sockets and shells inside them.
 
-It is apart from the supervisor because it must be single-threaded and because a process without privileges that
-entered a node's network namespace cannot go back to the host's. One message per datagram on a socket pair, JSON with
-descriptors beside it:
+It is separate from the supervisor because it must be single-threaded and because an unprivileged process that entered
+a node's network namespace cannot return to the host's. Messages are JSON datagrams with descriptors on a socket pair:
 
     {"do": "boot", "node": N, ...}          -> {"event": "exit", "node": N, "how": H} when the node's process 1 ends
     {"do": "kill", "node": N}
@@ -10,7 +9,7 @@ descriptors beside it:
     {"do": "exec", "id": I, "node": N, "command": C} with stdin, stdout, stderr
                                             -> {"event": "done", "id": I, "status": S}
 
-All nodes die with this process, and it dies with the supervisor.
+All nodes end with this process, and it ends with the supervisor.
 """
 
 from __future__ import annotations
@@ -33,38 +32,38 @@ from meshlab import namespaces as ns
 from meshlab.container import FLAGS, Container, become_node
 from meshlab.errors import LabError
 
-# JSON of one request or event; commands of `lab shell NODE -- ...` are the longest
+# the longest request or event; the longest are commands of `lab shell NODE -- ...`
 MESSAGE_BYTES = 1 << 17
 _SPACES = (("mnt", ns.CLONE_NEWNS), ("net", ns.CLONE_NEWNET), ("uts", ns.CLONE_NEWUTS), ("ipc", ns.CLONE_NEWIPC))
 _SHELL_ENVIRONMENT = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root", "TERM": "vt102", "USER": "root"}
 
 
 @dataclass(slots=True)
-class _Running:
+class _RunningNode:
     pid: int
     pidfd: int
     network: int
     deny_setgroups: bool
 
 
-class Warden:
+class NodeRunner:
     """Serves requests on `channel` until the supervisor closes it.
 
-    `put_devices` gives a new node (its process number) its network devices before its process 1 begins; `take_devices`
-    takes them back when the node (its name, its network namespace as a descriptor) has just ended.
+    `attach_devices` moves a node's network devices to its new namespace (by pid) before its process 1 starts;
+    `detach_devices` takes them back from the namespace (a descriptor) of a node that ended.
     """
 
     def __init__(
         self,
         channel: socket.socket,
-        put_devices: Callable[[Container, int], None] | None = None,
-        take_devices: Callable[[str, int], None] | None = None,
+        attach_devices: Callable[[Container, int], None] | None = None,
+        detach_devices: Callable[[str, int], None] | None = None,
     ) -> None:
         self._channel = channel
-        self._put_devices = put_devices
-        self._take_devices = take_devices
+        self._attach_devices = attach_devices
+        self._detach_devices = detach_devices
         self._selector = selectors.DefaultSelector()
-        self._nodes: dict[str, _Running] = {}
+        self._nodes: dict[str, _RunningNode] = {}
 
     def serve(self) -> None:
         self._selector.register(self._channel, selectors.EVENT_READ, None)
@@ -96,7 +95,7 @@ class Warden:
             case "exec":
                 self._exec(request, descriptors)
 
-    # -- a node's life --
+    # -- boot and exit --
 
     def _boot(self, request: dict[str, Any]) -> None:
         container = Container(
@@ -105,7 +104,7 @@ class Warden:
             overlay_kib=request["overlay_kib"],
             memory_kib=request["memory_kib"],
             deny_setgroups=request["deny_setgroups"],
-            real_devices=self._put_devices is not None,
+            real_devices=self._attach_devices is not None,
         )
         console = os.open(container.home / "console.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
         silence = os.open("/dev/null", os.O_RDONLY | os.O_CLOEXEC)
@@ -123,17 +122,17 @@ class Warden:
             os.close(descriptor)
         pidfd = os.pidfd_open(pid)
         network = os.open(f"/proc/{pid}/ns/net", os.O_RDONLY | os.O_CLOEXEC)
-        self._nodes[container.name] = _Running(pid, pidfd, network, container.deny_setgroups)
+        self._nodes[container.name] = _RunningNode(pid, pidfd, network, container.deny_setgroups)
         self._selector.register(pidfd, selectors.EVENT_READ, lambda: self._ended(container.name, report))
-        self._tell({"event": "started", "node": container.name, "pid": pid})
+        self._send_event({"event": "started", "node": container.name, "pid": pid})
 
     def _open_gate(self, container: Container, pid: int, gate: int, report: int) -> None:
         try:
-            if self._put_devices is not None:
-                self._put_devices(container, pid)
+            if self._attach_devices is not None:
+                self._attach_devices(container, pid)
             os.write(gate, b"\n")
         except LabError as error:
-            # a gate that closes unopened ends the node
+            # a gate that closes without a byte ends the node
             os.write(report, str(error).encode())
 
     def _ended(self, name: str, report: int) -> None:
@@ -141,27 +140,27 @@ class Warden:
         self._selector.unregister(running.pidfd)
         _, status = os.waitpid(running.pid, 0)
         reason = os.read(report, 4096).decode("utf-8", "replace") if _readable(report) else ""
-        if self._take_devices is not None:
-            self._take_devices(name, running.network)
+        if self._detach_devices is not None:
+            self._detach_devices(name, running.network)
         for descriptor in (running.pidfd, running.network, report):
             os.close(descriptor)
-        self._tell({"event": "exit", "node": name, "status": os.waitstatus_to_exitcode(status), "reason": reason})
+        self._send_event({"event": "exit", "node": name, "status": os.waitstatus_to_exitcode(status), "reason": reason})
 
-    # -- reaching into a node --
+    # -- entering a node --
 
     def _dial(self, request: dict[str, Any]) -> None:
         running = self._nodes.get(request["node"])
         if running is None:
-            self._tell({"event": "dialled", "id": request["id"], "error": "off"})
+            self._send_event({"event": "dialled", "id": request["id"], "error": "off"})
             return
         ns.setns(running.network, ns.CLONE_NEWNET)
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as made:
-            self._tell({"event": "dialled", "id": request["id"]}, (made.fileno(),))
+            self._send_event({"event": "dialled", "id": request["id"]}, (made.fileno(),))
 
     def _exec(self, request: dict[str, Any], descriptors: Sequence[int]) -> None:
         running = self._nodes.get(request["node"])
         if running is None:
-            self._tell({"event": "done", "id": request["id"], "status": -1, "reason": "the node is off"})
+            self._send_event({"event": "done", "id": request["id"], "status": -1, "reason": "the node is off"})
             return
         pid = os.fork()
         if pid == 0:
@@ -172,11 +171,11 @@ class Warden:
             self._selector.unregister(pidfd)
             os.close(pidfd)
             _, status = os.waitpid(pid, 0)
-            self._tell({"event": "done", "id": request["id"], "status": os.waitstatus_to_exitcode(status)})
+            self._send_event({"event": "done", "id": request["id"], "status": os.waitstatus_to_exitcode(status)})
 
         self._selector.register(pidfd, selectors.EVENT_READ, done)
 
-    def _tell(self, event: dict[str, Any], descriptors: Sequence[int] = ()) -> None:
+    def _send_event(self, event: dict[str, Any], descriptors: Sequence[int] = ()) -> None:
         socket.send_fds(self._channel, [json.dumps(event).encode()], list(descriptors))
 
 
@@ -184,21 +183,21 @@ def _readable(descriptor: int) -> bool:
     return bool(select.select([descriptor], [], [], 0)[0])
 
 
-def _close_all_but(kept: Sequence[int]) -> None:
-    """Close what the warden had open. A shell may stay for hours, and a descriptor of another node's network would keep
-    that network for as long."""
+def _close_all_except(kept: Sequence[int]) -> None:
+    """Close the runner's descriptors. A shell may run for hours, and a descriptor of another node's network namespace
+    would keep that namespace alive."""
     for descriptor in map(int, os.listdir("/proc/self/fd")):
         if descriptor > 2 and descriptor not in kept:
-            # one of them was that of the listing
+            # one of them belonged to the listing
             with contextlib.suppress(OSError):
                 os.close(descriptor)
 
 
-def _enter_and_run(node: _Running, command: str, descriptors: Sequence[int]) -> None:
-    """In a forked child: enter the node, run `command` in its shell, pass on its exit status."""
+def _enter_and_run(node: _RunningNode, command: str, descriptors: Sequence[int]) -> None:
+    """In a forked child: enter the node, run `command` in its shell, return its exit status."""
     try:
         ns.die_with_parent()
-        _close_all_but(descriptors)
+        _close_all_except(descriptors)
         spaces = [(os.open(f"/proc/{node.pid}/ns/{kind}", os.O_RDONLY), flag) for kind, flag in _SPACES]
         pid_space = os.open(f"/proc/{node.pid}/ns/pid", os.O_RDONLY)
         with contextlib.suppress(FileNotFoundError):
@@ -213,7 +212,7 @@ def _enter_and_run(node: _Running, command: str, descriptors: Sequence[int]) -> 
         for descriptor, flag in spaces:
             ns.setns(descriptor, flag)
         if node.deny_setgroups:
-            # it may restart the SSH server
+            # the command may restart the SSH server
             ns.accept_setgroups()
         os.chdir("/")
         os.setsid()

@@ -1,8 +1,7 @@
-"""The ground under a running fleet: told to the fleet, kept in its directory, changed by one at a time.
+"""The radio environment of a running fleet, kept as `ground.json` in its directory; a lock serializes changes.
 
-`ground_of` reads it, `stand_on` replaces it, `move` changes one node's place, `switch` is a node's power switch and
-`forget` has the others forget its radio: what a mission needs of a fleet. Works for every fleet that
-`VirtualFleet.attach` finds.
+`current_environment` reads it, `set_environment` replaces it, `move` changes one node's position. `set_power` and
+`flush_stations` do the rest of what a scenario does to a fleet. Works for every fleet that `VirtualFleet.attach` finds.
 """
 
 from __future__ import annotations
@@ -16,78 +15,78 @@ from dataclasses import asdict
 from meshlab import propagation_file
 from meshlab.errors import LabError
 from meshlab.fleet import VirtualFleet, VirtualNode
-from meshlab.propagation import Ground, Point, links_of
+from meshlab.propagation import Point, RadioEnvironment, links_of
 from meshlab.state import Power
 
 _FILE_NAME = "ground.json"
 _LOCK_NAME = "ground.lock"
-# of some 250 bytes each, so that a request stays below the 128 KiB of one (`warden.MESSAGE_BYTES`)
-_LINKS_AT_ONCE = 300
-_TOLD_AT_ONCE = 8
+# some 250 bytes each, so that a request stays below 128 KiB (`node_runner.MESSAGE_BYTES`)
+_LINKS_PER_REQUEST = 300
+_PARALLEL_FLUSHES = 8
 
 
-def ground_of(fleet: VirtualFleet) -> Ground:
-    """What the fleet stands on now; the links it was started with when nobody told it anything else."""
+def current_environment(fleet: VirtualFleet) -> RadioEnvironment:
+    """The fleet's radio environment; until one is set, the links it was started with."""
     path = fleet.directory / _FILE_NAME
-    return propagation_file.load(path) if path.exists() else Ground(links=fleet.spec.links)
+    return propagation_file.load(path) if path.exists() else RadioEnvironment(links=fleet.spec.links)
 
 
-def stand_on(fleet: VirtualFleet, ground: Ground) -> None:
-    """From now on who hears whom is as `ground` has it, but for links that were set one by one.
+def set_environment(fleet: VirtualFleet, environment: RadioEnvironment) -> None:
+    """Replace the fleet's links by those of `environment`, except links that were set one by one.
 
-    Nodes that the fleet has not do not count; nodes without a place or a link hear nobody.
+    Nodes outside the fleet are ignored; nodes without a position or a link hear no one.
     """
-    with _alone(fleet):
-        _tell(fleet, ground)
+    with _locked(fleet):
+        _apply(fleet, environment)
 
 
 def move(fleet: VirtualFleet, name: str, to: Point) -> None:
-    """A node is elsewhere now. Raises InputError for a node that has no place on the fleet's ground."""
+    """Move a node. Raises InputError for a node without a position."""
     fleet.spec.node(name)
-    with _alone(fleet):
-        _tell(fleet, ground_of(fleet).moved(name, to))
+    with _locked(fleet):
+        _apply(fleet, current_environment(fleet).with_moved(name, to))
 
 
-def switch(fleet: VirtualFleet, name: str, on: bool) -> None:
-    """A node's power switch: off as after an orderly end, everything in its flash; on without waiting for its boot."""
+def set_power(fleet: VirtualFleet, name: str, on: bool) -> None:
+    """Switch a node off, with everything synced, or on, without waiting for its boot."""
     if on:
         fleet.ask("power_on", node=name)
     elif fleet.node(name).power is not Power.OFF:
         fleet.ask("power_cut", node=name, unsynced="kept", back=False)
 
 
-def forget(fleet: VirtualFleet, name: str) -> None:
-    """Have every other node that is up forget the radios of `name`, as the kernel does by itself within a minute."""
+def flush_stations(fleet: VirtualFleet, name: str) -> None:
+    """Delete the stations of `name` on every other node that is up, as the kernel does by itself within a minute."""
     stations = "; ".join(
         f'iw dev "$dev" station del {radio.mac} 2>/dev/null' for radio in fleet.spec.node(name).radios if radio.mac
     )
     script = f"for dev in $(iw dev | sed -n 's/^[[:space:]]*Interface //p'); do {stations or ':'}; done; true"
 
-    def tell(node: VirtualNode) -> None:
-        # one that goes off or is not up yet knows nobody
+    def flush(node: VirtualNode) -> None:
+        # a node that is going off or not up yet has no stations
         with contextlib.suppress(LabError):
             if node.name != name and node.is_up():
                 node.exec(script)
 
-    with ThreadPoolExecutor(_TOLD_AT_ONCE) as pool:
-        list(pool.map(tell, fleet.nodes))
+    with ThreadPoolExecutor(_PARALLEL_FLUSHES) as pool:
+        list(pool.map(flush, fleet.nodes))
 
 
-def _tell(fleet: VirtualFleet, ground: Ground) -> None:
+def _apply(fleet: VirtualFleet, environment: RadioEnvironment) -> None:
     names = set(fleet.spec.names)
-    links = [asdict(link) for link in links_of(ground) if link.ends <= names]
-    parts = [links[first : first + _LINKS_AT_ONCE] for first in range(0, len(links), _LINKS_AT_ONCE)] or [[]]
+    links = [asdict(link) for link in links_of(environment) if link.ends <= names]
+    parts = [links[first : first + _LINKS_PER_REQUEST] for first in range(0, len(links), _LINKS_PER_REQUEST)] or [[]]
     for number, part in enumerate(parts, 1):
         fleet.ask("links", part=part, is_last=number == len(parts))
     path = fleet.directory / _FILE_NAME
     new = path.with_name(f"{_FILE_NAME}.new")
-    new.write_text(propagation_file.dump(ground), encoding="utf-8")
+    new.write_text(propagation_file.dump(environment), encoding="utf-8")
     new.replace(path)
 
 
 @contextlib.contextmanager
-def _alone(fleet: VirtualFleet) -> Iterator[None]:
-    """Wait until nobody else changes this fleet's ground, and keep others waiting."""
+def _locked(fleet: VirtualFleet) -> Iterator[None]:
+    """Hold the lock on the fleet's radio environment."""
     with (fleet.directory / _LOCK_NAME).open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

@@ -1,8 +1,7 @@
-"""The operator's way in: one listening socket on 127/8 for each address that is reachable at this moment.
+"""Forward ports from 127/8 to the nodes' SSH servers: one listening socket per address that is reachable now.
 
-A socket is closed as soon as its address is not reachable, so connecting there is refused; connections that are open
-then stall, as they do in the field. It is closed, too, while the firewall that the node has loaded lets nobody in; that
-leaves open connections alone.
+When an address becomes unreachable its socket closes, so new connections are refused, and established ones stall, as in
+the field. The socket also closes while the node's firewall rejects SSH; established connections are not affected then.
 """
 
 from __future__ import annotations
@@ -12,28 +11,25 @@ import errno
 import logging
 import random
 import socket
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from meshlab.addresses import FACTORY_ADDRESS, bench_of, loopback_of
 from meshlab.errors import LabError
+from meshlab.fleet_state import FleetState, NodeControl
+from meshlab.link_state import LinkState
 from meshlab.shaped_tunnel import Shape, Tunnel, reset
 from meshlab.spec import Medium
-
-if TYPE_CHECKING:
-    from meshlab.supervisor import Supervisor
 
 log = logging.getLogger("meshlab.port_forwarder")
 _SSH_PORT = 22
 _BACKLOG = 16
-# ports tried for a fleet that asked for none
+# tried in order when the fleet's spec has no port
 _FIRST_PORT, _LAST_PORT = 20022, 20999
 
 
 @dataclass(frozen=True, slots=True)
-class Door:
-    """Where a connection to `host` leads; `bench`: through the LAN port alone."""
+class ForwardedPort:
+    """A connection to `host` is forwarded to `address` of `node`; `bench`: over its LAN port only."""
 
     host: str
     node: str
@@ -41,24 +37,23 @@ class Door:
     bench: bool
 
 
-class Doors:
-    """Keeps the listening sockets in step with what is reachable."""
+class PortForwarder:
+    """Keeps one listening socket open for each reachable address."""
 
-    def __init__(self, fleet: Supervisor) -> None:
+    def __init__(self, fleet: FleetState, link_state: LinkState, control: NodeControl) -> None:
         self._fleet = fleet
-        self._listening: dict[Door, tuple[socket.socket, asyncio.Task[None]]] = {}
+        self._link_state = link_state
+        self._control = control
+        self._listening: dict[ForwardedPort, tuple[socket.socket, asyncio.Task[None]]] = {}
         self._tunnels: set[asyncio.Task[None]] = set()
         self.port = fleet.spec.port
-        self._claim: socket.socket | None = None
-        # the same dice in every fleet: losses are part of the scenario
+        self._port_lock: socket.socket | None = None
+        # a fixed seed, so that losses are the same in every run
         self._dice = random.Random(1)
 
     def open(self) -> None:
-        """Settle on a port; it is held on 127.255.255.254 for as long as the fleet runs.
-
-        Raises LabError when it is taken (or all are).
-        """
-        self._claim, self.port = claim_port(self.port)
+        """Choose a port and hold it on 127.255.255.254 while the fleet runs. Raises LabError when it is in use."""
+        self._port_lock, self.port = claim_port(self.port)
 
     async def close(self) -> None:
         for listener, task in self._listening.values():
@@ -68,69 +63,70 @@ class Doors:
         for task in self._tunnels:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        if self._claim is not None:
-            self._claim.close()
+        if self._port_lock is not None:
+            self._port_lock.close()
 
-    def wanted(self) -> dict[str, Door]:
-        """What is reachable now, by loopback address. Of several nodes with one address the first in order answers."""
-        doors: dict[str, Door] = {}
+    def reachable(self) -> dict[str, ForwardedPort]:
+        """The ports reachable now, by loopback address. If nodes share an address, the first in order gets it."""
+        ports: dict[str, ForwardedPort] = {}
         for name, state in self._fleet.nodes.items():
             if not state.is_running:
                 continue
-            if self._fleet.ether.wire(name, FACTORY_ADDRESS) is not None and state.effective.admits(FACTORY_ADDRESS):
-                door = Door(bench_of(state.number), name, FACTORY_ADDRESS, bench=True)
-                doors[door.host] = door
+            on_bench = self._link_state.bench_shape(name, FACTORY_ADDRESS) is not None
+            if on_bench and state.effective.admits(FACTORY_ADDRESS):
+                port = ForwardedPort(bench_of(state.number), name, FACTORY_ADDRESS, bench=True)
+                ports[port.host] = port
             for address in state.effective.addresses:
-                # many factory devices on one bench: each is told apart by its own port only
+                # factory devices share this address: on the bench each is reached over its own LAN port only
                 if address.address == FACTORY_ADDRESS and state.spec.medium is not Medium.BASE:
                     continue
                 if not address.admitted:
                     continue
                 host = loopback_of(address.address)
-                if host not in doors and self._fleet.ether.way(name, address.address) is not None:
-                    doors[host] = Door(host, name, address.address, bench=False)
-        return doors
+                if host not in ports and self._link_state.path_shape(name, address.address) is not None:
+                    ports[host] = ForwardedPort(host, name, address.address, bench=False)
+        return ports
 
     def refresh(self) -> None:
-        """Open and close sockets until they are what `wanted` says."""
-        wanted = set(self.wanted().values())
-        for door in self._listening.keys() - wanted:
-            listener, task = self._listening.pop(door)
+        """Open and close sockets to match `reachable`."""
+        reachable = set(self.reachable().values())
+        for port in self._listening.keys() - reachable:
+            listener, task = self._listening.pop(port)
             task.cancel()
             listener.close()
-        for door in wanted - self._listening.keys():
+        for port in reachable - self._listening.keys():
             listener = socket.socket()
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
-                listener.bind((door.host, self.port))
+                listener.bind((port.host, self.port))
             except OSError as error:
                 listener.close()
-                log.error("door-taken host=%s port=%d error=%s", door.host, self.port, error)
+                log.error("port-in-use host=%s port=%d error=%s", port.host, self.port, error)
                 continue
             listener.listen(_BACKLOG)
             listener.setblocking(False)
-            self._listening[door] = (listener, asyncio.ensure_future(self._accept(door, listener)))
+            self._listening[port] = (listener, asyncio.ensure_future(self._accept(port, listener)))
 
-    async def _accept(self, door: Door, listener: socket.socket) -> None:
+    async def _accept(self, port: ForwardedPort, listener: socket.socket) -> None:
         loop = asyncio.get_running_loop()
         while True:
             client, _ = await loop.sock_accept(listener)
             client.setblocking(False)
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            task = asyncio.ensure_future(self._serve(door, client))
+            task = asyncio.ensure_future(self._serve(port, client))
             self._tunnels.add(task)
             task.add_done_callback(self._tunnels.discard)
 
-    async def _serve(self, door: Door, client: socket.socket) -> None:
+    async def _serve(self, port: ForwardedPort, client: socket.socket) -> None:
         loop = asyncio.get_running_loop()
-        state = self._fleet.nodes[door.node]
+        state = self._fleet.nodes[port.node]
         boots = state.boots
         if state.hung:
             await self._hang(client)
             return
-        answer, descriptors = await self._fleet.ask_for({"do": "dial", "node": door.node})
+        answer, descriptors = await self._control.request({"do": "dial", "node": port.node})
         if not descriptors:
-            log.info("dial-failed node=%s reason=%s", door.node, answer.get("error"))
+            log.info("dial-failed node=%s reason=%s", port.node, answer.get("error"))
             reset(client)
             client.close()
             return
@@ -138,19 +134,22 @@ class Doors:
         node.setblocking(False)
         node.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
-            await loop.sock_connect(node, (door.address, _SSH_PORT))
+            await loop.sock_connect(node, (port.address, _SSH_PORT))
         except OSError as error:
-            log.info("refused node=%s reason=%s", door.node, errno.errorcode.get(error.errno or 0))
+            log.info("refused node=%s reason=%s", port.node, errno.errorcode.get(error.errno or 0))
             reset(client)
             client.close()
             node.close()
             return
-        way = self._fleet.ether.wire if door.bench else self._fleet.ether.way
-        shape: Callable[[], Shape | None] = lambda: None if state.hung else way(door.node, door.address)  # noqa: E731
-        await Tunnel(client, node, shape, self._fleet.ether.condition, lambda: state.boots == boots, self._dice).run()
+        path_shape = self._link_state.bench_shape if port.bench else self._link_state.path_shape
+
+        def shape() -> Shape | None:
+            return None if state.hung else path_shape(port.node, port.address)
+
+        await Tunnel(client, node, shape, self._link_state.condition, lambda: state.boots == boots, self._dice).run()
 
     async def _hang(self, client: socket.socket) -> None:
-        """Keep the connection and answer nothing until the other side gives up."""
+        """Keep the connection open and send nothing until the client closes it."""
         loop = asyncio.get_running_loop()
         try:
             while await loop.sock_recv(client, 4096):
@@ -162,7 +161,10 @@ class Doors:
 
 
 def claim_port(wanted: int) -> tuple[socket.socket, int]:
-    """A fleet's port, `wanted` or (0) a free one, and what holds it. Raises LabError when it is taken (or all are)."""
+    """A socket that holds the fleet's port, and the port: `wanted`, or a free one for 0.
+
+    Raises LabError when the port (or every port of the range) is in use.
+    """
     for port in (wanted,) if wanted else range(_FIRST_PORT, _LAST_PORT + 1):
         claim = socket.socket()
         try:
@@ -173,4 +175,11 @@ def claim_port(wanted: int) -> tuple[socket.socket, int]:
             claim.close()
             continue
         return claim, port
-    raise LabError(f"port {wanted or f'{_FIRST_PORT}-{_LAST_PORT}'} on 127.255.255.254 is taken by another fleet")
+    if wanted:
+        raise LabError(
+            f"port {wanted} on 127.255.255.254 is in use", hint="another fleet may run; choose another --port"
+        )
+    raise LabError(
+        f"ports {_FIRST_PORT} to {_LAST_PORT} on 127.255.255.254 are all in use",
+        hint="stop another fleet, or choose --port",
+    )

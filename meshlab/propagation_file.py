@@ -1,11 +1,11 @@
-"""A ground as a YAML file: `load` and `parse` read it, `dump` writes one that reads back as the same ground.
+"""A radio environment as a YAML file: `load` and `parse` read it, `dump` writes it so that it reads back equal.
 
-    nodes: {base: [0, 0], b01: {at: [80, 0], tx_power_dbm: 33}}      # metres
+    nodes: {base: [0, 0], b01: {at: [80, 0], tx_power_dbm: 33}}      # meters
     walls: [{a: [40, 10], b: [200, 10], loss_db: 40}]
-    air: {exponent: 3.5}                                             # `ground.Air` has the keys and what they mean
-    links: [{between: [base, b01], loss: 30%, loss_back: 5%}]        # `spec.LinkSpec` has the keys
+    air: {exponent: 3.5}                                             # keys: `propagation.PathLossModel`
+    links: [{between: [base, b01], loss: 30%, loss_back: 5%}]        # keys: `spec.LinkSpec`
 
-A link given by hand holds wherever its nodes are. docs/lab-ground.md explains all of it.
+An explicit link does not depend on its nodes' positions. docs/lab-ground.md describes the format.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from meshlab.propagation import Air, Ground, Place, Wall
+from meshlab.propagation import NodePosition, PathLossModel, RadioEnvironment, Wall
 from meshlab.quality import TQ_MAX
 from meshlab.spec import LinkSpec
-from meshlab.yaml_entries import Entry, entry_of, read
+from meshlab.yaml_entries import YamlEntry, parse_text, read
 
 _LINK_KEYS = tuple(item.name for item in fields(LinkSpec) if item.name not in ("a", "b"))
-# least and most that make sense for each of `Air`'s numbers
-_AIR_BOUNDS = {
+# the plausible range of each number of `PathLossModel`
+_PATH_LOSS_BOUNDS = {
     "tx_power_dbm": (-20.0, 60.0),
     "antenna_gain_dbi": (-20.0, 40.0),
     "frequency_mhz": (100.0, 100_000.0),
@@ -32,27 +32,27 @@ _AIR_BOUNDS = {
 }
 
 
-def load(path: Path) -> Ground:
-    """Read a ground. Raises InvalidInput with every problem found, each with file, line and column."""
-    return _ground_of(read(path))
+def load(path: Path) -> RadioEnvironment:
+    """Read a radio environment. Raises InvalidInput with every problem found, each with file, line and column."""
+    return _environment(read(path))
 
 
-def parse(text: str, file: str) -> Ground:
-    """As `load`, from the file's text; `file` is the name that problems show."""
-    return _ground_of(entry_of(text, file))
+def parse(text: str, file: str) -> RadioEnvironment:
+    """Like `load`, from the file's text; `file` is the file name in problems."""
+    return _environment(parse_text(text, file))
 
 
-def _ground_of(root: Entry) -> Ground:
-    ground = ground_in(root.mapping(("nodes", "walls", "air", "links")))
+def _environment(root: YamlEntry) -> RadioEnvironment:
+    environment = environment_in(root.mapping(("nodes", "walls", "air", "links")))
     if not root.is_there:
         root.problem("a mapping")
     root.finish()
-    return ground
+    return environment
 
 
-def ground_in(keys: dict[str, Entry]) -> Ground:
-    """The ground that the entries `nodes`, `walls`, `air` and `links` describe; problems are noted in them."""
-    places = {name: _place(entry) for name, entry in keys["nodes"].mapping().items()}
+def environment_in(keys: dict[str, YamlEntry]) -> RadioEnvironment:
+    """The radio environment of the entries `nodes`, `walls`, `air` and `links`, which collect the problems."""
+    positions = {name: _position(entry) for name, entry in keys["nodes"].mapping().items()}
     links: dict[frozenset[str], LinkSpec] = {}
     for entry in keys["links"].items():
         link = _link(entry)
@@ -60,35 +60,39 @@ def ground_in(keys: dict[str, Entry]) -> Ground:
             entry.problem("each pair once", f"{link.a}-{link.b} again")
         elif link is not None:
             links[link.ends] = link
-    return Ground(places, tuple(_wall(entry) for entry in keys["walls"].items()), _air(keys["air"]), (*links.values(),))
-
-
-def _place(entry: Entry) -> Place:
-    """`[x, y]`, or `{at: [x, y], tx_power_dbm: 33}`."""
-    if entry.is_list:
-        return Place(entry.point())
-    keys = entry.mapping(("at", "tx_power_dbm"), required=("at",))
-    power = keys["tx_power_dbm"]
-    least, most = _AIR_BOUNDS["tx_power_dbm"]
-    return Place(
-        keys["at"].point() if keys["at"].is_there else (0.0, 0.0),
-        power.number(0.0, least, most) if power.is_there else None,
+    return RadioEnvironment(
+        positions, tuple(_wall(entry) for entry in keys["walls"].items()), _path_loss(keys["air"]), (*links.values(),)
     )
 
 
-def _wall(entry: Entry) -> Wall:
+def _position(entry: YamlEntry) -> NodePosition:
+    """`[x, y]`, or `{at: [x, y], tx_power_dbm: 33}`."""
+    if entry.is_list:
+        return NodePosition(entry.point())
+    keys = entry.mapping(("at", "tx_power_dbm"), required=("at",))
+    power = keys["tx_power_dbm"]
+    minimum, maximum = _PATH_LOSS_BOUNDS["tx_power_dbm"]
+    return NodePosition(
+        keys["at"].point() if keys["at"].is_there else (0.0, 0.0),
+        power.number(0.0, minimum, maximum) if power.is_there else None,
+    )
+
+
+def _wall(entry: YamlEntry) -> Wall:
     keys = entry.mapping(("a", "b", "loss_db"), required=("a", "b"))
     ends = [keys[end].point() if keys[end].is_there else (0.0, 0.0) for end in ("a", "b")]
     return Wall(ends[0], ends[1], keys["loss_db"].number(Wall(ends[0], ends[1]).loss_db, 0.0, 1000.0))
 
 
-def _air(entry: Entry) -> Air:
-    keys = entry.mapping(tuple(_AIR_BOUNDS))
-    standard = asdict(Air())
-    return Air(**{name: keys[name].number(standard[name], *bounds) for name, bounds in _AIR_BOUNDS.items()})
+def _path_loss(entry: YamlEntry) -> PathLossModel:
+    keys = entry.mapping(tuple(_PATH_LOSS_BOUNDS))
+    standard = asdict(PathLossModel())
+    return PathLossModel(
+        **{name: keys[name].number(standard[name], *bounds) for name, bounds in _PATH_LOSS_BOUNDS.items()}
+    )
 
 
-def _link(entry: Entry) -> LinkSpec | None:
+def _link(entry: YamlEntry) -> LinkSpec | None:
     keys = entry.mapping(("between", *_LINK_KEYS), required=("between",))
     ends = [item.text() for item in keys["between"].items()]
     if len(ends) != 2 or ends[0] == ends[1] or not all(ends):
@@ -100,31 +104,31 @@ def _link(entry: Entry) -> LinkSpec | None:
     return LinkSpec(
         ends[0],
         ends[1],
-        tq=keys["tq"].whole(standard.tq, 0, TQ_MAX),
-        signal_dbm=keys["signal_dbm"].whole(standard.signal_dbm, -120, 30),
+        tq=keys["tq"].integer(standard.tq, 0, TQ_MAX),
+        signal_dbm=keys["signal_dbm"].integer(standard.signal_dbm, -120, 30),
         delay_ms=keys["delay_ms"].number(standard.delay_ms, 0.0, 60_000.0),
         loss=keys["loss"].share(standard.loss),
-        rate_kbps=rate.whole(1, 1, 10_000_000) if rate.is_there else None,
+        rate_kbps=rate.integer(1, 1, 10_000_000) if rate.is_there else None,
         up=keys["up"].flag(standard.up),
         loss_back=loss_back.share(0.0) if loss_back.is_there else None,
-        signal_back_dbm=signal_back.whole(0, -120, 30) if signal_back.is_there else None,
+        signal_back_dbm=signal_back.integer(0, -120, 30) if signal_back.is_there else None,
     )
 
 
-def dump(ground: Ground) -> str:
-    """The ground as text that `parse` reads as the same ground; JSON, which is YAML as well."""
+def dump(environment: RadioEnvironment) -> str:
+    """The environment as text that `parse` reads back equal; JSON, which is YAML, too."""
 
     def given(value: Any) -> dict[str, Any]:
         return {key: item for key, item in asdict(value).items() if item is not None}
 
     links = []
-    for link in ground.links:
+    for link in environment.links:
         keys = given(link)
         links.append({"between": [keys.pop("a"), keys.pop("b")], **keys})
     content = {
-        "nodes": {name: given(place) for name, place in ground.places.items()},
-        "walls": [asdict(wall) for wall in ground.walls],
-        "air": asdict(ground.air),
+        "nodes": {name: given(place) for name, place in environment.positions.items()},
+        "walls": [asdict(wall) for wall in environment.walls],
+        "air": asdict(environment.path_loss),
         "links": links,
     }
     return json.dumps(content, indent=1) + "\n"

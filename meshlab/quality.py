@@ -1,7 +1,7 @@
-"""Frame loss on a link <-> BATMAN_IV's transmit quality, as net/batman-adv/bat_iv_ogm.c works it out from OGMs.
+"""Frame loss on a link <-> BATMAN_IV's transmit quality (TQ), as net/batman-adv/bat_iv_ogm.c derives it from OGMs.
 
-A node's quality towards a neighbour is the share of its own OGMs that the neighbour echoes back, less a penalty for
-what it misses of the neighbour: tq = 255 * (1 - loss there) * (1 - loss back ** 3).
+A node's TQ towards a neighbor is the share of its own OGMs that the neighbor echoes back, less a penalty for link
+asymmetry: tq = 255 * (1 - loss there) * (1 - loss back ** 3).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ TQ_MAX = 255
 
 
 def tq_of(loss_there: float, loss_back: float) -> int:
-    """The quality (0..255) of sending over a link that loses these shares (0..1) of frames on its way there and back.
+    """The TQ (0..255) of sending over a link that loses these shares (0..1) of frames in each direction.
 
     Source: `batadv_iv_ogm_calc_tq`, with exact shares instead of a window of 64 OGMs.
     """
@@ -18,7 +18,7 @@ def tq_of(loss_there: float, loss_back: float) -> int:
 
 
 def loss_of(tq: int) -> float:
-    """The loss, the same both ways, that gives a link this quality: to the nearest thousandth, `tq_of` undoes it."""
+    """The symmetric loss, to the nearest thousandth, that gives a link this TQ: the inverse of `tq_of`."""
     low, high = 0.0, 1.0
     while high - low > 1e-6:
         middle = (low + high) / 2

@@ -1,8 +1,7 @@
 """What each OpenWrt release looks like from a shell: versions, package tool, packages of its image.
 
 Version and revision strings are those of the release builds on downloads.openwrt.org; batman-adv's are from
-docs/facts/openwrt-facts.md section 10. Package versions of a virtual image are the release's own number: nothing here
-depends on them.
+docs/facts/openwrt-facts.md section 10. Packages of a virtual image have the release's version: nothing depends on it.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ def facts(release: Release) -> ReleaseFacts:
 
 
 def image_packages(release: Release, extra: tuple[str, ...]) -> tuple[str, ...]:
-    """The packages of an image: the release's own and `extra`, whose `wpad-*` takes the place of wpad-basic."""
+    """The packages of an image: the release's own and `extra`; a `wpad-*` among these replaces wpad-basic."""
     known = _FACTS[release]
     tool = ("apk-mbedtls",) if release.package_tool is PackageTool.APK else ("opkg",)
     scripts = ("wifi-scripts",) if release >= Release.V24_10 else ()
@@ -68,7 +67,7 @@ def image_packages(release: Release, extra: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def firmware_text(release: Release, packages: tuple[str, ...], target: str) -> str:
-    """An image's content as lines `NAME='value'`, as the node's stand-ins source them; without STATE."""
+    """An image's content as shell lines `NAME='value'` for the node's stand-ins; without STATE."""
     known = _FACTS[release]
     tool = release.package_tool
     lines = {

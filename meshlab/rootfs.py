@@ -1,10 +1,10 @@
-"""The read-only part of every node of a fleet: busybox, dropbear, the libraries they need, and the stand-ins.
+"""The read-only root file system that all nodes of a fleet share: busybox, dropbear, their libraries, the stand-ins.
 
-find the programs -> copy them -> take from busybox what OpenWrt's lacks -> check that the shell behaves
+find the programs -> copy them -> remove applets that OpenWrt's busybox does not have -> check the shell
 
-Debian's busybox is a "standalone shell": its ash runs its own applets before it looks at PATH, so no stand-in for
-`sync`, `reboot` or `logread` would ever be called. OpenWrt's is not. Applet names lie in one sorted table of the
-program, so the fleet's copies get the names that must not be found there overwritten, order kept.
+Debian's busybox is a "standalone shell": its ash runs its own applets before it searches PATH, so a stand-in for
+`sync`, `reboot` or `logread` would never run. OpenWrt's is not. Applet names are in one sorted table of the program;
+in the fleet's copies the unwanted names are overwritten in place, keeping the order.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from meshlab.errors import LabError
 
 STAND_INS = Path(__file__).resolve().parent / "node_root"
 
-# applets that stand-ins replace: the fleet's busybox must not answer to these names
+# applets that stand-ins replace: the fleet's busybox must not have these names
 _REPLACED = frozenset({"date", "sync", "fsync", "reboot", "poweroff", "halt", "logread", "logger", "sh", "ash"})
 _APPLETS = STAND_INS / "lab" / "applets"
 _SEARCH_PATHS = ("/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin")
@@ -28,10 +28,10 @@ _SEARCH_PATHS = ("/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "
 def build(
     rom: Path, *, sysroot: Path | None = None, more: Path | None = None, library_folders: Sequence[str] = ()
 ) -> None:
-    """Make the ROM in the new directory `rom`. Raises LabError naming the package that is missing.
+    """Build the ROM in the new directory `rom`. Raises LabError that names a missing package.
 
-    `sysroot`: take the programs from another root of this architecture; the caller then puts the libraries into
-    `library_folders`. `more` is laid over the stand-ins.
+    `sysroot`: copy the programs from another root of this architecture; the caller then copies the libraries into
+    `library_folders`. `more`: a directory of files that replace or extend the stand-ins.
     """
     busybox = find_program("busybox", "busybox-static", sysroot=sysroot)
     dropbear = find_program("dropbear", "dropbear-bin", sysroot=sysroot)
@@ -54,23 +54,23 @@ def build(
 
 
 def find_program(name: str, package: str, *, sysroot: Path | None = None) -> Path:
-    """The program's path. Raises LabError naming Debian's package when it is not installed (in `sysroot`)."""
+    """The program's path. Raises LabError that names the Debian package when it is not installed (in `sysroot`)."""
     places = ":".join(f"{sysroot or ''}{folder}" for folder in _SEARCH_PATHS)
     found = (None if sysroot else shutil.which(name)) or shutil.which(name, path=places)
     if found is None:
-        raise LabError(f"the virtual fleet needs {name}, which is not installed", hint=f"apt install {package}")
+        raise LabError(f"the virtual fleet needs {name}, which is not installed", hint=f"run `apt install {package}`")
     return Path(found).resolve()
 
 
 def library_paths(program: Path) -> tuple[str, ...]:
-    """The absolute paths of the shared libraries and the loader that `program` needs; empty for a static one."""
+    """The absolute paths of the shared libraries and the loader of `program`; empty for a static one."""
     listed = subprocess.run(["ldd", str(program)], capture_output=True, text=True, check=False)
     paths = re.findall(r"(?:=> |^\s*)(/\S+) \(0x", listed.stdout, re.MULTILINE)
     return tuple(dict.fromkeys(paths))
 
 
 def library_folders(rom: Path) -> tuple[str, ...]:
-    """The folders of libraries in the ROM, relative to the root, as `_copy_libraries` noted them."""
+    """The library folders in the ROM, relative to its root, as `build` recorded them."""
     return tuple((rom / "lab" / "library_folders").read_text(encoding="utf-8").split())
 
 
@@ -91,11 +91,11 @@ def _note_library_folders(folders: Iterable[str], rom: Path) -> None:
 def _install_busybox(busybox: Path, rom: Path) -> None:
     image = busybox.read_bytes()
     names = subprocess.run([str(busybox), "--list"], capture_output=True, text=True, check=True).stdout.split()
-    # each is called busybox, because that is how it knows that the next word names the applet
+    # each is called busybox: only under that name does it take the applet from its first argument
     shell, tools, genuine = (rom / "lab" / use / "busybox" for use in ("shell", "tools", "genuine"))
     for program in (shell, tools, genuine):
         program.parent.mkdir()
-    # for the stand-ins themselves
+    # used by the stand-ins
     shutil.copy2(busybox, genuine)
     applets = _applets()
     if _is_standalone(busybox):
@@ -108,7 +108,10 @@ def _install_busybox(busybox: Path, rom: Path) -> None:
     shell.chmod(0o755)
     tools.chmod(0o755)
     if _is_standalone(shell):
-        raise LabError(f"the shell of {busybox} runs its own applets whatever PATH says", hint="install busybox-static")
+        raise LabError(
+            f"the shell of {busybox} runs its own applets before it searches PATH",
+            hint="run `apt install busybox-static`",
+        )
     present = set(names)
     for name in applets:
         use = "shell" if name in ("sh", "ash") else "tools"
@@ -124,7 +127,7 @@ def _applets() -> list[str]:
 
 
 def _is_standalone(shell: Path) -> bool:
-    """Whether this busybox's ash finds `cat` with nothing in PATH."""
+    """Whether this busybox's ash finds `cat` with an empty PATH."""
     found = subprocess.run(
         [str(shell), "ash", "-c", "PATH=/nonexistent; cat /dev/null"], capture_output=True, check=False
     )
@@ -134,13 +137,15 @@ def _is_standalone(shell: Path) -> bool:
 def without_applets(image: bytes, names: Sequence[str], hidden: Iterable[str], *, keep: Sequence[str]) -> bytes:
     """The busybox `image` with the applets `hidden` renamed, so that no lookup finds them.
 
-    The table of `names` is searched by comparison, so a new name must stay on the same side of every name in `keep`.
-    Raises LabError when the table is not in the image as `busybox --list` prints it.
+    Lookups are a binary search in the table of `names`, so a new name must sort like the old one relative to every
+    name in `keep`. Raises LabError when the image does not contain the table that `busybox --list` prints.
     """
     table = b"\0".join(name.encode() for name in names) + b"\0"
     start = image.find(table)
     if start < 0:
-        raise LabError("this busybox keeps its applet names in another way than known", hint="install busybox-static")
+        raise LabError(
+            "the table of applet names was not found in this busybox", hint="run `apt install busybox-static`"
+        )
     hidden = set(hidden)
     renamed = b"".join((_renamed(name, keep) if name in hidden else name.encode()) + b"\0" for name in names)
     return image[:start] + renamed + image[start + len(table) :]
@@ -152,5 +157,5 @@ def _renamed(name: str, keep: Sequence[str]) -> bytes:
         new = own[:-1] + bytes((ending,))
         if all(new != other.encode() and (new < other.encode()) == (name < other) for other in keep):
             return new
-    # a name of one letter (`[`, `w`) may fit nowhere; ash has `[` built in, and nothing here is called `w`
+    # a one-letter name (`[`, `w`) may not fit; ash has `[` built in, and `w` is not used
     return own

@@ -1,8 +1,8 @@
-"""A mission: robots that drive along way points over a ground and drop the beacons they carry. Values and time alone.
+"""A scenario: robots drive along waypoints and deploy the beacons they carry. Pure.
 
-`scene(mission, t)` is the fleet at mission time `t`: the ground with everybody in place, and who has power.
-`agenda(mission)` is everything that happens, in order: arrivals, drops, radios that go off and on, links that come and
-go, and who loses and regains the base. `mission_file` reads missions, `mission_run` plays them on a fleet.
+`snapshot(scenario, t)` is the fleet at scenario time `t`: the positions of all nodes, and which nodes have power.
+`timeline(scenario)` is the sequence of all events: arrivals, deployments, power changes, links that come and go, nodes
+that lose and regain the base. `scenario_file` reads scenarios, `scenario_run` plays them on a fleet.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from enum import Enum
 from types import MappingProxyType
 
 from meshctl.topology import Link, graph_of
-from meshlab.propagation import Ground, Place, Point, links_of
+from meshlab.propagation import NodePosition, Point, RadioEnvironment, links_of
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
-    """A path over the ground: at `times_s[i]` the robot is at `points[i]`, in between on the straight line."""
+class Trajectory:
+    """At `times_s[i]` the robot is at `points[i]`; in between it moves on the straight line."""
 
     times_s: tuple[float, ...]
     points: tuple[Point, ...]
 
     def at(self, t: float) -> Point:
-        """Before the first time it stands at the first point, after the last at the last."""
+        """The position at time `t`: the first point before the first time, the last point after the last."""
         index = bisect_right(self.times_s, t)
         if index == 0:
             return self.points[0]
@@ -39,54 +39,54 @@ class Course:
 
 
 @dataclass(frozen=True, slots=True)
-class Drop:
-    """A beacon rides with `by`, without power, until it is dropped and switched on at `at_s`."""
+class Deployment:
+    """A beacon moves with `carrier`, without power, until it is deployed and powered on at `at_s`."""
 
-    by: str
+    carrier: str
     at_s: float
 
 
 @dataclass(frozen=True, slots=True)
-class Incident:
-    """A node's radio goes off or on at `at_s`."""
+class PowerEvent:
+    """A node is powered on or off at `at_s`."""
 
     at_s: float
-    who: str
+    node: str
     on: bool
 
 
 @dataclass(frozen=True, slots=True)
-class Mission:
-    """`robots` drive, `beacons` are carried and dropped, both by node name; everybody else stands where `ground` says.
+class Scenario:
+    """`robots` move and `beacons` are deployed, by node name; the others stay where `environment` has them.
 
-    `step_s` is how often the fleet's links follow the robots, in mission time; `base` is where the operator sits.
+    `step_s` is the interval at which the links follow the robots, in scenario time; the operator is at `base`.
     """
 
     name: str
     base: str
-    ground: Ground
+    environment: RadioEnvironment
     duration_s: float
     step_s: float = 1.0
-    robots: Mapping[str, Course] = field(default_factory=lambda: MappingProxyType({}))
-    beacons: Mapping[str, Drop] = field(default_factory=lambda: MappingProxyType({}))
-    incidents: tuple[Incident, ...] = ()
+    robots: Mapping[str, Trajectory] = field(default_factory=lambda: MappingProxyType({}))
+    beacons: Mapping[str, Deployment] = field(default_factory=lambda: MappingProxyType({}))
+    power_events: tuple[PowerEvent, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Every node that takes part, sorted."""
-        return tuple(sorted({self.base, *self.ground.names, *self.robots, *self.beacons}))
+        """Every node of the scenario, sorted."""
+        return tuple(sorted({self.base, *self.environment.names, *self.robots, *self.beacons}))
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
-    """The fleet at one moment: everybody in place, and the nodes that have power."""
+class Snapshot:
+    """The fleet at one moment: all positions, and the nodes with power."""
 
-    ground: Ground
+    environment: RadioEnvironment
     powered: frozenset[str]
 
 
-class Happening(Enum):
-    """The value is the word in the output; `Event.other` is the node at the other end, or the beacon's robot."""
+class EventKind(Enum):
+    """The value is the name in the output; `Event.peer` is the node at the other end, or the beacon's carrier."""
 
     ARRIVES = "arrives"
     DROPPED = "dropped"
@@ -101,99 +101,107 @@ class Happening(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happens to `who` at mission time `at_s`; `place` where that says something."""
+    """An event of `node` at scenario time `at_s`; `position` for arrivals and deployments."""
 
     at_s: float
-    what: Happening
-    who: str
-    other: str = ""
-    place: Point | None = None
+    kind: EventKind
+    node: str
+    peer: str = ""
+    position: Point | None = None
 
 
-def scene(mission: Mission, t: float) -> Scene:
-    """Everybody's place and power at mission time `t`."""
-    places = dict(mission.ground.places)
+def snapshot(scenario: Scenario, t: float) -> Snapshot:
+    """The positions and power of all nodes at scenario time `t`."""
+    positions = dict(scenario.environment.positions)
 
     def put(name: str, at: Point) -> None:
-        places[name] = replace(places[name], at=at) if name in places else Place(at)
+        positions[name] = replace(positions[name], at=at) if name in positions else NodePosition(at)
 
-    for name, course in mission.robots.items():
-        put(name, course.at(t))
-    for name, drop in mission.beacons.items():
-        put(name, _carrier_at(mission, drop, min(t, drop.at_s)))
-    off = {name for name, drop in mission.beacons.items() if t < drop.at_s}
-    for incident in sorted(mission.incidents, key=lambda one: one.at_s):
-        if incident.at_s <= t and incident.on and not _is_carried(mission, incident.who, t):
-            off.discard(incident.who)
-        elif incident.at_s <= t and not incident.on:
-            off.add(incident.who)
-    return Scene(replace(mission.ground, places=places), frozenset(mission.names) - off)
-
-
-def _carrier_at(mission: Mission, drop: Drop, t: float) -> Point:
-    course = mission.robots.get(drop.by)
-    return course.at(t) if course is not None else mission.ground.places[drop.by].at
+    for name, trajectory in scenario.robots.items():
+        put(name, trajectory.at(t))
+    for name, deployment in scenario.beacons.items():
+        put(name, _carrier_at(scenario, deployment, min(t, deployment.at_s)))
+    off = {name for name, drop in scenario.beacons.items() if t < drop.at_s}
+    for event in sorted(scenario.power_events, key=lambda one: one.at_s):
+        if event.at_s <= t and event.on and not _is_carried(scenario, event.node, t):
+            off.discard(event.node)
+        elif event.at_s <= t and not event.on:
+            off.add(event.node)
+    return Snapshot(replace(scenario.environment, positions=positions), frozenset(scenario.names) - off)
 
 
-def _is_carried(mission: Mission, name: str, t: float) -> bool:
-    drop = mission.beacons.get(name)
-    return drop is not None and t < drop.at_s
+def _carrier_at(scenario: Scenario, deployment: Deployment, t: float) -> Point:
+    carrier = scenario.robots.get(deployment.carrier)
+    return carrier.at(t) if carrier is not None else scenario.environment.positions[deployment.carrier].at
 
 
-def agenda(mission: Mission) -> tuple[Event, ...]:
-    """Everything that happens from 0 to the mission's end, by time; links and reach are looked at every `step_s`."""
-    planned = sorted(_planned(mission), key=lambda event: event.at_s)
+def _is_carried(scenario: Scenario, name: str, t: float) -> bool:
+    deployment = scenario.beacons.get(name)
+    return deployment is not None and t < deployment.at_s
+
+
+def timeline(scenario: Scenario) -> tuple[Event, ...]:
+    """All events from 0 to the scenario's end, by time; links and reachability are sampled every `step_s`."""
+    planned = sorted(_planned(scenario), key=lambda event: event.at_s)
     events: list[Event] = []
-    joined: frozenset[tuple[str, str]] | None = None
-    reached: frozenset[str] = frozenset()
-    for t in _moments(mission, planned):
+    connected: frozenset[tuple[str, str]] | None = None
+    reachable_before: frozenset[str] = frozenset()
+    for t in _sample_times(scenario, planned):
         events += [event for event in planned if event.at_s == t]
-        now = scene(mission, t)
-        pairs = _pairs(now)
-        within = graph_of(now.powered, [Link(a, b) for a, b in pairs]).reachable(mission.base)
-        if joined is not None:
-            events += [Event(t, Happening.LINK_UP, *pair) for pair in sorted(pairs - joined)]
-            events += [Event(t, Happening.LINK_DOWN, *pair) for pair in sorted(joined - pairs)]
-            events += [Event(t, Happening.REACHED, name) for name in sorted(within - reached)]
-            # who has no power is told as off, not as cut off
-            events += [Event(t, Happening.CUT_OFF, name) for name in sorted((reached - within) & now.powered)]
-        joined, reached = pairs, within
-    return (*events, Event(mission.duration_s, Happening.END, mission.base))
+        now = snapshot(scenario, t)
+        pairs = _connected_pairs(now)
+        reachable = graph_of(now.powered, [Link(a, b) for a, b in pairs]).reachable(scenario.base)
+        if connected is not None:
+            events += [Event(t, EventKind.LINK_UP, *pair) for pair in sorted(pairs - connected)]
+            events += [Event(t, EventKind.LINK_DOWN, *pair) for pair in sorted(connected - pairs)]
+            events += [Event(t, EventKind.REACHED, name) for name in sorted(reachable - reachable_before)]
+            # a node without power is off, not cut off
+            events += [
+                Event(t, EventKind.CUT_OFF, name) for name in sorted((reachable_before - reachable) & now.powered)
+            ]
+        connected, reachable_before = pairs, reachable
+    return (*events, Event(scenario.duration_s, EventKind.END, scenario.base))
 
 
-def _planned(mission: Mission) -> Iterator[Event]:
-    """What the mission's file says will happen, within its duration."""
-    for name, course in mission.robots.items():
-        for at_s, place in zip(course.times_s, course.points, strict=True):
-            if 0 < at_s <= mission.duration_s:
-                yield Event(at_s, Happening.ARRIVES, name, place=place)
-    for name, drop in mission.beacons.items():
-        if 0 < drop.at_s <= mission.duration_s:
-            yield Event(drop.at_s, Happening.DROPPED, name, drop.by, _carrier_at(mission, drop, drop.at_s))
-    for incident in mission.incidents:
-        if 0 < incident.at_s <= mission.duration_s:
-            yield Event(incident.at_s, Happening.ON if incident.on else Happening.OFF, incident.who)
+def _planned(scenario: Scenario) -> Iterator[Event]:
+    """The events that the scenario specifies, within its duration."""
+    for name, robot in scenario.robots.items():
+        for at_s, place in zip(robot.times_s, robot.points, strict=True):
+            if 0 < at_s <= scenario.duration_s:
+                yield Event(at_s, EventKind.ARRIVES, name, position=place)
+    for name, deployment in scenario.beacons.items():
+        if 0 < deployment.at_s <= scenario.duration_s:
+            yield Event(
+                deployment.at_s,
+                EventKind.DROPPED,
+                name,
+                deployment.carrier,
+                _carrier_at(scenario, deployment, deployment.at_s),
+            )
+    for event in scenario.power_events:
+        if 0 < event.at_s <= scenario.duration_s:
+            yield Event(event.at_s, EventKind.ON if event.on else EventKind.OFF, event.node)
 
 
-def _moments(mission: Mission, planned: Sequence[Event]) -> list[float]:
-    """When to look: at every step, and whenever something is planned."""
-    count = int(mission.duration_s / mission.step_s)
-    steps = (number * mission.step_s for number in range(count + 1))
-    return sorted({*steps, *(event.at_s for event in planned), mission.duration_s})
+def _sample_times(scenario: Scenario, planned: Sequence[Event]) -> list[float]:
+    """The times to sample: every step, and every planned event."""
+    count = int(scenario.duration_s / scenario.step_s)
+    steps = (number * scenario.step_s for number in range(count + 1))
+    return sorted({*steps, *(event.at_s for event in planned), scenario.duration_s})
 
 
-def _pairs(now: Scene) -> frozenset[tuple[str, str]]:
-    """Who can talk to whom: both have power and neither is deaf to the other."""
+def _connected_pairs(now: Snapshot) -> frozenset[tuple[str, str]]:
+    """The pairs of nodes that have power and hear each other in both directions."""
     return frozenset(
         (min(link.ends), max(link.ends))
-        for link in links_of(now.ground)
+        for link in links_of(now.environment)
         if link.up and link.ends <= now.powered and max(link.loss_to(link.a), link.loss_to(link.b)) < 1.0
     )
 
 
-def course(way_points: Sequence[tuple[float, Point]]) -> Course:
-    """A course through (seconds, place) pairs; raises ValueError unless there is one and the times rise."""
-    times = tuple(time_s for time_s, _ in way_points)
+def trajectory(waypoints: Sequence[tuple[float, Point]]) -> Trajectory:
+    """A trajectory through (seconds, point) pairs. Raises ValueError unless there is one and times increase."""
+    times = tuple(time_s for time_s, _ in waypoints)
     if not times or any(later <= earlier for earlier, later in itertools.pairwise(times)):
-        raise ValueError("way points: expected at least one, with rising times")
-    return Course(times, tuple(point for _, point in way_points))
+        raise ValueError("waypoints: expected at least one, with increasing times")
+    return Trajectory(times, tuple(point for _, point in waypoints))

@@ -1,6 +1,6 @@
-"""Playing a mission on a running fleet: each step puts everybody in place, each event is told and done when it is due.
+"""Play a scenario on a running fleet: each step updates the links, each event is reported and applied when it is due.
 
-`play` takes the clock, the waiting and the fleet as arguments; `stage_of` makes a running fleet such a stage.
+`play` takes the clock, the wait function and the target as arguments; `FleetTarget` is a running fleet as the target.
 """
 
 from __future__ import annotations
@@ -11,41 +11,41 @@ from typing import Protocol
 
 from meshlab import placement
 from meshlab.fleet import VirtualFleet
-from meshlab.propagation import Ground, links_of
-from meshlab.scenario import Event, Happening, Mission, agenda, scene
+from meshlab.propagation import RadioEnvironment, links_of
+from meshlab.scenario import Event, EventKind, Scenario, snapshot, timeline
 
-# links follow the robots at most so often in real time: a fast replay takes bigger steps
-_LEAST_STEP_S = 0.2
-# Mission time without power after which nobody knows a node's radio any more when it is back: an ad-hoc cell of Linux
-# forgets within a minute, and a board takes most of that to boot, which a node of the lab does not. Before that its
-# neighbours go on with the numbers it had, and are half deaf to it (docs/lab.md).
-FORGOTTEN_S = 20.0
+# the shortest step in real time: a fast replay takes longer steps in scenario time
+_MIN_STEP_S = 0.2
+# Scenario time without power after which a node's neighbors have dropped its station entries when it is back. Linux
+# drops an ad-hoc station within a minute, most of which a real board takes to boot; a node of the lab boots in seconds.
+# After a shorter time, neighbors keep the old sequence numbers and drop its unicast frames (docs/lab.md).
+STATION_EXPIRY_S = 20.0
 
 
-class Stage(Protocol):
-    """What a mission needs of a fleet."""
+class ScenarioTarget(Protocol):
+    """What a scenario needs from a fleet."""
 
     @property
     def names(self) -> tuple[str, ...]:
         """The fleet's nodes."""
         ...
 
-    def stand_on(self, ground: Ground) -> None:
-        """From now on who hears whom is as this ground has it."""
+    def set_environment(self, environment: RadioEnvironment) -> None:
+        """Replace the fleet's links by those of `environment`."""
         ...
 
-    def switch(self, name: str, on: bool) -> None:
-        """A node's power switch; no matter when it is in that position already."""
+    def set_power(self, name: str, on: bool) -> None:
+        """Power a node on or off; does nothing when it is already."""
         ...
 
-    def forget(self, name: str) -> None:
-        """Nobody knows the node's radio any more: so long has it been away, as time passes in the mission."""
+    def flush_stations(self, name: str) -> None:
+        """Delete the node's station entries on all other nodes: it was off for longer than these last."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
-class FleetStage:
-    """A running fleet as a stage."""
+class FleetTarget:
+    """A running fleet as the target."""
 
     fleet: VirtualFleet
 
@@ -53,86 +53,86 @@ class FleetStage:
     def names(self) -> tuple[str, ...]:
         return self.fleet.spec.names
 
-    def stand_on(self, ground: Ground) -> None:
-        placement.stand_on(self.fleet, ground)
+    def set_environment(self, environment: RadioEnvironment) -> None:
+        placement.set_environment(self.fleet, environment)
 
-    def switch(self, name: str, on: bool) -> None:
-        placement.switch(self.fleet, name, on)
+    def set_power(self, name: str, on: bool) -> None:
+        placement.set_power(self.fleet, name, on)
 
-    def forget(self, name: str) -> None:
-        placement.forget(self.fleet, name)
+    def flush_stations(self, name: str) -> None:
+        placement.flush_stations(self.fleet, name)
 
 
 def play(
-    mission: Mission,
-    stage: Stage,
+    scenario: Scenario,
+    target: ScenarioTarget,
     *,
-    tell: Callable[[Event], None],
+    on_event: Callable[[Event], None],
     clock: Callable[[], float],
     wait: Callable[[float], None],
     speed: float = 1.0,
     start_s: float = 0.0,
 ) -> float | None:
-    """Play the mission from `start_s` on, `speed` times as fast as `clock` goes; nodes the fleet has not do nothing.
+    """Play the scenario from `start_s` on at `speed` times the speed of `clock`; nodes outside the fleet are skipped.
 
-    At the start everybody is put in place, and carried beacons are switched off. `tell` gets every event from there on,
-    in order. Returns None at the mission's end; when a KeyboardInterrupt came, the mission time at which it stopped:
-    everything then stays as it is, and can be taken up from there.
+    At the start all nodes are placed, and carried beacons are powered off. `on_event` gets every later event in order.
+    Returns None at the scenario's end. A KeyboardInterrupt stops it: the fleet stays as it is, and the scenario time
+    is returned, from which it can be continued.
     """
-    there = frozenset(stage.names)
-    events = [event for event in agenda(mission) if event.at_s > start_s]
-    off_s = _off_since(mission, start_s)
+    present = frozenset(target.names)
+    events = [event for event in timeline(scenario) if event.at_s > start_s]
+    off_s = _off_since(scenario, start_s)
     now_s = start_s
     try:
-        _put(mission, stage, start_s, there)
-        links = links_of(scene(mission, start_s).ground)
-        begun = clock()
+        _apply_snapshot(scenario, target, start_s, present)
+        links = links_of(snapshot(scenario, start_s).environment)
+        started = clock()
         while events:
-            wait(max(_LEAST_STEP_S, mission.step_s / speed))
-            # never past the end: the last step puts everybody where the mission leaves them
-            now_s = min(mission.duration_s, start_s + (clock() - begun) * speed)
-            now = scene(mission, now_s)
-            if links_of(now.ground) != links:
-                links = links_of(now.ground)
-                stage.stand_on(now.ground)
+            wait(max(_MIN_STEP_S, scenario.step_s / speed))
+            # never past the end: the last step applies the final positions
+            now_s = min(scenario.duration_s, start_s + (clock() - started) * speed)
+            now = snapshot(scenario, now_s)
+            if links_of(now.environment) != links:
+                links = links_of(now.environment)
+                target.set_environment(now.environment)
             while events and events[0].at_s <= now_s:
                 event = events.pop(0)
-                tell(event)
-                if event.who in there:
-                    _do(event, stage, off_s)
+                on_event(event)
+                if event.node in present:
+                    _apply_event(event, target, off_s)
     except KeyboardInterrupt:
         return now_s
     return None
 
 
-def _off_since(mission: Mission, t: float) -> dict[str, float]:
-    """Who has no power at `t`, and since when; whoever is carried has been away since long before."""
-    off_s = {name: float("-inf") for name in mission.beacons}
-    for event in agenda(mission):
-        if event.at_s <= t and event.what is Happening.OFF:
-            off_s[event.who] = event.at_s
-        elif event.at_s <= t and event.what in (Happening.DROPPED, Happening.ON):
-            off_s.pop(event.who, None)
+def _off_since(scenario: Scenario, t: float) -> dict[str, float]:
+    """The nodes without power at `t`, and since when; a carried beacon has been off since before the start."""
+    off_s = {name: float("-inf") for name in scenario.beacons}
+    for event in timeline(scenario):
+        if event.at_s <= t and event.kind is EventKind.OFF:
+            off_s[event.node] = event.at_s
+        elif event.at_s <= t and event.kind in (EventKind.DROPPED, EventKind.ON):
+            off_s.pop(event.node, None)
     return off_s
 
 
-def _put(mission: Mission, stage: Stage, t: float, there: frozenset[str]) -> None:
-    """Everybody's place and power as the mission has it at `t`, whatever they were before."""
-    now = scene(mission, t)
-    stage.stand_on(now.ground)
-    for name in mission.names:
-        if name in there:
-            stage.switch(name, name in now.powered)
+def _apply_snapshot(scenario: Scenario, target: ScenarioTarget, t: float, present: frozenset[str]) -> None:
+    """Apply all positions and power states at `t`, whatever they were before."""
+    now = snapshot(scenario, t)
+    target.set_environment(now.environment)
+    for name in scenario.names:
+        if name in present:
+            target.set_power(name, name in now.powered)
 
 
-def _do(event: Event, stage: Stage, off_s: dict[str, float]) -> None:
-    match event.what:
-        case Happening.DROPPED | Happening.ON:
-            if event.at_s - off_s.pop(event.who, event.at_s) >= FORGOTTEN_S:
-                stage.forget(event.who)
-            stage.switch(event.who, True)
-        case Happening.OFF:
-            off_s[event.who] = event.at_s
-            stage.switch(event.who, False)
+def _apply_event(event: Event, target: ScenarioTarget, off_s: dict[str, float]) -> None:
+    match event.kind:
+        case EventKind.DROPPED | EventKind.ON:
+            if event.at_s - off_s.pop(event.node, event.at_s) >= STATION_EXPIRY_S:
+                target.flush_stations(event.node)
+            target.set_power(event.node, True)
+        case EventKind.OFF:
+            off_s[event.node] = event.at_s
+            target.set_power(event.node, False)
         case _:
             pass

@@ -1,7 +1,7 @@
-"""One TCP connection of the operator carried into a node, over links that may be slow, lossy or cut at any moment.
+"""Forward one TCP connection of the operator to a node, over links that may be slow, lossy or cut at any moment.
 
-A cut link does not close a connection, it stops it: bytes wait until there is a path again. So does the death of a
-node: the operator learns of it when the node is back and answers with a reset, or by its own deadline.
+A cut link does not close the connection but stalls it: bytes wait until there is a path again. So does a node that
+loses power: the operator notices when the node is back and resets the connection, or by its own timeout.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from dataclasses import dataclass
 
 _CHUNK_BYTES = 16 * 1024
 _PACKET_BYTES = 1448
-# Linux' least retransmission timeout
+# Linux's minimum retransmission timeout
 _RETRANSMIT_S = 0.2
-# what may be on its way in one direction, so that a slow link slows its sender down
+# chunks in flight per direction: the limit that makes a slow link slow its sender down
 _IN_FLIGHT_CHUNKS = 16
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """What a path does to packets: one-way delay, loss 0..1, bytes per second (None: unlimited)."""
+    """One-way delay, loss 0..1 and rate in bytes per second (None: unlimited) of a path."""
 
     delay_s: float = 0.0
     loss: float = 0.0
     rate_bytes_s: float | None = None
 
     def hold_s(self, size: int, dice: random.Random) -> float:
-        """How long `size` bytes take: the wire's rate, and one retransmission timeout for each packet lost."""
+        """The time for `size` bytes at the path's rate, plus one retransmission timeout per lost packet."""
         lost = sum(dice.random() < self.loss for _ in range(-(-size // _PACKET_BYTES))) if self.loss else 0
         return (size / self.rate_bytes_s if self.rate_bytes_s else 0.0) + lost * (_RETRANSMIT_S + 2 * self.delay_s)
 
 
 class Tunnel:
-    """Carries bytes between `client` and `node` until both directions ended, the node reset it, or `abort`.
+    """Forwards bytes between `client` and `node` until both directions ended or the node reset the connection.
 
-    `shape()` gives the path at this moment, None while it is cut; `changed` is notified when that may be different;
-    `is_same_boot()` tells whether the node is still the one that was connected to.
+    `shape()` returns the current path, None while it is cut; `changed` is notified when it may have changed;
+    `is_same_boot()` is false once the node has restarted since the connection was made.
     """
 
     def __init__(
@@ -60,10 +60,10 @@ class Tunnel:
         self._dice = dice
 
     async def run(self) -> None:
-        """Returns when the connection is over; closes both sockets."""
+        """Forward until the connection ends; closes both sockets."""
         tasks = [
-            asyncio.ensure_future(self._carry(self._client, self._node, from_node=False)),
-            asyncio.ensure_future(self._carry(self._node, self._client, from_node=True)),
+            asyncio.ensure_future(self._forward(self._client, self._node, from_node=False)),
+            asyncio.ensure_future(self._forward(self._node, self._client, from_node=True)),
         ]
         try:
             await asyncio.gather(*tasks)
@@ -76,7 +76,7 @@ class Tunnel:
             self._client.close()
             self._node.close()
 
-    async def _carry(self, source: socket.socket, target: socket.socket, *, from_node: bool) -> None:
+    async def _forward(self, source: socket.socket, target: socket.socket, *, from_node: bool) -> None:
         loop = asyncio.get_running_loop()
         flying: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(_IN_FLIGHT_CHUNKS)
 
@@ -91,7 +91,7 @@ class Tunnel:
                     data = b""
                 shape = await self._path()
                 if from_node and not data and not self._is_same_boot():
-                    raise ConnectionResetError("the node has been off in between")
+                    raise ConnectionResetError("the node has restarted")
                 line_free = max(line_free, loop.time()) + shape.hold_s(len(data), self._dice)
                 await flying.put((line_free + shape.delay_s, data))
                 if not data:
@@ -103,7 +103,7 @@ class Tunnel:
                 await asyncio.sleep(max(0.0, due - loop.time()))
                 await self._path()
                 if not from_node and not self._is_same_boot():
-                    raise ConnectionResetError("the node has been off in between")
+                    raise ConnectionResetError("the node has restarted")
                 if not data:
                     with contextlib.suppress(OSError):
                         target.shutdown(socket.SHUT_WR)
@@ -119,7 +119,7 @@ class Tunnel:
             await asyncio.gather(*halves, return_exceptions=True)
 
     async def _path(self) -> Shape:
-        """The path, once there is one."""
+        """Wait until there is a path; returns it."""
         shape = self._shape()
         while shape is None:
             async with self._changed:
@@ -129,6 +129,6 @@ class Tunnel:
 
 
 def reset(connection: socket.socket) -> None:
-    """Close with a TCP reset instead of an orderly end."""
+    """Make close() send a TCP reset."""
     with contextlib.suppress(OSError):
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))

@@ -1,7 +1,6 @@
-"""What a virtual fleet consists of: nodes, radios, links, as frozen values that travel as JSON.
+"""The spec of a virtual fleet: nodes, radios and links, as frozen values that convert to JSON and back without loss.
 
-A spec is made from an inventory (`twin.spec_of`) or by hand in a test; the supervisor reads it from the fleet's
-directory, so everything here converts to JSON and back without loss.
+A spec comes from an inventory (`from_inventory.spec_of`) or a test; the supervisor reads it from the fleet's directory.
 """
 
 from __future__ import annotations
@@ -16,24 +15,24 @@ from meshctl.errors import InputError
 from meshctl.model import Release
 from meshlab.quality import TQ_MAX, tq_of
 
-# what an image needs to take part in an encrypted mesh (openwrt-facts.md section 10)
+# the packages an image needs for an encrypted mesh (openwrt-facts.md section 10)
 MESH_PACKAGES = ("kmod-batman-adv", "batctl-default", "wpad-openssl")
 
 
 class Medium(Enum):
     """How the operator's machine is wired to a node's LAN port."""
 
-    # not wired: reached through the mesh alone
+    # not wired: reached only over the mesh
     NONE = "none"
-    # on the bench: its LAN port is plugged into the operator's machine, whatever address it has
+    # on the bench: its LAN port is connected to the operator's machine, whatever its address
     BENCH = "bench"
-    # the base: the operator's machine sits on its LAN, and reaches the mesh through it
+    # the base: the operator's machine is on its LAN, and reaches the mesh through it
     BASE = "base"
 
 
 @dataclass(frozen=True, slots=True)
 class RadioSpec:
-    """One radio as the board has it; the UCI section's name, the kernel's path, `2g` or `5g`, its MAC address."""
+    """One radio of the board: UCI section, device path in the kernel, band (`2g` or `5g`), MAC address."""
 
     name: str = "radio0"
     path: str = "platform/ahb/18100000.wmac"
@@ -44,13 +43,13 @@ class RadioSpec:
 
 @dataclass(frozen=True, slots=True)
 class NodeSpec:
-    """One node as it comes out of its box: factory image, factory address 192.168.1.1, no password.
+    """One factory-fresh node: factory image, factory address 192.168.1.1, no password.
 
-    `release` names the series; its revision and kernel are the lab's (`releases`). `packages` are baked into its image
-    beside the release's own. `mac` is the label's address, on the first LAN port; radios without one get `mac` + 1, ...
-    `overlay_kib` is the flash left for changes, `memory_kib` the RAM. `host_key_types` None: as the release makes them
-    (19.07 RSA, later RSA and ed25519); naming `("ed25519",)` alone makes big fleets start faster.
-    `flash_s` is how long writing an image takes.
+    `release` is the series; `releases` has its revision and kernel. `packages` are built into its image besides the
+    release's own. `mac` is the label's address, on the first LAN port; radios without one get `mac` + 1, ...
+    `overlay_kib` is the flash left for changes, `memory_kib` the RAM. `host_key_types` None: the release's defaults
+    (19.07 RSA, later RSA and ed25519); `("ed25519",)` makes big fleets start faster. `flash_s` is the time to write an
+    image.
     """
 
     name: str
@@ -73,10 +72,10 @@ class NodeSpec:
 class LinkSpec:
     """Two nodes that can hear each other while their radios share a cell.
 
-    `loss` is the share (0..1) of frames from `a` that `b` misses, `loss_back` that of frames from `b` (None: the same);
-    1.0 is deafness. `signal_dbm` is how strong `b` hears `a`, `signal_back_dbm` how strong `a` hears `b` (None: the
-    same). `tq` is the best quality (0..255) that batman-adv may give the link, losses lower it. `delay_ms` is one way,
-    `rate_kbps` None: unlimited.
+    `loss` is the share (0..1) of frames from `a` that `b` loses, `loss_back` that of frames from `b` (None: the same);
+    1.0: no frame arrives. `signal_dbm` is the signal of `a` at `b`, `signal_back_dbm` that of `b` at `a` (None: the
+    same). `tq` limits batman-adv's quality (0..255) of the link; losses lower it. `delay_ms` is one way; `rate_kbps`
+    None: unlimited.
     """
 
     a: str
@@ -95,11 +94,11 @@ class LinkSpec:
         return frozenset((self.a, self.b))
 
     def loss_to(self, name: str) -> float:
-        """The share of frames that the end `name` misses of the other end's."""
+        """The share of the other end's frames that the end `name` loses."""
         return self.loss if name == self.b or self.loss_back is None else self.loss_back
 
     def signal_at(self, name: str) -> int:
-        """How strong the end `name` hears the other end, in dBm."""
+        """The other end's signal at the end `name`, in dBm."""
         return self.signal_dbm if name == self.b or self.signal_back_dbm is None else self.signal_back_dbm
 
     def tq_to(self, name: str) -> int:
@@ -121,24 +120,24 @@ class LinkSpec:
 
 
 def changed_link(link: LinkSpec, changes: Mapping[str, Any]) -> LinkSpec:
-    """The link with other fields, as seen from its `a`; `loss_to_b` is the loss in that direction alone.
+    """The link with changed fields, as seen from its `a`; `loss_to_b` is the loss in that direction only.
 
-    A new loss decides the quality: `tq` no longer limits it, unless it is among the changes. A new `loss` holds both
-    ways unless `loss_back` is among them. Raises TypeError for a field that links have not.
+    A new loss determines the quality: `tq` no longer limits it, unless `changes` has `tq`. A new `loss` applies to both
+    directions unless `changes` has `loss_back`. Raises TypeError for an unknown field.
     """
-    wanted = dict(changes)
-    if "loss_to_b" in wanted:
-        wanted = {"loss_back": link.loss_to(link.a), **wanted, "loss": wanted["loss_to_b"]}
-        del wanted["loss_to_b"]
-    if "loss" in wanted:
-        wanted = {"tq": TQ_MAX, "loss_back": None, **wanted}
-    return replace(link, **wanted)
+    fields = dict(changes)
+    if "loss_to_b" in fields:
+        fields = {"loss_back": link.loss_to(link.a), **fields, "loss": fields["loss_to_b"]}
+        del fields["loss_to_b"]
+    if "loss" in fields:
+        fields = {"tq": TQ_MAX, "loss_back": None, **fields}
+    return replace(link, **fields)
 
 
 @dataclass(frozen=True, slots=True)
 class LanSpec:
-    """A robot's wired network in the field: one switch, the LAN ports of `nodes`, and its computer with an address
-    such as `10.42.0.21/24`. Only fleets of real radios have LANs."""
+    """A robot's wired network: one switch, the LAN ports of `nodes`, and its computer with an address such as
+    `10.42.0.21/24`. Only QEMU fleets have LANs."""
 
     name: str
     nodes: tuple[str, ...]
@@ -147,18 +146,18 @@ class LanSpec:
 
 @dataclass(frozen=True, slots=True)
 class FleetSpec:
-    """A whole fleet. `port` is the one TCP port all its loopback addresses listen on (`addresses.loopback_of`).
+    """A whole fleet. `port` is the TCP port of all its loopback addresses (`addresses.loopback_of`).
 
-    0 lets the supervisor choose a free one; `VirtualFleet.port` tells which. `seed` decides what is left to chance on
-    the nodes: how long their services and radios take. A virtual boot takes a second, a real one about as long as
-    neighbours remember a station that is silent; `quick_boot` lets them remember it, as after a boot within a minute.
+    0 lets the supervisor choose a free one, which `VirtualFleet.port` returns. `seed` seeds the random start-up times
+    of services and radios. A virtual node boots in a second, a real one takes about as long as neighbors keep the entry
+    of a silent station; with `quick_boot` they keep it over a boot, as after a real boot within a minute.
     """
 
     name: str
     nodes: tuple[NodeSpec, ...]
     links: tuple[LinkSpec, ...] = ()
     port: int = 0
-    # how long a link takes until batman-adv knows it; real meshes need 10 to 20 s
+    # the time until batman-adv knows a new link; real meshes need 10 to 20 s
     convergence_s: float = 0.2
     lans: tuple[LanSpec, ...] = ()
     seed: int = 0
@@ -168,7 +167,7 @@ class FleetSpec:
         names = [node.name for node in self.nodes]
         doubles = sorted({name for name in names if names.count(name) > 1})
         if doubles:
-            raise InputError(f"lab fleet {self.name}: expected each node once, found twice: {', '.join(doubles)}")
+            raise InputError(f"lab fleet {self.name}: expected unique node names, found twice: {', '.join(doubles)}")
         for link in self.links:
             for end in (link.a, link.b):
                 if end not in names:
@@ -195,14 +194,14 @@ def dump(spec: FleetSpec) -> str:
 
 
 def load(text: str) -> FleetSpec:
-    """The spec that `dump` wrote. Raises InputError for the text of a fleet that another version of meshctl started."""
+    """Read a spec that `dump` wrote. Raises InputError when another version of meshctl wrote it."""
     try:
         return _loaded(json.loads(text))
     except (KeyError, TypeError, ValueError) as error:
         found = f"nothing under {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(
-            f"spec.json of the lab's fleet: expected what this version of meshctl writes, found {found}",
-            hint="the fleet was started by another version: `meshctl lab down`, then start it anew",
+            f"spec.json of the lab's fleet: expected the format of this version of meshctl, found {found}",
+            hint="another version started the fleet: run `meshctl lab down`, then `meshctl lab up`",
         ) from error
 
 

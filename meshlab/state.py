@@ -1,4 +1,4 @@
-"""What the supervisor knows of one node, and the files the node reads about itself."""
+"""The supervisor's state of one node, and the files that describe its board and flash chip to the node."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from enum import Enum
 from pathlib import Path
 
 from meshctl.model import Release
-from meshlab.mesh_model import Effective
+from meshlab.mesh_model import EffectiveState
 from meshlab.releases import firmware_text
 from meshlab.spec import NodeSpec
 
 
 class Power(Enum):
-    """Where a node is in its life."""
+    """The power state of a node."""
 
     OFF = "off"
     BOOTING = "booting"
     UP = "up"
     FLASHING = "flashing"
-    # its firmware does not start: an image half written
+    # its firmware does not start: the image was written in part
     DEAD = "dead"
-    # this machine could not start it; `VirtualNodeState.reason` says why
+    # this machine could not start it, for `NodeState.reason`
     FAILED = "failed"
 
 
 @dataclass(slots=True)
 class NodeState:
-    """`want_on`: the power switch. `boots` counts, so that a connection knows whether its node is still the same."""
+    """`want_on`: the power switch. `boots` counts boots, so that a connection can detect a restart of its node."""
 
     spec: NodeSpec
     number: int
@@ -40,21 +40,21 @@ class NodeState:
     boots: int = 0
     boot_id: str = ""
     reason: str = ""
-    effective: Effective = field(default_factory=Effective)
+    effective: EffectiveState = field(default_factory=EffectiveState)
     hung: bool = False
     cut_at_flash: bool = False
     wrong_board: bool = False
-    breaks: list[str] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
 
     @property
     def is_running(self) -> bool:
         return self.power in (Power.BOOTING, Power.UP, Power.FLASHING)
 
 
-def write_facts(state: NodeState, radios_mac: str, seed: int = 0) -> None:
-    """What the node is told about its own board, in files that its stand-ins source. Replaced atomically.
+def write_board(state: NodeState, radios_mac: str, seed: int = 0) -> None:
+    """Write the files that describe the node's board to its stand-ins, which source them. Replaced atomically.
 
-    `seed` decides what is left to chance on the node: how long its services take.
+    `seed` seeds the random start-up times of its services.
     """
     spec = state.spec
     types = spec.host_key_types
@@ -79,13 +79,13 @@ def write_facts(state: NodeState, radios_mac: str, seed: int = 0) -> None:
 
 
 def write_firmware(home: Path, release: Release, packages: tuple[str, ...], target: str) -> None:
-    """Put a release into the node's flash chip, whole."""
+    """Write a complete image of a release into the node's flash chip."""
     (home / "firmware").mkdir(parents=True, exist_ok=True)
     _replace(home / "firmware" / "env", firmware_text(release, packages, target) + "STATE=whole\n")
 
 
 def label_mac(spec: NodeSpec, number: int) -> str:
-    """The label's address: as specified, or a locally administered one that counts the nodes."""
+    """The MAC address on the label: the specified one, or a locally administered one with the node's number."""
     return spec.mac or f"02:4d:{number // 256:02x}:{number % 256:02x}:00:00"
 
 

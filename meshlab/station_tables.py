@@ -1,12 +1,12 @@
-"""Whom the radios have in their station tables, and whose unicast frames are dropped because of it.
+"""Station tables: the entries of each radio, and the unicast frames that are dropped because of stale entries.
 
-who hears whom, and which incarnation of each interface -> `Stations.update` -> entries (since when, last heard when),
-and the pairs of which one drops what the other sends to it alone
+edges, and the instance of each interface -> `StationTables.update` -> entries (since when, silent since when), and
+the pairs of interfaces of which one drops the other's unicast frames
 
-A radio numbers its frames to each station. One whose interface was made anew counts from 0; a neighbour that still has
-its old entry, under the same address, goes on with the old window and drops them (docs/lab.md, "What only real radios
-showed"). Broadcasts carry no such number, so batman-adv sees nothing of it. Likewise one that deletes the entry of a
-station which did not start anew counts its own frames to it from 0. Pure: nothing here reads a clock or sleeps.
+A radio numbers its unicast frames to each station. A recreated interface starts at 0; a neighbor that still has the old
+entry for the same address keeps the old receive window and drops the frames (docs/lab.md, "What only real radios
+showed"). Broadcasts are not numbered that way, so batman-adv does not notice. Likewise, a radio that deletes the entry
+of a station which did not restart numbers its own frames to it from 0. Pure: reads no clock.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from dataclasses import dataclass, replace
 
 from meshlab.mesh_model import Edge
 
-# an ad-hoc station that is not heard is dropped after so long (IEEE80211_IBSS_INACTIVITY_LIMIT, net/mac80211)
+# a silent ad-hoc station expires after this (IEEE80211_IBSS_INACTIVITY_LIMIT, net/mac80211)
 EXPIRY_S = 60.0
-# how long a sender's numbers take to catch up; "six minutes later still dead" was recorded, the end never
+# the time until a sender's numbers catch up: "six minutes later still dead" was recorded, the end never was
 DEAF_S = 600.0
 
 
 @dataclass(frozen=True, slots=True)
-class Radio:
-    """One interface from its making to its end: the node, its boot, and the kernel's number of the interface."""
+class InterfaceInstance:
+    """One interface from its creation to its removal: the node, its boot, and the kernel's interface index."""
 
     node: str
     boot: int
@@ -33,11 +33,11 @@ class Radio:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
-    """A line of `holder`'s station table: who is behind `mac`, since when (s), and since when silent (None: heard)."""
+class StationEntry:
+    """A row of `holder`'s station table: the peer with `mac`, since when (s), and silent since when (None: heard)."""
 
-    holder: Radio
-    peer: Radio
+    holder: InterfaceInstance
+    peer: InterfaceInstance
     mac: str
     signal_dbm: int
     tq: int
@@ -45,27 +45,27 @@ class Entry:
     silent_since_s: float | None = None
 
 
-class Stations:
-    """The station tables of a fleet. `now_s` is any clock, the same in all calls."""
+class StationTables:
+    """The station tables of a fleet. `now_s` may be any clock, the same in all calls."""
 
     def __init__(self) -> None:
-        self._entries: dict[tuple[str, str, str], Entry] = {}
-        # (sender, receiver): until when the receiver drops what the sender sends to it alone
-        self._deaf: dict[tuple[Radio, Radio], float] = {}
+        self._entries: dict[tuple[str, str, str], StationEntry] = {}
+        # (sender, receiver): until when the receiver drops the sender's unicast frames
+        self._deaf_until_s: dict[tuple[InterfaceInstance, InterfaceInstance], float] = {}
 
     def update(self, graph: Mapping[str, Sequence[Edge]], boots: Mapping[str, int], now_s: float) -> None:
-        """`graph` is who hears whom now, `boots` the count of boots of each node that runs."""
+        """`graph` has the current edges, `boots` the boot count of each running node."""
         heard = set()
         for name, edges in graph.items():
             for edge in edges:
-                own, peer = radio_of(name, boots, edge), peer_of(boots, edge)
+                own, peer = own_instance(name, boots, edge), peer_instance(boots, edge)
                 place = (name, edge.own.interface, edge.peer.mac)
                 heard.add(place)
                 known = self._entries.get(place)
                 if known is None or known.holder != own:
-                    known = Entry(own, peer, edge.peer.mac, 0, 0, now_s)
+                    known = StationEntry(own, peer, edge.peer.mac, 0, 0, now_s)
                 elif known.peer != peer:
-                    self._deaf[peer, own] = now_s + DEAF_S
+                    self._deaf_until_s[peer, own] = now_s + DEAF_S
                 signal_dbm = edge.link.signal_at(name)
                 self._entries[place] = replace(known, peer=peer, signal_dbm=signal_dbm, tq=edge.tq, silent_since_s=None)
         for place, entry in list(self._entries.items()):
@@ -75,46 +75,46 @@ class Stations:
                 self._entries[place] = replace(entry, silent_since_s=now_s)
             elif entry.silent_since_s is not None and now_s - entry.silent_since_s >= EXPIRY_S:
                 del self._entries[place]
-                self._deaf.pop((entry.peer, entry.holder), None)
-        self._deaf = {
+                self._deaf_until_s.pop((entry.peer, entry.holder), None)
+        self._deaf_until_s = {
             pair: until_s
-            for pair, until_s in self._deaf.items()
+            for pair, until_s in self._deaf_until_s.items()
             if until_s > now_s and all(boots.get(radio.node) == radio.boot for radio in pair)
         }
 
     def delete(self, node: str, interface: str, mac: str, now_s: float) -> None:
-        """`iw dev INTERFACE station del MAC` on the node; it is known again from its next beacon on."""
+        """`iw dev INTERFACE station del MAC` on the node; the station's next beacon makes a new entry."""
         entry = self._entries.pop((node, interface, mac), None)
         if entry is None or entry.silent_since_s is not None:
             return
-        if self._deaf.pop((entry.peer, entry.holder), None) is None:
-            # nothing was wrong: now the other one drops what comes from here
-            self._deaf[entry.holder, entry.peer] = now_s + DEAF_S
+        if self._deaf_until_s.pop((entry.peer, entry.holder), None) is None:
+            # the entry was not stale: now the peer drops this node's frames
+            self._deaf_until_s[entry.holder, entry.peer] = now_s + DEAF_S
 
-    def forget_silent(self, node: str) -> None:
-        """The node was away for longer than stations are remembered: nobody has it in a table any more."""
+    def remove_node(self, node: str) -> None:
+        """Drop all entries for the node: it was off for longer than entries last."""
         self._entries = {place: entry for place, entry in self._entries.items() if entry.peer.node != node}
 
-    def of(self, node: str) -> list[Entry]:
-        """The lines of the node's tables."""
+    def entries_of(self, node: str) -> list[StationEntry]:
+        """The rows of the node's tables."""
         return [entry for (name, _, _), entry in self._entries.items() if name == node]
 
     def passes(self, name: str, boots: Mapping[str, int], edge: Edge) -> bool:
-        """Whether frames to one station pass over an edge, both ways."""
-        if not self._deaf:
+        """Whether unicast frames pass over an edge in both directions."""
+        if not self._deaf_until_s:
             return True
-        own, peer = radio_of(name, boots, edge), peer_of(boots, edge)
-        return (own, peer) not in self._deaf and (peer, own) not in self._deaf
+        own, peer = own_instance(name, boots, edge), peer_instance(boots, edge)
+        return (own, peer) not in self._deaf_until_s and (peer, own) not in self._deaf_until_s
 
     def next_change_s(self) -> float | None:
-        """When something ends by itself, unless something happens before."""
+        """The time at which the next entry or drop expires, None when there is none."""
         ends = [entry.silent_since_s + EXPIRY_S for entry in self._entries.values() if entry.silent_since_s is not None]
-        return min([*ends, *self._deaf.values()], default=None)
+        return min([*ends, *self._deaf_until_s.values()], default=None)
 
 
-def radio_of(name: str, boots: Mapping[str, int], edge: Edge) -> Radio:
-    return Radio(name, boots.get(name, 0), edge.own.interface, edge.own.index)
+def own_instance(name: str, boots: Mapping[str, int], edge: Edge) -> InterfaceInstance:
+    return InterfaceInstance(name, boots.get(name, 0), edge.own.interface, edge.own.index)
 
 
-def peer_of(boots: Mapping[str, int], edge: Edge) -> Radio:
-    return Radio(edge.node, boots.get(edge.node, 0), edge.peer.interface, edge.peer.index)
+def peer_instance(boots: Mapping[str, int], edge: Edge) -> InterfaceInstance:
+    return InterfaceInstance(edge.node, boots.get(edge.node, 0), edge.peer.interface, edge.peer.index)

@@ -1,7 +1,7 @@
-"""A lab file's YAML with its places: typed access to entries, every problem collected with file, line and column.
+"""Typed access to a lab file's YAML that collects every problem with file, line and column.
 
-text -> tree (the inventory's reader) -> `Entry` -> the values that `ground_file` and `mission_file` ask for ->
-`Entry.finish` raises InvalidInput with all problems at once.
+text -> tree (the inventory's reader) -> `YamlEntry` -> the values that `propagation_file` and `scenario_file` read ->
+`YamlEntry.finish` raises InvalidInput with all problems at once.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from meshctl.inventory.source import Source, read_source
 from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, describe, position
 
 
-class Entry:
-    """One place in the file, or the absence of one: then every reader gives its default."""
+class YamlEntry:
+    """One entry of the file, or an absent one, for which every reader returns its default."""
 
     def __init__(self, tree: Tree | None, path: str, problems: list[Diagnostic]) -> None:
         self.tree = None if isinstance(tree, Scalar) and tree.is_null else tree
@@ -35,17 +35,17 @@ class Entry:
         return isinstance(self.tree, SequenceNode)
 
     def problem(self, expected: str, found: str = "") -> None:
-        """Note that something else was expected here."""
+        """Add the problem that this entry is not `expected`."""
         place = Position("") if self._where is None else position(self._where)
         self._note(codes.WRONG_VALUE, place, expected, found or self._seen())
 
     def finish(self) -> None:
-        """Raises InvalidInput when anything in the file was wrong."""
+        """Raises InvalidInput when the file has problems."""
         if self._problems:
             raise InvalidInput(self._problems)
 
-    def mapping(self, known: tuple[str, ...] | None = None, required: tuple[str, ...] = ()) -> dict[str, Entry]:
-        """The entries by key; for `known` keys (None: any) an absent entry each, so that it can be asked as well."""
+    def mapping(self, known: tuple[str, ...] | None = None, required: tuple[str, ...] = ()) -> dict[str, YamlEntry]:
+        """The entries by key. A `known` key (None: any key is) that is missing gets an absent entry."""
         if not isinstance(self.tree, MappingNode):
             if self.is_there or required:
                 self.problem("a mapping")
@@ -61,11 +61,11 @@ class Entry:
                 self._note(codes.MISSING_KEY, position(self.tree), f"the key {key}", "no such key")
         return entries
 
-    def items(self) -> Iterator[Entry]:
+    def items(self) -> Iterator[YamlEntry]:
         """The entries of a list."""
         if isinstance(self.tree, SequenceNode):
             for number, item in enumerate(self.tree.items):
-                yield Entry(item, f"{self.path}[{number}]", self._problems)
+                yield YamlEntry(item, f"{self.path}[{number}]", self._problems)
         elif self.is_there:
             self.problem("a list")
 
@@ -77,22 +77,22 @@ class Entry:
         self.problem("text" if one_of is None else f"one of {', '.join(one_of)}")
         return default
 
-    def number(self, default: float, least: float = -1e6, most: float = 1e6) -> float:
+    def number(self, default: float, minimum: float = -1e6, maximum: float = 1e6) -> float:
         if self.tree is None:
             return default
         try:
             value = float(self.tree.text) if isinstance(self.tree, Scalar) else math.nan
         except ValueError:
             value = math.nan
-        if not least <= value <= most:
-            self.problem(f"a number from {least:g} to {most:g}")
+        if not minimum <= value <= maximum:
+            self.problem(f"a number from {minimum:g} to {maximum:g}")
             return default
         return value
 
-    def whole(self, default: int, least: int, most: int) -> int:
-        value = self.number(float(default), least, most)
+    def integer(self, default: int, minimum: int, maximum: int) -> int:
+        value = self.number(float(default), minimum, maximum)
         if value != int(value):
-            self.problem(f"a whole number from {least} to {most}")
+            self.problem(f"an integer from {minimum} to {maximum}")
             return default
         return int(value)
 
@@ -110,12 +110,12 @@ class Entry:
         return value
 
     def point(self, default: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
-        """`[x, y]` in metres."""
-        values = self.row(2, "[x, y] in metres")
+        """`[x, y]` in meters."""
+        values = self.row(2, "[x, y] in meters")
         return (values[0], values[1]) if values else default
 
     def row(self, count: int, shape: str) -> list[float]:
-        """A list of `count` numbers; empty, with the problem noted, when it is something else."""
+        """A list of `count` numbers; for anything else an empty list and a problem."""
         if not isinstance(self.tree, SequenceNode) or len(self.tree.items) != count:
             self.problem(shape)
             return []
@@ -123,8 +123,8 @@ class Entry:
         values = [item.number(0.0) for item in self.items()]
         return values if len(self._problems) == before else []
 
-    def _below(self, tree: Tree | None, key: str) -> Entry:
-        entry = Entry(tree, f"{self.path}.{key}" if self.path else key, self._problems)
+    def _below(self, tree: Tree | None, key: str) -> YamlEntry:
+        entry = YamlEntry(tree, f"{self.path}.{key}" if self.path else key, self._problems)
         entry._where = tree or self._where
         return entry
 
@@ -144,7 +144,7 @@ class Entry:
 
 
 def share_of(text: str) -> float | None:
-    """`0.3` or `30%` as 0.3; None when it is no share from 0 to 1."""
+    """`0.3` or `30%` as 0.3; None when it is not a share from 0 to 1."""
     number, scale = (text[:-1], 100.0) if text.endswith("%") else (text, 1.0)
     try:
         value = float(number) / scale
@@ -153,17 +153,17 @@ def share_of(text: str) -> float | None:
     return value if 0.0 <= value <= 1.0 else None
 
 
-def read(path: Path) -> Entry:
-    """The file's root. Raises InvalidInput when it cannot be read or is not YAML."""
+def read(path: Path) -> YamlEntry:
+    """The root entry of the file. Raises InvalidInput when it cannot be read or is not YAML."""
     source = read_source(path)
     if isinstance(source, Diagnostic):
         raise InvalidInput([source])
-    return entry_of(source.text, str(path))
+    return parse_text(source.text, str(path))
 
 
-def entry_of(text: str, file: str) -> Entry:
-    """The root of a file's text. Raises InvalidInput when it is not YAML."""
+def parse_text(text: str, file: str) -> YamlEntry:
+    """The root entry of a file's text. Raises InvalidInput when it is not YAML."""
     composed = compose(Source(file, text))
     if composed.root is None:
         raise InvalidInput(composed.diagnostics)
-    return Entry(composed.root, "", list(composed.diagnostics))
+    return YamlEntry(composed.root, "", list(composed.diagnostics))

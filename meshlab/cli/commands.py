@@ -1,4 +1,4 @@
-"""`meshctl lab`: a virtual fleet on this machine; who hears whom in it is `lab_ground`'s part."""
+"""`meshctl lab`: a virtual fleet on this machine; `links` has the commands for its links."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ from meshctl.resources import shipped
 from meshlab.cli import links
 from meshlab.console import run_shell
 from meshlab.errors import LabError
-from meshlab.faults import BREAKS, parse, told
-from meshlab.fleet import VirtualFleet, end
+from meshlab.faults import FAULTS, describe, parse
+from meshlab.fleet import QemuFleet, VirtualFleet, stop_fleet
 from meshlab.from_inventory import spec_of
 from meshlab.images import firmware_image
-from meshlab.inventory_copy import prepare
-from meshlab.qemu.fleet import RealFleet
+from meshlab.inventory_copy import copy_inventory
 from meshlab.releases import facts
 
 app = typer.Typer(help="A virtual fleet on this machine.", no_args_is_help=True)
 
-# seconds for one node to boot on a machine that has much else to do, and for the first one to begin
+# seconds for each node to boot on a busy machine, and for the first one to start
 _BOOT_S = 2.0
 _START_S = 60.0
-# the same for a machine under emulation: packages are fetched, its kernel boots, at worst twice
+# the same under emulation: packages are downloaded, and the kernel boots, at worst twice
 _REAL_BOOT_S = 10.0
 _REAL_START_S = 600.0
 
@@ -40,14 +39,12 @@ Where = Annotated[str, typer.Argument(help="A node (b03) or a link (b01-b02).")]
 @app.command("up")
 def up(
     inventory: Annotated[Path | None, typer.Argument(help="The fleet to copy; default: the example lab.")] = None,
-    chosen: Annotated[
-        Path | None, typer.Option("--inventory", "-i", help="The same as the argument, as other commands take it.")
-    ] = None,
-    nodes: Annotated[int | None, typer.Option("--nodes", min=1, help="Only its first N nodes.")] = None,
+    chosen: Annotated[Path | None, typer.Option("--inventory", "-i", help="Same as the argument.")] = None,
+    nodes: Annotated[int | None, typer.Option("--nodes", min=1, help="Use only the first N nodes.")] = None,
     directory: LabDirectory = None,
-    port: Annotated[int, typer.Option("--port", help="TCP port of all its addresses; 0 takes a free one.")] = 0,
+    port: Annotated[int, typer.Option("--port", help="TCP port of all nodes; 0: any free port.")] = 0,
     real: Annotated[
-        bool, typer.Option("--real", help="In a machine with the kernel's own 802.11 radios and batman-adv (QEMU).")
+        bool, typer.Option("--real", help="Run in a QEMU machine with the kernel's own 802.11 radios and batman-adv.")
     ] = False,
 ) -> None:
     """Start a fleet of factory-fresh OpenWrt-like nodes, as the inventory describes them.
@@ -55,40 +52,40 @@ def up(
     Example: meshctl lab up inventory/lab --nodes 6 --real
     """
     if inventory is not None and chosen is not None:
-        raise InputError("expected one inventory, found an argument and --inventory")
+        raise InputError("expected one inventory, found an argument and --inventory; use one of them")
     place = lab_directory(directory)
-    copy = prepare(inventory or chosen or shipped("inventory") / "lab", place)
+    copy = copy_inventory(inventory or chosen or shipped("inventory") / "lab", place)
     spec = spec_of(copy.fleet, links=copy.links, nodes=nodes, port=port)
     if real:
-        echo("starting a machine with real radios; its image is made at the first start")
-        fleet: VirtualFleet = RealFleet(spec, place).up(wait_s=_REAL_START_S + _REAL_BOOT_S * len(spec.nodes))
+        echo("starting a QEMU machine with the kernel's radios; the first start builds its image")
+        fleet: VirtualFleet = QemuFleet(spec, place).up(wait_s=_REAL_START_S + _REAL_BOOT_S * len(spec.nodes))
     else:
         fleet = VirtualFleet(spec, place).up(wait_s=_START_S + _BOOT_S * len(spec.nodes))
     echo(f"{len(spec.nodes)} nodes of {spec.name} are up, each at 192.168.1.1 on its own bench port")
     if copy.kept is not None:
-        echo(f"kept:      {copy.kept} is the earlier copy of the inventory, which was edited")
+        echo(f"kept:      {copy.kept}, the earlier copy of the inventory, which was edited")
     echo(f"inventory: {copy.inventory}")
-    echo(f"reach it:  export MESHCTL_LAB={place} MESHCTL_INVENTORY={copy.inventory}")
-    echo(f"by hand:   meshctl lab shell {fleet.spec.names[0]}")
-    echo("then:      meshctl bootstrap --yes; meshctl lab unplug; meshctl topology")
+    echo(f"use it:    export MESHCTL_LAB={place} MESHCTL_INVENTORY={copy.inventory}")
+    echo(f"console:   meshctl lab shell {fleet.spec.names[0]}")
+    echo("next:      meshctl bootstrap --yes; meshctl lab unplug; meshctl topology")
 
 
 @app.command("down")
 def down(directory: LabDirectory = None) -> None:
-    """End the fleet; its directory stays, for a look at flash and logs.
+    """Stop the fleet; its directory stays, with flash contents and logs.
 
     Example: meshctl lab down
     """
     place = lab_directory(directory)
-    name = end(place)
+    name = stop_fleet(place)
     if not name:
-        raise LabError(f"no virtual fleet runs in {place}", hint="meshctl lab up starts one")
+        raise LabError(f"no virtual fleet runs in {place}", hint="run `meshctl lab up` to start one")
     echo(f"{name} is down")
 
 
 @app.command("status")
 def status(directory: LabDirectory = None, as_json: AsJson = False) -> None:
-    """Show every node's power, address, way in, and what was broken.
+    """Show every node's power, release, addresses and faults.
 
     Example: meshctl lab status --json
     """
@@ -97,7 +94,7 @@ def status(directory: LabDirectory = None, as_json: AsJson = False) -> None:
         echo_json(json.dumps(state, indent=2))
         return
     echo(f"{state['fleet']}: process {state['pid']}, port {state['port']}")
-    head = ("NODE", "POWER", "RELEASE", "ADDRESS", "PLUGGED", "MESH", "REACHED AT", "BROKEN")
+    head = ("NODE", "POWER", "RELEASE", "ADDRESS", "PLUGGED", "MESH", "REACHED AT", "FAULTS")
     rows: list[tuple[str, ...]] = [head]
     rows += [_row(node) for node in state["nodes"]]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
@@ -111,10 +108,10 @@ def status(directory: LabDirectory = None, as_json: AsJson = False) -> None:
 @app.command("shell")
 def shell(
     node: Annotated[str, typer.Argument(help="Name of the node.")],
-    command: Annotated[list[str] | None, typer.Argument(help="A command; without it an interactive shell.")] = None,
+    command: Annotated[list[str] | None, typer.Argument(help="A command; default: an interactive shell.")] = None,
     directory: LabDirectory = None,
 ) -> None:
-    """Open a node's serial console, which works without its network.
+    """Open a node's serial console, which does not need its network.
 
     Example: meshctl lab shell b01 -- uci show network
     """
@@ -124,8 +121,8 @@ def shell(
 
 _BREAK_HELP = "\n\n".join(
     (
-        "Break something, now or at a step; `meshctl lab mend` undoes it.",
-        *(f"{one.value}: {text}" for one, text in BREAKS.items()),
+        "Inject a fault, now or at a step; `meshctl lab mend` repairs it.",
+        *(f"{one.value}: {text}" for one, text in FAULTS.items()),
         "Example: meshctl lab break b03 'power-cut@reload_config'",
         "Example: meshctl lab break b01-b02 link-down",
     )
@@ -135,25 +132,25 @@ _BREAK_HELP = "\n\n".join(
 @app.command("break", help=_BREAK_HELP)
 def break_(
     where: Where,
-    what: Annotated[str, typer.Argument(help="What happens to it, some with @STEP: power-cut@7, power-cut@flash.")],
+    what: Annotated[str, typer.Argument(help="The fault; some take @STEP: power-cut@7, power-cut@flash.")],
     directory: LabDirectory = None,
 ) -> None:
-    order = parse(what)
-    VirtualFleet.attach(lab_directory(directory)).break_(where, what)
-    echo(f"{where}: {told(order)}")
+    request = parse(what)
+    VirtualFleet.attach(lab_directory(directory)).inject_fault(where, what)
+    echo(f"{where}: {describe(request)}")
 
 
 @app.command("mend")
 def mend(
-    where: Annotated[str, typer.Argument(help="A node or a link; without it everything.")] = "",
+    where: Annotated[str, typer.Argument(help="A node or a link; default: everything.")] = "",
     directory: LabDirectory = None,
 ) -> None:
-    """Undo what was broken: power and links back, flash freed, dead firmware recovered as on a bench.
+    """Repair injected faults: restore power and links, free the flash, recover dead firmware.
 
     Example: meshctl lab mend b03
     """
-    VirtualFleet.attach(lab_directory(directory)).mend(where)
-    echo(f"{where or 'everything'}: mended")
+    VirtualFleet.attach(lab_directory(directory)).repair(where)
+    echo(f"{where or 'everything'}: repaired")
 
 
 links.register(app)
@@ -161,9 +158,10 @@ links.register(app)
 
 @app.command("plug")
 def plug(
-    nodes: Annotated[list[str] | None, typer.Argument(help="Nodes; none: all.")] = None, directory: LabDirectory = None
+    nodes: Annotated[list[str] | None, typer.Argument(help="Nodes; default: all.")] = None,
+    directory: LabDirectory = None,
 ) -> None:
-    """Plug nodes' LAN ports into this machine, as on a bench.
+    """Connect nodes' LAN ports to this machine, as on a bench.
 
     Example: meshctl lab plug b01
     """
@@ -172,10 +170,10 @@ def plug(
 
 @app.command("unplug")
 def unplug(
-    nodes: Annotated[list[str] | None, typer.Argument(help="Nodes; none: all but the base.")] = None,
+    nodes: Annotated[list[str] | None, typer.Argument(help="Nodes; default: all except the base.")] = None,
     directory: LabDirectory = None,
 ) -> None:
-    """Pull nodes' LAN ports out: from then on only the mesh leads to them.
+    """Disconnect nodes' LAN ports: from then on they are reached only over the mesh.
 
     Example: meshctl lab unplug
     """
@@ -187,10 +185,10 @@ def image(
     release: Annotated[Release, typer.Argument(help="Release series, such as 24.10.")],
     board: Annotated[str, typer.Argument(help="Board name, such as compex,wpj344-16m.")],
     out: Annotated[Path, typer.Argument(help="The file to write.")],
-    package: Annotated[list[str] | None, typer.Option("--package", help="Baked in beside the mesh's own.")] = None,
-    revision: Annotated[str, typer.Option("--revision", help="Build; default: the one nodes start with.")] = "",
+    package: Annotated[list[str] | None, typer.Option("--package", help="Package to add to the mesh packages.")] = None,
+    revision: Annotated[str, typer.Option("--revision", help="Build revision; default: that of new nodes.")] = "",
 ) -> None:
-    """Write a firmware image for virtual nodes, checked as a real one is, and tell its line in the inventory.
+    """Write a firmware image for virtual nodes and print its line for the inventory.
 
     Example: meshctl lab image 23.05 compex,wpj344-16m wpj344.bin --revision r24107-0123456789
     """
@@ -199,7 +197,7 @@ def image(
     try:
         out.write_bytes(content)
     except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+        raise InputError(f"cannot write {out}: {error.strerror}") from error
     echo(f"firmware: {{image: {out.name}, sha256: {hashlib.sha256(content).hexdigest()}, revision: {named}}}")
 
 

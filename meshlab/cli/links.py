@@ -1,4 +1,4 @@
-"""`meshctl lab link|move|ground|mission`: who hears whom in a running fleet, changed while it runs."""
+"""`meshctl lab link|move|ground|mission`: change the links of a running fleet."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshlab import placement, propagation_file, scenario_file
 from meshlab.fleet import VirtualFleet
-from meshlab.propagation import Ground, links_of
-from meshlab.scenario import Event, Happening
-from meshlab.scenario_run import FleetStage, play
+from meshlab.propagation import RadioEnvironment, links_of
+from meshlab.scenario import Event, EventKind
+from meshlab.scenario_run import FleetTarget, play
 from meshlab.spec import LinkSpec
 from meshlab.yaml_entries import share_of
 
 
 def register(app: typer.Typer) -> None:
-    """Make these commands of `app`."""
+    """Add these commands to `app`."""
     app.command("link")(link)
-    # coordinates may be negative, and are no options then
+    # negative coordinates must not be parsed as options
     app.command("move", context_settings={"ignore_unknown_options": True})(move)
     app.command("ground")(ground)
     app.command("mission")(mission)
 
 
 def link(
-    a: Annotated[str, typer.Argument(help="One node.")],
-    b: Annotated[str, typer.Argument(help="The other.")],
-    up: Annotated[bool | None, typer.Option("--up/--down", help="Whether they hear each other.")] = None,
+    a: Annotated[str, typer.Argument(help="First node.")],
+    b: Annotated[str, typer.Argument(help="Second node.")],
+    up: Annotated[bool | None, typer.Option("--up/--down", help="Bring the link up or down.")] = None,
     loss: Annotated[str | None, typer.Option("--loss", help="Share of frames lost: 30% or 0.3.")] = None,
-    one_way: Annotated[bool, typer.Option("--one-way", help="The loss is of frames from A to B alone.")] = False,
-    tq: Annotated[int | None, typer.Option("--tq", min=0, max=255, help="At most this link quality, of 255.")] = None,
-    delay_ms: Annotated[float | None, typer.Option("--delay", min=0, help="Milliseconds one way.")] = None,
-    rate_kbps: Annotated[int | None, typer.Option("--rate", min=1, help="Kilobit per second.")] = None,
+    one_way: Annotated[bool, typer.Option("--one-way", help="Apply the loss only to frames from A to B.")] = False,
+    tq: Annotated[int | None, typer.Option("--tq", min=0, max=255, help="Maximum link quality, 0 to 255.")] = None,
+    delay_ms: Annotated[float | None, typer.Option("--delay", min=0, help="One-way delay in milliseconds.")] = None,
+    rate_kbps: Annotated[int | None, typer.Option("--rate", min=1, help="Rate in kbit/s.")] = None,
     directory: LabDirectory = None,
 ) -> None:
-    """Change a link between two nodes, or make one; `meshctl lab mend A-B` undoes it.
+    """Change or add a link between two nodes; `meshctl lab mend A-B` undoes it.
 
     Example: meshctl lab link b01 b02 --loss 30% --one-way
     """
@@ -49,7 +49,7 @@ def link(
     if loss is not None and share is None:
         raise InputError(f"--loss: expected a share such as 30% or 0.3, found {loss!r}")
     if one_way and share is None:
-        raise InputError("--one-way says in which direction frames are lost, and needs --loss")
+        raise InputError("--one-way needs --loss")
     given = {
         "up": up,
         "loss_to_b" if one_way else "loss": share,
@@ -60,140 +60,146 @@ def link(
     changes = {name: value for name, value in given.items() if value is not None}
     if not changes:
         raise InputError(
-            f"nothing to change between {a} and {b}", hint="--loss, --up, --down, --tq, --delay, --rate say what"
+            f"nothing to change between {a} and {b}", hint="use --loss, --up, --down, --tq, --delay or --rate"
         )
     fleet = VirtualFleet.attach(lab_directory(directory))
     fleet.link(a, b, **changes)
     for now in fleet.status()["links"]:
         if set(now["between"]) == {a, b}:
-            echo(_set(now))
+            echo(_changed_line(now))
 
 
-def _set(now: dict[str, Any]) -> str:
-    """`b01 - b02: loses 30% there, 5% back, 20 ms later, at most 256 kbit/s`"""
+def _changed_line(now: dict[str, Any]) -> str:
+    """`b01 - b02: loss 30% there, 5% back, delay 20 ms, rate 256 kbit/s`"""
     a, b = now["between"]
     if not now["up"]:
         return f"{a} - {b}: down"
-    delay = f", {now['delay_ms']:g} ms later" if now["delay_ms"] else ""
-    rate = f", at most {now['rate_kbps']} kbit/s" if now["rate_kbps"] else ""
-    return f"{a} - {b}: loses {_lost(now['loss'], now['loss_back'])}{delay}{rate}"
+    delay = f", delay {now['delay_ms']:g} ms" if now["delay_ms"] else ""
+    rate = f", rate {now['rate_kbps']} kbit/s" if now["rate_kbps"] else ""
+    return f"{a} - {b}: loss {_loss_text(now['loss'], now['loss_back'])}{delay}{rate}"
 
 
 def move(
-    node: Annotated[str, typer.Argument(help="The node that moves.")],
-    x: Annotated[float, typer.Argument(help="Metres.")],
-    y: Annotated[float, typer.Argument(help="Metres.")],
+    node: Annotated[str, typer.Argument(help="The node to move.")],
+    x: Annotated[float, typer.Argument(help="Meters.")],
+    y: Annotated[float, typer.Argument(help="Meters.")],
     directory: LabDirectory = None,
 ) -> None:
-    """Put a node elsewhere on the ground; its links follow from where it is, but for those set by hand.
+    """Move a node; its links follow from its new position, except those set with `meshctl lab link`.
 
     Example: meshctl lab move rover1 120 -40
     """
     fleet = VirtualFleet.attach(lab_directory(directory))
     placement.move(fleet, node, (x, y))
-    for one in links_of(placement.ground_of(fleet)):
+    for one in links_of(placement.current_environment(fleet)):
         if node in one.ends and one.ends <= set(fleet.spec.names):
-            echo(_described(one.seen_from(node)))
+            echo(_link_line(one.seen_from(node)))
 
 
 def ground(
-    file: Annotated[Path | None, typer.Argument(help="Places, walls and links (YAML); none: show the ground.")] = None,
+    file: Annotated[Path | None, typer.Argument(help="Positions, walls and links (YAML); default: show them.")] = None,
     directory: LabDirectory = None,
     as_json: AsJson = False,
 ) -> None:
-    """Put the fleet on a ground: who hears whom follows from its places, walls and links. Without FILE, show it.
+    """Load node positions, walls and links, which determine the fleet's links. Without FILE, show the current ones.
 
     Example: meshctl lab ground inventory/lab/ground.yaml
     """
     fleet = VirtualFleet.attach(lab_directory(directory))
     if file is not None:
-        wanted = propagation_file.load(file)
-        if not set(wanted.names) & set(fleet.spec.names):
+        environment = propagation_file.load(file)
+        if not set(environment.names) & set(fleet.spec.names):
             raise InputError(f"{file}: expected nodes of this fleet ({', '.join(fleet.spec.names)}), found none")
-        placement.stand_on(fleet, wanted)
-    now = placement.ground_of(fleet)
+        placement.set_environment(fleet, environment)
+    now = placement.current_environment(fleet)
     if as_json:
         echo(propagation_file.dump(now), nl=False)
         return
-    _show(now, fleet.spec.names)
+    _print_environment(now, fleet.spec.names)
 
 
 def mission(
     file: Annotated[Path, typer.Argument(help="The mission (YAML).")],
-    speed: Annotated[float, typer.Option("--speed", min=0.01, help="So many times as fast as real time.")] = 1.0,
-    start_s: Annotated[float, typer.Option("--from", min=0, help="Begin at this mission time, in seconds.")] = 0.0,
+    speed: Annotated[float, typer.Option("--speed", min=0.01, help="Replay speed; 2 is twice real time.")] = 1.0,
+    start_s: Annotated[float, typer.Option("--from", min=0, help="Start at this mission time, in seconds.")] = 0.0,
     directory: LabDirectory = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print each event as one line of JSON.")] = False,
 ) -> None:
-    """Replay a mission: robots drive along their way points and drop the beacons they carry.
+    """Replay a mission: robots drive along their waypoints and drop the beacons they carry.
 
-    Carried beacons are switched off at the start and on when they are dropped. Ctrl-C leaves everything as it is then.
+    Carried beacons are off until they are dropped. Ctrl-C stops the replay and leaves the fleet as it is.
 
     Example: meshctl lab mission inventory/lab/mission.yaml --speed 10
     """
-    wanted = scenario_file.load(file)
-    if start_s >= wanted.duration_s:
-        raise InputError(f"--from: expected less than the mission's {wanted.duration_s:g} s, found {start_s:g}")
+    scenario = scenario_file.load(file)
+    if start_s >= scenario.duration_s:
+        raise InputError(f"--from: expected less than the mission's {scenario.duration_s:g} s, found {start_s:g}")
     fleet = VirtualFleet.attach(lab_directory(directory))
-    absent = sorted(set(wanted.names) - set(fleet.spec.names))
+    absent = sorted(set(scenario.names) - set(fleet.spec.names))
     if absent:
-        echo(f"not in this fleet: {', '.join(absent)}", err=True)
-    say = _tell_json if as_json else _tell
+        echo(f"nodes of the mission that are not in this fleet: {', '.join(absent)}", err=True)
+    report = _print_event_json if as_json else _print_event
     stopped_s = play(
-        wanted, FleetStage(fleet), tell=say, clock=time.monotonic, wait=time.sleep, speed=speed, start_s=start_s
+        scenario,
+        FleetTarget(fleet),
+        on_event=report,
+        clock=time.monotonic,
+        wait=time.sleep,
+        speed=speed,
+        start_s=start_s,
     )
     if stopped_s is not None:
-        echo(f"stopped at {stopped_s:.1f} s; everything stays as it is", err=True)
-        echo(f"go on with: meshctl lab mission {file} --from {stopped_s:.1f}", err=True)
+        echo(f"stopped at {stopped_s:.1f} s; the fleet stays as it is", err=True)
+        echo(f"continue with: meshctl lab mission {file} --from {stopped_s:.1f}", err=True)
         raise typer.Exit(int(ExitCode.INTERRUPTED))
 
 
-def _show(now: Ground, names: tuple[str, ...]) -> None:
+def _print_environment(now: RadioEnvironment, names: tuple[str, ...]) -> None:
     for name in names:
-        place = now.places.get(name)
-        echo(f"{name} at {place.at[0]:g}, {place.at[1]:g} m" if place else f"{name} has no place")
+        place = now.positions.get(name)
+        echo(f"{name} at {place.at[0]:g}, {place.at[1]:g} m" if place else f"{name} has no position")
     for one in links_of(now):
         if one.ends <= set(names):
-            echo(_described(one))
+            echo(_link_line(one))
 
 
-def _described(one: LinkSpec) -> str:
-    """`b01 - b02: loses 3% there, 5% back; quality 247 and 242 of 255`"""
+def _link_line(one: LinkSpec) -> str:
+    """`b01 - b02: loss 3% there, 5% back; TQ 247 there, 242 back, of 255`"""
     if not one.up:
         return f"{one.a} - {one.b}: down"
     there, back = one.loss_to(one.b), one.loss_to(one.a)
-    lost, qualities = _lost(there, back), f"{one.tq_to(one.b)} there, {one.tq_to(one.a)} back"
-    return f"{one.a} - {one.b}: loses {lost}; quality {qualities}, of 255"
+    loss, qualities = _loss_text(there, back), f"{one.tq_to(one.b)} there, {one.tq_to(one.a)} back"
+    return f"{one.a} - {one.b}: loss {loss}; TQ {qualities}, of 255"
 
 
-def _lost(there: float, back: float) -> str:
+def _loss_text(there: float, back: float) -> str:
     return f"{there:.0%}" if there == back else f"{there:.0%} there, {back:.0%} back"
 
 
-_SAID = {
-    Happening.ARRIVES: "{who} arrives at {place}",
-    Happening.DROPPED: "{other} drops {who} at {place}",
-    Happening.OFF: "{who} goes off",
-    Happening.ON: "{who} comes on",
-    Happening.LINK_UP: "{who} and {other} hear each other",
-    Happening.LINK_DOWN: "{who} and {other} no longer hear each other",
-    Happening.CUT_OFF: "{who} is cut off from the base",
-    Happening.REACHED: "{who} reaches the base",
-    Happening.END: "the mission ends",
+_EVENT_TEXT = {
+    EventKind.ARRIVES: "{who} arrives at {place}",
+    EventKind.DROPPED: "{other} drops {who} at {place}",
+    EventKind.OFF: "{who} is powered off",
+    EventKind.ON: "{who} is powered on",
+    EventKind.LINK_UP: "link {who} - {other} is up",
+    EventKind.LINK_DOWN: "link {who} - {other} is down",
+    EventKind.CUT_OFF: "{who} loses the base",
+    EventKind.REACHED: "{who} reaches the base",
+    EventKind.END: "the mission ends",
 }
 
 
-def _tell(event: Event) -> None:
-    place = "" if event.place is None else f"{event.place[0]:g}, {event.place[1]:g} m"
-    echo(f"{event.at_s:8.1f} s  " + _SAID[event.what].format(who=event.who, other=event.other, place=place))
+def _print_event(event: Event) -> None:
+    place = "" if event.position is None else f"{event.position[0]:g}, {event.position[1]:g} m"
+    echo(f"{event.at_s:8.1f} s  " + _EVENT_TEXT[event.kind].format(who=event.node, other=event.peer, place=place))
 
 
-def _tell_json(event: Event) -> None:
+def _print_event_json(event: Event) -> None:
     content = {
         "at_s": event.at_s,
-        "event": event.what.value,
-        "node": event.who,
-        "other": event.other or None,
-        "place_m": event.place,
+        "event": event.kind.value,
+        "node": event.node,
+        "other": event.peer or None,
+        "place_m": event.position,
     }
     echo_json(json.dumps({key: value for key, value in content.items() if value is not None}))

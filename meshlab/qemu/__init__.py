@@ -1,7 +1,8 @@
-"""A fleet whose radios, mesh and bridges are the Linux kernel's own, inside one machine that QEMU runs.
+"""A fleet in one QEMU machine, with the Linux kernel's own radios, mesh and bridges.
 
-`image` assembles the machine's root from Debian packages, `machine` starts it, `relay` is the process behind a running
-fleet on this side, `guest` the one on the other side: the virtual fleet's supervisor with `ether` for its air and
-`hardware` for its cables and radios. `fleet.RealFleet` brings it up and down, `control` reaches into the machine.
-docs/lab.md tells how it works and where it differs from real radios.
+`initramfs` builds the machine's root from Debian packages, `qemu` starts the machine. `host_proxy` is the fleet's
+process on the host; it talks to `guest_agent` in the machine over `guest_protocol`. `guest_supervisor` is the virtual
+fleet's supervisor in the machine, with `link_state` for links, `traffic_control` for losses and `hwsim_devices` for
+radios and cables. `meshlab.fleet.QemuFleet` starts and stops it, `control` runs commands in the machine. docs/lab.md
+explains how it works and how it differs from real radios.
 """

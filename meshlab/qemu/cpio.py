@@ -1,4 +1,4 @@
-"""A directory as a cpio archive of the kernel's kind (newc), everything owned by root. It takes several in a row.
+"""Write a directory as a cpio archive for the kernel (newc), everything owned by root. Archives can be concatenated.
 
 Format: the kernel's Documentation/driver-api/early-userspace/buffer-format.rst.
 """
@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import BinaryIO
 
 _ALIGNMENT = 4
-# the kernel wants the next archive at a multiple of this
+# the next archive must start at a multiple of this
 _BLOCK = 512
 
 
 def write(root: Path, out: BinaryIO) -> None:
-    """Append everything below `root`. Hard links become files of their own."""
+    """Append everything below `root`. Hard links become separate files."""
     number = 0
     for folder, folders, files in os.walk(root):
         folders.sort()
@@ -43,7 +43,7 @@ def _entry(out: BinaryIO, number: int, name: str, path: Path) -> None:
 
 def _header(out: BinaryIO, number: int, name: str, *, mode: int, mtime: int, size: int) -> None:
     encoded = name.encode() + b"\0"
-    # ino mode uid gid nlink mtime size, the devices' four numbers, the name's length, no checksum
+    # ino mode uid gid nlink mtime size, four device numbers, the name's length, no checksum
     fields = (number, mode, 0, 0, 1, mtime, size, 0, 0, 0, 0, len(encoded), 0)
     out.write(b"070701" + b"".join(b"%08x" % field for field in fields) + encoded)
     out.write(bytes(-out.tell() % _ALIGNMENT))

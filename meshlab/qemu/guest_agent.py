@@ -1,4 +1,4 @@
-"""The machine's end of the channel to the host: requests, processes, doors (`channel` has the words)."""
+"""The machine's end of `guest_protocol`: requests, processes and forwarded ports."""
 
 from __future__ import annotations
 
@@ -17,24 +17,27 @@ from typing import Any
 
 from meshlab.errors import LabError
 from meshlab.qemu import guest_protocol
-from meshlab.qemu.port_forwarder import RealDoors
+from meshlab.qemu.port_forwarder import QemuPortForwarder
 
 log = logging.getLogger("meshlab.qemu.guest_agent")
 _CHUNK_BYTES = 1 << 16
-# a terminal passes on what was written to it a little later
+# a terminal passes on output with a delay
 _TERMINAL_DRAIN_S = 0.05
-_FAREWELL_S = 5.0
+_CLOSE_WAIT_S = 5.0
 
 
-class Agent:
-    """Serves connections whose first line holds `token`; `answer` is the fleet's (`control.Answer`)."""
+class GuestAgent:
+    """Serves connections whose first line has `token`; `answer` handles the fleet's requests (`control.Answer`)."""
 
     def __init__(
-        self, token: str, answer: Callable[[dict[str, Any], list[int]], Awaitable[dict[str, Any]]], doors: RealDoors
+        self,
+        token: str,
+        answer: Callable[[dict[str, Any], list[int]], Awaitable[dict[str, Any]]],
+        port_forwarder: QemuPortForwarder,
     ) -> None:
         self._token = token
         self._answer = answer
-        self._doors = doors
+        self._port_forwarder = port_forwarder
         self._server: asyncio.Server | None = None
         self._serving: set[asyncio.Task[None]] = set()
 
@@ -46,7 +49,7 @@ class Agent:
             self._server.close()
 
     def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        # a connection that is over must not take the task that serves it along
+        # keep a reference: the event loop holds tasks only weakly
         task = asyncio.ensure_future(self._serve(reader, writer))
         self._serving.add(task)
         task.add_done_callback(self._serving.discard)
@@ -71,25 +74,25 @@ class Agent:
         finally:
             writer.close()
 
-    # -- doors --
+    # -- forwarded ports --
 
     async def _watch(self, writer: asyncio.StreamWriter) -> None:
         while True:
-            changed = self._doors.changed
-            doors = {host: door.node for host, door in self._doors.wanted().items()}
-            writer.write(guest_protocol.line({"doors": doors}))
+            changed = self._port_forwarder.changed
+            ports = {host: port.node for host, port in self._port_forwarder.reachable().items()}
+            writer.write(guest_protocol.line({"doors": ports}))
             await writer.drain()
             await changed.wait()
 
     async def _dial(self, host: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._doors.is_hung(host):
-            # accepted, and then nothing until the other side gives up
+        if self._port_forwarder.is_hung(host):
+            # accept, and send nothing until the client closes
             writer.write(guest_protocol.line({}))
             while await reader.read(_CHUNK_BYTES):
                 pass
             return
         try:
-            made = await self._doors.dial(host)
+            made = await self._port_forwarder.dial(host)
         except (OSError, LabError) as error:
             log.info("dial-failed host=%s reason=%s", host, error or type(error).__name__)
             writer.write(guest_protocol.line({"error": str(error) or type(error).__name__}))
@@ -101,9 +104,9 @@ class Agent:
             there = asyncio.ensure_future(_copy(reader, node_writer))
             back = asyncio.ensure_future(_copy(node_reader, writer))
             try:
-                # whichever ends first, the other one gets a while: a node without power says no farewell
+                # after one direction ends, wait only a while for the other: a node without power never closes
                 await asyncio.wait((there, back), return_when=asyncio.FIRST_COMPLETED)
-                await asyncio.wait((there, back), timeout=_FAREWELL_S)
+                await asyncio.wait((there, back), timeout=_CLOSE_WAIT_S)
             finally:
                 there.cancel()
                 back.cancel()
@@ -116,9 +119,11 @@ class Agent:
     async def _execute(self, first: dict[str, Any], reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         streams = _Terminal(first["terminal"]) if first["terminal"] else _Pipes()
         loop = asyncio.get_running_loop()
-        tasks = [asyncio.ensure_future(_feed(reader, streams))]
+        tasks = [asyncio.ensure_future(_stream_input(reader, streams))]
         ended = asyncio.Event()
-        waiting = [loop.create_task(_tell(number, source, writer, ended)) for number, source in streams.outputs]
+        waiting = [
+            loop.create_task(_stream_output(number, source, writer, ended)) for number, source in streams.outputs
+        ]
         try:
             answer = await self._answer(first["request"], list(streams.theirs))
             streams.close_theirs()
@@ -134,7 +139,7 @@ class Agent:
 
 
 class _Pipes:
-    """Three pipes: what a process gets, and our ends of them. Every descriptor is closed once."""
+    """Pipes for a process's stdin, stdout and stderr, and our ends of them. Every descriptor is closed once."""
 
     def __init__(self) -> None:
         read, self.input = os.pipe()
@@ -145,7 +150,7 @@ class _Pipes:
         self._ours = {self.input, out, err}
 
     def end_input(self) -> None:
-        """Tell the process that nothing more comes."""
+        """Close the process's stdin."""
         self._ours.discard(self.input)
         os.close(self.input)
 
@@ -161,7 +166,7 @@ class _Pipes:
 
 
 class _Terminal(_Pipes):
-    """One terminal for all three, of so many rows and columns."""
+    """One terminal for all three streams, of the given rows and columns."""
 
     def __init__(self, size: list[int]) -> None:
         ours, theirs = pty.openpty()
@@ -172,7 +177,7 @@ class _Terminal(_Pipes):
         self._ours = {ours}
 
     def end_input(self) -> None:
-        """A terminal has no end of input of its own; it ends with the process."""
+        """A terminal's input ends with the process."""
 
 
 async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -183,8 +188,8 @@ async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
         writer.write_eof()
 
 
-async def _feed(reader: asyncio.StreamReader, streams: _Pipes) -> None:
-    """Input frames into a process; an empty one ends them."""
+async def _stream_input(reader: asyncio.StreamReader, streams: _Pipes) -> None:
+    """Write input frames to a process until an empty one closes its stdin."""
     loop = asyncio.get_running_loop()
     while True:
         _, length = guest_protocol.header(await reader.readexactly(guest_protocol.HEADER_BYTES))
@@ -192,7 +197,7 @@ async def _feed(reader: asyncio.StreamReader, streams: _Pipes) -> None:
         if not content:
             streams.end_input()
             return
-        # a pipe that is full waits in a thread of its own
+        # in a thread: writing to a full pipe blocks
         await loop.run_in_executor(None, _write_all, streams.input, content)
 
 
@@ -202,9 +207,9 @@ def _write_all(descriptor: int, content: bytes) -> None:
             content = content[os.write(descriptor, content) :]
 
 
-async def _tell(number: int, descriptor: int, writer: asyncio.StreamWriter, ended: asyncio.Event) -> None:
-    """A process's output as frames, until it is closed. One that stays behind may keep it open for ever and go on: so
-    once the process has `ended`, what a pipe holds at most is read, as far as it is there."""
+async def _stream_output(number: int, descriptor: int, writer: asyncio.StreamWriter, ended: asyncio.Event) -> None:
+    """Send a process's output as frames until it is closed. A background child may keep it open forever, so once the
+    process has `ended`, at most one pipe buffer of the available output is read."""
     loop = asyncio.get_running_loop()
     os.set_blocking(descriptor, False)
     ready = asyncio.Event()
@@ -214,7 +219,7 @@ async def _tell(number: int, descriptor: int, writer: asyncio.StreamWriter, ende
     try:
         while left > 0:
             await ready.wait()
-            # asked before reading: what comes later is not the ended process's
+            # checked before reading: later output is not the ended process's
             has_ended = ended.is_set()
             try:
                 content = os.read(descriptor, _CHUNK_BYTES)
@@ -224,7 +229,7 @@ async def _tell(number: int, descriptor: int, writer: asyncio.StreamWriter, ende
                 ready.clear()
                 continue
             except OSError:
-                # EIO: a terminal whose other side is gone
+                # EIO: the terminal's other end is closed
                 return
             if not content:
                 return

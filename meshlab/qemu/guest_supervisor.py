@@ -1,8 +1,8 @@
-"""The process behind the fleet on the machine's side, and process 1 there: the virtual fleet's supervisor and warden,
-with the kernel's radios for air and the host for a way in.
+"""The fleet's process inside the machine, and its process 1: the virtual fleet's supervisor and node runner, with the
+kernel's radios as links and ports that the host forwards.
 
-It starts as `python -m meshlab.qemu.guest_supervisor DIRECTORY`, where the image has put the ROM, the spec and the
-token. When it ends, the kernel panics and the machine with it: the host's process sees that.
+It starts as `python -m meshlab.qemu.guest_supervisor DIRECTORY`; the image has the ROM, the spec and the token there.
+When it ends, the kernel panics and the machine stops, which the host's process notices.
 """
 
 from __future__ import annotations
@@ -19,48 +19,43 @@ from typing import Any
 from meshlab.container import Container
 from meshlab.control import Operations
 from meshlab.errors import LabError
-from meshlab.link_state import Ether
-from meshlab.node_runner import Warden
-from meshlab.port_forwarder import Doors
+from meshlab.link_state import LinkState
+from meshlab.node_runner import NodeRunner
+from meshlab.port_forwarder import PortForwarder
 from meshlab.qemu import hwsim_devices
-from meshlab.qemu.guest_agent import Agent
-from meshlab.qemu.link_state import RealEther
-from meshlab.qemu.port_forwarder import RealDoors
-from meshlab.qemu.traffic_control import Fate
+from meshlab.qemu.guest_agent import GuestAgent
+from meshlab.qemu.guest_protocol import ADDRESS, PORT, READY
+from meshlab.qemu.link_state import QemuLinkState
+from meshlab.qemu.port_forwarder import QemuPortForwarder
+from meshlab.qemu.traffic_control import Impairment
 from meshlab.spec import FleetSpec, load
 from meshlab.state import NodeState
-from meshlab.supervisor import Supervisor, fork_warden
+from meshlab.supervisor import Supervisor, fork_node_runner
 
 log = logging.getLogger("meshlab.qemu")
-# TEST-NET-1 (RFC 5737): no fleet has it, and nothing leaves the machine
-ADDRESS = "192.0.2.15"
-GATEWAY = "192.0.2.2"
-NETWORK = "192.0.2.0/24"
-PORT = 7000
-READY = "lab: ready"
 
 
-class RealSupervisor(Supervisor):
-    """A supervisor whose air, cables and doors are the kernel's."""
+class QemuSupervisor(Supervisor):
+    """A supervisor whose links, cables and connections are the kernel's."""
 
-    def __init__(self, spec: FleetSpec, directory: Path, warden: socket.socket) -> None:
-        self.places = hwsim_devices.places(spec)
-        super().__init__(spec, directory, warden, deny_setgroups=False)
+    def __init__(self, spec: FleetSpec, directory: Path, runner: socket.socket) -> None:
+        self.hardware = hwsim_devices.node_hardware(spec)
+        super().__init__(spec, directory, runner, deny_setgroups=False)
 
-    def _make_ether(self) -> Ether:
-        self.real_ether = RealEther(self, self.places)
-        return self.real_ether
+    def _make_link_state(self) -> LinkState:
+        self.qemu_link_state = QemuLinkState(self.fleet, self.hardware)
+        return self.qemu_link_state
 
-    def _make_doors(self) -> Doors:
-        self.real_doors = RealDoors(self, self.places)
-        return self.real_doors
+    def _make_port_forwarder(self) -> PortForwarder:
+        self.qemu_port_forwarder = QemuPortForwarder(self.fleet, self.link_state, self, self.hardware)
+        return self.qemu_port_forwarder
 
     def _make_operations(self) -> Operations:
-        return RealOperations(self)
+        return QemuOperations(self)
 
     async def run(self) -> None:
         token = (self.directory / "token").read_text(encoding="ascii")
-        agent = Agent(token, self.operations.answer, self.real_doors)
+        agent = GuestAgent(token, self.operations.answer, self.qemu_port_forwarder)
         await agent.open(ADDRESS, PORT)
         sys.stderr.write(f"{READY}\n")
         try:
@@ -70,21 +65,24 @@ class RealSupervisor(Supervisor):
 
     def _read_effective(self, state: NodeState) -> None:
         super()._read_effective(state)
-        self.real_ether.forget(state.spec.name)
-        self.ether.changed()
+        self.qemu_link_state.reset_impairments(state.spec.name)
+        self.link_state.changed()
 
 
-class RealOperations(Operations):
-    """What a fleet of real radios can be asked for besides."""
+class QemuOperations(Operations):
+    """The additional operations of a QEMU fleet."""
 
-    def __init__(self, fleet: RealSupervisor) -> None:
-        super().__init__(fleet)
-        self._real = fleet
+    def __init__(self, supervisor: QemuSupervisor) -> None:
+        super().__init__(
+            supervisor.fleet, supervisor.link_state, supervisor.port_forwarder, supervisor.faults, supervisor
+        )
+        self._hardware = supervisor.hardware
+        self._qemu_link_state = supervisor.qemu_link_state
 
-    async def carry_out(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
+    async def dispatch(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
         if request["op"] == "machine":
             return await self._machine(request["command"], descriptors)
-        return await super().carry_out(request, descriptors)
+        return await super().dispatch(request, descriptors)
 
     async def _machine(self, command: str, descriptors: list[int]) -> dict[str, Any]:
         source, out, err = descriptors
@@ -92,24 +90,24 @@ class RealOperations(Operations):
         return {"status": await process.wait()}
 
     def radios(self) -> dict[str, Any]:
-        return {"radios": {name: list(place.phys) for name, place in self._real.places.items()}}
+        return {"radios": {name: list(hardware.phys) for name, hardware in self._hardware.items()}}
 
     def set_groups(self, masks: dict[str, int]) -> None:
         for name in masks:
-            self._real.hurt.find(name)
-        self._real.real_ether.set_groups(masks)
+            self._fleet.node(name)
+        self._qemu_link_state.set_groups(masks)
 
     def set_loss(self, losses: list[tuple[str, str, float]]) -> None:
-        fates: dict[str, dict[str, Fate]] = {}
+        impairments: dict[str, dict[str, Impairment]] = {}
         for sender, receiver, loss in losses:
-            cells = self._real.hurt.find(sender).effective.cells
-            fates.setdefault(receiver, {}).update({cell.mac: Fate(loss) for cell in cells})
-        for receiver, heard in fates.items():
-            self._real.real_ether.lose(self._real.hurt.find(receiver), heard)
+            cells = self._fleet.node(sender).effective.interfaces
+            impairments.setdefault(receiver, {}).update({cell.mac: Impairment(loss) for cell in cells})
+        for receiver, heard in impairments.items():
+            self._qemu_link_state.impair(self._fleet.node(receiver), heard)
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Become the supervisor of the fleet in DIRECTORY."""
+    """Run the supervisor of the fleet in DIRECTORY."""
     directory = Path(arguments[1])
     logging.basicConfig(level=logging.INFO, format="%(relativeCreated)d %(name)s %(message)s")
     spec = load((directory / "spec.json").read_text(encoding="utf-8"))
@@ -118,18 +116,18 @@ def main(arguments: Sequence[str]) -> int:
     (directory / "mnt").mkdir(exist_ok=True)
     os.mkfifo(directory / "bell", 0o622)
     (directory / "bell").chmod(0o622)
-    places = hwsim_devices.places(spec)
+    hardware = hwsim_devices.node_hardware(spec)
 
-    def put_devices(container: Container, pid: int) -> None:
-        hwsim_devices.put_devices(places[container.name], pid)
+    def attach_devices(container: Container, pid: int) -> None:
+        hwsim_devices.attach_devices(hardware[container.name], pid)
 
-    def take_devices(name: str, network: int) -> None:
-        hwsim_devices.take_devices(places[name], network)
+    def detach_devices(name: str, network: int) -> None:
+        hwsim_devices.detach_devices(hardware[name], network)
 
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    fork_warden(lambda: Warden(theirs, put_devices, take_devices), theirs, close=ours)
+    fork_node_runner(lambda: NodeRunner(theirs, attach_devices, detach_devices), theirs, close=ours)
     try:
-        asyncio.run(RealSupervisor(spec, directory, ours).run())
+        asyncio.run(QemuSupervisor(spec, directory, ours).run())
     except LabError as error:
         log.error("failed reason=%s", error)
         return 1

@@ -1,12 +1,12 @@
-"""The process behind a fleet of real radios on this side: it runs the machine, and carries everything into it.
+"""The process of a QEMU fleet on the host: it runs the machine and proxies requests and connections into it.
 
-It starts as `python -m meshlab.qemu.host_proxy DIRECTORY`, in whose spec.json the fleet is:
+It starts as `python -m meshlab.qemu.host_proxy DIRECTORY` and reads the fleet from spec.json there:
 
-    image -> machine (one more try, the reason in the log) -> a watch on its doors
-    control.sock: requests, and processes with their descriptors, as a virtual fleet's supervisor takes them
-    127.b.c.d, one port: a listening socket for each door, each connection dialled in the machine
+    initramfs -> machine (retried once, with the reason in the log) -> a watch on the machine's forwarded ports
+    control.sock: requests, and processes with their descriptors, like a virtual fleet's supervisor
+    127.b.c.d, one port: a listening socket for each forwarded port, each connection dialed in the machine
 
-It ends with the machine, or when asked to (`down`), and the machine ends with it.
+It ends with the machine, or on `down`, and the machine ends with it.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from meshlab.control import Control
 from meshlab.errors import LabError
 from meshlab.port_forwarder import claim_port
 from meshlab.qemu import guest_protocol, initramfs
-from meshlab.qemu.qemu import TCG, Machine, accelerator_here, find_qemu
-from meshlab.qemu.remote_exec import carry_process
+from meshlab.qemu.qemu import TCG, Machine, cached_accelerator, find_qemu
+from meshlab.qemu.remote_exec import run_process
 from meshlab.shaped_tunnel import reset
 from meshlab.spec import load
 
@@ -37,14 +37,14 @@ log = logging.getLogger("meshlab.qemu.host_proxy")
 _BACKLOG = 16
 _CHUNK_BYTES = 1 << 16
 _POLL_S = 0.5
-# from QEMU's first instruction until the supervisor is there: under emulation, on a machine with much else to do
+# the time to boot until the supervisor is ready, under emulation on a busy host
 _START_S = 180.0
-_TRIES = 2
+_ATTEMPTS = 2
 _ANSWER_S = 60.0
 
 
-class Relay:
-    """Carries requests and connections to the machine until `stopping`."""
+class HostProxy:
+    """Proxies requests and connections to the machine until `stopping`."""
 
     def __init__(self, directory: Path, machine: Machine, token: str, port: int) -> None:
         self._directory = directory
@@ -60,7 +60,7 @@ class Relay:
         loop = asyncio.get_running_loop()
         for ending in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(ending, self.stopping.set)
-        claim, self.port = claim_port(self._wanted_port)
+        port_lock, self.port = claim_port(self._wanted_port)
         control = Control(self._directory, self.answer)
         control.open()
         watching = asyncio.ensure_future(self._watch())
@@ -74,24 +74,24 @@ class Relay:
             control.close()
             for task in (watching, *self._tunnels):
                 task.cancel()
-            self._open({})
+            self._update_listeners({})
             await asyncio.gather(watching, *self._tunnels, return_exceptions=True)
-            claim.close()
+            port_lock.close()
 
     def _machine_ended(self) -> None:
-        log.error("machine-ended\n%s", self._machine.last_words())
+        log.error("machine-ended\n%s", self._machine.console_tail())
         self.stopping.set()
 
     # -- requests --
 
     async def answer(self, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
-        """One request of `control.sock` (`control.Answer`)."""
+        """Forward one request of `control.sock` (`control.Answer`)."""
         if request["op"] == "down":
             self.stopping.set()
             return {}
         try:
             if descriptors:
-                return await carry_process(self._connect, request, descriptors)
+                return await run_process(self._connect, request, descriptors)
             reader, writer = await self._connect("request", request=request)
             try:
                 answer: dict[str, Any] = json.loads(await reader.readline())
@@ -109,33 +109,33 @@ class Relay:
         await writer.drain()
         return reader, writer
 
-    # -- doors --
+    # -- forwarded ports --
 
     async def _watch(self) -> None:
-        """Keep the listening sockets in step with what the machine says."""
+        """Keep the listening sockets in sync with the machine's reachable ports."""
         while True:
             with contextlib.suppress(OSError, ValueError):
                 reader, writer = await self._connect("watch")
                 try:
                     while line := await reader.readline():
-                        self._open(json.loads(line)["doors"])
+                        self._update_listeners(json.loads(line)["doors"])
                 finally:
                     writer.close()
             await asyncio.sleep(_POLL_S)
 
-    def _open(self, doors: dict[str, str]) -> None:
-        for host in self._listening.keys() - doors.keys():
+    def _update_listeners(self, ports: dict[str, str]) -> None:
+        for host in self._listening.keys() - ports.keys():
             listener, task = self._listening.pop(host)
             task.cancel()
             listener.close()
-        for host in doors.keys() - self._listening.keys():
+        for host in ports.keys() - self._listening.keys():
             listener = socket.socket()
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 listener.bind((host, self.port))
             except OSError as error:
                 listener.close()
-                log.error("door-taken host=%s port=%d error=%s", host, self.port, error)
+                log.error("port-in-use host=%s port=%d error=%s", host, self.port, error)
                 continue
             listener.listen(_BACKLOG)
             listener.setblocking(False)
@@ -185,35 +185,35 @@ async def _from_machine(reader: asyncio.StreamReader, client: socket.socket) -> 
 
 
 def start(directory: Path, spec_text: str, token: str) -> Machine:
-    """The fleet's machine, ready. Raises LabError when it does not start twice in a row; its consoles are kept."""
+    """Start the fleet's machine. Raises LabError after two failed attempts, whose consoles are kept."""
     find_qemu()
     cache = initramfs.cache_folder()
-    base = initramfs.base(cache)
-    initrd = initramfs.product(base, spec_text, token, directory)
+    base = initramfs.base_image(cache)
+    initrd = initramfs.build_initrd(base, spec_text, token, directory)
     spec = load(spec_text)
     radios = sum(len(node.radios) for node in spec.nodes)
-    how = accelerator_here(base.kernel, cache)
-    log.info("accelerator words=%s", " ".join(how.words))
+    how = cached_accelerator(base.kernel, cache)
+    log.info("accelerator words=%s", " ".join(how.options))
     machine = Machine(directory, base.kernel, initrd, radios=radios, nodes=len(spec.nodes))
-    for attempt in range(1, _TRIES + 1):
+    for attempt in range(1, _ATTEMPTS + 1):
         try:
             machine.start(how, _START_S)
-            _wait_answer(machine, token)
+            _check_reachable(machine, token)
             break
         except LabError as error:
             machine.stop()
             log.error("start-failed attempt=%d reason=%s\n%s", attempt, error, error.hint)
             kept = machine.console.rename(directory / f"console.failed-{attempt}") if machine.console.exists() else None
-            if attempt == _TRIES:
-                raise LabError(f"{error} ({_TRIES} times); consoles are kept: {kept}", hint=error.hint) from error
-            # what a short boot did not show, a long one may
+            if attempt == _ATTEMPTS:
+                raise LabError(f"{error} ({_ATTEMPTS} times); consoles are kept: {kept}", hint=error.hint) from error
+            # KVM may fail in a long boot though the short probe succeeded
             how = TCG
     initrd.unlink()
     return machine
 
 
-def _wait_answer(machine: Machine, token: str) -> None:
-    """A machine that says it is ready must be reached, too. Raises LabError when it is not."""
+def _check_reachable(machine: Machine, token: str) -> None:
+    """Check that a machine that reports ready also answers. Raises LabError when it does not."""
     try:
         with socket.create_connection(("127.0.0.1", machine.port), timeout=_ANSWER_S) as connection:
             connection.sendall(guest_protocol.line({"token": token, "kind": "request", "request": {"op": "status"}}))
@@ -222,11 +222,11 @@ def _wait_answer(machine: Machine, token: str) -> None:
             reason = "it closed the connection"
     except OSError as error:
         reason = str(error)
-    raise LabError(f"the machine is ready and does not answer: {reason}", hint=machine.last_words())
+    raise LabError(f"the machine is ready but does not answer: {reason}", hint=machine.console_tail())
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Become the process behind the fleet in DIRECTORY. Errors go to `failure` there, as the virtual fleet's do."""
+    """Run the fleet in DIRECTORY. Errors are written to `failure` there, as for a virtual fleet."""
     directory = Path(arguments[1]).resolve()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
     spec_text = (directory / "spec.json").read_text(encoding="utf-8")
@@ -235,7 +235,7 @@ def main(arguments: Sequence[str]) -> int:
         machine = start(directory, spec_text, token)
         try:
             (directory / "supervisor.pid").write_text(f"{os.getpid()}\n", encoding="ascii")
-            asyncio.run(Relay(directory, machine, token, load(spec_text).port).run())
+            asyncio.run(HostProxy(directory, machine, token, load(spec_text).port).run())
         finally:
             machine.stop()
     except (LabError, OSError) as error:

@@ -1,7 +1,7 @@
-"""The machine's image: Debian's kernel, and an archive of files in two parts.
+"""The machine's image: Debian's kernel, and an initramfs in two parts.
 
-`base` (cached; rebuilt when this package's recipe changes): packages, kernel modules, compiled Python.
-`product` (at every start, in well under a second of CPU): the nodes' ROM, this package's code, the fleet's spec.
+`base_image` (cached; rebuilt when its recipe changes): packages, kernel modules, compiled Python.
+`build_initrd` (at every start, under a second of CPU): the base, the nodes' ROM, this package's code, the fleet's spec.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from pathlib import Path
 import meshctl
 from meshlab import rootfs
 from meshlab.errors import LabError
-from meshlab.qemu import apt, cpio, debian_packages, kernel_modules
+from meshlab.qemu import apt, cpio, kernel_modules
 
 _HERE = Path(__file__).resolve().parent
 _PACKAGE = Path(meshctl.__file__).resolve().parent
-# of this package, what runs in the machine
+# the parts of meshctl that run in the machine
 _CODE = ("__init__.py", "diagnostics.py", "errors.py", "model")
 CODE_FOLDER = "opt/lab"
 FLEET_FOLDER = "lab"
-# what the nodes' stand-ins run on real devices; each is a program of Debian's
+# Debian's programs that the nodes' stand-ins run on real devices
 _NODE_PROGRAMS = ("iw", "batctl", "ip", "wpa_supplicant", "iperf3", "tcpdump")
 _PROGRAM_FOLDERS = ("usr/sbin", "sbin", "usr/bin", "bin")
 _LIBRARY_FOLDERS = ("lib/x86_64-linux-gnu", "usr/lib/x86_64-linux-gnu", "lib64")
@@ -39,8 +39,8 @@ _FOLDERS = ("proc", "sys", "dev", "run", "tmp", "mnt", "root", "etc", "sbin", "b
 
 
 @dataclass(frozen=True, slots=True)
-class Base:
-    """The cached part: `root` are the unpacked files that `archive` holds."""
+class BaseImage:
+    """The cached part: `archive` has the files below `root`."""
 
     kernel: Path
     archive: Path
@@ -52,43 +52,45 @@ def cache_folder(environ: Mapping[str, str] = os.environ) -> Path:
     return Path(environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "meshctl" / "lab-real"
 
 
-def base(cache: Path) -> Base:
-    """The base, built if it is not in `cache`. Raises LabError when it cannot be built here."""
+def base_image(cache: Path) -> BaseImage:
+    """The base, built if `cache` does not have it. Raises LabError when it cannot be built on this host."""
     if platform.machine() != "x86_64":
-        raise LabError(f"the machine of real radios is an x86_64 one; this is {platform.machine()}")
+        raise LabError(
+            f"--real needs an x86_64 host, found {platform.machine()}", hint="run `meshctl lab up` without --real"
+        )
     cache.mkdir(parents=True, exist_ok=True)
-    place = cache / _recipe()
-    with _alone(cache):
+    place = cache / _recipe_digest()
+    with _locked(cache):
         if not place.exists():
             _build_base(cache, place)
-    return Base(place / "vmlinuz", place / "base.cpio", place / "root")
+    return BaseImage(place / "vmlinuz", place / "base.cpio", place / "root")
 
 
-def product(base_: Base, spec_text: str, token: str, work: Path) -> Path:
-    """The whole initial RAM disk as a file in `work`: the base's archive and what belongs to this fleet behind it."""
+def build_initrd(image: BaseImage, spec_text: str, token: str, work: Path) -> Path:
+    """Write the initramfs to a file in `work`: the base's archive followed by the files of this fleet."""
     tree = work / "product"
     shutil.rmtree(tree, ignore_errors=True)
-    _lay_code(tree / CODE_FOLDER)
-    _compile(base_.root, tree / CODE_FOLDER)
+    _install_code(tree / CODE_FOLDER)
+    _compile(image.root, tree / CODE_FOLDER)
     fleet = tree / FLEET_FOLDER
     fleet.mkdir()
-    rootfs.build(fleet / "rom", sysroot=base_.root, more=_HERE / "node_root", library_folders=_LIBRARY_FOLDERS)
-    _lay_programs(base_.root, fleet / "rom")
+    rootfs.build(fleet / "rom", sysroot=image.root, more=_HERE / "node_root", library_folders=_LIBRARY_FOLDERS)
+    _install_programs(image.root, fleet / "rom")
     (fleet / "spec.json").write_text(spec_text, encoding="utf-8")
     (fleet / "token").write_text(token, encoding="ascii")
     shutil.copy2(_HERE / "machine_root" / "init", tree / "init")
     (tree / "init").chmod(0o755)
     initrd = work / "initrd"
     with initrd.open("wb") as out:
-        with base_.archive.open("rb") as first:
+        with image.archive.open("rb") as first:
             shutil.copyfileobj(first, out, 1 << 20)
         cpio.write(tree, out)
     shutil.rmtree(tree)
     return initrd
 
 
-def _recipe() -> str:
-    """A name for what a base is made of: another recipe makes another base."""
+def _recipe_digest() -> str:
+    """The cache key of a base: a digest of the code that builds it."""
     text = "".join(inspect.getsource(module) for module in (apt, kernel_modules, cpio)) + inspect.getsource(_build_base)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -96,7 +98,7 @@ def _recipe() -> str:
 def _build_base(cache: Path, place: Path) -> None:
     with tempfile.TemporaryDirectory(prefix="building-", dir=cache) as folder:
         work = Path(folder)
-        tools = apt.Apt(work, debian_packages.sources(cache))
+        tools = apt.Apt(work, apt.sources(cache))
         apt.update(tools)
         resolved = apt.resolve(tools)
         apt.download(resolved, tools, cache / "archives")
@@ -104,8 +106,8 @@ def _build_base(cache: Path, place: Path) -> None:
         apt.unpack_kernel(resolved, cache / "archives", work / "kernel")
         root, made = work / "root", work / "made"
         made.mkdir()
-        _lay_modules(next((work / "kernel" / "lib" / "modules").iterdir()), root)
-        _lay_folders(root)
+        _install_modules(next((work / "kernel" / "lib" / "modules").iterdir()), root)
+        _make_folders(root)
         _compile(root, next((root / "usr" / "lib").glob("python3.*")))
         _compile(root, root / "usr" / "lib" / "python3" / "dist-packages")
         shutil.copy2(next((work / "kernel" / "boot").glob("vmlinuz-*")), made / "vmlinuz")
@@ -115,7 +117,7 @@ def _build_base(cache: Path, place: Path) -> None:
         made.rename(place)
 
 
-def _lay_modules(modules: Path, root: Path) -> None:
+def _install_modules(modules: Path, root: Path) -> None:
     target = root / "lib" / "modules"
     target.mkdir(parents=True, exist_ok=True)
     names = []
@@ -125,7 +127,7 @@ def _lay_modules(modules: Path, root: Path) -> None:
     (target / "order").write_text("".join(f"{name}\n" for name in names), encoding="ascii")
 
 
-def _lay_folders(root: Path) -> None:
+def _make_folders(root: Path) -> None:
     for folder in _FOLDERS:
         (root / folder).mkdir(parents=True, exist_ok=True)
     for name, content in (("passwd", "root::0:0:root:/root:/bin/sh\n"), ("group", "root:x:0:\n")):
@@ -135,14 +137,14 @@ def _lay_folders(root: Path) -> None:
         if not (firmware / name).exists():
             (firmware / name).unlink(missing_ok=True)
             (firmware / name).symlink_to(f"{name}-debian")
-    # dash: busybox' own shell prefers its applets over iproute2
+    # dash: busybox's shell prefers its applets over iproute2
     (root / "bin" / "sh").unlink(missing_ok=True)
     (root / "bin" / "sh").symlink_to("dash")
     if not (root / "bin" / "busybox").exists():
         (root / "bin" / "busybox").symlink_to("../usr/bin/busybox")
 
 
-def _lay_code(target: Path) -> None:
+def _install_code(target: Path) -> None:
     package = target / "meshctl"
     package.mkdir(parents=True)
     ignored = shutil.ignore_patterns("__pycache__", "node_root", "machine_root")
@@ -155,8 +157,8 @@ def _lay_code(target: Path) -> None:
             shutil.copy2(source, package / name)
 
 
-def _lay_programs(root: Path, rom_folder: Path) -> None:
-    """Debian's programs for the nodes, and the libraries that they and the ROM's need."""
+def _install_programs(root: Path, rom_folder: Path) -> None:
+    """Copy Debian's programs for the nodes, and the libraries of these and of the ROM's programs."""
     kernel = rom_folder / "lab" / "kernel"
     kernel.mkdir(exist_ok=True)
     for name in _NODE_PROGRAMS:
@@ -170,7 +172,7 @@ def _lay_programs(root: Path, rom_folder: Path) -> None:
 
 
 def _libraries(root: Path, program: Path) -> list[Path]:
-    """The libraries in `root` that a program needs, and the loader."""
+    """The program's libraries in `root`, and the loader."""
     loader = _loader(root)
     listed = subprocess.run((*loader, "--list", program), capture_output=True, text=True, check=False).stdout
     return [Path(path) for path in re.findall(r"=> (/\S+) \(0x", listed)] + [Path(loader[0])]
@@ -179,29 +181,29 @@ def _libraries(root: Path, program: Path) -> list[Path]:
 def _program(root: Path, name: str) -> Path:
     found = next((root / folder / name for folder in _PROGRAM_FOLDERS if (root / folder / name).is_file()), None)
     if found is None:
-        raise LabError(f"{name} is not among the packages of the lab's machine")
+        raise LabError(f"no package of the lab's machine contains {name}")
     return found
 
 
 def _compile(root: Path, folder: Path) -> None:
-    """Compile Python files with the machine's own Python: under emulation that would take most of the start."""
+    """Compile Python files with the machine's Python on the host: under emulation it would take most of the start."""
     python = sorted((root / "usr" / "bin").glob("python3.*"))[0]
     options = ("-m", "compileall", "-q", "--invalidation-mode", "unchecked-hash", folder)
     environment = {"PYTHONHOME": str(root / "usr"), "PATH": "/usr/bin:/bin"}
     words = (*_loader(root), python, *options)
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise LabError(f"Python files in {folder} cannot be compiled: {done.stderr.strip() or done.stdout.strip()}")
+        raise LabError(f"cannot compile the Python files in {folder}: {done.stderr.strip() or done.stdout.strip()}")
 
 
 def _loader(root: Path) -> tuple[str, str, str]:
-    """How a program of `root` is started on this machine, with the libraries of `root`."""
+    """The command prefix that runs a program of `root` on the host with the libraries of `root`."""
     libraries = ":".join(str(root / name) for name in _LIBRARY_FOLDERS)
     return str(root / "lib64" / "ld-linux-x86-64.so.2"), "--library-path", libraries
 
 
 @contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def _locked(folder: Path) -> Iterator[None]:
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

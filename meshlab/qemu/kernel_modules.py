@@ -1,4 +1,4 @@
-"""Kernel modules with what they need, in the order of loading; read from the modules themselves, as depmod does."""
+"""Kernel modules and their dependencies in loading order, read from the modules themselves, as depmod does."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from meshlab.errors import LabError
 
-# in this order: batman-adv wants a checksum that no module names as a dependency, encryption its ciphers
+# in this order: batman-adv needs crc32c and encryption needs ciphers, neither of which is a declared dependency
 MODULES = (
     "crc32c_generic", "virtio_pci", "virtio_net", "af_packet", "bridge", "veth",
     "aes_generic", "ctr", "ccm", "cmac", "gcm", "mac80211_hwsim", "batman-adv",
@@ -20,7 +20,8 @@ _DEPENDS = re.compile(rb"\0depends=([^\0]*)\0")
 def in_order(modules: Path, names: Iterable[str] = MODULES) -> list[Path]:
     """The files to load below `modules` (lib/modules/VERSION), dependencies first.
 
-    A module that is built in, or that this kernel has not (ciphers move), is left out; mac80211_hwsim must be there.
+    Modules that are built in or missing (ciphers move between modules) are skipped. Raises LabError when
+    mac80211_hwsim is missing.
     """
     files = {_canonical(path.name.split(".")[0]): path for path in modules.rglob("*.ko*")}
     found: dict[str, Path] = {}
@@ -39,7 +40,7 @@ def in_order(modules: Path, names: Iterable[str] = MODULES) -> list[Path]:
     for name in names:
         visit(_canonical(name))
     if "mac80211_hwsim" not in found:
-        raise LabError(f"the kernel in {modules} has no mac80211_hwsim", hint="the lab's machine needs Debian's kernel")
+        raise LabError(f"the kernel in {modules} has no mac80211_hwsim", hint="use Debian's kernel")
     return list(found.values())
 
 

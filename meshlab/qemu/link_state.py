@@ -1,50 +1,44 @@
-"""The air of a fleet of real radios: links -> hwsim's groups, and what is lost on its way, in the kernel.
+"""Link state of a QEMU fleet: links -> hwsim groups and traffic control in the kernel.
 
-A link that is up, or a node that gets power, changes the groups; losses, delays and rates become traffic control on the
-node that hears (`losses`). Nobody computes tables or paths here: batman-adv does. Cables are laid here, too, because
-`changed()` is also how the supervisor says that a node was plugged in or pulled out.
+Links and power changes set the hwsim groups; losses, delays and rates become traffic control on the receiving node
+(`traffic_control`). Tables and routes are batman-adv's own. Cables are connected here, too, because `changed()` also
+reports that a node was plugged in or unplugged.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING
 
 from meshlab import hwsim_groups
 from meshlab.errors import LabError
-from meshlab.link_state import Ether
+from meshlab.fleet_state import FleetState
+from meshlab.link_state import LinkState
 from meshlab.qemu import hwsim_devices, traffic_control
 from meshlab.quality import loss_of
 from meshlab.shaped_tunnel import Shape
 from meshlab.spec import Medium
 from meshlab.state import NodeState
 
-if TYPE_CHECKING:
-    from meshlab.supervisor import Supervisor
-
 log = logging.getLogger("meshlab.qemu.link_state")
-# so soon after the last change; many changes at once are one
-_SOON_S = 0.02
-# after something could not be applied to a node that goes on running
-_AGAIN_S = 1.0
+# after a change could not be applied to a running node
+_RETRY_S = 1.0
 
 
-class RealEther(Ether):
-    """`places` tells where each node's hardware is."""
+class QemuLinkState(LinkState):
+    """`hardware` has each node's devices in the machine."""
 
-    def __init__(self, fleet: Supervisor, places: dict[str, hwsim_devices.Place]) -> None:
+    def __init__(self, fleet: FleetState, hardware: dict[str, hwsim_devices.NodeHardware]) -> None:
         super().__init__(fleet)
-        self._places = places
+        self._hardware = hardware
         self._groups: dict[str, int] = {}
-        self._laid: dict[str, tuple[int, bool]] = {}
-        self._lossy: dict[str, tuple[int, str]] = {}
-        self._soon_s = _SOON_S
+        self._cabled: dict[str, tuple[int, bool]] = {}
+        self._impaired: dict[str, tuple[int, str]] = {}
 
-    # -- what holds now --
+    # -- groups, cables and impairments --
 
-    def _cut(self) -> None:
-        """A node without power is silent at once; the kernel takes its interfaces apart a little later."""
+    def _remove_lost_routes(self) -> None:
+        """Silence a node without power now; the kernel removes its interfaces a little later."""
         off = [name for name, state in self._fleet.nodes.items() if not state.is_running and self._groups.get(name)]
         if off:
             self.set_groups(dict.fromkeys(off, 0))
@@ -57,33 +51,33 @@ class RealEther(Ether):
         self.set_groups(hwsim_groups.assign(list(self._fleet.nodes), edges))
         for state in self._fleet.nodes.values():
             try:
-                self._lay_cable(state)
-                self._lose(state)
+                self._connect_cable(state)
+                self._impair_node(state)
             except LabError as error:
-                # a node that ends in this moment takes its devices with it, one that configures them makes them again
+                # a node that is ending removes its devices; one that is reconfiguring recreates them
                 log.warning("not-applied node=%s reason=%s", state.spec.name, error)
                 if state.is_running:
-                    asyncio.get_running_loop().call_later(_AGAIN_S, self.changed)
-        self._tell()
+                    asyncio.get_running_loop().call_later(_RETRY_S, self.changed)
+        self._notify()
 
     def set_groups(self, masks: dict[str, int]) -> None:
-        """Give nodes' radios their masks, in an order in which nobody hears whom it should not."""
-        for name, mask in hwsim_groups.steps(self._groups, masks):
-            for phy in self._places[name].phys:
+        """Write radios' group masks in an order that links no other radios meanwhile."""
+        for name, mask in hwsim_groups.transition(self._groups, masks):
+            for phy in self._hardware[name].phys:
                 hwsim_devices.set_group(phy, mask)
             self._groups[name] = mask
 
-    def _lay_cable(self, state: NodeState) -> None:
+    def _connect_cable(self, state: NodeState) -> None:
         if state.pid <= 0:
             return
         on_bench = state.plugged and not self._is_base(state)
-        wanted = (state.boots, on_bench)
-        if self._laid.get(state.spec.name) != wanted:
-            hwsim_devices.lay_cable(self._places[state.spec.name], self._fleet.spec, on_bench=on_bench)
-            self._laid[state.spec.name] = wanted
+        cabled = (state.boots, on_bench)
+        if self._cabled.get(state.spec.name) != cabled:
+            hwsim_devices.connect_cable(self._hardware[state.spec.name], self._fleet.spec, on_bench=on_bench)
+            self._cabled[state.spec.name] = cabled
 
-    def _lose(self, state: NodeState) -> None:
-        """What this node's radios do not hear of what they could hear."""
+    def _impair_node(self, state: NodeState) -> None:
+        """Set the impairments of everything that this node's radios receive."""
         if state.pid <= 0:
             return
         name = state.spec.name
@@ -92,48 +86,51 @@ class RealEther(Ether):
             if name not in link.ends or not link.up:
                 continue
             other = link.b if name == link.a else link.a
-            # a quality given by hand is what losses of that size make of a link
+            # a TQ limit is implemented as the loss that leads to it
             loss = max(link.loss_to(name), loss_of(link.tq))
-            fate = traffic_control.Fate(loss, link.delay_ms, link.rate_kbps)
-            if not fate.is_nothing:
-                heard.update({cell.mac: fate for cell in self._fleet.nodes[other].effective.cells})
-        self.lose(state, heard)
+            impairment = traffic_control.Impairment(loss, link.delay_ms, link.rate_kbps)
+            if not impairment.is_none:
+                heard.update({cell.mac: impairment for cell in self._fleet.nodes[other].effective.interfaces})
+        self.impair(state, heard)
 
-    def lose(self, state: NodeState, heard: dict[str, traffic_control.Fate]) -> None:
-        """Make it so on every radio interface of the node that is up."""
-        batch = "".join(traffic_control.batch(cell.interface, heard) for cell in state.effective.cells)
-        wanted = (state.boots, batch)
-        if self._lossy.get(state.spec.name, (state.boots, "")) == wanted:
+    def impair(self, state: NodeState, heard: dict[str, traffic_control.Impairment]) -> None:
+        """Apply impairments, by the sender's MAC, on every radio interface of the node that is up."""
+        batch = "".join(traffic_control.batch(cell.interface, heard) for cell in state.effective.interfaces)
+        impaired = (state.boots, batch)
+        if self._impaired.get(state.spec.name, (state.boots, "")) == impaired:
             return
-        for cell in state.effective.cells:
+        for cell in state.effective.interfaces:
             traffic_control.clear(state.pid, cell.interface)
             if heard:
-                traffic_control.put(state.pid, cell.interface, traffic_control.batch(cell.interface, heard))
-        self._lossy[state.spec.name] = wanted
+                traffic_control.apply(state.pid, cell.interface, traffic_control.batch(cell.interface, heard))
+        self._impaired[state.spec.name] = impaired
 
-    def forget(self, name: str) -> None:
-        """The node has configured its interfaces anew: what was done to them is gone."""
-        self._lossy[name] = (self._fleet.nodes[name].boots, "?")
+    def reset_impairments(self, name: str) -> None:
+        """The node has reconfigured its interfaces, which removed their traffic control."""
+        self._impaired[name] = (self._fleet.nodes[name].boots, "?")
 
-    # -- the way to the operator --
+    # -- the operator's path --
 
-    def way(self, name: str, address: str) -> Shape | None:
-        """Whether a door may stand there; where it leads, the kernel finds out when somebody enters."""
+    def path_shape(self, name: str, address: str) -> Shape | None:
+        """An unrestricted shape if the address may be reachable; the kernel decides when a connection is made."""
         state = self._fleet.nodes[name]
         if not state.is_running:
             return None
-        if self.wire(name, address) is not None:
+        if self.bench_shape(name, address) is not None:
             return Shape()
         return Shape() if state.effective.holds(address, over="mesh") else None
 
-    def reached(self) -> set[str]:
-        """The nodes that the base's batman-adv has a route to at this moment."""
+    def reachable(self) -> set[str]:
+        """The nodes to which the base's batman-adv has a route."""
         of_mac = {
-            cell.mac: name for name, state in self._fleet.nodes.items() for cell in state.effective.cells if state.pid
+            cell.mac: name
+            for name, state in self._fleet.nodes.items()
+            for cell in state.effective.interfaces
+            if state.pid
         }
         found: set[str] = set()
         for state in self._fleet.nodes.values():
-            if self._is_base(state) and state.pid > 0 and state.effective.cells:
+            if self._is_base(state) and state.pid > 0 and state.effective.interfaces:
                 found.add(state.spec.name)
                 found.update(of_mac[mac] for mac in traffic_control.originators(state.pid) if mac in of_mac)
         return found

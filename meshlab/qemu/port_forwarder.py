@@ -1,7 +1,7 @@
-"""The operator's way in, on the machine's side: which doors stand, and a socket from where the operator is.
+"""Port forwarding inside the machine: the reachable ports, and connections to them.
 
-The host listens and asks for a door (`relay`); whether the node behind it answers, the kernel finds out: on the bench
-over the node's own cable, else from the computer at the base's LAN, through the mesh.
+The host listens and requests a connection (`host_proxy`); it is made over the node's own cable on the bench, else from
+the computer on the base's LAN, through the mesh.
 """
 
 from __future__ import annotations
@@ -12,117 +12,121 @@ import os
 import socket
 from ipaddress import IPv4Interface
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from meshlab import namespaces as ns
 from meshlab.errors import LabError
-from meshlab.port_forwarder import Door, Doors
+from meshlab.fleet_state import FleetState, NodeControl
+from meshlab.link_state import LinkState
+from meshlab.port_forwarder import ForwardedPort, PortForwarder
 from meshlab.qemu import hwsim_devices
 from meshlab.spec import Medium
 
-if TYPE_CHECKING:
-    from meshlab.supervisor import Supervisor
-
 _SSH_PORT = 22
-# the kernel gives up an address that nobody answers for after 3 s, a lost SYN is repeated after 1, 3 and 7
+# the kernel gives up unanswered ARP after 3 s, and retransmits a lost SYN after 1, 3 and 7 s
 _DIAL_S = 10.0
 _FACTORY_PREFIX = 24
 
 
-class RealDoors(Doors):
-    """`changed` is notified when other doors stand than before."""
+class QemuPortForwarder(PortForwarder):
+    """`changed` is set when the reachable ports have changed, and replaced by a new event."""
 
-    def __init__(self, fleet: Supervisor, places: dict[str, hwsim_devices.Place]) -> None:
-        super().__init__(fleet)
-        self._places = places
-        self._standing: dict[str, Door] = {}
+    def __init__(
+        self,
+        fleet: FleetState,
+        link_state: LinkState,
+        control: NodeControl,
+        hardware: dict[str, hwsim_devices.NodeHardware],
+    ) -> None:
+        super().__init__(fleet, link_state, control)
+        self._hardware = hardware
+        self._reachable: dict[str, ForwardedPort] = {}
         self.changed = asyncio.Event()
         self._computers: dict[str, int] = {}
 
     def open(self) -> None:
-        """Nothing listens here."""
+        """Nothing listens in the machine."""
 
     async def close(self) -> None:
         for descriptor in self._computers.values():
             os.close(descriptor)
 
     def refresh(self) -> None:
-        """Tell who waits for `changed`, if something did."""
-        wanted = self.wanted()
-        if wanted != self._standing:
-            self._standing = wanted
+        """Set `changed` if the reachable ports have changed."""
+        reachable = self.reachable()
+        if reachable != self._reachable:
+            self._reachable = reachable
             self.changed.set()
             self.changed = asyncio.Event()
 
     async def dial(self, host: str) -> socket.socket:
-        """A connection to the SSH server behind the door at `host`. Raises OSError or LabError when nobody answers."""
-        door = self._standing.get(host)
-        if door is None:
-            raise LabError(f"nothing is reached at {host}")
-        state = self._fleet.nodes[door.node]
+        """Connect to the SSH server that `host` is forwarded to. Raises OSError or LabError when it does not answer."""
+        port = self._reachable.get(host)
+        if port is None:
+            raise LabError(f"{host} is not reachable")
+        state = self._fleet.nodes[port.node]
         if state.hung:
-            raise TimeoutError(f"{door.node} accepts connections and says nothing")
-        made = self._socket(door)
+            raise TimeoutError(f"{port.node} accepts connections but does not answer")
+        made = self._socket(port)
         made.setblocking(False)
         made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
             async with asyncio.timeout(_DIAL_S):
-                await self._connected(made, host, door)
+                await self._connected(made, host, port)
         except BaseException:
             made.close()
             raise
         return made
 
-    async def _connected(self, made: socket.socket, host: str, door: Door) -> None:
-        """Returns when the socket is connected. Raises LabError as soon as the door leads elsewhere: a node that has
-        given up an address does not refuse what still comes for it."""
-        connecting = asyncio.ensure_future(asyncio.get_running_loop().sock_connect(made, (door.address, _SSH_PORT)))
-        moving = asyncio.ensure_future(self._moved(host, door))
+    async def _connected(self, made: socket.socket, host: str, port: ForwardedPort) -> None:
+        """Wait until the socket is connected. Raises LabError as soon as the port's target changes: a node that gave up
+        an address does not reject packets to it."""
+        connecting = asyncio.ensure_future(asyncio.get_running_loop().sock_connect(made, (port.address, _SSH_PORT)))
+        moving = asyncio.ensure_future(self._moved(host, port))
         try:
             await asyncio.wait((connecting, moving), return_when=asyncio.FIRST_COMPLETED)
             if not connecting.done():
-                raise LabError(f"{door.node} is no longer at {door.address}")
+                raise LabError(f"{port.node} is no longer at {port.address}")
             await connecting
         finally:
             connecting.cancel()
             moving.cancel()
-            # the socket must not be closed before its waiting has ended
+            # the socket must not be closed while it is being waited for
             await asyncio.gather(connecting, moving, return_exceptions=True)
 
-    async def _moved(self, host: str, door: Door) -> None:
-        while self._standing.get(host) == door:
+    async def _moved(self, host: str, port: ForwardedPort) -> None:
+        while self._reachable.get(host) == port:
             await self.changed.wait()
 
     def is_hung(self, host: str) -> bool:
-        door = self._standing.get(host)
-        return door is not None and self._fleet.nodes[door.node].hung
+        port = self._reachable.get(host)
+        return port is not None and self._fleet.nodes[port.node].hung
 
-    def _socket(self, door: Door) -> socket.socket:
-        """A socket from where the operator reaches this door: a bench cable, or the base's LAN."""
-        state = self._fleet.nodes[door.node]
-        prefix = next((a.prefix for a in state.effective.addresses if a.address == door.address), _FACTORY_PREFIX)
-        address = IPv4Interface(f"{door.address}/{prefix}")
-        by_wire = self._fleet.ether.wire(door.node, door.address) is not None
+    def _socket(self, port: ForwardedPort) -> socket.socket:
+        """A socket on the operator's side of this port: on the bench cable, or on the base's LAN."""
+        state = self._fleet.nodes[port.node]
+        prefix = next((a.prefix for a in state.effective.addresses if a.address == port.address), _FACTORY_PREFIX)
+        address = IPv4Interface(f"{port.address}/{prefix}")
+        by_wire = self._link_state.bench_shape(port.node, port.address) is not None
         if by_wire and state.spec.medium is not Medium.BASE:
-            place = self._places[door.node]
-            _take_address(place.cable, hwsim_devices.operator_address(address, place.number))
+            hardware = self._hardware[port.node]
+            _add_address(hardware.cable, hwsim_devices.operator_address(address, hardware.number))
             made = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-            made.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, place.cable.encode())
+            made.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, hardware.cable.encode())
             return made
         lan = hwsim_devices.operator_lan(self._fleet.spec)
         if lan is None:
-            raise LabError("no base stands in this fleet's mesh: nodes are reached on the bench alone")
-        space = hwsim_devices.computer_of(lan)
+            raise LabError("the fleet has no base: its nodes are reachable on the bench only")
+        space = hwsim_devices.computer_namespace(lan)
         if not lan.computer or IPv4Interface(lan.computer).network != address.network:
-            _take_address("eth0", hwsim_devices.operator_address(address, 0), space=space)
-        return self._socket_of(space)
+            _add_address("eth0", hwsim_devices.operator_address(address, 0), space=space)
+        return self._socket_in(space)
 
-    def _socket_of(self, space: str) -> socket.socket:
+    def _socket_in(self, space: str) -> socket.socket:
         if space not in self._computers:
             self._computers[space] = os.open(Path("/run/netns") / space, os.O_RDONLY | os.O_CLOEXEC)
         home = os.open("/proc/self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
         try:
-            # the loop's own thread: nothing runs between the two
+            # synchronous, so that nothing else runs in the other namespace
             ns.setns(self._computers[space], ns.CLONE_NEWNET)
             try:
                 return socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -132,7 +136,7 @@ class RealDoors(Doors):
             os.close(home)
 
 
-def _take_address(device: str, address: IPv4Interface, *, space: str = "") -> None:
+def _add_address(device: str, address: IPv4Interface, *, space: str = "") -> None:
     with contextlib.suppress(LabError):
-        # it may be there already
+        # the address may already be set
         hwsim_devices.ip([f"addr add {address} dev {device}"], space=space)

@@ -1,7 +1,7 @@
-"""A process in the machine with descriptors of this side: input, output and errors are copied as frames.
+"""Run a process in the machine with the host's descriptors: stdin, stdout and stderr are copied as frames.
 
-Descriptors may be files, pipes or a terminal; they are read and written in threads, because not all of them can be
-waited for in a loop.
+Descriptors may be files, pipes or a terminal; they are read and written in threads, because an event loop cannot wait
+for all of these.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from meshlab.qemu import guest_protocol
 Connect = Callable[..., Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWriter]]]
 
 
-async def carry_process(connect: Connect, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
-    """Run the process that `request` asks for; its answer. Raises OSError when the machine goes away."""
+async def run_process(connect: Connect, request: dict[str, Any], descriptors: list[int]) -> dict[str, Any]:
+    """Run the process of `request`; returns the reply. Raises OSError when the machine ends."""
     source, out, err = descriptors
     size = _terminal_size(source)
     reader, writer = await connect("exec", request=request, terminal=size)
     loop = asyncio.get_running_loop()
     wake, wake_end = os.pipe()
-    feeding = loop.run_in_executor(None, _feed, source, wake, loop, writer)
+    feeding = loop.run_in_executor(None, _stream_input, source, wake, loop, writer)
     try:
         while True:
             stream, length = guest_protocol.header(await reader.readexactly(guest_protocol.HEADER_BYTES))
@@ -47,7 +47,7 @@ async def carry_process(connect: Connect, request: dict[str, Any], descriptors: 
 
 
 def _terminal_size(descriptor: int) -> list[int] | None:
-    """Rows and columns when it is a terminal, which then passes every key on as it is."""
+    """Rows and columns of a terminal, which is put in raw mode; None for anything else."""
     if not os.isatty(descriptor):
         return None
     tty.setraw(descriptor)
@@ -55,8 +55,8 @@ def _terminal_size(descriptor: int) -> list[int] | None:
     return [rows or 24, columns or 80]
 
 
-def _feed(source: int, wake: int, loop: asyncio.AbstractEventLoop, writer: asyncio.StreamWriter) -> None:
-    """Copy `source` into the machine until it ends or `wake` is closed on its other side."""
+def _stream_input(source: int, wake: int, loop: asyncio.AbstractEventLoop, writer: asyncio.StreamWriter) -> None:
+    """Copy `source` into the machine until end of file or until the other end of `wake` is closed."""
 
     def send(content: bytes) -> None:
         if not writer.is_closing():
@@ -81,7 +81,7 @@ def _feed(source: int, wake: int, loop: asyncio.AbstractEventLoop, writer: async
 
 
 def _write_all(target: int, content: bytes) -> None:
-    # whoever asked may have closed its end
+    # the client may have closed its end
     with contextlib.suppress(OSError):
         while content:
             content = content[os.write(target, content) :]

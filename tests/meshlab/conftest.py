@@ -74,7 +74,7 @@ def mesh(fleet: VirtualFleet) -> Iterator[VirtualFleet]:
     """The line of three; what a test did to it is undone afterwards, by a power cut where it changed a node."""
     until(lambda: in_mesh(fleet) == {"near", "far"}, "the mesh of three")
     yield fleet
-    fleet.mend()
+    fleet.repair()
     for name in LINE:
         restore(fleet.node(name))
     unplug(fleet)
@@ -86,7 +86,7 @@ def node(fleet: VirtualFleet) -> Iterator[VirtualNode]:
     box = fleet.node("box")
     box.wait_up()
     yield box
-    fleet.mend("box")
+    fleet.repair("box")
     box.wait_up()
     box.exec("cd /lab/node/flash && rm -rf current copy.* sysupgrade.tgz").check("erase flash")
     box.power_cut()

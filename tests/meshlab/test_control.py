@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -15,14 +15,13 @@ from meshlab.control import Control, Operations
 from meshlab.errors import LabError
 from meshlab.fleet import VirtualFleet
 from meshlab.spec import FleetSpec, NodeSpec, dump, load
-from meshlab.supervisor import Supervisor
 
 
 class Faulty(Operations):
     """What a fleet can be asked for, with a fault in it."""
 
     def __init__(self) -> None:
-        super().__init__(cast(Supervisor, None))
+        """No fleet behind it."""
 
     def status(self) -> dict[str, Any]:
         return {"power": {"b01": "up"}["b02"]}

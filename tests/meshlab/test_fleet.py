@@ -29,7 +29,7 @@ def spec(count: int) -> FleetSpec:
 
 
 def processes_of(directory: Path) -> list[int]:
-    """Processes that work in the fleet's directory: the supervisor, the warden, and everything on the nodes."""
+    """Processes that work in the fleet's directory: the supervisor, the node runner, and everything on the nodes."""
     found = []
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit():
@@ -106,11 +106,11 @@ def test_a_port_that_is_taken_is_named(tmp_path: Path) -> None:
 
 def test_unknown_nodes_links_and_breaks_are_named(fleet: VirtualFleet) -> None:
     with pytest.raises(InputError, match="no node named nobody"):
-        fleet.break_("nobody", "power-cut")
-    with pytest.raises(InputError, match="no break is called"):
-        fleet.break_("near", "explode")
+        fleet.inject_fault("nobody", "power-cut")
+    with pytest.raises(InputError, match="unknown fault"):
+        fleet.inject_fault("near", "explode")
     with pytest.raises(InputError, match="is for nodes"):
-        fleet.break_("base-near", "full-flash")
+        fleet.inject_fault("base-near", "full-flash")
     with pytest.raises(InputError, match="colour"):
         fleet.link("base", "near", colour="red")
 

@@ -20,7 +20,7 @@ from meshctl.resources import shipped
 from meshlab import fleet_directory
 from meshlab.control import address_of
 from meshlab.errors import LabError
-from meshlab.inventory_copy import prepare
+from meshlab.inventory_copy import copy_inventory
 
 EXAMPLE = shipped("inventory") / "lab"
 
@@ -47,8 +47,8 @@ def test_a_directory_with_other_files_is_refused_and_left_as_it_is(mine: Path, m
         result = CliRunner().invoke(build("lab"), ["lab", "up", *arguments])
         assert result.exit_code == ExitCode.COULD_NOT_RUN, result.output
         assert contents(mine) == before
-    with pytest.raises(LabError, match="expected a directory that `meshctl lab up` made"):
-        prepare(mine / "inventory", mine)
+    with pytest.raises(LabError, match="expected an empty directory or one made by `meshctl lab up`"):
+        copy_inventory(mine / "inventory", mine)
 
 
 def test_the_inventory_s_own_directory_is_refused(tmp_path: Path) -> None:
@@ -56,16 +56,16 @@ def test_the_inventory_s_own_directory_is_refused(tmp_path: Path) -> None:
     shutil.copytree(EXAMPLE, project)
     before = contents(project)
     with pytest.raises(LabError, match="found other files"):
-        prepare(project, project)
+        copy_inventory(project, project)
     (project / MARK).write_text("", encoding="utf-8")
     with pytest.raises(InputError, match="expected an inventory outside --dir"):
-        prepare(project, project)
+        copy_inventory(project, project)
     (project / MARK).unlink()
     assert contents(project) == before
 
 
 def test_a_directory_in_which_a_fleet_runs_keeps_everything(tmp_path: Path) -> None:
-    prepare(EXAMPLE, tmp_path)
+    copy_inventory(EXAMPLE, tmp_path)
     (tmp_path / "inventory" / "firmware.bin").write_bytes(b"image")
     (tmp_path / "inventory" / "known_hosts").write_text("b01 ssh-ed25519 AAAA\n", encoding="utf-8")
     before = contents(tmp_path)
@@ -83,31 +83,31 @@ def test_a_directory_in_which_a_fleet_runs_keeps_everything(tmp_path: Path) -> N
         thread = threading.Thread(target=answer)
         thread.start()
         with pytest.raises(LabError, match=r"runs in .* already"):
-            prepare(EXAMPLE, tmp_path)
+            copy_inventory(EXAMPLE, tmp_path)
         thread.join()
     os.close(folder)
     assert contents(tmp_path) == before
 
 
 def test_a_copy_that_was_edited_is_kept_beside_the_new_one(tmp_path: Path) -> None:
-    first = prepare(EXAMPLE, tmp_path)
+    first = copy_inventory(EXAMPLE, tmp_path)
     assert first.kept is None
-    again = prepare(EXAMPLE, tmp_path)
+    again = copy_inventory(EXAMPLE, tmp_path)
     assert again.kept is None, "nothing was edited"
     edited = tmp_path / "inventory" / "fleet.yaml"
     edited.write_text(edited.read_text(encoding="utf-8") + "# my notes\n", encoding="utf-8")
-    third = prepare(EXAMPLE, tmp_path)
+    third = copy_inventory(EXAMPLE, tmp_path)
     assert third.kept is not None
     assert (third.kept / "fleet.yaml").read_text(encoding="utf-8").endswith("# my notes\n")
     assert "# my notes" not in edited.read_text(encoding="utf-8")
 
 
 def test_a_fleet_can_start_again_from_its_own_edited_copy(tmp_path: Path) -> None:
-    copy = prepare(EXAMPLE, tmp_path)
+    copy = copy_inventory(EXAMPLE, tmp_path)
     edited = copy.inventory / "fleet.yaml"
     edited.write_text(edited.read_text(encoding="utf-8") + "# my notes\n", encoding="utf-8")
     (copy.inventory / "known_hosts").write_text("of nodes that are gone\n", encoding="utf-8")
-    again = prepare(copy.inventory, tmp_path)
+    again = copy_inventory(copy.inventory, tmp_path)
     assert edited.read_text(encoding="utf-8").endswith("# my notes\n")
     assert not (copy.inventory / "known_hosts").exists()
     assert again.fleet.operators.ssh_keys == copy.fleet.operators.ssh_keys, "the lab's key is there once"
@@ -117,7 +117,7 @@ def test_a_lab_may_lie_inside_its_inventory_s_directory(tmp_path: Path) -> None:
     project = tmp_path / "project"
     shutil.copytree(EXAMPLE, project)
     for _ in range(2):
-        prepare(project, project / "lab")
+        copy_inventory(project, project / "lab")
     assert not (project / "lab" / "inventory" / "lab").exists()
     assert load_fleet(project / "lab" / "inventory", environ={}).name
 
@@ -130,17 +130,17 @@ def test_the_copy_has_host_keys_of_its_own(tmp_path: Path) -> None:
     text = fleet.read_text(encoding="utf-8").replace("operators:\n", f"operators:\n  known_hosts: {real}\n", 1)
     fleet.write_text(text, encoding="utf-8")
     assert load_fleet(project, environ={}).operators.known_hosts == str(real)
-    assert prepare(project, tmp_path / "lab").fleet.operators.known_hosts == "known_hosts"
+    assert copy_inventory(project, tmp_path / "lab").fleet.operators.known_hosts == "known_hosts"
 
 
 def test_an_inventory_that_cannot_be_copied_leaves_the_earlier_copy(tmp_path: Path) -> None:
-    copy = prepare(EXAMPLE, tmp_path / "lab")
+    copy = copy_inventory(EXAMPLE, tmp_path / "lab")
     before = contents(copy.inventory)
     project = tmp_path / "project"
     shutil.copytree(EXAMPLE, project)
     (project / "dangling").symlink_to(tmp_path / "nowhere")
-    with pytest.raises(InputError, match="cannot be copied"):
-        prepare(project, tmp_path / "lab")
+    with pytest.raises(InputError, match="cannot copy"):
+        copy_inventory(project, tmp_path / "lab")
     assert contents(copy.inventory) == before
     assert not [path for path in (tmp_path / "lab").iterdir() if path.name.startswith(".inventory.")]
 
@@ -148,7 +148,7 @@ def test_an_inventory_that_cannot_be_copied_leaves_the_earlier_copy(tmp_path: Pa
 def test_a_copy_that_cannot_be_put_in_place_leaves_the_earlier_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    copy = prepare(EXAMPLE, tmp_path)
+    copy = copy_inventory(EXAMPLE, tmp_path)
     before = contents(copy.inventory)
     rename = Path.rename
 
@@ -168,7 +168,7 @@ def test_what_no_fleet_leaves_is_named_and_stays(tmp_path: Path) -> None:
     fleet_directory.claim(tmp_path)
     (tmp_path / "log").mkdir()
     (tmp_path / "rom").mkdir()
-    with pytest.raises(LabError, match=r"log: expected a file that an earlier fleet left"):
+    with pytest.raises(LabError, match=r"log: expected a file of an earlier fleet"):
         fleet_directory.clear(tmp_path)
     assert (tmp_path / "log").is_dir()
     assert (tmp_path / "rom").is_dir()
@@ -189,15 +189,15 @@ def test_a_link_among_what_a_fleet_left_is_removed_and_not_followed(tmp_path: Pa
 
 
 def test_a_lab_of_a_version_that_did_not_mark_is_recognized(tmp_path: Path) -> None:
-    prepare(EXAMPLE, tmp_path)
+    copy_inventory(EXAMPLE, tmp_path)
     (tmp_path / "spec.json").write_text('{"nodes": [], "links": []}', encoding="utf-8")
     (tmp_path / MARK).unlink()
-    assert prepare(EXAMPLE, tmp_path).kept is None
+    assert copy_inventory(EXAMPLE, tmp_path).kept is None
     assert (tmp_path / MARK).exists()
 
 
 def test_an_inventory_belongs_to_the_lab_whose_copy_it_is(tmp_path: Path) -> None:
-    copy = prepare(EXAMPLE, tmp_path / "lab")
+    copy = copy_inventory(EXAMPLE, tmp_path / "lab")
     assert lab_of(str(copy.inventory)) == str(tmp_path / "lab")
     assert lab_of(str(copy.inventory / "fleet.yaml")) == str(tmp_path / "lab")
     assert lab_of(str(EXAMPLE)) == ""

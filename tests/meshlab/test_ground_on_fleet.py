@@ -17,7 +17,7 @@ from meshctl.cli.main import build
 from meshctl.errors import InputError
 from meshlab import placement
 from meshlab.fleet import VirtualFleet
-from meshlab.propagation import Ground, Place, Wall, links_of
+from meshlab.propagation import NodePosition, RadioEnvironment, Wall, links_of
 from meshlab.quality import tq_of
 from meshlab.spec import LinkSpec
 from meshlab.state import Power
@@ -30,14 +30,14 @@ HEARD_MS = 2000
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
 
 # base, near and far in a row, each 60 m from the next
-ROW = Ground({"base": Place((0, 0)), "near": Place((60, 0)), "far": Place((120, 0))})
+ROW = RadioEnvironment({"base": NodePosition((0, 0)), "near": NodePosition((60, 0)), "far": NodePosition((120, 0))})
 
 
 @pytest.fixture
 def grounded(mesh: VirtualFleet) -> Iterator[VirtualFleet]:
     """The line of three, and its links as they were afterwards."""
     yield mesh
-    placement.stand_on(mesh, Ground(links=mesh.spec.links))
+    placement.set_environment(mesh, RadioEnvironment(links=mesh.spec.links))
     (mesh.directory / "ground.json").unlink()
 
 
@@ -88,7 +88,7 @@ def test_a_node_that_nobody_hears_hears_others_and_is_not_reached(grounded: Virt
 
 
 def test_a_node_that_moves_away_leaves_the_mesh_and_returns_over_another(grounded: VirtualFleet) -> None:
-    placement.stand_on(grounded, ROW)
+    placement.set_environment(grounded, ROW)
     until(lambda: set(neighbours(grounded, "base")) == {"near", "far"}, "three that hear each other")
     (link,) = [link for link in links_of(ROW) if link.ends == {"base", "near"}]
     assert neighbours(grounded, "base")["near"] == link.tq_to("near")
@@ -99,12 +99,12 @@ def test_a_node_that_moves_away_leaves_the_mesh_and_returns_over_another(grounde
     lab(grounded, "move", "far", "900", "0")
     until(lambda: in_mesh(grounded) == {"near"}, "far to be out of everybody's earshot")
     assert not answers(grounded.endpoint("10.42.0.3"))
-    assert placement.ground_of(grounded).places["far"].at == (900, 0)
+    assert placement.current_environment(grounded).positions["far"].at == (900, 0)
 
 
 def test_what_was_set_by_hand_outlives_a_ground_until_it_is_mended(grounded: VirtualFleet) -> None:
     lab(grounded, "link", "base", "near", "--down")
-    placement.stand_on(grounded, ROW)
+    placement.set_environment(grounded, ROW)
     until(lambda: set(neighbours(grounded, "base")) == {"far"}, "the base without near")
     lab(grounded, "mend", "base-near")
     until(lambda: set(neighbours(grounded, "base")) == {"near", "far"}, "the link of the ground")
@@ -115,8 +115,8 @@ def test_a_ground_is_loaded_shown_and_refused_when_it_is_another_s(grounded: Vir
     file.write_text("nodes: {base: [0, 0], near: [60, 0], far: [120, 0], other: [0, 9]}\n", encoding="utf-8")
     shown = lab(grounded, "ground", str(file))
     assert "near at 60, 0 m" in shown
-    assert "base - near: loses 0%" in shown
-    assert "box has no place" in shown
+    assert "base - near: loss 0%" in shown
+    assert "box has no position" in shown
     assert "other" not in shown
     assert json.loads(lab(grounded, "ground", "--json"))["nodes"]["far"] == {"at": [120, 0]}
     file.write_text("nodes: {x: [0, 0]}\n", encoding="utf-8")
@@ -131,14 +131,14 @@ def test_words_that_say_nothing_are_refused_with_what_was_expected(grounded: Vir
     )
     assert "needs --loss" in lab(grounded, "link", "base", "near", "--one-way", "--down", status=2)
     assert "nothing to change" in lab(grounded, "link", "base", "near", status=2)
-    assert "far has no place" in lab(grounded, "move", "far", "0", "0", status=2)
+    assert "cannot move far: it has no position" in lab(grounded, "move", "far", "0", "0", status=2)
     with pytest.raises(InputError, match="no node named nobody"):
         placement.move(grounded, "nobody", (0, 0))
 
 
 def test_a_big_ground_comes_in_parts(grounded: VirtualFleet) -> None:
-    crowd = {f"other{number}": Place((0, number)) for number in range(40)}
-    placement.stand_on(grounded, Ground({**ROW.places, **crowd}, (Wall((90, -9), (90, 9)),)))
+    crowd = {f"other{number}": NodePosition((0, number)) for number in range(40)}
+    placement.set_environment(grounded, RadioEnvironment({**ROW.positions, **crowd}, (Wall((90, -9), (90, 9)),)))
     until(lambda: set(neighbours(grounded, "base")) == {"near"}, "the wall between near and far")
 
 
@@ -157,7 +157,7 @@ def test_a_mission_drops_a_beacon_and_the_robot_is_reached_over_it(grounded: Vir
     until(lambda: grounded.node("near").power is Power.UP, "the beacon to boot")
     until(lambda: in_mesh(grounded) == {"near", "far"}, "the robot over its beacon")
     assert grounded.node("near").exec("cat /proc/uptime").exit_status == 0
-    assert placement.ground_of(grounded).places["near"].at == (90.0, 0.0)
+    assert placement.current_environment(grounded).positions["near"].at == (90.0, 0.0)
     until(lambda: set(neighbours(grounded, "base")) == {"near"}, "the robot out of the base's own earshot")
 
 
@@ -175,11 +175,11 @@ def test_a_mission_that_is_interrupted_says_where_to_go_on(grounded: VirtualFlee
         playing.send_signal(signal.SIGINT)
         _, said = playing.communicate(timeout=60)
     assert playing.returncode == 130
-    assert "everything stays as it is" in said
-    assert f"go on with: meshctl lab mission {file} --from " in said
-    assert placement.ground_of(grounded).places["far"].at[0] < 100
+    assert "the fleet stays as it is" in said
+    assert f"continue with: meshctl lab mission {file} --from " in said
+    assert placement.current_environment(grounded).positions["far"].at[0] < 100
 
 
 def test_a_link_of_the_spec_is_a_ground_of_its_own(grounded: VirtualFleet) -> None:
-    assert placement.ground_of(grounded).links == grounded.spec.links
+    assert placement.current_environment(grounded).links == grounded.spec.links
     assert LinkSpec("base", "near", tq=240, signal_dbm=-61) in grounded.spec.links

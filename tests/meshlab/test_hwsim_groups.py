@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshctl.errors import InputError
-from meshlab.hwsim_groups import GROUP_BITS, assign, cover, steps
+from meshlab.hwsim_groups import GROUP_BITS, assign, clique_cover, transition
 
 Edges = set[tuple[str, str]]
 
@@ -59,7 +59,7 @@ def test_cliques_cover_every_edge_and_nothing_else(graph: tuple[list[str], Edges
     for a, b in edges:
         joined[a].add(b)
         joined[b].add(a)
-    cliques = cover(names, joined)
+    cliques = clique_cover(names, joined)
     assert {frozenset(pair) for clique in cliques for pair in combinations(clique, 2)} == unordered(edges)
     assert len(cliques) <= len(edges)
 
@@ -73,17 +73,17 @@ def test_no_step_joins_a_pair_that_is_joined_neither_before_nor_after(
     _, after = data.draw(graphs(most, most, close=close))
     masks, wanted = assign(names, before), assign(names, after)
     allowed = unordered(before) | unordered(after)
-    for name, mask in steps(masks, wanted):
+    for name, mask in transition(masks, wanted):
         masks[name] = mask
         assert overlapping(masks) <= allowed
     assert masks == wanted
-    assert steps(wanted, wanted) == []
+    assert transition(wanted, wanted) == []
 
 
 def test_a_changed_link_of_a_small_fleet_touches_its_two_ends_alone() -> None:
     names = [f"n{number}" for number in range(11)]
     everybody = set(combinations(names, 2))
-    written = steps(assign(names, everybody), assign(names, everybody - {("n3", "n7")}))
+    written = transition(assign(names, everybody), assign(names, everybody - {("n3", "n7")}))
     assert {name for name, _ in written} == {"n3", "n7"}
 
 

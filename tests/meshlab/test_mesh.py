@@ -105,11 +105,11 @@ def test_a_slow_link_slows_and_delivers(mesh: VirtualFleet) -> None:
 
 def test_severing_at_a_step_leaves_the_node_working_alone(mesh: VirtualFleet) -> None:
     far = mesh.node("far")
-    mesh.break_("far", "sever@sync")
+    mesh.inject_fault("far", "sever@sync")
     far.exec("touch /etc/a; sync; touch /etc/b").check("work")
     until(lambda: in_mesh(mesh) == {"near"}, "the cut")
     assert far.exec("ls /etc/a /etc/b").exit_status == 0
-    mesh.mend("far")
+    mesh.repair("far")
     far.plug(False)
     until(lambda: in_mesh(mesh) == {"near", "far"}, "the link to come back")
     until(lambda: answers(mesh.endpoint("10.42.0.3")), "the way back")

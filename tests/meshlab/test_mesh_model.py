@@ -10,18 +10,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshlab import mesh_model
-from meshlab.mesh_model import Address, Cell, Effective
+from meshlab.mesh_model import Address, EffectiveState, WirelessInterface
 from meshlab.spec import LinkSpec
 
-CELL = Cell("mesh0", "adhoc", 2437, "team", "02:ca:fe:00:00:01", "none", "", "02:00:00:00:00:01", "bat0", "BATMAN_IV")
+CELL = WirelessInterface(
+    "mesh0", "adhoc", 2437, "team", "02:ca:fe:00:00:01", "none", "", "02:00:00:00:00:01", "bat0", "BATMAN_IV"
+)
 
 
-def node(number: int, **changes: object) -> Effective:
+def node(number: int, **changes: object) -> EffectiveState:
     cell = replace(CELL, mac=f"02:00:00:00:00:{number:02x}", **changes)  # type: ignore[arg-type]
-    return Effective((cell,), (Address("lan", f"10.42.0.{number}", 24, True, True),))
+    return EffectiveState((cell,), (Address("lan", f"10.42.0.{number}", 24, True, True),))
 
 
-def chain(count: int) -> tuple[dict[str, Effective], list[LinkSpec]]:
+def chain(count: int) -> tuple[dict[str, EffectiveState], list[LinkSpec]]:
     names = [f"n{number}" for number in range(count)]
     return (
         {name: node(number) for number, name in enumerate(names)},
@@ -54,13 +56,13 @@ def test_two_routing_algorithms_hear_but_do_not_route() -> None:
     nodes = {"a": node(1), "b": node(2, routing="BATMAN_V")}
     graph = mesh_model.edges(nodes, [LinkSpec("a", "b")])
     assert len(graph["a"]) == 1
-    assert mesh_model.paths(graph, "a") == {}
+    assert mesh_model.best_routes(graph, "a") == {}
 
 
 def test_a_path_takes_the_better_way_around() -> None:
     nodes = {"a": node(1), "b": node(2), "c": node(3)}
     links = [LinkSpec("a", "c", tq=80), LinkSpec("a", "b", tq=250), LinkSpec("b", "c", tq=250)]
-    path = mesh_model.paths(mesh_model.edges(nodes, links), "a")["c"]
+    path = mesh_model.best_routes(mesh_model.edges(nodes, links), "a")["c"]
     assert path.first.node == "b"
     assert [link.ends for link in path.links] == [frozenset("ab"), frozenset("bc")]
     assert path.tq == 250 * 250 // 255 * (255 - mesh_model.HOP_PENALTY) // 255
@@ -69,7 +71,7 @@ def test_a_path_takes_the_better_way_around() -> None:
 def test_of_two_equal_ways_one_is_taken_and_the_same_every_time() -> None:
     nodes = {name: node(number) for number, name in enumerate("abcd")}
     links = [LinkSpec(one, other, tq=200) for one, other in ("ab", "ac", "bd", "cd")]
-    taken = {mesh_model.paths(mesh_model.edges(nodes, links), "a")["d"].first.node for _ in range(3)}
+    taken = {mesh_model.best_routes(mesh_model.edges(nodes, links), "a")["d"].first.node for _ in range(3)}
     assert taken == {"b"}
 
 
@@ -78,7 +80,7 @@ def test_cutting_a_chain_separates_exactly_what_lies_behind(count: int, data: st
     nodes, links = chain(count)
     cut = data.draw(st.integers(0, count - 2))
     links[cut] = replace(links[cut], up=False)
-    reached = mesh_model.paths(mesh_model.edges(nodes, links), "n0")
+    reached = mesh_model.best_routes(mesh_model.edges(nodes, links), "n0")
     assert set(reached) == {f"n{number}" for number in range(1, cut + 1)}
 
 
@@ -86,7 +88,8 @@ def test_what_a_node_hears_is_one_line_per_station_neighbour_and_originator() ->
     nodes, links = chain(3)
     graph = mesh_model.edges(nodes, links)
     lines = [
-        line.split("\t") for line in mesh_model.heard("n0", nodes, graph, mesh_model.paths(graph, "n0")).splitlines()
+        line.split("\t")
+        for line in mesh_model.heard_text("n0", nodes, graph, mesh_model.best_routes(graph, "n0")).splitlines()
     ]
     assert [line[0] for line in lines] == ["S", "N", "O", "O"]
     assert {line[2] for line in lines if line[0] == "O"} == {"02:00:00:00:00:01", "02:00:00:00:00:02"}
@@ -101,4 +104,4 @@ def test_effective_text_is_read_as_the_stand_in_writes_it() -> None:
     read = mesh_model.parse_effective(text)
     assert read.holds("10.42.0.11", over="mesh")
     assert not read.holds("10.42.0.11", over="wire")
-    assert read.cells[0].ssid == "a team"
+    assert read.interfaces[0].ssid == "a team"

@@ -165,37 +165,37 @@ def test_facts_have_the_shape_of_the_release(fleet: VirtualFleet, name: str) -> 
 
 def test_a_full_flash_and_a_full_memory_are_really_full(fleet: VirtualFleet) -> None:
     node = fleet.node("new")
-    fleet.break_("new", "full-flash")
+    fleet.inject_fault("new", "full-flash")
     assert node.exec("dd if=/dev/zero of=/etc/big bs=1k count=64 2>/dev/null").exit_status != 0
-    fleet.break_("new", "full-memory")
+    fleet.inject_fault("new", "full-memory")
     assert node.exec("echo x >/tmp/one && dd if=/dev/zero of=/tmp/two bs=1k count=64 2>/dev/null").exit_status != 0
     assert int(node.exec("awk '/MemAvailable/ { print $2 }' /proc/meminfo").stdout) <= 2048
-    fleet.mend("new")
+    fleet.repair("new")
     node.exec("rm -f /etc/big /tmp/one /tmp/two; echo x >/etc/small && echo y >/tmp/small").check("write again")
 
 
 def test_a_changed_host_key_is_another_key(fleet: VirtualFleet, node: VirtualNode) -> None:
     before = host_key(node)
-    fleet.break_("box", "host-key")
+    fleet.inject_fault("box", "host-key")
     until(lambda: answers(node.bench), "the restarted server")
     assert host_key(node) != before
 
 
 def test_a_foreign_delta_is_seen_by_uci_changes(fleet: VirtualFleet, node: VirtualNode) -> None:
-    fleet.break_("box", "foreign-delta")
+    fleet.inject_fault("box", "foreign-delta")
     assert "description='left by hand'" in node.exec("uci changes").stdout
 
 
 def test_a_clock_off_by_years_moves_date_and_not_uptime(fleet: VirtualFleet, node: VirtualNode) -> None:
     now = int(node.exec("date +%s").stdout)
-    fleet.break_("box", "clock")
+    fleet.inject_fault("box", "clock")
     assert now - int(node.exec("date +%s").stdout) > 9 * 365 * 86400
-    fleet.mend("box")
+    fleet.repair("box")
     assert int(node.exec("date +%s").stdout) >= now
 
 
 def test_ssh_that_hangs_accepts_and_says_nothing(fleet: VirtualFleet, node: VirtualNode) -> None:
-    fleet.break_("box", "ssh-hang")
+    fleet.inject_fault("box", "ssh-hang")
     transport = paramiko.Transport((node.bench.host, node.bench.port))
     transport.banner_timeout = 0.5
     with pytest.raises(paramiko.SSHException):
@@ -204,12 +204,12 @@ def test_ssh_that_hangs_accepts_and_says_nothing(fleet: VirtualFleet, node: Virt
 
 
 def test_a_wrong_board_says_so_before_and_after_a_boot(fleet: VirtualFleet, node: VirtualNode) -> None:
-    fleet.break_("box", "wrong-board")
+    fleet.inject_fault("box", "wrong-board")
     for _ in range(2):
         board = json.loads(node.exec("ubus call system board").stdout)
         assert board["board_name"] == "virtual,other-board"
         node.power_cut()
-    fleet.mend("box")
+    fleet.repair("box")
     assert node.exec("cat /tmp/sysinfo/board_name").stdout.strip() == node.spec.board
 
 
@@ -273,11 +273,11 @@ def test_a_power_cut_in_the_middle_of_a_flash_leaves_a_node_that_needs_the_bench
     fleet: VirtualFleet, node: VirtualNode
 ) -> None:
     put_image(node, firmware_image(Release.V24_10, board=node.spec.board))
-    fleet.break_("box", "power-cut@flash")
+    fleet.inject_fault("box", "power-cut@flash")
     node.exec("start-stop-daemon -S -b -x /sbin/sysupgrade -- -n /tmp/firmware.bin")
     until(lambda: node.power is Power.DEAD, "the dead firmware")
     assert not answers(node.bench)
-    fleet.mend("box")
+    fleet.repair("box")
     node.wait_up()
     assert "23.05" in node.exec("cat /etc/openwrt_release").stdout
 
@@ -294,7 +294,7 @@ def test_a_power_cut_strikes_before_the_step_it_names(fleet: VirtualFleet, node:
     node.exec("rm -f /etc/one /etc/two; sync")
     for number, left in ((2, "one"), (4, "one two"), (5, "one two")):
         boot_id = node.boot_id
-        fleet.break_("box", f"power-cut@{number}")
+        fleet.inject_fault("box", f"power-cut@{number}")
         node.exec(work)
         until(lambda old=boot_id: node.boot_id not in (None, old), "the reboot")  # type: ignore[misc]
         assert node.exec("cd /etc && ls one two 2>/dev/null").stdout.split() == left.split()
@@ -303,7 +303,7 @@ def test_a_power_cut_strikes_before_the_step_it_names(fleet: VirtualFleet, node:
 
 def test_a_step_can_be_named_by_its_words(fleet: VirtualFleet, node: VirtualNode) -> None:
     boot_id = node.boot_id
-    fleet.break_("box", "power-cut@uci commit system")
+    fleet.inject_fault("box", "power-cut@uci commit system")
     node.exec("uci set system.@system[0].hostname=a; uci commit network; uci commit system; uci commit")
     until(lambda: node.boot_id not in (None, boot_id), "the reboot")
     assert node.exec("uci get system.@system[0].hostname").stdout == "OpenWrt\n"

@@ -13,7 +13,16 @@ from hypothesis import strategies as st
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
 from meshlab import propagation_file
-from meshlab.propagation import DEAF_LOSS, Air, Ground, Place, Wall, frame_loss, links_of, received_dbm
+from meshlab.propagation import (
+    DEAF_LOSS,
+    NodePosition,
+    PathLossModel,
+    RadioEnvironment,
+    Wall,
+    frame_loss,
+    links_of,
+    received_dbm,
+)
 from meshlab.spec import LinkSpec
 from meshlab.yaml_entries import share_of
 
@@ -33,20 +42,20 @@ links = st.builds(
     rate_kbps=st.none() | st.integers(1, 1000),
 )
 grounds = st.builds(
-    Ground,
-    st.dictionaries(names, st.builds(Place, points, powers), max_size=8),
+    RadioEnvironment,
+    st.dictionaries(names, st.builds(NodePosition, points, powers), max_size=8),
     st.lists(st.builds(Wall, points, points, st.sampled_from([3.0, 40.0, 100.0])), max_size=3).map(tuple),
-    st.builds(Air, exponent=st.sampled_from([1.8, 3.5, 5.0]), fading_db=st.sampled_from([0.5, 2.0])),
+    st.builds(PathLossModel, exponent=st.sampled_from([1.8, 3.5, 5.0]), fading_db=st.sampled_from([0.5, 2.0])),
     st.lists(links, max_size=3, unique_by=lambda link: link.ends).map(tuple),
 )
 
 
-def loss_at(distance_m: float, air: Air = Air(), walls_db: float = 0.0) -> float:  # noqa: B008
+def loss_at(distance_m: float, air: PathLossModel = PathLossModel(), walls_db: float = 0.0) -> float:  # noqa: B008
     return frame_loss(air, received_dbm(air, distance_m, air.tx_power_dbm, walls_db))
 
 
 def test_a_tenth_is_lost_at_the_sensitivity_and_free_space_holds_for_the_first_metre() -> None:
-    air = Air()
+    air = PathLossModel()
     assert frame_loss(air, air.sensitivity_dbm) == 0.1
     first_metre = received_dbm(replace(air, antenna_gain_dbi=0.0), 1.0, 0.0)
     wavelength_m = 299_792_458 / 2.437e9
@@ -61,7 +70,7 @@ def test_farther_or_behind_more_rock_is_never_heard_better(near_m: float, more_m
 
 
 @given(grounds)
-def test_links_join_each_pair_once_and_the_deaf_not_at_all(ground: Ground) -> None:
+def test_links_join_each_pair_once_and_the_deaf_not_at_all(ground: RadioEnvironment) -> None:
     found = links_of(ground)
     assert len({link.ends for link in found}) == len(found)
     by_hand = {link.ends for link in ground.links}
@@ -73,22 +82,22 @@ def test_links_join_each_pair_once_and_the_deaf_not_at_all(ground: Ground) -> No
 
 
 @given(grounds)
-def test_a_link_by_hand_holds_wherever_its_nodes_are(ground: Ground) -> None:
+def test_a_link_by_hand_holds_wherever_its_nodes_are(ground: RadioEnvironment) -> None:
     assert set(ground.links) <= set(links_of(ground))
 
 
 @given(grounds, points)
-def test_who_moves_changes_no_link_of_others(ground: Ground, to: tuple[float, float]) -> None:
-    if "n0" not in ground.places:
-        with pytest.raises(InputError, match="n0 has no place"):
-            ground.moved("n0", to)
+def test_who_moves_changes_no_link_of_others(ground: RadioEnvironment, to: tuple[float, float]) -> None:
+    if "n0" not in ground.positions:
+        with pytest.raises(InputError, match="n0: it has no position"):
+            ground.with_moved("n0", to)
         return
     before = [link for link in links_of(ground) if "n0" not in link.ends]
-    assert [link for link in links_of(ground.moved("n0", to)) if "n0" not in link.ends] == before
+    assert [link for link in links_of(ground.with_moved("n0", to)) if "n0" not in link.ends] == before
 
 
 def test_the_stronger_sender_is_heard_where_the_weaker_is_not() -> None:
-    ground = Ground({"strong": Place((0, 0), 33.0), "weak": Place((330, 0), 15.0)})
+    ground = RadioEnvironment({"strong": NodePosition((0, 0), 33.0), "weak": NodePosition((330, 0), 15.0)})
     (link,) = links_of(ground)
     assert link.loss_to("weak") < 0.5
     assert link.loss_to("strong") == 1.0
@@ -97,7 +106,7 @@ def test_the_stronger_sender_is_heard_where_the_weaker_is_not() -> None:
 
 
 def test_a_wall_between_two_nodes_separates_them_and_one_beside_them_does_not() -> None:
-    ground = Ground({"a": Place((0, 0)), "b": Place((40, 0))})
+    ground = RadioEnvironment({"a": NodePosition((0, 0)), "b": NodePosition((40, 0))})
     assert len(links_of(replace(ground, walls=(Wall((20, -10), (20, 10)),)))) == 0
     assert len(links_of(replace(ground, walls=(Wall((20, 5), (20, 10)),)))) == 1
     assert len(links_of(replace(ground, walls=(Wall((20, -10), (20, 10), 6.0),)))) == 1
@@ -115,10 +124,10 @@ links:
   - {between: [base, b02], loss: 30%, loss_back: 0.05, delay_ms: 5, rate_kbps: 64}
   - {between: [b01, b02], up: false}
 """
-    assert propagation_file.parse(text, FILE) == Ground(
-        {"base": Place((0, 0)), "b01": Place((80, 0.5), 33.0)},
+    assert propagation_file.parse(text, FILE) == RadioEnvironment(
+        {"base": NodePosition((0, 0)), "b01": NodePosition((80, 0.5), 33.0)},
         (Wall((40, 10), (200, 10), 40.0), Wall((0, 0), (1, 1))),
-        Air(exponent=2.0, sensitivity_dbm=-90.0),
+        PathLossModel(exponent=2.0, sensitivity_dbm=-90.0),
         (
             LinkSpec("base", "b02", loss=0.3, loss_back=0.05, delay_ms=5.0, rate_kbps=64),
             LinkSpec("b01", "b02", up=False),
@@ -128,7 +137,7 @@ links:
 
 def test_the_example_s_links_are_a_ground_without_places() -> None:
     ground = propagation_file.load(EXAMPLES / "links.yaml")
-    assert ground.places == {}
+    assert ground.positions == {}
     assert links_of(ground)[0] == LinkSpec("base", "b01", tq=252, signal_dbm=-52)
 
 
@@ -138,14 +147,14 @@ def test_the_example_s_places_make_a_line_with_a_robot_at_two_of_its_nodes() -> 
 
 
 @given(grounds)
-def test_a_ground_survives_its_file(ground: Ground) -> None:
+def test_a_ground_survives_its_file(ground: RadioEnvironment) -> None:
     assert propagation_file.parse(propagation_file.dump(ground), FILE) == ground
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("nodes: {a: [0]}", "ground.yaml:1:12: nodes.a: expected [x, y] in metres, found a list of 1 [INV021]"),
+        ("nodes: {a: [0]}", "ground.yaml:1:12: nodes.a: expected [x, y] in meters, found a list of 1 [INV021]"),
         (
             "nodes:\n  a: {at: [0, x]}",
             "ground.yaml:2:15: nodes.a.at[1]: expected a number from -1e+06 to 1e+06, found 'x'",
@@ -159,7 +168,7 @@ def test_a_ground_survives_its_file(ground: Ground) -> None:
         ("links: [{between: [a, a]}]", "ground.yaml:1:19: links[0].between: expected two different nodes"),
         ("links: [{between: [a, b], loss: 130%}]", "expected a share from 0 to 1, or 0% to 100%, found '130%'"),
         ("links: [{between: [a, b], up: maybe}]", "expected one of true, false, found 'maybe'"),
-        ("links: [{between: [a, b], tq: 2.5}]", "expected a whole number from 0 to 255, found '2.5'"),
+        ("links: [{between: [a, b], tq: 2.5}]", "expected an integer from 0 to 255, found '2.5'"),
         ("place: {}", "ground.yaml:1:1: expected one of nodes, walls, air, links, found 'place'"),
         ("[1, 2]", "ground.yaml:1:1: expected a mapping, found a list of 2"),
         ("nodes: {a: [0, 0}", "ground.yaml:1:17: not valid YAML"),

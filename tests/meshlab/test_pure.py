@@ -11,7 +11,7 @@ from meshctl.firmware.metadata import read_metadata
 from meshctl.model import Release
 from meshlab import addresses, faults, from_inventory, releases, rootfs
 from meshlab.errors import LabError
-from meshlab.faults import Break, Order
+from meshlab.faults import Fault, FaultRequest
 from meshlab.images import firmware_image
 from meshlab.spec import FleetSpec, LinkSpec, Medium, NodeSpec, RadioSpec, dump, load
 
@@ -54,16 +54,14 @@ def test_every_node_of_a_big_fleet_is_a_few_hops_away() -> None:
 
 
 def test_breaks_are_words_and_some_take_a_step() -> None:
-    assert faults.parse("power-cut@7") == Order(Break.CUT, "7")
-    assert faults.parse("full-flash") == Order(Break.FULL_FLASH)
-    assert faults.told(Order(Break.FULL_FLASH)) == "no space left in flash but 8 KiB"
-    assert faults.told(Order(Break.CUT, "7")).endswith(
-        "what was not synced is lost; at command 7 that it runs from now on"
+    assert faults.parse("power-cut@7") == FaultRequest(Fault.CUT, "7")
+    assert faults.parse("full-flash") == FaultRequest(Fault.FULL_FLASH)
+    assert faults.describe(FaultRequest(Fault.FULL_FLASH)) == "only 8 KiB left in flash"
+    assert faults.describe(FaultRequest(Fault.CUT, "7")).endswith("unsynced data is lost; at command 7 from now on")
+    assert faults.describe(FaultRequest(Fault.SEVER, "uci commit")).endswith(
+        "before the first command that contains 'uci commit'"
     )
-    assert faults.told(Order(Break.SEVER, "uci commit")).endswith(
-        "before the first command whose words hold 'uci commit'"
-    )
-    assert set(faults.BREAKS) == set(Break)
+    assert set(faults.FAULTS) == set(Fault)
     with pytest.raises(InputError, match="explode"):
         faults.parse("explode")
     with pytest.raises(InputError, match="takes no @STEP"):

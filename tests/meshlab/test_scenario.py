@@ -11,32 +11,42 @@ from hypothesis import strategies as st
 
 from meshctl.diagnostics import InvalidInput
 from meshlab import scenario_file
-from meshlab.propagation import Ground, Place, links_of
-from meshlab.scenario import Course, Drop, Event, Happening, Incident, Mission, agenda, course, scene
+from meshlab.propagation import NodePosition, RadioEnvironment, links_of
+from meshlab.scenario import (
+    Deployment,
+    Event,
+    EventKind,
+    PowerEvent,
+    Scenario,
+    Trajectory,
+    snapshot,
+    timeline,
+    trajectory,
+)
 
 FILE = Path("mission.yaml")
 EXAMPLE = Path(__file__).parents[2] / "inventory" / "lab" / "mission.yaml"
 
 # a robot that drives away from the base at 2 m/s with a beacon, which it drops after 100 m
-AWAY = Mission(
+AWAY = Scenario(
     "away",
     "base",
-    Ground({"base": Place((0, 0), 27.0), "spare": Place((0, 5))}),
+    RadioEnvironment({"base": NodePosition((0, 0), 27.0), "spare": NodePosition((0, 5))}),
     duration_s=200.0,
-    robots={"rover": Course((0.0, 200.0), ((0.0, 0.0), (400.0, 0.0)))},
-    beacons={"beacon": Drop("rover", 50.0)},
+    robots={"rover": Trajectory((0.0, 200.0), ((0.0, 0.0), (400.0, 0.0)))},
+    beacons={"beacon": Deployment("rover", 50.0)},
 )
 times = st.integers(0, 200).map(float)
 
 
-def happenings(mission: Mission, what: Happening) -> list[tuple[float, str, str]]:
-    return [(event.at_s, event.who, event.other) for event in agenda(mission) if event.what is what]
+def happenings(mission: Scenario, what: EventKind) -> list[tuple[float, str, str]]:
+    return [(event.at_s, event.node, event.peer) for event in timeline(mission) if event.kind is what]
 
 
 @given(times)
 def test_a_beacon_rides_without_power_and_stays_with_power_where_it_was_dropped(t: float) -> None:
-    now = scene(AWAY, t)
-    rover, beacon = now.ground.places["rover"].at, now.ground.places["beacon"].at
+    now = snapshot(AWAY, t)
+    rover, beacon = now.environment.positions["rover"].at, now.environment.positions["beacon"].at
     assert rover == pytest.approx((2 * t, 0.0))
     assert beacon == (rover if t < 50 else (100.0, 0.0))
     assert ("beacon" in now.powered) == (t >= 50)
@@ -48,7 +58,7 @@ def test_a_course_goes_through_its_points_and_stands_at_its_ends(
     points: list[tuple[float, tuple[float, float]]],
 ) -> None:
     points.sort()
-    path = course(points)
+    path = trajectory(points)
     assert all(path.at(at_s) == pytest.approx(place) for at_s, place in points)
     assert path.at(-1.0) == points[0][1]
     assert path.at(1000.0) == points[-1][1]
@@ -56,55 +66,61 @@ def test_a_course_goes_through_its_points_and_stands_at_its_ends(
 
 @pytest.mark.parametrize("way_points", [[], [(1.0, (0.0, 0.0)), (1.0, (1.0, 0.0))]])
 def test_a_course_needs_rising_times(way_points: list[tuple[float, tuple[float, float]]]) -> None:
-    with pytest.raises(ValueError, match="rising times"):
-        course(way_points)
+    with pytest.raises(ValueError, match="increasing times"):
+        trajectory(way_points)
 
 
 def test_the_agenda_tells_what_was_planned_and_what_came_of_it() -> None:
-    assert happenings(AWAY, Happening.ARRIVES) == [(200.0, "rover", "")]
-    assert happenings(AWAY, Happening.DROPPED) == [(50.0, "beacon", "rover")]
+    assert happenings(AWAY, EventKind.ARRIVES) == [(200.0, "rover", "")]
+    assert happenings(AWAY, EventKind.DROPPED) == [(50.0, "beacon", "rover")]
     # the beacon joins the mesh where it is dropped, and keeps the robot in it for a while
-    assert (50.0, "beacon", "") in happenings(AWAY, Happening.REACHED)
-    ((lost_s, *_),) = happenings(AWAY, Happening.CUT_OFF)
-    alone = replace(AWAY, beacons={}, ground=replace(AWAY.ground, places={"base": Place((0, 0), 27.0)}))
-    ((lost_alone_s, *_),) = happenings(alone, Happening.CUT_OFF)
+    assert (50.0, "beacon", "") in happenings(AWAY, EventKind.REACHED)
+    ((lost_s, *_),) = happenings(AWAY, EventKind.CUT_OFF)
+    alone = replace(
+        AWAY, beacons={}, environment=replace(AWAY.environment, positions={"base": NodePosition((0, 0), 27.0)})
+    )
+    ((lost_alone_s, *_),) = happenings(alone, EventKind.CUT_OFF)
     assert lost_s > lost_alone_s + 40
-    assert agenda(AWAY)[-1] == Event(200.0, Happening.END, "base")
+    assert timeline(AWAY)[-1] == Event(200.0, EventKind.END, "base")
 
 
 @given(st.sampled_from([0.5, 1.0, 3.0, 7.0]))
 def test_events_come_in_order_and_links_as_the_ground_has_them(step_s: float) -> None:
     mission = replace(AWAY, step_s=step_s)
-    events = agenda(mission)
+    events = timeline(mission)
     assert [event.at_s for event in events] == sorted(event.at_s for event in events)
-    joined: set[frozenset[str]] = {link.ends for link in links_of(scene(mission, 0.0).ground)} - {
+    joined: set[frozenset[str]] = {link.ends for link in links_of(snapshot(mission, 0.0).environment)} - {
         frozenset(("beacon", other)) for other in ("base", "rover", "spare")
     }
     for event in events:
-        if event.what is Happening.LINK_UP:
-            joined.add(frozenset((event.who, event.other)))
-        elif event.what is Happening.LINK_DOWN:
-            joined.remove(frozenset((event.who, event.other)))
-    end = {link.ends for link in links_of(scene(mission, 200.0).ground)}
+        if event.kind is EventKind.LINK_UP:
+            joined.add(frozenset((event.node, event.peer)))
+        elif event.kind is EventKind.LINK_DOWN:
+            joined.remove(frozenset((event.node, event.peer)))
+    end = {link.ends for link in links_of(snapshot(mission, 200.0).environment)}
     assert joined == end
 
 
 def test_an_incident_takes_a_radio_off_and_back_and_never_wakes_a_carried_beacon() -> None:
     mission = replace(
         AWAY,
-        incidents=(Incident(10.0, "beacon", True), Incident(80.0, "beacon", False), Incident(90.0, "beacon", True)),
+        power_events=(
+            PowerEvent(10.0, "beacon", True),
+            PowerEvent(80.0, "beacon", False),
+            PowerEvent(90.0, "beacon", True),
+        ),
     )
-    assert ["beacon" in scene(mission, t).powered for t in (9.0, 11.0, 50.0, 80.0, 89.0, 90.0)] == [
+    assert ["beacon" in snapshot(mission, t).powered for t in (9.0, 11.0, 50.0, 80.0, 89.0, 90.0)] == [
         False, False, True, False, False, True,
     ]  # fmt: skip
-    assert happenings(mission, Happening.OFF) == [(80.0, "beacon", "")]
+    assert happenings(mission, EventKind.OFF) == [(80.0, "beacon", "")]
 
 
 def test_the_order_of_incidents_in_the_file_does_not_matter() -> None:
-    late, early = Incident(90.0, "spare", True), Incident(80.0, "spare", False)
-    mission = replace(AWAY, incidents=(late, early))
-    assert "spare" not in scene(mission, 85.0).powered
-    assert "spare" in scene(mission, 95.0).powered
+    late, early = PowerEvent(90.0, "spare", True), PowerEvent(80.0, "spare", False)
+    mission = replace(AWAY, power_events=(late, early))
+    assert "spare" not in snapshot(mission, 85.0).powered
+    assert "spare" in snapshot(mission, 95.0).powered
 
 
 # -- the file --
@@ -124,10 +140,10 @@ incidents: [{at_s: 80, what: "off", who: spare}]
 """
     mission = scenario_file.parse(text, tmp_path / "away.yaml")
     assert (mission.name, mission.base, mission.step_s) == ("away", "base", 1.0)
-    assert mission.ground.places == {"base": Place((0, 0)), "spare": Place((0, 5))}
-    assert mission.ground.air.exponent == 2
+    assert mission.environment.positions == {"base": NodePosition((0, 0)), "spare": NodePosition((0, 5))}
+    assert mission.environment.path_loss.exponent == 2
     assert (mission.robots, mission.beacons) == (AWAY.robots, AWAY.beacons)
-    assert mission.incidents == (Incident(80.0, "spare", False),)
+    assert mission.power_events == (PowerEvent(80.0, "spare", False),)
     assert mission.names == ("base", "beacon", "rover", "spare")
 
 
@@ -149,7 +165,7 @@ GOOD = "nodes: {base: [0, 0]}\nduration_s: 9\nrobots: {r: {path: [[0, 0, 0]]}}\n
         (GOOD + "base: x", "mission.yaml:4:7: base: expected one of base, r, found 'x'"),
         (GOOD + "ground: nowhere.yaml", "nowhere.yaml: cannot be read"),
         (GOOD + "step_s: 0", "step_s: expected a number from 0.1"),
-        ("duration_s: 9\nnodes: {base: [0, 0]}\nrobots: {r: {path: [[1, 0, 0], [1, 2, 2]]}}", "with rising times"),
+        ("duration_s: 9\nnodes: {base: [0, 0]}\nrobots: {r: {path: [[1, 0, 0], [1, 2, 2]]}}", "with increasing times"),
         ("duration_s: 9\nnodes: {base: [0, 0]}\nrobots: {r: {path: [[1, 0]]}}", "path[0]: expected [seconds, x, y]"),
     ],
 )
@@ -162,8 +178,10 @@ def test_a_problem_names_file_line_what_was_expected_and_found(text: str, said: 
 def test_the_example_drops_every_beacon_in_reach_and_ends_with_everybody_at_the_base() -> None:
     mission = scenario_file.load(EXAMPLE)
     for name, drop in mission.beacons.items():
-        assert (drop.at_s, name, "") in happenings(mission, Happening.REACHED)
-    lost = {name for _, name, _ in happenings(mission, Happening.CUT_OFF)}
+        assert (drop.at_s, name, "") in happenings(mission, EventKind.REACHED)
+    lost = {name for _, name, _ in happenings(mission, EventKind.CUT_OFF)}
     assert lost == {"rover1", "rover2", "b03"}
-    last = {event.who: event.what for event in agenda(mission) if event.what in (Happening.CUT_OFF, Happening.REACHED)}
-    assert set(last.values()) == {Happening.REACHED}
+    last = {
+        event.node: event.kind for event in timeline(mission) if event.kind in (EventKind.CUT_OFF, EventKind.REACHED)
+    }
+    assert set(last.values()) == {EventKind.REACHED}

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshlab.propagation import Ground, links_of
-from meshlab.scenario import Event, Happening, Incident, agenda, scene
-from meshlab.scenario_run import FORGOTTEN_S, play
+from meshlab.propagation import RadioEnvironment, links_of
+from meshlab.scenario import Event, EventKind, PowerEvent, snapshot, timeline
+from meshlab.scenario_run import STATION_EXPIRY_S, play
 from tests.meshlab.test_scenario import AWAY
 
 
@@ -22,21 +22,21 @@ class Recorded:
     names: tuple[str, ...] = AWAY.names
     stop_at_s: float = float("inf")
     now_s: float = 1000.0
-    grounds: list[Ground] = field(default_factory=list)
+    environments: list[RadioEnvironment] = field(default_factory=list)
     powered: dict[str, bool] = field(default_factory=dict)
     switched: list[tuple[str, bool]] = field(default_factory=list)
     forgotten: list[str] = field(default_factory=list)
     told: list[Event] = field(default_factory=list)
 
-    def stand_on(self, ground: Ground) -> None:
-        self.grounds.append(ground)
+    def set_environment(self, environment: RadioEnvironment) -> None:
+        self.environments.append(environment)
 
-    def switch(self, name: str, on: bool) -> None:
+    def set_power(self, name: str, on: bool) -> None:
         assert name in self.names
         self.powered[name] = on
         self.switched.append((name, on))
 
-    def forget(self, name: str) -> None:
+    def flush_stations(self, name: str) -> None:
         assert not self.powered[name]
         self.forgotten.append(name)
 
@@ -50,16 +50,18 @@ class Recorded:
 
 
 def played(stage: Recorded, *, speed: float = 1.0, start_s: float = 0.0) -> float | None:
-    return play(AWAY, stage, tell=stage.told.append, clock=stage.clock, wait=stage.wait, speed=speed, start_s=start_s)
+    return play(
+        AWAY, stage, on_event=stage.told.append, clock=stage.clock, wait=stage.wait, speed=speed, start_s=start_s
+    )
 
 
 @given(st.sampled_from([0.5, 1.0, 10.0, 1000.0]))
 def test_every_event_is_told_once_in_order_however_fast(speed: float) -> None:
     stage = Recorded()
     assert played(stage, speed=speed) is None
-    assert stage.told == list(agenda(AWAY))
+    assert stage.told == list(timeline(AWAY))
     assert stage.powered == {"base": True, "beacon": True, "rover": True, "spare": True}
-    assert links_of(stage.grounds[-1]) == links_of(scene(AWAY, AWAY.duration_s).ground)
+    assert links_of(stage.environments[-1]) == links_of(snapshot(AWAY, AWAY.duration_s).environment)
 
 
 def test_carried_beacons_are_off_until_they_are_dropped() -> None:
@@ -71,7 +73,7 @@ def test_carried_beacons_are_off_until_they_are_dropped() -> None:
 def test_the_fleet_is_told_of_new_links_alone() -> None:
     stage = Recorded()
     played(stage)
-    told = [links_of(ground) for ground in stage.grounds]
+    told = [links_of(ground) for ground in stage.environments]
     assert all(one != other for one, other in pairwise(told))
     assert len(told) < AWAY.duration_s
 
@@ -84,18 +86,20 @@ def test_what_was_stopped_and_taken_up_again_is_the_same_mission(stop_at_s: int)
     assert stopped_s <= stop_at_s
     second = Recorded()
     assert played(second, start_s=stopped_s) is None
-    assert first.told + second.told == list(agenda(AWAY))
+    assert first.told + second.told == list(timeline(AWAY))
     assert (second.switched[0][0], dict(second.switched[:4])["beacon"]) == ("base", stopped_s >= 50)
 
 
-@pytest.mark.parametrize(("on_s", "is_forgotten"), [(80.0 + FORGOTTEN_S - 1, False), (80.0 + FORGOTTEN_S, True)])
+@pytest.mark.parametrize(
+    ("on_s", "is_forgotten"), [(80.0 + STATION_EXPIRY_S - 1, False), (80.0 + STATION_EXPIRY_S, True)]
+)
 @pytest.mark.parametrize("start_s", [0.0, 85.0])
 def test_whoever_was_away_for_long_is_known_to_nobody_when_it_comes_on(
     on_s: float, start_s: float, is_forgotten: bool
 ) -> None:
     stage = Recorded()
-    mission = replace(AWAY, incidents=(Incident(80.0, "spare", False), Incident(on_s, "spare", True)))
-    play(mission, stage, tell=stage.told.append, clock=stage.clock, wait=stage.wait, start_s=start_s)
+    mission = replace(AWAY, power_events=(PowerEvent(80.0, "spare", False), PowerEvent(on_s, "spare", True)))
+    play(mission, stage, on_event=stage.told.append, clock=stage.clock, wait=stage.wait, start_s=start_s)
     assert ("spare" in stage.forgotten) == is_forgotten
     assert ("beacon" in stage.forgotten) == (start_s < 50)
 
@@ -104,12 +108,12 @@ def test_nodes_that_the_fleet_has_not_are_told_of_and_not_switched() -> None:
     stage = Recorded(names=("base", "rover"))
     played(stage)
     assert set(stage.powered) == {"base", "rover"}
-    assert Happening.DROPPED in {event.what for event in stage.told}
+    assert EventKind.DROPPED in {event.kind for event in stage.told}
 
 
 @pytest.mark.parametrize("speed", [1.0, 50.0])
 def test_incidents_switch_radios(speed: float) -> None:
     stage = Recorded()
-    mission = replace(AWAY, incidents=(Incident(80.0, "spare", False), Incident(90.0, "spare", True)))
-    play(mission, stage, tell=stage.told.append, clock=stage.clock, wait=stage.wait, speed=speed)
+    mission = replace(AWAY, power_events=(PowerEvent(80.0, "spare", False), PowerEvent(90.0, "spare", True)))
+    play(mission, stage, on_event=stage.told.append, clock=stage.clock, wait=stage.wait, speed=speed)
     assert [on for name, on in stage.switched if name == "spare"] == [True, False, True]

@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 
 from meshlab import mesh_model
-from meshlab.mesh_model import Edge, Effective
+from meshlab.mesh_model import Edge, EffectiveState
 from meshlab.spec import LinkSpec
-from meshlab.station_tables import DEAF_S, EXPIRY_S, Stations
+from meshlab.station_tables import DEAF_S, EXPIRY_S, StationTables
 from tests.meshlab.test_mesh_model import node
 
 BOOTS = {"a": 1, "b": 1}
@@ -21,7 +21,7 @@ class Pair:
     """Two nodes that hear each other, and a clock."""
 
     def __init__(self) -> None:
-        self.stations = Stations()
+        self.stations = StationTables()
         self.nodes = {"a": node(1, index=21), "b": node(2, index=21)}
         self.now_s = 1000.0
         self.boots = dict(BOOTS)
@@ -35,22 +35,22 @@ class Pair:
         self.stations.update(self.graph(), self.boots, self.now_s)
 
     def change(self, name: str, **changes: object) -> None:
-        cell = replace(self.nodes[name].cells[0], **changes)  # type: ignore[arg-type]
-        self.nodes[name] = Effective((cell,), self.nodes[name].addresses)
+        cell = replace(self.nodes[name].interfaces[0], **changes)  # type: ignore[arg-type]
+        self.nodes[name] = EffectiveState((cell,), self.nodes[name].addresses)
 
     def restart(self, name: str, *, away_s: float = 1.0) -> None:
         """The interface is made anew; nobody hears it meanwhile."""
-        cell = self.nodes[name].cells[0]
-        self.nodes[name] = Effective((), self.nodes[name].addresses)
+        cell = self.nodes[name].interfaces[0]
+        self.nodes[name] = EffectiveState((), self.nodes[name].addresses)
         self.hear()
-        self.nodes[name] = Effective((replace(cell, index=cell.index + 1),), self.nodes[name].addresses)
+        self.nodes[name] = EffectiveState((replace(cell, index=cell.index + 1),), self.nodes[name].addresses)
         self.hear(after_s=away_s)
 
     def passes(self) -> bool:
         return self.stations.passes("a", self.boots, self.graph()["a"][0])
 
     def connected_s(self, name: str) -> list[float]:
-        return [self.now_s - entry.since_s for entry in self.stations.of(name)]
+        return [self.now_s - entry.since_s for entry in self.stations.entries_of(name)]
 
 
 @pytest.fixture
@@ -80,10 +80,10 @@ def test_a_radio_with_another_address_is_a_stranger_and_the_old_entry_falls_sile
     pair.change("b", mac="42:00:00:00:00:02", index=22)
     pair.hear(after_s=10)
     assert pair.passes()
-    silent = {entry.mac: entry.silent_since_s for entry in pair.stations.of("a")}
+    silent = {entry.mac: entry.silent_since_s for entry in pair.stations.entries_of("a")}
     assert silent == {B: pair.now_s, "42:00:00:00:00:02": None}
     pair.hear(after_s=EXPIRY_S)
-    assert [entry.mac for entry in pair.stations.of("a")] == ["42:00:00:00:00:02"]
+    assert [entry.mac for entry in pair.stations.entries_of("a")] == ["42:00:00:00:00:02"]
 
 
 def test_one_that_forgets_a_radio_that_did_not_restart_is_not_heard_until_that_one_forgets_it_too(pair: Pair) -> None:
@@ -104,13 +104,13 @@ def test_numbers_catch_up_after_minutes(pair: Pair) -> None:
 
 
 def test_one_that_was_away_for_longer_than_it_is_remembered_is_heard_at_once(pair: Pair) -> None:
-    cells = pair.nodes["b"].cells
-    pair.nodes["b"] = Effective()
+    cells = pair.nodes["b"].interfaces
+    pair.nodes["b"] = EffectiveState()
     pair.hear()
     assert pair.stations.next_change_s() == pair.now_s + EXPIRY_S
     pair.hear(after_s=EXPIRY_S + 1)
-    assert pair.stations.of("a") == []
-    pair.nodes["b"] = Effective((replace(cells[0], index=22),))
+    assert pair.stations.entries_of("a") == []
+    pair.nodes["b"] = EffectiveState((replace(cells[0], index=22),))
     pair.hear()
     assert pair.passes()
 
@@ -125,11 +125,11 @@ def test_a_link_that_fails_for_a_moment_changes_nothing_about_it(pair: Pair) -> 
 
 
 def test_an_entry_that_is_deleted_while_its_radio_is_silent_costs_nothing(pair: Pair) -> None:
-    cells = pair.nodes["b"].cells
-    pair.nodes["b"] = Effective()
+    cells = pair.nodes["b"].interfaces
+    pair.nodes["b"] = EffectiveState()
     pair.hear()
     pair.stations.delete("a", "mesh0", B, pair.now_s)
-    pair.nodes["b"] = Effective((replace(cells[0], index=22),))
+    pair.nodes["b"] = EffectiveState((replace(cells[0], index=22),))
     pair.hear()
     assert pair.passes()
 

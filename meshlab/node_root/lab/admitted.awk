@@ -1,5 +1,5 @@
-# The loaded rules (lab/firewall_rules.awk) and netifd's lines -> the same lines, each `addr` with 1 or 0 at its end:
-# whether a new connection to its port 22 is let in. The first rule that fits decides; no firewall lets everything in.
+# The loaded rules (lab/firewall_rules.awk) and netifd's lines -> the same lines, each `addr` with 1 or 0 appended: whether
+# a new connection to port 22 is accepted. The first matching rule decides; without a firewall everything is accepted.
 BEGIN { FS = OFS = "\t" }
 FILENAME ~ /loaded$/ { device[++n] = $2; address[n] = $3; verdict[n] = $4; next }
 $1 == "addr" {

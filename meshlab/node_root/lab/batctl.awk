@@ -1,9 +1,9 @@
-# batctl's stand-in, the printing part. effective: cell lines of this node's radios; heard: N neighbour, O originator.
+# Stand-in for batctl, output. effective: cell lines of this node's radios; heard: N neighbor, O originator.
 BEGIN { FS = "\t" }
 FILENAME ~ /effective$/ && $1 == "cell" && $11 == soft { faces[++nfaces] = $3; index_of[$3] = $13; address[$3] = $10; algorithm = $12 }
 FILENAME ~ /heard$/ && $1 == "N" && $2 in index_of { neighbour[++n] = $3; n_face[n] = $2; n_age[n] = $4; n_tq[n] = $5 }
 FILENAME ~ /heard$/ && $1 == "O" && $2 in index_of { origin[++o] = $3; o_face[o] = $2; o_hop[o] = $4; o_tq[o] = $5; o_age[o] = $6; best[o] = $7 }
-# BATMAN_V measures throughput: taken from the same quality, 100 Mbit/s at most
+# BATMAN_V measures throughput: derived from the TQ, at most 100 Mbit/s
 function metric(tq) { return algorithm == "BATMAN_V" ? "\"throughput\":" int(tq * 100000 / 255) : "\"tq\":" tq }
 function face(name) { return "\"hard_ifindex\":" index_of[name] (series == "21.02" ? "" : ",\"hard_ifname\":\"" name "\"") }
 function header() {

@@ -1,13 +1,12 @@
-# What fw3's and fw4's stand-ins share. The rules that are loaded: $LOADED (lab/firewall_rules.awk has its lines).
+# Shared by the stand-ins of fw3 and fw4. $LOADED has the loaded rules (format: lab/firewall_rules.awk).
 RUN=/tmp/run/firewall
 LOADED=$RUN/loaded
 mkdir -p $RUN
 umask 022
 
-# take MS [MORE]: how long it takes, and up to so much more; while the node boots it takes no time, because a real node
-# boots for many times as long
+# take MS [MORE]: sleep MS plus up to MORE; not while the node boots, because a real boot takes many times as long
 take() { [ ! -f /tmp/run/procd/booted ] || /rom/lab/genuine/busybox usleep $((($1 + $(chance "${2:-0}")) * 1000)); }
-# each network's device at this moment
+# the current device of each network
 devices_now() {
 	ubus call network.interface dump 2>/dev/null | awk -F '"' '
 		$2 == "interface" && NF > 4 { name = $4; device = "" }
@@ -16,7 +15,7 @@ devices_now() {
 		/^\t\t\}/ { if (l3 device != "") print name, (l3 != "" ? l3 : device); name = device = l3 = "" }' >$RUN/devices
 }
 read_rules() { uci -q export firewall 2>/dev/null | awk -v devices=$RUN/devices -f /rom/lab/firewall_rules.awk >$LOADED.new; }
-# every load adds its rules to the table behind those it flushes: their handles grow, as long as the table is the same
+# a load flushes the table's rules and adds new ones: handles grow as long as the table exists
 put_rules() {
 	read -r handle 2>/dev/null <$RUN/handle || handle=36
 	awk -v handle="$handle" 'BEGIN { OFS = "\t" } { print $0, handle + 2 + NR }' $LOADED.new >$LOADED.handles

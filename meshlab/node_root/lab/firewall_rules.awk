@@ -1,7 +1,7 @@
-# fw3's and fw4's stand-in: `uci export firewall` and the devices of the networks (NETWORK DEVICE, in the file `devices`)
-# -> what decides about a new connection to SSH, one rule a line, the first that fits decides:
+# Stand-in for fw3 and fw4: `uci export firewall` and the devices of the networks (NETWORK DEVICE, in the file `devices`)
+# -> the rules for a new SSH connection, one per line; the first that matches decides:
 #   rule DEVICE|* ADDRESS|* ACCEPT|REJECT|DROP COMMENT
-# Rules for certain senders (src_ip, src_mac, src_port, ipset) are taken to fit nobody.
+# Rules for certain senders (src_ip, src_mac, src_port, ipset) never match.
 BEGIN {
 	while ((getline line < devices) > 0) { split(line, part, " "); device_of[part[1]] = device_of[part[1]] " " part[2] }
 	FS = " "
@@ -14,7 +14,7 @@ BEGIN {
 }
 function get(id, option, otherwise) { return (id, option) in opt ? opt[id, option] : otherwise }
 function off(id) { return get(id, "enabled", "1") ~ /^(0|off|false|no|disabled)$/ }
-# the verdict as the release reads it: one that is none is DROP
+# the verdict as the release reads it; an invalid one is DROP
 function verdict_of(text, otherwise) { text = toupper(text); return text ~ /^(ACCEPT|REJECT|DROP)$/ ? text : otherwise }
 function covers_ssh(ports,    n, i, list, ends) {
 	if (ports == "") return 1
@@ -27,7 +27,7 @@ function each_device(zone, address, verdict, comment,    n, i, list) {
 	for (i = 1; i <= n; i++) print "rule\t" list[i] "\t" address "\t" verdict "\t" comment
 }
 END {
-	# nothing to read: fw4 takes it for a configuration without zones that drops everything
+	# no configuration: fw4 handles it like one without zones, which drops everything
 	input = "DROP"
 	for (id = 1; id <= sections; id++) if (kind[id] == "defaults") input = verdict_of(get(id, "input", input), "DROP")
 	for (id = 1; id <= sections; id++) if (kind[id] == "zone" && !off(id)) {

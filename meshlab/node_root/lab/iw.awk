@@ -1,9 +1,9 @@
-# iw's stand-in, the printing part. A station that is deleted is known again from its next beacon, which is at once; one that
-# has fallen silent stays in the table for a minute, and gone when it is deleted. `now` is Unix time, as in air/heard.
+# Stand-in for iw, output. A deleted station that is still heard reappears with its next beacon, immediately; a silent one
+# stays in the table for a minute, and does not reappear when deleted. `now` is Unix time, as in air/heard.
 BEGIN {
 	FS = "\t"
 	while ((getline line < "/tmp/run/netifd/forgotten") > 0) { split(line, told, " "); since[told[1] " " told[2]] = told[3] }
-	# what is open for reading is not written
+	# a file that is open for reading is not written
 	close("/tmp/run/netifd/forgotten")
 }
 function describe(indent, face,    width, type) {
@@ -36,7 +36,7 @@ FILENAME ~ /iw$/ {
 		else print "Not connected."
 	}
 }
-# deleted, and not heard since
+# deleted and not heard since
 FILENAME ~ /heard$/ && $1 == "S" && $8 && since[$2 " " $3] >= $8 { next }
 FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" && act == "del" { if ($3 == mac) known = 1; next }
 FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" && (act == "dump" || $3 == mac) {

@@ -1,4 +1,4 @@
-# One at a time: `lock NAME` waits for its turn, `try_lock` does not, `unlock NAME` ends it. A holder that died holds nothing.
+# Locks: `lock NAME` waits, `try_lock` does not, `unlock NAME` releases. The lock of a dead process is free.
 try_lock() {
 	ln -s $$ "/tmp/run/lock.$1" 2>/dev/null && return
 	holder=$(readlink "/tmp/run/lock.$1")
@@ -7,7 +7,7 @@ try_lock() {
 }
 lock() { until try_lock "$1"; do /rom/lab/genuine/busybox usleep 10000; done; }
 unlock() { rm -f "/tmp/run/lock.$1"; }
-# A number from 0 to MOST, from the board's seed: the same series in every fleet with that seed.
+# A number from 0 to MAX, from the board's seed: the same sequence in every fleet with that seed.
 chance() { # MOST
 	. /lab/node/board
 	read -r drawn 2>/dev/null </tmp/run/drawn || drawn=$((SEED + 1))

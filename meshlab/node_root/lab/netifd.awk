@@ -1,12 +1,12 @@
-# netifd's stand-in, the computing part. Input: `uci export network; uci export wireless`.
+# Stand-in for netifd, the model. Input: `uci export network; uci export wireless`.
 #
 # sections -> which radio interfaces come up -> which devices exist -> which interfaces are up
 #   -> run/dump, run/wireless (JSON for ubus), run/iw, run/addresses.new, run/effective, run/sys (a shell script)
 #
-# Setting radios up takes time, so a change comes in two phases. Phase 1: everything else is as configured; radios whose
-# configuration differs from run/radios are pending, and their interfaces that are to be made anew are gone. Phase 2: all is
-# as configured, and run/radios.new says what stands: lines "device NAME OPTIONS" and "face NAME KEY MAC IFINDEX". A board's
-# own MAC address is base; from 23.05 on one that replaces an interface which still stands gets the other (wdev.uc).
+# Setting up radios takes time, so a change has two phases. Phase 1: everything else is as configured; radios whose
+# configuration differs from run/radios are pending, and their interfaces that will be recreated are gone. Phase 2: all is
+# as configured, and run/radios.new has the state: lines "device NAME OPTIONS" and "face NAME KEY MAC IFINDEX". A board's
+# own MAC address is base; from 23.05 on, the replacement of an interface that still exists gets the other one (wdev.uc).
 
 /^package / { package = $2; next }
 /^config / {
@@ -27,7 +27,7 @@ function yes(value) { return value ~ /^(1|on|true|yes|enabled)$/ }
 function json(text) { gsub(/\\/, "\\\\", text); gsub(/"/, "\\\"", text); return "\"" text "\"" }
 function shell(text) { gsub(/'/, "'\\''", text); return "'" text "'" }
 
-# --- what stands already, and what a change does to it ------------------------------------------------------------------
+# --- the current state, and what a change does to it --------------------------------------------------------------------
 
 function read_standing(    line, part) {
 	while ((getline line < (run "/radios")) > 0) {
@@ -41,7 +41,7 @@ function read_standing(    line, part) {
 	close(run "/last_index")
 }
 
-# every option of a section in its order, as netifd compares them up to 24.10
+# every option of a section in order, as netifd compares them up to 24.10
 function all_options(id,    n, i, list, text) {
 	n = split(names[id], list, " ")
 	for (i = 1; i <= n; i++) text = text " " list[i] "=" opt[id, list[i]]
@@ -54,7 +54,7 @@ function iw_width(htmode) {
 	return htmode == "" || htmode == "NONE" ? "NOHT" : htmode
 }
 
-# from 23.05 on: what makes an interface anew when it differs (wdev.uc's object, or wpa_supplicant's file)
+# from 23.05 on: the settings whose change recreates an interface (wdev.uc's object, or wpa_supplicant's file)
 function own_key(id, device, by,    d, n, i, list, text) {
 	d = id_of(device)
 	text = by " " get(id, "mode", "ap") " " get(id, "ssid", "") get(id, "mesh_id", "") " " band(d) " " get(d, "channel", "auto") " " \
@@ -67,16 +67,16 @@ function own_key(id, device, by,    d, n, i, list, text) {
 	return text
 }
 
-# the address that the interface gets when there is one of this name already (keep: it stays)
+# the address of an interface whose name already exists (keep: it stays)
 function other_mac(base,    first) {
 	first = index("0123456789abcdef", tolower(substr(base, 2, 1))) - 1
-	# a globally administered one becomes local, as on ath9k (04: -> 06:); a local one 42:.., as on hwsim (02: -> 42:)
+	# a globally administered address becomes local, as on ath9k (04: -> 06:); a local one 42:.., as on hwsim (02: -> 42:)
 	if (int(first / 2) % 2 == 0) return substr(base, 1, 1) substr("0123456789abcdef", first + 3, 1) substr(base, 3)
 	first = index("0123456789abcdef", tolower(substr(base, 1, 1))) - 1
 	return substr("456789ab0123cdef", first + 1, 1) substr(base, 2)
 }
 
-# whether the radio, and whether this interface of it, is made anew
+# whether the radio, and whether this interface of it, is recreated
 function judge_device(device,    text, n, i, list) {
 	text = all_options(id_of(device))
 	for (i = 1; i <= sections; i++) if (kind[order[i]] == "wireless.wifi-iface" && get(order[i], "device", "") == device) text = text " |" label[order[i]] all_options(order[i])
@@ -85,7 +85,7 @@ function judge_device(device,    text, n, i, list) {
 	whole[device] = !(device in was_device) || was_up[device] != (device in radio_up ? 1 : 0)
 	if (series == "19.07" || series == "21.02" || series == "22.03") whole[device] = whole[device] || differs[device]
 	else if (antennas(was_device[device]) != antennas(text)) whole[device] = 1
-	# a radio that is off is set up by nobody
+	# a disabled radio is not set up
 	pending[device] = differs[device] && ((device in radio_up) || was_up[device])
 }
 function antennas(text,    found) { return (match(text, / txantenna=[^ ]*/) ? substr(text, RSTART, RLENGTH) : "") (match(text, / rxantenna=[^ ]*/) ? substr(text, RSTART, RLENGTH) : "") }
@@ -129,7 +129,7 @@ function board_radios(    n, i, field, list) {
 	}
 }
 
-# the band the UCI section asks for: `band` from 21.02, `hwmode` before
+# the band of the UCI section: `band` from 21.02, `hwmode` before
 function band(id) {
 	if ((id, "band") in opt) return opt[id, "band"]
 	return get(id, "hwmode", "11g") ~ /a/ ? "5g" : "2g"
@@ -197,12 +197,12 @@ function attach(network, ifname) { attached[network] = attached[network] " " ifn
 
 # --- devices and interfaces ------------------------------------------------------------------------------------------
 
-# the bridges, their ports, and the devices that exist at all
+# the bridges, their ports, and the devices that exist
 function all_devices(    i, n, id, list, name) {
 	n = split(ports, list, " ")
 	for (i = 1; i <= n; i++) { exists[list[i]] = 1; mac[list[i]] = lan_mac; wired[list[i]] = 1; names_of_ports[list[i]] = 1 }
 	exists["lo"] = 1; mac["lo"] = "00:00:00:00:00:00"
-	# bat0 stands as soon as a hard interface's master is configured and the module is there
+	# bat0 exists once a hard interface's master is configured and the module is loaded
 	for (i = 1; i <= sections; i++) {
 		id = order[i]
 		if (kind[id] != "network.interface") continue
@@ -222,7 +222,7 @@ function all_devices(    i, n, id, list, name) {
 	}
 }
 
-# its own address, as the kernel draws one at random at each creation
+# a new address, as the kernel chooses a random one at each creation
 function soft_mac(name) { return "fe" substr(lan_mac, 3) }
 
 function make_bridge(name, members,    n, i, list) {
@@ -309,7 +309,7 @@ function wireless_status(    i, d, text, n, list, j, id, m, k, o, first) {
 	print text "\n}" > (run "/wireless")
 }
 
-# options of a section as JSON members; netifd types the ones it knows
+# options of a section as JSON members; netifd types the options it knows
 function options(id, indent, without,    n, list, k, name, value, text, parts, m, j) {
 	n = split(names[id], list, " ")
 	text = ""
@@ -332,7 +332,7 @@ function options(id, indent, without,    n, list, k, name, value, text, parts, m
 
 # --- /sys ------------------------------------------------------------------------------------------------------------
 
-# numbers of the devices that stay: lo, ports, bridges, bat0
+# interface indexes of the permanent devices: lo, ports, bridges, bat0
 function device_index(name,    n, i, list) {
 	if (name == "lo") return 1
 	n = split(ports, list, " ")
@@ -343,7 +343,7 @@ function device_index(name,    n, i, list) {
 function sys_script(    d, file, port, n, i, list, dir) {
 	file = run "/sys"
 	print "cd /sys/class/net || exit 1" > file
-	# what the last call made and this one does not
+	# remove what the last run created and this one does not
 	print "for d in *; do case \" lo " ports " \" in *\" $d \"*) ;; *) [ -e '/tmp/run/netifd/has.'\"$d\" ] || rm -rf \"$d\" ;; esac; done" > (run "/sys.end")
 	close(run "/sys.end")
 	printf "rm -f /tmp/run/netifd/has.*\nrm -rf /var/run/wpa_supplicant; mkdir -p /var/run/wpa_supplicant\n" > file

@@ -1,4 +1,4 @@
-# Packages of a virtual node: the database of the release's tool (opkg or apk), and the programs that come with some.
+# Packages of a virtual node: the database of the release's tool (opkg or apk), and the programs of some packages.
 # Sourced after /lab/node/firmware/env.
 if [ "$PACKAGE_TOOL" = apk ]; then
 	PACKAGE_DB=/lib/apk/db/installed
@@ -7,7 +7,7 @@ else
 fi
 PACKAGE_TEXT=
 
-# package_put NAME VERSION: its entry is collected in PACKAGE_TEXT, its programs are put in place
+# package_put NAME VERSION: add its entry to PACKAGE_TEXT and install its programs
 package_put() {
 	if [ "$PACKAGE_TOOL" = apk ]; then
 		PACKAGE_TEXT="${PACKAGE_TEXT}P:$1
@@ -52,7 +52,7 @@ package_drop() {
 	esac
 }
 
-# package_version NAME: prints it, 1 when it is not installed
+# package_version NAME: prints it; 1 when the package is not installed
 package_version() {
 	awk -v name="$1" -v p="$([ "$PACKAGE_TOOL" = apk ] && echo P: || echo Package:)" -v v="$([ "$PACKAGE_TOOL" = apk ] && echo V: || echo Version:)" '
 		index($0, p) == 1 { now = substr($0, length(p) + 1); sub(/^ /, "", now) }

@@ -1,6 +1,6 @@
-# procd's stand-in, the judging part of `ubus call service event`: the triggers of all services (JSON, a file each; the
-# service that was set last comes first) and the event -> one line "DELAY_MS WORD WORD..." (tabs between) per run_script
-# that the event calls for.
+# Stand-in for procd, evaluation of `ubus call service event`: the triggers of all services (JSON, one file each, the last set
+# service first) and the event -> one line "DELAY_MS WORD WORD..." (tab-separated) per run_script that the event
+# triggers.
 function truth(path,    n, list, i) {
 	n = split(substr(members[path], 2), list, "\t")
 	kind = value[path "/0"]
@@ -45,7 +45,7 @@ BEGIN {
 		forget()
 		if (!json(text)) continue
 		n = split(substr(members[""], 2), list, "\t")
-		# what was added last comes first
+		# the last added comes first
 		for (i = n; i; i--) if (matches(type, value["/" list[i] "/0"])) run("/" list[i] "/1", value["/" list[i] "/2"] + 0)
 	}
 	exit 0

@@ -1,5 +1,5 @@
-# procd's stand-in, the telling part of `ubus call service list`: one service's directory and what procd wrote of its
-# instances, as netifd-style JSON. Variables: name, at (its directory), verbose, first (nothing is before it).
+# Stand-in for procd, output of `ubus call service list`: the directory of one service and its instances, as netifd-style
+# JSON. Variables: name, at (its directory), verbose, first (no service before it).
 function lines(file,    n, line) {
 	split("", got)
 	n = 0

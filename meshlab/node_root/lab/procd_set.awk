@@ -1,8 +1,8 @@
-# procd's stand-in, the reading part of `ubus call service set|add`: JSON on standard input -> the directory `out`:
+# Stand-in for procd, parser of `ubus call service set|add`: JSON on standard input -> the directory `out`:
 #   name, script (one line each); triggers, only if given: the JSON array;
-#   instances/NAME/command: one word a line; instances/NAME/env: NAME=VALUE, one a line;
-#   instances/NAME/settings: KEY VALUE, one a line; instances/NAME/files: their sums
-# Fails when there is no name.
+#   instances/NAME/command: one word per line; instances/NAME/env: one NAME=VALUE per line;
+#   instances/NAME/settings: one KEY VALUE per line; instances/NAME/files: checksums
+# Fails without a name.
 function put(file, text) { printf "%s", text > (out "/" file); close(out "/" file) }
 function each(path, between,    n, i, list, text) {
 	n = split(substr(members[path], 2), list, "\t")

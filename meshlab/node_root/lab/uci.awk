@@ -22,7 +22,7 @@ function find_section(pkg, text,    type, wanted, n, count) {
 	return wanted >= 0 && wanted < count ? FOUND[wanted] : ""
 }
 
-# how `show` calls it: @type[n] for an anonymous section
+# its name in `show`: @type[n] for an anonymous section
 function shown(pkg, id,    n, count) {
 	if (!ANON[pkg, id] || EXTENDED == 0) return id
 	count = 0
@@ -81,7 +81,7 @@ function dotted(path, part,    n) {
 	return n > 3 ? 0 : n
 }
 
-# PACKAGE.SECTION[.OPTION][=VALUE] of a changing command; 0 after an error
+# parse PACKAGE.SECTION[.OPTION][=VALUE] of a modifying command; 0 after an error
 function target(text, needs_value, out,    at, part, n) {
 	at = index(text, "=")
 	if (needs_value && !at) return fail("Invalid argument")
@@ -213,7 +213,7 @@ function export_package(pkg,    names, n, count) {
 	return 1
 }
 
-# text from standard input becomes the package, committed at once; `package NAME` lines name more than one
+# replace the package by text from standard input and commit it; `package NAME` lines name further packages
 function import_line(line) { IMPORT = IMPORT line "\n" }
 
 function import_end(pkg,    temporary, status) {

@@ -1,11 +1,11 @@
 # Stand-in for OpenWrt's uci, the tree: configuration files in /etc/config, uncommitted changes as deltas in /tmp/.uci.
-# The commands are in uci.awk, which is run together with this file.
+# The commands are in uci.awk, which runs together with this file.
 #
 # arguments -> commands (from the command line, or one per line with `batch`) -> load(package), its delta applied
 #   -> change in memory, one delta line per change -> `commit` writes the file
 #
 # A section is SEC[pkg, n] = id, an option OPT[pkg, id, k] = name; TYPE, ANON, VAL, LIST, ITEM hang off these.
-# Left out: -l, -t; locking; `import -m` merges by sections.
+# Not supported: -l, -t; locking; `import -m` merges by sections.
 
 function fail(text, status) {
 	if (!QUIET) print "uci: " text > "/dev/stderr"

@@ -275,7 +275,7 @@ class TestOnAVirtualFleet:
 
     def test_of_a_neighbour_that_is_not_reached_the_operator_is_told_unless_it_can_be_later(self, rig: Rig) -> None:
         # its host key is not the pinned one, so nothing is asked of it until somebody has looked after that
-        rig.fleet.break_("base", "host-key")
+        rig.fleet.inject_fault("base", "host-key")
         _, new = rig.flip()
         ended = rig.meshctl("provision", new, "n001", "--yes", "--json")
         assert ended.results == {"n001": "done"}, ended.out + ended.err
@@ -318,7 +318,7 @@ class TestOnAVirtualFleet:
                 if json.loads(line).get("text") == "prove":
                     process.send_signal(signal.SIGKILL)
                     break
-        rig.fleet.break_("n001", "power-cut")
+        rig.fleet.inject_fault("n001", "power-cut")
         waiting.until(lambda: rig.fleet.node("n001").boot_id != boot, "the node to boot")
         rig.fleet.node("n001").wait_up(wait_s=120.0)
         waiting.until(lambda: bool(known_for_s(rig)), "its radio to be heard again")

@@ -29,12 +29,12 @@ def hurt_and_provision(rig: Rig, *, share: float, old: str, new: str) -> dict[st
     hurt = dict(zip(rig.names[:: max(1, len(rig.names) // max(1, count))], list(RIGHT) * count, strict=False))
     hurt = dict(list(hurt.items())[:count])
     for name, what in hurt.items():
-        rig.fleet.break_(name, what)
+        rig.fleet.inject_fault(name, what)
     began = time.monotonic()
     first = rig.meshctl("provision", new, "--yes", "--json")
     took_s = time.monotonic() - began
     wrong = _wrong(rig, hurt, first)
-    rig.fleet.mend()
+    rig.fleet.repair()
     rig.wait_all_up()
     keys = [name for name, what in hurt.items() if what == "host-key"]
     if keys:

@@ -54,7 +54,7 @@ def strike_nodes(
 ) -> list[Case]:
     """`steps`: node -> the n-th external command, or words of one. `kind` is `power-cut` or `sever`."""
     for name, step in steps.items():
-        rig.fleet.break_(name, f"{kind}@{step}")
+        rig.fleet.inject_fault(name, f"{kind}@{step}")
     with rig.start("provision", new, "--yes", "--json") as process, ThreadPoolExecutor(1) as reader:
         talk = reader.submit(process.communicate)
         _mend_when_undone(rig, set(steps), talk)
@@ -62,7 +62,7 @@ def strike_nodes(
     run = Ended(process.returncode, out, err)
     dead = [name for name in steps if rig.fleet.node(name).power is Power.DEAD]
     for name in steps:
-        rig.fleet.mend(name)
+        rig.fleet.repair(name)
     if dead:
         # what the recovery recipe gives back: a factory device on the bench
         rig.wait_all_up()
@@ -83,7 +83,7 @@ def _mend_when_undone(rig: Rig, names: set[str], talk: Future[tuple[str, str]]) 
             if name in names and not node["plugged"]:
                 began = severed.setdefault(name, time.monotonic())
                 if time.monotonic() - began > rig.window_s + SLACK_S:
-                    rig.fleet.mend(name)
+                    rig.fleet.repair(name)
                     names.discard(name)
         wait([talk], timeout=0.5)
 

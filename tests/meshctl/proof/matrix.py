@@ -69,7 +69,7 @@ def recorded(rig: Rig, new: str) -> list[str]:
     node.record_steps()
     ended = rig.meshctl("provision", new, "--yes", "--json")
     commands = [command for command in node.steps() if "steps.log" not in command]
-    rig.fleet.mend(rig.names[0])
+    rig.fleet.repair(rig.names[0])
     if ended.code != 0:
         raise AssertionError(f"an undisturbed run failed: {ended.out} {ended.err}")
     return commands

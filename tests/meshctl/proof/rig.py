@@ -238,7 +238,7 @@ class Rig:
 
     def settle(self) -> None:
         """Mended, up and wholly on `current`, whatever was done before or left undone."""
-        self.fleet.mend()
+        self.fleet.repair()
         self.wait_all_up()
         other = "b" if self.current == "a" else "a"
         if any(self.state_of(name, other, self.current) != "new" for name in ("base", *self.names)):

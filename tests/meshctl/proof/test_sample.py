@@ -31,22 +31,22 @@ def test_after_meshctl_was_killed_every_node_is_old_or_new_and_a_resume_finishes
 @pytest.mark.proof
 def test_a_mesh_whose_base_fails_in_a_switch_goes_back_as_a_whole_and_then_changes_as_a_whole(rig: Rig) -> None:
     everybody = ("base", *rig.names)
-    rig.fleet.break_("base", "power-cut@reload_config")
+    rig.fleet.inject_fault("base", "power-cut@reload_config")
     failed = rig.meshctl("provision", "split", "--yes", "--json")
-    rig.fleet.mend("base")
+    rig.fleet.repair("base")
     assert set(failed.results.values()) == {"rolled back"}, failed.out
     assert {rig.state_of(name, rig.current, "split") for name in everybody} == {"old"}
     ended = rig.meshctl("resume", "split", "--yes", "--json")
     assert (ended.code, set(ended.results.values())) == (0, {"done"}), ended.out + ended.err
     assert {rig.state_of(name, rig.current, "split") for name in everybody} == {"new"}
     # On the way back one node is left behind: it is told as uncertain, and a resume settles it.
-    rig.fleet.break_("n001", "sever@mv -f /etc/meshctl/change/new")
+    rig.fleet.inject_fault("n001", "sever@mv -f /etc/meshctl/change/new")
     ended = rig.meshctl("provision", "a", "--yes", "--json")
     expected = {name: "uncertain" if name == "n001" else "done" for name in ("base", *rig.names)}
     assert ended.results == expected, ended.out
     (left,) = (event["text"] for event in ended.events if event["event"] == "note" and event["node"] == "n001")
     assert "last seen" in left
-    rig.fleet.mend("n001")
+    rig.fleet.repair("n001")
     resumed = rig.meshctl("resume", "a", "--yes")
     assert "n001: uncertain after run" in resumed.out
     assert "it runs what it ran before" in resumed.out

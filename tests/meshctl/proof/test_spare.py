@@ -23,7 +23,7 @@ def test_a_spare_takes_over_a_dead_nodes_name_address_and_pin(tmp_path: Path) ->
         inventory.write_text(text + spares, encoding="utf-8")
         alive = rig.meshctl("replace", "spare", "n001", "n002", "--yes", "--json")
         assert "still answers" in alive.err
-        rig.fleet.break_("n001", "off")
+        rig.fleet.inject_fault("n001", "off")
         replaced = rig.meshctl("replace", "spare", "n001", "n002", "--yes", "--json")
         assert (replaced.code, replaced.results) == (0, {"n001": "done"}), replaced.out + replaced.err
         assert rig.fleet.node("n002").address == "10.42.1.1"
@@ -31,7 +31,7 @@ def test_a_spare_takes_over_a_dead_nodes_name_address_and_pin(tmp_path: Path) ->
         assert (fleet.nodes["n001"].label, fleet.nodes["n002"].state.value) == ("S2", "retired")
         assert rig.meshctl("provision", "spare", "n001", "--check", "--json").verdicts == {"n001": "same"}
         # its successor dies, too, and somebody breaks the inventory while the next one takes over
-        rig.fleet.break_("n002", "off")
+        rig.fleet.inject_fault("n002", "off")
         good = inventory.read_text(encoding="utf-8")
         with rig.start("replace", "spare", "n001", "n003", "--yes", "--json") as process:
             assert process.stdout is not None

@@ -133,7 +133,7 @@ def bench(standing: Bench) -> Iterator[Bench]:
 
     until(is_whole, "the line of three", wait_s=PATIENCE_S)
     yield standing
-    standing.fleet.mend()
+    standing.fleet.repair()
     for name in NAMES:
         standing.fleet.node(name).wait_up()
 
@@ -150,7 +150,7 @@ def test_a_whole_fleet_is_all_well_and_compared_with_the_inventory(bench: Bench)
 
 
 def test_a_node_without_power_is_shown_as_it_was(bench: Bench) -> None:
-    bench.fleet.break_("b02", "off")
+    bench.fleet.inject_fault("b02", "off")
     told = bench.status()
     assert told["exit_code"] == 3
     last = told["by_name"]["b02"]["last_known"]
@@ -161,7 +161,7 @@ def test_a_node_without_power_is_shown_as_it_was(bench: Bench) -> None:
 
 
 def test_a_node_with_another_host_key_is_told_while_the_others_are_looked_at(bench: Bench) -> None:
-    bench.fleet.break_("b01", "host-key")
+    bench.fleet.inject_fault("b01", "host-key")
     told = bench.status()
     assert [alarm["code"] for alarm in told["by_name"]["b01"]["alarms"]] == ["host-key"]
     assert told["by_name"]["base"]["answers"]
@@ -185,7 +185,7 @@ def test_a_fleet_is_shown_without_its_secrets(bench: Bench) -> None:
 def test_preflight_is_a_go_for_a_whole_fleet_and_a_no_go_with_its_reason_for_a_broken_one(bench: Bench) -> None:
     told = bench.run("preflight").stdout
     assert told.splitlines()[-1] == "GO (radios only)", told
-    bench.fleet.break_("base", "off")
+    bench.fleet.inject_fault("base", "off")
     done = bench.run("preflight", "--json")
     broken = json.loads(done.stdout)
     assert (done.exit_code, broken["go"]) == (1, False)
@@ -200,7 +200,7 @@ def test_topology_draws_the_line(bench: Bench) -> None:
 
 
 def test_whoever_leaves_a_look_need_not_wait_for_the_silent(bench: Bench) -> None:
-    bench.fleet.break_("b01", "ssh-hang")
+    bench.fleet.inject_fault("b01", "ssh-hang")
     with subprocess.Popen(
         bench.command("status", "--timeout", "3600", "--watch", "1", "--json"),
         env=bench.environ,

@@ -22,11 +22,10 @@ from typing import Any, ClassVar, TypeVar
 import pytest
 
 from meshctl.topology import with_alternates
-from meshlab.fleet import VirtualNode
+from meshlab.fleet import QemuFleet, VirtualNode
 from meshlab.from_inventory import spec_of
-from meshlab.inventory_copy import prepare
+from meshlab.inventory_copy import copy_inventory
 from meshlab.qemu import control
-from meshlab.qemu.fleet import RealFleet
 from meshlab.spec import FleetSpec
 from tests import waiting
 from tests.conftest import TRIED_AGAIN
@@ -67,7 +66,7 @@ class Lab:
 
     NODES: ClassVar[tuple[str, ...]] = NODES
 
-    fleet: RealFleet
+    fleet: QemuFleet
     inventory: Path
     state: Path
 
@@ -257,8 +256,8 @@ def fielded(kind: type[L], inventory: Path, place: Path, *, before: Callable[[L]
     """
     set_up_host()
     for turn in ("lab", "again"):
-        copy = prepare(inventory, place / turn)
-        fleet = RealFleet(_quick(spec_of(copy.fleet, links=copy.links)), place / turn)
+        copy = copy_inventory(inventory, place / turn)
+        fleet = QemuFleet(_quick(spec_of(copy.fleet, links=copy.links)), place / turn)
         try:
             fleet.up(wait_s=START_S)
             made = kind(fleet, copy.inventory, place / f"state-{turn}")

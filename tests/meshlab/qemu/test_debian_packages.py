@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from meshlab.errors import LabError
-from meshlab.qemu import apt, debian_packages
+from meshlab.qemu import apt
 
 BOOKWORM = 'PRETTY_NAME="Debian GNU/Linux 12 (bookworm)"\nVERSION_CODENAME=bookworm\n'
 NOBLE = 'PRETTY_NAME="Ubuntu 24.04.1 LTS"\nVERSION_CODENAME=noble\nUBUNTU_CODENAME=noble\n'
@@ -22,16 +22,16 @@ def release(tmp_path: Path, text: str) -> Path:
 
 
 def test_bookworm_has_the_machines_packages_in_its_own_sources(tmp_path: Path) -> None:
-    assert debian_packages.sources(tmp_path / "cache", {}, release(tmp_path, BOOKWORM)) == {}
+    assert apt.sources(tmp_path / "cache", {}, release(tmp_path, BOOKWORM)) == {}
 
 
 def test_another_distribution_gets_a_list_of_bookworms_packages_and_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(debian_packages, "KEYRING", release(tmp_path, NOBLE))
-    options = debian_packages.sources(tmp_path / "cache", {}, release(tmp_path, NOBLE))
+    monkeypatch.setattr(apt, "KEYRING", release(tmp_path, NOBLE))
+    options = apt.sources(tmp_path / "cache", {}, release(tmp_path, NOBLE))
     listed = Path(options["Dir::Etc::sourcelist"]).read_text()
-    assert listed == f"deb [arch=amd64 signed-by={debian_packages.KEYRING}] {debian_packages.MIRROR} bookworm main\n"
+    assert listed == f"deb [arch=amd64 signed-by={apt.KEYRING}] {apt.MIRROR} bookworm main\n"
     assert options["Dir::Etc::sourceparts"] == "-"
     # apt itself reads the options as they are meant
     (tmp_path / "work").mkdir()
@@ -40,10 +40,10 @@ def test_another_distribution_gets_a_list_of_bookworms_packages_and_no_other(
 
 
 def test_another_mirror_is_taken_where_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(debian_packages, "KEYRING", release(tmp_path, NOBLE))
-    options = debian_packages.sources(
+    monkeypatch.setattr(apt, "KEYRING", release(tmp_path, NOBLE))
+    options = apt.sources(
         tmp_path / "cache",
-        {debian_packages.MIRROR_VARIABLE: "http://mirror.example/debian"},
+        {apt.MIRROR_VARIABLE: "http://mirror.example/debian"},
         release(tmp_path, BOOKWORM),
     )
     assert "http://mirror.example/debian bookworm main" in Path(options["Dir::Etc::sourcelist"]).read_text()
@@ -52,9 +52,9 @@ def test_another_mirror_is_taken_where_it_is_named(tmp_path: Path, monkeypatch: 
 def test_what_apt_cannot_verify_is_refused_with_the_way_to_mend_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(debian_packages, "KEYRING", tmp_path / "nothing")
+    monkeypatch.setattr(apt, "KEYRING", tmp_path / "nothing")
     with pytest.raises(LabError, match=r"Ubuntu 24\.04\.1 LTS has no .*nothing") as caught:
-        debian_packages.sources(tmp_path / "cache", {}, release(tmp_path, NOBLE))
+        apt.sources(tmp_path / "cache", {}, release(tmp_path, NOBLE))
     assert "setup-lab" in caught.value.hint
 
 

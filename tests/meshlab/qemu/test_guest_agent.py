@@ -8,8 +8,8 @@ import os
 from typing import Any, cast
 
 from meshlab.qemu import guest_protocol
-from meshlab.qemu.guest_agent import Agent
-from meshlab.qemu.port_forwarder import RealDoors
+from meshlab.qemu.guest_agent import GuestAgent
+from meshlab.qemu.port_forwarder import QemuPortForwarder
 
 # far longer than output takes that nothing holds up
 LATE_S = 0.3
@@ -45,7 +45,7 @@ def test_what_a_process_wrote_last_arrives_before_its_status_however_late_the_ho
             asyncio.get_running_loop().call_later(LATE_S, host.reads.set)
             return {"status": 0}
 
-        agent = Agent("token", process, cast(RealDoors, None))
+        agent = GuestAgent("token", process, cast(QemuPortForwarder, None))
         await agent._execute(EXEC, asyncio.StreamReader(), cast(asyncio.StreamWriter, host))
         return host.frames
 
@@ -76,7 +76,7 @@ def test_a_process_that_stays_behind_and_goes_on_writing_does_not_hold_up_the_st
             return {"status": 0}
 
         writing: list[asyncio.Task[None]] = []
-        agent = Agent("token", process, cast(RealDoors, None))
+        agent = GuestAgent("token", process, cast(QemuPortForwarder, None))
         await agent._execute(EXEC, asyncio.StreamReader(), cast(asyncio.StreamWriter, host))
         writing[0].cancel()
         return host.frames[-1][0]

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-from types import SimpleNamespace
-from typing import cast
 
 import pytest
 
 from meshlab.errors import LabError
+from meshlab.fleet_state import FleetState
 from meshlab.qemu import hwsim_devices
-from meshlab.qemu.link_state import RealEther
+from meshlab.qemu.link_state import QemuLinkState
 from meshlab.spec import FleetSpec, NodeSpec
 from meshlab.state import NodeState, Power
-from meshlab.supervisor import Supervisor
 
 
 def test_a_cable_that_could_not_be_laid_is_laid_again_without_another_change(
@@ -26,16 +24,17 @@ def test_a_cable_that_could_not_be_laid_is_laid_again_without_another_change(
     async def run() -> None:
         is_laid = asyncio.Event()
 
-        def lay_cable(place: hwsim_devices.Place, *_: object, on_bench: bool) -> None:
+        def connect_cable(place: hwsim_devices.NodeHardware, *_: object, on_bench: bool) -> None:
             tries.append(place.name)
             if len(tries) == 1:
                 raise LabError("ip link set cable0: Cannot find device")
             is_laid.set()
 
-        monkeypatch.setattr(hwsim_devices, "lay_cable", lay_cable)
+        monkeypatch.setattr(hwsim_devices, "connect_cable", connect_cable)
         monkeypatch.setattr(hwsim_devices, "set_group", lambda *_: None)
-        fleet = SimpleNamespace(spec=spec, nodes={"b01": state}, doors=SimpleNamespace(refresh=lambda: None))
-        RealEther(cast(Supervisor, fleet), hwsim_devices.places(spec)).changed()
+        fleet = FleetState(spec, state.home)
+        fleet.nodes["b01"] = state
+        QemuLinkState(fleet, hwsim_devices.node_hardware(spec)).changed()
         await asyncio.wait_for(is_laid.wait(), 60)
 
     asyncio.run(run())

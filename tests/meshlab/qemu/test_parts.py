@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from meshlab import rootfs
 from meshlab.errors import LabError
 from meshlab.qemu import cpio, guest_protocol, hwsim_devices, initramfs, kernel_modules, qemu, traffic_control
-from meshlab.qemu.traffic_control import Fate
+from meshlab.qemu.traffic_control import Impairment
 from meshlab.spec import FleetSpec, LanSpec, Medium, NodeSpec, RadioSpec, dump, load
 
 REAL_ROOT = Path(initramfs.__file__).with_name("node_root")
@@ -83,7 +83,7 @@ def test_a_frames_header_tells_its_stream_and_length(stream: int, content: bytes
 
 def test_unicast_is_lost_only_when_every_attempt_is() -> None:
     lines = traffic_control.batch(
-        "mesh0", {"02:00:00:00:00:01": Fate(loss=0.5, delay_ms=5, rate_kbps=1000)}
+        "mesh0", {"02:00:00:00:00:01": Impairment(loss=0.5, delay_ms=5, rate_kbps=1000)}
     ).splitlines()
     qdiscs = [line for line in lines if "netem" in line]
     assert "delay 5ms loss 50.0000% rate 1000kbit" in qdiscs[0]
@@ -95,7 +95,7 @@ def test_unicast_is_lost_only_when_every_attempt_is() -> None:
 
 def test_nothing_is_configured_where_nothing_is_lost() -> None:
     assert traffic_control.batch("mesh0", {}) == ""
-    assert Fate().is_nothing
+    assert Impairment().is_none
 
 
 def fleet() -> FleetSpec:
@@ -106,7 +106,7 @@ def fleet() -> FleetSpec:
 
 
 def test_radios_are_counted_through_and_each_node_knows_its_lan() -> None:
-    places = hwsim_devices.places(fleet())
+    places = hwsim_devices.node_hardware(fleet())
     assert [place.phys for place in places.values()] == [("phy0",), ("phy1", "phy2"), ("phy3",)]
     assert [place.lan.name if place.lan else None for place in places.values()] == ["station", "husky", None]
     operator = hwsim_devices.operator_lan(fleet())
@@ -129,7 +129,7 @@ def test_the_operators_address_on_a_bench_is_in_the_nodes_network_and_not_the_no
 
 
 def test_without_a_kvm_device_the_machine_is_emulated(tmp_path: Path) -> None:
-    assert qemu.accelerator(tmp_path / "no-kernel", tmp_path / "no-kvm") is qemu.TCG
+    assert qemu.probe_accelerator(tmp_path / "no-kernel", tmp_path / "no-kvm") is qemu.TCG
 
 
 CONFIG = """package network

@@ -115,7 +115,7 @@ def test_telemetry_flows_again_when_a_relay_has_died(lab: Lab) -> None:
             until(lambda: "base" in lab.neighbours("b02"), "the other way to be there")
             until(lambda: lab.originators("b02").get("base") == "b01", "the way over the relay to be the better one")
             until(lambda: arrived(lab) > PLENTY, "telemetry over the relay")
-            lab.fleet.break_("b01", "off")
+            lab.fleet.inject_fault("b01", "off")
             until(lambda: lab.originators("b02").get("base") == "base", "the route without the relay")
             before = arrived(lab)
             until(lambda: arrived(lab) > before + PLENTY, "telemetry without the relay")
@@ -124,7 +124,7 @@ def test_telemetry_flows_again_when_a_relay_has_died(lab: Lab) -> None:
         # else they would be half deaf to it: it is back within the minute in which Linux forgets
         for name in ("base", "b02"):
             have_forgotten(lab, name, "b01")
-        lab.fleet.mend("b01")
+        lab.fleet.repair("b01")
         lab.meshctl("lab", "mend", "base-b02")
     until(lambda: "base" not in lab.neighbours("b02"), "the links to be as they were")
     lab.settle()

@@ -1,4 +1,4 @@
-# Stand-in for OpenWrt's /lib/functions.sh: reading UCI from shell, as far as init scripts commonly do.
+# Stand-in for OpenWrt's /lib/functions.sh: reading UCI from shell, as far as common init scripts need.
 config_load() {
 	CONFIG_PACKAGE=$1
 	CONFIG_SECTIONS=

@@ -1,8 +1,8 @@
-# netifd's stand-in on real radios, the computing part: after netifd.awk, what the kernel is to have -> run/kernel.new.
+# Stand-in for netifd on real radios, the model: after netifd.awk, the kernel's target state -> run/kernel.new.
 #
-# One line per device, port or address, tab-separated, in the order of making. A line ends with the lines it stands on:
-# when a radio or bat0 is made anew, so is what hangs on it. MAKING counts how often netifd.awk had the interface made anew;
-# what acts in place on this release is another line, and so is the country, which all radios share.
+# One line per device, port or address, tab-separated, in the order of creation. A line ends with the lines it depends on:
+# when a radio or bat0 is recreated, so is what depends on it. MAKING counts how often netifd.awk recreated the interface;
+# settings that this release changes in place have a line of their own, and so has the country, which all radios share.
 #
 #   bridge NAME MAC
 #   soft   NAME ALGORITHM OPTIONS
@@ -14,7 +14,7 @@
 
 function field(value) { return "\t" (value == "" ? "-" : value) }
 
-# OPTION=VALUE of those that are set, separated by blanks
+# OPTION=VALUE of the set options, separated by blanks
 function chosen(id, wanted,    n, i, list, text) {
 	n = split(wanted, list, " ")
 	for (i = 1; i <= n; i++) if ((id, list[i]) in opt) text = text (text == "" ? "" : " ") list[i] "=" opt[id, list[i]]
@@ -23,7 +23,7 @@ function chosen(id, wanted,    n, i, list, text) {
 
 function add(name, line) { made_of[name] = line; plan = plan line "\n" }
 
-# without the tabs, so that a line's own fields can be told from those of what it stands on
+# without tabs, to separate a line's own fields from those of its dependencies
 function standing_on(name,    text) { text = made_of[name]; gsub(/\t/, "|", text); return field(text) }
 
 function plan_radios(    i, id, device, ifname, path, country) {

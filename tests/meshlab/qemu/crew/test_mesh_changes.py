@@ -52,10 +52,10 @@ def test_the_mesh_goes_back_when_some_of_it_never_arrives(crew: Crew) -> None:
     crew.edit("channel: 11\n", "channel: 1\n")
     crew.edit("confirm_window_s: &window 600", f"confirm_window_s: &window {SHORT_WINDOW_S}")
     # at the moment of the switch b02 hears nobody any more, and the Husky behind it nobody at all
-    crew.fleet.break_("b02", "sever@reload_config")
+    crew.fleet.inject_fault("b02", "sever@reload_config")
 
     def let_it_be_heard() -> None:
-        crew.fleet.mend("b02")
+        crew.fleet.repair("b02")
         crew.node("b02").plug(False)
 
     told = ("rolling back", let_it_be_heard)
@@ -145,7 +145,7 @@ def test_a_power_cut_inside_the_window_leaves_the_old_configuration(crew: Crew) 
     boot = crew.node("husky").boot_id
     plain, changed = "husky: {groups: [twins],", "husky: {radios: {radio0: {tx_power_dbm: 15}}, groups: [twins],"
     crew.edit(plain, changed)
-    crew.fleet.break_("husky", "power-cut@reload_config")
+    crew.fleet.inject_fault("husky", "power-cut@reload_config")
     crew.meshctl("provision", "--yes", "husky", expect=1)
     crew.edit(changed, plain)
     until(lambda: crew.node("husky").is_up() and crew.node("husky").boot_id != boot, "the node to boot")

@@ -16,7 +16,7 @@ def test_a_factory_fresh_device_takes_over_a_dead_beacons_name_and_place(crew: C
     place = crew.node("spare").bench
     alive = crew.meshctl("replace", "b01", "spare", "--at", f"{place.host}:{place.port}", "--yes", expect=None)
     assert "still answers" in alive.errors
-    crew.fleet.break_("b01", "off")
+    crew.fleet.inject_fault("b01", "off")
     done = crew.meshctl("replace", "b01", "spare", "--at", f"{place.host}:{place.port}", "--yes", "--json")
     assert {event["outcome"]["result"] for event in done.events if event["event"] == "finished"} == {"done"}
     crew.node("spare").plug(False)

@@ -1,5 +1,5 @@
-# Stand-in for procd's /lib/functions/procd.sh: what an init script says of its instances and triggers, as JSON for
-# `ubus call service`. The functions have the real names; the JSON is put together here and not by jshn.
+# Stand-in for procd's /lib/functions/procd.sh: an init script's instances and triggers as JSON for `ubus call
+# service`. The functions have the real names; the JSON is built here, not by jshn.
 PROCD_RELOAD_DELAY=1000
 
 _json_text() {
