@@ -1,4 +1,4 @@
-"""Document + node plans -> fleet: each section turned into the model's frozen values.
+"""Document + node specs -> fleet: each section turned into the model's frozen values.
 
 Order: hardware, meshes, robots (who carries which node), nodes, topics, settings.
 """
@@ -22,9 +22,9 @@ from meshctl.inventory.documents import (
     SecretDocument,
     TopicDocument,
 )
-from meshctl.inventory.layers import NodePlan
+from meshctl.inventory.layers import NodeSpec
 from meshctl.inventory.nodes import build_nodes, ssh_settings
-from meshctl.inventory.provenance import Origins
+from meshctl.inventory.provenance import Provenance
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
 from meshctl.inventory.tree import MappingNode, descend, place_of
 from meshctl.model import (
@@ -56,7 +56,7 @@ class Built:
 
 
 def build(
-    document: InventoryDocument, root: MappingNode, plans: Mapping[str, NodePlan], files: tuple[Path, ...]
+    document: InventoryDocument, root: MappingNode, specs: Mapping[str, NodeSpec], files: tuple[Path, ...]
 ) -> Built:
     """`files` are those read, the first one first."""
     hardware = {name: _hardware(name, item, root) for name, item in document.hardware.items()}
@@ -68,7 +68,7 @@ def build(
         for robot in robots.values():
             for node in getattr(robot, names):
                 robot_of.setdefault(node, robot.name)
-    built = build_nodes(plans, hardware, meshes, robot_of)
+    built = build_nodes(specs, hardware, meshes, robot_of)
     diagnostics.extend(built.diagnostics)
     if diagnostics:
         return Built(None, tuple(diagnostics))
@@ -101,7 +101,7 @@ def build(
             quorum=document.apply.quorum,
             parallel=document.apply.parallel,
         ),
-        origins=Origins(root, plans, robot_of),
+        provenance=Provenance(root, specs, robot_of),
         files=tuple(str(path) for path in files),
         base=str(files[0].parent),
     )

@@ -42,7 +42,7 @@ def compose(source: Source) -> Composed:
     composer = _Composer(source.file)
     try:
         for event in _events(source.text):
-            if not composer.take(event):
+            if not composer.handle(event):
                 break
     except yaml.MarkedYAMLError as reason:
         composer.fail(_syntax_error(source, reason))
@@ -124,7 +124,7 @@ class _Composer:
         self.is_broken = True
         self.diagnostics.append(diagnostic)
 
-    def take(self, event: yaml.Event) -> bool:
+    def handle(self, event: yaml.Event) -> bool:
         """One event; False when reading on is of no use."""
         match event:
             case yaml.ScalarEvent():
@@ -193,7 +193,7 @@ class _Composer:
             return
         container, _ = self._open[-1]
         if isinstance(container, MappingNode) and self._key is None:
-            self._take_key(tree)
+            self._set_key(tree)
             return
         container.weight += tree.weight
         if max(container.weight, self._count) > MAX_VALUES:
@@ -211,7 +211,7 @@ class _Composer:
         else:
             self._entry(container, tree)
 
-    def _take_key(self, tree: Tree) -> None:
+    def _set_key(self, tree: Tree) -> None:
         if isinstance(tree, Scalar):
             self._key = tree
             return

@@ -20,7 +20,7 @@ from types import MappingProxyType
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
 from meshctl.inventory.compose import compose
-from meshctl.inventory.include import gather
+from meshctl.inventory.include import read_files
 from meshctl.inventory.load import load
 from meshctl.inventory.ranges import BadRange, expand, is_range
 from meshctl.inventory.source import Source, read_bytes
@@ -40,7 +40,7 @@ _BOM = "\ufeff"
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class FileEdit:
     """One file's text before and after."""
 
     file: Path
@@ -75,7 +75,7 @@ class Editor:
         if loaded.fleet is None:
             raise InvalidInput(loaded.diagnostics)
         editor = cls(path, environ)
-        for file in gather(path, environ).files:
+        for file in read_files(path, environ).files:
             text = editor._before[file] = editor._texts[file] = read_bytes(file).decode("utf-8")
             root = _compose(file, text.removeprefix(_BOM))
             if root is None:
@@ -100,13 +100,13 @@ class Editor:
         text = remove_entry(self._text(file), mapping, path[-1])
         self._replace(file, _without(plain_data(root), path), text)
 
-    def changes(self) -> tuple[Change, ...]:
+    def changes(self) -> tuple[FileEdit, ...]:
         """The files that differ. Raises InvalidInput when the edited inventory would not load."""
         loaded = load(self.path, environ=self.environ, read=self._read)
         if loaded.fleet is None:
             raise InvalidInput(loaded.diagnostics)
         return tuple(
-            Change(file, self._before[file], text) for file, text in self._texts.items() if text != self._before[file]
+            FileEdit(file, self._before[file], text) for file, text in self._texts.items() if text != self._before[file]
         )
 
     def has(self, path: tuple[str, ...]) -> bool:
@@ -213,7 +213,7 @@ def remove_topic(editor: Editor, name: str) -> None:
     editor.remove(("topics", name))
 
 
-def save(changes: tuple[Change, ...]) -> None:
+def save(changes: tuple[FileEdit, ...]) -> None:
     """Write each file at once, keeping its mode. Raises InputError when one has changed meanwhile, or cannot be
     written."""
     for change in changes:

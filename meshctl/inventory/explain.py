@@ -9,7 +9,7 @@ from meshctl.model import Fleet, Node, Origin, Radio
 
 
 @dataclass(frozen=True, slots=True)
-class Why:
+class ExplainedValue:
     """`key` is the place below the node (`radios.radio0.mesh`); `value` is text for people."""
 
     key: str
@@ -17,10 +17,10 @@ class Why:
     origin: Origin
 
 
-def explain(fleet: Fleet, node: Node) -> tuple[Why, ...]:
+def explain(fleet: Fleet, node: Node) -> tuple[ExplainedValue, ...]:
     """Everything that holds for `node`, in the order of the format. A value that nobody wrote is `built-in`, at the
     place of what encloses it."""
-    return tuple(Why(key, value, _origin(fleet, node, key)) for key, value in _values(node))
+    return tuple(ExplainedValue(key, value, _origin(fleet, node, key)) for key, value in _values(node))
 
 
 def _values(node: Node) -> Iterator[tuple[str, str]]:
@@ -71,7 +71,7 @@ def _origin(fleet: Fleet, node: Node, key: str) -> Origin:
     # Names of UCI options hold dots of their own.
     parts = ("extra_uci", key.removeprefix("extra_uci.")) if key.startswith("extra_uci.") else tuple(key.split("."))
     for path in (("nodes", node.name, *parts), ("hardware", node.hardware.name, *parts)):
-        written = fleet.origins.get(path)
+        written = fleet.provenance.get(path)
         if written is not None:
             return written
     if parts[0] == "radios":

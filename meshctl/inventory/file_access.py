@@ -30,7 +30,7 @@ class Boundary:
         more = [path for path in environ.get(VARIABLE, "").split(":") if path]
         return cls((_tree(folder), *(os.path.realpath(os.path.expanduser(path)) for path in more)))
 
-    def objection(self, path: Path) -> str:
+    def refusal(self, path: Path) -> str:
         """Why `path`, with symbolic links followed, may not be read as part of the inventory; empty when it may."""
         real = os.path.realpath(path)
         inside = [root for root in self.roots if real == root or real.startswith(root.rstrip("/") + "/")]
@@ -38,10 +38,10 @@ class Boundary:
             return f"outside the inventory's tree {self.roots[0]}"
         if ".git" in os.path.relpath(real, inside[0]).split("/"):
             return "inside git's own directory"
-        return irregular(path)
+        return special_file(path)
 
 
-def irregular(path: Path) -> str:
+def special_file(path: Path) -> str:
     """What a file is that never ends or has no content of its own: a pipe, a device, a socket; empty for the rest."""
     try:
         mode = path.stat().st_mode

@@ -21,7 +21,7 @@ FIRST_FILE = "fleet.yaml"
 
 
 @dataclass(frozen=True, slots=True)
-class Gathered:
+class MergedFiles:
     """`root` is None when a file could not be read as a mapping. `files` are in the order they were read."""
 
     root: MappingNode | None
@@ -34,17 +34,17 @@ def first_file(path: Path) -> Path:
     return path / FIRST_FILE if os.path.isdir(path) else path
 
 
-def gather(path: Path, environ: Mapping[str, str], read: Reader = read_bytes) -> Gathered:
+def read_files(path: Path, environ: Mapping[str, str], read: Reader = read_bytes) -> MergedFiles:
     """Read `path` and its includes. An include's `~` is `HOME` of `environ`."""
     first = first_file(path)
-    gathering = _Gathering(environ, read, Boundary.of(first.parent, environ))
+    gathering = _FileMerger(environ, read, Boundary.of(first.parent, environ))
     root = gathering.file(first, ())
     complete = root if not gathering.is_broken else None
-    return Gathered(complete, tuple(gathering.files), tuple(gathering.diagnostics))
+    return MergedFiles(complete, tuple(gathering.files), tuple(gathering.diagnostics))
 
 
 @dataclass(slots=True)
-class _Gathering:
+class _FileMerger:
     environ: Mapping[str, str]
     read: Reader
     boundary: Boundary
@@ -84,14 +84,14 @@ class _Gathering:
                 )
             )
             return None
-        self._follow(root, path, (*above, os.path.realpath(path)))
+        self._follow_includes(root, path, (*above, os.path.realpath(path)))
         return root
 
     def _fail(self, diagnostic: Diagnostic) -> None:
         self.is_broken = True
         self.diagnostics.append(diagnostic)
 
-    def _follow(self, root: MappingNode, path: Path, above: tuple[str, ...]) -> None:
+    def _follow_includes(self, root: MappingNode, path: Path, above: tuple[str, ...]) -> None:
         includes = root.values.get("include")
         if not isinstance(includes, SequenceNode):
             return
@@ -102,9 +102,9 @@ class _Gathering:
             if target is None:
                 continue
             real = os.path.realpath(target)
-            if objection := self.boundary.objection(target):
-                problem = codes.error(codes.INCLUDE, position(item), f"the include {target} is {objection}")
-                self._fail(replace(problem, hint=HINT if objection.startswith("outside") else ""))
+            if refusal := self.boundary.refusal(target):
+                problem = codes.error(codes.INCLUDE, position(item), f"the include {target} is {refusal}")
+                self._fail(replace(problem, hint=HINT if refusal.startswith("outside") else ""))
             elif real in above:
                 circle = " -> ".join(Path(name).name for name in (*above[above.index(real) :], real))
                 self._fail(codes.error(codes.INCLUDE, position(item), f"files include each other: {circle}"))
@@ -118,7 +118,7 @@ class _Gathering:
             else:
                 known = len(self.diagnostics)
                 below = self.file(target, above)
-                self._tell_where_from(item, target, known)
+                self._report_at_include(item, target, known)
                 if below is not None:
                     self._merge(root, below)
 
@@ -137,7 +137,7 @@ class _Gathering:
             return Path(home) / item.text[2:]
         return path.parent / item.text
 
-    def _tell_where_from(self, item: Scalar | Tree, target: Path, known: int) -> None:
+    def _report_at_include(self, item: Scalar | Tree, target: Path, known: int) -> None:
         """A file that cannot be read is reported where it is included."""
         for number in range(known, len(self.diagnostics)):
             problem = self.diagnostics[number]

@@ -34,7 +34,7 @@ class Layer:
 
 
 @dataclass(frozen=True, slots=True)
-class NodePlan:
+class NodeSpec:
     """A node before it is built: its layers, nearest first, its groups, and its number (from 1) in its range."""
 
     name: str
@@ -49,16 +49,16 @@ class NodePlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Layered:
-    """`plans` in the inventory's order."""
+class ResolvedLayers:
+    """`specs` in the inventory's order."""
 
-    plans: dict[str, NodePlan]
+    nodes: dict[str, NodeSpec]
     diagnostics: tuple[Diagnostic, ...]
 
 
-def lay(document: InventoryDocument, root: MappingNode) -> Layered:
+def resolve_layers(document: InventoryDocument, root: MappingNode) -> ResolvedLayers:
     """Work out the layers of every node; groups that do not exist or inherit in a circle are reported."""
-    return _Laying(document, root).run()
+    return _LayerResolver(document, root).run()
 
 
 @dataclass(slots=True)
@@ -71,7 +71,7 @@ class _Entry:
 
 
 @dataclass(slots=True)
-class _Laying:
+class _LayerResolver:
     document: InventoryDocument
     root: MappingNode
     diagnostics: list[Diagnostic] = field(default_factory=list)
@@ -80,26 +80,26 @@ class _Laying:
     _stacks: dict[tuple[str, ...], tuple[Layer, ...] | None] = field(default_factory=dict)
     _joined: dict[tuple[int, ...], tuple[Layer, ...]] = field(default_factory=dict)
 
-    def run(self) -> Layered:
+    def run(self) -> ResolvedLayers:
         for name, group in self.document.groups.items():
             self._groups[name] = self._layer(f"group {name}", ("groups", name), group)
         for name, group in self.document.groups.items():
             for number, parent in enumerate(group.inherits):
                 self._check_known(parent, self._groups[name], "inherits", number)
-        self._find_circles()
+        self._find_cycles()
         defaults = (self._layer("defaults", ("defaults",), self.document.defaults),)
-        plans: dict[str, NodePlan] = {}
+        specs: dict[str, NodeSpec] = {}
         for name, entries in self._entries().items():
             own = tuple(entry.layer for entry in entries)
             groups = next(
                 (entry.document.groups for entry in entries if "groups" in entry.document.model_fields_set), ()
             )
-            stack = self._stack(groups)
+            stack = self._group_layers(groups)
             if stack is not None:
                 key = (*map(id, own), *map(id, stack))
                 layers = self._joined.setdefault(key, (*own, *stack, *defaults))
-                plans[name] = NodePlan(name, layers, groups, entries[-1].index)
-        return Layered(plans, tuple(self.diagnostics))
+                specs[name] = NodeSpec(name, layers, groups, entries[-1].index)
+        return ResolvedLayers(specs, tuple(self.diagnostics))
 
     def _layer(self, title: str, path: tuple[str, ...], document: NodeLayer) -> Layer:
         tree = descend(self.root, path)
@@ -108,7 +108,7 @@ class _Laying:
             tree = MappingNode(self.root.file, self.root.line, self.root.column, 0, 0, is_flow=True)
         return Layer(title, path, document, tree, place_of(self.root, path) or position(self.root))
 
-    def _find_circles(self) -> None:
+    def _find_cycles(self) -> None:
         """Depth first over the parents, each group once; an edge back to the trail closes a circle."""
         done: set[str] = set()
         for first in self._groups:
@@ -121,13 +121,13 @@ class _Laying:
                     done.add(name)
                 elif name in trail:
                     names = list(trail)
-                    self._report_circle([*names[names.index(name) :], name])
+                    self._report_cycle([*names[names.index(name) :], name])
                 elif name not in done and name in self._groups:
                     trail[name] = None
                     pending.append((name, True))
                     pending.extend((parent, False) for parent in reversed(self.document.groups[name].inherits))
 
-    def _report_circle(self, names: list[str]) -> None:
+    def _report_cycle(self, names: list[str]) -> None:
         self._broken.update(names)
         layer = self._groups[names[0]]
         message = f"groups inherit from each other: {' -> '.join(names[:20])}"
@@ -149,14 +149,14 @@ class _Laying:
             )
         )
 
-    def _stack(self, groups: tuple[str, ...]) -> tuple[Layer, ...] | None:
+    def _group_layers(self, groups: tuple[str, ...]) -> tuple[Layer, ...] | None:
         """The groups' layers, nearest first, each group once, at its farthest place; None when one of them is not
         known or stands in a circle, which has been reported."""
         if groups not in self._stacks:
-            self._stacks[groups] = self._follow(groups)
+            self._stacks[groups] = self._linearize(groups)
         return self._stacks[groups]
 
-    def _follow(self, groups: tuple[str, ...]) -> tuple[Layer, ...] | None:
+    def _linearize(self, groups: tuple[str, ...]) -> tuple[Layer, ...] | None:
         ordered: list[Layer] = []
         seen: set[str] = set()
         pending = [(name, False) for name in reversed(groups)]

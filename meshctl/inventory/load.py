@@ -1,4 +1,4 @@
-"""Files -> tree -> document -> node plans -> fleet; every stage adds its diagnostics, none stops at the first."""
+"""Files -> tree -> document -> node specs -> fleet; every stage adds its diagnostics, none stops at the first."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from types import MappingProxyType
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, sorted_diagnostics
 from meshctl.inventory.build import build
-from meshctl.inventory.include import gather
-from meshctl.inventory.layers import lay
+from meshctl.inventory.include import read_files
+from meshctl.inventory.layers import resolve_layers
 from meshctl.inventory.source import Reader, read_bytes
 from meshctl.inventory.validate import validate
 from meshctl.model import Fleet
@@ -33,17 +33,17 @@ def load(path: Path, *, environ: Mapping[str, str] = _NO_ENVIRON, read: Reader =
     `environ` gives `~` in includes its meaning (`HOME`); `read` gets a file's bytes and may raise OSError. Never raises
     for anything a file holds.
     """
-    gathered = gather(path, environ, read)
-    files = tuple(str(file) for file in gathered.files)
-    problems = list(gathered.diagnostics)
+    merged = read_files(path, environ, read)
+    files = tuple(str(file) for file in merged.files)
+    problems = list(merged.diagnostics)
     fleet: Fleet | None = None
-    if gathered.root is not None:
-        validated = validate(gathered.root)
+    if merged.root is not None:
+        validated = validate(merged.root)
         problems.extend(validated.diagnostics)
         if validated.document is not None:
-            layered = lay(validated.document, gathered.root)
-            built = build(validated.document, gathered.root, layered.plans, gathered.files)
-            problems.extend((*layered.diagnostics, *built.diagnostics))
+            resolved = resolve_layers(validated.document, merged.root)
+            built = build(validated.document, merged.root, resolved.nodes, merged.files)
+            problems.extend((*resolved.diagnostics, *built.diagnostics))
             fleet = built.fleet
     return Loaded(None if problems else fleet, sorted_diagnostics(problems), files)
 

@@ -31,12 +31,12 @@ _MAX_CHARACTERS = 2_000_000
 _SECRET_WORDS = re.compile(r"(key|psk|pass(word|phrase)?|secret|token|credentials?)s?", re.IGNORECASE)
 _VARIABLE = re.compile(r"[A-Z_][A-Z0-9_]*")
 # a comment that looks as if it held a secret: an assignment to such a word, or material as long as a key's
-_TELLING = re.compile(rf"({_SECRET_WORDS.pattern})\s*[:=]|[A-Za-z0-9+/_=-]{{20,}}", re.IGNORECASE)
+_SUSPICIOUS_COMMENT = re.compile(rf"({_SECRET_WORDS.pattern})\s*[:=]|[A-Za-z0-9+/_=-]{{20,}}", re.IGNORECASE)
 _WORD = re.compile(r"[^\s\[\]{},:#\"'&*|>-]+")
-_LONGEST_KEY = 40
+_MAX_KEY_CHARACTERS = 40
 
 
-class _Mark(IntEnum):
+class _Visibility(IntEnum):
     UNKNOWN = 0
     SHOWN = 1
     HIDDEN = 2
@@ -82,10 +82,10 @@ class Excerpts:
         else:
             for found in re.finditer(r"([A-Za-z_]+)[\"']?\s*:(?=\s|$)", self.text):
                 if found[1] in _all_keys():
-                    self._marks[found.start(1) : found.end(1)] = bytes([_Mark.SHOWN]) * len(found[1])
+                    self._marks[found.start(1) : found.end(1)] = bytes([_Visibility.SHOWN]) * len(found[1])
 
 
-def _spans(tree: Tree, kind: Any) -> Iterator[tuple[int, int, _Mark]]:
+def _spans(tree: Tree, kind: Any) -> Iterator[tuple[int, int, _Visibility]]:
     """The places of keys and values, and whether they are shown."""
     kind = _fitting(kind, tree)
     model = model_of(kind)
@@ -93,7 +93,7 @@ def _spans(tree: Tree, kind: Any) -> Iterator[tuple[int, int, _Mark]]:
         case Scalar():
             # a value where a mapping belongs, such as a key in place of its reference
             is_shown = kind is not None and model is None
-            yield tree.start, tree.end, _Mark.SHOWN if is_shown else _Mark.HIDDEN
+            yield tree.start, tree.end, _Visibility.SHOWN if is_shown else _Visibility.HIDDEN
         case SequenceNode():
             for number, item in enumerate(tree.items):
                 yield from _spans(item, step_into(kind, number) if kind is not None and model is None else None)
@@ -101,8 +101,8 @@ def _spans(tree: Tree, kind: Any) -> Iterator[tuple[int, int, _Mark]]:
             for key, value in tree.values.items():
                 word = tree.keys[key]
                 is_known = kind is not None and (model is None or key in _keys_of(model))
-                is_name = is_known or (len(key) <= _LONGEST_KEY and _WORD.fullmatch(key) is not None)
-                yield word.start, word.end, _Mark.SHOWN if is_name else _Mark.HIDDEN
+                is_name = is_known or (len(key) <= _MAX_KEY_CHARACTERS and _WORD.fullmatch(key) is not None)
+                yield word.start, word.end, _Visibility.SHOWN if is_name else _Visibility.HIDDEN
                 below = step_into(kind, key) if is_known else None
                 yield from _spans(value, None if _is_secret(key, value, below, model) else below)
 
@@ -140,19 +140,19 @@ def _masked(line: str, marks: bytearray, column: int, is_inventory: bool) -> tup
     hash_at = _comment(line, marks)
     for found in _WORD.finditer(line, 0, hash_at):
         for at in range(*found.span()):
-            if marks[at] == _Mark.UNKNOWN:
-                marks[at] = _Mark.HIDDEN
-    is_clear = _Mark.HIDDEN not in marks[:hash_at]
-    if hash_at < len(line) and not (is_clear and is_inventory and not _TELLING.search(line[hash_at:])):
-        marks[hash_at + 1 :] = bytes([_Mark.HIDDEN]) * (len(line) - hash_at - 1)
+            if marks[at] == _Visibility.UNKNOWN:
+                marks[at] = _Visibility.HIDDEN
+    is_clear = _Visibility.HIDDEN not in marks[:hash_at]
+    if hash_at < len(line) and not (is_clear and is_inventory and not _SUSPICIOUS_COMMENT.search(line[hash_at:])):
+        marks[hash_at + 1 :] = bytes([_Visibility.HIDDEN]) * (len(line) - hash_at - 1)
     shown: list[str] = []
     caret = 0
     for at, letter in enumerate(line):
         if at + 1 == column:
             caret = sum(map(len, shown)) + 1
-        if marks[at] != _Mark.HIDDEN:
+        if marks[at] != _Visibility.HIDDEN:
             shown.append(letter)
-        elif not at or marks[at - 1] != _Mark.HIDDEN:
+        elif not at or marks[at - 1] != _Visibility.HIDDEN:
             shown.append(HIDDEN)
         elif at + 1 == column:
             # the column is within what is hidden
@@ -164,7 +164,7 @@ def _masked(line: str, marks: bytearray, column: int, is_inventory: bool) -> tup
 def _comment(line: str, marks: bytearray) -> int:
     """Where the line's comment begins, its length when there is none."""
     for found in re.finditer(r"(?:^|(?<=\s))#", line):
-        if marks[found.start()] == _Mark.UNKNOWN:
+        if marks[found.start()] == _Visibility.UNKNOWN:
             return found.start()
     return len(line)
 

@@ -16,7 +16,7 @@ import pyrage
 from meshctl.diagnostics import Position
 from meshctl.errors import InputError
 from meshctl.inventory.compose import compose
-from meshctl.inventory.file_access import irregular
+from meshctl.inventory.file_access import special_file
 from meshctl.inventory.source import Source
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, Scalar
@@ -107,7 +107,7 @@ class _NoSecret(Exception):
 
 
 def _read(path: Path) -> bytes:
-    if found := irregular(path):
+    if found := special_file(path):
         raise _NoSecret(f"{path} is {found}")
     try:
         with path.open("rb") as stream:

@@ -6,7 +6,7 @@ besides the fleet. `example` and `pages` turn each rule into its page under docs
 """
 
 from meshctl.lint.catalog import BY_CODE, RULES
-from meshctl.lint.check_path import Examined, check_path
+from meshctl.lint.check_path import CheckResult, check_path
 from meshctl.lint.context import Files, LintContext, no_secret
 from meshctl.lint.engine import lint
 from meshctl.lint.files import DiskFiles
@@ -16,8 +16,8 @@ from meshctl.lint.suppress import Suppressed
 __all__ = [
     "BY_CODE",
     "RULES",
+    "CheckResult",
     "DiskFiles",
-    "Examined",
     "Example",
     "Files",
     "Finding",

@@ -24,7 +24,7 @@ _MAX_BYTES = 16 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
+class BaselineComparison:
     """`new` findings count; `known` ones were in the baseline; `stale` ones are about what is in it and not found."""
 
     new: tuple[Diagnostic, ...]
@@ -75,7 +75,7 @@ def _entry(path: Path, number: int, entry: object) -> tuple[str, str, str]:
 
 def compare(
     diagnostics: Iterable[Diagnostic], entries: Iterable[tuple[str, str, str]], path: Path, ran: Iterable[str]
-) -> Compared:
+) -> BaselineComparison:
     """Divide findings by a baseline read from `path`; entries of rules that did not run are left alone."""
     known_codes = set(ran)
     rows = list(entries)
@@ -95,4 +95,4 @@ def compare(
             left[mark] -= 1
             finding = Finding((), f"{code} is no longer found", "", about)
             stale.append(diagnostic(STALE_BASELINE, finding, Position(str(path))))
-    return Compared(tuple(new), tuple(known), tuple(stale))
+    return BaselineComparison(tuple(new), tuple(known), tuple(stale))

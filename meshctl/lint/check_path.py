@@ -27,16 +27,16 @@ from meshctl.regdb import Regdb
 
 
 @dataclass(frozen=True, slots=True)
-class Examined:
+class CheckResult:
     """`sources` maps the files that were read to their text. `is_readable` is False when a file could not be read."""
 
     diagnostics: tuple[Diagnostic, ...]
-    excused: tuple[Suppressed, ...]
+    suppressed: tuple[Suppressed, ...]
     sources: Mapping[str, str]
     is_readable: bool
 
 
-def check_path(path: Path, regdb: Regdb, environ: Mapping[str, str], rules: Iterable[Rule] = RULES) -> Examined:
+def check_path(path: Path, regdb: Regdb, environ: Mapping[str, str], rules: Iterable[Rule] = RULES) -> CheckResult:
     """Everything about the inventory at `path`; secrets are looked at where `environ` has them. Never raises."""
     chosen = tuple(rules)
     kept: dict[str, bytes] = {}
@@ -56,9 +56,9 @@ def check_path(path: Path, regdb: Regdb, environ: Mapping[str, str], rules: Iter
         ran = {rule.code for rule in chosen}
     divided = apply(sorted_diagnostics(found), sources, BY_CODE, ran)
     wanted = {rule.code for rule in chosen}
-    stay = tuple(item for item in divided.stay if item.code in wanted or item.code not in BY_CODE)
+    stay = tuple(item for item in divided.reported if item.code in wanted or item.code not in BY_CODE)
     is_readable = not any(item.code == UNREADABLE for item in loaded.diagnostics)
-    return Examined(stay, divided.excused, sources, is_readable)
+    return CheckResult(stay, divided.suppressed, sources, is_readable)
 
 
 def _lookup(store: SecretStore) -> SecretLookup:

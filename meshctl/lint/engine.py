@@ -8,7 +8,7 @@ from dataclasses import replace
 from meshctl.diagnostics import Diagnostic, Position, sorted_diagnostics
 from meshctl.lint.catalog import RULES
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import listed
+from meshctl.lint.grouping import join_limited
 from meshctl.lint.rule import Finding, Rule
 from meshctl.model import Fleet, MissingOrigin
 
@@ -51,7 +51,7 @@ def diagnostic(rule: Rule, finding: Finding, position: Position) -> Diagnostic:
         path=".".join(finding.path),
         expected=finding.expected,
         found=finding.found,
-        hint=finding.hint or rule.mend,
+        hint=finding.hint or rule.fix,
     )
 
 
@@ -72,7 +72,7 @@ def _merged(found: Iterable[Diagnostic]) -> Iterator[Diagnostic]:
     for first, *others in groups.values():
         names = list(dict.fromkeys(_subject(item.path) for item in others if item.path != first.path))
         if names:
-            also = f"also {listed(names)}"
+            also = f"also {join_limited(names)}"
             yield replace(first, message=f"{first.message} ({also})" if first.message else also)
         else:
             yield first

@@ -127,7 +127,7 @@ def compose(example: Example) -> str:
     """The example's whole inventory."""
     if "#" in example.fragment:
         return BASE + example.fragment
-    whole = _laid_over(_read(BASE), _read(example.fragment))
+    whole = _merged(_read(BASE), _read(example.fragment))
     return _with_hashes(yaml.dump(whole, Dumper=_DUMPER, sort_keys=False, allow_unicode=True, width=110), example.files)
 
 
@@ -162,13 +162,13 @@ def _read(text: str) -> dict[str, Any]:
     return document
 
 
-def _laid_over(base: dict[str, Any], fragment: Mapping[str, Any]) -> dict[str, Any]:
+def _merged(base: dict[str, Any], fragment: Mapping[str, Any]) -> dict[str, Any]:
     whole = copy.deepcopy(base)
     for key, value in fragment.items():
         if value == REMOVED:
             whole.pop(key, None)
         elif isinstance(value, dict) and isinstance(whole.get(key), dict) and not _is_secret(value):
-            whole[key] = _laid_over(whole[key], value)
+            whole[key] = _merged(whole[key], value)
         else:
             whole[key] = value
     return whole

@@ -52,7 +52,7 @@ PACKAGES = frozenset(FULL_SUPPLICANTS) | _words(
     lldpd"""
 )
 # shorter names are a slip away from too much
-_LEAST_LETTERS = 6
+_MIN_LETTERS = 6
 
 
 def chip_target(radio_path: str) -> str | None:
@@ -60,14 +60,16 @@ def chip_target(radio_path: str) -> str | None:
     return next((target for pattern, target in _CHIPS if pattern.fullmatch(radio_path)), None)
 
 
-def meant_package(name: str) -> str | None:
+def suggest_package(name: str) -> str | None:
     """The known package that is one slip away from `name`; None for a package that is known, or near to none."""
-    if name in PACKAGES or len(name) < _LEAST_LETTERS:
+    if name in PACKAGES or len(name) < _MIN_LETTERS:
         return None
-    return next((known for known in sorted(PACKAGES) if len(known) >= _LEAST_LETTERS and one_slip(name, known)), None)
+    return next(
+        (known for known in sorted(PACKAGES) if len(known) >= _MIN_LETTERS and is_one_edit_apart(name, known)), None
+    )
 
 
-def one_slip(one: str, other: str) -> bool:
+def is_one_edit_apart(one: str, other: str) -> bool:
     """Whether one letter is missing, added, wrong, or has changed places with its neighbour."""
     if abs(len(one) - len(other)) > 1 or one == other:
         return False

@@ -1,6 +1,6 @@
 """Each rule's page, from its code: `python -m meshctl.lint.pages docs/lint` writes them, `--explain` prints one.
 
-A page says what the rule finds, why it matters, how to mend it, and shows one inventory that fails and one that passes.
+A page says what the rule finds, why it matters, how to fix it, and shows one inventory that fails and one that passes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def page(rule: Rule) -> str:
         f"# {rule.code}: {rule.title}",
         f"`{rule.name}`, {_article(rule.severity.value)}.",
         rule.why,
-        f"**Mend it:** {rule.mend}",
+        f"**Mend it:** {rule.fix}",
         "## Fails",
         _example(rule.failing),
         "## Passes",

@@ -7,7 +7,7 @@ from meshctl.model import Fleet
 
 def is_written(fleet: Fleet, path: tuple[str, ...]) -> bool:
     """Whether the inventory writes this very value, in whatever layer, instead of leaving it to a default."""
-    return path in fleet.origins
+    return path in fleet.provenance
 
 
 def first_written(fleet: Fleet, *paths: tuple[str, ...]) -> tuple[str, ...]:

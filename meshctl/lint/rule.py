@@ -51,14 +51,14 @@ class Example:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """`why` says what goes wrong in the field, `mend` what to do; exactly one of the checks is set, or none for what
+    """`why` says what goes wrong in the field, `fix` what to do; exactly one of the checks is set, or none for what
     the engine itself reports (suppressions, the baseline). A fallback is silent where another rule has spoken."""
 
     code: str
     severity: Severity
     title: str
     why: str
-    mend: str
+    fix: str
     failing: Example
     passing: Example
     check: FleetCheck | None = None
@@ -73,7 +73,7 @@ def fleet_rule(
     title: str,
     *,
     why: str,
-    mend: str,
+    fix: str,
     failing: str | Example,
     passing: str | Example,
     is_fallback: bool = False,
@@ -81,7 +81,7 @@ def fleet_rule(
     """Make the decorated function, which reads a fleet, a rule."""
 
     def decorate(check: FleetCheck) -> Rule:
-        made = _rule(code, severity, title, why, mend, failing, passing, name=_slug(check), check=check)
+        made = _rule(code, severity, title, why, fix, failing, passing, name=_slug(check), check=check)
         return replace(made, is_fallback=is_fallback)
 
     return decorate
@@ -93,14 +93,14 @@ def text_rule(
     title: str,
     *,
     why: str,
-    mend: str,
+    fix: str,
     failing: str | Example,
     passing: str | Example,
 ) -> Callable[[TextCheck], Rule]:
     """Make the decorated function, which reads a file's name and text, a rule; it runs even when no fleet loads."""
 
     def decorate(check: TextCheck) -> Rule:
-        return _rule(code, severity, title, why, mend, failing, passing, name=_slug(check), check_text=check)
+        return _rule(code, severity, title, why, fix, failing, passing, name=_slug(check), check_text=check)
 
     return decorate
 
@@ -112,12 +112,12 @@ def engine_rule(
     *,
     name: str,
     why: str,
-    mend: str,
+    fix: str,
     failing: str | Example,
     passing: str | Example,
 ) -> Rule:
     """A rule that the engine checks by itself."""
-    return _rule(code, severity, title, why, mend, failing, passing, name=name)
+    return _rule(code, severity, title, why, fix, failing, passing, name=name)
 
 
 def _rule(
@@ -125,7 +125,7 @@ def _rule(
     severity: Severity,
     title: str,
     why: str,
-    mend: str,
+    fix: str,
     failing: str | Example,
     passing: str | Example,
     *,
@@ -139,8 +139,8 @@ def _rule(
         code,
         severity,
         title,
-        _flowed(why),
-        _flowed(mend),
+        _joined(why),
+        _joined(fix),
         _example(failing),
         _example(passing),
         check,
@@ -153,7 +153,7 @@ def _slug(check: Callable[..., object]) -> str:
     return check.__name__.replace("_", "-")
 
 
-def _flowed(text: str) -> str:
+def _joined(text: str) -> str:
     """A triple-quoted text as one paragraph."""
     return " ".join(text.split())
 

@@ -29,7 +29,7 @@ class BadKey(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class PublicKey:
+class AuthorizedKey:
     """`bits` is the modulus of an RSA or DSA key, 256 and so on for the others; `comment` names its owner."""
 
     kind: str
@@ -42,7 +42,7 @@ class PublicKey:
         return self.kind in ("ssh-ed25519", "sk-ssh-ed25519@openssh.com")
 
 
-def parse_public_key(line: str) -> PublicKey:
+def parse_authorized_key(line: str) -> AuthorizedKey:
     """The key on `line`, options before it allowed. Raises BadKey."""
     if "PRIVATE KEY" in line:
         raise BadKey("a private key")
@@ -60,7 +60,7 @@ def parse_public_key(line: str) -> PublicKey:
     fields = _fields(blob)
     if not fields or fields[0] != kind.encode():
         raise BadKey(f"the key inside is not {kind}")
-    return PublicKey(kind, _bits(kind, fields), " ".join(words[start + 2 :]), encoded)
+    return AuthorizedKey(kind, _bits(kind, fields), " ".join(words[start + 2 :]), encoded)
 
 
 def _fields(blob: bytes) -> list[bytes]:

@@ -15,7 +15,7 @@ import yaml
 from meshctl.diagnostics import Diagnostic, Position, sorted_diagnostics
 from meshctl.lint.engine import diagnostic
 from meshctl.lint.rule import CODE, Finding
-from meshctl.lint.rules.housekeeping import NO_REASON, UNKNOWN_CODE, USELESS
+from meshctl.lint.rules.housekeeping import NO_REASON, UNKNOWN_CODE, UNUSED
 
 _COMMENT = re.compile(r"#\s*meshctl:\s*ignore\b(?P<codes>.*?)(?:\s--(?P<reason>.*))?$", re.MULTILINE)
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -40,11 +40,11 @@ class Suppressed:
 
 
 @dataclass(frozen=True, slots=True)
-class Divided:
+class SplitFindings:
     """The findings that stay (those about comments among them), and those that are excused."""
 
-    stay: tuple[Diagnostic, ...]
-    excused: tuple[Suppressed, ...]
+    reported: tuple[Diagnostic, ...]
+    suppressed: tuple[Suppressed, ...]
 
 
 def find(file: str, text: str) -> tuple[Suppression, ...]:
@@ -62,14 +62,14 @@ def find(file: str, text: str) -> tuple[Suppression, ...]:
         column = match.start() - (text.rfind("\n", 0, match.start()) + 1)
         speaks_for = row
         if not lines[row][:column].strip():
-            speaks_for = next((n for n in range(row + 1, len(lines)) if _holds_something(lines[n])), row)
+            speaks_for = next((n for n in range(row + 1, len(lines)) if _has_content(lines[n])), row)
         codes = tuple(re.split(r"[\s,]+", match["codes"].strip())) if match["codes"].strip() else ()
         position = Position(file, row + 1, column + 1)
         found.append(Suppression(position, speaks_for + 1, codes, (match["reason"] or "").strip()))
     return tuple(found)
 
 
-def _holds_something(line: str) -> bool:
+def _has_content(line: str) -> bool:
     stripped = line.strip()
     return bool(stripped) and not stripped.startswith("#")
 
@@ -98,7 +98,7 @@ def apply(
     sources: Mapping[str, str],
     known: Collection[str],
     ran: Collection[str],
-) -> Divided:
+) -> SplitFindings:
     """Divide findings by the comments in `sources`.
 
     `known` are all rules' codes, `ran` those that were looked for: a comment is useless only for a code
@@ -121,11 +121,11 @@ def apply(
             used.add((excuse.position, item.code))
             excused.append(Suppressed(item, excuse.reason))
     for comment in comments:
-        stay.extend(_about(comment, known, ran, used))
-    return Divided(sorted_diagnostics(stay), tuple(excused))
+        stay.extend(_comment_findings(comment, known, ran, used))
+    return SplitFindings(sorted_diagnostics(stay), tuple(excused))
 
 
-def _about(
+def _comment_findings(
     comment: Suppression, known: Collection[str], ran: Collection[str], used: Collection[tuple[Position, str]]
 ) -> Iterable[Diagnostic]:
     unknown = [code for code in comment.codes if code not in known]
@@ -139,4 +139,4 @@ def _about(
     for code in comment.codes:
         if code in ran and (comment.position, code) not in used:
             finding = Finding((), f"line {comment.line} has no such finding", "", code)
-            yield diagnostic(USELESS, finding, comment.position)
+            yield diagnostic(UNUSED, finding, comment.position)

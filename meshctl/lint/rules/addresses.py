@@ -7,7 +7,7 @@ from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address, ip_a
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, repeated
+from meshctl.lint.grouping import duplicates, group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Backend, Fleet, Mesh, Node
 
@@ -29,12 +29,12 @@ def _meshes_of(fleet: Fleet, node: Node) -> list[Mesh]:
     "Two stations have the same address",
     why="""Both answer ARP and traffic goes to whichever spoke last: a node that comes and goes, and a change that lands
     on the wrong one.""",
-    mend="Give each node and each computer an address of its own.",
+    fix="Give each node and each computer an address of its own.",
     failing="nodes: {b01: {address: 10.42.0.1}}",
     passing="nodes: {b01: {address: 10.42.0.102}}",
 )
 def address_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for address, owners in repeated(_stations(fleet)):
+    for address, owners in duplicates(_stations(fleet)):
         (_, first), *later = owners
         for path, _ in later:
             yield Finding(path, f"{first} has the same address", "an address of its own", str(address))
@@ -56,7 +56,7 @@ def _stations(fleet: Fleet) -> Iterator[tuple[IPv4Address, tuple[tuple[str, ...]
     Severity.ERROR,
     "A node's address lies outside its mesh's network",
     why="Its neighbours have no route to it: after the change nobody reaches the node, and it rolls back.",
-    mend="Choose an address from the network of one of its meshes.",
+    fix="Choose an address from the network of one of its meshes.",
     failing="nodes: {b01: {address: 10.43.0.7}}",
     passing="nodes: {b01: {address: 10.42.0.7}}",
 )
@@ -73,7 +73,7 @@ def address_outside(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "An address is the network's own or its broadcast address",
     why="The kernel refuses it or answers nothing sent to it.",
-    mend="Choose an address between the two.",
+    fix="Choose an address between the two.",
     failing="nodes: {b01: {address: 10.42.0.255}}",
     passing="nodes: {b01: {address: 10.42.0.254}}",
 )
@@ -101,7 +101,7 @@ def _reserved(path: tuple[str, ...], address: IPv4Interface) -> Iterator[Finding
     "A node's gateway cannot be reached",
     why="""A gateway outside the node's network is refused by the kernel; a node that is its own gateway sends nothing
     out.""",
-    mend="Name an address of another station in the same network.",
+    fix="Name an address of another station in the same network.",
     failing="nodes: {b01: {gateway: 10.99.0.1}}",
     passing="nodes: {b01: {gateway: 10.42.0.254}}",
 )
@@ -119,7 +119,7 @@ def gateway_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     Severity.ERROR,
     "The networks of two meshes overlap",
     why="A node in both, or a robot bridging both, has two routes to one address and uses the wrong one half the time.",
-    mend="Give each mesh a network of its own, or both the same (cells of one network share a routing interface).",
+    fix="Give each mesh a network of its own, or both the same (cells of one network share a routing interface).",
     failing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.42.0.128/25,
@@ -161,7 +161,7 @@ def _routed_as_one(mesh: Mesh, other: Mesh) -> bool:
     "The network holds the factory address 192.168.1.1",
     why="""A device in failsafe, or freshly reset, answers at 192.168.1.1: inside the fleet's network it takes the place
     of the node that has that address, or is taken for part of the fleet.""",
-    mend="Use another network, such as 10.42.0.0/24.",
+    fix="Use another network, such as 10.42.0.0/24.",
     failing="""
     meshes: {main: {network: 192.168.1.0/24}}
     nodes: {base: {address: 192.168.1.2}, husky1-front: {address: 192.168.1.11}, b01: {address: 192.168.1.101}}
@@ -182,7 +182,7 @@ def factory_address(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The network is not private",
     why="""Addresses that belong to others on the internet become unreachable from every robot and laptop of the team,
     and replies leak out of the uplink.""",
-    mend="Use a network of RFC 1918, such as 10.42.0.0/24.",
+    fix="Use a network of RFC 1918, such as 10.42.0.0/24.",
     failing="""
     meshes: {main: {network: 11.42.0.0/24}}
     nodes: {base: {address: 11.42.0.1}, husky1-front: {address: 11.42.0.11}, b01: {address: 11.42.0.101}}
@@ -202,7 +202,7 @@ def network_public(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "The network is not for stations",
     why="Loopback, link-local, multicast and reserved ranges are not routed or not accepted on an interface.",
-    mend="Use a network of RFC 1918, such as 10.42.0.0/24.",
+    fix="Use a network of RFC 1918, such as 10.42.0.0/24.",
     failing="""
     meshes: {main: {network: 127.42.0.0/24}}
     nodes: {base: {address: 127.42.0.1}, husky1-front: {address: 127.42.0.11}, b01: {address: 127.42.0.101}}
@@ -227,7 +227,7 @@ def _unusable(network: IPv4Network) -> bool:
     "A robot's computer is in another network than its radios",
     why="""The radios bridge the mesh to the computer's switch: there is no router between them, so a computer in
     another network is cut off from the whole team.""",
-    mend="Give the computer an address in the network of its radios' mesh.",
+    fix="Give the computer an address in the network of its radios' mesh.",
     failing="robots: {husky1: {computer: {address: 10.99.0.5/24}}}",
     passing="robots: {husky1: {computer: {address: 10.42.0.120/24}}}",
 )
@@ -249,7 +249,7 @@ def computer_elsewhere(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     "A computer's prefix length differs from the mesh's",
     why="""With a longer prefix the computer sends part of the team's traffic to a gateway that does not exist; with a
     shorter one it answers for stations that are elsewhere.""",
-    mend="Write the computer's address with the prefix length of the mesh's network.",
+    fix="Write the computer's address with the prefix length of the mesh's network.",
     failing="robots: {husky1: {computer: {address: 10.42.0.120/28}}}",
     passing="robots: {husky1: {computer: {address: 10.42.0.120/24}}}",
 )
@@ -271,7 +271,7 @@ def prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The network has no room for a replacement",
     why="""When the last address is taken, a spare cannot be brought in beside the node it replaces, and a laptop cannot
     join to look.""",
-    mend="Use a wider network: a few bits cost nothing.",
+    fix="Use a wider network: a few bits cost nothing.",
     failing="""
     meshes: {main: {network: 10.42.0.0/29}}
     nodes: {base: {address: 10.42.0.1}, husky1-front: {address: 10.42.0.2}, b01: {address: 10.42.0.3}}
@@ -287,7 +287,7 @@ def network_full(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     # one for the spare, one for the operator's laptop
     reserve = 2
     taken: dict[str, set[IPv4Address]] = {name: set() for name in fleet.meshes}
-    by_network = grouped((mesh.network, name) for name, mesh in fleet.meshes.items())
+    by_network = group_by_key((mesh.network, name) for name, mesh in fleet.meshes.items())
     # an address is looked up once per length of prefix, not once per network
     lengths = {network.prefixlen for network in by_network}
     for address, _ in _stations(fleet):
@@ -308,7 +308,7 @@ def network_full(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "Logs are sent where no node can reach",
     why="The log host lies in no network of the fleet and no node has a gateway: after an accident there is no record.",
-    mend="Name the base station's computer in `system.log_host`, or give the nodes a gateway.",
+    fix="Name the base station's computer in `system.log_host`, or give the nodes a gateway.",
     failing="system: {log_host: 192.0.2.9}",
     passing="system: {log_host: 10.42.0.100}",
 )
@@ -324,7 +324,7 @@ def log_host_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     "No time server can be reached",
     why="""Radios have no clock battery. Without a time server in reach their logs start at the build date, and nothing
     that happened on two nodes can be put in order.""",
-    mend="Run a time server on the base station and name its address.",
+    fix="Run a time server on the base station and name its address.",
     failing="system: {ntp_servers: [0.openwrt.pool.ntp.org]}",
     passing="system: {ntp_servers: [10.42.0.100]}",
 )
@@ -356,7 +356,7 @@ def as_address(host: str) -> IPv4Address | IPv6Address | None:
     Severity.ERROR,
     "Two nodes are reached at the same SSH host and port",
     why="The second node would be changed into the first and back on every run; only the host key stops it.",
-    mend="Leave `ssh.host` out to use the node's own address, or give each node its own forwarded port.",
+    fix="Leave `ssh.host` out to use the node's own address, or give each node its own forwarded port.",
     failing="""
     nodes:
       base: {ssh: {host: 127.0.0.1, port: 2201}}
@@ -373,7 +373,7 @@ def ssh_endpoint_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     endpoints = (
         ((node.ssh.host, node.ssh.port, node.ssh.jump), node.name) for node in fleet.managed() if node.ssh.host
     )
-    for (host, port, _), names in repeated(endpoints):
+    for (host, port, _), names in duplicates(endpoints):
         for name in names[1:]:
             path = ("nodes", name, "ssh", "host")
             yield Finding(path, f"{names[0]} is reached at the same place", "one of its own", f"{host}:{port}")
@@ -385,7 +385,7 @@ def ssh_endpoint_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     "A node's prefix length differs from its mesh's",
     why="""With a longer prefix the node sends part of the mesh to a gateway that does not exist; with a shorter one it
     looks on the air for stations that are elsewhere. Some nodes then reach it and others do not.""",
-    mend="Write the address without a prefix length: it takes the one of its mesh's network.",
+    fix="Write the address without a prefix length: it takes the one of its mesh's network.",
     failing="nodes: {b01: {address: 10.42.0.7/16}}",
     passing="nodes: {b01: {address: 10.42.0.7}}",
 )

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, listed, repeated
+from meshctl.lint.grouping import duplicates, group_by_key, join_limited
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.routing import MESHMERIZE, PARTS
@@ -75,7 +75,7 @@ def _bridged_pairs(fleet: Fleet) -> Iterator[tuple[str, Mesh, list[Node]]]:
     for robot in fleet.robots.values():
         nodes = [fleet.nodes[name] for name in dict.fromkeys(robot.nodes) if name in fleet.nodes]
         bridged = [node for node in nodes if node.state.is_managed and node.lan_ports]
-        for mesh, members in grouped((mesh, node) for node in bridged for mesh in node.meshes).items():
+        for mesh, members in group_by_key((mesh, node) for node in bridged for mesh in node.meshes).items():
             if len(members) > 1 and mesh in fleet.meshes:
                 yield robot.name, fleet.meshes[mesh], members
 
@@ -86,14 +86,14 @@ def _bridged_pairs(fleet: Fleet) -> Iterator[tuple[str, Mesh, list[Node]]]:
     "Two radios on one switch without loop avoidance",
     why="""Both radios bridge the mesh to the same switch: a broadcast goes in at one, out at the other, and round
     again. Within seconds the storm fills every link of the fleet, not only this robot's.""",
-    mend="Set `batman: {bridge_loop_avoidance: true}` at the mesh, or bridge only one of the radios (`lan_ports: []`).",
+    fix="Set `batman: {bridge_loop_avoidance: true}` at the mesh, or bridge only one of the radios (`lan_ports: []`).",
     failing="meshes: {main: {batman: {bridge_loop_avoidance: false}}}" + _TWO_RADIOS,
     passing="meshes: {main: {batman: {bridge_loop_avoidance: true}}}" + _TWO_RADIOS,
 )
 def loop_without_avoidance(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot, mesh, nodes in _bridged_pairs(fleet):
         if mesh.backend is Backend.BATMAN and not mesh.batman.bridge_loop_avoidance:
-            names = listed([node.name for node in nodes])
+            names = join_limited([node.name for node in nodes])
             path = ("meshes", mesh.name, "batman", "bridge_loop_avoidance")
             yield Finding(path, f"{names} share the switch of {robot}", "true", "false")
 
@@ -104,14 +104,14 @@ def loop_without_avoidance(fleet: Fleet, _context: LintContext) -> Iterator[Find
     "Two radios on one switch over a back end whose loop avoidance is unknown",
     why="""meshctl knows batman-adv's loop avoidance only. Over another back end two bridged radios loop unless that
     back end takes care of it.""",
-    mend="Make sure the back end avoids the loop and suppress this finding, or bridge only one of the radios.",
+    fix="Make sure the back end avoids the loop and suppress this finding, or bridge only one of the radios.",
     failing=Example(MESHMERIZE + _TWO_RADIOS, files=PARTS),
     passing=Example(MESHMERIZE, files=PARTS),
 )
 def loop_over_other_back_end(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot, mesh, nodes in _bridged_pairs(fleet):
         if mesh.backend is not Backend.BATMAN:
-            names = listed([node.name for node in nodes])
+            names = join_limited([node.name for node in nodes])
             message = f"{names} share the switch of {robot}"
             yield Finding(
                 ("meshes", mesh.name, "backend"), message, "batman-adv, or one bridged radio", mesh.backend.value
@@ -124,7 +124,7 @@ def loop_over_other_back_end(fleet: Fleet, _context: LintContext) -> Iterator[Fi
     "The confirm window is too short for loop avoidance",
     why="""After a change the loop avoidance can hold broadcasts for 30 seconds while its nodes agree anew. The operator
     cannot confirm in that time, and a good change is rolled back.""",
-    mend="Set `confirm_window_s` above 60.",
+    fix="Set `confirm_window_s` above 60.",
     failing="hardware: {rocket: {confirm_window_s: 45}}",
     passing="hardware: {rocket: {confirm_window_s: 120}}",
 )
@@ -149,7 +149,7 @@ def _avoids_loops(fleet: Fleet, name: str) -> bool:
     Severity.WARNING,
     "The confirm window is very long",
     why="Until it ends, a node that was cut off by a bad change stays cut off.",
-    mend="Keep it below ten minutes.",
+    fix="Keep it below ten minutes.",
     failing="hardware: {rocket: {confirm_window_s: 1800}}",
     passing="hardware: {rocket: {confirm_window_s: 300}}",
 )
@@ -168,13 +168,13 @@ def confirm_window_long(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     Severity.ERROR,
     "A bridge port is listed twice",
     why="netifd adds the port once and fails the second time; on 19.07 the bridge may come up without it.",
-    mend="List each port once.",
+    fix="List each port once.",
     failing="hardware: {rocket: {lan_ports: [eth0, eth0]}}",
     passing="hardware: {rocket: {lan_ports: [eth0, eth1]}}",
 )
 def port_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for place, ports in _port_lists(fleet):
-        for port, indexes in repeated((port, index) for index, port in enumerate(ports)):
+        for port, indexes in duplicates((port, index) for index, port in enumerate(ports)):
             yield Finding((*place, str(indexes[1])), "stands twice", "each port once", port)
 
 
@@ -192,7 +192,7 @@ def _port_lists(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]
     "A bridge port belongs to the mesh",
     why="""meshctl bridges the routing interface itself. A radio interface in the bridge as well carries every frame
     twice, past the routing: a loop that no loop avoidance sees.""",
-    mend="List wired ports only, as in the device's /etc/board.json.",
+    fix="List wired ports only, as in the device's /etc/board.json.",
     failing="hardware: {rocket: {lan_ports: [eth0, bat0]}}",
     passing="hardware: {rocket: {lan_ports: [eth0]}}",
 )
@@ -208,7 +208,7 @@ def port_of_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "A bridge port and a VLAN of it are both bridged",
     why="eth0 carries eth0.1: with both in the bridge, frames of the VLAN come in twice and go round.",
-    mend="List the VLANs, or the port.",
+    fix="List the VLANs, or the port.",
     failing="hardware: {rocket: {lan_ports: [eth0, eth0.1], switch_vlans: {1: 3 0t}}}",
     passing="hardware: {rocket: {lan_ports: [eth0.1, eth0.2], switch_vlans: {1: 3 0t, 2: 2 0t}}}",
 )
@@ -225,7 +225,7 @@ def port_and_vlan(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "A robot's radio has no wired port",
     why="Nothing joins the mesh with the robot's switch: the radio is on the air, and its computer hears nothing.",
-    mend="Name the ports of /etc/board.json in `lan_ports`.",
+    fix="Name the ports of /etc/board.json in `lan_ports`.",
     failing="nodes: {husky1-front: {lan_ports: []}}",
     passing="nodes: {husky1-front: {lan_ports: [eth0]}}",
 )
@@ -237,8 +237,8 @@ def robot_without_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
             profile = ("hardware", nodes[0].hardware.name, "lan_ports")
             cut_off.append((first_written(fleet, ("nodes", nodes[0].name, "lan_ports"), profile), robot.name))
     # a profile without ports is one mistake, whatever the number of robots that have it
-    for path, robots in grouped(cut_off).items():
-        yield Finding(path, f"the computer of {listed(robots)} is cut off", "at least one port", "none")
+    for path, robots in group_by_key(cut_off).items():
+        yield Finding(path, f"the computer of {join_limited(robots)} is cut off", "at least one port", "none")
 
 
 @fleet_rule(
@@ -247,7 +247,7 @@ def robot_without_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     "An extra UCI option changes what lint has checked",
     why="""Options set behind the templates can change channel, power, addresses and bridges after every check here has
     passed: the cell may split, a limit be broken, a node be lost, unseen.""",
-    mend="Use the inventory's own key for it: that one is checked.",
+    fix="Use the inventory's own key for it: that one is checked.",
     failing="nodes: {b01: {extra_uci: {wireless.radio0.channel: '13'}}}",
     passing="nodes: {b01: {extra_uci: {wireless.radio0.rts: '500'}}}",
 )
@@ -267,7 +267,7 @@ def extra_checked(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     why="""A port such as eth0.1 leads through a switch that swconfig drives, and /etc/config/network holds which of the
     switch's ports belong to it. A node that is provisioned keeps what it has; an image built with the rendered files
     has none, and nothing makes it any more: after its first boot the wired ports are dead.""",
-    mend="""Copy the sections `switch_vlan` of a new device's /etc/config/network into `switch_vlans` of the hardware:
+    fix="""Copy the sections `switch_vlan` of a new device's /etc/config/network into `switch_vlans` of the hardware:
     `{1: "3 0t", 2: "2 0t"}`. Where the VLAN belongs to a switch outside the box, suppress this finding.""",
     failing="hardware: {rocket: {lan_ports: [eth0.1]}}",
     passing="hardware: {rocket: {lan_ports: [eth0.1], switch_vlans: {1: 3 0t}}}",
@@ -280,4 +280,4 @@ def vlan_without_switch(fleet: Fleet, _context: LintContext) -> Iterator[Finding
         for port in node.unswitched_ports:
             path = (*place, "lan_ports", str(node.lan_ports.index(port)))
             expected = f"VLAN {port.rpartition('.')[2]} in switch_vlans"
-            yield Finding(path, f"{port} needs it", expected, f"VLANs {listed(vlans)}" if vlans else "none")
+            yield Finding(path, f"{port} needs it", expected, f"VLANs {join_limited(vlans)}" if vlans else "none")

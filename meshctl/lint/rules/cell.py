@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, listed, repeated
+from meshctl.lint.grouping import duplicates, group_by_key, join_limited
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.access import RSA_KEY
 from meshctl.model import Band, Fleet, MeshMode, Release
@@ -16,7 +16,7 @@ from meshctl.regdb import occupied
 _DSSS_KBPS = (1000, 2000, 5500, 11000)
 _OFDM_KBPS = (6000, 9000, 12000, 18000, 24000, 36000, 48000, 54000)
 # IEEE 802.11-2020 9.4.2.2: an SSID has 0 to 32 octets
-_SSID_BYTES = 32
+_MAX_SSID_BYTES = 32
 _SECOND_MESH = """
     meshes:
       second: {ssid: SSID, bssid: "BSSID", band: 2g, channel: CHANNEL, network: 10.43.0.0/24,
@@ -40,7 +40,7 @@ def _second(ssid: str, bssid: str, channel: int) -> str:
     "The BSSID is a group address or zero",
     why="""An ad-hoc cell's id is a unicast address; the kernel refuses to join one whose first octet is odd, and the
     radio stays silent.""",
-    mend="Use a locally administered unicast address, such as 02:ca:fe:00:00:01.",
+    fix="Use a locally administered unicast address, such as 02:ca:fe:00:00:01.",
     failing="""meshes: {main: {bssid: "03:ca:fe:00:00:01"}}""",
     passing="""meshes: {main: {bssid: "02:ca:fe:00:00:01"}}""",
 )
@@ -56,7 +56,7 @@ def bssid_not_unicast(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The BSSID is not locally administered",
     why="""An address without the local bit belongs to some maker's device; a station of that address nearby makes the
     radios merge with it or split.""",
-    mend="Set the second lowest bit of the first octet: 02, 06, 0a or 0e at its end, as in 02:ca:fe:00:00:01.",
+    fix="Set the second lowest bit of the first octet: 02, 06, 0a or 0e at its end, as in 02:ca:fe:00:00:01.",
     failing="""meshes: {main: {bssid: "00:15:6d:00:00:01"}}""",
     passing="""meshes: {main: {bssid: "02:15:6d:00:00:01"}}""",
 )
@@ -74,7 +74,7 @@ def bssid_not_local(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "An ad-hoc mesh has no fixed BSSID",
     why="""Radios that start out of reach of each other each make a cell with an id of its own; when they meet, merging
     is left to chance, and the mesh stays split.""",
-    mend="Give the mesh a `bssid`, locally administered and unicast.",
+    fix="Give the mesh a `bssid`, locally administered and unicast.",
     failing="meshes: {main: {bssid: <removed>}}",
     passing="""meshes: {main: {bssid: "02:ca:fe:00:00:01"}}""",
 )
@@ -90,19 +90,19 @@ def bssid_missing(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "Two meshes share a cell",
     why="""With one BSSID, or one SSID on one channel, the radios of both meshes join each other: two networks in one,
     with two sets of routing messages.""",
-    mend="Give each mesh an SSID and a BSSID of its own.",
+    fix="Give each mesh an SSID and a BSSID of its own.",
     failing=_second("other", "02:ca:fe:00:00:01", 11),
     passing=_second("other", "02:ca:fe:00:00:02", 11),
 )
 def cell_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     meshes = fleet.meshes.values()
     reported: set[str] = set()
-    for bssid, sharing in repeated(((mesh.band, mesh.bssid), mesh) for mesh in meshes if mesh.bssid):
+    for bssid, sharing in duplicates(((mesh.band, mesh.bssid), mesh) for mesh in meshes if mesh.bssid):
         for mesh in sharing[1:]:
             reported.add(mesh.name)
             message = f"mesh {sharing[0].name} has the same cell id"
             yield Finding(("meshes", mesh.name, "bssid"), message, "a BSSID of its own", bssid[1])
-    for ssid, sharing in repeated(((mesh.band, mesh.channel, mesh.ssid), mesh) for mesh in meshes):
+    for ssid, sharing in duplicates(((mesh.band, mesh.channel, mesh.ssid), mesh) for mesh in meshes):
         for mesh in sharing[1:]:
             if mesh.name not in reported:
                 message = f"mesh {sharing[0].name} has the same SSID on the same channel"
@@ -115,7 +115,7 @@ def cell_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "Two meshes overlap in frequency",
     why="""Cells on overlapping channels take air time from each other and cannot take turns as they would on one
     channel: each hears the other as noise.""",
-    mend="Use channels that lie apart: 1, 6 and 11 at 2.4 GHz, or another band.",
+    fix="Use channels that lie apart: 1, 6 and 11 at 2.4 GHz, or another band.",
     failing=_second("other", "02:ca:fe:00:00:02", 9),
     passing=_second("other", "02:ca:fe:00:00:02", 11),
 )
@@ -147,7 +147,7 @@ def cells_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "A radio joins a mesh of another band",
     why="A 5 GHz radio cannot tune to 2.4 GHz: the interface never comes up.",
-    mend="Let a radio of the mesh's band join, or mend the hardware profile's `band`.",
+    fix="Let a radio of the mesh's band join, or mend the hardware profile's `band`.",
     failing="nodes: {base: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}}",
     passing="nodes: {base: {radios: {radio0: {mesh: main}}}}",
 )
@@ -167,7 +167,7 @@ def band_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "Two radios of one node are on one channel of one mesh",
     why="""Two radios in one box deafen each other while either sends, and the mesh sees every message twice. Only
     radios on different channels add anything.""",
-    mend="Leave one of the radios off, or put it in a mesh of another channel.",
+    fix="Leave one of the radios off, or put it in a mesh of another channel.",
     failing="""
     hardware: {rocket: {radios: {radio1: {band: 2g}}}}
     nodes: {base: {radios: {radio0: {mesh: main}, radio1: {mesh: main}}}}
@@ -176,9 +176,9 @@ def band_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def radios_on_one_channel(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
-        for name, radios in repeated((radio.mesh, radio.name) for radio in node.radios if radio.mesh is not None):
+        for name, radios in duplicates((radio.mesh, radio.name) for radio in node.radios if radio.mesh is not None):
             path = ("nodes", node.name, "radios", radios[1], "mesh")
-            yield Finding(path, f"{radios[0]} is in the same cell", f"one radio in {name}", listed(radios))
+            yield Finding(path, f"{radios[0]} is in the same cell", f"one radio in {name}", join_limited(radios))
 
 
 @fleet_rule(
@@ -187,15 +187,17 @@ def radios_on_one_channel(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     "The SSID is longer than 32 bytes",
     why="""The standard gives an SSID 32 octets; the driver refuses a longer one and the radio stays off. Letters
     outside ASCII take several.""",
-    mend="Shorten it.",
+    fix="Shorten it.",
     failing="meshes: {main: {ssid: a-name-that-is-longer-than-a-beacon-can-say}}",
     passing="meshes: {main: {ssid: fleet}}",
 )
 def ssid_too_long(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in fleet.meshes.values():
         length = len(mesh.ssid.encode())
-        if length > _SSID_BYTES:
-            yield Finding(("meshes", mesh.name, "ssid"), "too long", f"at most {_SSID_BYTES} bytes", f"{length} bytes")
+        if length > _MAX_SSID_BYTES:
+            yield Finding(
+                ("meshes", mesh.name, "ssid"), "too long", f"at most {_MAX_SSID_BYTES} bytes", f"{length} bytes"
+            )
 
 
 @fleet_rule(
@@ -203,7 +205,7 @@ def ssid_too_long(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "The SSID starts or ends with a space",
     why="Nobody sees it, and a laptop that joins by hand never finds the cell.",
-    mend="Take the space away.",
+    fix="Take the space away.",
     failing="""meshes: {main: {ssid: "fleet "}}""",
     passing="""meshes: {main: {ssid: "fleet 1"}}""",
 )
@@ -219,7 +221,7 @@ def ssid_spaces(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "An apostrophe in the SSID breaks OpenWrt 25.12",
     why="""25.12's wifi scripts put the configuration between apostrophes on a shell's command line: one in the SSID
     ends it there, the interface does not come up, and what follows is run.""",
-    mend="Choose an SSID without an apostrophe.",
+    fix="Choose an SSID without an apostrophe.",
     failing="""
     hardware: {rocket: {release: "25.12"}}
     meshes: {main: {ssid: "bob's fleet", mode: mesh, encryption: sae}}
@@ -234,8 +236,8 @@ def ssid_apostrophe(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 
 def _releases(fleet: Fleet) -> dict[str, dict[Release, list[str]]]:
     """The names of every mesh's members by release."""
-    members = grouped((mesh, node) for node in fleet.managed() for mesh in node.meshes)
-    return {mesh: grouped((node.release, node.name) for node in nodes) for mesh, nodes in members.items()}
+    members = group_by_key((mesh, node) for node in fleet.managed() for mesh in node.meshes)
+    return {mesh: group_by_key((node.release, node.name) for node in nodes) for mesh, nodes in members.items()}
 
 
 @fleet_rule(
@@ -244,7 +246,7 @@ def _releases(fleet: Fleet) -> dict[str, dict[Release, list[str]]]:
     "One mesh runs several OpenWrt releases",
     why="""They work together, but each brings its own batman-adv and drivers: what was tested on one is not tested on
     the mixture.""",
-    mend="Bring the older nodes to the newer release when there is time.",
+    fix="Bring the older nodes to the newer release when there is time.",
     failing="""
     nodes: {b01: {release: "23.05"}}
     """,
@@ -255,7 +257,7 @@ def _releases(fleet: Fleet) -> dict[str, dict[Release, list[str]]]:
 def releases_mixed(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh, releases in _releases(fleet).items():
         if mesh in fleet.meshes and len(releases) > 1:
-            found = ", ".join(f"{release}: {listed(names)}" for release, names in sorted(releases.items()))
+            found = ", ".join(f"{release}: {join_limited(names)}" for release, names in sorted(releases.items()))
             yield Finding(("meshes", mesh), "its members run several releases", "one release", found)
 
 
@@ -265,7 +267,7 @@ def releases_mixed(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "Ad-hoc mode on OpenWrt 19.07",
     why="""Trouble of ath9k's ad-hoc mode under batman-adv is on record for 19.07 (lime-packages#855): nodes that stay
     in the cell and pass no traffic.""",
-    mend="Move these nodes to a newer release, or set `mode: mesh`.",
+    fix="Move these nodes to a newer release, or set `mode: mesh`.",
     failing=Example(
         f"""
         nodes: {{b01: {{release: "19.07"}}}}
@@ -281,7 +283,7 @@ def adhoc_on_19_07(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         old = releases.get(mesh.name, {}).get(Release.V19_07, [])
         if old and mesh.mode is MeshMode.ADHOC:
             message = "ad-hoc mode is not dependable on 19.07"
-            yield Finding(("meshes", mesh.name, "mode"), message, "21.02 or later, or mode mesh", listed(old))
+            yield Finding(("meshes", mesh.name, "mode"), message, "21.02 or later, or mode mesh", join_limited(old))
 
 
 @fleet_rule(
@@ -289,7 +291,7 @@ def adhoc_on_19_07(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "The broadcast rate is no rate of the band",
     why="The driver refuses the rate and the interface does not come up, or it falls back to the lowest.",
-    mend="Use 6000, 9000, 12000, 18000, 24000, 36000, 48000 or 54000 (also 1000, 2000, 5500, 11000 at 2.4 GHz).",
+    fix="Use 6000, 9000, 12000, 18000, 24000, 36000, 48000 or 54000 (also 1000, 2000, 5500, 11000 at 2.4 GHz).",
     failing="meshes: {main: {mcast_rate_kbps: 13000}}",
     passing="meshes: {main: {mcast_rate_kbps: 12000}}",
 )
@@ -308,7 +310,7 @@ def broadcast_rate_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Find
     "The broadcast rate is low",
     why="""Originator messages at 1 Mbit/s reach far beyond where data can follow: BATMAN_IV then prefers one long weak
     link to two good ones, and every broadcast takes twelve times the air.""",
-    mend="Set `mcast_rate_kbps` to 12000, or 6000 for long open links.",
+    fix="Set `mcast_rate_kbps` to 12000, or 6000 for long open links.",
     failing="meshes: {main: {mcast_rate_kbps: 1000}}",
     passing="meshes: {main: {mcast_rate_kbps: 6000}}",
 )
@@ -325,7 +327,7 @@ def broadcast_rate_low(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     "The distance for acknowledgements is too short",
     why="""A radio gives up on an acknowledgement that arrives later than `distance_m` allows and sends again, though
     the frame arrived: a link beyond it loses nearly all its throughput.""",
-    mend="Set `distance_m` to the longest link you expect; a few hundred metres too many cost next to nothing.",
+    fix="Set `distance_m` to the longest link you expect; a few hundred metres too many cost next to nothing.",
     failing="meshes: {main: {distance_m: 50}}",
     passing="meshes: {main: {distance_m: 500}}",
 )
@@ -343,7 +345,7 @@ def distance_short(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The distance for acknowledgements is very long",
     why="""After each lost frame the radio waits this long before it sends again: 30 km cost 200 microseconds each time,
     for every node of the cell.""",
-    mend="Set `distance_m` to the longest link you expect.",
+    fix="Set `distance_m` to the longest link you expect.",
     failing="meshes: {main: {distance_m: 60000}}",
     passing="meshes: {main: {distance_m: 3000}}",
 )
@@ -360,7 +362,7 @@ def distance_long(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The beacon interval is unusual",
     why="""Short intervals fill the channel with beacons of every node; long ones keep a node that comes into reach from
     joining the cell for seconds.""",
-    mend="Keep 100, the standard's usual value.",
+    fix="Keep 100, the standard's usual value.",
     failing="meshes: {main: {beacon_interval_tu: 2000}}",
     passing="meshes: {main: {beacon_interval_tu: 100}}",
 )

@@ -8,10 +8,10 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Band, Fleet, Mesh, MeshMode, Release
-from meshctl.regdb import CHANNELS, Country, Flag, Verdict, judge, legal_channels, occupied, primary, width_mhz
+from meshctl.regdb import CHANNELS, Country, Flag, Legality, check_span, legal_channels, occupied, primary, width_mhz
 
 # what keeps a station from starting a cell on its own
-_SILENT = Flag.DFS | Flag.NO_IR
+_NO_INITIATE = Flag.DFS | Flag.NO_IR
 # its wifi-scripts alone have `mcast_rate` as an array (docs/facts/openwrt-checked.md)
 _NO_MCAST_RATE = "25.12.0-rc1"
 _IMAGE = 'image for {"supported_devices":["ubnt,rocket-m"],"version":{"version":"%s","revision":"r1-1"}}'
@@ -31,24 +31,24 @@ def _country(fleet: Fleet, context: LintContext) -> Country | None:
     return context.regdb.country(fleet.country)
 
 
-def _channels(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, Country, Verdict]]:
+def _channels(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, Country, Legality]]:
     """Every mesh whose channel exists, with the country's verdict on its first 20 MHz."""
     country = _country(fleet, context)
     if country is None:
         return
     for mesh in fleet.meshes.values():
         if mesh.channel in CHANNELS[mesh.band]:
-            yield mesh, country, judge(country, primary(mesh.band, mesh.channel))
+            yield mesh, country, check_span(country, primary(mesh.band, mesh.channel))
 
 
-def _wide(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, Country, Verdict, int]]:
+def _wide(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, Country, Legality, int]]:
     """The meshes wider than 20 MHz whose first 20 MHz are in order, with the verdict on all of it and its width."""
     for mesh, country, verdict in _channels(fleet, context):
         if not verdict.covered or mesh.htmode not in _known_htmodes(mesh.band):
             continue
         span = occupied(mesh.band, mesh.channel, mesh.htmode)
         if span is not None and span.width_mhz > 20:
-            yield mesh, country, judge(country, span), span.width_mhz
+            yield mesh, country, check_span(country, span), span.width_mhz
 
 
 def _known_htmodes(band: Band) -> tuple[str, ...]:
@@ -63,7 +63,7 @@ def _known_htmodes(band: Band) -> tuple[str, ...]:
     "The country is not in the regulatory database",
     why="""The kernel falls back to the rules of the world, where most channels may not be used to start a cell: radios
     come up weak or not at all.""",
-    mend="Write the ISO 3166-1 code of the country you transmit in.",
+    fix="Write the ISO 3166-1 code of the country you transmit in.",
     failing="country: XX",
     passing="country: CA",
 )
@@ -77,7 +77,7 @@ def country_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "The band has no such channel",
     why="A channel number of the other band, or of none: the interface does not come up.",
-    mend="Choose a channel of the mesh's band.",
+    fix="Choose a channel of the mesh's band.",
     failing="meshes: {main: {channel: 36}}",
     passing="meshes: {main: {channel: 11}}",
 )
@@ -85,7 +85,9 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     country = _country(fleet, context)
     for mesh in fleet.meshes.values():
         if mesh.channel not in CHANNELS[mesh.band]:
-            legal = legal_channels(country, mesh.band, "HT20", forbidden=_SILENT) if country else CHANNELS[mesh.band]
+            legal = (
+                legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE) if country else CHANNELS[mesh.band]
+            )
             path = ("meshes", mesh.name, "channel")
             yield Finding(path, f"no channel of {mesh.band.value}", _shown(legal), str(mesh.channel))
 
@@ -96,7 +98,7 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "The channel is not legal in the country",
     why="""The kernel disables it there: the radio does not start. Forcing it with another country code is an offence,
     and disturbs whoever has the frequency.""",
-    mend="Choose a channel that the country allows.",
+    fix="Choose a channel that the country allows.",
     failing="meshes: {main: {channel: 13}}",
     passing="""
     country: CA
@@ -106,7 +108,7 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 def channel_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if not verdict.covered:
-            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_SILENT))
+            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
             path = ("meshes", mesh.name, "channel")
             yield Finding(path, "not allowed", f"{legal} (country {country.alpha2})", str(mesh.channel))
 
@@ -117,7 +119,7 @@ def channel_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "The channel needs radar detection, which ad-hoc mode cannot do",
     why="""On DFS channels one station must watch for radar and move the others away. An ad-hoc cell has no such
     station: mac80211 refuses to join.""",
-    mend="Choose a channel without DFS.",
+    fix="Choose a channel without DFS.",
     failing="""
     meshes: {main: {band: 5g, channel: 52}}
     defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
@@ -137,7 +139,7 @@ def channel_needs_radar_detection(fleet: Fleet, context: LintContext) -> Iterato
     "The channel must be left when a radar is heard",
     why="""In 802.11s mode DFS channels work, but the radio is silent for a minute or more before it may start, and a
     radar (or what sounds like one) takes the whole cell off the air in the middle of a run.""",
-    mend="Choose a channel without DFS.",
+    fix="Choose a channel without DFS.",
     failing="""
     meshes: {main: {band: 5g, channel: 52, mode: mesh, encryption: sae}}
     defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
@@ -154,7 +156,7 @@ def channel_may_be_lost(fleet: Fleet, context: LintContext) -> Iterator[Finding]
 def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if mesh.mode is mode and verdict.covered and Flag.DFS in verdict.flags:
-            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_SILENT))
+            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
             path = ("meshes", mesh.name, "channel")
             yield Finding(path, message, f"{legal} (country {country.alpha2})", f"{mesh.channel} (DFS)")
 
@@ -165,7 +167,7 @@ def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> 
     "No station may start a cell on the channel",
     why="""The country marks the channel no-IR: a station may answer there, never speak first. A mesh of such stations
     stays silent for ever.""",
-    mend="Choose a channel without this restriction.",
+    fix="Choose a channel without this restriction.",
     failing="""
     meshes: {main: {band: 5g, channel: 173}}
     defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
@@ -178,7 +180,7 @@ def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> 
 def channel_passive(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if verdict.covered and Flag.NO_IR in verdict.flags and Flag.DFS not in verdict.flags:
-            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_SILENT))
+            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
             path = ("meshes", mesh.name, "channel")
             expected = f"{legal} (country {country.alpha2})"
             yield Finding(path, "nobody may speak first there", expected, f"{mesh.channel} (no-IR)")
@@ -190,7 +192,7 @@ def channel_passive(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "The channel does not exist at this width",
     why="""The secondary channel would lie outside the band: the driver refuses, or the radio comes up narrower than its
     neighbours and does not hear them.""",
-    mend="Take HT20, or a channel that has room on that side.",
+    fix="Take HT20, or a channel that has room on that side.",
     failing="""
     meshes: {main: {band: 5g, channel: 36, htmode: HT40-}}
     defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
@@ -205,7 +207,7 @@ def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         if not verdict.covered or mesh.htmode not in _known_htmodes(mesh.band):
             continue
         if occupied(mesh.band, mesh.channel, mesh.htmode) is None:
-            legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_SILENT)
+            legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_NO_INITIATE)
             expected = f"a channel {_shown(legal)}" if legal else "a narrower htmode"
             path = ("meshes", mesh.name, "htmode")
             yield Finding(path, f"no room beside channel {mesh.channel}", expected, mesh.htmode)
@@ -217,7 +219,7 @@ def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "The channel is too wide for the country",
     why="""Part of the bonded channel lies where the country forbids it, or needs radar detection, or allows only
     narrower ones: the kernel refuses it, or narrows it on this node alone.""",
-    mend="Take HT20, or another channel.",
+    fix="Take HT20, or another channel.",
     failing="""
     meshes: {main: {band: 5g, channel: 36, htmode: VHT160}}
     defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
@@ -229,11 +231,11 @@ def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 )
 def width_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict, width in _wide(fleet, context):
-        silent = verdict.flags & _SILENT if verdict.covered else Flag(0)
-        own = judge(country, primary(mesh.band, mesh.channel)).flags & _SILENT
+        silent = verdict.flags & _NO_INITIATE if verdict.covered else Flag(0)
+        own = check_span(country, primary(mesh.band, mesh.channel)).flags & _NO_INITIATE
         if verdict.allows(width) and (not silent or own):
             continue
-        legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_SILENT)
+        legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_NO_INITIATE)
         expected = f"a channel {_shown(legal)} (country {country.alpha2})" if legal else "a narrower htmode"
         path = ("meshes", mesh.name, "htmode")
         yield Finding(path, f"channel {mesh.channel} may not be {width} MHz wide", expected, mesh.htmode)
@@ -245,7 +247,7 @@ def width_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "The htmode is not one of the band",
     why="""OpenWrt ignores an htmode it does not know and the radio falls to the rates of 802.11g: less than half the
     throughput, and nobody is told.""",
-    mend="Use HT20, or HT40, VHT20, VHT40, VHT80 at 5 GHz where the hardware has them.",
+    fix="Use HT20, or HT40, VHT20, VHT40, VHT80 at 5 GHz where the hardware has them.",
     failing="meshes: {main: {htmode: VHT80}}",
     passing="meshes: {main: {htmode: HT20}}",
 )
@@ -264,7 +266,7 @@ def htmode_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "OpenWrt 25.12 drops HT40+ and HT40- in ad-hoc mode",
     why="""25.12's scripts know only HT20 and HT40 for ad-hoc cells; with a sign behind them the radio joins without HT,
     at less than half the throughput, beside neighbours that use it.""",
-    mend="Write HT40, or HT20.",
+    fix="Write HT40, or HT20.",
     failing=Example(
         """
         hardware: {rocket: {release: "25.12"}}
@@ -296,7 +298,7 @@ def htmode_sign_on_25_12(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     "40 MHz at 2.4 GHz",
     why="""It takes half of a band that has room for three cells, doubles the noise that is let in, and collides with
     every hotspot and every robot's own Wi-Fi. On long links it is slower than HT20.""",
-    mend="Use HT20 at 2.4 GHz.",
+    fix="Use HT20 at 2.4 GHz.",
     failing="meshes: {main: {htmode: HT40}}",
     passing="meshes: {main: {htmode: HT20}}",
 )
@@ -312,7 +314,7 @@ def wide_at_2g(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The channel is none of 1, 6, 11",
     why="""Everybody else's cells are on 1, 6 and 11. One in between is disturbed by two of them and can take turns with
     neither.""",
-    mend="Use 1, 6 or 11 (5, 9 and 13 also fit together where 13 is allowed).",
+    fix="Use 1, 6 or 11 (5, 9 and 13 also fit together where 13 is allowed).",
     failing="meshes: {main: {channel: 4}}",
     passing="meshes: {main: {channel: 11}}",
 )
@@ -328,7 +330,7 @@ def channel_between(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "The channel is for indoor use",
     why="The country allows it inside buildings only. A mine or a cave may count as one; the staging area does not.",
-    mend="Choose a channel without this restriction if any radio works outdoors.",
+    fix="Choose a channel without this restriction if any radio works outdoors.",
     failing="""
     country: DE
     meshes: {main: {band: 5g, channel: 36}}
@@ -342,8 +344,8 @@ def channel_between(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 )
 def channel_indoor(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
-        if verdict.covered and Flag.NO_OUTDOOR in verdict.flags and not verdict.flags & _SILENT:
-            outdoor = legal_channels(country, mesh.band, "HT20", forbidden=_SILENT | Flag.NO_OUTDOOR)
+        if verdict.covered and Flag.NO_OUTDOOR in verdict.flags and not verdict.flags & _NO_INITIATE:
+            outdoor = legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE | Flag.NO_OUTDOOR)
             expected = f"{_shown(outdoor)} (country {country.alpha2})"
             yield Finding(("meshes", mesh.name, "channel"), "for indoor use only", expected, str(mesh.channel))
 
@@ -354,7 +356,7 @@ def channel_indoor(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "OpenWrt 25.12.0-rc1 joins no ad-hoc cell",
     why="""The wifi scripts of this one build take `mcast_rate` for a list and give `iw` no number, so the radio joins
     no cell. 25.12.0-rc2 and all later builds read it correctly.""",
-    mend="Use the image of 25.12.0 or later.",
+    fix="Use the image of 25.12.0 or later.",
     failing=Example(
         """
         hardware: {rocket: {release: "25.12", firmware: {image: rc1.bin, sha256: <sha256 of rc1.bin>, revision: r1}}}

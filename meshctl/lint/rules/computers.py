@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import listed
+from meshctl.lint.grouping import join_limited
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.references import known
+from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet
 from meshctl.model.computers import ARCHITECTURES, ROS_1, ROS_2, ROS_TOO_OLD
 
@@ -22,7 +22,7 @@ _ALIASES = {"amd64": "x86_64", "x64": "x86_64", "arm64": "aarch64", "armhf": "ar
     "A computer's processor is of no known kind",
     why="""The wheels of udp_mesh are chosen by it, and a deployment refuses a computer that calls itself otherwise:
     with a slip here, no robot gets udp_mesh.""",
-    mend="Write what `uname -m` prints on the computer.",
+    fix="Write what `uname -m` prints on the computer.",
     failing="robots: {husky1: {computer: {arch: x86-64}}}",
     passing="robots: {husky1: {computer: {arch: aarch64}}}",
 )
@@ -30,10 +30,10 @@ def arch_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot in fleet.robots.values():
         arch = "" if robot.computer is None else robot.computer.arch
         if arch and arch not in ARCHITECTURES:
-            _, near = known(ARCHITECTURES, arch)
+            _, near = suggest(ARCHITECTURES, arch)
             hint = f"write {_ALIASES[arch.lower()]}" if arch.lower() in _ALIASES else near
             path = ("robots", robot.name, "computer", "arch")
-            yield Finding(path, "not a name of the kernel's", f"one of {listed(ARCHITECTURES)}", arch, hint)
+            yield Finding(path, "not a name of the kernel's", f"one of {join_limited(ARCHITECTURES)}", arch, hint)
 
 
 @fleet_rule(
@@ -42,7 +42,7 @@ def arch_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "A computer's ROS is of no known release",
     why="""It decides which bridge is deployed. With a name that is none, `meshctl robots deploy` refuses the robot, in
     the field if not here.""",
-    mend="Write the release's name (`echo $ROS_DISTRO` there), or remove `ros`: no bridge is deployed then.",
+    fix="Write the release's name (`echo $ROS_DISTRO` there), or remove `ros`: no bridge is deployed then.",
     failing="robots: {husky1: {computer: {ros: humbel}}}",
     passing="robots: {husky1: {computer: {ros: humble}}}",
 )
@@ -53,5 +53,5 @@ def ros_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if ros in ROS_TOO_OLD:
             yield Finding(path, "its Python is older than 3.8", f"{ROS_1}, or a release of ROS 2", ros)
         elif ros not in ("", ROS_1, *ROS_2):
-            _, hint = known((ROS_1, *ROS_2), ros)
+            _, hint = suggest((ROS_1, *ROS_2), ros)
             yield Finding(path, "no such release", f"{ROS_1}, or a release of ROS 2", ros, hint)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, listed
+from meshctl.lint.grouping import group_by_key, join_limited
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Band, Fleet, HardwareProfile, MeshMode, RadioHardware
 
@@ -27,7 +27,7 @@ _MODE_NAMES = {MeshMode.ADHOC: "ad-hoc", MeshMode.MESH: "802.11s"}
     why="""ath10k with Qualcomm's firmware for access points, ath11k and ath12k have no ad-hoc mode, brcmfmac has no
     802.11s: the interface is never made, and the node comes up without a mesh. Community firmware for ath10k has the
     ad-hoc mode: OpenWrt's kmod-ath10k-ct with ath10k-firmware-...-ct.""",
-    mend="""Use `mode: mesh` with the Qualcomm drivers, ath10k-ct in place of ath10k, or another radio. `driver` at the
+    fix="""Use `mode: mesh` with the Qualcomm drivers, ath10k-ct in place of ath10k, or another radio. `driver` at the
     radio says which driver it has.""",
     failing="""
     hardware: {rocket: {radios: {radio0: {driver: ath10k}}}}
@@ -43,13 +43,13 @@ def driver_lacks_mode(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         for radio in node.radios
         if radio.mesh in fleet.meshes
     )
-    for (profile_name, radio_name, mesh_name), nodes in grouped(joined).items():
+    for (profile_name, radio_name, mesh_name), nodes in group_by_key(joined).items():
         profile = fleet.hardware[profile_name]
         radio = profile.radio(radio_name)
         mode = fleet.meshes[mesh_name or ""].mode
         driver, path = ("", ()) if radio is None else _driver(profile, radio)
         if mode in _LACKS.get(driver, frozenset()):
-            message = f"{radio_name} joins mesh {mesh_name} on {listed(nodes)}"
+            message = f"{radio_name} joins mesh {mesh_name} on {join_limited(nodes)}"
             yield Finding(path, message, f"a driver with {_MODE_NAMES[mode]} mode", driver)
 
 

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, listed
+from meshctl.lint.grouping import group_by_key, join_limited
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Encryption, Fleet, Mesh, MeshMode, Node, Release
 from meshctl.resolve import FULL_SUPPLICANTS, supplicant_need
 
 # a passphrase shorter than this is found by trying: the handshake can be recorded by anyone in reach
-_SAFE_PASSPHRASE_LETTERS = 16
+_MIN_PASSPHRASE_CHARACTERS = 16
 
 
 def _members(fleet: Fleet) -> Iterator[tuple[Node, Mesh]]:
@@ -28,7 +28,7 @@ def _members(fleet: Fleet) -> Iterator[tuple[Node, Mesh]]:
     "An encrypted ad-hoc cell on OpenWrt 25.12 is open",
     why="""25.12's wifi script looks for the cipher before it is set, so an ad-hoc cell with a key is joined without
     one. Everything looks right: the configuration says psk2, the node is in the mesh, and anybody else can be, too.""",
-    mend="Use `mode: mesh` with `encryption: sae`, an earlier release, or write `encryption: none` and mean it.",
+    fix="Use `mode: mesh` with `encryption: sae`, an earlier release, or write `encryption: none` and mean it.",
     failing="""hardware: {rocket: {release: "25.12"}}""",
     passing="""
     hardware: {rocket: {release: "25.12"}}
@@ -36,13 +36,13 @@ def _members(fleet: Fleet) -> Iterator[tuple[Node, Mesh]]:
     """,
 )
 def encrypted_adhoc_on_25_12(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    trapped = grouped(
+    trapped = group_by_key(
         (mesh.name, node.name)
         for node, mesh in _members(fleet)
         if mesh.mode is MeshMode.ADHOC and mesh.encryption is Encryption.PSK2 and node.release >= Release.V25_12
     )
     for name, nodes in trapped.items():
-        message = f"joined open, silently, by nodes on 25.12: {listed(nodes)}"
+        message = f"joined open, silently, by nodes on 25.12: {join_limited(nodes)}"
         yield Finding(
             ("meshes", name, "encryption"), message, "none, or mode mesh with sae", "psk2+ccmp in ad-hoc mode"
         )
@@ -53,7 +53,7 @@ def encrypted_adhoc_on_25_12(fleet: Fleet, _context: LintContext) -> Iterator[Fi
     Severity.ERROR,
     "An encrypted mesh has no key",
     why="The supplicant does not start without a key and the radio stays out of the mesh.",
-    mend="Say where the key is: `key: {env: MESH_KEY}`.",
+    fix="Say where the key is: `key: {env: MESH_KEY}`.",
     failing="meshes: {main: {key: <removed>}}",
     passing="meshes: {main: {key: {env: MESH_KEY}}}",
 )
@@ -69,7 +69,7 @@ def key_missing(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "A key is given but the mesh is not encrypted",
     why="Whoever wrote the key believed the mesh was closed. It is open.",
-    mend="Set `encryption`, or take the key away.",
+    fix="Set `encryption`, or take the key away.",
     failing="meshes: {main: {encryption: none}}",
     passing="meshes: {main: {encryption: psk2+ccmp}}",
 )
@@ -85,7 +85,7 @@ def key_unused(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "SAE does not exist in ad-hoc mode",
     why="The supplicant has no SAE for ad-hoc cells; the interface does not come up.",
-    mend="Use psk2+ccmp, or `mode: mesh`.",
+    fix="Use psk2+ccmp, or `mode: mesh`.",
     failing="meshes: {main: {encryption: sae}}",
     passing="meshes: {main: {encryption: sae, mode: mesh}}",
 )
@@ -100,7 +100,7 @@ def sae_in_adhoc(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "WPA2 passphrases do not exist in 802.11s mode",
     why="802.11s encrypts with SAE only; with psk2 the supplicant starts an open mesh or none at all.",
-    mend="Use `encryption: sae`.",
+    fix="Use `encryption: sae`.",
     failing="meshes: {main: {mode: mesh}}",
     passing="meshes: {main: {mode: mesh, encryption: sae}}",
 )
@@ -116,7 +116,7 @@ def psk_in_mesh_mode(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The supplicant cannot encrypt a mesh",
     why="""`wpad-basic*` and `wpad-mini` are built without IBSS_RSN and without encrypted 802.11s: the radio never
     joins.""",
-    mend="Replace it by a full one: `wpad-mesh-mbedtls`, `wpad-openssl` or another of `wpad-*` without basic or mini.",
+    fix="Replace it by a full one: `wpad-mesh-mbedtls`, `wpad-openssl` or another of `wpad-*` without basic or mini.",
     failing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-basic-mbedtls]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-mesh-mbedtls]}}",
 )
@@ -128,7 +128,7 @@ def supplicant_too_small(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         if need is None or not small or any(name in FULL_SUPPLICANTS for name in named):
             continue
         path = packages_path(node, small[0])
-        yield Finding(path, f"cannot encrypt mesh {mesh.name}", f"one of {listed(need.any_of)}", small[0])
+        yield Finding(path, f"cannot encrypt mesh {mesh.name}", f"one of {join_limited(need.any_of)}", small[0])
 
 
 def packages_path(node: Node, package: str) -> tuple[str, ...]:
@@ -145,7 +145,7 @@ def packages_path(node: Node, package: str) -> tuple[str, ...]:
     Severity.ERROR,
     "Two supplicants in one image",
     why="The packages hold the same files: the ImageBuilder stops, or the one installed last wins.",
-    mend="Keep one of them.",
+    fix="Keep one of them.",
     failing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, wpad-mbedtls]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl]}}",
 )
@@ -153,7 +153,9 @@ def two_supplicants(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
         named = [name for name in dict.fromkeys((*node.hardware.packages, *node.packages)) if name.startswith("wpad")]
         if len(named) > 1:
-            yield Finding(packages_path(node, named[1]), f"conflicts with {named[0]}", "one supplicant", listed(named))
+            yield Finding(
+                packages_path(node, named[1]), f"conflicts with {named[0]}", "one supplicant", join_limited(named)
+            )
 
 
 @fleet_rule(
@@ -162,7 +164,7 @@ def two_supplicants(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The mesh is open",
     why="""Anyone in reach can join the mesh, reach every node's SSH, and spoil the routing with false originator
     messages. udp_mesh seals what robots say, but not the mesh below it.""",
-    mend="Set `encryption: psk2+ccmp` (ad-hoc, up to 24.10) or `mode: mesh` with `sae`; or suppress it with a reason.",
+    fix="Set `encryption: psk2+ccmp` (ad-hoc, up to 24.10) or `mode: mesh` with `sae`; or suppress it with a reason.",
     failing="meshes: {main: {encryption: none, key: <removed>}}",
     passing="meshes: {main: {encryption: psk2+ccmp}}",
 )
@@ -179,7 +181,7 @@ def mesh_open(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The mesh's passphrase is not allowed",
     why="""WPA takes 8 to 63 printable ASCII characters, or 64 hexadecimal digits: with anything else the supplicant
     refuses its configuration on every node at once.""",
-    mend="Make a new one: `openssl rand -base64 24`.",
+    fix="Make a new one: `openssl rand -base64 24`.",
     failing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "short"}),
     passing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "cedar-lantern-93-quarry"}),
 )
@@ -215,7 +217,7 @@ def _is_passphrase(value: str) -> bool:
     "The mesh's passphrase is short",
     why="""The handshake can be recorded by anyone in reach and tried at leisure, millions of guesses a second: a
     passphrase of a word and a year lasts minutes.""",
-    mend="Make a new one of at least 16 characters: `openssl rand -base64 24`.",
+    fix="Make a new one of at least 16 characters: `openssl rand -base64 24`.",
     failing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "husky2021"}),
     passing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "cedar-lantern-93-quarry"}),
 )
@@ -223,6 +225,6 @@ def passphrase_short(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, value in _passphrases(fleet, context):
         # SAE's handshake cannot be tried against later
         is_tried = mesh.encryption is Encryption.PSK2 and _is_passphrase(value)
-        if is_tried and len(value) < _SAFE_PASSPHRASE_LETTERS:
-            expected = f"at least {_SAFE_PASSPHRASE_LETTERS} characters"
+        if is_tried and len(value) < _MIN_PASSPHRASE_CHARACTERS:
+            expected = f"at least {_MIN_PASSPHRASE_CHARACTERS} characters"
             yield Finding(("meshes", mesh.name, "key"), "can be found by trying", expected, f"{len(value)} characters")

@@ -52,7 +52,7 @@ def _found(fleet: Fleet, context: LintContext, code: str, *key: str) -> Iterator
     Severity.ERROR,
     "A firmware image is missing",
     why="It is found out in the field, where there is no internet to fetch it from.",
-    mend="Bring the image, or mend the path: it is relative to the file that names it.",
+    fix="Bring the image, or mend the path: it is relative to the file that names it.",
     failing="hardware: {rocket: {firmware: {image: absent.bin, revision: r28739, sha256: HASH}}}".replace(
         "HASH", _OTHER_HASH
     ),
@@ -68,7 +68,7 @@ def image_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "A firmware image is not the one that was written down",
     why="""Cut off by a full disk, replaced by a newer build, or tampered with: whichever it is, nobody tested this
     file.""",
-    mend="Fetch the image again; if it was replaced on purpose, write its new SHA-256 down.",
+    fix="Fetch the image again; if it was replaced on purpose, write its new SHA-256 down.",
     failing=Example(
         f"hardware: {{rocket: {{firmware: {{image: rocket.bin, revision: r28739, sha256: {_OTHER_HASH}}}}}}}",
         files={"rocket.bin": ROCKET_IMAGE},
@@ -84,7 +84,7 @@ def image_wrong_hash(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "A firmware image is damaged",
     why="Its own checksum does not fit its contents: sysupgrade would refuse it, at best.",
-    mend="Fetch the image again.",
+    fix="Fetch the image again.",
     failing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE.replace("image for", "damaged image for")}),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
@@ -98,7 +98,7 @@ def image_damaged(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "A firmware image says nothing of its board",
     why="""Without metadata sysupgrade refuses the image (ath79 requires it), and nothing tells whether it is for this
     board. A factory image is the usual case: it is for the maker's own boot loader.""",
-    mend="Use the image with `sysupgrade` in its name.",
+    fix="Use the image with `sysupgrade` in its name.",
     failing=Example(_IMAGE, files={"rocket.bin": "a factory image"}),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
@@ -111,7 +111,7 @@ def image_without_metadata(fleet: Fleet, context: LintContext) -> Iterator[Findi
     Severity.ERROR,
     "A firmware image is for another board",
     why="Forced onto the wrong board it leaves a device that only a serial cable revives.",
-    mend="Use the image of this profile, or mend the profile's `board` and `target`.",
+    fix="Use the image of this profile, or mend the profile's `board` and `target`.",
     failing=Example(_IMAGE, files={"rocket.bin": _BULLET}),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
@@ -125,7 +125,7 @@ def image_wrong_board(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "A firmware image is of another release than the profile",
     why="""The configuration is rendered for the profile's release: on another one, bridges, radios or the firewall come
     up differently, or not at all.""",
-    mend="Set the profile's `release` to the image's.",
+    fix="Set the profile's `release` to the image's.",
     failing=Example(_IMAGE.replace("r28739", "r24106"), files={"rocket.bin": _OLD}),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
@@ -139,7 +139,7 @@ def image_wrong_release(fleet: Fleet, context: LintContext) -> Iterator[Finding]
     "A firmware image is of another revision than written down",
     why="""After a flash a node must report this revision to count as done: with another in the image, every flash ends
     as failed.""",
-    mend="Write the revision that the image carries.",
+    fix="Write the revision that the image carries.",
     failing=Example(_IMAGE.replace("revision: r28739", "revision: r24106"), files={"rocket.bin": ROCKET_IMAGE}),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
@@ -153,7 +153,7 @@ def image_wrong_revision(fleet: Fleet, context: LintContext) -> Iterator[Finding
     "A firmware image's signature does not hold",
     why="""The profile names a key that must have signed the image, and it did not, or the signature or the key is
     missing. OpenWrt itself does not check it.""",
-    mend="Put the release's sha256sums and sha256sums.sig (or the image's own .sig) beside the image.",
+    fix="Put the release's sha256sums and sha256sums.sig (or the image's own .sig) beside the image.",
     failing=Example(
         _IMAGE.replace("image: rocket.bin", "image: rocket.bin, usign_key: absent.pub"),
         files={"rocket.bin": ROCKET_IMAGE},
@@ -169,7 +169,7 @@ def image_signature(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "A firmware image has no hash",
     why="Any file of that name would be flashed, also half of one.",
-    mend="Write its SHA-256 down: `sha256sum IMAGE`.",
+    fix="Write its SHA-256 down: `sha256sum IMAGE`.",
     failing=Example(
         "hardware: {rocket: {firmware: {image: rocket.bin, revision: r28739}}}", files={"rocket.bin": ROCKET_IMAGE}
     ),
@@ -187,7 +187,7 @@ def image_without_hash(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     Severity.ERROR,
     "A firmware image does not fit the flash",
     why="sysupgrade writes it until the flash ends: the device does not boot again.",
-    mend="Use a smaller image, or mend the profile's `flash_mib`.",
+    fix="Use a smaller image, or mend the profile's `flash_mib`.",
     failing=Example(
         _IMAGE.replace("rocket: {", "rocket: {flash_mib: 4, "), files={"rocket.bin": "4 MiB " + ROCKET_IMAGE}
     ),
@@ -210,7 +210,7 @@ def image_too_large(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "A package file is missing, or of the wrong kind",
     why="""opkg (up to 24.10) installs .ipk files, apk (from 25.12) .apk files; with the wrong one, or none, the back
     end is not installed and the node comes up without a mesh.""",
-    mend="Bring the file, built for this release.",
+    fix="Bring the file, built for this release.",
     failing=Example("hardware: {rocket: {package_files: [tool.apk]}}", files={"tool.apk": "a package"}),
     passing=Example("hardware: {rocket: {package_files: [tool.ipk]}}", files={"tool.ipk": "a package"}),
 )
@@ -242,7 +242,7 @@ def _package_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], str, tuple[s
     "A firmware image has no revision, so it is never flashed",
     why="""meshctl flashes a node whose revision differs from the one written down, and knows by it that the flash is
     done. Without one the image is checked and never used: plan, apply and status say that all is well.""",
-    mend="Write the image's revision: `ubus call system board` of a node that runs it, release.revision.",
+    fix="Write the image's revision: `ubus call system board` of a node that runs it, release.revision.",
     failing=Example(_IMAGE.replace(", revision: r28739", ""), files={"rocket.bin": ROCKET_IMAGE}),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )

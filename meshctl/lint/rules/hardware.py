@@ -10,20 +10,20 @@ from pathlib import PurePath
 from meshctl import firmware
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import listed
-from meshctl.lint.openwrt_names import SUBTARGETS, TARGETS, chip_target, meant_package
+from meshctl.lint.grouping import join_limited
+from meshctl.lint.openwrt_names import SUBTARGETS, TARGETS, chip_target, suggest_package
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.encryption import packages_path
 from meshctl.lint.rules.firmware import ROCKET_IMAGE
-from meshctl.lint.rules.references import known
+from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet, Release
 from meshctl.resolve import package_needs
 
 # no security fixes any more (openwrt.org/docs/guide-developer/security)
 _UNMAINTAINED = (Release.V19_07, Release.V21_02, Release.V22_03, Release.V23_05)
 # OpenWrt's own warning: 8/64 devices are the least that current releases run well on
-_LEAST_MEMORY_MIB = 64
-_LEAST_FLASH_MIB = 8
+_MIN_MEMORY_MIB = 64
+_MIN_FLASH_MIB = 8
 
 
 @fleet_rule(
@@ -31,7 +31,7 @@ _LEAST_FLASH_MIB = 8
     Severity.ERROR,
     "A package that the mesh needs is taken out",
     why="Nodes come up without the mesh's module or its tools: the image builds, flashes, boots, and never joins.",
-    mend="Take the `-` away from the package, or use another mesh back end.",
+    fix="Take the `-` away from the package, or use another mesh back end.",
     failing="hardware: {rocket: {packages: [-kmod-batman-adv, iw, wpad-openssl]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, iw, wpad-openssl]}}",
 )
@@ -47,7 +47,7 @@ def needed_package_removed(fleet: Fleet, _context: LintContext) -> Iterator[Find
             if dropped.issuperset(need.any_of) or (need.any_of[0] in dropped and not set(named) & set(need.any_of)):
                 package = next(name for name in need.any_of if name in dropped)
                 path = packages_path(node, f"-{package}")
-                yield Finding(path, need.reason, f"one of {listed(need.any_of)}", f"-{package}")
+                yield Finding(path, need.reason, f"one of {join_limited(need.any_of)}", f"-{package}")
 
 
 @fleet_rule(
@@ -56,7 +56,7 @@ def needed_package_removed(fleet: Fleet, _context: LintContext) -> Iterator[Find
     "A ready image may lack what the mesh needs",
     why="""The profile names a finished image, and none of the packages that the mesh needs among those in it. Nodes
     have no internet: what is not in the image is not on the node.""",
-    mend="List what the image holds in `packages`, or bring the rest as `package_files`.",
+    fix="List what the image holds in `packages`, or bring the rest as `package_files`.",
     failing=Example(
         """
         hardware:
@@ -86,7 +86,7 @@ def image_lacks_packages(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         for need in package_needs(fleet, node):
             if not named.intersection(need.any_of) and not any(file.startswith(need.any_of) for file in brought):
                 path = ("hardware", profile.name, "packages")
-                yield Finding(path, need.reason, f"one of {listed(need.any_of)}", "none of them")
+                yield Finding(path, need.reason, f"one of {join_limited(need.any_of)}", "none of them")
 
 
 @fleet_rule(
@@ -94,7 +94,7 @@ def image_lacks_packages(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     Severity.WARNING,
     "batctl-tiny cannot tell the state of the mesh",
     why="It has no JSON and no tables of loop avoidance: status would show the node without neighbours and routes.",
-    mend="Use batctl-default or batctl-full.",
+    fix="Use batctl-default or batctl-full.",
     failing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-tiny, iw, wpad-openssl]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-full, iw, wpad-openssl]}}",
 )
@@ -110,7 +110,7 @@ def batctl_tiny(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "A package is both wanted and taken out",
     why="One of two people who edited the profile is wrong about what is on the node.",
-    mend="Keep one of the two lines.",
+    fix="Keep one of the two lines.",
     failing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, tcpdump, -tcpdump]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, tcpdump]}}",
 )
@@ -128,7 +128,7 @@ def package_contradiction(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     "Board and profile name different devices",
     why="""The board is what the device calls itself, the profile what the ImageBuilder calls it: the same words with a
     comma or an underscore. When they differ, one was copied from another profile, and the image will be refused.""",
-    mend="Read the board off the device: `ubus call system board`.",
+    fix="Read the board off the device: `ubus call system board`.",
     failing="hardware: {rocket: {profile: ubnt_bullet-m-xw}}",
     passing="hardware: {rocket: {profile: ubnt_rocket-m}}",
 )
@@ -146,7 +146,7 @@ def board_and_profile_differ(fleet: Fleet, _context: LintContext) -> Iterator[Fi
     "A target is not of OpenWrt's form",
     why="""The ImageBuilder and the image's own metadata name targets as `ath79/generic`; anything else finds no builder
     and fits no image.""",
-    mend="Read the target off the device: `ubus call system board`, release.target.",
+    fix="Read the target off the device: `ubus call system board`, release.target.",
     failing="hardware: {rocket: {target: ath79}}",
     passing="hardware: {rocket: {target: ath79/generic}}",
 )
@@ -162,7 +162,7 @@ def target_form(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.NOTE,
     "The release is no longer maintained",
     why="No security fixes: what is found in its kernel, dropbear or wpad stays open on every radio of the fleet.",
-    mend="Move to 24.10 or later when the fleet can be tested on it.",
+    fix="Move to 24.10 or later when the fleet can be tested on it.",
     failing="""hardware: {rocket: {release: "22.03"}}""",
     passing="""hardware: {rocket: {release: "24.10"}}""",
 )
@@ -180,7 +180,7 @@ def release_unmaintained(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     "The device is too small for the release",
     why="""Releases from 22.03 on run out of memory on 32 MiB, and do not fit into 4 MiB of flash with the mesh's
     packages: such nodes reboot under load.""",
-    mend="Use other hardware, or an older release for these.",
+    fix="Use other hardware, or an older release for these.",
     failing="hardware: {rocket: {memory_mib: 32}}",
     passing="hardware: {rocket: {memory_mib: 64}}",
 )
@@ -189,8 +189,8 @@ def device_too_small(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         if profile.release < Release.V22_03:
             continue
         sizes = (
-            ("memory_mib", profile.memory_mib, _LEAST_MEMORY_MIB),
-            ("flash_mib", profile.flash_mib, _LEAST_FLASH_MIB),
+            ("memory_mib", profile.memory_mib, _MIN_MEMORY_MIB),
+            ("flash_mib", profile.flash_mib, _MIN_FLASH_MIB),
         )
         for key, size, least in sizes:
             # an image at hand is held against the flash by a rule of its own
@@ -206,7 +206,7 @@ def device_too_small(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "There is no recipe for recovery",
     why="""It is printed before a device is flashed, and wanted when the flash went wrong: at night, without internet,
     by whoever is there.""",
-    mend="Write in `recovery` how this device is brought back: which button, when, at which address.",
+    fix="Write in `recovery` how this device is brought back: which button, when, at which address.",
     failing="""hardware: {rocket: {recovery: ""}}""",
     passing="hardware: {rocket: {recovery: Hold reset at power-on for 8 s and send the image to 192.168.1.20 by TFTP}}",
 )
@@ -223,7 +223,7 @@ def no_recovery(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "A hardware profile has no radio",
     why="A node without a radio is in no mesh. The section was forgotten.",
-    mend="Describe its radios by the names of their UCI sections, usually radio0.",
+    fix="Describe its radios by the names of their UCI sections, usually radio0.",
     failing=Example(
         """
         hardware: {box: {board: "x,box", profile: x_box, target: ath79/generic, release: "24.10", lan_ports: [eth0],
@@ -245,7 +245,7 @@ def profile_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     "A robot's switch hangs on another mesh than its computer",
     why="""A node with radios in several networks bridges its wired ports with the one that holds its address. With the
     address in one network and the robot's computer in another, the computer is on the wrong side: it hears nothing.""",
-    mend="Give the node an address in its computer's network.",
+    fix="Give the node an address in its computer's network.",
     failing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
@@ -282,7 +282,7 @@ def switch_on_other_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     "A package's name is misspelt",
     why="""The ImageBuilder stops at a package that no feed has, and opkg finds none on the bench. Where the mesh
     needs the package, meshctl adds the right name beside the wrong one.""",
-    mend="Correct the name.",
+    fix="Correct the name.",
     failing="hardware: {rocket: {packages: [kmod-batman-adb, batctl-default, iw, wpad-openssl]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, my-own-tool]}}",
 )
@@ -292,7 +292,7 @@ def package_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         for written in (*node.hardware.packages, *node.packages):
             name = written.removeprefix("-")
             if name not in judged:
-                judged[name] = meant_package(name)
+                judged[name] = suggest_package(name)
             meant = judged[name]
             if meant is not None:
                 hint = f"did you mean {meant}?"
@@ -304,7 +304,7 @@ def package_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "OpenWrt has no such target",
     why="The ImageBuilder is fetched by its target, and an image's metadata names it: with a slip, neither fits.",
-    mend="Read the target off the device: `ubus call system board`, release.target.",
+    fix="Read the target off the device: `ubus call system board`, release.target.",
     failing="hardware: {rocket: {target: ath97/generic}}",
     passing="hardware: {rocket: {target: ath79/generic}}",
 )
@@ -316,7 +316,7 @@ def target_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             continue
         # OpenWrt gets new ones with each release: only what is near to a known one is taken for a slip
         if target not in TARGETS:
-            _, hint = known(TARGETS, target)
+            _, hint = suggest(TARGETS, target)
             if hint:
                 yield Finding(path, "no such target", "a target of OpenWrt", profile.target, hint)
         elif target in SUBTARGETS and subtarget not in SUBTARGETS[target]:
@@ -332,7 +332,7 @@ def target_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The target is of another chip than the radio",
     why="""The radio's path says which chip it is part of. An image for another chip does not boot; forced onto the
     board, it leaves a device that only a serial cable revives.""",
-    mend="Read both off the device: release.target of `ubus call system board`, `uci get wireless.radio0.path`.",
+    fix="Read both off the device: release.target of `ubus call system board`, `uci get wireless.radio0.path`.",
     failing="""
     hardware: {rocket: {target: ramips/mt7621, radios: {radio0: {path: platform/ahb/18100000.wmac}}}}
     """,

@@ -11,7 +11,7 @@ from meshctl.device.trust import Pin, parse_pins
 from meshctl.diagnostics import Severity
 from meshctl.errors import InputError
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import listed, repeated
+from meshctl.lint.grouping import duplicates, join_limited
 from meshctl.lint.places import is_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Fleet, Node, NodeState
@@ -32,7 +32,7 @@ def _collisions(fleet: Fleet, marks: Iterable[tuple[str, tuple[str, ...]]], what
     The one without a finding is the first whose mark is not written (a host name that is the node's own name), or
     else the first of all.
     """
-    for mark, paths in repeated(marks):
+    for mark, paths in duplicates(marks):
         by_node: dict[str, tuple[str, ...]] = {}
         for path in paths:
             by_node.setdefault(path[1], path)
@@ -49,7 +49,7 @@ def _collisions(fleet: Fleet, marks: Iterable[tuple[str, tuple[str, ...]]], what
     Severity.ERROR,
     "Two nodes have the same hostname",
     why="Logs, prompts and `batctl` name nodes by hostname: the operator restarts the wrong one.",
-    mend="Give each node a hostname of its own, or leave it out: the node's name serves.",
+    fix="Give each node a hostname of its own, or leave it out: the node's name serves.",
     failing="nodes: {b01: {hostname: base}}",
     passing="nodes: {b01: {hostname: beacon-1}}",
 )
@@ -64,7 +64,7 @@ def hostname_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "A hostname is not valid",
     why="""OpenWrt hands the name to the kernel and to syslog; one with an underscore, a dot or an umlaut is refused
     there, cut, or not found by any resolver (RFC 1123).""",
-    mend="Use letters, digits and inner hyphens, at most 63 of them.",
+    fix="Use letters, digits and inner hyphens, at most 63 of them.",
     failing="nodes: {b01: {hostname: beacon_1}}",
     passing="nodes: {b01: {hostname: beacon-1}}",
 )
@@ -80,13 +80,13 @@ def hostname_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "Names differ in nothing but capitals",
     why="Hostnames, known_hosts and file systems of laptops treat `B01` and `b01` as one.",
-    mend="Rename one of them.",
+    fix="Rename one of them.",
     failing="nodes: {B01: {address: 10.42.0.99, hostname: other, role: beacon}}",
     passing="nodes: {b99: {address: 10.42.0.99, hostname: other, role: beacon}}",
 )
 def names_by_case(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for section, every in (("nodes", fleet.nodes), ("robots", fleet.robots), ("meshes", fleet.meshes)):
-        for lowered, names in repeated((name.lower(), name) for name in every):
+        for lowered, names in duplicates((name.lower(), name) for name in every):
             for name in names[1:]:
                 yield Finding((section, name), f"differs from {names[0]} in capitals only", "another name", lowered)
 
@@ -97,7 +97,7 @@ def names_by_case(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "Two nodes have the same MAC address",
     why="""The MAC is how bootstrap knows one factory device from another and how status joins what radios hear to
     names; two alike in one cell also break the mesh itself.""",
-    mend="Read the MAC off the device's label.",
+    fix="Read the MAC off the device's label.",
     failing="""
     nodes:
       base: {mac: "00:15:6d:aa:00:01"}
@@ -129,7 +129,7 @@ def _macs(fleet: Fleet) -> Iterator[tuple[str, tuple[str, ...]]]:
     "A MAC address is no device's",
     why="""A group address (an odd first byte), zero, or text that is no MAC never matches a real device, so bootstrap
     would refuse the right one.""",
-    mend="Read the MAC off the device's label.",
+    fix="Read the MAC off the device's label.",
     failing="""nodes: {b01: {mac: "01:15:6d:aa:00:01"}}""",
     passing="""nodes: {b01: {mac: "00:15:6d:aa:00:01"}}""",
 )
@@ -156,7 +156,7 @@ def is_device_mac(mac: str) -> bool:
     "Two nodes are pinned to the same SSH host key",
     why="""Either one line was copied, and the other node will be refused, or both run an image with a key baked in, and
     each can pass for the other.""",
-    mend="Run `meshctl trust NODE` for each; make new host keys where an image brought its own.",
+    fix="Run `meshctl trust NODE` for each; make new host keys where an image brought its own.",
     failing="""
     nodes:
       base: {host_keys: ["ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f"]}
@@ -169,7 +169,7 @@ def is_device_mac(mac: str) -> bool:
 )
 def host_key_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     # a key may stand both in the inventory and in known_hosts: each node counts once
-    for key, nodes in repeated(dict.fromkeys(_host_keys(fleet, context))):
+    for key, nodes in duplicates(dict.fromkeys(_host_keys(fleet, context))):
         first, *later = nodes
         for name in later:
             found = f"{key[:24]}...{key[-8:]}"
@@ -196,7 +196,7 @@ def _host_keys(fleet: Fleet, context: LintContext) -> Iterator[tuple[str, str]]:
     "Two nodes wear the same label",
     why="""The label is what a person reads off the box in the rack: with two alike, the wrong beacon is dropped,
     flashed or written off.""",
-    mend="Print labels that differ.",
+    fix="Print labels that differ.",
     failing="nodes: {base: {label: B1}, b01: {label: B1}}",
     passing="nodes: {base: {label: BASE}, b01: {label: B1}}",
 )
@@ -210,7 +210,7 @@ def label_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "Two nodes have the same serial number",
     why="One device cannot be two nodes; `replace` would take the wrong one out of the box.",
-    mend="Read the serial number off the device.",
+    fix="Read the serial number off the device.",
     failing="nodes: {base: {serial: A1}, b01: {serial: A1}}",
     passing="nodes: {base: {serial: A1}, b01: {serial: A2}}",
 )
@@ -225,7 +225,7 @@ def serial_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "Deployed nodes have no physical identity",
     why="""On the bench all devices answer at 192.168.1.1. Only a MAC or a serial number keeps bootstrap and `replace`
     from writing one node's identity onto another box.""",
-    mend="Write down `mac` or `serial` from the sticker.",
+    fix="Write down `mac` or `serial` from the sticker.",
     failing="nodes: {base: {mac: <removed>}}",
     passing="""nodes: {base: {serial: "UB-1234"}}""",
 )
@@ -237,7 +237,10 @@ def no_physical_identity(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     ]
     if bare:
         yield Finding(
-            ("nodes", bare[0]), "nothing ties them to a device", "`mac` or `serial`", f"neither for {listed(bare)}"
+            ("nodes", bare[0]),
+            "nothing ties them to a device",
+            "`mac` or `serial`",
+            f"neither for {join_limited(bare)}",
         )
 
 
@@ -250,7 +253,7 @@ def _deployed(fleet: Fleet) -> Iterator[Node]:
     Severity.NOTE,
     "Host keys of deployed nodes are not pinned",
     why="Whoever answers first at the address is believed. meshctl refuses to change a node it cannot recognise.",
-    mend="Run `meshctl trust NODE` once, on the bench, where nobody can stand between.",
+    fix="Run `meshctl trust NODE` once, on the bench, where nobody can stand between.",
     failing="nodes: {base: {host_keys: <removed>}}",
     passing=Example(
         "nodes: {base: {host_keys: <removed>}}",
@@ -261,7 +264,7 @@ def host_key_not_pinned(fleet: Fleet, context: LintContext) -> Iterator[Finding]
     pinned = _pinned_names(fleet, context)
     strangers = [node.name for node in _deployed(fleet) if not node.host_keys and node.name not in pinned]
     if strangers and _HASHED not in pinned:
-        found = f"none for {listed(strangers)}"
+        found = f"none for {join_limited(strangers)}"
         expected = f"`host_keys`, or lines in {fleet.operators.known_hosts}"
         yield Finding(("nodes", strangers[0]), "any device is believed", expected, found)
 
@@ -296,7 +299,7 @@ def known_hosts_path(fleet: Fleet) -> Path:
     Severity.WARNING,
     "A robot and a node share a name, and the node is not the robot's",
     why="Commands take robots and nodes by name: `meshctl run husky1` would reach a radio that rides elsewhere.",
-    mend="Rename one of them, or put the node on the robot.",
+    fix="Rename one of them, or put the node on the robot.",
     failing="""
     nodes: {husky1: {role: beacon, address: 10.42.0.99}}
     """,
@@ -315,7 +318,7 @@ def robot_and_node_share_name(fleet: Fleet, _context: LintContext) -> Iterator[F
     Severity.ERROR,
     "A robot's name cannot be a peer's name",
     why="udp_mesh knows peers by the robot's name, at most 63 bytes on the wire, and ROS topics are named after it.",
-    mend="Use letters, digits, hyphens and underscores, a letter first.",
+    fix="Use letters, digits, hyphens and underscores, a letter first.",
     failing="""
     nodes: {h2: {role: robot, address: 10.42.0.12}}
     robots: {2nd-husky: {nodes: [h2]}}

@@ -14,10 +14,10 @@ from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Robot
 
 # what the fielded program uses unless somebody changed its source
-_FIELDED_PORT = 8700
+_LEGACY_PORT = 8700
 
 
-def _fielded(fleet: Fleet) -> Iterator[Robot]:
+def _legacy_robots(fleet: Fleet) -> Iterator[Robot]:
     return (robot for robot in fleet.robots.values() if robot.fielded is not None)
 
 
@@ -27,7 +27,7 @@ def _fielded(fleet: Fleet) -> Iterator[Robot]:
     "A fielded robot cannot be heard without broadcasts",
     why="""Robots with the fielded program announce themselves by broadcast, and nothing is sent to one that was not
     heard: with `broadcast: false` no daemon ever talks to it.""",
-    mend="Leave `broadcast` on until the last robot has moved over.",
+    fix="Leave `broadcast` on until the last robot has moved over.",
     failing="""
     udp_mesh: {broadcast: false}
     robots: {husky1: {computer: <removed>, fielded: 10.42.0.110}}
@@ -36,7 +36,7 @@ def _fielded(fleet: Fleet) -> Iterator[Robot]:
 )
 def fielded_without_broadcast(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     if not fleet.udp_mesh.broadcast:
-        for robot in _fielded(fleet):
+        for robot in _legacy_robots(fleet):
             yield Finding(("udp_mesh", "broadcast"), f"{robot.name} is never heard", "true", "false")
 
 
@@ -46,7 +46,7 @@ def fielded_without_broadcast(fleet: Fleet, _context: LintContext) -> Iterator[F
     "The fielded robots use another port",
     why="""Both programs hear and are heard on one port. The fielded one's is 8700 unless somebody changed it; on
     another port the daemons and it do not notice each other.""",
-    mend="Use port 8700, or suppress this with the reason that the fielded robots were given the same port.",
+    fix="Use port 8700, or suppress this with the reason that the fielded robots were given the same port.",
     failing="""
     udp_mesh: {port: 8701}
     robots: {husky1: {computer: <removed>, fielded: 10.42.0.110}}
@@ -58,9 +58,9 @@ def fielded_without_broadcast(fleet: Fleet, _context: LintContext) -> Iterator[F
 )
 def fielded_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     port = fleet.udp_mesh.port
-    for robot in _fielded(fleet):
-        if port != _FIELDED_PORT:
-            yield Finding(("udp_mesh", "port"), f"{robot.name} is not there", str(_FIELDED_PORT), str(port))
+    for robot in _legacy_robots(fleet):
+        if port != _LEGACY_PORT:
+            yield Finding(("udp_mesh", "port"), f"{robot.name} is not there", str(_LEGACY_PORT), str(port))
             return
 
 
@@ -70,12 +70,12 @@ def fielded_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "A robot is fielded and has moved over",
     why="""With `computer` it gets a daemon of ours, which the others find. What is left of `fielded` has every robot go
     on covering its broadcasts for a program that is not there, and nobody can tell whether the fleet has moved.""",
-    mend="Take `fielded` out when the robot gets a `computer`, and deploy to all robots.",
+    fix="Take `fielded` out when the robot gets a `computer`, and deploy to all robots.",
     failing="robots: {husky1: {fielded: 10.42.0.110}}",
     passing="robots: {husky1: {computer: <removed>, fielded: 10.42.0.110}}",
 )
 def fielded_and_moved(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for robot in _fielded(fleet):
+    for robot in _legacy_robots(fleet):
         if robot.computer is not None:
             path = ("robots", robot.name, "fielded")
             yield Finding(path, "", "either `fielded` or `computer`", "both")
@@ -86,13 +86,13 @@ def fielded_and_moved(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "A fielded robot is in another network than a computer",
     why="Broadcasts, by which the fielded program is found, end at the network's border.",
-    mend="Write the address that the robot has in the mesh's network.",
+    fix="Write the address that the robot has in the mesh's network.",
     failing="robots: {husky1: {computer: <removed>, fielded: 10.99.0.110}}",
     passing="robots: {husky1: {computer: <removed>, fielded: 10.42.0.110}}",
 )
 def fielded_elsewhere(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     networks = {robot.computer.address.network for robot in fleet.robots.values() if robot.computer is not None}
-    for robot in _fielded(fleet):
+    for robot in _legacy_robots(fleet):
         apart = sorted(str(network) for network in networks if robot.fielded not in network)
         if apart:
             path = ("robots", robot.name, "fielded")

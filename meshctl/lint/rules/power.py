@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped
+from meshctl.lint.grouping import group_by_key
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import AntennaKind, Fleet, Mesh, Node, Radio
-from meshctl.regdb import CHANNELS, judge, primary
+from meshctl.regdb import CHANNELS, check_span, primary
 
 # 47 CFR 15.247(b)(3), (b)(4), and the same in RSS-247 5.4(d): digital modulation at 2400-2483.5 and 5725-5850 MHz
 _CONDUCTED_LIMIT_DBM = 30.0
@@ -24,7 +24,7 @@ _ASYMMETRY_DB = 10.0
 # boxes are sold by the class above what their drivers offer: "1 W" often means 28 dBm
 _CLASS_TOLERANCE_DB = 3.0
 # 46 dBm are 40 W: no radio of a robot; 500 or 1000 are milliwatts
-_LARGEST_RATED_DBM = 40.0
+_MAX_RATED_DBM = 40.0
 
 
 def _dbm(value: float) -> str:
@@ -72,7 +72,7 @@ def _at(fleet: Fleet, node: Node, radio: Radio) -> tuple[str, ...]:
     "The radiated power is above the country's limit",
     why="""The limit counts what leaves the antenna: drive level, amplifier, less the cable, plus the antenna's gain.
     The kernel clamps only what it knows, the drive level, so an amplifier or a large antenna breaks the law unseen.""",
-    mend="Lower `tx_power_dbm` by what the sum is too high.",
+    fix="Lower `tx_power_dbm` by what the sum is too high.",
     failing="country: DE",
     passing="""
     country: DE
@@ -84,7 +84,7 @@ def eirp_above_country(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     if country is None:
         return
     limits = {
-        mesh.name: judge(country, primary(mesh.band, mesh.channel))
+        mesh.name: check_span(country, primary(mesh.band, mesh.channel))
         for mesh in fleet.meshes.values()
         if mesh.channel in CHANNELS[mesh.band] and not _has_conducted_limit(fleet, mesh)
     }
@@ -106,7 +106,7 @@ def eirp_above_country(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "The conducted power is above the FCC's limit",
     why="""At 2.4 and 5.8 GHz 47 CFR 15.247 allows 1 W (30 dBm) into the antenna, and 1 dB less for each dBi of antenna
     gain above 6; so 2 W hardware may not be driven to its rating, and 1 W hardware not with a large sector antenna.""",
-    mend="Lower `tx_power_dbm` by what the sum is too high, or use an antenna of less gain.",
+    fix="Lower `tx_power_dbm` by what the sum is too high, or use an antenna of less gain.",
     failing="""
     hardware: {rocket: {radios: {radio0: {rated_power_dbm: 33, amplifier_gain_db: 6, max_drive_dbm: 27}}}}
     defaults: {radios: {radio0: {tx_power_dbm: 27}}}
@@ -140,7 +140,7 @@ def _is_limited(fleet: Fleet, mesh: Mesh) -> bool:
     Severity.ERROR,
     "The drive level is above what the driver offers",
     why="The driver takes its own highest level and says nothing: the link budget on paper is not the one on the air.",
-    mend="Lower `tx_power_dbm` to the profile's `max_drive_dbm`.",
+    fix="Lower `tx_power_dbm` to the profile's `max_drive_dbm`.",
     failing="nodes: {b01: {radios: {radio0: {tx_power_dbm: 29}}}}",
     passing="nodes: {b01: {radios: {radio0: {tx_power_dbm: 25}}}}",
 )
@@ -157,7 +157,7 @@ def drive_above_driver(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     "The amplifier is driven beyond its rating",
     why="""An amplifier past its rating distorts: high rates fail first, neighbouring channels are disturbed, and it may
     not live long. A 2 W stage behind a full 1 W drive is the usual case.""",
-    mend="Lower `tx_power_dbm` until drive and amplifier together reach the rating.",
+    fix="Lower `tx_power_dbm` until drive and amplifier together reach the rating.",
     failing="""
     hardware: {rocket: {radios: {radio0: {rated_power_dbm: 30, amplifier_gain_db: 10}}}}
     defaults: {radios: {radio0: {tx_power_dbm: 24}}}
@@ -183,7 +183,7 @@ def amplifier_overdriven(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     "The hardware cannot reach its rated power",
     why="""The profile promises a class (1 W, 2 W) that its own numbers do not add up to: either the amplifier is
     missing from the profile, and every sum above is too low, or the rating is.""",
-    mend="Mend `rated_power_dbm`, `max_drive_dbm` or `amplifier_gain_db` from the data sheet.",
+    fix="Mend `rated_power_dbm`, `max_drive_dbm` or `amplifier_gain_db` from the data sheet.",
     failing="hardware: {rocket: {radios: {radio0: {rated_power_dbm: 33}}}}",
     passing="hardware: {rocket: {radios: {radio0: {rated_power_dbm: 28}}}}",
 )
@@ -191,7 +191,7 @@ def rating_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     for profile in fleet.hardware.values():
         for radio in profile.radios:
             most = radio.max_drive_dbm + radio.amplifier_gain_db
-            if most + _CLASS_TOLERANCE_DB < radio.rated_power_dbm <= _LARGEST_RATED_DBM:
+            if most + _CLASS_TOLERANCE_DB < radio.rated_power_dbm <= _MAX_RATED_DBM:
                 path = ("hardware", profile.name, "radios", radio.name, "rated_power_dbm")
                 found = f"{radio.max_drive_dbm} drive + {_dbm(radio.amplifier_gain_db)} amplifier = {_dbm(most)} dBm"
                 expected = f"a sum that reaches {_dbm(radio.rated_power_dbm)} dBm"
@@ -204,14 +204,14 @@ def rating_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     "A rated power looks like milliwatts",
     why="""Powers are in dBm: 1 W is 30, 2 W is 33. A number far above means that every check on power compares with
     nonsense.""",
-    mend="Write dBm: 10 times the logarithm of the milliwatts (1000 mW is 30 dBm).",
+    fix="Write dBm: 10 times the logarithm of the milliwatts (1000 mW is 30 dBm).",
     failing="hardware: {rocket: {radios: {radio0: {rated_power_dbm: 50}}}}",
     passing="hardware: {rocket: {radios: {radio0: {rated_power_dbm: 28}}}}",
 )
 def rating_in_milliwatts(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for profile in fleet.hardware.values():
         for radio in profile.radios:
-            if radio.rated_power_dbm > _LARGEST_RATED_DBM:
+            if radio.rated_power_dbm > _MAX_RATED_DBM:
                 path = ("hardware", profile.name, "radios", radio.name, "rated_power_dbm")
                 yield Finding(path, "not a power in dBm", "at most 40", _dbm(radio.rated_power_dbm))
 
@@ -222,7 +222,7 @@ def rating_in_milliwatts(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     "A directional antenna without gain",
     why="""A sector, panel or dish that gains nothing is a profile filled in by halves: the radiated power is
     understated by ten and more dB, and lint cannot see a breach of the limit.""",
-    mend="Write the antenna's gain from its data sheet in `antenna_gain_dbi`.",
+    fix="Write the antenna's gain from its data sheet in `antenna_gain_dbi`.",
     failing="hardware: {rocket: {radios: {radio0: {antenna: sector, antenna_gain_dbi: 0, beamwidth_deg: 120}}}}",
     passing="hardware: {rocket: {radios: {radio0: {antenna: sector, antenna_gain_dbi: 5, beamwidth_deg: 120}}}}",
 )
@@ -241,7 +241,7 @@ def directional_without_gain(fleet: Fleet, _context: LintContext) -> Iterator[Fi
     "Antenna kind and beamwidth contradict each other",
     why="""Coverage and the placing of beacons are judged by these two; an omni of 90 degrees, or a sector all around,
     is one of them copied from another profile.""",
-    mend="Give an omni 360 degrees, and a directional antenna the width of its beam.",
+    fix="Give an omni 360 degrees, and a directional antenna the width of its beam.",
     failing="hardware: {rocket: {radios: {radio0: {antenna: sector, beamwidth_deg: 360}}}}",
     passing="hardware: {rocket: {radios: {radio0: {antenna: sector, beamwidth_deg: 90}}}}",
 )
@@ -260,12 +260,12 @@ def beamwidth_contradicts(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     "A node is heard where it cannot be answered",
     why="""The strong radio's frames arrive, the weak one's acknowledgements do not: the strong node sends everything
     again and again, and the link looks good in one direction only.""",
-    mend="Bring the powers of the mesh's radios within 10 dB of each other.",
+    fix="Bring the powers of the mesh's radios within 10 dB of each other.",
     failing="nodes: {b01: {radios: {radio0: {tx_power_dbm: 10}}}}",
     passing="nodes: {b01: {radios: {radio0: {tx_power_dbm: 20}}}}",
 )
 def powers_far_apart(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    by_mesh = grouped((mesh.name, (node, radio)) for node, radio, mesh in _transmitting(fleet))
+    by_mesh = group_by_key((mesh.name, (node, radio)) for node, radio, mesh in _transmitting(fleet))
     for name, members in by_mesh.items():
         strongest, strong = max(members, key=lambda member: member[1].conducted_dbm)
         for node, radio in members:
@@ -282,7 +282,7 @@ def powers_far_apart(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "Two radios of a profile have the same device path",
     why="""The path is how a node finds its radio again after a reboot: with one path twice, both sections configure the
     same radio and the other stays off.""",
-    mend="Read the paths off a device: `uci get wireless.radio0.path`.",
+    fix="Read the paths off a device: `uci get wireless.radio0.path`.",
     failing="hardware: {rocket: {radios: {radio1: {path: pci0000:00/0000:00:00.0}}}}",
     passing="hardware: {rocket: {radios: {radio1: {path: pci0000:00/0000:00:01.0}}}}",
 )

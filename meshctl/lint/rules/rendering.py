@@ -18,7 +18,7 @@ from meshctl.resolve import resolve
 # stands for every secret: it is allowed as a passphrase, and never leaves this module
 _PLACEHOLDER = Secret("placeholder-for-lint")
 # a path from the inventory can be as long as the file
-_SHOWN_LETTERS = 200
+_MAX_SHOWN_CHARACTERS = 200
 _TEMPLATE_CODES = (TEMPLATE, NOT_UCI, NO_TEMPLATE, EXTRA)
 
 
@@ -57,7 +57,7 @@ def _holds_own_text(fleet: Fleet, node: Node) -> bool:
     "A template fails, or writes no UCI",
     why="""The template of the operator's own (or of the back end's parts) stops, or writes text that OpenWrt cannot
     read: found out at the first `provision`, unless it is found out here.""",
-    mend="Mend the template; `meshctl render NODE` shows its place.",
+    fix="Mend the template; `meshctl render NODE` shows its place.",
     failing=Example(
         "apply: {max_down: 1}", files={"templates/common/etc/config/extra.j2": "config {{ intent.no_such_value }}\n"}
     ),
@@ -71,7 +71,7 @@ def template_fails(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if isinstance(outcome, Rendered):
             continue
         if isinstance(outcome, OSError):
-            found = f"{outcome.filename or 'it'}: {outcome.strerror}"[:_SHOWN_LETTERS]
+            found = f"{outcome.filename or 'it'}: {outcome.strerror}"[:_MAX_SHOWN_CHARACTERS]
             yield Finding(("meshes",), "templates cannot be read", "a folder of templates", found)
             return
         for item in outcome.diagnostics:
@@ -87,7 +87,7 @@ def template_fails(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     why="""From 23.05 OpenWrt rejects what no zone allows, and meshctl's own template does so on every release. It
     renders a zone for the management network; a template of your own, or extra text behind it, that leaves the zone out
     or closes it shuts the operator out.""",
-    mend="Keep a zone with `list network 'lan'` and `option input 'ACCEPT'` in the firewall package.",
+    fix="Keep a zone with `list network 'lan'` and `option input 'ACCEPT'` in the firewall package.",
     failing="nodes: {b01: {extra_uci: {firewall.management.input: REJECT}}}",
     passing="nodes: {b01: {extra_uci: {firewall.management.masq: '1'}}}",
 )
@@ -137,7 +137,7 @@ def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Rendered | InvalidInput | OS
     why="""UCI holds any text, but the programs behind it do not: netifd's scripts put values into shell commands, the
     supplicant reads lines. `meshctl render` refuses such a value; here it is found with all the others. Where a rule of
     its own speaks of the same place, this one is silent.""",
-    mend="Write the value as it is expected.",
+    fix="Write the value as it is expected.",
     failing="nodes: {b01: {extra_uci: {'wireless.radio0 .rts': '500'}}}",
     passing="nodes: {b01: {extra_uci: {wireless.radio0.rts: '500'}}}",
     is_fallback=True,

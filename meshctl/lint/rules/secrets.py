@@ -10,7 +10,7 @@ from pathlib import Path
 
 from meshctl.diagnostics import Position, Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import repeated
+from meshctl.lint.grouping import duplicates
 from meshctl.lint.rule import Example, Finding, fleet_rule, text_rule
 from meshctl.model import Fleet, Secret, SecretKind, SecretRef, SshSettings
 from meshctl.render.daemon import key_bytes, key_text
@@ -18,10 +18,10 @@ from meshctl.render.daemon import key_bytes, key_text
 # what udp_mesh takes (udp_mesh/crypto/keys.py)
 _KEY_BYTES = 32
 _SAFE_MODE_MASK = 0o077
-_LEAST_DIFFERENT_BYTES = 16
+_MIN_DISTINCT_BYTES = 16
 _TRANSPORT_KEY = "b4f8e7f0c3a94c21a1d2d9a0f5c36e7722d1b6c8e3f04a5b9c7d8e1f2a3b4c5d"
 
-_MATERIAL = (
+_KEY_MATERIAL = (
     (re.compile(r"-----BEGIN [A-Z0-9 ]*PRIVATE KEY-----"), "a private key"),
     (re.compile(r"AGE-SECRET-KEY-1[0-9A-Z]{20,}"), "an age identity"),
     (re.compile(r"untrusted comment: (?:OpenWrt )?(?:secret|private) key", re.IGNORECASE), "a usign secret key"),
@@ -85,13 +85,13 @@ def logins(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SshSettings]]:
     "Key material stands in the inventory",
     why="""The inventory is kept in git, copied to laptops and pasted into chats: a key that ever stood in it is public,
     also after it was removed.""",
-    mend="Refer to it instead (`{env: NAME}`, `{file: ...}` or `{age: ...}`), and make a new key.",
+    fix="Refer to it instead (`{env: NAME}`, `{file: ...}` or `{age: ...}`), and make a new key.",
     failing="system: {log_host: 10.42.0.100}  # psk: 5f4dcc3b5aa765d61d8327deb882cf99",
     passing="system: {log_host: 10.42.0.100}  # the key is in the vault",
 )
 def key_material(file: str, text: str) -> Iterator[Finding]:
     for number, line in enumerate(text.splitlines(), 1):
-        for pattern, what in _MATERIAL:
+        for pattern, what in _KEY_MATERIAL:
             match = pattern.search(line)
             if match is not None:
                 place = Position(file, number, match.start() + 1)
@@ -104,7 +104,7 @@ def key_material(file: str, text: str) -> Iterator[Finding]:
     Severity.ERROR,
     "A file with a secret can be read by others",
     why="Everybody with a login on the operator's machine, and every program that runs there, has the fleet's key.",
-    mend="`chmod 600` the file.",
+    fix="`chmod 600` the file.",
     failing=Example(
         "udp_mesh: {keys: [{file: mode-0644.key}]}",
         files={"mode-0644.key": _TRANSPORT_KEY},
@@ -126,7 +126,7 @@ def secret_readable(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "A file with a secret lies inside the repository",
     why="The next `git add .` publishes it.",
-    mend="Move it out of the repository, list it in .gitignore, or encrypt it with age.",
+    fix="Move it out of the repository, list it in .gitignore, or encrypt it with age.",
     failing=Example(
         "udp_mesh: {keys: [{file: fleet.key}]}",
         files={".git/HEAD": "ref: refs/heads/main", "fleet.key": _TRANSPORT_KEY},
@@ -148,7 +148,7 @@ def secret_in_repository(fleet: Fleet, context: LintContext) -> Iterator[Finding
     "An encrypted file that a secret refers to is missing",
     why="""An encrypted file is meant to travel with the inventory. Without it nobody can render anything, and it is
     better to learn that now than in the field.""",
-    mend="Commit the file, or mend the path: it is relative to the file that names it.",
+    fix="Commit the file, or mend the path: it is relative to the file that names it.",
     failing="udp_mesh: {keys: [{age: absent.age, key: udp_mesh}]}",
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}]}",
 )
@@ -165,7 +165,7 @@ def secret_file_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]
     why="""udp_mesh takes 32 random bytes, as 64 hexadecimal digits or in base64, and refuses to start with anything
     else. A word or a short key would be found by trying: a few seconds of recorded traffic are enough to try
     against.""",
-    mend="Make a new one: `udp-mesh keygen FILE` or `openssl rand -hex 32`.",
+    fix="Make a new one: `udp-mesh keygen FILE` or `openssl rand -hex 32`.",
     failing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": "husky2021"}),
     # as `udp-mesh keygen` writes it, with the key's id behind it
     passing=Example(
@@ -186,7 +186,7 @@ def transport_key_invalid(fleet: Fleet, context: LintContext) -> Iterator[Findin
     Severity.ERROR,
     "The transport has no key",
     why="Without a fleet key anyone in reach can send an emergency stop, or lift one.",
-    mend="Say where the key is: `udp_mesh: {keys: [{env: UDP_MESH_KEY}]}`.",
+    fix="Say where the key is: `udp_mesh: {keys: [{env: UDP_MESH_KEY}]}`.",
     failing="udp_mesh: {keys: []}",
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}]}",
 )
@@ -202,20 +202,20 @@ def transport_key_missing(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     "One secret is used for two things",
     why="""The Wi-Fi passphrase is on every radio, in flash, and in the hands of whoever finds a lost beacon. If it is
     the transport's key as well, a lost beacon opens everything.""",
-    mend="Use a secret of its own for each.",
+    fix="Use a secret of its own for each.",
     failing=Example("udp_mesh: {keys: [{env: MESH_KEY}]}", environment={"MESH_KEY": _TRANSPORT_KEY}),
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}]}",
 )
 def secret_shared(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    mesh_keys = {_mark(context, ref): place for place, ref in secret_refs(fleet) if place[0] == "meshes"}
+    mesh_keys = {_identity(context, ref): place for place, ref in secret_refs(fleet) if place[0] == "meshes"}
     for index, ref in enumerate(fleet.udp_mesh.keys):
-        place = mesh_keys.get(_mark(context, ref))
+        place = mesh_keys.get(_identity(context, ref))
         if place is not None:
             message = f"also the key of {place[0]}.{place[1]}"
             yield Finding(("udp_mesh", "keys", str(index)), message, "a secret of its own", str(ref))
 
 
-def _mark(context: LintContext, ref: SecretRef) -> Hashable:
+def _identity(context: LintContext, ref: SecretRef) -> Hashable:
     """What two references to one secret share: its value where that is at hand, else where it is."""
     secret = context.secret(ref)
     return (ref.kind, ref.where, ref.key) if secret is None else Secret(key_text(secret))
@@ -226,13 +226,13 @@ def _mark(context: LintContext, ref: SecretRef) -> Hashable:
     Severity.WARNING,
     "One transport key is listed twice",
     why="Two live keys are for a change of keys: the old beside the new. The same one twice rotates nothing.",
-    mend="List the new key first and the old one behind it; take the old one out when all robots have the new.",
+    fix="List the new key first and the old one behind it; take the old one out when all robots have the new.",
     failing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: UDP_MESH_KEY}]}",
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: UDP_MESH_OLD_KEY}]}",
 )
 def transport_key_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    marks = ((_mark(context, ref), index) for index, ref in enumerate(fleet.udp_mesh.keys))
-    for _, indexes in repeated(marks):
+    marks = ((_identity(context, ref), index) for index, ref in enumerate(fleet.udp_mesh.keys))
+    for _, indexes in duplicates(marks):
         for index in indexes[1:]:
             found = str(fleet.udp_mesh.keys[index])
             yield Finding(("udp_mesh", "keys", str(index)), "the same key stands above", "another key", found)
@@ -244,7 +244,7 @@ def transport_key_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]
     "More than two transport keys are live",
     why="""udp_mesh holds two keys: the one it seals with and the one before. A third is never tried, and robots that
     still use it fall silent.""",
-    mend="Finish the change of keys: leave the new one and at most one old one.",
+    fix="Finish the change of keys: leave the new one and at most one old one.",
     failing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: SECOND}, {env: THIRD}]}",
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: SECOND}]}",
 )
@@ -260,7 +260,7 @@ def too_many_transport_keys(fleet: Fleet, _context: LintContext) -> Iterator[Fin
     "A file of secrets lacks the secret",
     why="""The file is here, and what the inventory looks for in it is not: rendering and provisioning stop at this
     reference, in the field if not here.""",
-    mend="Correct `key`, or add the entry to the file.",
+    fix="Correct `key`, or add the entry to the file.",
     failing=Example(
         "udp_mesh: {keys: [{file: mode-0600.yaml, key: udp-mesh}]}",
         files={"mode-0600.yaml": f"udp_mesh: {_TRANSPORT_KEY}\n"},
@@ -290,7 +290,7 @@ def secret_absent(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "The variable of a secret is empty",
     why="""The variable is set, to nothing: a misspelt name on the right of `export`, or a CI job without access to its
     secrets. Rendering refuses it like one that is not set.""",
-    mend="Export the secret, or unset the variable where secrets are not needed.",
+    fix="Export the secret, or unset the variable where secrets are not needed.",
     failing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": ""}),
     passing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": _TRANSPORT_KEY}),
 )
@@ -306,7 +306,7 @@ def variable_empty(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "A file with a key is not on this machine",
     why="""Continuous integration has no keys, and need not. The operator's laptop must have them: without the file,
     rendering or logging in fails.""",
-    mend="Copy the file to this machine, or correct the path: it is relative to the file that names it.",
+    fix="Copy the file to this machine, or correct the path: it is relative to the file that names it.",
     failing="nodes: {base: {ssh: {key_files: [absent_ed25519]}}}",
     passing=Example("nodes: {base: {ssh: {key_files: [id_ed25519]}}}", files={"id_ed25519": "a private key"}),
 )
@@ -322,7 +322,7 @@ def key_file_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "The transport's key can be guessed",
     why="""32 bytes of zeros, one byte repeated or a count are keys in form only: they are the first ones to be tried,
     and anyone who finds one can stop every robot.""",
-    mend="Make a new one: `udp-mesh keygen FILE` or `openssl rand -hex 32`.",
+    fix="Make a new one: `udp-mesh keygen FILE` or `openssl rand -hex 32`.",
     failing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": "0" * 64}),
     passing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": _TRANSPORT_KEY}),
 )
@@ -337,4 +337,4 @@ def transport_key_guessable(fleet: Fleet, context: LintContext) -> Iterator[Find
 def _is_pattern(raw: bytes) -> bool:
     """Few different bytes (32 random ones have 30, and never below 16), or all of them at one distance."""
     distances = {(second - first) % 256 for first, second in pairwise(raw)}
-    return len(set(raw)) < _LEAST_DIFFERENT_BYTES or len(distances) == 1
+    return len(set(raw)) < _MIN_DISTINCT_BYTES or len(distances) == 1

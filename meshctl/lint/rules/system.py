@@ -8,7 +8,7 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.addresses import as_address
-from meshctl.lint.rules.references import known
+from meshctl.lint.rules.references import suggest
 from meshctl.lint.zones import is_posix, posix_of, same_clock, zones
 from meshctl.model import Fleet
 
@@ -19,7 +19,7 @@ from meshctl.model import Fleet
     "The time zone is not a POSIX time zone",
     why="""OpenWrt's C library reads `timezone` and knows no names such as America/Denver: it falls back to UTC
     without a word, and the radios' logs are hours apart from everyone's notes.""",
-    mend="Write the POSIX string in `timezone`, and the name in `zonename`.",
+    fix="Write the POSIX string in `timezone`, and the name in `zonename`.",
     failing="system: {timezone: America/Denver}",
     passing="system: {timezone: 'MST7MDT,M3.2.0,M11.1.0', zonename: America/Denver}",
 )
@@ -37,14 +37,14 @@ def timezone_not_posix(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     Severity.WARNING,
     "The name of the time zone is not known",
     why="OpenWrt links /tmp/localtime to the zone's file. With a name that no zone has, the link is not made.",
-    mend="Write a name of the time zone database, such as America/New_York.",
+    fix="Write a name of the time zone database, such as America/New_York.",
     failing="system: {timezone: 'MST7MDT,M3.2.0,M11.1.0', zonename: America/Dever}",
     passing="system: {timezone: 'MST7MDT,M3.2.0,M11.1.0', zonename: America/Denver}",
 )
 def zonename_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     name = fleet.system.zonename
     if name and posix_of(name) is None:
-        _, hint = known(_near_by(name), name)
+        _, hint = suggest(_near_by(name), name)
         yield Finding(("system", "zonename"), "no such zone", "a name of the time zone database", name, hint)
 
 
@@ -61,7 +61,7 @@ def _near_by(name: str) -> list[str]:
     "The time zone and its name disagree",
     why="""Which of the two counts depends on the packages in the image: with zoneinfo the name, without it the POSIX
     string. Nodes of two images then have two clocks.""",
-    mend="Write the POSIX string of the zone that is named.",
+    fix="Write the POSIX string of the zone that is named.",
     failing="system: {timezone: 'CST6CDT,M3.2.0,M11.1.0', zonename: America/Denver}",
     passing="system: {timezone: 'MST7MDT,M3.2.0,M11.1.0', zonename: America/Denver}",
 )
@@ -81,7 +81,7 @@ def zone_disagrees(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "Logs or the time come from an unknown address",
     why="""The address lies in the fleet's network, and no node and no computer of the inventory has it. If it is a
     slip, the logs are lost, and that shows only when they are needed.""",
-    mend="Name the address of a computer, or suppress this finding for a server that the inventory does not know.",
+    fix="Name the address of a computer, or suppress this finding for a server that the inventory does not know.",
     failing="system: {log_host: 10.42.0.77}",
     passing="system: {log_host: 10.42.0.100}",
 )

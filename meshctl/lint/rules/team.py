@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, listed, repeated
+from meshctl.lint.grouping import duplicates, group_by_key, join_limited
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, NodeState, Role
@@ -19,7 +19,7 @@ from meshctl.model import Fleet, NodeState, Role
     "A mesh has no route to the base",
     why="""Its nodes talk to each other and to nobody who could stop them: no node, and no robot with radios in several
     meshes, joins it to the mesh of the base station.""",
-    mend="Give the base a radio in this mesh, or a robot radios in both.",
+    fix="Give the base a radio in this mesh, or a robot radios in both.",
     failing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 2g, channel: 11, network: 10.43.0.0/24,
@@ -45,13 +45,13 @@ def mesh_cut_off(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     reached = _reached_from_base(fleet)
     if not reached:
         return
-    members_of = grouped((mesh, node.name) for node in fleet.managed() for mesh in node.meshes)
+    members_of = group_by_key((mesh, node.name) for node in fleet.managed() for mesh in node.meshes)
     for name in fleet.meshes:
         members = members_of.get(name, ())
         if members and name not in reached:
             path = ("meshes", name)
-            message = f"{len(members)} nodes ({listed(members)}) cannot reach the base"
-            yield Finding(path, message, f"a radio in {listed(sorted(reached))} as well", "none")
+            message = f"{len(members)} nodes ({join_limited(members)}) cannot reach the base"
+            yield Finding(path, message, f"a radio in {join_limited(sorted(reached))} as well", "none")
 
 
 def _reached_from_base(fleet: Fleet) -> set[str]:
@@ -66,7 +66,7 @@ def _reached_from_base(fleet: Fleet) -> set[str]:
     for robot in fleet.robots.values():
         nodes = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
         joints.append({mesh for node in nodes if node.state.is_managed for mesh in node.meshes})
-    joints_of = grouped((mesh, joint) for joint in joints for mesh in joint)
+    joints_of = group_by_key((mesh, joint) for joint in joints for mesh in joint)
     reached: set[str] = set()
     waiting = list(start)
     while waiting:
@@ -85,7 +85,7 @@ def _reached_from_base(fleet: Fleet) -> set[str]:
     "The fleet has no base",
     why="""Plans order nodes by their distance from the operator, and keep the way to them open until the last. Without
     a base there is no such order.""",
-    mend="Give the operator's radio `role: base`.",
+    fix="Give the operator's radio `role: base`.",
     failing="nodes: {base: {role: robot}}",
     passing="nodes: {base: {role: base}}",
 )
@@ -100,12 +100,12 @@ def no_base(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "The mesh has too few beacons",
     why="The chain will not reach as deep as planned, and there is none to spare for one that falls on its antenna.",
-    mend="Add beacons, mark repaired ones as `carried`, or lower `min_beacons`.",
+    fix="Add beacons, mark repaired ones as `carried`, or lower `min_beacons`.",
     failing="meshes: {main: {min_beacons: 3}}",
     passing="meshes: {main: {min_beacons: 1}}",
 )
 def too_few_beacons(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    ready = grouped(
+    ready = group_by_key(
         (mesh, node.name)
         for node in fleet.managed()
         if node.role is Role.BEACON and node.state is not NodeState.SPARE
@@ -123,14 +123,14 @@ def too_few_beacons(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "Two robots are the base station",
     why="udp_mesh sends what is for the base to one peer; with two, half of the reports go to the wrong one.",
-    mend="Set `is_base: true` at one robot only.",
+    fix="Set `is_base: true` at one robot only.",
     failing="robots: {husky1: {is_base: true}}",
     passing="robots: {husky1: {is_base: false}}",
 )
 def two_bases(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     bases = [robot.name for robot in fleet.robots.values() if robot.is_base]
     for name in bases[1:]:
-        yield Finding(("robots", name, "is_base"), f"{bases[0]} is the base as well", "one base", listed(bases))
+        yield Finding(("robots", name, "is_base"), f"{bases[0]} is the base as well", "one base", join_limited(bases))
 
 
 @fleet_rule(
@@ -138,7 +138,7 @@ def two_bases(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "Two robots claim one node",
     why="A radio rides on one robot: the loop check, the order of changes and the status page of both would be wrong.",
-    mend="Leave the node with the robot it is mounted on.",
+    fix="Leave the node with the robot it is mounted on.",
     failing="robots: {base-station: {nodes: [base, husky1-front]}}",
     passing="robots: {base-station: {nodes: [base]}}",
 )
@@ -150,7 +150,7 @@ def node_of_two_robots(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
         for key, names in (("nodes", robot.nodes), ("carries", robot.carries))
         for name in names
     )
-    for (key, name), (first, *others) in repeated(claims):
+    for (key, name), (first, *others) in duplicates(claims):
         for robot in others:
             message = f"{name} is claimed by {first} already"
             yield Finding(("robots", robot, key, name), message, "one robot for each node", name)
@@ -176,7 +176,7 @@ def _mounted(fleet: Fleet) -> set[str]:
     "A node and a robot disagree about who rides where",
     why="""The node says it rides on one robot, another robot lists it: one of the two lines was not changed when the
     radio was moved.""",
-    mend="Say it in one place: leave `robot` out at the node, or mend the robot's list.",
+    fix="Say it in one place: leave `robot` out at the node, or mend the robot's list.",
     failing="nodes: {husky1-front: {robot: base-station}}",
     passing="nodes: {husky1-front: {robot: husky1}}",
 )
@@ -197,7 +197,7 @@ def robot_disagrees(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "A robot carries what is no beacon",
     why="""What a robot carries is dropped, or flies off: a beacon, or the radio of a robot that is brought along and
     has an entry of its own. A base radio, or a robot's radio that no robot has under `nodes`, is a slip.""",
-    mend="List beacons and the radios of carried robots under `carries`, and mounted radios under `nodes`.",
+    fix="List beacons and the radios of carried robots under `carries`, and mounted radios under `nodes`.",
     failing="""
     nodes: {extra: {role: robot, address: 10.42.0.60, robot: husky1}}
     robots: {husky1: {carries: [b01, extra]}}
@@ -226,7 +226,7 @@ def carries_no_beacon(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "A carried beacon is on no robot",
     why="""A beacon that is `carried` may be off and raises no alarm. If no robot carries it, it is in nobody's rack,
     and will be missed when it is wanted.""",
-    mend="List it under a robot's `carries`, or set its state to `spare`.",
+    fix="List it under a robot's `carries`, or set its state to `spare`.",
     failing="nodes: {b02: {role: beacon, state: carried, address: 10.42.0.102}}",
     passing="""
     nodes: {b02: {role: beacon, state: carried, address: 10.42.0.102}}
@@ -246,7 +246,7 @@ def carried_by_nobody(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "A robot has no radio",
     why="Without a managed node it hears nobody, and nobody can stop it.",
-    mend="List its radio under `nodes`; a lost one does not count.",
+    fix="List its radio under `nodes`; a lost one does not count.",
     failing="""
     nodes: {husky1-front: {state: lost}}
     """,
@@ -256,7 +256,7 @@ def robot_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     for robot in fleet.robots.values():
         known = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
         if len(known) == len(robot.nodes) and not any(node.state.is_managed for node in known):
-            found = listed([f"{node.name} ({node.state.value})" for node in known]) or "none"
+            found = join_limited([f"{node.name} ({node.state.value})" for node in known]) or "none"
             yield Finding(("robots", robot.name), "no radio is in use", "at least one managed node", found)
 
 
@@ -266,7 +266,7 @@ def robot_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     "A radio of a robot rides on none",
     why="""A node with `role: robot` moves, and with it everything behind it; without its robot, lint cannot see loops,
     nor plans whom a change cuts off.""",
-    mend="List it under the robot's `nodes`, or give it another role.",
+    fix="List it under the robot's `nodes`, or give it another role.",
     failing="nodes: {stray: {role: robot, address: 10.42.0.77}}",
     passing="""
     nodes: {stray: {role: robot, address: 10.42.0.77}}
@@ -284,7 +284,7 @@ def robot_radio_without_robot(fleet: Fleet, _context: LintContext) -> Iterator[F
     Severity.WARNING,
     "The base is not deployed",
     why="Everything is reached through the base. As `carried` or `spare` it may be off, and status would not alarm.",
-    mend="Set its state to `deployed`.",
+    fix="Set its state to `deployed`.",
     failing="nodes: {base: {state: spare}}",
     passing="nodes: {base: {state: deployed}}",
 )
@@ -300,7 +300,7 @@ def base_not_deployed(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "A way leads through a node that is not in use",
     why="The jump host is lost, retired or still in its box: the node behind it cannot be reached.",
-    mend="Jump through a node that is deployed.",
+    fix="Jump through a node that is deployed.",
     failing="""
     nodes:
       old: {role: beacon, state: lost, address: 10.42.0.66}
@@ -322,12 +322,12 @@ def jump_not_in_use(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "Most of a mesh may be changed at once",
     why="With more than half of the nodes down together, a bad change takes the mesh and the way to mend it.",
-    mend="Lower `apply.max_down`: one at a time is safe, a fifth of the mesh is usual.",
+    fix="Lower `apply.max_down`: one at a time is safe, a fifth of the mesh is usual.",
     failing="apply: {max_down: 3}",
     passing="apply: {max_down: 1}",
 )
 def max_down_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    sizes = grouped((mesh, node.name) for node in fleet.managed() for mesh in node.meshes)
+    sizes = group_by_key((mesh, node.name) for node in fleet.managed() for mesh in node.meshes)
     smallest = min((len(names) for names in sizes.values()), default=0)
     if smallest > 1 and fleet.apply.max_down > max(smallest // 2, 1):
         expected = f"at most {max(smallest // 2, 1)}"
@@ -340,7 +340,7 @@ def max_down_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "Many nodes are changed without trying one first",
     why="Without a canary the first node that shows a mistake is one of many that have it.",
-    mend="Set `apply.canary: true`.",
+    fix="Set `apply.canary: true`.",
     failing="apply: {canary: false}",
     passing="apply: {canary: true}",
 )
@@ -355,7 +355,7 @@ def no_canary(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The quorum is below one half",
     why="""A change of the whole cell is kept when the quorum forms again. Below a half, a split mesh counts as success,
     and both parts may keep different configurations.""",
-    mend="Set `apply.quorum` to 0.6 or more.",
+    fix="Set `apply.quorum` to 0.6 or more.",
     failing="apply: {quorum: 0.4}",
     passing="apply: {quorum: 0.8}",
 )
@@ -370,7 +370,7 @@ def quorum_low(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "A run goes on after many failures",
     why="The second node that fails the same way says what the tenth would: by then ten have to be mended by hand.",
-    mend="Set `apply.stop_after_failures` to 1 or 2.",
+    fix="Set `apply.stop_after_failures` to 1 or 2.",
     failing="apply: {stop_after_failures: 10}",
     passing="apply: {stop_after_failures: 2}",
 )
@@ -386,7 +386,7 @@ def stops_late(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "A robot that sends or gets messages has no computer",
     why="""udp_mesh runs on the robot's computer: a topic that names a robot without one is never sent, or never
     arrives.""",
-    mend="Give the robot a `computer`, or `fielded` while it runs the fielded program, or take it out of the topic.",
+    fix="Give the robot a `computer`, or `fielded` while it runs the fielded program, or take it out of the topic.",
     failing="robots: {husky1: {computer: <removed>}}",
     passing="robots: {husky1: {computer: {python: python3}}}",
 )
@@ -406,7 +406,7 @@ def peer_without_computer(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     "No robot is the base station",
     why="""udp_mesh runs on computers, and none of them is the operator's: status cannot say who reaches the base, nor
     preflight whether the emergency stop does.""",
-    mend="Set `is_base: true` at the robot that stands for the operator's computer.",
+    fix="Set `is_base: true` at the robot that stands for the operator's computer.",
     failing="robots: {base-station: {is_base: false}}",
     passing="robots: {base-station: {is_base: true}}",
 )
@@ -423,7 +423,7 @@ def no_base_station(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "The base joins no mesh",
     why="Every way to the fleet begins at the base. Without a radio in a mesh nothing behind it can be reached.",
-    mend="Name the mesh at one of its radios.",
+    fix="Name the mesh at one of its radios.",
     failing="nodes: {base: {radios: {radio0: {mesh: null}}}}",
     passing="nodes: {base: {radios: {radio0: {mesh: main}}}}",
 )

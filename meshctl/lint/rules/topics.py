@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, listed
+from meshctl.lint.grouping import group_by_key, join_limited
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.references import known
+from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet, Outbox, Topic, TopicClass
 
 _ALL = "all"
@@ -43,7 +43,7 @@ def _at(topic: Topic, *key: str) -> tuple[str, ...]:
     "Something is as urgent as the emergency stop",
     why="""udp_mesh sends strictly by priority, and within one level in turn: whatever shares the emergency stop's
     level, or stands above it, is sent before it, for as long as there is any.""",
-    mend="Give the emergency stop a level of its own, 0, and everything else a larger number.",
+    fix="Give the emergency stop a level of its own, 0, and everything else a larger number.",
     failing="topics: {commands: {priority: 0}}",
     passing="topics: {commands: {priority: 1}}",
 )
@@ -64,7 +64,7 @@ def stop_not_first(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "Bulk is as urgent as commands",
     why="""Maps and video fill every gap in the air. On the level of commands, or above, they fill it before the
     supervisor's orders.""",
-    mend="Give maps and video larger numbers than every command.",
+    fix="Give maps and video larger numbers than every command.",
     failing="topics: {video: {priority: 1}}",
     passing="topics: {video: {priority: 9}}",
 )
@@ -87,16 +87,16 @@ def bulk_above_commands(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     "Topics of different classes share a priority",
     why="""On one level topics take turns: a large map piece delays a telemetry message by as many fragments as it has.
     Nobody decided that.""",
-    mend="Give each class a level of its own: there are sixteen.",
+    fix="Give each class a level of its own: there are sixteen.",
     failing="topics: {telemetry: {priority: 3}}",
     passing="topics: {telemetry: {priority: 4}}",
 )
 def classes_tie(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for level, topics in grouped((topic.priority, topic) for topic in fleet.topics).items():
+    for level, topics in group_by_key((topic.priority, topic) for topic in fleet.topics).items():
         classes = dict.fromkeys(topic.topic_class for topic in topics if topic.topic_class is not TopicClass.OTHER)
         if len(classes) > 1 and not any(topic.topic_class in _URGENT for topic in topics):
             later = next(topic for topic in topics if topic.topic_class is not topics[0].topic_class)
-            found = f"{level} for {listed([topic.name for topic in topics])}"
+            found = f"{level} for {join_limited([topic.name for topic in topics])}"
             yield Finding(_at(later, "priority"), f"takes turns with {topics[0].name}", "a level of its own", found)
 
 
@@ -106,7 +106,7 @@ def classes_tie(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "A class is more urgent than a class that should go before it",
     why="""Reports of artifacts are what the run is scored by; telemetry comes again in a second, a map piece can wait a
     minute. An order that is turned around is usually a slip of one number.""",
-    mend="Order the levels: emergency stop, command, artifact, telemetry, map, video.",
+    fix="Order the levels: emergency stop, command, artifact, telemetry, map, video.",
     failing="topics: {telemetry: {priority: 10}}",
     passing="topics: {telemetry: {priority: 4}}",
 )
@@ -134,7 +134,7 @@ def order_turned(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "There is no emergency stop",
     why="""A fleet of robots that can be told everything but to stop. If the stop goes another way, say so in a
     suppression.""",
-    mend="Add a topic of `class: emergency_stop` with priority 0.",
+    fix="Add a topic of `class: emergency_stop` with priority 0.",
     failing="topics: {estop: {class: other}}",
     passing="topics: {estop: {class: emergency_stop}}",
 )
@@ -148,7 +148,7 @@ def no_emergency_stop(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "The emergency stop is best effort",
     why="A lost datagram is not sent again: the operator presses the button and one robot keeps walking.",
-    mend="Set `reliable: true`.",
+    fix="Set `reliable: true`.",
     failing="topics: {estop: {reliable: false}}",
     passing="topics: {estop: {reliable: true}}",
 )
@@ -163,7 +163,7 @@ def stop_best_effort(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "The emergency stop does not reach every robot",
     why="A robot that was added later, or forgotten, does not stop with the others.",
-    mend="Write `destinations: [all]`.",
+    fix="Write `destinations: [all]`.",
     failing="topics: {estop: {sources: [husky1], destinations: [base-station]}}",
     passing="topics: {estop: {destinations: [all]}}",
 )
@@ -174,7 +174,10 @@ def stop_not_for_all(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         missing = [name for name, robot in fleet.robots.items() if not robot.is_base and name not in topic.destinations]
         if missing:
             yield Finding(
-                _at(topic, "destinations"), f"{listed(missing)} would not stop", "all", listed(topic.destinations)
+                _at(topic, "destinations"),
+                f"{join_limited(missing)} would not stop",
+                "all",
+                join_limited(topic.destinations),
             )
 
 
@@ -184,7 +187,7 @@ def stop_not_for_all(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The emergency stop is held back",
     why="""A rate limit or a deadline drops exactly the stop that was pressed twice, or that came late because the link
     was bad.""",
-    mend="Take `rate_limit_bytes_per_s` and `deadline_s` away from the emergency stop.",
+    fix="Take `rate_limit_bytes_per_s` and `deadline_s` away from the emergency stop.",
     failing="topics: {estop: {deadline_s: 1}}",
     passing="topics: {estop: {keep_last: 1}}",
 )
@@ -204,7 +207,7 @@ def stop_held_back(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "A destination does not exist",
     why="Messages for a peer that nobody is wait until they expire; the reader believes they are delivered.",
-    mend="Name a robot of `robots`, or `all`.",
+    fix="Name a robot of `robots`, or `all`.",
     failing="topics: {commands: {destinations: [husky1, huskey2]}}",
     passing="topics: {commands: {destinations: [husky1]}}",
 )
@@ -212,7 +215,7 @@ def destination_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     for topic in fleet.topics:
         for index, name in enumerate(topic.destinations):
             if name != _ALL and name not in fleet.robots:
-                expected, hint = known((*fleet.robots, _ALL), name)
+                expected, hint = suggest((*fleet.robots, _ALL), name)
                 yield Finding(_at(topic, "destinations", str(index)), "no such robot", expected, name, hint)
 
 
@@ -221,7 +224,7 @@ def destination_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     Severity.ERROR,
     "A source does not exist",
     why="The topic is bridged on no robot: nothing is ever sent, and nothing says so.",
-    mend="Name a robot of `robots`, or leave `sources` out for all of them.",
+    fix="Name a robot of `robots`, or leave `sources` out for all of them.",
     failing="topics: {commands: {sources: [base]}}",
     passing="topics: {commands: {sources: [base-station]}}",
 )
@@ -229,7 +232,7 @@ def source_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
         for index, name in enumerate(topic.sources):
             if name not in fleet.robots:
-                expected, hint = known(fleet.robots, name)
+                expected, hint = suggest(fleet.robots, name)
                 yield Finding(_at(topic, "sources", str(index)), "no such robot", expected, name, hint)
 
 
@@ -238,7 +241,7 @@ def source_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "A topic goes nowhere",
     why="Its only destination is its only source, or it has none: it takes memory and settings, and carries nothing.",
-    mend="Name other destinations, or remove the topic.",
+    fix="Name other destinations, or remove the topic.",
     failing="topics: {commands: {sources: [base-station], destinations: [base-station]}}",
     passing="topics: {commands: {sources: [base-station], destinations: [husky1]}}",
 )
@@ -247,7 +250,7 @@ def topic_to_itself(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if not topic.destinations or (
             topic.sources and set(topic.destinations) == set(topic.sources) and len(topic.sources) == 1
         ):
-            found = listed(topic.destinations) or "none"
+            found = join_limited(topic.destinations) or "none"
             yield Finding(_at(topic, "destinations"), "reaches nobody else", "another robot, or all", found)
 
 
@@ -257,7 +260,7 @@ def topic_to_itself(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "Video is sent reliably",
     why="""Sending an old frame again delays the new one: on a bad link a reliable video falls minutes behind, and fills
     the queue with what nobody wants to see any more.""",
-    mend="Set `reliable: false`, with `keep_last: 1`.",
+    fix="Set `reliable: false`, with `keep_last: 1`.",
     failing="topics: {video: {reliable: true}}",
     passing="topics: {video: {reliable: false}}",
 )
@@ -273,7 +276,7 @@ def video_reliable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "A best-effort message is too large to arrive",
     why="""A message arrives when each of its fragments does. At 5 % loss a message of 32 fragments arrives one time in
     five.""",
-    mend="Send smaller messages, or set `reliable: true` or `repair: true`.",
+    fix="Send smaller messages, or set `reliable: true` or `repair: true`.",
     failing="topics: {video: {size_bytes: 200000}}",
     passing="topics: {video: {size_bytes: 5000}}",
 )
@@ -292,7 +295,7 @@ def best_effort_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "An outbox keeps what will have expired",
     why="""Messages wait for an offline peer, but their deadline passes before a peer even counts as offline: the outbox
     is always empty when the peer comes back.""",
-    mend="Lengthen `deadline_s`, or take the outbox away.",
+    fix="Lengthen `deadline_s`, or take the outbox away.",
     failing="topics: {commands: {outbox: last, deadline_s: 5}}",
     passing="topics: {commands: {outbox: last, deadline_s: 600}}",
 )
@@ -310,7 +313,7 @@ def outbox_expires(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "An outbox holds less than one message",
     why="Nothing fits: what was to be kept for an offline peer is dropped at once.",
-    mend="Raise `outbox_bytes` to several messages.",
+    fix="Raise `outbox_bytes` to several messages.",
     failing="topics: {artifacts: {outbox: all, outbox_bytes: 10000, size_bytes: 60000}}",
     passing="topics: {artifacts: {outbox: all, outbox_bytes: 6000000, size_bytes: 60000}}",
 )
@@ -327,7 +330,7 @@ def outbox_too_small(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "A best-effort topic has an outbox",
     why="""Best effort means: now or never. Kept messages would be sent once, without anybody learning whether they
     arrived.""",
-    mend="Set `reliable: true`, or take the outbox away.",
+    fix="Set `reliable: true`, or take the outbox away.",
     failing="topics: {video: {outbox: all}}",
     passing="topics: {video: {outbox: none}}",
 )
@@ -343,7 +346,7 @@ def outbox_best_effort(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     "A topic's type is not a ROS type",
     why="""The bridge looks the type up by this name to subscribe and publish: a type it cannot find ends in a bridge
     that passes nothing.""",
-    mend="Write `package/Type` (ROS 1) or `package/msg/Type` (ROS 2).",
+    fix="Write `package/Type` (ROS 1) or `package/msg/Type` (ROS 2).",
     failing="topics: {commands: {type: String}}",
     passing="topics: {commands: {type: std_msgs/String}}",
 )
@@ -359,7 +362,7 @@ def type_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "A topic's name is not a ROS name",
     why="ROS refuses names with spaces, hyphens or a digit at the start of a part: the bridge does not start.",
-    mend="Use letters, digits and underscores, parts joined by slashes.",
+    fix="Use letters, digits and underscores, parts joined by slashes.",
     failing="topics: {map-diffs: {priority: 8, class: map, type: std_msgs/String, rate_hz: 0.1, size_bytes: 1000}}",
     passing="topics: {map_diffs: {priority: 8, class: map, type: std_msgs/String, rate_hz: 0.1, size_bytes: 1000}}",
 )

@@ -41,7 +41,7 @@ _TCP_PORTS = frozenset({22, 53, 7447, 11311})
 
 
 @dataclass(frozen=True, slots=True)
-class Load:
+class OfferedLoad:
     """What the topics ask of one mesh: bytes per second sent to one peer each, and to everybody."""
 
     unicast_bytes_per_s: float
@@ -56,7 +56,7 @@ class Load:
         return unicast + broadcast
 
 
-def offered_load(fleet: Fleet) -> dict[str, Load]:
+def offered_load(fleet: Fleet) -> dict[str, OfferedLoad]:
     """The topics' load on every mesh: rate x size x sources x destinations, by the meshes of the sources' radios."""
     peers = [robot.name for robot in fleet.robots.values() if robot.computer is not None]
     meshes_of = {
@@ -78,7 +78,7 @@ def offered_load(fleet: Fleet) -> dict[str, Load]:
                 sums.setdefault(mesh, [0.0, 0.0])[is_broadcast] += total
                 if total >= largest.get(mesh, (0.0, topic))[0]:
                     largest[mesh] = (total, topic)
-    return {mesh: Load(unicast, broadcast, largest[mesh][1]) for mesh, (unicast, broadcast) in sums.items()}
+    return {mesh: OfferedLoad(unicast, broadcast, largest[mesh][1]) for mesh, (unicast, broadcast) in sums.items()}
 
 
 def _best_mbps(fleet: Fleet, mesh: Mesh) -> float:
@@ -93,7 +93,7 @@ def _best_mbps(fleet: Fleet, mesh: Mesh) -> float:
     return _MCS7_MBPS[width] * max(chains, default=1) * _EFFICIENCY
 
 
-def _shares(fleet: Fleet) -> Iterator[tuple[Mesh, Load, float, float]]:
+def _shares(fleet: Fleet) -> Iterator[tuple[Mesh, OfferedLoad, float, float]]:
     """Every loaded mesh with its share of the channel at the very best, and as it usually is."""
     for name, load in offered_load(fleet).items():
         mesh = fleet.meshes.get(name)
@@ -106,7 +106,7 @@ def _shares(fleet: Fleet) -> Iterator[tuple[Mesh, Load, float, float]]:
         yield mesh, load, best, usual
 
 
-def _sum(load: Load) -> str:
+def _sum(load: OfferedLoad) -> str:
     kbps = (load.unicast_bytes_per_s * 8 / 1000, load.broadcast_bytes_per_s * 8 / 1000)
     return f"{kbps[0]:.0f} kbit/s to single peers and {kbps[1]:.0f} kbit/s to all, most of it {load.largest.name}"
 
@@ -117,7 +117,7 @@ def _sum(load: Load) -> str:
     "The topics offer more than the channel can carry",
     why="""Even if all robots stood side by side at the highest rate, there is not enough air. What has no priority is
     never delivered, and its queues fill.""",
-    mend="Send less often or smaller, limit a topic's rate, or use a wider channel.",
+    fix="Send less often or smaller, limit a topic's rate, or use a wider channel.",
     failing="topics: {video: {rate_hz: 30, size_bytes: 1000000, reliable: false, repair: true}}",
     passing="topics: {video: {rate_hz: 1, size_bytes: 5000}}",
 )
@@ -135,7 +135,7 @@ def load_above_channel(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     "The topics need most of the channel",
     why="""At the usual rate, over two hops, with broadcasts repeated by every node, more than half the air is taken:
     what waits grows with every lost frame, and far robots go silent first.""",
-    mend="Send less often or smaller, limit a topic's rate, or name destinations instead of `all` for large messages.",
+    fix="Send less often or smaller, limit a topic's rate, or name destinations instead of `all` for large messages.",
     failing="topics: {map: {rate_hz: 20, size_bytes: 20000, destinations: [all]}}",
     passing="topics: {map: {rate_hz: 0.1, size_bytes: 20000, destinations: [base-station]}}",
 )
@@ -153,7 +153,7 @@ def load_high(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.NOTE,
     "A bulk topic's load is not given",
     why="Without `rate_hz` and `size_bytes` lint cannot say whether the channel carries the fleet's load.",
-    mend="Write what one source offers at most.",
+    fix="Write what one source offers at most.",
     failing="topics: {video: {rate_hz: 0}}",
     passing="topics: {video: {rate_hz: 1}}",
 )
@@ -172,7 +172,7 @@ def load_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "Video goes to everybody",
     why="""What is sent to all leaves at the broadcast rate and is repeated by every node: one camera can take the whole
     mesh.""",
-    mend="Name the robots that look at it, usually the base station.",
+    fix="Name the robots that look at it, usually the base station.",
     failing="topics: {video: {destinations: [all]}}",
     passing="topics: {video: {destinations: [base-station]}}",
 )
@@ -188,7 +188,7 @@ def video_to_all(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "A topic's rate limit is below its load",
     why="It offers more than it may send: the queue grows until messages are dropped, and what arrives is always late.",
-    mend="Raise the limit, send less, or keep only the latest with `keep_last`.",
+    fix="Raise the limit, send less, or keep only the latest with `keep_last`.",
     failing="topics: {video: {rate_hz: 10, size_bytes: 5000, rate_limit_bytes_per_s: 20000, keep_last: 0}}",
     passing="topics: {video: {rate_hz: 2, size_bytes: 5000, rate_limit_bytes_per_s: 20000}}",
 )
@@ -207,7 +207,7 @@ def limit_below_load(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "The transport's port belongs to something else",
     why="udp_mesh cannot bind the port, or takes it from a service that the robots need.",
-    mend="Use a free port above 1024, such as 8700.",
+    fix="Use a free port above 1024, such as 8700.",
     failing="udp_mesh: {port: 5353}",
     passing="udp_mesh: {port: 8700}",
 )
@@ -227,7 +227,7 @@ def port_taken(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The log host's port is the transport's",
     why="""The nodes' logs arrive at the daemon's port of the base station's computer: both are UDP. Log lines are
     counted as forged datagrams, and no log is kept.""",
-    mend="Give them different ports.",
+    fix="Give them different ports.",
     failing="""
     udp_mesh: {port: 5140}
     system: {log_host: 10.42.0.100, log_port: 5140}
@@ -249,7 +249,7 @@ def log_port_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "The metrics' port is SSH's",
     why="On one of the computers sshd listens there: whichever starts second fails, and it may be sshd.",
-    mend="Give the metrics another port, such as 9700.",
+    fix="Give the metrics another port, such as 9700.",
     failing="""
     udp_mesh: {metrics_port: 2222}
     robots: {husky1: {computer: {ssh: {port: 2222}}}}
@@ -278,7 +278,7 @@ def metrics_port_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     "A lost heartbeat makes a peer offline",
     why="""On a lossy link one heartbeat in five is lost. When a peer counts as offline after fewer than three, robots
     come and go all the time, and every outbox with them.""",
-    mend="Set `offline_after_s` to at least three heartbeats; ten is usual.",
+    fix="Set `offline_after_s` to at least three heartbeats; ten is usual.",
     failing="udp_mesh: {heartbeat_s: 5, offline_after_s: 10}",
     passing="udp_mesh: {heartbeat_s: 1, offline_after_s: 10}",
 )
@@ -295,7 +295,7 @@ def offline_too_soon(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "A peer counts as offline only after minutes",
     why="Until then its messages are sent into the void, and the operator believes it is there.",
-    mend="Set `offline_after_s` to 10 or 20.",
+    fix="Set `offline_after_s` to 10 or 20.",
     failing="udp_mesh: {offline_after_s: 300}",
     passing="udp_mesh: {offline_after_s: 10}",
 )
@@ -311,7 +311,7 @@ def offline_too_late(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The transport's port is one that the kernel gives away",
     why="""From 32768 on Linux hands ports to any program that asks for one: now and then it has given this one away
     before udp_mesh starts.""",
-    mend="Use a port from 1024 to 32767, such as 8700.",
+    fix="Use a port from 1024 to 32767, such as 8700.",
     failing="udp_mesh: {port: 40000}",
     passing="udp_mesh: {port: 8700}",
 )
