@@ -1,8 +1,8 @@
-"""Rules over the whole inventory, each a small function with a stable code, a page and two examples.
+"""Lint rules over the whole inventory, each a small function with a stable code, a page and two examples.
 
-The flow: `rules/` (the functions) -> `catalog` (all of them) -> `engine` (fleet -> findings) -> `suppress`, `baseline`
-(what is excused) -> `check_path` (a path -> everything to report). `context` and `files` hold what rules may look at
-besides the fleet. `example` and `pages` turn each rule into its page under docs/lint/.
+Flow: `rules/` -> `catalog` (all rules) -> `engine` (fleet -> findings) -> `suppress`, `baseline` (known findings)
+-> `check_path` (path -> result). `context` and `files` give rules access to secrets and files. `example` and `pages`
+generate docs/lint/.
 """
 
 from meshctl.lint.catalog import BY_CODE, RULES

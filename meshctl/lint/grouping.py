@@ -1,4 +1,4 @@
-"""Group equal things in one pass, so that a rule about collisions costs what the fleet's size costs."""
+"""Find duplicates in one pass, so that rules stay linear in the size of the fleet."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from typing import TypeVar
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
-# more names than these say nothing more to a reader
 _MAX_SHOWN = 4
 
 
 def group_by_key(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
-    """The values of every key, both in the order of their coming."""
+    """The values of every key; keys and values keep their order."""
     groups: dict[K, list[V]] = {}
     for key, value in pairs:
         groups.setdefault(key, []).append(value)
@@ -21,11 +20,11 @@ def group_by_key(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
 
 
 def duplicates(pairs: Iterable[tuple[K, V]]) -> Iterator[tuple[K, list[V]]]:
-    """The keys that came more than once, with their values."""
+    """The keys that occur more than once, with their values."""
     return ((key, values) for key, values in group_by_key(pairs).items() if len(values) > 1)
 
 
 def join_limited(names: Sequence[str]) -> str:
-    """`a, b, c`, cut after a few."""
+    """`a, b, c, d and 3 more`."""
     shown = ", ".join(names[:_MAX_SHOWN])
     return shown if len(names) <= _MAX_SHOWN else f"{shown} and {len(names) - _MAX_SHOWN} more"

@@ -1,7 +1,6 @@
-"""What a rule is: a stable code, the words of its page, two examples, and the function that looks.
+"""A rule: a stable code, the text of its page, two examples, and the check.
 
-A rule's module writes `@fleet_rule(...)` (or `@text_rule(...)`) above a function; the decorated name then holds the
-`Rule`. `meshctl.lint.catalog` gathers them.
+`@fleet_rule(...)` or `@text_rule(...)` above a function turns it into a `Rule`; `meshctl.lint.catalog` collects them.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ CODE = re.compile(r"MC\d{3}")
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What a rule saw: the place as the inventory's path (or a `position` of its own), and what is wrong there.
+    """A problem at a path of the inventory (or at an explicit `position`).
 
-    Findings that differ in nothing but the path are reported as one (a value that a whole group inherits), so a
-    message names no node that its path already names.
+    Findings that differ only in the path are reported as one (a value that a group inherits), so a message does not
+    repeat the node that the path names.
     """
 
     path: tuple[str, ...]
@@ -40,8 +39,8 @@ TextCheck = Callable[[str, str], Iterator[Finding]]
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A fragment laid over the base inventory (`meshctl.lint.example`). `files` stand beside it, `environment` holds
-    the variables its secrets name; `also` are codes that cannot but come with the rule's own."""
+    """A fragment merged into the base inventory (`meshctl.lint.example`). `files` are written next to it,
+    `environment` holds its secrets; `also` lists codes that necessarily occur together with the rule's own."""
 
     fragment: str
     files: Mapping[str, str] = field(default_factory=dict)
@@ -51,8 +50,8 @@ class Example:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """`why` says what goes wrong in the field, `fix` what to do; exactly one of the checks is set, or none for what
-    the engine itself reports (suppressions, the baseline). A fallback is silent where another rule has spoken."""
+    """`why` says what goes wrong in the field, `fix` what to do. Exactly one check is set, or none for findings of the
+    engine itself (suppressions, the baseline). A fallback rule is silent where another rule reports."""
 
     code: str
     severity: Severity
@@ -78,7 +77,7 @@ def fleet_rule(
     passing: str | Example,
     is_fallback: bool = False,
 ) -> Callable[[FleetCheck], Rule]:
-    """Make the decorated function, which reads a fleet, a rule."""
+    """Turn the decorated function, which checks a fleet, into a rule."""
 
     def decorate(check: FleetCheck) -> Rule:
         made = _rule(code, severity, title, why, fix, failing, passing, name=_slug(check), check=check)
@@ -97,7 +96,7 @@ def text_rule(
     failing: str | Example,
     passing: str | Example,
 ) -> Callable[[TextCheck], Rule]:
-    """Make the decorated function, which reads a file's name and text, a rule; it runs even when no fleet loads."""
+    """Turn the decorated function, which checks a file's name and text, into a rule; it runs even if loading fails."""
 
     def decorate(check: TextCheck) -> Rule:
         return _rule(code, severity, title, why, fix, failing, passing, name=_slug(check), check_text=check)
@@ -116,7 +115,7 @@ def engine_rule(
     failing: str | Example,
     passing: str | Example,
 ) -> Rule:
-    """A rule that the engine checks by itself."""
+    """A rule that the engine itself checks."""
     return _rule(code, severity, title, why, fix, failing, passing, name=name)
 
 
@@ -134,7 +133,7 @@ def _rule(
     check_text: TextCheck | None = None,
 ) -> Rule:
     if CODE.fullmatch(code) is None:
-        raise ValueError(f"a rule's code is MC and three digits, not {code}")
+        raise ValueError(f"expected a rule code such as MC123, found {code}")
     return Rule(
         code,
         severity,
@@ -154,7 +153,7 @@ def _slug(check: Callable[..., object]) -> str:
 
 
 def _joined(text: str) -> str:
-    """A triple-quoted text as one paragraph."""
+    """A triple-quoted text on one line."""
     return " ".join(text.split())
 
 

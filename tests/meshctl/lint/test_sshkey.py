@@ -33,15 +33,15 @@ def test_options_may_stand_before_the_key() -> None:
 @pytest.mark.parametrize(
     ("line", "why"),
     [
-        ("", "no kind of key"),
-        ("hello world", "no kind of key"),
+        ("", "unknown key type"),
+        ("hello world", "unknown key type"),
         ("-----BEGIN OPENSSH PRIVATE KEY-----", "a private key"),
-        ("ssh-ed25519", "without a key"),
+        ("ssh-ed25519", "without key data"),
         ("ssh-ed25519 !!!!", "not base64"),
-        ("ssh-ed25519 AAAA", "cut off"),
+        ("ssh-ed25519 AAAA", "truncated"),
         ("ssh-rsa AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f", "not ssh-rsa"),
-        ("ssh-rsa AAAAB3NzaC1yc2E=", "cut off"),
-        ("ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAAkFC", "cut off"),
+        ("ssh-rsa AAAAB3NzaC1yc2E=", "truncated"),
+        ("ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAAkFC", "truncated"),
     ],
 )
 def test_what_is_no_whole_key_is_refused(line: str, why: str) -> None:
