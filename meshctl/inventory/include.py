@@ -1,4 +1,4 @@
-"""The inventory's files -> one tree: the first file, then what it includes, each key in one place only."""
+"""The inventory's files -> one tree: the first file and its includes; each key may be set only once."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from meshctl.inventory.file_access import HINT, Boundary
 from meshctl.inventory.source import Reader, Source, read_bytes, read_source
 from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, describe, position
 
-# Files, counted with every include; bounds the time that a crafted inventory can cost.
+# Number of files including all includes; bounds the time that a crafted inventory can cost.
 MAX_FILES = 256
-# The name that a directory's first file has.
+# The first file of a directory.
 FIRST_FILE = "fleet.yaml"
 
 
 @dataclass(frozen=True, slots=True)
 class MergedFiles:
-    """`root` is None when a file could not be read as a mapping. `files` are in the order they were read."""
+    """`root` is None if a file could not be read as a mapping. `files` are in the order of reading."""
 
     root: MappingNode | None
     files: tuple[Path, ...]
@@ -30,7 +30,7 @@ class MergedFiles:
 
 
 def first_file(path: Path) -> Path:
-    """The file to begin with: `path`, or `fleet.yaml` in it when it is a directory."""
+    """The first file: `path`, or `fleet.yaml` in it if it is a directory."""
     return path / FIRST_FILE if os.path.isdir(path) else path
 
 
@@ -54,7 +54,7 @@ class _FileMerger:
     weight: int = 0
 
     def file(self, path: Path, above: tuple[str, ...]) -> MappingNode | None:
-        """One file with everything it includes; `above` are the real paths of the files that led here."""
+        """Read a file and its includes; `above` are the resolved paths of the including files."""
         source = read_source(path, self.read)
         if not isinstance(source, Source):
             is_first_missing = source.code == codes.UNREADABLE and not above
@@ -79,7 +79,7 @@ class _FileMerger:
                 codes.error(
                     codes.TOO_MANY_VALUES,
                     position(root),
-                    "too many values in all files together",
+                    "too many values in all files",
                     expected=f"at most {MAX_VALUES}",
                 )
             )
@@ -107,7 +107,7 @@ class _FileMerger:
                 self._fail(replace(problem, hint=HINT if refusal.startswith("outside") else ""))
             elif real in above:
                 circle = " -> ".join(Path(name).name for name in (*above[above.index(real) :], real))
-                self._fail(codes.error(codes.INCLUDE, position(item), f"files include each other: {circle}"))
+                self._fail(codes.error(codes.INCLUDE, position(item), f"include cycle: {circle}"))
             elif any(os.path.realpath(known) == real for known in self.files):
                 self._fail(codes.error(codes.INCLUDE, position(item), f"{target} is included twice"))
             elif len(self.files) >= MAX_FILES:
@@ -123,11 +123,11 @@ class _FileMerger:
                     self._merge(root, below)
 
     def _target(self, item: Tree, path: Path) -> Path | None:
-        """The path that an entry of `include` names; None when it is no text (the format check reports that)."""
+        """The path of an `include` entry; None if it is not text, which validation reports."""
         if not isinstance(item, Scalar) or item.is_null:
             return None
         if "\0" in item.text:
-            self._fail(codes.error(codes.INCLUDE, position(item), "not a path: it holds the character NUL"))
+            self._fail(codes.error(codes.INCLUDE, position(item), "not a path: it contains a NUL character"))
             return None
         if item.text.startswith("~/"):
             home = self.environ.get("HOME", "")
@@ -138,7 +138,7 @@ class _FileMerger:
         return path.parent / item.text
 
     def _report_at_include(self, item: Scalar | Tree, target: Path, known: int) -> None:
-        """A file that cannot be read is reported where it is included."""
+        """Report an unreadable file at its include."""
         for number in range(known, len(self.diagnostics)):
             problem = self.diagnostics[number]
             if problem.code == codes.UNREADABLE and problem.position.file == str(target):
@@ -147,7 +147,7 @@ class _FileMerger:
                 )
 
     def _merge(self, root: MappingNode, below: MappingNode) -> None:
-        """Add an included file's keys: new sections as they are, mappings in both key by key."""
+        """Add the keys of an included file; mappings in both are merged key by key."""
         for key, value in below.values.items():
             here = root.values.get(key)
             if key == "include" or (key == "meshctl" and here is not None and _same_text(here, value)):
@@ -175,10 +175,10 @@ class _FileMerger:
             codes.error(
                 codes.INCLUDE_CLASH,
                 position(second),
-                "written in two files",
+                "set in two files",
                 path=path,
                 found=f"also in {position(first)}",
-                hint="keep it in one of them",
+                hint="remove it from one of them",
             )
         )
 

@@ -1,6 +1,6 @@
-"""Who says what about a node: entries expanded, groups followed, layers in order, nearest first.
+"""Resolve the layers of each node: expand ranges, follow groups, order the layers from highest to lowest precedence.
 
-defaults < groups (a parent below its child, an earlier below a later) < range < the node's own entry.
+Precedence: defaults < groups (parents before children, earlier before later) < range < the node's own entry.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from meshctl.inventory.tree import MappingNode, Tree, descend, place_of, positio
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layer:
-    """One place that says something about nodes. `title` is what an origin calls it; `path` is where it stands."""
+    """A mapping with values of nodes. `title` is its name in an origin; `path` is its location in the inventory."""
 
     title: str
     path: tuple[str, ...]
@@ -29,13 +29,13 @@ class Layer:
     place: Position
 
     def place_of(self, path: Sequence[str | int]) -> Position:
-        """Where the layer writes `path`; where it stands itself when it does not."""
+        """The position of `path` in the layer; the layer's own position if it does not set `path`."""
         return (place_of(self.tree, path) if path else None) or self.place
 
 
 @dataclass(frozen=True, slots=True)
 class NodeSpec:
-    """A node before it is built: its layers, nearest first, its groups, and its number (from 1) in its range."""
+    """A node to build: its layers, highest precedence first, its groups, and its index (from 1) in its range."""
 
     name: str
     layers: tuple[Layer, ...]
@@ -44,26 +44,26 @@ class NodeSpec:
 
     @property
     def entry(self) -> Layer:
-        """The layer that is reported when something is wrong with the node."""
+        """The layer at which errors of the node are reported."""
         return self.layers[0]
 
 
 @dataclass(frozen=True, slots=True)
 class ResolvedLayers:
-    """`specs` in the inventory's order."""
+    """`nodes` are in the inventory's order."""
 
     nodes: dict[str, NodeSpec]
     diagnostics: tuple[Diagnostic, ...]
 
 
 def resolve_layers(document: InventoryDocument, root: MappingNode) -> ResolvedLayers:
-    """Work out the layers of every node; groups that do not exist or inherit in a circle are reported."""
+    """Resolve the layers of every node; reports unknown groups and inheritance cycles."""
     return _LayerResolver(document, root).run()
 
 
 @dataclass(slots=True)
 class _Entry:
-    """A key under `nodes`: its layer and, for a range, the number of each name in it."""
+    """A key of `nodes`: its layer and, for a range, the index of the name."""
 
     layer: Layer
     document: NodeDocument
@@ -104,12 +104,12 @@ class _LayerResolver:
     def _layer(self, title: str, path: tuple[str, ...], document: NodeLayer) -> Layer:
         tree = descend(self.root, path)
         if tree is None:
-            # `defaults` that nobody wrote.
+            # `defaults` is not set.
             tree = MappingNode(self.root.file, self.root.line, self.root.column, 0, 0, is_flow=True)
         return Layer(title, path, document, tree, place_of(self.root, path) or position(self.root))
 
     def _find_cycles(self) -> None:
-        """Depth first over the parents, each group once; an edge back to the trail closes a circle."""
+        """Depth-first search over the parents; an edge back to the trail closes a cycle."""
         done: set[str] = set()
         for first in self._groups:
             trail: dict[str, None] = {}
@@ -130,7 +130,7 @@ class _LayerResolver:
     def _report_cycle(self, names: list[str]) -> None:
         self._broken.update(names)
         layer = self._groups[names[0]]
-        message = f"groups inherit from each other: {' -> '.join(names[:20])}"
+        message = f"inheritance cycle of groups: {' -> '.join(names[:20])}"
         self.diagnostics.append(
             codes.error(codes.GROUP_CYCLE, layer.place_of(("inherits",)), message, path=f"groups.{names[0]}.inherits")
         )
@@ -150,8 +150,8 @@ class _LayerResolver:
         )
 
     def _group_layers(self, groups: tuple[str, ...]) -> tuple[Layer, ...] | None:
-        """The groups' layers, nearest first, each group once, at its farthest place; None when one of them is not
-        known or stands in a circle, which has been reported."""
+        """The groups' layers, highest precedence first, each group once at its lowest precedence; None if a group is
+        unknown or part of a cycle, which is already reported."""
         if groups not in self._stacks:
             self._stacks[groups] = self._linearize(groups)
         return self._stacks[groups]
@@ -173,7 +173,7 @@ class _LayerResolver:
         return tuple(reversed(ordered))
 
     def _entries(self) -> dict[str, list[_Entry]]:
-        """Each node's entries, its own before its range's."""
+        """The entries of each node, its own before its range's."""
         made: dict[str, list[_Entry]] = {}
         for pattern, document in self.document.nodes.items():
             ranged = is_range(pattern)
@@ -182,7 +182,7 @@ class _LayerResolver:
                 self._check_known(group, layer, "groups", number)
             names = self._names(pattern, layer)
             if len(made) + len(names) > MAX_NAMES:
-                self._refuse(layer, f"too many nodes: at most {MAX_NAMES} are allowed")
+                self._refuse(layer, f"too many nodes (at most {MAX_NAMES})")
                 break
             for index, name in enumerate(names, start=1):
                 entries = made.setdefault(name, [])
@@ -194,7 +194,7 @@ class _LayerResolver:
                         codes.error(
                             codes.NODE_TWICE,
                             layer.place,
-                            f"makes the node '{name}', which '{first.path[1]}' makes too",
+                            f"node '{name}' is also in range '{first.path[1]}'",
                             path=f"nodes.{pattern}",
                             found=f"also in {first.place}",
                         )
@@ -208,11 +208,11 @@ class _LayerResolver:
         try:
             names = expand(pattern)
         except BadRange as reason:
-            self._refuse(layer, f"not a range such as b[01-12]: {reason}")
+            self._refuse(layer, f"invalid range (expected e.g. b[01-12]): {reason}")
             return ()
         wrong = next((name for name in names if not is_name(name)), None)
         if wrong is not None:
-            self._refuse(layer, f"'{shown(wrong)}' is not a name of letters, digits, '.', '_' and '-', at most 63")
+            self._refuse(layer, f"'{shown(wrong)}' is not a name of at most 63 letters, digits, '.', '_' and '-'")
             return ()
         return names
 

@@ -1,4 +1,4 @@
-"""Files -> tree -> document -> node specs -> fleet; every stage adds its diagnostics, none stops at the first."""
+"""Files -> tree -> document -> node specs -> fleet; each stage reports all its diagnostics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NO_ENVIRON: Mapping[str, str] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
-    """`fleet` is None exactly when `diagnostics` holds an error. `files` are those read, the first one first."""
+    """`fleet` is None exactly if `diagnostics` contains an error. `files` are all files read, in order."""
 
     fleet: Fleet | None
     diagnostics: tuple[Diagnostic, ...]
@@ -28,10 +28,10 @@ class Loaded:
 
 
 def load(path: Path, *, environ: Mapping[str, str] = _NO_ENVIRON, read: Reader = read_bytes) -> Loaded:
-    """The fleet that `path` describes: a YAML file, or a directory that holds `fleet.yaml`.
+    """Load the inventory at `path`: a YAML file, or a directory with `fleet.yaml`.
 
-    `environ` gives `~` in includes its meaning (`HOME`); `read` gets a file's bytes and may raise OSError. Never raises
-    for anything a file holds.
+    `environ` provides `HOME` for `~` in includes; `read` returns a file's bytes and may raise OSError. Never raises for
+    the content of a file.
     """
     merged = read_files(path, environ, read)
     files = tuple(str(file) for file in merged.files)
@@ -49,7 +49,7 @@ def load(path: Path, *, environ: Mapping[str, str] = _NO_ENVIRON, read: Reader =
 
 
 def load_fleet(path: Path, *, environ: Mapping[str, str] = _NO_ENVIRON) -> Fleet:
-    """The fleet. Raises InvalidInput with every diagnostic when there is any."""
+    """Load the fleet. Raises InvalidInput with all diagnostics if there are any."""
     loaded = load(path, environ=environ)
     if loaded.fleet is None:
         raise InvalidInput(loaded.diagnostics)

@@ -1,6 +1,6 @@
-"""Layers -> nodes: values joined, radios matched with hardware and mesh, addresses worked out.
+"""Layers -> nodes: merge values, match radios with hardware and mesh, compute addresses.
 
-Nodes with the same layers (a range) are worked out once; only name, host name and address differ.
+Nodes with the same layers (a range) are built once; only name, hostname and address differ.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from meshctl.inventory.layers import Layer, NodeSpec
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Band, HardwareProfile, Mesh, Node, NodeState, Radio, Role, SshSettings
 
-# Stands in a template until the node's own address is known.
+# Placeholder in a template until the node's address is known.
 _NO_ADDRESS = IPv4Interface("0.0.0.0/0")
 
 
@@ -32,7 +32,7 @@ class BuiltNodes:
 
 @dataclass(frozen=True, slots=True)
 class _Template:
-    """What all nodes with the same layers share."""
+    """The shared part of all nodes with the same layers."""
 
     node: Node
     address: AddressValue
@@ -47,9 +47,9 @@ def build_nodes(
     meshes: Mapping[str, Mesh],
     robot_of: Mapping[str, str],
 ) -> BuiltNodes:
-    """Every node that can be built; a diagnostic, once for a whole range, for each that cannot.
+    """Build all nodes; errors of a range are reported once.
 
-    `robot_of` names the robot that lists a node, for nodes that do not name it themselves.
+    `robot_of` maps nodes to the robots that list them, for nodes without `robot`.
     """
     building = _Building(hardware, meshes, _only_meshes(meshes))
     nodes: dict[str, Node] = {}
@@ -61,7 +61,7 @@ def build_nodes(
 
 
 def joined(layers: tuple[Layer, ...]) -> dict[str, Any]:
-    """The values written in any layer, the nearest winning; mappings (`radios`, `ssh`, `extra_uci`) join key by key."""
+    """The values of all layers by precedence; mappings (`radios`, `ssh`, `extra_uci`) merge key by key."""
     values: dict[str, Any] = {}
     for layer in reversed(layers):
         document = layer.document
@@ -115,8 +115,8 @@ class _Building:
         )
 
     def _count(self, spec: NodeSpec) -> dict[Layer, int]:
-        """The node's number under each rule that holds for it, also where a nearer layer overrules it, so that one
-        node with an address of its own does not move the others."""
+        """The node's index under each of its rules, including overridden ones, so that a node with its own address does
+        not shift the others."""
         index_of = {}
         for layer in spec.layers:
             if isinstance(layer.document.address, AddressRule):
@@ -216,7 +216,7 @@ class _Building:
         return IPv4Interface((value, self._prefix_length(value, template.network)))
 
     def _prefix_length(self, address: IPv4Address, network: IPv4Network | None) -> int:
-        """That of the node's own mesh; of the mesh that holds the address for a node in none; else of one host."""
+        """The prefix length of the node's mesh, or for a node without one of the mesh with the address; else 32."""
         if network is None:
             network = next((mesh.network for mesh in self.meshes.values() if address in mesh.network), None)
         return 32 if network is None else network.prefixlen
@@ -240,13 +240,13 @@ class _Building:
 
 
 def _only_meshes(meshes: Mapping[str, Mesh]) -> dict[Band, str]:
-    """The bands with exactly one mesh, which radios join that name none."""
+    """The mesh of each band with exactly one, the default for its radios."""
     counts = Counter(mesh.band for mesh in meshes.values())
     return {mesh.band: mesh.name for mesh in meshes.values() if counts[mesh.band] == 1}
 
 
 def ssh_settings(values: Mapping[str, Any], *, user: str) -> SshSettings:
-    """`user` is taken where none is written."""
+    """`user` is the default."""
     return SshSettings(
         host=values.get("host", ""),
         port=values.get("port", 22),

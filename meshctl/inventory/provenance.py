@@ -1,4 +1,4 @@
-"""Where every value was written, looked up when asked: a fleet of thousands keeps one tree, not a table of places."""
+"""The origin of every value, looked up on demand: a large fleet keeps one tree instead of a table of positions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from meshctl.inventory.ranges import expand
 from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, child, descend, place_of
 from meshctl.model import Origin
 
-# How an origin names a value of each section; `{}` is the entry's name.
+# Layer name of each section; `{}` is the entry's name.
 _TITLES = {
     "hardware": "hardware {}",
     "meshes": "mesh {}",
@@ -18,16 +18,16 @@ _TITLES = {
     "topics": "topic {}",
     "defaults": "defaults",
 }
-# what a robot lists nodes under
+# keys under which a robot lists nodes
 _NODE_LISTS = ("nodes", "carries")
 
 
 class Provenance(Mapping[tuple[str, ...], Origin]):
     """Paths such as `("nodes", "b03", "radios", "radio0", "tx_power_dbm")` to origins.
 
-    A node's values stand under the node's path with the layer they came from, a value of the file's other sections
-    under its own path, `("operators", "ssh_keys", "0")`. In a robot's lists of nodes a node's name is a path as well,
-    `("robots", "husky1", "carries", "b03")`: it leads to the element, perhaps a range, that makes the name.
+    A node's values have the node's path and the layer they come from; values of other sections have their own path,
+    such as `("operators", "ssh_keys", "0")`. In a robot's lists of nodes a node's name is also a path,
+    `("robots", "husky1", "carries", "b03")`: it refers to the element, perhaps a range, that contains the name.
     """
 
     __slots__ = ("_elements", "_robot_of", "_root", "_specs")
@@ -69,7 +69,7 @@ class Provenance(Mapping[tuple[str, ...], Origin]):
         return Origin(place, title.format(path[1]) if len(path) > 1 else "fleet" if "{}" in title else title)
 
     def _element(self, path: tuple[str, ...]) -> dict[str, str]:
-        """The place in a robot's list, as text, of each node that the list names."""
+        """The index (as text) of each node in a robot's list."""
         found = self._elements.get(path)
         if found is None:
             found = self._elements[path] = {}
@@ -105,7 +105,7 @@ def _writes(layer: Layer, path: tuple[str, ...]) -> bool:
 
 
 def _paths(tree: Tree, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """Every path in `tree`, containers before what they hold."""
+    """Every path in `tree`, containers before their content."""
     yield path
     match tree:
         case MappingNode():

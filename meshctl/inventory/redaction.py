@@ -1,8 +1,8 @@
-"""Which parts of an inventory's text may be shown in a finding: those that the format knows and that hold no secret.
+"""Redact source lines in findings: show only values with a known key that is not secret.
 
-A line is shown to everybody who reads CI's log. It may belong to a file that is no inventory at all (an included file
-of secrets), or hold a key where a reference belongs, beside a key that is misspelt. So a value is shown only where the
-format knows its key; the rest becomes `***`.
+Everyone with access to the CI log can read these lines. A line may belong to a file that is not an inventory (an
+included file of secrets), or contain a key in place of a reference, or a misspelled key. So a value is shown only if
+the format knows its key; the rest becomes `***`.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from meshctl.inventory.validate import model_of, step_into
 from meshctl.uci import is_secret_option
 
 HIDDEN = "***"
-# a text larger than this is not parsed once more for an excerpt
+# larger texts are not parsed again for an excerpt
 _MAX_CHARACTERS = 2_000_000
 _SECRET_WORDS = re.compile(r"(key|psk|pass(word|phrase)?|secret|token|credentials?)s?", re.IGNORECASE)
 _VARIABLE = re.compile(r"[A-Z_][A-Z0-9_]*")
-# a comment that looks as if it held a secret: an assignment to such a word, or material as long as a key's
+# a comment that may contain a secret: an assignment to such a word, or text as long as a key
 _SUSPICIOUS_COMMENT = re.compile(rf"({_SECRET_WORDS.pattern})\s*[:=]|[A-Za-z0-9+/_=-]{{20,}}", re.IGNORECASE)
 _WORD = re.compile(r"[^\s\[\]{},:#\"'&*|>-]+")
 _MAX_KEY_CHARACTERS = 40
@@ -44,7 +44,7 @@ class _Visibility(IntEnum):
 
 @dataclass(slots=True)
 class Excerpts:
-    """The lines of one file as they may be shown."""
+    """The redacted lines of one file."""
 
     text: str
     _marks: bytearray | None = field(default=None, repr=False)
@@ -52,7 +52,7 @@ class Excerpts:
     _is_inventory: bool = False
 
     def line(self, number: int, column: int) -> tuple[str, int] | None:
-        """Line `number` (from 1) with what is secret masked, and the place of `column` in it; None when there is none.
+        """The redacted line `number` (from 1), and the new position of `column`; None if there is no such line.
 
         A column of 0 stays 0.
         """
@@ -68,7 +68,7 @@ class Excerpts:
     def _read(self) -> None:
         self.text = self.text.removeprefix("\ufeff")
         self._marks = bytearray(len(self.text))
-        # as editors and PyYAML count lines, not str.splitlines, which also ends lines at form feeds
+        # as editors and PyYAML count lines; str.splitlines also splits at form feeds
         self._starts = [0]
         for part in self.text.split("\n"):
             self._starts.append(self._starts[-1] + len(part) + 1)
@@ -86,12 +86,12 @@ class Excerpts:
 
 
 def _spans(tree: Tree, kind: Any) -> Iterator[tuple[int, int, _Visibility]]:
-    """The places of keys and values, and whether they are shown."""
+    """The spans of keys and values, and whether they are shown."""
     kind = _fitting(kind, tree)
     model = model_of(kind)
     match tree:
         case Scalar():
-            # a value where a mapping belongs, such as a key in place of its reference
+            # hide a value in place of a mapping, such as a key in place of its reference
             is_shown = kind is not None and model is None
             yield tree.start, tree.end, _Visibility.SHOWN if is_shown else _Visibility.HIDDEN
         case SequenceNode():
@@ -108,11 +108,11 @@ def _spans(tree: Tree, kind: Any) -> Iterator[tuple[int, int, _Visibility]]:
 
 
 def _fitting(kind: Any, tree: Tree) -> Any:
-    """Of a field that takes one kind or another (`address: 10.42.0.1` or `{from: ...}`) the one that the tree is of."""
+    """The alternative of a union type (`address: 10.42.0.1` or `{from: ...}`) that matches the tree."""
     if get_origin(kind) is Annotated:
         return _fitting(get_args(kind)[0], tree)
     if kind is AddressRule:
-        # read by a function of its own: `{from: 10.42.0.101, step: 1}`
+        # parsed by parse_address
         return dict[str, str]
     if get_origin(kind) not in (Union, UnionType):
         return kind
@@ -126,9 +126,9 @@ def _is_mapping(kind: Any) -> bool:
 
 
 def _is_secret(key: str, value: Tree, below: Any, model: type[BaseModel] | None) -> bool:
-    """Whether a value is hidden although the format knows its key."""
+    """Whether a value with a known key is hidden."""
     if model is SecretDocument:
-        # the name of a variable is none; of `key` it is the name of an entry
+        # names of variables and entries are not secret
         return key == "env" and not (isinstance(value, Scalar) and _VARIABLE.fullmatch(value.text))
     last = key.rpartition(".")[2]
     is_reference = SecretDocument in (model_of(below), model_of(step_into(below, 0)) if below is not None else None)
@@ -136,7 +136,7 @@ def _is_secret(key: str, value: Tree, below: Any, model: type[BaseModel] | None)
 
 
 def _masked(line: str, marks: bytearray, column: int, is_inventory: bool) -> tuple[str, int]:
-    """The line, and where the column went."""
+    """The masked line, and the new column."""
     hash_at = _comment(line, marks)
     for found in _WORD.finditer(line, 0, hash_at):
         for at in range(*found.span()):
@@ -155,14 +155,14 @@ def _masked(line: str, marks: bytearray, column: int, is_inventory: bool) -> tup
         elif not at or marks[at - 1] != _Visibility.HIDDEN:
             shown.append(HIDDEN)
         elif at + 1 == column:
-            # the column is within what is hidden
+            # the column is in hidden text
             caret -= len(HIDDEN)
     text = "".join(shown)
     return text, (caret or len(text) + 1) if column else 0
 
 
 def _comment(line: str, marks: bytearray) -> int:
-    """Where the line's comment begins, its length when there is none."""
+    """The start of the line's comment; the length of the line if there is none."""
     for found in re.finditer(r"(?:^|(?<=\s))#", line):
         if marks[found.start()] == _Visibility.UNKNOWN:
             return found.start()

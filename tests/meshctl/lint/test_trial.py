@@ -78,8 +78,8 @@ def test_one_key_with_and_without_its_id_is_one_key(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "found"),
     [
-        ("udp_mesh: [not, text]\n", "has no entry 'udp_mesh' with a text"),
-        ("udp-mesh: abc\n", "has no entry 'udp_mesh' with a text"),
+        ("udp_mesh: [not, text]\n", "has no entry 'udp_mesh' with text"),
+        ("udp-mesh: abc\n", "has no entry 'udp_mesh' with text"),
         ("udp_mesh: {", "is not valid YAML"),
     ],
 )
