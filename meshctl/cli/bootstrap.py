@@ -30,12 +30,12 @@ from meshctl.cli.output import complain, echo
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
 from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Outcome, Result
-from meshctl.inventory.edit import Change, Editor, save, set_node
+from meshctl.inventory.edit import Editor, FileEdit, save, set_node
 from meshctl.model import Node, NodeState
 from meshctl.plan import Verdict
 from meshctl.report.progress import outcome_text
 
-Changes = tuple[Change, ...]
+Changes = tuple[FileEdit, ...]
 
 # Stands for a device that is in no inventory yet.
 BENCH = "bench"

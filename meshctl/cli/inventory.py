@@ -15,7 +15,7 @@ from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state
-from meshctl.inventory.explain import Why, explain
+from meshctl.inventory.explain import ExplainedValue, explain
 from meshctl.inventory.json_schema import json_schema
 from meshctl.inventory.load import load_fleet
 from meshctl.inventory.starter import write_starter
@@ -175,7 +175,7 @@ def _cell(value: Any) -> str:
     return ", ".join(value) if isinstance(value, list) else str(value) or "-"
 
 
-def _record(value: Why) -> dict[str, Any]:
+def _record(value: ExplainedValue) -> dict[str, Any]:
     place = value.origin.position
     return {
         "key": value.key,
@@ -187,7 +187,7 @@ def _record(value: Why) -> dict[str, Any]:
     }
 
 
-def _row(value: Why, why: bool) -> list[str]:
+def _row(value: ExplainedValue, why: bool) -> list[str]:
     text = value.value if value.value and value.value.isprintable() else json.dumps(value.value)
     if not why:
         return [value.key, text]

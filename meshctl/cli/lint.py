@@ -15,7 +15,7 @@ from meshctl.cli.output import echo, echo_json
 from meshctl.diagnostics import Severity, sorted_diagnostics
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.codes import MEANINGS
-from meshctl.lint import BY_CODE, RULES, Examined, Rule, check_path
+from meshctl.lint import BY_CODE, RULES, CheckResult, Rule, check_path
 from meshctl.lint import baseline as baselines
 from meshctl.lint.pages import page
 from meshctl.regdb import SHIPPED, load, shipped_version
@@ -161,12 +161,12 @@ def _selected(findings: Findings, prefixes: tuple[str, ...]) -> Findings:
     return replace(findings, diagnostics=kept)
 
 
-def gathered(examined: Iterable[Examined]) -> Findings:
+def gathered(examined: Iterable[CheckResult]) -> Findings:
     """What several inventories gave, as one; a file that two of them include is reported once."""
     parts = list(examined)
     sources = {file: text for part in parts for file, text in part.sources.items()}
     diagnostics = dict.fromkeys(item for part in parts for item in part.diagnostics)
-    excused = dict.fromkeys(item for part in parts for item in part.excused)
+    excused = dict.fromkeys(item for part in parts for item in part.suppressed)
     return Findings(sorted_diagnostics(diagnostics), sources, tuple(excused), files=tuple(sources))
 
 

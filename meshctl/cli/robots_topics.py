@@ -21,7 +21,7 @@ from meshctl.cli.robots_work import begin
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, totals
 from meshctl.inventory import load_fleet
-from meshctl.inventory.edit import Change, Editor, add_topic, remove_topic, save, set_topic
+from meshctl.inventory.edit import Editor, FileEdit, add_topic, remove_topic, save, set_topic
 from meshctl.inventory.yaml_text import Value
 from meshctl.model import SecretRef
 from meshctl.robots.key_rotation import parse_ref, stages, written
@@ -101,7 +101,7 @@ def _change_topics(crew: Crew, topic: str, edit: Callable[[Editor], None]) -> No
     raise end(changed, outcomes)
 
 
-def _edited(crew: Crew, edit: Callable[[Editor], None]) -> tuple[Crew, tuple[Change, ...]]:
+def _edited(crew: Crew, edit: Callable[[Editor], None]) -> tuple[Crew, tuple[FileEdit, ...]]:
     """The inventory edited, checked and saved, and the crew under it."""
     editor = Editor.open(crew.inventory, environ=os.environ)
     edit(editor)
@@ -115,8 +115,8 @@ def _edited(crew: Crew, edit: Callable[[Editor], None]) -> tuple[Crew, tuple[Cha
         raise
 
 
-def _undo(changes: tuple[Change, ...]) -> None:
-    save(tuple(Change(change.file, change.after, change.before) for change in changes))
+def _undo(changes: tuple[FileEdit, ...]) -> None:
+    save(tuple(FileEdit(change.file, change.after, change.before) for change in changes))
 
 
 @with_crew(*_SHARED)

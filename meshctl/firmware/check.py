@@ -14,7 +14,7 @@ from meshctl.diagnostics import Diagnostic, Position, Severity
 from meshctl.firmware.metadata import Metadata, read_metadata
 from meshctl.firmware.trailer import DamagedImage
 from meshctl.firmware.usign import BadSignature, PublicKey, parse_public_key, verify
-from meshctl.inventory.file_access import irregular
+from meshctl.inventory.file_access import special_file
 from meshctl.model import HardwareProfile
 
 # The codes, each with what it means (docs/render.md).
@@ -67,7 +67,7 @@ def sha256(content: bytes) -> str:
 
 
 def _read(path: Path, limit: int) -> bytes:
-    if reason := irregular(path):
+    if reason := special_file(path):
         raise OSError(reason)
     with path.open("rb") as stream:
         content = stream.read(limit + 1)

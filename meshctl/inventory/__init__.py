@@ -1,9 +1,9 @@
-"""One YAML inventory in, one frozen fleet out, with the place of every value.
+"""YAML inventory -> frozen fleet, with the position of every value.
 
-The flow: bytes -> text (`source`) -> tree with positions (`compose`) -> one tree of all files (`include`) -> checked
+Flow: bytes -> text (`source`) -> tree with positions (`compose`) -> one tree of all files (`include`) -> validated
 document (`validate`, `documents`) -> layers of every node (`layers`, `ranges`) -> fleet (`build`, `nodes`, `addresses`,
-`origins`). Beside it: `secrets` fetches what references name, `json_schema` describes the format to editors, `explain`
-tells where a node's values come from, `edit` changes files and keeps their comments, `starter` writes a first one.
+`provenance`). Also: `secrets` resolves references, `json_schema` generates the schema for editors, `explain` lists the
+origin of a node's values, `edit` changes files and keeps their comments, `starter` writes a first inventory.
 """
 
 from meshctl.inventory.load import Loaded, load, load_fleet

@@ -1,8 +1,8 @@
-"""Addresses of nodes: written out, or one rule for all nodes that share it.
+"""Addresses of nodes: literal, or a rule for all nodes that share it.
 
-`10.42.0.11` takes its prefix length from the mesh's network, `10.42.0.11/24` brings its own. `{from: 10.42.0.101}`
-counts up from that address, `{rule: network + 100 + 2 * index}` reckons; `index` counts, from 1, the nodes that the
-rule holds for, in the inventory's order: along the range it stands at, or through the group or the defaults.
+`10.42.0.11` uses the prefix length of the mesh's network, `10.42.0.11/24` sets its own. `{from: 10.42.0.101}` counts up
+from that address, `{rule: network + 100 + 2 * index}` is a formula. `index` counts from 1 the nodes that the rule
+applies to, in the inventory's order: along its range, or through its group or the defaults.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _TERM = re.compile(
 
 
 class BadAddress(ValueError):
-    """A rule that leads nowhere for this node; the text says why."""
+    """A rule that yields no address for this node; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,19 +38,19 @@ class AddressRule:
         start = self.start
         if start is None:
             if network is None:
-                raise BadAddress("the rule counts from `network`, but the node is in no mesh")
+                raise BadAddress("the rule uses `network`, but the node is in no mesh")
             start = network.network_address
         try:
             return start + (self.offset + self.factor * index)
         except AddressValueError:
-            raise BadAddress(f"the rule leaves the IPv4 addresses at index {index}") from None
+            raise BadAddress(f"the rule exceeds the IPv4 address range at index {index}") from None
 
 
 AddressValue = IPv4Interface | IPv4Address | AddressRule
 
 
 def parse_address(value: object) -> AddressValue:
-    """What stands under `address`: text, or a mapping with `from` or `rule`."""
+    """Parse a value of `address`: text, or a mapping with `from` or `rule`."""
     match value:
         case str():
             return _static(str(value))
@@ -73,7 +73,7 @@ def _static(text: str) -> IPv4Interface | IPv4Address:
 
 
 def parse_rule(text: str) -> AddressRule:
-    """A sum of one start (`network` or an address), numbers and multiples of `index`."""
+    """Parse a sum of one start (`network` or an address), numbers and multiples of `index`."""
     refused = wrong("a sum such as network + 100 + index, of `network` or an address, numbers and multiples of index")
     start: list[IPv4Address | None] = []
     offset = factor = at = 0

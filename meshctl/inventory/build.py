@@ -1,6 +1,6 @@
-"""Document + node plans -> fleet: each section turned into the model's frozen values.
+"""Document + node specs -> fleet: each section turned into the model's frozen values.
 
-Order: hardware, meshes, robots (who carries which node), nodes, topics, settings.
+Order: hardware, meshes, robots (which assign nodes), nodes, topics, settings.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from meshctl.inventory.documents import (
     SecretDocument,
     TopicDocument,
 )
-from meshctl.inventory.layers import NodePlan
+from meshctl.inventory.layers import NodeSpec
 from meshctl.inventory.nodes import build_nodes, ssh_settings
-from meshctl.inventory.provenance import Origins
+from meshctl.inventory.provenance import Provenance
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
 from meshctl.inventory.tree import MappingNode, descend, place_of
 from meshctl.model import (
@@ -49,16 +49,16 @@ from meshctl.model import (
 
 @dataclass(frozen=True, slots=True)
 class Built:
-    """`fleet` is None when there is any diagnostic."""
+    """`fleet` is None if there is any diagnostic."""
 
     fleet: Fleet | None
     diagnostics: tuple[Diagnostic, ...]
 
 
 def build(
-    document: InventoryDocument, root: MappingNode, plans: Mapping[str, NodePlan], files: tuple[Path, ...]
+    document: InventoryDocument, root: MappingNode, specs: Mapping[str, NodeSpec], files: tuple[Path, ...]
 ) -> Built:
-    """`files` are those read, the first one first."""
+    """`files` are all files read, starting with the first one."""
     hardware = {name: _hardware(name, item, root) for name, item in document.hardware.items()}
     meshes = {name: _mesh(name, item, root) for name, item in document.meshes.items()}
     diagnostics: list[Diagnostic] = []
@@ -68,7 +68,7 @@ def build(
         for robot in robots.values():
             for node in getattr(robot, names):
                 robot_of.setdefault(node, robot.name)
-    built = build_nodes(plans, hardware, meshes, robot_of)
+    built = build_nodes(specs, hardware, meshes, robot_of)
     diagnostics.extend(built.diagnostics)
     if diagnostics:
         return Built(None, tuple(diagnostics))
@@ -101,7 +101,7 @@ def build(
             quorum=document.apply.quorum,
             parallel=document.apply.parallel,
         ),
-        origins=Origins(root, plans, robot_of),
+        provenance=Provenance(root, specs, robot_of),
         files=tuple(str(path) for path in files),
         base=str(files[0].parent),
     )
@@ -109,7 +109,7 @@ def build(
 
 
 def _base(root: MappingNode, *path: str | int) -> str:
-    """The directory of the file that writes `path`; of the first file when none does."""
+    """The directory of the file that sets `path`; of the first file if none does."""
     tree = descend(root, path)
     return str(Path((root if tree is None else tree).file).parent)
 
@@ -210,7 +210,7 @@ def _secret(document: SecretDocument, base: str) -> SecretRef:
 
 
 def _robots(document: InventoryDocument, root: MappingNode, diagnostics: list[Diagnostic]) -> dict[str, Robot]:
-    """All robots, up to the first bad list: one line may ask for many names."""
+    """All robots, up to the first invalid list: one line may expand to many names."""
     robots: dict[str, Robot] = {}
     count = 0
     for name, item in document.robots.items():
@@ -239,19 +239,19 @@ def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: l
 def _names(
     path: tuple[str, ...], patterns: tuple[str, ...], root: MappingNode, diagnostics: list[Diagnostic]
 ) -> tuple[str, ...]:
-    """The nodes that a robot's list names, its ranges expanded."""
+    """The nodes in a robot's list, with ranges expanded."""
     made: list[str] = []
     for number, pattern in enumerate(patterns):
         try:
             made.extend(expand(pattern))
             if len(made) > MAX_NAMES:
-                raise BadRange(f"the list makes more than {MAX_NAMES} names")
+                raise BadRange(f"the list expands to more than {MAX_NAMES} names")
         except BadRange as reason:
             diagnostics.append(
                 codes.error(
                     codes.BAD_RANGE,
                     place_of(root, (*path, number)) or Position(root.file),
-                    f"not a range such as b[01-12]: {reason}",
+                    f"invalid range (expected e.g. b[01-12]): {reason}",
                     path=".".join(path),
                     found=f"'{shown(pattern)}'",
                 )

@@ -1,4 +1,4 @@
-"""The loader's diagnostic codes, each with what it means; lint rules have codes of their own (`MC...`)."""
+"""Diagnostic codes of the loader and their meanings; lint rules have separate codes (`MC...`)."""
 
 from __future__ import annotations
 
@@ -27,33 +27,33 @@ UNKNOWN_RADIO = "INV035"
 BAD_ADDRESS = "INV036"
 TOO_MANY_ERRORS = "INV099"
 
-# More than a person reads; bounds the time that a file which is no inventory at all can cost.
+# Bounds the time that a file that is not an inventory can cost.
 MAX_DIAGNOSTICS = 1000
 
 # One line each, for `meshctl lint --explain` and docs/inventory.md.
 MEANINGS = {
     UNREADABLE: "A file of the inventory cannot be read.",
-    TOO_LARGE: "A file of the inventory is larger than any inventory needs to be.",
-    NOT_TEXT: "A file of the inventory is not UTF-8 text, or holds control characters.",
-    YAML_SYNTAX: "A file of the inventory is not valid YAML; what follows the place was not read.",
-    YAML_FEATURE: "A part of YAML that is refused: tags, merge keys, several documents, keys that are not text.",
-    DUPLICATE_KEY: "A key stands twice in one mapping.",
-    TOO_MANY_VALUES: "The inventory holds more values than the limit, as written or after its aliases are followed.",
-    TOO_DEEP: "The inventory nests deeper than any inventory needs to.",
+    TOO_LARGE: "A file of the inventory exceeds the size limit.",
+    NOT_TEXT: "A file of the inventory is not UTF-8 text, or contains control characters.",
+    YAML_SYNTAX: "A file of the inventory is not valid YAML; the rest of the file was not read.",
+    YAML_FEATURE: "Unsupported YAML: tags, merge keys, multiple documents, keys that are not text.",
+    DUPLICATE_KEY: "A mapping contains a key twice.",
+    TOO_MANY_VALUES: "The inventory exceeds the limit of values, as written or with aliases expanded.",
+    TOO_DEEP: "The inventory exceeds the nesting limit.",
     EMPTY: "The inventory is empty.",
-    INCLUDE: "An include cannot be followed: it names itself in a circle, nests too deep, or leads nowhere.",
-    INCLUDE_CLASH: "Two files of the inventory write the same key.",
-    UNKNOWN_KEY: "A key that the format does not know; often a slip of the pen.",
-    WRONG_VALUE: "A value of the wrong type, or outside its bounds.",
-    MISSING_KEY: "A key that must be written is missing.",
-    BAD_RANGE: "A range such as `b[01-12]` cannot be read, or makes more names than the limit.",
-    NODE_TWICE: "Two ranges make the same node.",
+    INCLUDE: "An include cannot be followed: a cycle, too many files, or a path that is not allowed.",
+    INCLUDE_CLASH: "Two files of the inventory set the same key.",
+    UNKNOWN_KEY: "An unknown key, often a typo.",
+    WRONG_VALUE: "A value of the wrong type, or out of range.",
+    MISSING_KEY: "A required key is missing.",
+    BAD_RANGE: "A range such as `b[01-12]` is invalid, or expands to more names than the limit.",
+    NODE_TWICE: "Two ranges expand to the same node.",
     UNKNOWN_GROUP: "A group that is not defined.",
-    GROUP_CYCLE: "Groups inherit from each other in a circle.",
+    GROUP_CYCLE: "The inheritance of groups has a cycle.",
     UNKNOWN_HARDWARE: "A node's hardware is not defined.",
     UNKNOWN_RADIO: "A node sets a radio that its hardware does not have.",
-    BAD_ADDRESS: "A node's address cannot be worked out.",
-    TOO_MANY_ERRORS: "There are more errors than are reported.",
+    BAD_ADDRESS: "A node's address cannot be determined.",
+    TOO_MANY_ERRORS: "Too many errors: the rest is not reported.",
 }
 
 
@@ -67,10 +67,10 @@ def error(
     found: str = "",
     hint: str = "",
 ) -> Diagnostic:
-    """An error of the loader; everything it reports is one."""
+    """An error of the loader, which reports nothing but errors."""
     return Diagnostic(code, Severity.ERROR, position, message, path, expected, found, hint)
 
 
 def too_many(position: Position) -> Diagnostic:
-    """What stands at the end when not everything is reported."""
-    return error(TOO_MANY_ERRORS, position, f"more than {MAX_DIAGNOSTICS} errors; mend these first")
+    """The last diagnostic if not everything is reported."""
+    return error(TOO_MANY_ERRORS, position, f"more than {MAX_DIAGNOSTICS} errors; fix these first")

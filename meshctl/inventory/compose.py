@@ -1,8 +1,8 @@
-"""Text -> YAML events (libyaml's parser where PyYAML has it) -> one tree, with every limit kept on the way.
+"""Text -> YAML events (libyaml's parser if PyYAML has it) -> one tree, with all limits enforced.
 
-The tree is built from events with a stack of its own: deep nesting cannot exhaust Python's, and an alias shares the
-value it names, so a bomb costs nothing before it is refused. Refused with a place: tags, merge keys, keys that are not
-text, several documents. Everything but a syntax error is reported together.
+The tree is built with an explicit stack, so deep nesting cannot exhaust Python's, and aliases share values, so an alias
+bomb costs nothing before it is rejected. Tags, merge keys, keys that are not text and multiple documents are rejected.
+Everything but a syntax error is reported together.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, posi
 
 # The deepest place of the format, nodes.*.radios.*.mesh, is five levels down.
 MAX_DEPTH = 32
-# 10,000 nodes with 20 values each are 200,000. Bounds memory (about 300 bytes a value) and alias bombs.
+# 10,000 nodes with 20 values each are 200,000. Bounds memory (about 300 bytes per value) and alias bombs.
 MAX_VALUES = 1_000_000
 
 # The parser stops at the bracket of a name such as b[01-12] in flow style.
@@ -31,7 +31,7 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 @dataclass(frozen=True, slots=True)
 class Composed:
-    """`root` is None when the text could not be read to its end; the diagnostics then say why."""
+    """`root` is None if the text could not be parsed to its end; the diagnostics then say why."""
 
     root: Tree | None
     diagnostics: tuple[Diagnostic, ...]
@@ -42,7 +42,7 @@ def compose(source: Source) -> Composed:
     composer = _Composer(source.file)
     try:
         for event in _events(source.text):
-            if not composer.take(event):
+            if not composer.handle(event):
                 break
     except yaml.MarkedYAMLError as reason:
         composer.fail(_syntax_error(source, reason))
@@ -62,7 +62,7 @@ def _syntax_error(source: Source, reason: yaml.MarkedYAMLError) -> Diagnostic:
     mark = reason.problem_mark or reason.context_mark
     place = Position(source.file)
     if mark is not None:
-        # libyaml counts a line more when the text ends without a newline.
+        # libyaml counts one more line if the text does not end in a newline.
         last = source.text.count("\n")
         beyond = mark.line > last
         column = len(source.text) - source.text.rfind("\n") - 1 if beyond else mark.column
@@ -74,24 +74,24 @@ def _syntax_error(source: Source, reason: yaml.MarkedYAMLError) -> Diagnostic:
 
 
 def _hint(source: Source, place: Position) -> str:
-    """What the usual slips look like to YAML's grammar."""
+    """A hint for common YAML mistakes."""
     lines = source.text.splitlines()
     if not 0 < place.line <= len(lines):
         return ""
     before = lines[place.line - 1][: place.column]
     if "\t" in before:
-        return "YAML is indented with spaces, never with tabs"
+        return "indent YAML with spaces, not tabs"
     if _RANGE_IN_BRACES.search(before):
-        return 'inside braces a range needs quotes: {"b[01-12]": ...}'
+        return 'quote a range inside braces: {"b[01-12]": ...}'
     if before.endswith(":") and before.count(": ") > 0:
-        return "quote a value that holds a colon and a space"
+        return "quote a value that contains a colon and a space"
     if before.endswith(("@", "`", "%")):
         return f"quote a value that begins with {before[-1]}"
     return ""
 
 
 class _Mark(Protocol):
-    """A place in the text, counted from 0; both of PyYAML's parsers have one."""
+    """A position in the text, from 0, as in both of PyYAML's parsers."""
 
     line: int
     column: int
@@ -99,7 +99,7 @@ class _Mark(Protocol):
 
 
 def _marks(event: yaml.Event) -> tuple[_Mark, _Mark]:
-    """Where an event begins and ends; the parsers always say so."""
+    """Start and end of an event, which the parsers always set."""
     start, end = event.start_mark, event.end_mark
     assert start is not None
     assert end is not None
@@ -108,7 +108,7 @@ def _marks(event: yaml.Event) -> tuple[_Mark, _Mark]:
 
 @dataclass(slots=True)
 class _Composer:
-    """The open containers, innermost last, each with the key that waits for its value and the anchor it defines."""
+    """The open containers, innermost last, each with its pending key and its anchor."""
 
     file: str
     root: Tree | None = None
@@ -124,8 +124,8 @@ class _Composer:
         self.is_broken = True
         self.diagnostics.append(diagnostic)
 
-    def take(self, event: yaml.Event) -> bool:
-        """One event; False when reading on is of no use."""
+    def handle(self, event: yaml.Event) -> bool:
+        """Handle one event; False to stop reading."""
         match event:
             case yaml.ScalarEvent():
                 self._refuse_tag(event)
@@ -138,7 +138,7 @@ class _Composer:
             case yaml.AliasEvent():
                 self._alias(event)
             case yaml.DocumentStartEvent() if self.root is not None:
-                self._refuse(event, "only one YAML document may stand in a file", hint="remove the line `---`")
+                self._refuse(event, "a file must contain only one YAML document", hint="remove the line `---`")
                 return False
             case _:
                 pass
@@ -177,14 +177,14 @@ class _Composer:
         target = self._anchors.get(event.anchor or "")
         if target is None:
             inside = any(anchor == event.anchor for _, anchor in self._open)
-            what = "stands inside the value it names" if inside else "names no anchor written before it"
+            what = "is inside the value that it refers to" if inside else "refers to no earlier anchor"
             place = self._place(event)
             self.fail(codes.error(codes.YAML_FEATURE, place, f"the alias *{event.anchor} {what}"))
             return
         self._add(target, None)
 
     def _add(self, tree: Tree, anchor: str | None) -> None:
-        """A complete value: a key, an entry's value, a list's item or the document."""
+        """Add a complete value: a key, the value of an entry, an item of a list or the document."""
         if anchor is not None:
             self._anchors[anchor] = tree
         self._count += 1
@@ -193,7 +193,7 @@ class _Composer:
             return
         container, _ = self._open[-1]
         if isinstance(container, MappingNode) and self._key is None:
-            self._take_key(tree)
+            self._set_key(tree)
             return
         container.weight += tree.weight
         if max(container.weight, self._count) > MAX_VALUES:
@@ -201,9 +201,9 @@ class _Composer:
                 codes.error(
                     codes.TOO_MANY_VALUES,
                     position(tree),
-                    "too many values, counted with aliases followed",
+                    "too many values (with aliases expanded)",
                     expected=f"at most {MAX_VALUES}",
-                    hint="write nodes that are alike as a range, and what they share as a group",
+                    hint="write similar nodes as a range, and shared values as a group",
                 )
             )
         elif isinstance(container, SequenceNode):
@@ -211,7 +211,7 @@ class _Composer:
         else:
             self._entry(container, tree)
 
-    def _take_key(self, tree: Tree) -> None:
+    def _set_key(self, tree: Tree) -> None:
         if isinstance(tree, Scalar):
             self._key = tree
             return
@@ -222,14 +222,14 @@ class _Composer:
         assert key is not None
         first = mapping.keys.get(key.text)
         if key.is_plain and key.text == "<<":
-            hint = "let nodes share values through `groups` and `defaults`"
+            hint = "share values between nodes with `groups` and `defaults`"
             self._note(codes.error(codes.YAML_FEATURE, position(key), "merge keys are not supported", hint=hint))
         elif first is not None:
             self._note(
                 codes.error(
                     codes.DUPLICATE_KEY,
                     position(key),
-                    f"the key '{shown(key.text)}' stands twice in one mapping, first in line {first.line}",
+                    f"duplicate key '{shown(key.text)}', first set on line {first.line}",
                 )
             )
         else:
@@ -245,7 +245,7 @@ class _Composer:
         self._note(codes.error(codes.YAML_FEATURE, self._place(event), message, hint=hint))
 
     def _note(self, diagnostic: Diagnostic) -> None:
-        """Something wrong after which reading goes on, until there is too much of it."""
+        """Report an error and go on, up to the limit of errors."""
         self.diagnostics.append(diagnostic)
         if len(self.diagnostics) >= codes.MAX_DIAGNOSTICS:
             self.fail(codes.too_many(diagnostic.position))
@@ -256,6 +256,6 @@ class _Composer:
 
 
 def shown(text: str, limit: int = 60) -> str:
-    """Text on one line and of bounded length, for a message."""
+    """Text for a message: on one line, of bounded length."""
     flat = "".join(letter if letter.isprintable() else "?" for letter in text)
     return flat if len(flat) <= limit else flat[: limit - 3] + "..."

@@ -1,8 +1,8 @@
-"""Edits of an inventory that keep its comments and layout.
+"""Edit an inventory and keep its comments and layout.
 
-Open an inventory, set and remove values, ask for the changes, save them. After each step the text is read again and
-must say exactly what was meant, and the whole inventory must still load: a step that does not is refused, and nothing
-is written.
+Flow: `Editor.open` -> `set` and `remove` -> `changes` -> `save`. After each edit the text is parsed again and must
+contain exactly the intended data, and the whole inventory must still load; otherwise the edit is refused and nothing is
+written.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from types import MappingProxyType
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
 from meshctl.inventory.compose import compose
-from meshctl.inventory.include import gather
+from meshctl.inventory.include import read_files
 from meshctl.inventory.load import load
 from meshctl.inventory.ranges import BadRange, expand, is_range
 from meshctl.inventory.source import Source, read_bytes
@@ -40,7 +40,7 @@ _BOM = "\ufeff"
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class FileEdit:
     """One file's text before and after."""
 
     file: Path
@@ -60,7 +60,7 @@ class Change:
 
 @dataclass(slots=True)
 class Editor:
-    """The texts of an inventory's files while they are edited. Open one with `Editor.open`."""
+    """The texts of an inventory's files during an edit; create it with `Editor.open`."""
 
     path: Path
     environ: Mapping[str, str]
@@ -70,52 +70,52 @@ class Editor:
 
     @classmethod
     def open(cls, path: Path, *, environ: Mapping[str, str] = MappingProxyType({})) -> Editor:
-        """Raises InvalidInput when the inventory has errors: they are mended first, by hand."""
+        """Raises InvalidInput if the inventory has errors, which must be fixed by hand first."""
         loaded = load(path, environ=environ)
         if loaded.fleet is None:
             raise InvalidInput(loaded.diagnostics)
         editor = cls(path, environ)
-        for file in gather(path, environ).files:
+        for file in read_files(path, environ).files:
             text = editor._before[file] = editor._texts[file] = read_bytes(file).decode("utf-8")
             root = _compose(file, text.removeprefix(_BOM))
             if root is None:
-                raise InputError(f"{file}: has changed while it was read")
+                raise InputError(f"{file}: changed while it was being read")
             editor._roots[file] = root
         return editor
 
     def set(self, path: tuple[str, ...], value: Value, *, after: str = "") -> None:
-        """Write `value` at `path`, in the file that has it or its nearest container; a new entry goes to the end of
-        its mapping, or behind the entry `after`. Raises InputError when the layout does not allow it."""
+        """Set `path` to `value`, in the file that has it or its nearest container; a new entry goes to the end of its
+        mapping, or after the entry `after`. Raises InputError if the layout does not allow it."""
         file = self._file_of(path)
         root = self._roots[file]
         self._replace(file, _with(plain_data(root), path, data(value)), self._set_text(file, root, path, value, after))
 
     def remove(self, path: tuple[str, ...]) -> None:
-        """Take the entry at `path` out. Raises InputError when there is none, or the layout does not allow it."""
+        """Remove the entry at `path`. Raises InputError if there is none, or the layout does not allow it."""
         file = self._file_of(path)
         root = self._roots[file]
         mapping = descend(root, path[:-1])
         if not isinstance(mapping, MappingNode) or path[-1] not in mapping.keys:
-            raise InputError(f"{file}: there is no {'.'.join(path)} to remove")
+            raise InputError(f"{file}: no entry {'.'.join(path)} to remove")
         text = remove_entry(self._text(file), mapping, path[-1])
         self._replace(file, _without(plain_data(root), path), text)
 
-    def changes(self) -> tuple[Change, ...]:
-        """The files that differ. Raises InvalidInput when the edited inventory would not load."""
+    def changes(self) -> tuple[FileEdit, ...]:
+        """The edits of each changed file. Raises InvalidInput if the edited inventory does not load."""
         loaded = load(self.path, environ=self.environ, read=self._read)
         if loaded.fleet is None:
             raise InvalidInput(loaded.diagnostics)
         return tuple(
-            Change(file, self._before[file], text) for file, text in self._texts.items() if text != self._before[file]
+            FileEdit(file, self._before[file], text) for file, text in self._texts.items() if text != self._before[file]
         )
 
     def has(self, path: tuple[str, ...]) -> bool:
-        """Whether a file writes `path`."""
+        """Whether a file sets `path`."""
         return any(descend(self._roots[file], path) is not None for file in self._texts)
 
     def sibling_of(self, node: str) -> str:
-        """The entry that `node`'s own belongs behind: the range that makes it, or the last of its nodes' own entries
-        right below the range; the empty text when no range makes it."""
+        """The entry after which `node`'s own entry belongs: the range that contains it, or the last entry of a node of
+        that range right below it; an empty string if no range contains it."""
         for file in self._texts:
             nodes = self._roots[file].values.get("nodes")
             patterns = list(nodes.keys) if isinstance(nodes, MappingNode) else []
@@ -134,7 +134,7 @@ class Editor:
         return self._texts[file].removeprefix(_BOM)
 
     def _file_of(self, path: tuple[str, ...]) -> Path:
-        """The file that writes `path`, or the longest part of it; the first file when none does."""
+        """The file that sets `path` or its longest prefix; the first file if none does."""
 
         def depth(file: Path) -> int:
             root = self._roots[file]
@@ -164,23 +164,23 @@ class Editor:
             assert isinstance(parent, MappingNode)
             return fill_empty(text, container, parent.keys[path[known - 1]].column + 1, key, value)
         if not isinstance(container, MappingNode):
-            raise InputError(f"{file}: {'.'.join(path[:known])} is no mapping, so {key} cannot be set in it")
+            raise InputError(f"{file}: {'.'.join(path[:known])} is not a mapping, so {key} cannot be set")
         return insert_entry(text, container, key, value, after=after)
 
     def _replace(self, file: Path, meant: object, text: str) -> None:
-        """Take `text` for `file` when it says what is meant."""
+        """Replace `file` by `text` if it contains the intended data."""
         root = _compose(file, text)
         if root is None or not _same(plain_data(root), meant):
             raise InputError(
-                f"{file}: the layout does not allow this edit without touching more than it",
-                hint="make the edit by hand, or write the entry in a simpler layout first",
+                f"{file}: the layout does not allow this edit without changing other values",
+                hint="edit the file by hand, or simplify the layout of the entry first",
             )
         bom = _BOM if self._texts[file].startswith(_BOM) else ""
         self._texts[file], self._roots[file] = bom + text, root
 
 
 def set_node(editor: Editor, node: str, values: Mapping[str, Value]) -> None:
-    """Write values at one node. A node that a range makes gets an entry of its own, behind the range."""
+    """Set values of one node. A node of a range gets its own entry, after the range."""
     if not editor.has(("nodes", node)):
         editor.set(("nodes", node), dict(values), after=editor.sibling_of(node))
         return
@@ -189,45 +189,45 @@ def set_node(editor: Editor, node: str, values: Mapping[str, Value]) -> None:
 
 
 def set_state(editor: Editor, node: str, state: NodeState) -> None:
-    """Write a node's state."""
+    """Set a node's state."""
     set_node(editor, node, {"state": state.value})
 
 
 def add_topic(editor: Editor, name: str, fields: Mapping[str, Value]) -> None:
-    """A new topic, `fields` by the keys of the format (`priority`, `class`, ...). Raises InputError when it exists."""
+    """Add a topic with `fields` by the format's keys (`priority`, `class`, ...). Raises InputError if it exists."""
     if editor.has(("topics", name)):
-        raise InputError(f"there is a topic '{name}' already", hint="change it with `set`")
+        raise InputError(f"topic '{name}' already exists", hint="change it with `set`")
     editor.set(("topics", name), dict(fields))
 
 
 def set_topic(editor: Editor, name: str, fields: Mapping[str, Value]) -> None:
-    """Change keys of a topic. Raises InputError when there is none."""
+    """Change keys of a topic. Raises InputError if it does not exist."""
     if not editor.has(("topics", name)):
-        raise InputError(f"there is no topic '{name}'", hint="make it with `add`")
+        raise InputError(f"there is no topic '{name}'", hint="create it with `add`")
     for key, value in fields.items():
         editor.set(("topics", name, key), value)
 
 
 def remove_topic(editor: Editor, name: str) -> None:
-    """Take a topic out. Raises InputError when there is none."""
+    """Remove a topic. Raises InputError if it does not exist."""
     editor.remove(("topics", name))
 
 
-def save(changes: tuple[Change, ...]) -> None:
-    """Write each file at once, keeping its mode. Raises InputError when one has changed meanwhile, or cannot be
+def save(changes: tuple[FileEdit, ...]) -> None:
+    """Write each file atomically, keeping its mode. Raises InputError if a file changed meanwhile or cannot be
     written."""
     for change in changes:
         target = Path(os.path.realpath(change.file))
         try:
             if target.read_bytes() != change.before.encode("utf-8"):
-                raise InputError(f"{change.file}: has changed meanwhile, so nothing was written to it")
+                raise InputError(f"{change.file}: changed meanwhile; not written")
             _write(target, change.after.encode("utf-8"))
         except OSError as reason:
             raise InputError(f"{change.file}: cannot be written: {reason.strerror}") from reason
 
 
 def _write(target: Path, content: bytes) -> None:
-    """Through a file beside it, so that a crash leaves the old text or the new one."""
+    """Write a temporary file and rename it, so that a crash leaves either the old or the new text."""
     mode = stat.S_IMODE(target.stat().st_mode)
     descriptor, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
     try:
@@ -255,7 +255,7 @@ def _names(pattern: str) -> tuple[str, ...]:
 
 
 def _append(text: str, key: str, value: Value) -> str:
-    """A new top-level key: entries of a section below it, anything else on its line."""
+    """Append a top-level key: a section's entries below it, other values on the same line."""
     match value:
         case Mapping() if len(value) == 1:
             ((name, item),) = value.items()
@@ -265,7 +265,7 @@ def _append(text: str, key: str, value: Value) -> str:
 
 
 def _with(old: object, path: tuple[str, ...], value: object) -> object:
-    """`old` with `value` at `path`; containers that are missing on the way are made."""
+    """`old` with `value` at `path`; missing containers are created."""
     if not path:
         return value
     if isinstance(old, list):
@@ -283,7 +283,7 @@ def _without(old: object, path: tuple[str, ...]) -> object:
 
 
 def _same(one: object, other: object) -> bool:
-    """Equal values in the same order of keys or any other; text that could be a number must be quoted in both."""
+    """Whether two values are equal, ignoring key order; text that could be a number must be quoted in both."""
     match one, other:
         case dict(), dict():
             return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)

@@ -1,4 +1,4 @@
-"""A node's values, each with the layer and the line it comes from."""
+"""A node's values, each with its layer and position."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from meshctl.model import Fleet, Node, Origin, Radio
 
 
 @dataclass(frozen=True, slots=True)
-class Why:
-    """`key` is the place below the node (`radios.radio0.mesh`); `value` is text for people."""
+class ExplainedValue:
+    """`key` is the path below the node (`radios.radio0.mesh`); `value` is text for display."""
 
     key: str
     value: str
     origin: Origin
 
 
-def explain(fleet: Fleet, node: Node) -> tuple[Why, ...]:
-    """Everything that holds for `node`, in the order of the format. A value that nobody wrote is `built-in`, at the
-    place of what encloses it."""
-    return tuple(Why(key, value, _origin(fleet, node, key)) for key, value in _values(node))
+def explain(fleet: Fleet, node: Node) -> tuple[ExplainedValue, ...]:
+    """All values of `node`, in the order of the format. A default value is `built-in`, at the position of its
+    container."""
+    return tuple(ExplainedValue(key, value, _origin(fleet, node, key)) for key, value in _values(node))
 
 
 def _values(node: Node) -> Iterator[tuple[str, str]]:
@@ -68,15 +68,15 @@ def _radio_values(radio: Radio) -> Iterator[tuple[str, str]]:
 
 
 def _origin(fleet: Fleet, node: Node, key: str) -> Origin:
-    # Names of UCI options hold dots of their own.
+    # Names of UCI options contain dots.
     parts = ("extra_uci", key.removeprefix("extra_uci.")) if key.startswith("extra_uci.") else tuple(key.split("."))
     for path in (("nodes", node.name, *parts), ("hardware", node.hardware.name, *parts)):
-        written = fleet.origins.get(path)
+        written = fleet.provenance.get(path)
         if written is not None:
             return written
     if parts[0] == "radios":
         place = fleet.where("hardware", node.hardware.name, *parts[:2])
-        # The drive level defaults to the most that the driver offers, the mesh to the only one of the band.
+        # The drive level defaults to the driver's maximum, the mesh to the only one of the band.
         source = {"tx_power_dbm": "max_drive_dbm", "mesh": "band"}.get(parts[2])
         if source is not None:
             place = fleet.where("hardware", node.hardware.name, *parts[:2], source)

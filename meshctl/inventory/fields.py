@@ -1,7 +1,7 @@
-"""Types of single values: what a scalar's text means to the field that reads it, strictly.
+"""Strict types of single values: how a field interprets the text of a scalar.
 
-Each type refuses with an error whose context says what was `expected`; the message never repeats the value, which may
-be a secret put in the wrong place.
+The error of a type has the `expected` text in its context; the message never repeats the value, which may be a
+misplaced secret.
 """
 
 from __future__ import annotations
@@ -54,21 +54,19 @@ def _text(value: object) -> str:
     if not isinstance(value, str):
         raise wrong("text")
     if "\0" in value:
-        raise wrong("text without the character NUL")
+        raise wrong("text without NUL characters")
     return str(value)
 
 
 def is_name(value: str) -> bool:
-    """Names become host names, file names and keys: letters, digits, `.`, `_`, `-`, at most 63 of them."""
+    """Names become hostnames, file names and keys: at most 63 letters, digits, `.`, `_`, `-`."""
     return _NAME.fullmatch(value) is not None
 
 
 def _name(value: str) -> str:
     if is_name(value):
         return value
-    raise wrong(
-        "a name of letters, digits, '.', '_' and '-', at most 63 of them, starting and ending with a letter or digit"
-    )
+    raise wrong("a name of at most 63 letters, digits, '.', '_' and '-', starting and ending with a letter or digit")
 
 
 def _mac(value: str) -> str:
@@ -84,7 +82,7 @@ def _country(value: str) -> str:
 
 
 def _vlan(value: str) -> str:
-    # swconfig's drivers take VLANs 1 to 127 or to 4094; 802.1Q has no more
+    # swconfig drivers accept VLANs up to 127 or 4094; 802.1Q allows 4094
     if re.fullmatch("[1-9][0-9]{0,3}", value) and int(value) <= 4094:
         return value
     raise wrong("a VLAN from 1 to 4094")
@@ -93,7 +91,7 @@ def _vlan(value: str) -> str:
 def _switch_ports(value: str) -> str:
     if re.fullmatch(_SWITCH_PORTS, value):
         return value
-    raise wrong("numbers of ports, 't' behind a tagged one, such as 3 0t")
+    raise wrong("port numbers, with 't' after a tagged one, such as 3 0t")
 
 
 def _address(value: object) -> IPv4Address:
@@ -119,7 +117,7 @@ def _network(value: object) -> IPv4Network:
     except (AddressValueError, NetmaskValueError):
         pass
     except ValueError:
-        raise wrong("a network address: the part behind the prefix must be zero") from None
+        raise wrong("a network address, with all host bits zero") from None
     raise wrong("an IPv4 network such as 10.42.0.0/24")
 
 
@@ -138,7 +136,7 @@ def _version(value: object) -> object:
 
 
 def empty_mapping(value: object) -> object:
-    """A section with nothing under it is an empty one."""
+    """Read an empty section as an empty mapping."""
     return {} if value is None else value
 
 
@@ -172,7 +170,7 @@ Window = Annotated[
     BeforeValidator(_window),
     WithJsonSchema({"anyOf": [{"const": "adaptive"}, {"type": "integer", "minimum": 1, "maximum": 1024}]}),
 ]
-# Releases look like numbers; editors must accept them without quotes, as the loader does.
+# Releases look like numbers: editors must accept them unquoted, as the loader does.
 _RELEASES = [release.value for release in Release]
 ReleaseName = Annotated[Release, WithJsonSchema({"enum": [*_RELEASES, *map(float, _RELEASES)]})]
 Address = Annotated[IPv4Address, PlainValidator(_address), WithJsonSchema({"type": "string", "format": "ipv4"})]

@@ -1,9 +1,9 @@
-"""Which files an inventory may name to be read as its own: those of its tree, and no pipe or device.
+"""Files that an inventory may include: those of its tree, and no pipes or devices.
 
-An inventory may be untrusted, such as a pull request that CI lints. Its includes and templates are shown in
-findings and renderings, so they must not reach /etc/shadow, a token beside the checkout, or a pipe that never ends.
-The tree is the git work tree that holds the inventory, else the directory of its first file. `MESHCTL_INCLUDE_PATH`
-(directories joined by `:`) adds others.
+An inventory may be untrusted, such as a pull request that CI lints. Findings and renderings show its includes and
+templates, so they must not reach /etc/shadow, a token next to the checkout, or an endless pipe. The tree is the git
+work tree of the inventory, else the directory of its first file. `MESHCTL_INCLUDE_PATH` (directories separated by `:`)
+adds others.
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ HINT = f"move it there, or allow its directory: export {VARIABLE}=DIR"
 
 @dataclass(frozen=True, slots=True)
 class Boundary:
-    """`roots` are real paths of directories; the first one is the inventory's tree."""
+    """`roots` are resolved directories; the first one is the inventory's tree."""
 
     roots: tuple[str, ...]
 
     @classmethod
     def of(cls, folder: Path, environ: Mapping[str, str]) -> Boundary:
-        """For an inventory whose first file lies in `folder`."""
+        """The boundary of an inventory whose first file is in `folder`."""
         more = [path for path in environ.get(VARIABLE, "").split(":") if path]
         return cls((_tree(folder), *(os.path.realpath(os.path.expanduser(path)) for path in more)))
 
-    def objection(self, path: Path) -> str:
-        """Why `path`, with symbolic links followed, may not be read as part of the inventory; empty when it may."""
+    def refusal(self, path: Path) -> str:
+        """Why `path`, with symbolic links resolved, must not be read as part of the inventory; empty if it may."""
         real = os.path.realpath(path)
         inside = [root for root in self.roots if real == root or real.startswith(root.rstrip("/") + "/")]
         if not inside:
             return f"outside the inventory's tree {self.roots[0]}"
         if ".git" in os.path.relpath(real, inside[0]).split("/"):
             return "inside git's own directory"
-        return irregular(path)
+        return special_file(path)
 
 
-def irregular(path: Path) -> str:
-    """What a file is that never ends or has no content of its own: a pipe, a device, a socket; empty for the rest."""
+def special_file(path: Path) -> str:
+    """A description of a pipe, device or socket, which may never end; empty for regular files and directories."""
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):
-        # reading it gives the reason
+        # reading reports the reason
         return ""
-    return "" if stat.S_ISREG(mode) or stat.S_ISDIR(mode) else "not a regular file, but a pipe, a socket or a device"
+    return "" if stat.S_ISREG(mode) or stat.S_ISDIR(mode) else "not a regular file (a pipe, socket or device)"
 
 
 def _tree(folder: Path) -> str:

@@ -1,4 +1,4 @@
-"""The inventory's files -> one tree: the first file, then what it includes, each key in one place only."""
+"""The inventory's files -> one tree: the first file and its includes; each key may be set only once."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from meshctl.inventory.file_access import HINT, Boundary
 from meshctl.inventory.source import Reader, Source, read_bytes, read_source
 from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, describe, position
 
-# Files, counted with every include; bounds the time that a crafted inventory can cost.
+# Number of files including all includes; bounds the time that a crafted inventory can cost.
 MAX_FILES = 256
-# The name that a directory's first file has.
+# The first file of a directory.
 FIRST_FILE = "fleet.yaml"
 
 
 @dataclass(frozen=True, slots=True)
-class Gathered:
-    """`root` is None when a file could not be read as a mapping. `files` are in the order they were read."""
+class MergedFiles:
+    """`root` is None if a file could not be read as a mapping. `files` are in the order of reading."""
 
     root: MappingNode | None
     files: tuple[Path, ...]
@@ -30,21 +30,21 @@ class Gathered:
 
 
 def first_file(path: Path) -> Path:
-    """The file to begin with: `path`, or `fleet.yaml` in it when it is a directory."""
+    """The first file: `path`, or `fleet.yaml` in it if it is a directory."""
     return path / FIRST_FILE if os.path.isdir(path) else path
 
 
-def gather(path: Path, environ: Mapping[str, str], read: Reader = read_bytes) -> Gathered:
+def read_files(path: Path, environ: Mapping[str, str], read: Reader = read_bytes) -> MergedFiles:
     """Read `path` and its includes. An include's `~` is `HOME` of `environ`."""
     first = first_file(path)
-    gathering = _Gathering(environ, read, Boundary.of(first.parent, environ))
+    gathering = _FileMerger(environ, read, Boundary.of(first.parent, environ))
     root = gathering.file(first, ())
     complete = root if not gathering.is_broken else None
-    return Gathered(complete, tuple(gathering.files), tuple(gathering.diagnostics))
+    return MergedFiles(complete, tuple(gathering.files), tuple(gathering.diagnostics))
 
 
 @dataclass(slots=True)
-class _Gathering:
+class _FileMerger:
     environ: Mapping[str, str]
     read: Reader
     boundary: Boundary
@@ -54,7 +54,7 @@ class _Gathering:
     weight: int = 0
 
     def file(self, path: Path, above: tuple[str, ...]) -> MappingNode | None:
-        """One file with everything it includes; `above` are the real paths of the files that led here."""
+        """Read a file and its includes; `above` are the resolved paths of the including files."""
         source = read_source(path, self.read)
         if not isinstance(source, Source):
             is_first_missing = source.code == codes.UNREADABLE and not above
@@ -79,19 +79,19 @@ class _Gathering:
                 codes.error(
                     codes.TOO_MANY_VALUES,
                     position(root),
-                    "too many values in all files together",
+                    "too many values in all files",
                     expected=f"at most {MAX_VALUES}",
                 )
             )
             return None
-        self._follow(root, path, (*above, os.path.realpath(path)))
+        self._follow_includes(root, path, (*above, os.path.realpath(path)))
         return root
 
     def _fail(self, diagnostic: Diagnostic) -> None:
         self.is_broken = True
         self.diagnostics.append(diagnostic)
 
-    def _follow(self, root: MappingNode, path: Path, above: tuple[str, ...]) -> None:
+    def _follow_includes(self, root: MappingNode, path: Path, above: tuple[str, ...]) -> None:
         includes = root.values.get("include")
         if not isinstance(includes, SequenceNode):
             return
@@ -102,12 +102,12 @@ class _Gathering:
             if target is None:
                 continue
             real = os.path.realpath(target)
-            if objection := self.boundary.objection(target):
-                problem = codes.error(codes.INCLUDE, position(item), f"the include {target} is {objection}")
-                self._fail(replace(problem, hint=HINT if objection.startswith("outside") else ""))
+            if refusal := self.boundary.refusal(target):
+                problem = codes.error(codes.INCLUDE, position(item), f"the include {target} is {refusal}")
+                self._fail(replace(problem, hint=HINT if refusal.startswith("outside") else ""))
             elif real in above:
                 circle = " -> ".join(Path(name).name for name in (*above[above.index(real) :], real))
-                self._fail(codes.error(codes.INCLUDE, position(item), f"files include each other: {circle}"))
+                self._fail(codes.error(codes.INCLUDE, position(item), f"include cycle: {circle}"))
             elif any(os.path.realpath(known) == real for known in self.files):
                 self._fail(codes.error(codes.INCLUDE, position(item), f"{target} is included twice"))
             elif len(self.files) >= MAX_FILES:
@@ -118,16 +118,16 @@ class _Gathering:
             else:
                 known = len(self.diagnostics)
                 below = self.file(target, above)
-                self._tell_where_from(item, target, known)
+                self._report_at_include(item, target, known)
                 if below is not None:
                     self._merge(root, below)
 
     def _target(self, item: Tree, path: Path) -> Path | None:
-        """The path that an entry of `include` names; None when it is no text (the format check reports that)."""
+        """The path of an `include` entry; None if it is not text, which validation reports."""
         if not isinstance(item, Scalar) or item.is_null:
             return None
         if "\0" in item.text:
-            self._fail(codes.error(codes.INCLUDE, position(item), "not a path: it holds the character NUL"))
+            self._fail(codes.error(codes.INCLUDE, position(item), "not a path: it contains a NUL character"))
             return None
         if item.text.startswith("~/"):
             home = self.environ.get("HOME", "")
@@ -137,8 +137,8 @@ class _Gathering:
             return Path(home) / item.text[2:]
         return path.parent / item.text
 
-    def _tell_where_from(self, item: Scalar | Tree, target: Path, known: int) -> None:
-        """A file that cannot be read is reported where it is included."""
+    def _report_at_include(self, item: Scalar | Tree, target: Path, known: int) -> None:
+        """Report an unreadable file at its include."""
         for number in range(known, len(self.diagnostics)):
             problem = self.diagnostics[number]
             if problem.code == codes.UNREADABLE and problem.position.file == str(target):
@@ -147,7 +147,7 @@ class _Gathering:
                 )
 
     def _merge(self, root: MappingNode, below: MappingNode) -> None:
-        """Add an included file's keys: new sections as they are, mappings in both key by key."""
+        """Add the keys of an included file; mappings in both are merged key by key."""
         for key, value in below.values.items():
             here = root.values.get(key)
             if key == "include" or (key == "meshctl" and here is not None and _same_text(here, value)):
@@ -175,10 +175,10 @@ class _Gathering:
             codes.error(
                 codes.INCLUDE_CLASH,
                 position(second),
-                "written in two files",
+                "set in two files",
                 path=path,
                 found=f"also in {position(first)}",
-                hint="keep it in one of them",
+                hint="remove it from one of them",
             )
         )
 

@@ -1,4 +1,4 @@
-"""The format as a JSON Schema (draft 2020-12), so that editors complete and check an inventory."""
+"""The format as a JSON Schema (draft 2020-12), for completion and validation in editors."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ SCHEMA_ID = "urn:meshctl:inventory:1"
 def json_schema() -> dict[str, Any]:
     """The schema of every file of an inventory.
 
-    A file that names the format's version is the first one and holds what a fleet must have; one that does not is
-    included, and holds any of the same keys.
+    A file with `meshctl` is the first one and must have the required keys; a file without it is included, and may have
+    any keys.
     """
     schema = _untitled(InventoryDocument.model_json_schema(by_alias=True, schema_generator=_Generator))
     required = schema.pop("required")
@@ -27,14 +27,14 @@ def json_schema() -> dict[str, Any]:
 
 
 class _Generator(GenerateJsonSchema):
-    """Leaves out defaults that say nothing: that a key is not written, or that a section has its own."""
+    """Omits defaults without information: unset keys, and sections with their own defaults."""
 
     def get_default_value(self, schema: core_schema.WithDefaultSchema) -> Any:
         default = super().get_default_value(schema)
         return NoDefault if default is None or isinstance(default, BaseModel) else default
 
     def function_before_schema(self, schema: core_schema.BeforeValidatorFunctionSchema) -> dict[str, Any]:
-        """Where nothing may stand for an empty mapping, null is allowed."""
+        """Allow null where it means an empty mapping."""
         inner = super().function_before_schema(schema)
         if schema["function"]["function"] is empty_mapping:
             return {"anyOf": [inner, {"type": "null"}]}
@@ -42,7 +42,7 @@ class _Generator(GenerateJsonSchema):
 
 
 def _untitled(value: Any) -> Any:
-    """Without the titles, which repeat the keys."""
+    """Remove titles, which repeat the keys."""
     if isinstance(value, list):
         return [_untitled(item) for item in value]
     if not isinstance(value, dict):

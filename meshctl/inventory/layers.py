@@ -1,6 +1,6 @@
-"""Who says what about a node: entries expanded, groups followed, layers in order, nearest first.
+"""Resolve the layers of each node: expand ranges, follow groups, order the layers from highest to lowest precedence.
 
-defaults < groups (a parent below its child, an earlier below a later) < range < the node's own entry.
+Precedence: defaults < groups (parents before children, earlier before later) < range < the node's own entry.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from meshctl.inventory.tree import MappingNode, Tree, descend, place_of, positio
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layer:
-    """One place that says something about nodes. `title` is what an origin calls it; `path` is where it stands."""
+    """A mapping with values of nodes. `title` is its name in an origin; `path` is its location in the inventory."""
 
     title: str
     path: tuple[str, ...]
@@ -29,13 +29,13 @@ class Layer:
     place: Position
 
     def place_of(self, path: Sequence[str | int]) -> Position:
-        """Where the layer writes `path`; where it stands itself when it does not."""
+        """The position of `path` in the layer; the layer's own position if it does not set `path`."""
         return (place_of(self.tree, path) if path else None) or self.place
 
 
 @dataclass(frozen=True, slots=True)
-class NodePlan:
-    """A node before it is built: its layers, nearest first, its groups, and its number (from 1) in its range."""
+class NodeSpec:
+    """A node to build: its layers, highest precedence first, its groups, and its index (from 1) in its range."""
 
     name: str
     layers: tuple[Layer, ...]
@@ -44,26 +44,26 @@ class NodePlan:
 
     @property
     def entry(self) -> Layer:
-        """The layer that is reported when something is wrong with the node."""
+        """The layer at which errors of the node are reported."""
         return self.layers[0]
 
 
 @dataclass(frozen=True, slots=True)
-class Layered:
-    """`plans` in the inventory's order."""
+class ResolvedLayers:
+    """`nodes` are in the inventory's order."""
 
-    plans: dict[str, NodePlan]
+    nodes: dict[str, NodeSpec]
     diagnostics: tuple[Diagnostic, ...]
 
 
-def lay(document: InventoryDocument, root: MappingNode) -> Layered:
-    """Work out the layers of every node; groups that do not exist or inherit in a circle are reported."""
-    return _Laying(document, root).run()
+def resolve_layers(document: InventoryDocument, root: MappingNode) -> ResolvedLayers:
+    """Resolve the layers of every node; reports unknown groups and inheritance cycles."""
+    return _LayerResolver(document, root).run()
 
 
 @dataclass(slots=True)
 class _Entry:
-    """A key under `nodes`: its layer and, for a range, the number of each name in it."""
+    """A key of `nodes`: its layer and, for a range, the index of the name."""
 
     layer: Layer
     document: NodeDocument
@@ -71,7 +71,7 @@ class _Entry:
 
 
 @dataclass(slots=True)
-class _Laying:
+class _LayerResolver:
     document: InventoryDocument
     root: MappingNode
     diagnostics: list[Diagnostic] = field(default_factory=list)
@@ -80,36 +80,36 @@ class _Laying:
     _stacks: dict[tuple[str, ...], tuple[Layer, ...] | None] = field(default_factory=dict)
     _joined: dict[tuple[int, ...], tuple[Layer, ...]] = field(default_factory=dict)
 
-    def run(self) -> Layered:
+    def run(self) -> ResolvedLayers:
         for name, group in self.document.groups.items():
             self._groups[name] = self._layer(f"group {name}", ("groups", name), group)
         for name, group in self.document.groups.items():
             for number, parent in enumerate(group.inherits):
                 self._check_known(parent, self._groups[name], "inherits", number)
-        self._find_circles()
+        self._find_cycles()
         defaults = (self._layer("defaults", ("defaults",), self.document.defaults),)
-        plans: dict[str, NodePlan] = {}
+        specs: dict[str, NodeSpec] = {}
         for name, entries in self._entries().items():
             own = tuple(entry.layer for entry in entries)
             groups = next(
                 (entry.document.groups for entry in entries if "groups" in entry.document.model_fields_set), ()
             )
-            stack = self._stack(groups)
+            stack = self._group_layers(groups)
             if stack is not None:
                 key = (*map(id, own), *map(id, stack))
                 layers = self._joined.setdefault(key, (*own, *stack, *defaults))
-                plans[name] = NodePlan(name, layers, groups, entries[-1].index)
-        return Layered(plans, tuple(self.diagnostics))
+                specs[name] = NodeSpec(name, layers, groups, entries[-1].index)
+        return ResolvedLayers(specs, tuple(self.diagnostics))
 
     def _layer(self, title: str, path: tuple[str, ...], document: NodeLayer) -> Layer:
         tree = descend(self.root, path)
         if tree is None:
-            # `defaults` that nobody wrote.
+            # `defaults` is not set.
             tree = MappingNode(self.root.file, self.root.line, self.root.column, 0, 0, is_flow=True)
         return Layer(title, path, document, tree, place_of(self.root, path) or position(self.root))
 
-    def _find_circles(self) -> None:
-        """Depth first over the parents, each group once; an edge back to the trail closes a circle."""
+    def _find_cycles(self) -> None:
+        """Depth-first search over the parents; an edge back to the trail closes a cycle."""
         done: set[str] = set()
         for first in self._groups:
             trail: dict[str, None] = {}
@@ -121,16 +121,16 @@ class _Laying:
                     done.add(name)
                 elif name in trail:
                     names = list(trail)
-                    self._report_circle([*names[names.index(name) :], name])
+                    self._report_cycle([*names[names.index(name) :], name])
                 elif name not in done and name in self._groups:
                     trail[name] = None
                     pending.append((name, True))
                     pending.extend((parent, False) for parent in reversed(self.document.groups[name].inherits))
 
-    def _report_circle(self, names: list[str]) -> None:
+    def _report_cycle(self, names: list[str]) -> None:
         self._broken.update(names)
         layer = self._groups[names[0]]
-        message = f"groups inherit from each other: {' -> '.join(names[:20])}"
+        message = f"inheritance cycle of groups: {' -> '.join(names[:20])}"
         self.diagnostics.append(
             codes.error(codes.GROUP_CYCLE, layer.place_of(("inherits",)), message, path=f"groups.{names[0]}.inherits")
         )
@@ -149,14 +149,14 @@ class _Laying:
             )
         )
 
-    def _stack(self, groups: tuple[str, ...]) -> tuple[Layer, ...] | None:
-        """The groups' layers, nearest first, each group once, at its farthest place; None when one of them is not
-        known or stands in a circle, which has been reported."""
+    def _group_layers(self, groups: tuple[str, ...]) -> tuple[Layer, ...] | None:
+        """The groups' layers, highest precedence first, each group once at its lowest precedence; None if a group is
+        unknown or part of a cycle, which is already reported."""
         if groups not in self._stacks:
-            self._stacks[groups] = self._follow(groups)
+            self._stacks[groups] = self._linearize(groups)
         return self._stacks[groups]
 
-    def _follow(self, groups: tuple[str, ...]) -> tuple[Layer, ...] | None:
+    def _linearize(self, groups: tuple[str, ...]) -> tuple[Layer, ...] | None:
         ordered: list[Layer] = []
         seen: set[str] = set()
         pending = [(name, False) for name in reversed(groups)]
@@ -173,7 +173,7 @@ class _Laying:
         return tuple(reversed(ordered))
 
     def _entries(self) -> dict[str, list[_Entry]]:
-        """Each node's entries, its own before its range's."""
+        """The entries of each node, its own before its range's."""
         made: dict[str, list[_Entry]] = {}
         for pattern, document in self.document.nodes.items():
             ranged = is_range(pattern)
@@ -182,7 +182,7 @@ class _Laying:
                 self._check_known(group, layer, "groups", number)
             names = self._names(pattern, layer)
             if len(made) + len(names) > MAX_NAMES:
-                self._refuse(layer, f"too many nodes: at most {MAX_NAMES} are allowed")
+                self._refuse(layer, f"too many nodes (at most {MAX_NAMES})")
                 break
             for index, name in enumerate(names, start=1):
                 entries = made.setdefault(name, [])
@@ -194,7 +194,7 @@ class _Laying:
                         codes.error(
                             codes.NODE_TWICE,
                             layer.place,
-                            f"makes the node '{name}', which '{first.path[1]}' makes too",
+                            f"node '{name}' is also in range '{first.path[1]}'",
                             path=f"nodes.{pattern}",
                             found=f"also in {first.place}",
                         )
@@ -208,11 +208,11 @@ class _Laying:
         try:
             names = expand(pattern)
         except BadRange as reason:
-            self._refuse(layer, f"not a range such as b[01-12]: {reason}")
+            self._refuse(layer, f"invalid range (expected e.g. b[01-12]): {reason}")
             return ()
         wrong = next((name for name in names if not is_name(name)), None)
         if wrong is not None:
-            self._refuse(layer, f"'{shown(wrong)}' is not a name of letters, digits, '.', '_' and '-', at most 63")
+            self._refuse(layer, f"'{shown(wrong)}' is not a name of at most 63 letters, digits, '.', '_' and '-'")
             return ()
         return names
 

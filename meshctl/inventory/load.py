@@ -1,4 +1,4 @@
-"""Files -> tree -> document -> node plans -> fleet; every stage adds its diagnostics, none stops at the first."""
+"""Files -> tree -> document -> node specs -> fleet; each stage reports all its diagnostics."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from types import MappingProxyType
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, sorted_diagnostics
 from meshctl.inventory.build import build
-from meshctl.inventory.include import gather
-from meshctl.inventory.layers import lay
+from meshctl.inventory.include import read_files
+from meshctl.inventory.layers import resolve_layers
 from meshctl.inventory.source import Reader, read_bytes
 from meshctl.inventory.validate import validate
 from meshctl.model import Fleet
@@ -20,7 +20,7 @@ _NO_ENVIRON: Mapping[str, str] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
-    """`fleet` is None exactly when `diagnostics` holds an error. `files` are those read, the first one first."""
+    """`fleet` is None exactly if `diagnostics` contains an error. `files` are all files read, in order."""
 
     fleet: Fleet | None
     diagnostics: tuple[Diagnostic, ...]
@@ -28,28 +28,28 @@ class Loaded:
 
 
 def load(path: Path, *, environ: Mapping[str, str] = _NO_ENVIRON, read: Reader = read_bytes) -> Loaded:
-    """The fleet that `path` describes: a YAML file, or a directory that holds `fleet.yaml`.
+    """Load the inventory at `path`: a YAML file, or a directory with `fleet.yaml`.
 
-    `environ` gives `~` in includes its meaning (`HOME`); `read` gets a file's bytes and may raise OSError. Never raises
-    for anything a file holds.
+    `environ` provides `HOME` for `~` in includes; `read` returns a file's bytes and may raise OSError. Never raises for
+    the content of a file.
     """
-    gathered = gather(path, environ, read)
-    files = tuple(str(file) for file in gathered.files)
-    problems = list(gathered.diagnostics)
+    merged = read_files(path, environ, read)
+    files = tuple(str(file) for file in merged.files)
+    problems = list(merged.diagnostics)
     fleet: Fleet | None = None
-    if gathered.root is not None:
-        validated = validate(gathered.root)
+    if merged.root is not None:
+        validated = validate(merged.root)
         problems.extend(validated.diagnostics)
         if validated.document is not None:
-            layered = lay(validated.document, gathered.root)
-            built = build(validated.document, gathered.root, layered.plans, gathered.files)
-            problems.extend((*layered.diagnostics, *built.diagnostics))
+            resolved = resolve_layers(validated.document, merged.root)
+            built = build(validated.document, merged.root, resolved.nodes, merged.files)
+            problems.extend((*resolved.diagnostics, *built.diagnostics))
             fleet = built.fleet
     return Loaded(None if problems else fleet, sorted_diagnostics(problems), files)
 
 
 def load_fleet(path: Path, *, environ: Mapping[str, str] = _NO_ENVIRON) -> Fleet:
-    """The fleet. Raises InvalidInput with every diagnostic when there is any."""
+    """Load the fleet. Raises InvalidInput with all diagnostics if there are any."""
     loaded = load(path, environ=environ)
     if loaded.fleet is None:
         raise InvalidInput(loaded.diagnostics)

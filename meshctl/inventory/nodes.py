@@ -1,6 +1,6 @@
-"""Layers -> nodes: values joined, radios matched with hardware and mesh, addresses worked out.
+"""Layers -> nodes: merge values, match radios with hardware and mesh, compute addresses.
 
-Nodes with the same layers (a range) are worked out once; only name, host name and address differ.
+Nodes with the same layers (a range) are built once; only name, hostname and address differ.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from meshctl.diagnostics import Diagnostic
 from meshctl.inventory import codes
 from meshctl.inventory.addresses import AddressRule, AddressValue, BadAddress
 from meshctl.inventory.documents import RadioLayer, SshLayer
-from meshctl.inventory.layers import Layer, NodePlan
+from meshctl.inventory.layers import Layer, NodeSpec
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Band, HardwareProfile, Mesh, Node, NodeState, Radio, Role, SshSettings
 
-# Stands in a template until the node's own address is known.
+# Placeholder in a template until the node's address is known.
 _NO_ADDRESS = IPv4Interface("0.0.0.0/0")
 
 
@@ -32,7 +32,7 @@ class BuiltNodes:
 
 @dataclass(frozen=True, slots=True)
 class _Template:
-    """What all nodes with the same layers share."""
+    """The shared part of all nodes with the same layers."""
 
     node: Node
     address: AddressValue
@@ -42,26 +42,26 @@ class _Template:
 
 
 def build_nodes(
-    plans: Mapping[str, NodePlan],
+    specs: Mapping[str, NodeSpec],
     hardware: Mapping[str, HardwareProfile],
     meshes: Mapping[str, Mesh],
     robot_of: Mapping[str, str],
 ) -> BuiltNodes:
-    """Every node that can be built; a diagnostic, once for a whole range, for each that cannot.
+    """Build all nodes; errors of a range are reported once.
 
-    `robot_of` names the robot that lists a node, for nodes that do not name it themselves.
+    `robot_of` maps nodes to the robots that list them, for nodes without `robot`.
     """
     building = _Building(hardware, meshes, _only_meshes(meshes))
     nodes: dict[str, Node] = {}
-    for plan in plans.values():
-        node = building.node(plan, robot_of.get(plan.name, ""))
+    for spec in specs.values():
+        node = building.node(spec, robot_of.get(spec.name, ""))
         if node is not None:
-            nodes[plan.name] = node
+            nodes[spec.name] = node
     return BuiltNodes(nodes, tuple(building.diagnostics))
 
 
 def joined(layers: tuple[Layer, ...]) -> dict[str, Any]:
-    """The values written in any layer, the nearest winning; mappings (`radios`, `ssh`, `extra_uci`) join key by key."""
+    """The values of all layers by precedence; mappings (`radios`, `ssh`, `extra_uci`) merge key by key."""
     values: dict[str, Any] = {}
     for layer in reversed(layers):
         document = layer.document
@@ -96,48 +96,48 @@ class _Building:
     _counts: Counter[Layer] = field(default_factory=Counter)
     _failed: set[Layer] = field(default_factory=set)
 
-    def node(self, plan: NodePlan, robot: str) -> Node | None:
-        index_of = self._count(plan)
-        if plan.layers not in self._templates:
-            self._templates[plan.layers] = self._template(plan)
-        template = self._templates[plan.layers]
+    def node(self, spec: NodeSpec, robot: str) -> Node | None:
+        index_of = self._count(spec)
+        if spec.layers not in self._templates:
+            self._templates[spec.layers] = self._template(spec)
+        template = self._templates[spec.layers]
         if template is None:
             return None
-        address = self._address(plan, template, index_of)
+        address = self._address(spec, template, index_of)
         if address is None:
             return None
         return replace(
             template.node,
-            name=plan.name,
-            hostname=template.hostname or plan.name,
+            name=spec.name,
+            hostname=template.hostname or spec.name,
             address=address,
             robot=template.node.robot or robot,
         )
 
-    def _count(self, plan: NodePlan) -> dict[Layer, int]:
-        """The node's number under each rule that holds for it, also where a nearer layer overrules it, so that one
-        node with an address of its own does not move the others."""
+    def _count(self, spec: NodeSpec) -> dict[Layer, int]:
+        """The node's index under each of its rules, including overridden ones, so that a node with its own address does
+        not shift the others."""
         index_of = {}
-        for layer in plan.layers:
+        for layer in spec.layers:
             if isinstance(layer.document.address, AddressRule):
                 self._counts[layer] += 1
                 in_range = layer.title.startswith("range ")
-                index_of[layer] = plan.range_index if in_range else self._counts[layer]
+                index_of[layer] = spec.range_index if in_range else self._counts[layer]
         return index_of
 
-    def _template(self, plan: NodePlan) -> _Template | None:
-        values = joined(plan.layers)
-        profile = self._profile(plan, values)
-        address_layer = next((layer for layer in plan.layers if "address" in layer.document.model_fields_set), None)
+    def _template(self, spec: NodeSpec) -> _Template | None:
+        values = joined(spec.layers)
+        profile = self._profile(spec, values)
+        address_layer = next((layer for layer in spec.layers if "address" in layer.document.model_fields_set), None)
         if address_layer is None:
             hint = "write `address: 10.42.0.11`, or a rule in its group or range: `address: {from: 10.42.0.101}`"
-            self._report(codes.BAD_ADDRESS, plan.entry, "the node has no address", hint=hint)
+            self._report(codes.BAD_ADDRESS, spec.entry, "the node has no address", hint=hint)
         if profile is None or address_layer is None:
             return None
-        radios = self._radios(plan, values, profile)
+        radios = self._radios(spec, values, profile)
         first_mesh = next((radio.mesh for radio in radios if radio.mesh in self.meshes), None)
         node = Node(
-            name=plan.name,
+            name=spec.name,
             hostname="",
             role=values.get("role", Role.BEACON),
             state=values.get("state", NodeState.DEPLOYED),
@@ -152,7 +152,7 @@ class _Building:
             serial=values.get("serial", ""),
             mac=values.get("mac", ""),
             host_keys=tuple(values.get("host_keys", ())),
-            groups=plan.groups,
+            groups=spec.groups,
             confirm_window_s=values.get("confirm_window_s", profile.confirm_window_s),
             packages=tuple(values.get("packages", ())),
             extra_uci=MappingProxyType(values.get("extra_uci", {})),
@@ -161,15 +161,15 @@ class _Building:
         network = self.meshes[first_mesh].network if first_mesh is not None else None
         return _Template(node, values["address"], address_layer, values.get("hostname", ""), network)
 
-    def _profile(self, plan: NodePlan, values: Mapping[str, Any]) -> HardwareProfile | None:
+    def _profile(self, spec: NodeSpec, values: Mapping[str, Any]) -> HardwareProfile | None:
         name = values.get("hardware")
         if name is None:
             hint = "write `hardware: NAME` at the node, in its group or in `defaults`"
-            self._report(codes.UNKNOWN_HARDWARE, plan.entry, "the node has no hardware", hint=hint)
+            self._report(codes.UNKNOWN_HARDWARE, spec.entry, "the node has no hardware", hint=hint)
             return None
         profile = self.hardware.get(name)
         if profile is None:
-            layer = next(layer for layer in plan.layers if "hardware" in layer.document.model_fields_set)
+            layer = next(layer for layer in spec.layers if "hardware" in layer.document.model_fields_set)
             self._report(
                 codes.UNKNOWN_HARDWARE,
                 layer,
@@ -179,12 +179,12 @@ class _Building:
             )
         return profile
 
-    def _radios(self, plan: NodePlan, values: Mapping[str, Any], profile: HardwareProfile) -> tuple[Radio, ...]:
+    def _radios(self, spec: NodeSpec, values: Mapping[str, Any], profile: HardwareProfile) -> tuple[Radio, ...]:
         written: dict[str, dict[str, Any]] = values.get("radios", {})
         known = [radio.name for radio in profile.radios]
         for name in written:
             if name not in known:
-                layer = next(layer for layer in plan.layers if name in layer.document.radios)
+                layer = next(layer for layer in spec.layers if name in layer.document.radios)
                 self._report(
                     codes.UNKNOWN_RADIO,
                     layer,
@@ -203,7 +203,7 @@ class _Building:
             for settings in (written.get(radio.name, {}),)
         )
 
-    def _address(self, plan: NodePlan, template: _Template, index_of: Mapping[Layer, int]) -> IPv4Interface | None:
+    def _address(self, spec: NodeSpec, template: _Template, index_of: Mapping[Layer, int]) -> IPv4Interface | None:
         value, layer = template.address, template.address_layer
         if isinstance(value, IPv4Interface):
             return value
@@ -211,12 +211,12 @@ class _Building:
             try:
                 value = value.address(template.network, index_of[layer])
             except BadAddress as reason:
-                self._report(codes.BAD_ADDRESS, layer, f"{reason} (node '{plan.name}')", below=("address",))
+                self._report(codes.BAD_ADDRESS, layer, f"{reason} (node '{spec.name}')", below=("address",))
                 return None
         return IPv4Interface((value, self._prefix_length(value, template.network)))
 
     def _prefix_length(self, address: IPv4Address, network: IPv4Network | None) -> int:
-        """That of the node's own mesh; of the mesh that holds the address for a node in none; else of one host."""
+        """The prefix length of the node's mesh, or for a node without one of the mesh with the address; else 32."""
         if network is None:
             network = next((mesh.network for mesh in self.meshes.values() if address in mesh.network), None)
         return 32 if network is None else network.prefixlen
@@ -240,13 +240,13 @@ class _Building:
 
 
 def _only_meshes(meshes: Mapping[str, Mesh]) -> dict[Band, str]:
-    """The bands with exactly one mesh, which radios join that name none."""
+    """The mesh of each band with exactly one, the default for its radios."""
     counts = Counter(mesh.band for mesh in meshes.values())
     return {mesh.band: mesh.name for mesh in meshes.values() if counts[mesh.band] == 1}
 
 
 def ssh_settings(values: Mapping[str, Any], *, user: str) -> SshSettings:
-    """`user` is taken where none is written."""
+    """`user` is the default."""
     return SshSettings(
         host=values.get("host", ""),
         port=values.get("port", 22),

@@ -1,15 +1,15 @@
-"""Where every value was written, looked up when asked: a fleet of thousands keeps one tree, not a table of places."""
+"""The origin of every value, looked up on demand: a large fleet keeps one tree instead of a table of positions."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from meshctl.inventory.layers import Layer, NodePlan
+from meshctl.inventory.layers import Layer, NodeSpec
 from meshctl.inventory.ranges import expand
 from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, child, descend, place_of
 from meshctl.model import Origin
 
-# How an origin names a value of each section; `{}` is the entry's name.
+# Layer name of each section; `{}` is the entry's name.
 _TITLES = {
     "hardware": "hardware {}",
     "meshes": "mesh {}",
@@ -18,23 +18,23 @@ _TITLES = {
     "topics": "topic {}",
     "defaults": "defaults",
 }
-# what a robot lists nodes under
+# keys under which a robot lists nodes
 _NODE_LISTS = ("nodes", "carries")
 
 
-class Origins(Mapping[tuple[str, ...], Origin]):
+class Provenance(Mapping[tuple[str, ...], Origin]):
     """Paths such as `("nodes", "b03", "radios", "radio0", "tx_power_dbm")` to origins.
 
-    A node's values stand under the node's path with the layer they came from, a value of the file's other sections
-    under its own path, `("operators", "ssh_keys", "0")`. In a robot's lists of nodes a node's name is a path as well,
-    `("robots", "husky1", "carries", "b03")`: it leads to the element, perhaps a range, that makes the name.
+    A node's values have the node's path and the layer they come from; values of other sections have their own path,
+    such as `("operators", "ssh_keys", "0")`. In a robot's lists of nodes a node's name is also a path,
+    `("robots", "husky1", "carries", "b03")`: it refers to the element, perhaps a range, that contains the name.
     """
 
-    __slots__ = ("_elements", "_plans", "_robot_of", "_root")
+    __slots__ = ("_elements", "_robot_of", "_root", "_specs")
 
-    def __init__(self, root: MappingNode, plans: Mapping[str, NodePlan], robot_of: Mapping[str, str]) -> None:
+    def __init__(self, root: MappingNode, specs: Mapping[str, NodeSpec], robot_of: Mapping[str, str]) -> None:
         self._root = root
-        self._plans = plans
+        self._specs = specs
         self._robot_of = robot_of
         self._elements: dict[tuple[str, ...], dict[str, str]] = {}
 
@@ -48,8 +48,8 @@ class Origins(Mapping[tuple[str, ...], Origin]):
         for section, tree in self._root.values.items():
             if section != "nodes":
                 yield from _paths(tree, (section,))
-        for name, plan in self._plans.items():
-            below = {path for layer in plan.layers for path in _paths(layer.tree, ())}
+        for name, spec in self._specs.items():
+            below = {path for layer in spec.layers for path in _paths(layer.tree, ())}
             yield from (("nodes", name, *path) for path in sorted(below) if path[:1] != ("inherits",))
             if ("robot",) not in below and name in self._robot_of:
                 yield ("nodes", name, "robot")
@@ -69,7 +69,7 @@ class Origins(Mapping[tuple[str, ...], Origin]):
         return Origin(place, title.format(path[1]) if len(path) > 1 else "fleet" if "{}" in title else title)
 
     def _element(self, path: tuple[str, ...]) -> dict[str, str]:
-        """The place in a robot's list, as text, of each node that the list names."""
+        """The index (as text) of each node in a robot's list."""
         found = self._elements.get(path)
         if found is None:
             found = self._elements[path] = {}
@@ -82,16 +82,16 @@ class Origins(Mapping[tuple[str, ...], Origin]):
         return found
 
     def _node(self, path: tuple[str, ...]) -> Origin | None:
-        plan = self._plans.get(path[1])
+        spec = self._specs.get(path[1])
         below = path[2:]
-        if plan is None or below[:1] == ("inherits",):
+        if spec is None or below[:1] == ("inherits",):
             return None
-        for layer in plan.layers:
+        for layer in spec.layers:
             if below and not _writes(layer, below):
                 continue
             is_rule = below == ("address",) and isinstance(child(layer.tree, "address"), MappingNode)
             return Origin(layer.place_of(below), "rule" if is_rule else layer.title)
-        robot = self._robot_of.get(plan.name)
+        robot = self._robot_of.get(spec.name)
         if below == ("robot",) and robot is not None:
             return self._section(("robots", robot))
         return None
@@ -105,7 +105,7 @@ def _writes(layer: Layer, path: tuple[str, ...]) -> bool:
 
 
 def _paths(tree: Tree, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """Every path in `tree`, containers before what they hold."""
+    """Every path in `tree`, containers before their content."""
     yield path
     match tree:
         case MappingNode():

@@ -1,8 +1,8 @@
-"""Which parts of an inventory's text may be shown in a finding: those that the format knows and that hold no secret.
+"""Redact source lines in findings: show only values with a known key that is not secret.
 
-A line is shown to everybody who reads CI's log. It may belong to a file that is no inventory at all (an included file
-of secrets), or hold a key where a reference belongs, beside a key that is misspelt. So a value is shown only where the
-format knows its key; the rest becomes `***`.
+Everyone with access to the CI log can read these lines. A line may belong to a file that is not an inventory (an
+included file of secrets), or contain a key in place of a reference, or a misspelled key. So a value is shown only if
+the format knows its key; the rest becomes `***`.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from meshctl.inventory.validate import model_of, step_into
 from meshctl.uci import is_secret_option
 
 HIDDEN = "***"
-# a text larger than this is not parsed once more for an excerpt
+# larger texts are not parsed again for an excerpt
 _MAX_CHARACTERS = 2_000_000
 _SECRET_WORDS = re.compile(r"(key|psk|pass(word|phrase)?|secret|token|credentials?)s?", re.IGNORECASE)
 _VARIABLE = re.compile(r"[A-Z_][A-Z0-9_]*")
-# a comment that looks as if it held a secret: an assignment to such a word, or material as long as a key's
-_TELLING = re.compile(rf"({_SECRET_WORDS.pattern})\s*[:=]|[A-Za-z0-9+/_=-]{{20,}}", re.IGNORECASE)
+# a comment that may contain a secret: an assignment to such a word, or text as long as a key
+_SUSPICIOUS_COMMENT = re.compile(rf"({_SECRET_WORDS.pattern})\s*[:=]|[A-Za-z0-9+/_=-]{{20,}}", re.IGNORECASE)
 _WORD = re.compile(r"[^\s\[\]{},:#\"'&*|>-]+")
-_LONGEST_KEY = 40
+_MAX_KEY_CHARACTERS = 40
 
 
-class _Mark(IntEnum):
+class _Visibility(IntEnum):
     UNKNOWN = 0
     SHOWN = 1
     HIDDEN = 2
@@ -44,7 +44,7 @@ class _Mark(IntEnum):
 
 @dataclass(slots=True)
 class Excerpts:
-    """The lines of one file as they may be shown."""
+    """The redacted lines of one file."""
 
     text: str
     _marks: bytearray | None = field(default=None, repr=False)
@@ -52,7 +52,7 @@ class Excerpts:
     _is_inventory: bool = False
 
     def line(self, number: int, column: int) -> tuple[str, int] | None:
-        """Line `number` (from 1) with what is secret masked, and the place of `column` in it; None when there is none.
+        """The redacted line `number` (from 1), and the new position of `column`; None if there is no such line.
 
         A column of 0 stays 0.
         """
@@ -68,7 +68,7 @@ class Excerpts:
     def _read(self) -> None:
         self.text = self.text.removeprefix("\ufeff")
         self._marks = bytearray(len(self.text))
-        # as editors and PyYAML count lines, not str.splitlines, which also ends lines at form feeds
+        # as editors and PyYAML count lines; str.splitlines also splits at form feeds
         self._starts = [0]
         for part in self.text.split("\n"):
             self._starts.append(self._starts[-1] + len(part) + 1)
@@ -82,18 +82,18 @@ class Excerpts:
         else:
             for found in re.finditer(r"([A-Za-z_]+)[\"']?\s*:(?=\s|$)", self.text):
                 if found[1] in _all_keys():
-                    self._marks[found.start(1) : found.end(1)] = bytes([_Mark.SHOWN]) * len(found[1])
+                    self._marks[found.start(1) : found.end(1)] = bytes([_Visibility.SHOWN]) * len(found[1])
 
 
-def _spans(tree: Tree, kind: Any) -> Iterator[tuple[int, int, _Mark]]:
-    """The places of keys and values, and whether they are shown."""
+def _spans(tree: Tree, kind: Any) -> Iterator[tuple[int, int, _Visibility]]:
+    """The spans of keys and values, and whether they are shown."""
     kind = _fitting(kind, tree)
     model = model_of(kind)
     match tree:
         case Scalar():
-            # a value where a mapping belongs, such as a key in place of its reference
+            # hide a value in place of a mapping, such as a key in place of its reference
             is_shown = kind is not None and model is None
-            yield tree.start, tree.end, _Mark.SHOWN if is_shown else _Mark.HIDDEN
+            yield tree.start, tree.end, _Visibility.SHOWN if is_shown else _Visibility.HIDDEN
         case SequenceNode():
             for number, item in enumerate(tree.items):
                 yield from _spans(item, step_into(kind, number) if kind is not None and model is None else None)
@@ -101,18 +101,18 @@ def _spans(tree: Tree, kind: Any) -> Iterator[tuple[int, int, _Mark]]:
             for key, value in tree.values.items():
                 word = tree.keys[key]
                 is_known = kind is not None and (model is None or key in _keys_of(model))
-                is_name = is_known or (len(key) <= _LONGEST_KEY and _WORD.fullmatch(key) is not None)
-                yield word.start, word.end, _Mark.SHOWN if is_name else _Mark.HIDDEN
+                is_name = is_known or (len(key) <= _MAX_KEY_CHARACTERS and _WORD.fullmatch(key) is not None)
+                yield word.start, word.end, _Visibility.SHOWN if is_name else _Visibility.HIDDEN
                 below = step_into(kind, key) if is_known else None
                 yield from _spans(value, None if _is_secret(key, value, below, model) else below)
 
 
 def _fitting(kind: Any, tree: Tree) -> Any:
-    """Of a field that takes one kind or another (`address: 10.42.0.1` or `{from: ...}`) the one that the tree is of."""
+    """The alternative of a union type (`address: 10.42.0.1` or `{from: ...}`) that matches the tree."""
     if get_origin(kind) is Annotated:
         return _fitting(get_args(kind)[0], tree)
     if kind is AddressRule:
-        # read by a function of its own: `{from: 10.42.0.101, step: 1}`
+        # parsed by parse_address
         return dict[str, str]
     if get_origin(kind) not in (Union, UnionType):
         return kind
@@ -126,9 +126,9 @@ def _is_mapping(kind: Any) -> bool:
 
 
 def _is_secret(key: str, value: Tree, below: Any, model: type[BaseModel] | None) -> bool:
-    """Whether a value is hidden although the format knows its key."""
+    """Whether a value with a known key is hidden."""
     if model is SecretDocument:
-        # the name of a variable is none; of `key` it is the name of an entry
+        # names of variables and entries are not secret
         return key == "env" and not (isinstance(value, Scalar) and _VARIABLE.fullmatch(value.text))
     last = key.rpartition(".")[2]
     is_reference = SecretDocument in (model_of(below), model_of(step_into(below, 0)) if below is not None else None)
@@ -136,35 +136,35 @@ def _is_secret(key: str, value: Tree, below: Any, model: type[BaseModel] | None)
 
 
 def _masked(line: str, marks: bytearray, column: int, is_inventory: bool) -> tuple[str, int]:
-    """The line, and where the column went."""
+    """The masked line, and the new column."""
     hash_at = _comment(line, marks)
     for found in _WORD.finditer(line, 0, hash_at):
         for at in range(*found.span()):
-            if marks[at] == _Mark.UNKNOWN:
-                marks[at] = _Mark.HIDDEN
-    is_clear = _Mark.HIDDEN not in marks[:hash_at]
-    if hash_at < len(line) and not (is_clear and is_inventory and not _TELLING.search(line[hash_at:])):
-        marks[hash_at + 1 :] = bytes([_Mark.HIDDEN]) * (len(line) - hash_at - 1)
+            if marks[at] == _Visibility.UNKNOWN:
+                marks[at] = _Visibility.HIDDEN
+    is_clear = _Visibility.HIDDEN not in marks[:hash_at]
+    if hash_at < len(line) and not (is_clear and is_inventory and not _SUSPICIOUS_COMMENT.search(line[hash_at:])):
+        marks[hash_at + 1 :] = bytes([_Visibility.HIDDEN]) * (len(line) - hash_at - 1)
     shown: list[str] = []
     caret = 0
     for at, letter in enumerate(line):
         if at + 1 == column:
             caret = sum(map(len, shown)) + 1
-        if marks[at] != _Mark.HIDDEN:
+        if marks[at] != _Visibility.HIDDEN:
             shown.append(letter)
-        elif not at or marks[at - 1] != _Mark.HIDDEN:
+        elif not at or marks[at - 1] != _Visibility.HIDDEN:
             shown.append(HIDDEN)
         elif at + 1 == column:
-            # the column is within what is hidden
+            # the column is in hidden text
             caret -= len(HIDDEN)
     text = "".join(shown)
     return text, (caret or len(text) + 1) if column else 0
 
 
 def _comment(line: str, marks: bytearray) -> int:
-    """Where the line's comment begins, its length when there is none."""
+    """The start of the line's comment; the length of the line if there is none."""
     for found in re.finditer(r"(?:^|(?<=\s))#", line):
-        if marks[found.start()] == _Mark.UNKNOWN:
+        if marks[found.start()] == _Visibility.UNKNOWN:
             return found.start()
     return len(line)
 

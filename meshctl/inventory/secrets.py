@@ -1,7 +1,6 @@
-"""References -> secrets: from the environment, from a file, or from a file encrypted with age.
+"""Resolve secret references from the environment, from files, or from files encrypted with age.
 
-Each file is read and decrypted once. No message, whatever goes wrong, repeats anything from such a file but the names
-of its keys.
+Each file is read and decrypted once. Messages never contain content of such a file except the names of its keys.
 """
 
 from __future__ import annotations
@@ -16,28 +15,28 @@ import pyrage
 from meshctl.diagnostics import Position
 from meshctl.errors import InputError
 from meshctl.inventory.compose import compose
-from meshctl.inventory.file_access import irregular
+from meshctl.inventory.file_access import special_file
 from meshctl.inventory.source import Source
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, Scalar
 from meshctl.model import Secret, SecretKind, SecretRef
 
-# A file of keys is a few lines; more is the wrong file.
+# A key file has a few lines.
 MAX_SECRET_FILE_BYTES = 1024 * 1024
-# Names the identity file for references that name none.
+# The identity file for references without `identity`.
 IDENTITY_VARIABLE = "MESHCTL_AGE_IDENTITY"
 
 
 @dataclass(slots=True)
 class SecretStore:
-    """`environ` is the process environment; `base` is where paths of references without a base of their own begin."""
+    """`environ` is the process environment; `base` is the directory for references without their own `base`."""
 
     environ: Mapping[str, str] = field(repr=False)
     base: Path = Path()
     _files: dict[tuple[Path, Path | None], bytes] = field(default_factory=dict, repr=False)
 
     def get(self, ref: SecretRef, at: Position | None = None) -> Secret:
-        """The secret that `ref` names. Raises InputError, with the place `at` when given, when there is none."""
+        """The secret that `ref` refers to. Raises InputError, with the position `at` if given."""
         try:
             return Secret(self._value(ref))
         except _NoSecret as reason:
@@ -73,9 +72,7 @@ class SecretStore:
             return self._path(ref, ref.identity)
         named = self.environ.get(IDENTITY_VARIABLE, "")
         if not named:
-            raise _NoSecret(
-                "no identity to decrypt it with", f"write `identity: PATH` or export {IDENTITY_VARIABLE}=PATH"
-            )
+            raise _NoSecret("no identity for decryption", f"set `identity: PATH` or export {IDENTITY_VARIABLE}=PATH")
         return Path(named)
 
     def _read(self, path: Path) -> bytes:
@@ -92,14 +89,14 @@ class SecretStore:
             except pyrage.DecryptError:
                 raise _NoSecret(
                     f"{path} cannot be decrypted with {identity}",
-                    "is it an age file, and is this identity among its recipients?",
+                    "check that it is an age file and that this identity is one of its recipients",
                 ) from None
             self._files[path, identity] = known
         return known
 
 
 class _NoSecret(Exception):
-    """Why there is no secret; the text holds nothing of it."""
+    """Why a secret is unavailable; the message contains nothing of it."""
 
     def __init__(self, message: str, hint: str = "") -> None:
         super().__init__(message)
@@ -107,7 +104,7 @@ class _NoSecret(Exception):
 
 
 def _read(path: Path) -> bytes:
-    if found := irregular(path):
+    if found := special_file(path):
         raise _NoSecret(f"{path} is {found}")
     try:
         with path.open("rb") as stream:
@@ -121,7 +118,7 @@ def _read(path: Path) -> bytes:
 
 
 def _identities(path: Path) -> list[pyrage.x25519.Identity | pyrage.ssh.Identity]:
-    """An SSH private key, or the lines `AGE-SECRET-KEY-1...` that age-keygen writes."""
+    """An SSH private key, or the `AGE-SECRET-KEY-1...` lines of age-keygen."""
     content = _read(path)
     try:
         if content.startswith(b"-----BEGIN"):
@@ -130,14 +127,14 @@ def _identities(path: Path) -> list[pyrage.x25519.Identity | pyrage.ssh.Identity
         keys = [line.strip() for line in lines if line.strip() and not line.startswith("#")]
         identities = [pyrage.x25519.Identity.from_str(key) for key in keys]
     except pyrage.IdentityError:
-        raise _NoSecret(f"{path} holds no identity that can be used", "make one with `age-keygen -o PATH`") from None
+        raise _NoSecret(f"{path} contains no usable identity", "generate one with `age-keygen -o PATH`") from None
     if not identities:
-        raise _NoSecret(f"{path} holds no identity", "make one with `age-keygen -o PATH`")
+        raise _NoSecret(f"{path} contains no identity", "generate one with `age-keygen -o PATH`")
     return identities
 
 
 def _entry(path: Path, content: bytes, key: str) -> str:
-    """One entry of a YAML mapping, or the whole file without its last line end."""
+    """One entry of a YAML mapping, or the whole file without its final newline."""
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError:
@@ -149,11 +146,11 @@ def _entry(path: Path, content: bytes, key: str) -> str:
         return value
     composed = compose(Source(str(path), text))
     if composed.diagnostics:
-        # Only the place: the parser's own words may quote what it stumbled over.
+        # Only the position: the parser's message may quote the content.
         raise _NoSecret(f"{composed.diagnostics[0].position} is not valid YAML")
     if not isinstance(composed.root, MappingNode):
-        raise _NoSecret(f"{path} is no mapping, so it has no entry '{key}'")
+        raise _NoSecret(f"{path} is not a mapping, so it has no entry '{key}'")
     value_node = composed.root.values.get(key)
     if not isinstance(value_node, Scalar) or not value_node.text:
-        raise _NoSecret(f"{path} has no entry '{key}' with a text", did_you_mean(key, composed.root.values))
+        raise _NoSecret(f"{path} has no entry '{key}' with text", did_you_mean(key, composed.root.values))
     return value_node.text

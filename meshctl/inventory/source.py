@@ -1,4 +1,4 @@
-"""Bytes of one inventory file -> text, or the diagnostic that says why not."""
+"""Bytes of one inventory file -> text, or a diagnostic."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 from meshctl.diagnostics import Diagnostic, Position
 from meshctl.inventory import codes
 
-# 10,000 nodes written out one by one, each with its keys, take about 5 MB; more is a mistake or an attack on memory.
+# 10,000 individually written nodes take about 5 MB; more is a mistake or an attack on memory.
 MAX_FILE_BYTES = 16 * 1024 * 1024
 
-# What YAML 1.1 section 5.1 calls printable, without the byte order mark.
+# Printable characters by YAML 1.1 section 5.1, without the byte order mark.
 _UNPRINTABLE = re.compile("[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff]")
 
 Reader = Callable[[Path], bytes]
@@ -21,20 +21,20 @@ Reader = Callable[[Path], bytes]
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A file's text under the name that diagnostics show."""
+    """A file's text, and its name in diagnostics."""
 
     file: str
     text: str
 
 
 def read_bytes(path: Path) -> bytes:
-    """At most one byte more than `MAX_FILE_BYTES`, so that a huge file costs no more. Raises OSError."""
+    """Read at most `MAX_FILE_BYTES` + 1 bytes. Raises OSError."""
     with path.open("rb") as stream:
         return stream.read(MAX_FILE_BYTES + 1)
 
 
 def read_source(path: Path, read: Reader = read_bytes) -> Source | Diagnostic:
-    """The text of `path`; a diagnostic when it is unreadable, too large, not UTF-8 or holds control characters."""
+    """The text of `path`; a diagnostic if it is unreadable, too large, not UTF-8 or contains control characters."""
     file = str(path)
     try:
         content = read(path)
@@ -47,7 +47,7 @@ def read_source(path: Path, read: Reader = read_bytes) -> Source | Diagnostic:
             Position(file),
             "the file is too large",
             expected=f"at most {MAX_FILE_BYTES} bytes",
-            hint="write nodes that are alike as a range (`b[001-500]`) and what they share as a group",
+            hint="write similar nodes as a range (`b[001-500]`), and shared values as a group",
         )
     try:
         text = content.decode("utf-8-sig")

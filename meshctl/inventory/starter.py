@@ -1,4 +1,4 @@
-"""A first inventory for a new team: the commented starter that ships with meshctl, written into a directory."""
+"""Write the commented starter inventory that ships with meshctl into a directory."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from meshctl.resources import shipped
 
 
 def write_starter(directory: Path, ssh_key: str = "") -> tuple[Path, ...]:
-    """Copy the starter into `directory` and enter `ssh_key`; returns the files written.
+    """Copy the starter into `directory` and add `ssh_key`; returns the written files.
 
-    Raises InputError, before anything is written, when a file of the same name is there already.
+    Raises InputError, before anything is written, if one of the files exists.
     """
     source = shipped("inventory") / "starter"
     names = sorted(path.name for path in source.iterdir() if path.is_file())
     taken = [name for name in names if (directory / name).exists() or (directory / name).is_symlink()]
     if taken:
-        raise InputError(f"{directory / taken[0]} exists and is left as it is", hint="choose another directory")
+        raise InputError(f"{directory / taken[0]} already exists; not overwritten", hint="choose another directory")
     try:
         directory.mkdir(parents=True, exist_ok=True)
         for name in names:

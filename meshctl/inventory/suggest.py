@@ -1,4 +1,4 @@
-"""Did you mean: the known name nearest to one that is not known."""
+"""Suggestions for unknown names."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from difflib import get_close_matches
 
 
 def nearest(wrong: str, known: Iterable[str]) -> str:
-    """The known name that `wrong` most likely stands for, or the empty text."""
-    # Names longer than this are no slip of the pen, and comparing them costs the square of their length.
+    """The known name most similar to `wrong`, or an empty string."""
+    # Longer names are not typos, and the comparison is quadratic in their length.
     if len(wrong) > 64:
         return ""
     names = list(known)
@@ -21,6 +21,6 @@ def nearest(wrong: str, known: Iterable[str]) -> str:
 
 
 def did_you_mean(wrong: str, known: Iterable[str]) -> str:
-    """`did you mean 'channel'?`, or the empty text."""
+    """`did you mean 'channel'?`, or an empty string."""
     name = nearest(wrong, known)
     return f"did you mean '{name}'?" if name else ""

@@ -1,7 +1,7 @@
-"""Text + tree -> text with one value set or removed, everything else left as it stands.
+"""Text + tree -> text with one value set or removed, everything else unchanged.
 
-These functions only place characters; whether the result says what was meant is checked by reading it again
-(`edit.Editor`), so an unusual layout leads to a refusal and never to a wrong file.
+These functions only edit characters; `edit.Editor` parses the result to verify it, so an unusual layout leads to a
+refused edit, never to a wrong file.
 """
 
 from __future__ import annotations
@@ -9,40 +9,40 @@ from __future__ import annotations
 from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree
 from meshctl.inventory.yaml_text import Value, block, flow, line
 
-# Indentation of new blocks in a file that shows none.
+# Indentation of new blocks.
 _STEP = 2
 
 
 def replace_value(text: str, old: Tree, value: Value, key: Scalar | None) -> str:
-    """`old` replaced in place, in flow style. `key` is the key it stands under, None in a list."""
+    """Replace `old` in place, in flow style. `key` is the key of `old`, None in a list."""
     end = content_end(text, old)
     if isinstance(old, Scalar) or old.is_flow:
         space = "" if old.start == 0 or text[old.start - 1] in " \n" else " "
         return f"{text[: old.start]}{space}{flow(value)}{text[max(end, old.start) :]}"
     if key is None:
         return f"{text[: old.start]}{flow(value)}{text[end:]}"
-    # A block stands below its key: the new value joins the key's line, before a comment there.
+    # A block starts below its key: put the new value on the key's line, before its comment.
     colon = _after_colon(text, key)
     return f"{text[:colon]} {flow(value)}{text[colon : _line_end(text, colon)]}{text[end:]}"
 
 
 def insert_entry(text: str, mapping: MappingNode, key: str, value: Value, *, after: str = "") -> str:
-    """A new entry at the end of `mapping`, or behind its entry `after`, in the style of the entry before it."""
+    """Add an entry at the end of `mapping`, or after its entry `after`, in the style of the entry before it."""
     if mapping.is_flow:
         return _insert_into_flow(text, mapping, key, value)
     newline = _newline(text)
     last = after if after in mapping.keys else next(reversed(mapping.keys))
     indent = mapping.keys[last].column - 1
     end = _line_end(text, max(content_end(text, mapping.values[last]), mapping.keys[last].end))
-    neighbour = mapping.values[last]
-    is_line = isinstance(neighbour, MappingNode) and neighbour.is_flow
+    previous = mapping.values[last]
+    is_line = isinstance(previous, MappingNode) and previous.is_flow
     entry = line(key, value, indent) if is_line else block(key, value, indent, _STEP, newline)
-    gap = newline if isinstance(neighbour, MappingNode) and not is_line and _has_gaps(text, mapping) else ""
+    gap = newline if isinstance(previous, MappingNode) and not is_line and _has_gaps(text, mapping) else ""
     return f"{text[:end]}{newline}{gap}{entry}{text[end:]}"
 
 
 def fill_empty(text: str, old: Tree, indent: int, key: str, value: Value) -> str:
-    """`section:` or `section: {}` given its first entry, `indent` columns in."""
+    """Add the first entry of `section:` or `section: {}`, indented by `indent` columns."""
     if isinstance(old, MappingNode) and old.is_flow:
         return _insert_into_flow(text, old, key, value)
     newline = _newline(text)
@@ -52,20 +52,20 @@ def fill_empty(text: str, old: Tree, indent: int, key: str, value: Value) -> str
 
 
 def append_section(text: str, section: str, key: str, value: Value) -> str:
-    """A new section at the end of the file, holding one entry."""
+    """Append a section with one entry to the file."""
     newline = _newline(text)
     entry = block(key, value, _STEP, _STEP, newline)
     return f"{text.rstrip()}{newline}{newline}{section}:{newline}{entry}{newline}"
 
 
 def append_value(text: str, key: str, value: Value) -> str:
-    """A new key at the end of the file."""
+    """Append a key to the file."""
     newline = _newline(text)
     return f"{text.rstrip()}{newline}{newline}{block(key, value, 0, _STEP, newline)}{newline}"
 
 
 def remove_entry(text: str, mapping: MappingNode, key: str) -> str:
-    """`mapping` without `key`; comments above the entry stay. The last entry leaves `{}`."""
+    """Remove `key` from `mapping`; comments above the entry stay. The last entry leaves `{}`."""
     written, value = mapping.keys[key], mapping.values[key]
     end = max(content_end(text, value), written.end)
     if mapping.is_flow:
@@ -83,7 +83,7 @@ def remove_entry(text: str, mapping: MappingNode, key: str) -> str:
 
 
 def content_end(text: str, tree: Tree) -> int:
-    """Where the last character of a value stands; a block's own mark lies beyond comments and blank lines."""
+    """The end of a value's last character; the end mark of a block is after comments and blank lines."""
     while isinstance(tree, MappingNode | SequenceNode) and not tree.is_flow:
         if isinstance(tree, MappingNode):
             key = next(reversed(tree.keys))
@@ -119,19 +119,19 @@ def _remove_from_flow(text: str, mapping: MappingNode, written: Scalar, end: int
 
 
 def _empty(text: str, mapping: MappingNode, written: Scalar, end: int) -> str:
-    """A block mapping whose only entry goes: `{}` behind the colon of the line above that has one."""
+    """Remove the only entry of a block mapping: write `{}` after the colon of the key above."""
     colon = text.rfind(":", 0, text.rfind("\n", 0, written.start) + 1) + 1
     return f"{text[:colon]} {{}}{text[colon : _line_end(text, colon)]}{text[_line_end(text, end) :]}"
 
 
 def _has_gaps(text: str, mapping: MappingNode) -> bool:
-    """Whether the entries are set apart by blank lines."""
+    """Whether blank lines separate the entries."""
     starts = [key.start for key in mapping.keys.values()]
     return len(starts) > 1 and all(_is_blank_before(text, _block_start(text, start)) for start in starts[1:])
 
 
 def _block_start(text: str, start: int) -> int:
-    """The line of `start`, or the first of the comment lines right above it."""
+    """The start of the line at `start`, or of the first comment line right above it."""
     begin = text.rfind("\n", 0, start) + 1
     while begin:
         above = text.rfind("\n", 0, begin - 1) + 1
@@ -159,12 +159,12 @@ def _line_end(text: str, at: int) -> int:
 
 
 def _next_line(text: str, at: int) -> int:
-    """The offset of the next line's begin, or the text's end."""
+    """The offset of the next line, or the end of the text."""
     return text.find("\n", at) + 1 or len(text)
 
 
 def _after_colon(text: str, key: Scalar) -> int:
-    """Behind the colon of a key, or behind the key when it has none (`? key`)."""
+    """The offset after a key's colon, or after the key if it has none (`? key`)."""
     return text.find(":", key.end) + 1 or key.end
 
 

@@ -1,6 +1,6 @@
-"""YAML as values that know where they stand: scalars keep their text, the field that reads one decides its type.
+"""YAML values with positions: scalars keep their text, and the field that reads one decides its type.
 
-So `country: NO` stays Norway, `release: 24.10` keeps its zero and `mac: 12:34:56:12:34:56` is no number in base 60.
+So `country: NO` is Norway, `release: 24.10` keeps its zero, and `mac: 12:34:56:12:34:56` is not a base-60 number.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _NULLS = frozenset({"", "~", "null", "Null", "NULL"})
 
 
 class Plain(str):
-    """A scalar written without quotes, whose type is still open; a plain `str` was quoted and is text."""
+    """An unquoted scalar, whose type is undecided; a plain `str` was quoted and is text."""
 
     __slots__ = ()
 
@@ -42,7 +42,7 @@ class Scalar:
 
 @dataclass(slots=True)
 class SequenceNode:
-    """`weight` is the number of values in it with aliases followed. `end` is exact for flow style (`[a, b]`) only."""
+    """`weight` is the number of values with aliases expanded. `end` is exact for flow style (`[a, b]`) only."""
 
     file: str
     line: int
@@ -77,7 +77,7 @@ def position(tree: Tree) -> Position:
 
 
 def plain_data(tree: Tree) -> object:
-    """Dictionaries, lists, `Plain`, `str` and None: what the document models read."""
+    """Dictionaries, lists, `Plain`, `str` and None: the input of the document models."""
     match tree:
         case Scalar():
             if tree.is_null:
@@ -102,7 +102,7 @@ def child(tree: Tree, part: str | int) -> Tree | None:
 
 
 def descend(tree: Tree, path: Sequence[str | int]) -> Tree | None:
-    """The value at `path`, or None when any part is not there."""
+    """The value at `path`, or None if there is none."""
     found: Tree | None = tree
     for part in path:
         if found is None:
@@ -112,13 +112,13 @@ def descend(tree: Tree, path: Sequence[str | int]) -> Tree | None:
 
 
 def key_position(tree: MappingNode, key: str) -> Position:
-    """Where `key` is written in `tree`; the mapping's own place when it is not."""
+    """The position of `key` in `tree`; the mapping's own position if there is no such key."""
     written = tree.keys.get(key)
     return position(tree if written is None else written)
 
 
 def place_of(root: Tree, path: Sequence[str | int]) -> Position | None:
-    """Where the value at `path` is written: a single value itself, a list or mapping (or nothing) by its key."""
+    """The position of `path`: of a scalar itself; of the key of a list, mapping or null."""
     tree, place = root, position(root)
     for part in path:
         below = child(tree, part)
@@ -131,7 +131,7 @@ def place_of(root: Tree, path: Sequence[str | int]) -> Position | None:
 
 
 def describe(tree: Tree) -> str:
-    """What kind of value stands there, never the value: it may be a secret."""
+    """The kind of a value; never the value, which may be a secret."""
     match tree:
         case Scalar():
             return "nothing" if tree.is_null else "a single value"

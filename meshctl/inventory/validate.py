@@ -1,4 +1,4 @@
-"""Tree -> document, or one diagnostic with its place for everything that the format forbids."""
+"""Tree -> document, or a diagnostic with its position for each violation of the format."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, Scalar, Tree, child, describe, key_position, plain_data, position
 
 _REFERENCE = "a reference: {env: NAME}, {file: PATH, key: NAME} or {age: PATH, key: NAME}"
-# Keys whose values may be secrets written where a reference belongs; a message never repeats them.
+# Values of these keys may be secrets in place of references; messages never repeat them.
 _SECRET_KEYS = frozenset({"key", "keys", "env", "password", "passphrase", "psk"})
 _KINDS = {
     "model_type": "a mapping",
@@ -39,14 +39,14 @@ _BOUNDS = {
 
 @dataclass(frozen=True, slots=True)
 class Validated:
-    """`document` is None when there is any diagnostic."""
+    """`document` is None if there is any diagnostic."""
 
     document: InventoryDocument | None
     diagnostics: tuple[Diagnostic, ...]
 
 
 def validate(root: MappingNode) -> Validated:
-    """Check the whole tree against the format."""
+    """Validate the whole tree."""
     try:
         return Validated(InventoryDocument.model_validate(plain_data(root)), ())
     except ValidationError as reason:
@@ -67,7 +67,7 @@ def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
     dotted = ".".join(shown(str(part)) for part in path)
     if kind == "missing":
         dotted = ".".join(shown(str(part)) for part in path[:-1])
-        return codes.error(codes.MISSING_KEY, place, f"the key '{path[-1]}' is missing", path=dotted)
+        return codes.error(codes.MISSING_KEY, place, f"missing key '{path[-1]}'", path=dotted)
     if kind == "extra_forbidden":
         known = _known_keys(path[:-1])
         wrong = str(path[-1])
@@ -80,7 +80,7 @@ def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
 
 
 def _place(root: MappingNode, path: tuple[int | str, ...], *, is_key: bool) -> Position:
-    """The value at `path`; what encloses it when it is not there, by its key."""
+    """The position of the value at `path`; of its container's key if there is none."""
     tree: Tree = root
     place = position(root)
     for number, part in enumerate(path):
@@ -133,7 +133,7 @@ def _enum_hint(root: MappingNode, path: tuple[int | str, ...], error: ErrorDetai
 
 
 def _known_keys(path: tuple[int | str, ...]) -> list[str]:
-    """The keys of the model that stands at `path`."""
+    """The keys of the model at `path`."""
     kind: Any = InventoryDocument
     for part in path:
         kind = step_into(kind, part)
@@ -142,7 +142,7 @@ def _known_keys(path: tuple[int | str, ...]) -> list[str]:
 
 
 def step_into(kind: Any, part: int | str) -> Any:
-    """The type one part further down."""
+    """The type one path part further down."""
     model = model_of(kind)
     if model is not None:
         for name, field in model.model_fields.items():

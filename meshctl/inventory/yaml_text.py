@@ -1,4 +1,4 @@
-"""Values -> YAML text for an edit: one line in flow style, or an indented block."""
+"""Values -> YAML text for edits: one line in flow style, or an indented block."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Value = str | int | float | bool | None | Sequence["Value"] | Mapping[str, "Valu
 
 _BARE = re.compile(r"[A-Za-z_/][A-Za-z0-9_./@+-]*")
 _SPECIAL = frozenset({"true", "false", "yes", "no", "on", "off", "y", "n", "null"})
-# Ranges are written as keys without quotes in all examples: `b[01-06]:`; in block style that is plain text.
+# Ranges are unquoted keys in block style: `b[01-06]:`.
 _BARE_KEY = re.compile(r"[A-Za-z_/][A-Za-z0-9_./@+\[\],-]*")
 
 
@@ -39,7 +39,7 @@ def line(key: str, value: Value, indent: int) -> str:
 
 
 def block(key: str, value: Value, indent: int, step: int, newline: str) -> str:
-    """`key: value`; a mapping goes on below its key, `step` further in."""
+    """`key: value`; the entries of a mapping are below its key, indented by `step`."""
     if not isinstance(value, Mapping) or not value:
         return line(key, value, indent)
     lines = [line(name, item, indent + step) for name, item in value.items()]
@@ -47,7 +47,7 @@ def block(key: str, value: Value, indent: int, step: int, newline: str) -> str:
 
 
 def data(value: Value) -> object:
-    """What reading the text back must give; compare with `tree.plain_data`."""
+    """The expected result of parsing the text; compare with `tree.plain_data`."""
     match value:
         case None:
             return None

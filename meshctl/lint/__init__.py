@@ -1,12 +1,12 @@
-"""Rules over the whole inventory, each a small function with a stable code, a page and two examples.
+"""Lint rules over the whole inventory, each a small function with a stable code, a page and two examples.
 
-The flow: `rules/` (the functions) -> `catalog` (all of them) -> `engine` (fleet -> findings) -> `suppress`, `baseline`
-(what is excused) -> `check_path` (a path -> everything to report). `context` and `files` hold what rules may look at
-besides the fleet. `example` and `pages` turn each rule into its page under docs/lint/.
+Flow: `rules/` -> `catalog` (all rules) -> `engine` (fleet -> findings) -> `suppress`, `baseline` (known findings)
+-> `check_path` (path -> result). `context` and `files` give rules access to secrets and files. `example` and `pages`
+generate docs/lint/.
 """
 
 from meshctl.lint.catalog import BY_CODE, RULES
-from meshctl.lint.check_path import Examined, check_path
+from meshctl.lint.check_path import CheckResult, check_path
 from meshctl.lint.context import Files, LintContext, no_secret
 from meshctl.lint.engine import lint
 from meshctl.lint.files import DiskFiles
@@ -16,8 +16,8 @@ from meshctl.lint.suppress import Suppressed
 __all__ = [
     "BY_CODE",
     "RULES",
+    "CheckResult",
     "DiskFiles",
-    "Examined",
     "Example",
     "Files",
     "Finding",

@@ -1,6 +1,6 @@
-"""A baseline: findings that were there when a team began to lint, so that only new ones count.
+"""A baseline of known findings, so that only new ones count.
 
-`fingerprint` names a finding by what it is about, not by its line, so that edits elsewhere do not bring it back.
+`fingerprint` identifies a finding by its subject, not its line, so that edits elsewhere do not make it new.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from meshctl.lint.rule import Finding
 from meshctl.lint.rules.housekeeping import STALE_BASELINE
 
 _VERSION = 1
-# a finding takes some 200 bytes; a baseline above this is another file
+# a finding takes about 200 bytes
 _MAX_BYTES = 16 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
-    """`new` findings count; `known` ones were in the baseline; `stale` ones are about what is in it and not found."""
+class BaselineComparison:
+    """`new` findings count; `known` ones are in the baseline; `stale` ones report entries that no longer occur."""
 
     new: tuple[Diagnostic, ...]
     known: tuple[Diagnostic, ...]
@@ -33,13 +33,13 @@ class Compared:
 
 
 def fingerprint(item: Diagnostic) -> str:
-    """32 hexadecimal digits: the same for the same fault at the same place of the inventory."""
+    """32 hexadecimal digits, equal for the same fault at the same path of the inventory."""
     parts = (item.code, PurePath(item.position.file).name, item.path, item.expected, item.found)
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 
 def dump(diagnostics: Iterable[Diagnostic]) -> str:
-    """The baseline file of these findings, sorted, one finding a line."""
+    """The text of a baseline file: sorted, one finding per line."""
     entries = [
         json.dumps({"fingerprint": fingerprint(item), "code": item.code, "about": item.path or item.position.file})
         for item in sorted(diagnostics, key=lambda item: (item.code, item.path, fingerprint(item)))
@@ -57,7 +57,7 @@ def read(path: Path) -> tuple[tuple[str, str, str], ...]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}", hint="write one with --write-baseline") from error
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: expected a baseline in JSON, found something else: {error}") from error
+        raise InputError(f"{path}: expected a baseline in JSON: {error}") from error
     match document:
         case {"version": int(version), "findings": list(entries)} if version == _VERSION:
             return tuple(_entry(path, number, entry) for number, entry in enumerate(entries, 1))
@@ -75,8 +75,8 @@ def _entry(path: Path, number: int, entry: object) -> tuple[str, str, str]:
 
 def compare(
     diagnostics: Iterable[Diagnostic], entries: Iterable[tuple[str, str, str]], path: Path, ran: Iterable[str]
-) -> Compared:
-    """Divide findings by a baseline read from `path`; entries of rules that did not run are left alone."""
+) -> BaselineComparison:
+    """Split findings by the baseline of `path`; entries of rules that did not run are kept."""
     known_codes = set(ran)
     rows = list(entries)
     left = Counter(mark for mark, _, _ in rows)
@@ -95,4 +95,4 @@ def compare(
             left[mark] -= 1
             finding = Finding((), f"{code} is no longer found", "", about)
             stale.append(diagnostic(STALE_BASELINE, finding, Position(str(path))))
-    return Compared(tuple(new), tuple(known), tuple(stale))
+    return BaselineComparison(tuple(new), tuple(known), tuple(stale))

@@ -43,7 +43,7 @@ CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
     ("Channel and country", channel),
     ("Power", power),
     ("Encryption", encryption),
-    ("Logging in", access),
+    ("Login", access),
     ("Secrets", secrets),
     ("Routing", routing),
     ("Bridging", bridge),
@@ -51,7 +51,7 @@ CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
     ("The robots' computers", computers),
     ("Topics", topics),
     ("Load, ports and timers", traffic),
-    ("Robots not moved over yet", legacy),
+    ("Legacy robots", legacy),
     ("Firmware", firmware),
     ("Hardware and packages", hardware),
     ("Drivers", drivers),
@@ -60,7 +60,7 @@ CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
 
 
 def rules_of(module: ModuleType) -> Iterator[Rule]:
-    """The rules that a module defines, in its order."""
+    """The rules of a module, in source order."""
     return (value for value in vars(module).values() if isinstance(value, Rule))
 
 
@@ -68,7 +68,7 @@ def _all() -> tuple[Rule, ...]:
     rules = sorted((rule for _, module in CHAPTERS for rule in rules_of(module)), key=lambda rule: rule.code)
     for first, second in pairwise(rules):
         if first.code == second.code:
-            raise ValueError(f"two rules have the code {first.code}: {first.name} and {second.name}")
+            raise ValueError(f"duplicate rule code {first.code}: {first.name} and {second.name}")
     return tuple(rules)
 
 

@@ -1,7 +1,6 @@
-"""A path -> everything there is to report about it: load, run the rules, divide by comments.
+"""A path -> its findings: load, run the rules, apply suppressions.
 
-The loader's diagnostics are findings like any other. The inventory's text is kept as it was read, for the comments, for
-rules about text, and for reports that show the line.
+The loader's diagnostics are findings, too. The text is kept for suppressions, text rules and excerpts in reports.
 """
 
 from __future__ import annotations
@@ -27,17 +26,17 @@ from meshctl.regdb import Regdb
 
 
 @dataclass(frozen=True, slots=True)
-class Examined:
-    """`sources` maps the files that were read to their text. `is_readable` is False when a file could not be read."""
+class CheckResult:
+    """`sources` maps each file read to its text. `is_readable` is False if a file could not be read."""
 
     diagnostics: tuple[Diagnostic, ...]
-    excused: tuple[Suppressed, ...]
+    suppressed: tuple[Suppressed, ...]
     sources: Mapping[str, str]
     is_readable: bool
 
 
-def check_path(path: Path, regdb: Regdb, environ: Mapping[str, str], rules: Iterable[Rule] = RULES) -> Examined:
-    """Everything about the inventory at `path`; secrets are looked at where `environ` has them. Never raises."""
+def check_path(path: Path, regdb: Regdb, environ: Mapping[str, str], rules: Iterable[Rule] = RULES) -> CheckResult:
+    """Check the inventory at `path`, and its secrets as far as `environ` makes them available. Never raises."""
     chosen = tuple(rules)
     kept: dict[str, bytes] = {}
 
@@ -56,9 +55,9 @@ def check_path(path: Path, regdb: Regdb, environ: Mapping[str, str], rules: Iter
         ran = {rule.code for rule in chosen}
     divided = apply(sorted_diagnostics(found), sources, BY_CODE, ran)
     wanted = {rule.code for rule in chosen}
-    stay = tuple(item for item in divided.stay if item.code in wanted or item.code not in BY_CODE)
+    stay = tuple(item for item in divided.reported if item.code in wanted or item.code not in BY_CODE)
     is_readable = not any(item.code == UNREADABLE for item in loaded.diagnostics)
-    return Examined(stay, divided.excused, sources, is_readable)
+    return CheckResult(stay, divided.suppressed, sources, is_readable)
 
 
 def _lookup(store: SecretStore) -> SecretLookup:
@@ -66,7 +65,7 @@ def _lookup(store: SecretStore) -> SecretLookup:
         try:
             return store.get(ref)
         except InputError:
-            # not at hand on this machine; rules about files say when one is missing
+            # not available on this machine; MC450 to MC452 report what is missing
             return None
 
     return secret
@@ -88,7 +87,7 @@ def _problem(store: SecretStore) -> SecretProblem:
 
 
 def _opens(store: SecretStore, ref: SecretRef) -> bool:
-    """Whether this machine has an identity for the encrypted file."""
+    """Whether this machine can decrypt the file."""
     try:
         store.get(replace(ref, key=""))
     except InputError:

@@ -1,4 +1,4 @@
-"""What rules may look at besides the fleet: regulatory rules, files, secrets."""
+"""What rules may use besides the fleet: the regulatory database, files, secrets."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SecretProblem = Callable[[SecretRef], str]
 
 
 class Files(Protocol):
-    """Facts about files that an inventory names; None where there is no such file."""
+    """Facts about files that an inventory names; None for a missing file."""
 
     def size_bytes(self, path: Path) -> int | None: ...
 
@@ -24,35 +24,35 @@ class Files(Protocol):
         """The permission bits."""
 
     def text(self, path: Path) -> str | None:
-        """The whole file; a replacement character stands for what is not UTF-8."""
+        """The whole file, with replacement characters for invalid UTF-8."""
 
     def is_special(self, path: Path) -> bool:
-        """Whether something stands there that is no regular file: a directory, a device."""
+        """Whether the path exists but is not a regular file."""
 
     def in_repository(self, path: Path) -> bool:
-        """Whether git would take the file into a repository: inside a work tree, and not ignored."""
+        """Whether git would commit the file: it is inside a work tree, and not ignored."""
 
     def firmware(self, profile: HardwareProfile) -> tuple[Diagnostic, ...]:
-        """What `meshctl.firmware.check` says of the profile's image."""
+        """The result of `meshctl.firmware.check` for the profile's image."""
 
     def image_version(self, profile: HardwareProfile) -> str:
-        """OpenWrt's version in the metadata of the profile's image (`25.12.0-rc1`); empty where it is not known."""
+        """OpenWrt's version in the metadata of the profile's image (`25.12.0-rc1`); empty if unknown."""
 
 
 def no_secret(_ref: SecretRef) -> Secret | None:
-    """The lookup of a machine that holds no secrets (continuous integration)."""
+    """Lookup on a machine without secrets, such as a CI runner."""
     return None
 
 
 def no_problem(_ref: SecretRef) -> str:
-    """What is wrong with the places of secrets, on a machine that has none of them."""
+    """Problems with secrets on a machine that has none: never any."""
     return ""
 
 
 @dataclass(frozen=True, slots=True)
 class LintContext:
-    """`secret` gives None where a secret is not at hand; rules about its strength are then silent. `secret_problem`
-    says why a place that is at hand (a file that exists, a variable that is set) has no secret; empty for any other."""
+    """`secret` returns None for an unavailable secret; rules about its strength are then silent. `secret_problem`
+    returns why an existing file or variable yields no secret, and an empty string otherwise."""
 
     regdb: Regdb
     files: Files

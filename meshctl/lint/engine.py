@@ -1,4 +1,4 @@
-"""Fleet and text -> findings: run the rules, place what they saw, say what a whole group shares once."""
+"""Fleet and text -> findings: run the rules, add positions, merge findings that nodes share."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from dataclasses import replace
 from meshctl.diagnostics import Diagnostic, Position, sorted_diagnostics
 from meshctl.lint.catalog import RULES
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import listed
+from meshctl.lint.grouping import join_limited
 from meshctl.lint.rule import Finding, Rule
 from meshctl.model import Fleet, MissingOrigin
 
 
 def lint(fleet: Fleet, context: LintContext, rules: Iterable[Rule] = RULES) -> tuple[Diagnostic, ...]:
-    """What the rules find in the fleet, sorted by place. Linear in the size of the fleet."""
+    """Findings of the fleet rules, sorted by position. Linear in the size of the fleet."""
     found: list[Diagnostic] = []
-    spoken: set[Position] = set()
-    # fallbacks last, so that they know where others have spoken
+    reported: set[Position] = set()
+    # fallback rules run last: they skip positions that other rules report
     for rule in sorted(rules, key=lambda rule: rule.is_fallback):
         if rule.check is None:
             continue
         items = [diagnostic(rule, finding, _position(fleet, finding)) for finding in rule.check(fleet, context)]
         if rule.is_fallback:
-            items = [item for item in items if item.position not in spoken]
+            items = [item for item in items if item.position not in reported]
         found.extend(items)
-        spoken.update(item.position for item in items)
+        reported.update(item.position for item in items)
     return sorted_diagnostics(_merged(found))
 
 
 def lint_texts(sources: Mapping[str, str], rules: Iterable[Rule] = RULES) -> tuple[Diagnostic, ...]:
-    """What the rules find in the files' texts, which need not make a fleet."""
+    """Findings of the text rules, which need no valid fleet."""
     found = (
         diagnostic(rule, finding, finding.position or Position(file))
         for rule in rules
@@ -51,7 +51,7 @@ def diagnostic(rule: Rule, finding: Finding, position: Position) -> Diagnostic:
         path=".".join(finding.path),
         expected=finding.expected,
         found=finding.found,
-        hint=finding.hint or rule.mend,
+        hint=finding.hint or rule.fix,
     )
 
 
@@ -65,20 +65,20 @@ def _position(fleet: Fleet, finding: Finding) -> Position:
 
 
 def _merged(found: Iterable[Diagnostic]) -> Iterator[Diagnostic]:
-    """Findings that differ in the path alone (a value that a group or a range shares) as one, naming the others."""
+    """Merge findings that differ only in the path (a value that a group or range shares), naming the others."""
     groups: dict[tuple[str, Position, str, str, str], list[Diagnostic]] = {}
     for item in found:
         groups.setdefault((item.code, item.position, item.message, item.expected, item.found), []).append(item)
     for first, *others in groups.values():
         names = list(dict.fromkeys(_subject(item.path) for item in others if item.path != first.path))
         if names:
-            also = f"also {listed(names)}"
+            also = f"also {join_limited(names)}"
             yield replace(first, message=f"{first.message} ({also})" if first.message else also)
         else:
             yield first
 
 
 def _subject(path: str) -> str:
-    """The thing a path speaks of: `b03` in `nodes.b03.radios.radio0`."""
+    """The subject of a path: `b03` in `nodes.b03.radios.radio0`."""
     parts = path.split(".")
     return parts[1] if len(parts) > 1 else path

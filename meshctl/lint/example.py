@@ -1,8 +1,8 @@
-"""Examples as inventories: a rule's fragment laid over one small fleet that has nothing to report.
+"""Examples as inventories: a rule's fragment merged into a small fleet without findings.
 
-`compose` makes the whole inventory's text; `write` puts it and the files beside it into a directory. A fragment's
-mappings join with the base key by key, anything else replaces, `<removed>` takes a key away. A fragment with a comment
-stands behind the base as it is, for rules about text.
+`compose` returns the text of the whole inventory; `write` writes it and its files to a directory. Mappings merge key by
+key, other values replace, `<removed>` removes a key. A fragment with a comment is appended unchanged, for rules about
+text.
 """
 
 from __future__ import annotations
@@ -111,13 +111,13 @@ topics:
     size_bytes: 5000
 """
 
-# what the base's secrets are, unless the example says otherwise
+# secrets of the base inventory, unless the example overrides them
 ENVIRONMENT = {
     "MESH_KEY": "cedar-lantern-93-quarry",
     "UDP_MESH_KEY": "b4f8e7f0c3a94c21a1d2d9a0f5c36e7722d1b6c8e3f04a5b9c7d8e1f2a3b4c5d",
 }
 
-# a file whose text begins so is an image with this metadata behind it
+# a file text with this prefix describes an image with the metadata that follows
 _IMAGE = "image for "
 _DAMAGED = "damaged image for "
 _LARGE = "4 MiB image for "
@@ -127,12 +127,12 @@ def compose(example: Example) -> str:
     """The example's whole inventory."""
     if "#" in example.fragment:
         return BASE + example.fragment
-    whole = _laid_over(_read(BASE), _read(example.fragment))
+    whole = _merged(_read(BASE), _read(example.fragment))
     return _with_hashes(yaml.dump(whole, Dumper=_DUMPER, sort_keys=False, allow_unicode=True, width=110), example.files)
 
 
 def write(example: Example, directory: Path) -> Path:
-    """The inventory and its files in `directory`; the path to lint. Files named `mode-0644...` have that mode."""
+    """Write the inventory and its files; returns the path to lint. Files named `mode-0644...` get that mode."""
     for name, text in example.files.items():
         file = directory / name
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -144,12 +144,12 @@ def write(example: Example, directory: Path) -> Path:
 
 
 def environment(example: Example) -> dict[str, str]:
-    """The variables that the example's secrets are in."""
+    """The environment variables with the example's secrets."""
     return {**ENVIRONMENT, **example.environment}
 
 
 def content(text: str) -> bytes:
-    """What a file of an example holds: its text, or the image that the text describes."""
+    """The content of an example file: its text, or the image that the text describes."""
     for prefix, start in ((_IMAGE, b"kernel"), (_DAMAGED, b"kernel"), (_LARGE, b"\0" * (4 << 20))):
         if text.startswith(prefix):
             image = append_metadata(start, json.loads(text.removeprefix(prefix)))
@@ -162,13 +162,13 @@ def _read(text: str) -> dict[str, Any]:
     return document
 
 
-def _laid_over(base: dict[str, Any], fragment: Mapping[str, Any]) -> dict[str, Any]:
+def _merged(base: dict[str, Any], fragment: Mapping[str, Any]) -> dict[str, Any]:
     whole = copy.deepcopy(base)
     for key, value in fragment.items():
         if value == REMOVED:
             whole.pop(key, None)
         elif isinstance(value, dict) and isinstance(whole.get(key), dict) and not _is_secret(value):
-            whole[key] = _laid_over(whole[key], value)
+            whole[key] = _merged(whole[key], value)
         else:
             whole[key] = value
     return whole

@@ -1,4 +1,4 @@
-"""The one place where lint touches the disk: facts about the files an inventory names, each found out once."""
+"""File access of lint: cached facts about the files that an inventory names."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from meshctl import firmware
 from meshctl.diagnostics import Diagnostic
 from meshctl.model import HardwareProfile
 
-# ten thousand pinned keys take some 4 MB
+# 10,000 pinned keys take about 4 MB
 _MAX_TEXT_BYTES = 16 * 1024 * 1024
-# git answers at once, or hangs on a network file system that is gone
+# git answers immediately, or hangs on an unavailable network file system
 _GIT_TIMEOUT_S = 10
 
 
 class DiskFiles:
-    """`meshctl.lint.context.Files` on the real file system, with a memory.
+    """`meshctl.lint.context.Files` on the real file system, cached.
 
-    A name that no file can have (one with a NUL, a ValueError to Python) is a file that is not there.
+    An impossible name (with a NUL, for which Python raises ValueError) counts as a missing file.
     """
 
     def __init__(self) -> None:
@@ -80,7 +80,7 @@ def _status(path: Path) -> os.stat_result | None:
 
 
 def _would_be_committed(path: Path) -> bool:
-    # where the bytes are: `..` and symbolic links lead out of a work tree, and into one
+    # resolved: `..` and symbolic links lead into and out of work trees
     try:
         absolute = path.resolve()
     except OSError:
@@ -99,5 +99,5 @@ def _would_be_committed(path: Path) -> bool:
         )
     except (OSError, subprocess.TimeoutExpired):
         return True
-    # 0: ignored, 1: not, 128: git cannot tell
+    # 0: ignored, 1: not ignored, 128: unknown
     return ignored.returncode != 0

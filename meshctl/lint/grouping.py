@@ -1,4 +1,4 @@
-"""Group equal things in one pass, so that a rule about collisions costs what the fleet's size costs."""
+"""Find duplicates in one pass, so that rules stay linear in the size of the fleet."""
 
 from __future__ import annotations
 
@@ -8,24 +8,23 @@ from typing import TypeVar
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
-# more names than these say nothing more to a reader
-_SHOWN = 4
+_MAX_SHOWN = 4
 
 
-def grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
-    """The values of every key, both in the order of their coming."""
+def group_by_key(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
+    """The values of every key; keys and values keep their order."""
     groups: dict[K, list[V]] = {}
     for key, value in pairs:
         groups.setdefault(key, []).append(value)
     return groups
 
 
-def repeated(pairs: Iterable[tuple[K, V]]) -> Iterator[tuple[K, list[V]]]:
-    """The keys that came more than once, with their values."""
-    return ((key, values) for key, values in grouped(pairs).items() if len(values) > 1)
+def duplicates(pairs: Iterable[tuple[K, V]]) -> Iterator[tuple[K, list[V]]]:
+    """The keys that occur more than once, with their values."""
+    return ((key, values) for key, values in group_by_key(pairs).items() if len(values) > 1)
 
 
-def listed(names: Sequence[str]) -> str:
-    """`a, b, c`, cut after a few."""
-    shown = ", ".join(names[:_SHOWN])
-    return shown if len(names) <= _SHOWN else f"{shown} and {len(names) - _SHOWN} more"
+def join_limited(names: Sequence[str]) -> str:
+    """`a, b, c, d and 3 more`."""
+    shown = ", ".join(names[:_MAX_SHOWN])
+    return shown if len(names) <= _MAX_SHOWN else f"{shown} and {len(names) - _MAX_SHOWN} more"

@@ -1,7 +1,7 @@
-"""Names of OpenWrt that an inventory writes: targets, packages, and the paths of radios that are part of a chip.
+"""Known names of OpenWrt targets, packages and built-in radio paths.
 
-None of the lists is complete, so a name that is on none of them is not wrong; one that is a slip away from a name on
-them is. Sources: target/linux and package/ of OpenWrt 19.07 to 25.12.
+The lists are incomplete, so an unlisted name is not an error; a name one edit away from a listed one is.
+Sources: target/linux and package/ of OpenWrt 19.07 to 25.12.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SUBTARGETS: Mapping[str, frozenset[str]] = MappingProxyType(
         "x86": _words("64 generic geode legacy"),
     }
 )
-# the radio of a system on a chip by its path in the device tree: it exists on boards of this target alone
+# device tree paths of built-in radios, which exist only on boards of this target
 _CHIPS = (
     (re.compile(r"platform/ahb/.*\.wmac"), "ath79"),
     (re.compile(r"platform/(ar9\w+|qca9\w+)_wmac"), "ar71xx"),
@@ -51,24 +51,26 @@ PACKAGES = frozenset(FULL_SUPPLICANTS) | _words(
     luci luci-ssl uhttpd zoneinfo-core openssh-sftp-server rsync collectd socat alfred batmand olsrd babeld snmpd
     lldpd"""
 )
-# shorter names are a slip away from too much
-_LEAST_LETTERS = 6
+# shorter names are similar to too many others
+_MIN_LETTERS = 6
 
 
 def chip_target(radio_path: str) -> str | None:
-    """The target whose boards have a radio at this path, None where any may (PCI, USB)."""
+    """The only target with a radio at this path; None if any target may have it (PCI, USB)."""
     return next((target for pattern, target in _CHIPS if pattern.fullmatch(radio_path)), None)
 
 
-def meant_package(name: str) -> str | None:
-    """The known package that is one slip away from `name`; None for a package that is known, or near to none."""
-    if name in PACKAGES or len(name) < _LEAST_LETTERS:
+def suggest_package(name: str) -> str | None:
+    """The known package one edit away from `name`; None if `name` is known, or similar to none."""
+    if name in PACKAGES or len(name) < _MIN_LETTERS:
         return None
-    return next((known for known in sorted(PACKAGES) if len(known) >= _LEAST_LETTERS and one_slip(name, known)), None)
+    return next(
+        (known for known in sorted(PACKAGES) if len(known) >= _MIN_LETTERS and is_one_edit_apart(name, known)), None
+    )
 
 
-def one_slip(one: str, other: str) -> bool:
-    """Whether one letter is missing, added, wrong, or has changed places with its neighbour."""
+def is_one_edit_apart(one: str, other: str) -> bool:
+    """Whether one letter is missing, added, wrong, or swapped with the next."""
     if abs(len(one) - len(other)) > 1 or one == other:
         return False
     start = next((i for i, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other)))

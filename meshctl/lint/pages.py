@@ -1,6 +1,6 @@
-"""Each rule's page, from its code: `python -m meshctl.lint.pages docs/lint` writes them, `--explain` prints one.
+"""Documentation pages, generated from the rules: `python -m meshctl.lint.pages docs/lint`; `--explain` prints one.
 
-A page says what the rule finds, why it matters, how to mend it, and shows one inventory that fails and one that passes.
+A page says what the rule finds, why it matters and how to fix it, with an example that fails and one that passes.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ def page(rule: Rule) -> str:
         f"# {rule.code}: {rule.title}",
         f"`{rule.name}`, {_article(rule.severity.value)}.",
         rule.why,
-        f"**Mend it:** {rule.mend}",
+        f"**Fix:** {rule.fix}",
         "## Fails",
         _example(rule.failing),
         "## Passes",
         _example(rule.passing),
-        "Both are laid over the [base inventory](index.md#the-base-inventory) and run as tests.",
+        "Both examples are merged into the [base inventory](index.md#the-base-inventory) and run as tests.",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -38,13 +38,13 @@ def _example(example: Example) -> str:
     parts += [f"with the file `{name}`:\n\n```\n{text.rstrip()}\n```" for name, text in example.files.items()]
     parts += [f"with `{name}={value}` in the environment" for name, value in example.environment.items()]
     if example.also:
-        parts.append(f"(It also gives {', '.join(example.also)}.)")
+        parts.append(f"(Also reports {', '.join(example.also)}.)")
     return "\n\n".join(parts)
 
 
 def index() -> str:
-    """The page that lists all rules by chapter, with the base inventory of the examples."""
-    parts = ["# The rules of `meshctl lint`", f"{len(RULES)} rules. [How to use them](../lint.md)."]
+    """The list of all rules by chapter, with the base inventory of the examples."""
+    parts = ["# Rules of `meshctl lint`", f"{len(RULES)} rules. See [linting an inventory](../lint.md) for usage."]
     for title, module in CHAPTERS:
         rows = [
             f"| [{rule.code}]({rule.code}.md) | {rule.severity.value} | {rule.title} |" for rule in rules_of(module)
@@ -53,8 +53,8 @@ def index() -> str:
         parts.append("\n".join(["| code | severity | finds |", "| --- | --- | --- |", *rows]))
     parts.append("## The base inventory")
     parts.append(
-        "Every example is laid over this one, which has nothing to report: mappings join key by key, anything else"
-        "\nreplaces, `<removed>` takes a key away. An example with a comment stands behind it as it is."
+        "Every example is merged into this inventory, which has no findings: mappings merge key by key, other values"
+        "\nreplace, and `<removed>` removes a key. An example with a comment is appended unchanged."
     )
     parts.append(f"```yaml\n{BASE}```")
     return "\n\n".join(parts) + "\n"
@@ -66,7 +66,7 @@ def pages() -> dict[str, str]:
 
 
 def main(directory: Path) -> None:
-    """Write all pages into `directory`, and take away pages of rules that are gone."""
+    """Write all pages into `directory`, and delete pages of removed rules."""
     wanted = pages()
     directory.mkdir(parents=True, exist_ok=True)
     for file in directory.glob("*.md"):

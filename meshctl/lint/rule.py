@@ -1,7 +1,6 @@
-"""What a rule is: a stable code, the words of its page, two examples, and the function that looks.
+"""A rule: a stable code, the text of its page, two examples, and the check.
 
-A rule's module writes `@fleet_rule(...)` (or `@text_rule(...)`) above a function; the decorated name then holds the
-`Rule`. `meshctl.lint.catalog` gathers them.
+`@fleet_rule(...)` or `@text_rule(...)` above a function turns it into a `Rule`; `meshctl.lint.catalog` collects them.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ CODE = re.compile(r"MC\d{3}")
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What a rule saw: the place as the inventory's path (or a `position` of its own), and what is wrong there.
+    """A problem at a path of the inventory (or at an explicit `position`).
 
-    Findings that differ in nothing but the path are reported as one (a value that a whole group inherits), so a
-    message names no node that its path already names.
+    Findings that differ only in the path are reported as one (a value that a group inherits), so a message does not
+    repeat the node that the path names.
     """
 
     path: tuple[str, ...]
@@ -40,8 +39,8 @@ TextCheck = Callable[[str, str], Iterator[Finding]]
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A fragment laid over the base inventory (`meshctl.lint.example`). `files` stand beside it, `environment` holds
-    the variables its secrets name; `also` are codes that cannot but come with the rule's own."""
+    """A fragment merged into the base inventory (`meshctl.lint.example`). `files` are written next to it,
+    `environment` holds its secrets; `also` lists codes that necessarily occur together with the rule's own."""
 
     fragment: str
     files: Mapping[str, str] = field(default_factory=dict)
@@ -51,14 +50,14 @@ class Example:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """`why` says what goes wrong in the field, `mend` what to do; exactly one of the checks is set, or none for what
-    the engine itself reports (suppressions, the baseline). A fallback is silent where another rule has spoken."""
+    """`why` says what goes wrong in the field, `fix` what to do. Exactly one check is set, or none for findings of the
+    engine itself (suppressions, the baseline). A fallback rule is silent where another rule reports."""
 
     code: str
     severity: Severity
     title: str
     why: str
-    mend: str
+    fix: str
     failing: Example
     passing: Example
     check: FleetCheck | None = None
@@ -73,15 +72,15 @@ def fleet_rule(
     title: str,
     *,
     why: str,
-    mend: str,
+    fix: str,
     failing: str | Example,
     passing: str | Example,
     is_fallback: bool = False,
 ) -> Callable[[FleetCheck], Rule]:
-    """Make the decorated function, which reads a fleet, a rule."""
+    """Turn the decorated function, which checks a fleet, into a rule."""
 
     def decorate(check: FleetCheck) -> Rule:
-        made = _rule(code, severity, title, why, mend, failing, passing, name=_slug(check), check=check)
+        made = _rule(code, severity, title, why, fix, failing, passing, name=_slug(check), check=check)
         return replace(made, is_fallback=is_fallback)
 
     return decorate
@@ -93,14 +92,14 @@ def text_rule(
     title: str,
     *,
     why: str,
-    mend: str,
+    fix: str,
     failing: str | Example,
     passing: str | Example,
 ) -> Callable[[TextCheck], Rule]:
-    """Make the decorated function, which reads a file's name and text, a rule; it runs even when no fleet loads."""
+    """Turn the decorated function, which checks a file's name and text, into a rule; it runs even if loading fails."""
 
     def decorate(check: TextCheck) -> Rule:
-        return _rule(code, severity, title, why, mend, failing, passing, name=_slug(check), check_text=check)
+        return _rule(code, severity, title, why, fix, failing, passing, name=_slug(check), check_text=check)
 
     return decorate
 
@@ -112,12 +111,12 @@ def engine_rule(
     *,
     name: str,
     why: str,
-    mend: str,
+    fix: str,
     failing: str | Example,
     passing: str | Example,
 ) -> Rule:
-    """A rule that the engine checks by itself."""
-    return _rule(code, severity, title, why, mend, failing, passing, name=name)
+    """A rule that the engine itself checks."""
+    return _rule(code, severity, title, why, fix, failing, passing, name=name)
 
 
 def _rule(
@@ -125,7 +124,7 @@ def _rule(
     severity: Severity,
     title: str,
     why: str,
-    mend: str,
+    fix: str,
     failing: str | Example,
     passing: str | Example,
     *,
@@ -134,13 +133,13 @@ def _rule(
     check_text: TextCheck | None = None,
 ) -> Rule:
     if CODE.fullmatch(code) is None:
-        raise ValueError(f"a rule's code is MC and three digits, not {code}")
+        raise ValueError(f"expected a rule code such as MC123, found {code}")
     return Rule(
         code,
         severity,
         title,
-        _flowed(why),
-        _flowed(mend),
+        _joined(why),
+        _joined(fix),
         _example(failing),
         _example(passing),
         check,
@@ -153,8 +152,8 @@ def _slug(check: Callable[..., object]) -> str:
     return check.__name__.replace("_", "-")
 
 
-def _flowed(text: str) -> str:
-    """A triple-quoted text as one paragraph."""
+def _joined(text: str) -> str:
+    """A triple-quoted text on one line."""
     return " ".join(text.split())
 
 

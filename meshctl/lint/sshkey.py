@@ -1,4 +1,4 @@
-"""Read an SSH public key as it stands in authorized_keys: its kind, its strength, whether it is whole.
+"""Parse an SSH public key of an authorized_keys line: type, strength, integrity.
 
 The text form is that of OpenSSH's sshd(8), AUTHORIZED_KEYS FILE FORMAT; the blob that of RFC 4253 section 6.6.
 """
@@ -25,12 +25,12 @@ _KINDS = (
 
 
 class BadKey(ValueError):
-    """Text that is no public key; says why, and never repeats it."""
+    """Not a public key; the message gives the reason but never the text."""
 
 
 @dataclass(frozen=True, slots=True)
-class PublicKey:
-    """`bits` is the modulus of an RSA or DSA key, 256 and so on for the others; `comment` names its owner."""
+class AuthorizedKey:
+    """`bits` is the modulus size of an RSA or DSA key, 256 and so on for others; `comment` usually names the owner."""
 
     kind: str
     bits: int
@@ -42,25 +42,25 @@ class PublicKey:
         return self.kind in ("ssh-ed25519", "sk-ssh-ed25519@openssh.com")
 
 
-def parse_public_key(line: str) -> PublicKey:
-    """The key on `line`, options before it allowed. Raises BadKey."""
+def parse_authorized_key(line: str) -> AuthorizedKey:
+    """The key on `line`, which may start with options. Raises BadKey."""
     if "PRIVATE KEY" in line:
         raise BadKey("a private key")
     words = line.split()
     start = next((index for index, word in enumerate(words) if word in _KINDS), None)
     if start is None:
-        raise BadKey("no kind of key that is known")
+        raise BadKey("unknown key type")
     if start + 1 == len(words):
-        raise BadKey(f"{words[start]} without a key behind it")
+        raise BadKey(f"{words[start]} without key data")
     kind, encoded = words[start], words[start + 1]
     try:
         blob = base64.b64decode(encoded, validate=True)
     except binascii.Error as error:
-        raise BadKey("cut off or not base64") from error
+        raise BadKey("truncated or not base64") from error
     fields = _fields(blob)
     if not fields or fields[0] != kind.encode():
-        raise BadKey(f"the key inside is not {kind}")
-    return PublicKey(kind, _bits(kind, fields), " ".join(words[start + 2 :]), encoded)
+        raise BadKey(f"key data is not {kind}")
+    return AuthorizedKey(kind, _bits(kind, fields), " ".join(words[start + 2 :]), encoded)
 
 
 def _fields(blob: bytes) -> list[bytes]:
@@ -68,11 +68,11 @@ def _fields(blob: bytes) -> list[bytes]:
     offset = 0
     while offset < len(blob):
         if offset + 4 > len(blob):
-            raise BadKey("cut off")
+            raise BadKey("truncated")
         (length,) = struct.unpack_from(">I", blob, offset)
         offset += 4
         if offset + length > len(blob):
-            raise BadKey("cut off")
+            raise BadKey("truncated")
         fields.append(blob[offset : offset + length])
         offset += length
     return fields
@@ -83,14 +83,14 @@ def _bits(kind: str, fields: list[bytes]) -> int:
         case "ssh-rsa" | "ssh-dss":
             modulus = fields[2] if kind == "ssh-rsa" and len(fields) == 3 else fields[1] if len(fields) == 5 else b""
             if not modulus:
-                raise BadKey("cut off")
+                raise BadKey("truncated")
             return int.from_bytes(modulus, "big").bit_length()
         case "ssh-ed25519" | "sk-ssh-ed25519@openssh.com":
             if len(fields) < 2 or len(fields[1]) != _ED25519_BYTES:
-                raise BadKey("cut off")
+                raise BadKey("truncated")
             return 256
         case _:
             if len(fields) < 3:
-                raise BadKey("cut off")
+                raise BadKey("truncated")
             # the point is one byte and two coordinates
             return (len(fields[2]) - 1) * 4

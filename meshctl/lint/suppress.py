@@ -1,7 +1,7 @@
-"""Comments that excuse a finding: `# meshctl: ignore MC424 -- why`.
+"""Comments that suppress a finding: `# meshctl: ignore MC424 -- why`.
 
-Text -> suppressions (`find`) -> findings divided into those that stay and those that are excused (`apply`), with
-findings about the comments themselves. A comment on a line of its own speaks for the next line that holds something.
+Text -> suppressions (`find`) -> findings split into reported and suppressed ones (`apply`), plus findings about the
+comments themselves. A comment on its own line applies to the next line with content.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import yaml
 from meshctl.diagnostics import Diagnostic, Position, sorted_diagnostics
 from meshctl.lint.engine import diagnostic
 from meshctl.lint.rule import CODE, Finding
-from meshctl.lint.rules.housekeeping import NO_REASON, UNKNOWN_CODE, USELESS
+from meshctl.lint.rules.housekeeping import NO_REASON, UNKNOWN_CODE, UNUSED
 
 _COMMENT = re.compile(r"#\s*meshctl:\s*ignore\b(?P<codes>.*?)(?:\s--(?P<reason>.*))?$", re.MULTILINE)
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -23,7 +23,7 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 @dataclass(frozen=True, slots=True)
 class Suppression:
-    """One comment: where it stands, the line it speaks for, the codes and the reason, both as written."""
+    """One comment: its position, the line it applies to, and the codes and reason as written."""
 
     position: Position
     line: int
@@ -33,22 +33,22 @@ class Suppression:
 
 @dataclass(frozen=True, slots=True)
 class Suppressed:
-    """A finding that a comment excuses."""
+    """A finding suppressed by a comment."""
 
     diagnostic: Diagnostic
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
-class Divided:
-    """The findings that stay (those about comments among them), and those that are excused."""
+class SplitFindings:
+    """The reported findings, including those about comments, and the suppressed ones."""
 
-    stay: tuple[Diagnostic, ...]
-    excused: tuple[Suppressed, ...]
+    reported: tuple[Diagnostic, ...]
+    suppressed: tuple[Suppressed, ...]
 
 
 def find(file: str, text: str) -> tuple[Suppression, ...]:
-    """The suppressions in a file, in order; what stands inside quotes or block texts is none."""
+    """The suppressions in a file, in order; text in quotes or block scalars does not count."""
     matches = list(_COMMENT.finditer(text))
     if not matches:
         return ()
@@ -60,22 +60,22 @@ def find(file: str, text: str) -> tuple[Suppression, ...]:
             continue
         row = text.count("\n", 0, match.start())
         column = match.start() - (text.rfind("\n", 0, match.start()) + 1)
-        speaks_for = row
+        applies_to = row
         if not lines[row][:column].strip():
-            speaks_for = next((n for n in range(row + 1, len(lines)) if _holds_something(lines[n])), row)
+            applies_to = next((n for n in range(row + 1, len(lines)) if _has_content(lines[n])), row)
         codes = tuple(re.split(r"[\s,]+", match["codes"].strip())) if match["codes"].strip() else ()
         position = Position(file, row + 1, column + 1)
-        found.append(Suppression(position, speaks_for + 1, codes, (match["reason"] or "").strip()))
+        found.append(Suppression(position, applies_to + 1, codes, (match["reason"] or "").strip()))
     return tuple(found)
 
 
-def _holds_something(line: str) -> bool:
+def _has_content(line: str) -> bool:
     stripped = line.strip()
     return bool(stripped) and not stripped.startswith("#")
 
 
 def _inside_scalars(text: str, offsets: list[int]) -> set[int]:
-    """Which offsets lie inside a scalar. YAML that cannot be read to its end has scalars up to there."""
+    """The offsets inside a scalar. Invalid YAML has scalars up to the error."""
     spans = []
     try:
         for event in yaml.parse(text, Loader=_LOADER):
@@ -98,8 +98,8 @@ def apply(
     sources: Mapping[str, str],
     known: Collection[str],
     ran: Collection[str],
-) -> Divided:
-    """Divide findings by the comments in `sources`.
+) -> SplitFindings:
+    """Split findings by the comments in `sources`.
 
     `known` are all rules' codes, `ran` those that were looked for: a comment is useless only for a code
     that ran.
@@ -121,11 +121,11 @@ def apply(
             used.add((excuse.position, item.code))
             excused.append(Suppressed(item, excuse.reason))
     for comment in comments:
-        stay.extend(_about(comment, known, ran, used))
-    return Divided(sorted_diagnostics(stay), tuple(excused))
+        stay.extend(_comment_findings(comment, known, ran, used))
+    return SplitFindings(sorted_diagnostics(stay), tuple(excused))
 
 
-def _about(
+def _comment_findings(
     comment: Suppression, known: Collection[str], ran: Collection[str], used: Collection[tuple[Position, str]]
 ) -> Iterable[Diagnostic]:
     unknown = [code for code in comment.codes if code not in known]
@@ -134,9 +134,9 @@ def _about(
     for code in unknown:
         yield diagnostic(UNKNOWN_CODE, Finding((), "", "the code of a rule", code), comment.position)
     if not comment.reason:
-        yield diagnostic(NO_REASON, Finding((), "", "a reason behind --", "none"), comment.position)
+        yield diagnostic(NO_REASON, Finding((), "", "a reason after --", "none"), comment.position)
         return
     for code in comment.codes:
         if code in ran and (comment.position, code) not in used:
-            finding = Finding((), f"line {comment.line} has no such finding", "", code)
-            yield diagnostic(USELESS, finding, comment.position)
+            finding = Finding((), f"no such finding on line {comment.line}", "", code)
+            yield diagnostic(UNUSED, finding, comment.position)

@@ -1,6 +1,6 @@
-"""Time zones: their names, the POSIX string of each, and whether a text is such a string.
+"""Time zones: names, their POSIX strings, and validation of POSIX strings.
 
-The table is made from tzdata by `scripts/update-zones`, so that lint says the same on every machine.
+`scripts/update-zones` generates the table from tzdata, so that lint gives the same result on every machine.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ _POSIX = re.compile(rf"{_NAME}{_TIME}(?:{_NAME}(?:{_TIME})?(?:{_RULE}{_RULE})?)?
 
 @cache
 def zones() -> Mapping[str, str]:
-    """The POSIX time zone of every name, such as `MST7MDT,M3.2.0,M11.1.0` of `America/Denver`."""
+    """Name -> POSIX time zone string: `America/Denver` -> `MST7MDT,M3.2.0,M11.1.0`."""
     rows = (line.split("\t") for line in _TABLE.read_text(encoding="utf-8").splitlines() if not line.startswith("#"))
     return MappingProxyType({row[0]: row[1] for row in rows})
 
 
 def is_posix(text: str) -> bool:
-    """Whether OpenWrt's libc reads the text as a time zone; `UTC`, OpenWrt's own default, counts as one."""
+    """Whether OpenWrt's libc accepts the text as a time zone; OpenWrt's default `UTC` counts."""
     return text in ("UTC", "GMT") or _POSIX.fullmatch(text) is not None
 
 
 def posix_of(name: str) -> str | None:
-    """The POSIX string of a zone by its name, with spaces or underscores; None for a name that no zone has."""
+    """The POSIX string of a zone name, which may have spaces for underscores; None for an unknown name."""
     return zones().get(name.replace(" ", "_"))
 
 
 def same_clock(one: str, other: str) -> bool:
-    """Whether two POSIX strings name the same clock, however they abbreviate it."""
+    """Whether two POSIX strings describe the same local time, ignoring abbreviations."""
     return _unnamed(one) == _unnamed(other)
 
 

@@ -218,7 +218,7 @@ class Fleet:
     operators: Operators
     system: SystemSettings
     apply: ApplyPolicy
-    origins: Mapping[tuple[str, ...], Origin]
+    provenance: Mapping[tuple[str, ...], Origin]
     files: tuple[str, ...] = ()
     base: str = ""
 
@@ -229,7 +229,7 @@ class Fleet:
         MissingOrigin when not even its first part is known.
         """
         for end in range(len(path), 0, -1):
-            origin = self.origins.get(path[:end])
+            origin = self.provenance.get(path[:end])
             if origin is not None:
                 return origin
         raise MissingOrigin(".".join(path))

@@ -1,14 +1,14 @@
 """What a country allows on the air, from the kernel's wireless regulatory database.
 
-`load` reads the machine's database (or the one shipped here), `Regdb.country` gives a country's rules, `judge` holds a
-channel of a width against them.
+`load` reads the system database, or the copy shipped here; `Regdb.country` returns a country's rules; `check_span`
+checks a channel of a given width against them.
 """
 
 from meshctl.regdb.binary import RegdbError, decode
 from meshctl.regdb.channels import CHANNELS, Span, center_mhz, channel_at, occupied, width_mhz
 from meshctl.regdb.file import SHIPPED, SYSTEM, load, shipped_version
-from meshctl.regdb.legality import Verdict, judge, legal_channels, primary
-from meshctl.regdb.values import Country, DfsRegion, Flag, Regdb, Rule
+from meshctl.regdb.legality import Legality, check_span, legal_channels, primary
+from meshctl.regdb.values import Country, DfsRegion, Flag, FrequencyRule, Regdb
 
 __all__ = [
     "CHANNELS",
@@ -17,15 +17,15 @@ __all__ = [
     "Country",
     "DfsRegion",
     "Flag",
+    "FrequencyRule",
+    "Legality",
     "Regdb",
     "RegdbError",
-    "Rule",
     "Span",
-    "Verdict",
     "center_mhz",
     "channel_at",
+    "check_span",
     "decode",
-    "judge",
     "legal_channels",
     "load",
     "occupied",

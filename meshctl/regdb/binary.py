@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 from meshctl.errors import InputError
-from meshctl.regdb.values import Country, DfsRegion, Flag, Regdb, Rule
+from meshctl.regdb.values import Country, DfsRegion, Flag, FrequencyRule, Regdb
 
 # "RGDB"
 _MAGIC = 0x52474442
@@ -44,7 +44,7 @@ def decode(data: bytes, source: str) -> Regdb:
     if version != _VERSION:
         raise RegdbError(f"{source}: expected regulatory database version {_VERSION}, found {version}")
     countries: dict[str, Country] = {}
-    collections: dict[int, tuple[DfsRegion, tuple[Rule, ...]]] = {}
+    collections: dict[int, tuple[DfsRegion, tuple[FrequencyRule, ...]]] = {}
     offset = _HEADER.size
     while True:
         raw, pointer = _unpack(_COUNTRY, data, offset, source)
@@ -67,7 +67,7 @@ def _alpha2(raw: bytes, offset: int, source: str) -> str:
     return text
 
 
-def _collection(data: bytes, offset: int, source: str) -> tuple[DfsRegion, tuple[Rule, ...]]:
+def _collection(data: bytes, offset: int, source: str) -> tuple[DfsRegion, tuple[FrequencyRule, ...]]:
     length, count, region = _unpack(_COLLECTION, data, offset, source)
     if length < _COLLECTION.size:
         raise RegdbError(f"{source}: expected at least {_COLLECTION.size} bytes in the rules at byte {offset}")
@@ -81,14 +81,14 @@ def _collection(data: bytes, offset: int, source: str) -> tuple[DfsRegion, tuple
     return dfs_region, tuple(rules)
 
 
-def _rule(data: bytes, offset: int, source: str) -> Rule:
+def _rule(data: bytes, offset: int, source: str) -> FrequencyRule:
     length, flags, max_eirp_mbm, start_khz, end_khz, bandwidth_khz = _unpack(_RULE, data, offset, source)
     if length < _RULE.size:
         raise RegdbError(f"{source}: expected a rule of at least {_RULE.size} bytes at byte {offset}, found {length}")
     if not start_khz < end_khz:
         raise RegdbError(f"{source}: expected a rising frequency range at byte {offset}, found {start_khz}-{end_khz}")
     known = Flag(flags & (Flag.NO_OFDM | Flag.NO_OUTDOOR | Flag.DFS | Flag.NO_IR | Flag.AUTO_BW))
-    return Rule(start_khz, end_khz, bandwidth_khz, max_eirp_mbm / _MBM_PER_DBM, known)
+    return FrequencyRule(start_khz, end_khz, bandwidth_khz, max_eirp_mbm / _MBM_PER_DBM, known)
 
 
 def _unpack(layout: struct.Struct, data: bytes, offset: int, source: str) -> tuple[Any, ...]:

@@ -1,7 +1,7 @@
-"""Hold a channel of a width against a country's rules, as the kernel's cfg80211 does.
+"""Check a channel of a given width against a country's rules, as the kernel's cfg80211 does.
 
-`judge` finds the rules that cover the occupied range (neighbouring rules join only where they carry AUTO_BW), and says
-what they forbid; `legal_channels` lists what would pass instead.
+`check_span` finds the rules that cover the occupied range (adjacent rules combine only if they have AUTO_BW) and
+returns what they allow; `legal_channels` lists the channels that would pass.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 from meshctl.model import Band
 from meshctl.regdb.channels import CHANNELS, Span, center_mhz, occupied, width_mhz
-from meshctl.regdb.values import NO_FLAGS, Country, Flag, Rule
+from meshctl.regdb.values import NO_FLAGS, Country, Flag, FrequencyRule
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Legality:
     """What a country says about a channel of a width.
 
     `covered` is False when some of the range lies outside every rule (`flags` and `max_eirp_dbm` then mean nothing).
@@ -30,20 +30,20 @@ class Verdict:
         return self.covered and span_mhz * 1000 <= self.max_bandwidth_khz
 
 
-def judge(country: Country, span: Span, *, ofdm: bool = True) -> Verdict:
+def check_span(country: Country, span: Span, *, ofdm: bool = True) -> Legality:
     """The rules' verdict on the range `span`; `ofdm` False asks for the rules of 802.11b too (channel 14 in Japan)."""
     low, high = span.low_mhz * 1000, span.high_mhz * 1000
-    whole = _whole(country, low, high, ofdm=ofdm)
+    whole = _covering_rule(country, low, high, ofdm=ofdm)
     if whole is not None:
         joined = _joined_khz(country, whole) if whole.flags & Flag.AUTO_BW else whole.max_bandwidth_khz
-        return Verdict(True, whole.max_eirp_dbm, max(whole.max_bandwidth_khz, joined), whole.flags)
-    pieces = _chain(country, low, high)
+        return Legality(True, whole.max_eirp_dbm, max(whole.max_bandwidth_khz, joined), whole.flags)
+    pieces = _auto_bw_chain(country, low, high)
     if not pieces:
-        return Verdict(False)
+        return Legality(False)
     flags = NO_FLAGS
     for rule in pieces:
         flags |= rule.flags
-    return Verdict(True, min(rule.max_eirp_dbm for rule in pieces), high - low, flags)
+    return Legality(True, min(rule.max_eirp_dbm for rule in pieces), high - low, flags)
 
 
 def legal_channels(country: Country, band: Band, htmode: str, *, forbidden: Flag) -> tuple[int, ...]:
@@ -57,7 +57,7 @@ def legal_channels(country: Country, band: Band, htmode: str, *, forbidden: Flag
         span = occupied(band, channel, htmode)
         if span is None:
             continue
-        verdict = judge(country, span)
+        verdict = check_span(country, span)
         if verdict.allows(width) and not verdict.flags & forbidden:
             legal.append(channel)
     return tuple(legal)
@@ -69,7 +69,7 @@ def primary(band: Band, channel: int) -> Span:
     return Span(center - 10, center + 10)
 
 
-def _whole(country: Country, low_khz: int, high_khz: int, *, ofdm: bool) -> Rule | None:
+def _covering_rule(country: Country, low_khz: int, high_khz: int, *, ofdm: bool) -> FrequencyRule | None:
     """The first rule that covers the range alone, the one with the fewest restrictions if several do."""
     covering = [
         rule
@@ -79,9 +79,9 @@ def _whole(country: Country, low_khz: int, high_khz: int, *, ofdm: bool) -> Rule
     return min(covering, key=lambda rule: (rule.flags & ~Flag.AUTO_BW).bit_count(), default=None)
 
 
-def _chain(country: Country, low_khz: int, high_khz: int) -> tuple[Rule, ...]:
+def _auto_bw_chain(country: Country, low_khz: int, high_khz: int) -> tuple[FrequencyRule, ...]:
     """Adjoining AUTO_BW rules that cover the range together, empty when there are none."""
-    chain: list[Rule] = []
+    chain: list[FrequencyRule] = []
     reached = low_khz
     for rule in sorted(country.rules, key=lambda rule: rule.start_khz):
         if rule.flags & Flag.AUTO_BW and rule.start_khz <= reached < rule.end_khz:
@@ -92,7 +92,7 @@ def _chain(country: Country, low_khz: int, high_khz: int) -> tuple[Rule, ...]:
     return ()
 
 
-def _joined_khz(country: Country, rule: Rule) -> int:
+def _joined_khz(country: Country, rule: FrequencyRule) -> int:
     """The width of the unbroken AUTO_BW range that `rule` is part of."""
     low, high = rule.start_khz, rule.end_khz
     neighbours = [other for other in country.rules if other.flags & Flag.AUTO_BW]

@@ -6,9 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, IntFlag
 
-# the alpha-2 code of the world domain, which the kernel uses until it is told a country
-WORLD = "00"
-
 
 class Flag(IntFlag):
     """A rule's restrictions by the kernel's bits (net/wireless/reg.c, enum fwdb_flags)."""
@@ -33,7 +30,7 @@ class DfsRegion(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class FrequencyRule:
     """One frequency range: its edges, the widest channel, the highest power and the restrictions."""
 
     start_khz: int
@@ -47,7 +44,7 @@ class Rule:
 class Country:
     alpha2: str
     dfs_region: DfsRegion
-    rules: tuple[Rule, ...]
+    rules: tuple[FrequencyRule, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,15 +47,15 @@ class NodeDifference:
 
 def compare_fleets(before: Fleet, after: Fleet) -> Iterator[NodeDifference]:
     """The nodes that differ: those of `before` in its order, then new ones. Raises InvalidInput from rendering."""
-    old = {item.node: item for item in render_fleet(before, stand_in)}
-    new = {item.node: item for item in render_fleet(after, stand_in)}
+    old = {item.node: item for item in render_fleet(before, placeholder_secret)}
+    new = {item.node: item for item in render_fleet(after, placeholder_secret)}
     for name in dict.fromkeys((*old, *new)):
         difference = compare_nodes(old.get(name), new.get(name))
         if difference is not None:
             yield difference
 
 
-def stand_in(ref: SecretRef) -> Secret:
+def placeholder_secret(ref: SecretRef) -> Secret:
     """A text that stands for a secret: as long as the longest key, of the letters that every kind of key may have."""
     return Secret(hashlib.sha256(str(ref).encode()).hexdigest())
 

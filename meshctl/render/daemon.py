@@ -31,7 +31,7 @@ _MAX_WINDOW = 4096
 _MAX_KEYS = 2
 _KEY_BYTES = 32
 # Heartbeats grow this sparse at most, unless the team wants to be told sooner (udp_mesh's default).
-_SPARSE_S = 3.0
+_MAX_SPARSE_HEARTBEAT_S = 3.0
 # Silence after which unkept messages end as lost (udp_mesh's default): longer than a tunnel's shadow.
 _PEER_LOST_S = 60.0
 
@@ -55,7 +55,7 @@ def daemon_config(fleet: Fleet, robot: str, *, key_name: str = KEY_NAME) -> byte
         f"fragment_bytes = {transport.fragment_bytes}",
         *_rates(transport),
         *_links(fleet, robot, computer),
-        *_fielded(fleet, robot),
+        *_legacy_peers(fleet, robot),
         *(line for topic in fleet.topics for line in _topic(topic, robot)),
     ]
     if transport.metrics_port is not None:
@@ -146,7 +146,7 @@ def _check_topics(fleet: Fleet) -> Iterator[Diagnostic]:
 
 
 def _rates(transport: UdpMesh) -> Iterator[str]:
-    sparse_s = max(transport.heartbeat_s, min(_SPARSE_S, 0.3 * transport.offline_after_s))
+    sparse_s = max(transport.heartbeat_s, min(_MAX_SPARSE_HEARTBEAT_S, 0.3 * transport.offline_after_s))
     yield ""
     yield "[rates]"
     yield f"heartbeat_s = {_number(transport.heartbeat_s)}"
@@ -162,19 +162,19 @@ def _links(fleet: Fleet, robot: str, computer: Computer) -> Iterator[str]:
     if not fleet.udp_mesh.broadcast:
         for peer in _others(fleet, robot):
             if peer.computer is not None:
-                yield from _neighbour(peer.name, str(peer.computer.address.ip))
+                yield from _neighbor(peer.name, str(peer.computer.address.ip))
 
 
-def _neighbour(name: str, address: str) -> tuple[str, ...]:
+def _neighbor(name: str, address: str) -> tuple[str, ...]:
     return ("", "[[neighbours]]", f"name = {_text(name)}", f'address = "{address}"')
 
 
-def _fielded(fleet: Fleet, robot: str) -> Iterator[str]:
+def _legacy_peers(fleet: Fleet, robot: str) -> Iterator[str]:
     """Robots that still run the fielded program: spoken with in its format. A single one on the network obliges every
     daemon there to know it, or that daemon's broadcasts would end the program."""
     for peer in _others(fleet, robot):
         if peer.fielded is not None:
-            yield from (*_neighbour(peer.name, str(peer.fielded)), "legacy = true")
+            yield from (*_neighbor(peer.name, str(peer.fielded)), "legacy = true")
 
 
 def _others(fleet: Fleet, robot: str) -> Iterator[Robot]:

@@ -51,7 +51,7 @@ def with_switch(network: Package, vlans: Iterable[tuple[str, str, str]]) -> Pack
     return Package(network.name, (*network.sections, *switches, *members))
 
 
-def with_kept(package: Package, facts: DeviceFacts) -> Package:
+def with_board_sections(package: Package, facts: DeviceFacts) -> Package:
     """The rendered package with what the node's own one has to keep, in the node's order behind the rest."""
     keep = _KEEPERS.get(package.name)
     own = facts.packages.get(package.name)

@@ -14,13 +14,13 @@ from meshctl import uci
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.model import MASK, Fleet, Node, Secret, SecretRef
 from meshctl.render.extra import with_extra
-from meshctl.render.facts import NO_FACTS, DeviceFacts, with_kept
+from meshctl.render.facts import NO_FACTS, DeviceFacts, with_board_sections
 from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, RenderedFile, replace_secrets
 from meshctl.render.templates import NOT_UCI, TemplateFile, Templates
 from meshctl.resolve import Intent, resolve
 
 # A WEP key has 5 letters; what is shorter, such as the index in wireless' `key '1'`, is no secret.
-_SHORTEST_SECRET = 5
+_MIN_SECRET_CHARACTERS = 5
 
 
 class UnknownNode(InvalidInput):
@@ -111,7 +111,7 @@ def _files(intent: Intent, templates: Templates, facts: DeviceFacts) -> Iterator
         else:
             yield _file(file.path, text, 0o755 if file.is_executable else 0o644, intent.secrets, None)
     for name, written in with_extra(packages, intent).items():
-        package = with_kept(written, facts)
+        package = with_board_sections(written, facts)
         yield _file(CONFIG_FOLDER + name, uci.dump(package), 0o644, intent.secrets, package)
 
 
@@ -139,7 +139,7 @@ def _written_secrets(package: uci.Package) -> Iterator[Secret]:
     for section in package.sections:
         for name in section.options:
             if uci.is_secret_option(name):
-                yield from (Secret(item) for item in section.items(name) if len(item) >= _SHORTEST_SECRET)
+                yield from (Secret(item) for item in section.items(name) if len(item) >= _MIN_SECRET_CHARACTERS)
 
 
 def _config_hash(files: list[RenderedFile]) -> str:

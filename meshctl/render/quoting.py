@@ -1,6 +1,6 @@
 """The one way a value gets into a template: `{{ value | uci }}`. An expression without it is an error.
 
-Jinja2 itself is told to accept nothing but the filter's own results in UCI templates (`only_quoted`), so a template
+Jinja2 itself is told to accept nothing but the filter's own results in UCI templates (`require_quoted`), so a template
 cannot forget to quote.
 """
 
@@ -51,7 +51,7 @@ def _not_empty(value: str) -> str:
     return value
 
 
-def only_quoted(value: object) -> str:
+def require_quoted(value: object) -> str:
     """What jinja2 calls on every expression of a UCI template. Raises UnquotedValue."""
     if isinstance(value, Quoted):
         return value

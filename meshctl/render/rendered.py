@@ -33,12 +33,12 @@ class RenderedFile:
         return replace_secrets(text, self.secrets, lambda _: MASK)
 
 
-def replace_secrets(text: str, secrets: tuple[Secret, ...], stand_in: Callable[[Secret], str]) -> str:
+def replace_secrets(text: str, secrets: tuple[Secret, ...], replacement: Callable[[Secret], str]) -> str:
     """`text` with every secret replaced, both as it is written in UCI and as it is."""
     # the longest first, so that no secret inside another leaves half of it behind
     for secret in sorted(secrets, key=lambda secret: -len(secret.reveal())):
         for form in (uci.quote(secret.reveal())[1:-1], secret.reveal()):
-            text = text.replace(form, stand_in(secret))
+            text = text.replace(form, replacement(secret))
     return text
 
 

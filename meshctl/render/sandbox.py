@@ -41,7 +41,7 @@ class LimitExceeded(Exception):
     """A template exceeded a limit; the text says which."""
 
 
-class Renderer:
+class SandboxRenderer:
     """One worker process and the requests to it. Safe to use from several threads."""
 
     def __init__(self, *, cpu_s: int = CPU_S, memory_bytes: int = MEMORY_BYTES, wait_s: float = WAIT_S) -> None:

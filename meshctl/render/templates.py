@@ -31,9 +31,9 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.inventory.file_access import HINT, Boundary
 from meshctl.model import Backend, Fleet, MeshMode, OperatorParts, Release
-from meshctl.render.quoting import only_quoted, quoted, revealed
+from meshctl.render.quoting import quoted, require_quoted, revealed
 from meshctl.render.rendered import CONFIG_FOLDER
-from meshctl.render.sandbox import LimitExceeded, Renderer
+from meshctl.render.sandbox import LimitExceeded, SandboxRenderer
 from meshctl.resources import shipped
 
 # The codes of this package, each with what it means (docs/render.md).
@@ -71,7 +71,7 @@ class Templates:
         self._boundary = boundary or Boundary(tuple(os.path.realpath(folder) for folder in folders))
         self._sets: dict[tuple[Backend, OperatorParts], TemplateSet] = {}
         # for templates that are not shipped
-        self._bounded = Renderer()
+        self._bounded = SandboxRenderer()
 
     @classmethod
     def of(cls, fleet: Fleet) -> Templates:
@@ -84,7 +84,7 @@ class Templates:
         if not fleet.base or not own.is_dir():
             return cls((shipped("templates"),), boundary)
         _refuse_outside(own, boundary)
-        _refuse_strays(own, fleet)
+        _refuse_unknown_folders(own, fleet)
         return cls((own, shipped("templates")), boundary)
 
     def files(self, backend: Backend, parts: OperatorParts) -> tuple[TemplateFile, ...]:
@@ -118,10 +118,10 @@ class Templates:
 
 def _refuse_outside(path: Path, boundary: Boundary) -> None:
     """Raises InvalidInput for a folder or file of templates that an inventory may not name."""
-    if objection := boundary.objection(path):
-        hint = HINT if objection.startswith("outside") else ""
+    if refusal := boundary.refusal(path):
+        hint = HINT if refusal.startswith("outside") else ""
         raise InvalidInput(
-            [Diagnostic(NO_TEMPLATE, Severity.ERROR, Position(str(path)), f"it is {objection}", hint=hint)]
+            [Diagnostic(NO_TEMPLATE, Severity.ERROR, Position(str(path)), f"it is {refusal}", hint=hint)]
         )
 
 
@@ -137,7 +137,7 @@ class _BoundedLoader(FileSystemLoader):
         return super().get_source(environment, template)
 
 
-def _refuse_strays(own: Path, fleet: Fleet) -> None:
+def _refuse_unknown_folders(own: Path, fleet: Fleet) -> None:
     known = {COMMON, *(backend.value for backend in Backend)}
     parts = [mesh.operator_parts for mesh in fleet.meshes.values()]
     elsewhere = {(Path(item.base) / item.templates).resolve() for item in parts if item.templates}
@@ -212,7 +212,7 @@ def _environment(loader: BaseLoader, *, is_uci: bool = False) -> ImmutableSandbo
         lstrip_blocks=True,
         keep_trailing_newline=True,
         auto_reload=False,
-        finalize=only_quoted if is_uci else None,
+        finalize=require_quoted if is_uci else None,
     )
     environment.filters["uci"] = quoted
     environment.filters["reveal"] = revealed

@@ -6,7 +6,7 @@ from meshctl.resolve.intervals import MEASURED_HEAL_S, Intervals, UnreachableTar
 from meshctl.resolve.node import resolve
 from meshctl.resolve.packages import (
     FULL_SUPPLICANTS,
-    Need,
+    PackageNeed,
     PackagePlan,
     package_needs,
     package_plan,
@@ -23,7 +23,7 @@ __all__ = [
     "Lan",
     "Login",
     "MeshInterface",
-    "Need",
+    "PackageNeed",
     "PackagePlan",
     "RadioIntent",
     "UnreachableTarget",

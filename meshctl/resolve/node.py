@@ -17,7 +17,7 @@ from meshctl.model import Backend, Encryption, Fleet, Mesh, Node, OperatorParts,
 from meshctl.resolve.intent import BatmanInterface, Intent, Lan, Login, MeshInterface, RadioIntent
 from meshctl.resolve.intervals import Intervals, UnreachableTarget, batman_intervals
 from meshctl.resolve.packages import package_plan
-from meshctl.resolve.refusals import COMBINATION, RECONNECT, SECRET, Refusals
+from meshctl.resolve.refusals import COMBINATION, RECONNECT, SECRET, ValueChecks
 
 BRIDGE = "br-lan"
 # dropbear's own default
@@ -29,15 +29,15 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
 
     Raises InvalidInput with every value that the node's files cannot hold, each at its place (docs/render.md).
     """
-    refusals = Refusals(fleet)
+    checks = ValueChecks(fleet)
     meshes = tuple(fleet.meshes[name] for name in node.meshes)
     primary = _primary(meshes, node)
-    keys = _keys(meshes, node, secrets, refusals)
+    keys = _keys(meshes, node, secrets, checks)
     masters = _masters(meshes)
-    intervals = {mesh.name: _intervals(mesh, refusals) for mesh in meshes if mesh.backend is Backend.BATMAN}
+    intervals = {mesh.name: _intervals(mesh, checks) for mesh in meshes if mesh.backend is Backend.BATMAN}
     if len({(mesh.backend, mesh.operator_parts) for mesh in meshes}) > 1:
         path = ("nodes", node.name, "radios")
-        refusals.add(
+        checks.add(
             COMBINATION, path, "meshes of one back end", ", ".join(f"{m.name}: {m.backend.value}" for m in meshes)
         )
     plan = package_plan(fleet, node)
@@ -60,12 +60,12 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
         packages=plan.install,
         removed_packages=plan.remove,
         extra_uci=node.extra_uci,
-        extra_positions={key: refusals.position("nodes", node.name, "extra_uci", key) for key in node.extra_uci},
-        position=refusals.position("nodes", node.name),
+        extra_positions={key: checks.position("nodes", node.name, "extra_uci", key) for key in node.extra_uci},
+        position=checks.position("nodes", node.name),
     )
-    _refuse(fleet, node, intent, refusals)
-    if refusals.found:
-        raise InvalidInput(refusals.found)
+    _check_values(fleet, node, intent, checks)
+    if checks.found:
+        raise InvalidInput(checks.found)
     return intent
 
 
@@ -76,18 +76,18 @@ def _primary(meshes: tuple[Mesh, ...], node: Node) -> Mesh | None:
 
 
 def _keys(
-    meshes: tuple[Mesh, ...], node: Node, secrets: Callable[[SecretRef], Secret], refusals: Refusals
+    meshes: tuple[Mesh, ...], node: Node, secrets: Callable[[SecretRef], Secret], checks: ValueChecks
 ) -> dict[str, Secret]:
     keys = {}
     for mesh in meshes:
-        refusals.mesh(mesh, node.release)
+        checks.mesh(mesh, node.release)
         if mesh.encryption is not Encryption.NONE and mesh.key is not None:
             try:
                 keys[mesh.name] = secrets(mesh.key)
             except InputError as error:
-                refusals.add(SECRET, ("meshes", mesh.name, "key"), "", "", message=str(error), hint=error.hint)
+                checks.add(SECRET, ("meshes", mesh.name, "key"), "", "", message=str(error), hint=error.hint)
             else:
-                refusals.key(mesh, keys[mesh.name], node.release)
+                checks.key(mesh, keys[mesh.name], node.release)
     return keys
 
 
@@ -104,12 +104,12 @@ def _group(mesh: Mesh) -> tuple[IPv4Network, str]:
     return mesh.network, mesh.batman.routing_algo
 
 
-def _intervals(mesh: Mesh, refusals: Refusals) -> Intervals:
+def _intervals(mesh: Mesh, checks: ValueChecks) -> Intervals:
     try:
         return batman_intervals(mesh)
     except UnreachableTarget as target:
         path = ("meshes", mesh.name, "reconnect_s")
-        refusals.add(RECONNECT, path, f"at least {target.fastest_s:g} s", f"{mesh.reconnect_s:g} s")
+        checks.add(RECONNECT, path, f"at least {target.fastest_s:g} s", f"{mesh.reconnect_s:g} s")
         return Intervals(100, 50)
 
 
@@ -198,28 +198,28 @@ def _ssh_port(node: Node) -> int:
     return SSH_PORT if node.ssh.host else node.ssh.port
 
 
-def _refuse(fleet: Fleet, node: Node, intent: Intent, refusals: Refusals) -> None:
+def _check_values(fleet: Fleet, node: Node, intent: Intent, checks: ValueChecks) -> None:
     """Hold every text of the intent that did not come from a closed set against what the node can read."""
     path = ("nodes", node.name)
-    refusals.text(path, intent.node)
-    refusals.text(("fleet",), intent.fleet)
-    refusals.word(("country",), fleet.country)
-    refusals.hostname((*path, "hostname"), intent.hostname)
-    refusals.text((*path, "label"), intent.label)
+    checks.text(path, intent.node)
+    checks.text(("fleet",), intent.fleet)
+    checks.word(("country",), fleet.country)
+    checks.hostname((*path, "hostname"), intent.hostname)
+    checks.text((*path, "label"), intent.label)
     for key, value in intent.extra_uci.items():
-        refusals.uci_key((*path, "extra_uci", key), key)
-        refusals.text((*path, "extra_uci", key), value)
+        checks.uci_key((*path, "extra_uci", key), key)
+        checks.text((*path, "extra_uci", key), value)
     for index, port in enumerate(intent.lan.ports):
-        refusals.device((*path, "lan_ports", str(index)), port)
+        checks.device((*path, "lan_ports", str(index)), port)
     for radio in intent.radios:
         place = ("hardware", node.hardware.name, "radios", radio.name)
-        refusals.section(place, radio.name)
-        refusals.text((*place, "path"), radio.path, is_required=True)
-        refusals.tx_power((*path, "radios", radio.name, "tx_power_dbm"), radio.tx_power_dbm, intent.release)
-    refusals.text(("system", "timezone"), fleet.system.timezone, is_required=True)
-    refusals.text(("system", "zonename"), fleet.system.zonename)
-    refusals.text(("system", "log_host"), fleet.system.log_host)
+        checks.section(place, radio.name)
+        checks.text((*place, "path"), radio.path, is_required=True)
+        checks.tx_power((*path, "radios", radio.name, "tx_power_dbm"), radio.tx_power_dbm, intent.release)
+    checks.text(("system", "timezone"), fleet.system.timezone, is_required=True)
+    checks.text(("system", "zonename"), fleet.system.zonename)
+    checks.text(("system", "log_host"), fleet.system.log_host)
     for index, server in enumerate(fleet.system.ntp_servers):
-        refusals.text(("system", "ntp_servers", str(index)), server, is_required=True)
+        checks.text(("system", "ntp_servers", str(index)), server, is_required=True)
     login = intent.login
-    refusals.login(login.keys, is_password_allowed=login.is_password_allowed, release=intent.release)
+    checks.login(login.keys, is_password_allowed=login.is_password_allowed, release=intent.release)

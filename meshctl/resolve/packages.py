@@ -8,7 +8,7 @@ from meshctl.model import Backend, Encryption, Fleet, Mesh, MeshMode, Node, Rele
 
 
 @dataclass(frozen=True, slots=True)
-class Need:
+class PackageNeed:
     """One of `any_of` must be installed (the first is taken when the inventory names none), because of `reason`."""
 
     any_of: tuple[str, ...]
@@ -35,9 +35,9 @@ def package_plan(fleet: Fleet, node: Node) -> PackagePlan:
     return PackagePlan(tuple(sorted(named)), tuple(sorted(dropped - named)))
 
 
-def package_needs(fleet: Fleet, node: Node) -> tuple[Need, ...]:
+def package_needs(fleet: Fleet, node: Node) -> tuple[PackageNeed, ...]:
     """Every need of the node's meshes, each once, in the meshes' order."""
-    needs: dict[Need, None] = {}
+    needs: dict[PackageNeed, None] = {}
     for name in node.meshes:
         mesh = fleet.meshes[name]
         needs.update(dict.fromkeys(_backend_needs(mesh)))
@@ -47,19 +47,19 @@ def package_needs(fleet: Fleet, node: Node) -> tuple[Need, ...]:
     return tuple(needs)
 
 
-def _backend_needs(mesh: Mesh) -> tuple[Need, ...]:
-    tools = (Need(("iw", "iw-full"), "meshctl reads the radio's links with it"),)
+def _backend_needs(mesh: Mesh) -> tuple[PackageNeed, ...]:
+    tools = (PackageNeed(("iw", "iw-full"), "meshctl reads the radio's links with it"),)
     match mesh.backend:
         case Backend.BATMAN:
             return (
-                Need(("kmod-batman-adv",), f"mesh {mesh.name} routes with batman-adv"),
+                PackageNeed(("kmod-batman-adv",), f"mesh {mesh.name} routes with batman-adv"),
                 # batctl-tiny prints no JSON and knows no loop avoidance tables
-                Need(("batctl-default", "batctl-full"), f"meshctl reads the routes of mesh {mesh.name} with it"),
+                PackageNeed(("batctl-default", "batctl-full"), f"meshctl reads the routes of mesh {mesh.name} with it"),
                 *tools,
             )
         case Backend.MESHMERIZE:
             reason = f"mesh {mesh.name} routes with meshmerize"
-            return (*(Need((package,), reason) for package in mesh.operator_parts.packages), *tools)
+            return (*(PackageNeed((package,), reason) for package in mesh.operator_parts.packages), *tools)
 
 
 # wpa_supplicant builds with CONFIG_IBSS_RSN; `wpad-basic*` and `wpad-mini` do not have it. SAE and 802.11s are in all
@@ -76,7 +76,7 @@ FULL_SUPPLICANTS = (
 )
 
 
-def supplicant_need(mesh: Mesh, release: Release) -> Need | None:
+def supplicant_need(mesh: Mesh, release: Release) -> PackageNeed | None:
     """The supplicant that an encrypted mesh needs, in the build that the release ships with its own TLS library."""
     if mesh.encryption is Encryption.NONE:
         return None
@@ -87,7 +87,7 @@ def supplicant_need(mesh: Mesh, release: Release) -> Need | None:
     # where it cannot join the mesh, 23.05 and later join it in the open, without a word (wifi-scripts, mac80211.sh)
     lacking = () if mesh.mode is MeshMode.ADHOC else (_WITHOUT_MESH,)
     rest = tuple(name for name in offered if name != preferred and name not in lacking)
-    return Need((preferred, *rest), f"mesh {mesh.name} is {what}, which wpad-basic cannot join")
+    return PackageNeed((preferred, *rest), f"mesh {mesh.name} is {what}, which wpad-basic cannot join")
 
 
 def wireless_scripts(release: Release) -> str | None:

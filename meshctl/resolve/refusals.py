@@ -38,7 +38,7 @@ _MAX_SSID_BYTES = 32
 _MAX_SAE_CHARACTERS = 128
 
 
-class Refusals:
+class ValueChecks:
     """Collects what is wrong with one fleet's values; `found` holds every diagnostic."""
 
     def __init__(self, fleet: Fleet) -> None:
@@ -136,11 +136,11 @@ class Refusals:
         value = key.reveal()
         if mesh.encryption is Encryption.PSK2:
             if not _PASSPHRASE.fullmatch(value) and not _RAW_PSK.fullmatch(value):
-                self.add(VALUE, path, "8 to 63 printable ASCII characters or 64 hex digits", _outline(value))
+                self.add(VALUE, path, "8 to 63 printable ASCII characters or 64 hex digits", _describe_secret(value))
         elif not 1 <= len(value) <= _MAX_SAE_CHARACTERS or _CONTROL.search(value):
-            self.add(VALUE, path, f"1 to {_MAX_SAE_CHARACTERS} characters without line breaks", _outline(value))
+            self.add(VALUE, path, f"1 to {_MAX_SAE_CHARACTERS} characters without line breaks", _describe_secret(value))
         if release >= Release.V25_12 and "'" in value:
-            self.add(VALUE, path, f"no single quote (OpenWrt {release} hands it to a shell)", _outline(value))
+            self.add(VALUE, path, f"no single quote (OpenWrt {release} hands it to a shell)", _describe_secret(value))
 
     def login(self, keys: tuple[str, ...], *, is_password_allowed: bool, release: Release) -> None:
         """Public keys of one line each, at least one of which this release's dropbear knows."""
@@ -160,7 +160,7 @@ class Refusals:
             self.add(LOCKED_OUT, path, kinds, "none", message=message, hint="add a key to operators.ssh_keys")
 
 
-def _outline(secret: str) -> str:
+def _describe_secret(secret: str) -> str:
     """A secret's shape, for a message: nothing of its letters."""
     plain = "" if secret.isascii() and secret.isprintable() else ", some of them not printable ASCII"
     return f"{len(secret)} characters{plain}"

@@ -115,7 +115,7 @@ def diff(before: Package, after: Package) -> Diff:
     if before.name != after.name:
         raise ValueError(f"expected two versions of package {before.name}, found {after.name}")
     pairs = _pairs(before, after)
-    still = _in_order([pairs[index] for index in sorted(pairs)])
+    still = _longest_increasing([pairs[index] for index in sorted(pairs)])
     old_keys, new_keys = before.keys(), after.keys()
     changes = [
         SectionChange(ChangeKind.REMOVED, old_keys[index], section, None, index, None)
@@ -160,7 +160,7 @@ def _anonymous_pairs(before: Package, after: Package, type_name: str) -> Iterato
         yield from zip(old[old_start:old_end], new[new_start:new_end], strict=False)
 
 
-def _in_order(indexes: list[int]) -> frozenset[int]:
+def _longest_increasing(indexes: list[int]) -> frozenset[int]:
     """The members of a longest increasing subsequence."""
     tails: list[int] = []
     before: dict[int, int | None] = {}

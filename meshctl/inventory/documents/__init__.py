@@ -1,6 +1,6 @@
-"""The inventory's format: one model per mapping, unknown keys forbidden, each key's docstring its description.
+"""The inventory's format: one model per mapping; unknown keys are errors; docstrings are the keys' descriptions.
 
-The models hold what was written in one place; ranges, groups and references are worked out afterwards.
+The models hold one mapping as written; ranges, groups and references are resolved afterwards.
 """
 
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument

@@ -1,4 +1,4 @@
-"""What all models share, and the one that says where a secret is."""
+"""The base of all models, and the model of a secret reference."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from meshctl.inventory.fields import Text, wrong
 
-# A key without a default of its own that may be left out; `model_fields_set` tells whether it was written.
+# Default of an optional key without its own default; `model_fields_set` shows whether it is set.
 NOT_WRITTEN: Any = None
 
 
 class Document(BaseModel):
-    """What all models share: only known keys, attribute docstrings as descriptions, never a value in an error."""
+    """Base of all models: known keys only, attribute docstrings as descriptions, no values in errors."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -25,25 +25,25 @@ class Document(BaseModel):
 
 
 class SecretDocument(Document):
-    """Where a secret is: `{env: NAME}`, `{file: PATH, key: NAME}` or `{age: PATH, key: NAME, identity: PATH}`."""
+    """A reference to a secret: `{env: NAME}`, `{file: PATH, key: NAME}` or `{age: PATH, key: NAME, identity: PATH}`."""
 
     env: Text = Field(default="", pattern="^([A-Za-z_][A-Za-z0-9_]*)?$")
-    """Name of an environment variable that holds the secret."""
+    """Environment variable with the secret."""
     file: Text = ""
-    """A file that holds the secret, outside the repository; relative to the file that names it."""
+    """File with the secret, outside the repository; relative to this file."""
     age: Text = ""
-    """A file encrypted with age; relative to the file that names it."""
+    """File encrypted with age; relative to this file."""
     key: Text = ""
-    """Which entry of the file, when that is a mapping in YAML; without it the secret is the whole file."""
+    """Entry of the file, if it is a YAML mapping. Default: the whole file is the secret."""
     identity: Text = ""
-    """File with the age or SSH identity that decrypts; without it $MESHCTL_AGE_IDENTITY."""
+    """File with the age or SSH identity for decryption. Default: $MESHCTL_AGE_IDENTITY."""
 
     @model_validator(mode="after")
     def _one_place(self) -> Self:
         if sum(map(bool, (self.env, self.file, self.age))) != 1:
             raise wrong("exactly one of env, file and age")
         if self.env and (self.key or self.identity):
-            raise wrong("env alone: an environment variable has neither key nor identity")
+            raise wrong("no key and identity with env")
         if self.file and self.identity:
-            raise wrong("no identity: only age files are decrypted with one")
+            raise wrong("no identity with file: only age files have one")
         return self

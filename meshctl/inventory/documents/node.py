@@ -1,4 +1,4 @@
-"""Layers of nodes: defaults, groups, ranges and nodes say the same things, the nearest wins."""
+"""Layers of nodes: defaults, groups, ranges and nodes have the same keys; see `layers` for precedence."""
 
 from __future__ import annotations
 
@@ -11,69 +11,69 @@ from meshctl.model import NodeState, Role
 
 
 class RadioLayer(Document):
-    """What one node sets on one of its radios."""
+    """Settings of one radio of a node."""
 
     mesh: Name | None = None
-    """The mesh it joins; null switches it off. Without it the fleet's only mesh of the radio's band."""
+    """The mesh to join; null turns the radio off. Default: the fleet's only mesh of the radio's band."""
     tx_power_dbm: Whole = Field(default=NOT_WRITTEN, ge=0, le=40)
-    """The drive level that UCI gets; without it the most the driver offers."""
+    """Drive level for UCI in dBm. Default: the driver's maximum."""
     mac: Mac = ""
-    """Its MAC address, read off the device."""
+    """MAC address, as read from the device."""
 
 
 class SshLayer(Document):
-    """How to log in. Keys live in files, never in the inventory."""
+    """SSH login. Keys are in files, never in the inventory."""
 
     host: Text = ""
-    """Host to reach instead of the own address."""
+    """Host to connect to. Default: the device's own address."""
     port: Whole = Field(default=22, ge=1, le=65_535)
     """TCP port."""
     user: Text = NOT_WRITTEN
-    """User; root on radios, without it on computers the operator's own name."""
+    """User. Default: root on radios, the operator's user name on computers."""
     key_files: tuple[Text, ...] = ()
-    """Private key files to try; without it the SSH agent and the usual files."""
+    """Private key files to try. Default: the SSH agent and the usual files."""
     jump: Text = ""
-    """Another node to go through."""
+    """Node to use as a jump host."""
 
 
 class NodeLayer(Document):
-    """What may be said of a node in `defaults`, in a group, in a range or at the node itself; the nearest wins."""
+    """Settings of a node in `defaults`, in a group, in a range or in its own entry, by increasing precedence."""
 
     hardware: Name = NOT_WRITTEN
-    """Its hardware profile. Every node needs one."""
+    """Hardware profile. Required for every node."""
     address: AddressField = NOT_WRITTEN
-    """Its management address: `10.42.0.11`, or a rule for all who share it: `{from: 10.42.0.101}` counts up from there,
-    `{rule: network + 100 + index}` reckons. Every node needs one."""
+    """Management address: `10.42.0.11`, or a rule for all nodes that share it: `{from: 10.42.0.101}` counts up from
+    there, `{rule: network + 100 + index}` is a formula. Required for every node."""
     role: Role = Role.BEACON
-    """base: the operator's radio. robot: rides on a robot. beacon: dropped behind one."""
+    """base: the operator's radio. robot: mounted on a robot. beacon: dropped by a robot."""
     state: NodeState = NodeState.DEPLOYED
-    """carried: in its rack, may be off. deployed: must answer. spare: in the box. lost and retired: left alone."""
+    """carried: in its rack, may be off. deployed: must answer. spare: in storage. lost, retired: not managed."""
     radios: dict[Name, RadioLayer] = Field(default_factory=dict)
-    """Its radios by the names of the hardware profile."""
+    """Radios by their names in the hardware profile."""
     hostname: Name = NOT_WRITTEN
-    """Host name; without it the node's name."""
+    """Hostname. Default: the node's name."""
     release: ReleaseName = NOT_WRITTEN
-    """OpenWrt's release series, where it differs from the hardware profile's."""
+    """OpenWrt release series. Default: the hardware profile's."""
     lan_ports: tuple[Text, ...] = NOT_WRITTEN
-    """Ports bridged into the LAN, where they differ from the hardware profile's."""
+    """Ports bridged into the LAN. Default: the hardware profile's."""
     ssh: SshLayer = SshLayer()
-    """How to log in."""
+    """SSH login."""
     robot: Name = NOT_WRITTEN
-    """The robot that carries it; without it the robot that lists it."""
+    """The robot that carries the node. Default: the robot that lists it."""
     label: Text = ""
-    """What is written on the box."""
+    """Label on the device."""
     serial: Text = ""
-    """Serial number of the box."""
+    """Serial number of the device."""
     mac: Mac = ""
-    """MAC address of the box, as on its sticker."""
+    """MAC address of the device, as on its label."""
     host_keys: tuple[Text, ...] = ()
-    """Its SSH host keys, such as `ssh-ed25519 AAAA...`; written by `meshctl trust`."""
+    """SSH host keys, such as `ssh-ed25519 AAAA...`; written by `meshctl trust`."""
     confirm_window_s: Whole = Field(default=NOT_WRITTEN, ge=10, le=3600)
-    """Seconds to wait for a confirmation, where it differs from the hardware profile's."""
+    """Seconds to wait for confirmation of a change. Default: the hardware profile's."""
     packages: tuple[Text, ...] = ()
-    """Packages beyond the hardware profile's."""
+    """Packages in addition to the hardware profile's."""
     extra_uci: dict[Text, Text] = Field(default_factory=dict)
-    """Further UCI options by their full names: `wireless.radio0.rts: "500"`."""
+    """Additional UCI options by their full names: `wireless.radio0.rts: "500"`."""
     gateway: Address = NOT_WRITTEN
     """Default gateway."""
 
@@ -82,11 +82,11 @@ class NodeDocument(NodeLayer):
     """A node, or a range of them."""
 
     groups: tuple[Name, ...] = ()
-    """Its groups; a later one wins over an earlier one."""
+    """Groups; a later one overrides an earlier one."""
 
 
 class GroupDocument(NodeLayer):
-    """A named layer that nodes share."""
+    """A named layer shared by nodes."""
 
     inherits: tuple[Name, ...] = ()
-    """Groups whose values this one starts from; a later one wins over an earlier one."""
+    """Groups to inherit values from; a later one overrides an earlier one."""

@@ -1,4 +1,4 @@
-"""Robots and their computers, operators, settings of the whole fleet, the transport and its topics."""
+"""Robots and their computers, operators, fleet-wide settings, the transport and its topics."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ class ComputerDocument(Document):
     """A robot's computer, where the udp_mesh daemon runs."""
 
     address: Interface
-    """Its address with the prefix length."""
+    """Address with prefix length."""
     ssh: SshLayer = SshLayer()
-    """How to log in."""
+    """SSH login."""
     python: Text = "python3"
-    """The Python that runs the daemon."""
+    """Python interpreter for the daemon."""
     arch: Text = "x86_64"
-    """Its architecture as `uname -m` prints it."""
+    """Architecture, as printed by `uname -m`."""
     ros: Text = ""
-    """ROS distribution on it: noetic, humble..."""
+    """ROS distribution: noetic, humble..."""
 
 
 class RobotDocument(Document):
-    """A robot, or the operator's base station: the peer that udp_mesh knows by this name."""
+    """A robot or the operator's base station: a udp_mesh peer of this name."""
 
     nodes: tuple[Text, ...] = ()
-    """Radios mounted on it; ranges allowed."""
+    """Radios mounted on the robot; may contain ranges."""
     computer: ComputerDocument = NOT_WRITTEN
-    """Its computer."""
+    """The robot's computer."""
     is_base: Flag = False
     """True for the operator's base station."""
     carries: tuple[Text, ...] = ()
-    """Beacons in its racks; ranges allowed."""
+    """Beacons in the robot's racks; may contain ranges."""
     fielded: Address = NOT_WRITTEN
-    """Address of its computer while that still runs the fielded udp_mesh; `computer` takes its place later."""
+    """Address of the robot's computer while it runs the legacy udp_mesh; replace it with `computer` at migration."""
 
 
 class OperatorsDocument(Document):
@@ -46,62 +46,62 @@ class OperatorsDocument(Document):
     ssh_keys: tuple[Text, ...] = ()
     """Public keys for root on every node."""
     password_login: Flag = False
-    """Whether SSH takes passwords; leave it off."""
+    """Whether SSH accepts passwords; leave it off."""
     known_hosts: Text = "known_hosts"
-    """File with the nodes' host keys for plain ssh; relative to the inventory."""
+    """File of pinned host keys; relative to the inventory."""
 
 
 class SystemDocument(Document):
-    """OpenWrt's system settings, the same on all nodes."""
+    """OpenWrt system settings of all nodes."""
 
     timezone: Text = "UTC"
     """POSIX time zone, such as UTC or EST5EDT,M3.2.0,M11.1.0."""
     zonename: Text = "UTC"
-    """Its name, such as America/New_York."""
+    """Time zone name, such as America/New_York."""
     log_size_kib: Whole = Field(default=64, ge=8, le=65_536)
-    """Size of the log kept in RAM."""
+    """Size of the log in RAM."""
     log_host: Text = ""
-    """Where logs are sent by UDP; empty for nowhere."""
+    """Host that receives logs by UDP; empty for none."""
     log_port: Whole = Field(default=514, ge=1, le=65_535)
-    """Port there."""
+    """Port of the log host."""
     ntp_servers: tuple[Text, ...] = ()
-    """Time servers; a mesh without internet has its own or none."""
+    """Time servers; a mesh without internet needs its own."""
 
 
 class ApplyDocument(Document):
-    """How carefully a fleet is changed."""
+    """How changes are rolled out to the fleet."""
 
     max_down: Whole = Field(default=1, ge=1, le=100_000)
-    """Nodes that may be down for a change at the same time."""
+    """Maximum number of nodes that may be down at the same time."""
     canary: Flag = True
-    """Change one node first and look at it."""
+    """Change and check one node first."""
     stop_after_failures: Whole = Field(default=1, ge=1, le=100_000)
-    """Failures after which no further node is touched."""
+    """Number of failures after which a run stops."""
     quorum: Real = Field(default=0.8, gt=0, le=1)
-    """Share of the mesh that must be back after a change of the whole cell."""
+    """Share of the mesh that must rejoin after a change of the whole cell."""
     parallel: Whole = Field(default=8, ge=1, le=1024)
-    """Connections open at the same time."""
+    """Number of concurrent connections."""
 
 
 class UdpMeshDocument(Document):
-    """The transport's settings, the same on all robots."""
+    """Transport settings of all robots."""
 
     port: Whole = Field(default=8700, ge=1, le=65_535)
     """UDP port."""
     keys: tuple[SecretDocument, ...] = ()
-    """Live fleet keys: the first seals, all open."""
+    """Live fleet keys: the first encrypts, all decrypt."""
     heartbeat_s: Real = Field(default=1.0, gt=0, le=3600)
-    """Seconds between signs of life."""
+    """Seconds between heartbeats."""
     offline_after_s: Real = Field(default=10.0, gt=0, le=86_400)
     """Seconds of silence after which a peer counts as offline."""
     fragment_bytes: Whole = Field(default=1400, ge=256, le=65_000)
-    """Largest piece that a message is cut into."""
+    """Maximum fragment size of a message."""
     window: Window = None
-    """Fragments in flight to one peer: a number, or adaptive."""
+    """Congestion window per peer in fragments: a number, or adaptive."""
     broadcast: Flag = True
-    """Find peers and reach all of them by broadcast."""
+    """Discover peers and reach all of them by broadcast."""
     metrics_port: Whole = Field(default=NOT_WRITTEN, ge=1, le=65_535)
-    """TCP port of Prometheus metrics; without it none."""
+    """TCP port of Prometheus metrics. Default: no metrics."""
 
 
 class TopicDocument(Document):
@@ -110,32 +110,32 @@ class TopicDocument(Document):
     priority: Whole = Field(ge=0, le=15)
     """0 is the most urgent, 15 the least."""
     topic_class: TopicClass = Field(default=TopicClass.OTHER, alias="class")
-    """What it is for; lint holds priorities against it."""
+    """Purpose of the topic; lint checks its priority against it."""
     type_name: Text = Field(default="", alias="type")
     """Message type, such as std_msgs/Bool."""
     reliable: Flag = True
-    """Deliver or report, instead of best effort."""
+    """Reliable delivery instead of best effort."""
     sources: tuple[Text, ...] = ()
-    """Robots that send it; empty for every robot."""
+    """Robots that send the topic; empty for all."""
     destinations: tuple[Text, ...] = ("all",)
-    """Robots that get it; all for everyone."""
+    """Robots that receive the topic; `all` for all."""
     rate_hz: Real = Field(default=0.0, ge=0, le=100_000)
     """Messages per second that one source offers."""
     size_bytes: Whole = Field(default=0, ge=0, le=1_000_000_000)
     """Size of one message."""
     keep_last: Whole = Field(default=0, ge=0, le=1_000_000)
-    """Messages kept when they come faster than they leave; 0 keeps all."""
+    """Number of queued messages to keep when the queue grows; 0 keeps all."""
     deadline_s: Real = Field(default=NOT_WRITTEN, gt=0, le=86_400)
-    """Age in seconds at which a message is dropped."""
+    """Age in seconds after which a message is dropped."""
     rate_limit_bytes_per_s: Whole = Field(default=NOT_WRITTEN, ge=1, le=1_000_000_000)
-    """Most bytes per second that this topic may send."""
+    """Rate limit in bytes per second."""
     compression: Flag = False
     """Compress messages."""
     outbox: Outbox = Outbox.NONE
-    """What is kept for a peer that is offline: none, the last message, or all."""
+    """Messages kept for an offline peer: none, last or all."""
     outbox_bytes: Whole = Field(default=1_000_000, ge=0, le=1_000_000_000_000)
-    """Most bytes kept for it."""
+    """Maximum size of the outbox."""
     outbox_on_disk: Flag = False
-    """Keep it across restarts."""
+    """Keep the outbox across restarts."""
     repair: Flag = False
-    """Send extra fragments against loss."""
+    """Let receivers request lost broadcasts again."""

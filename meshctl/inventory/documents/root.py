@@ -21,7 +21,7 @@ from meshctl.inventory.fields import Country, Name, Text, Version, empty_mapping
 
 _Entry = TypeVar("_Entry")
 
-# Nothing written under a key means an empty mapping: `b03:` is a node with all its values from elsewhere.
+# A key without a value is an empty mapping: `b03:` is a node with all values from other layers.
 OrEmpty = Annotated[_Entry, BeforeValidator(empty_mapping)]
 Section = OrEmpty[dict[Name, _Entry]]
 NodeSection = OrEmpty[dict[Text, OrEmpty[NodeDocument]]]
@@ -29,35 +29,35 @@ TopicSection = OrEmpty[dict[Text, TopicDocument]]
 
 
 class InventoryDocument(Document):
-    """A fleet: what it is made of, who is in it, what it says."""
+    """A fleet: hardware, meshes, nodes, robots and topics."""
 
     meshctl: Version
-    """Version of this format: 1."""
+    """Format version: 1."""
     fleet: Name
     """Name of the fleet."""
     country: Country
-    """Country whose radio rules hold: two capital letters."""
+    """Country of the regulatory rules: two capital letters."""
     include: tuple[Text, ...] = ()
-    """Further files with parts of the inventory; relative to this file."""
+    """Additional files of the inventory; relative to this file."""
     operators: OperatorsDocument = OperatorsDocument()
-    """Who may log in."""
+    """Login to the radios."""
     system: SystemDocument = SystemDocument()
-    """OpenWrt's system settings."""
+    """OpenWrt system settings."""
     apply: ApplyDocument = ApplyDocument()
-    """How carefully the fleet is changed."""
+    """Rollout policy of changes."""
     hardware: Section[HardwareDocument] = Field(default_factory=dict)
     """Hardware profiles by name."""
     meshes: Section[MeshDocument] = Field(default_factory=dict)
     """Meshes by name."""
     defaults: OrEmpty[NodeLayer] = NodeLayer()
-    """What holds for every node that does not say otherwise."""
+    """Default values of all nodes."""
     groups: Section[OrEmpty[GroupDocument]] = Field(default_factory=dict)
     """Groups of nodes by name."""
     nodes: NodeSection = Field(default_factory=dict)
-    """Nodes by name; `b[01-12]` stands for twelve."""
+    """Nodes by name; `b[01-12]` expands to twelve."""
     robots: Section[OrEmpty[RobotDocument]] = Field(default_factory=dict)
     """Robots by name."""
     udp_mesh: UdpMeshDocument = UdpMeshDocument()
-    """The transport's settings."""
+    """Transport settings."""
     topics: TopicSection = Field(default_factory=dict)
     """Topics by name."""

@@ -1,4 +1,4 @@
-"""Who may log in: operators' keys, host keys, passwords (MC421 to MC433)."""
+"""Login: operators' keys, host keys, passwords (MC421 to MC433)."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from meshctl.device.trust import parse_pins
 from meshctl.diagnostics import Severity
 from meshctl.errors import InputError
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import listed, repeated
+from meshctl.lint.grouping import duplicates, join_limited
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.identity import known_hosts_path
 from meshctl.lint.rules.secrets import logins
-from meshctl.lint.sshkey import BadKey, PublicKey, parse_public_key
+from meshctl.lint.sshkey import AuthorizedKey, BadKey, parse_authorized_key
 from meshctl.model import Fleet
 
-# NIST SP 800-57 part 1: 2048 bits are the least that is still accepted
-_LEAST_RSA_BITS = 2048
-# keys for examples: whole in form, and nobody's
+# NIST SP 800-57 part 1: 2048 bits are the minimum
+_MIN_RSA_BITS = 2048
+# a well-formed key for examples, without a known private key
 _ALICE = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f alice"
 
 
@@ -31,11 +31,11 @@ def _rsa_key(bits: int) -> str:
 RSA_KEY = _rsa_key(2048)
 
 
-def operator_keys(fleet: Fleet) -> Iterator[tuple[int, PublicKey]]:
-    """The operators' keys that can be read, with their places in the list."""
+def operator_keys(fleet: Fleet) -> Iterator[tuple[int, AuthorizedKey]]:
+    """The operators' valid keys, with their list indexes."""
     for index, text in enumerate(fleet.operators.ssh_keys):
         try:
-            yield index, parse_public_key(text)
+            yield index, parse_authorized_key(text)
         except BadKey:
             continue
 
@@ -43,16 +43,16 @@ def operator_keys(fleet: Fleet) -> Iterator[tuple[int, PublicKey]]:
 @fleet_rule(
     "MC421",
     Severity.ERROR,
-    "An operator's key is no public key",
-    why="dropbear skips a line it cannot read without a word: after the change its owner is locked out.",
-    mend="Copy the whole line of `~/.ssh/id_ed25519.pub`.",
+    "An operator's key is not a public key",
+    why="dropbear silently skips a line that it cannot read: after the change, the key's owner is locked out.",
+    fix="Copy the whole line of `~/.ssh/id_ed25519.pub`.",
     failing=f"operators: {{ssh_keys: ['{_ALICE}', ssh-ed25519 AAAAC3NzaC1lZDI1NTE5 bob]}}",
     passing=f"operators: {{ssh_keys: ['{_ALICE}']}}",
 )
 def operator_key_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for index, text in enumerate(fleet.operators.ssh_keys):
         try:
-            parse_public_key(text)
+            parse_authorized_key(text)
         except BadKey as reason:
             if "PRIVATE KEY" not in text:
                 yield Finding(("operators", "ssh_keys", str(index)), "", "an SSH public key", str(reason))
@@ -62,24 +62,25 @@ def operator_key_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     "MC422",
     Severity.WARNING,
     "An operator's key is listed twice",
-    why="When its owner leaves the team, one line is removed and the other stays.",
-    mend="Keep one of the lines.",
+    why="When its owner leaves the team, one line is removed and the other remains.",
+    fix="Remove one of the lines.",
     failing=f"operators: {{ssh_keys: ['{_ALICE}', '{_ALICE}@laptop']}}",
     passing=f"operators: {{ssh_keys: ['{_ALICE}']}}",
 )
 def operator_key_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for _, keys in repeated((key.text, (index, key)) for index, key in operator_keys(fleet)):
+    for _, keys in duplicates((key.text, (index, key)) for index, key in operator_keys(fleet)):
         for index, key in keys[1:]:
             found = key.comment or key.kind
-            yield Finding(("operators", "ssh_keys", str(index)), "the same key stands above", "each key once", found)
+            yield Finding(("operators", "ssh_keys", str(index)), "duplicate of an earlier key", "each key once", found)
 
 
 @fleet_rule(
     "MC423",
     Severity.ERROR,
-    "Nobody can log in",
-    why="Without a key and without passwords the nodes answer no one: the next change is made with a ladder.",
-    mend="Add a public key to `operators.ssh_keys`.",
+    "No operator can log in",
+    why="""Without a key and without password login, the nodes cannot be accessed over SSH: the next change needs
+    physical access.""",
+    fix="Add a public key to `operators.ssh_keys`.",
     failing="operators: {ssh_keys: []}",
     passing=f"operators: {{ssh_keys: ['{_ALICE}']}}",
 )
@@ -91,24 +92,24 @@ def nobody_can_log_in(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC424",
     Severity.WARNING,
-    "Nodes take passwords over SSH",
-    why="A fresh OpenWrt has an empty password for root; anyone who joins the mesh is root on every radio.",
-    mend="Set `operators.password_login: false` and use keys.",
+    "Nodes accept passwords over SSH",
+    why="A fresh OpenWrt has an empty root password: anyone who joins the mesh becomes root on every radio.",
+    fix="Set `operators.password_login: false` and use keys.",
     failing="operators: {password_login: true}",
     passing="operators: {password_login: false}",
 )
 def password_login(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     if fleet.operators.password_login:
-        yield Finding(("operators", "password_login"), "passwords can be tried by anyone in reach", "false", "true")
+        yield Finding(("operators", "password_login"), "anyone in range can try passwords", "false", "true")
 
 
 @fleet_rule(
     "MC425",
     Severity.ERROR,
-    "OpenWrt 19.07 does not know ed25519 keys",
-    why="""dropbear of 19.07 has RSA only. With none but ed25519 keys, a node of that release is locked to everybody
+    "OpenWrt 19.07 does not support ed25519 keys",
+    why="""dropbear in 19.07 supports RSA only. If all operator keys are ed25519, no operator can log in to a 19.07 node
     after the change.""",
-    mend="Add an RSA key for these nodes, or move them to a newer release.",
+    fix="Add an RSA key for these nodes, or upgrade them.",
     failing=Example(
         """
         nodes: {b01: {release: "19.07"}}
@@ -129,33 +130,35 @@ def no_rsa_for_19_07(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     old = [node.name for node in fleet.managed() if not node.release.has_ed25519]
     keys = [key for _, key in operator_keys(fleet)]
     if old and keys and not fleet.operators.password_login and not any(key.kind == "ssh-rsa" for key in keys):
-        message = f"no key works on nodes with 19.07: {listed(old)}"
-        yield Finding(("operators", "ssh_keys"), message, "an ssh-rsa key", listed([key.kind for key in keys]))
+        message = f"no operator key works on nodes with 19.07: {join_limited(old)}"
+        yield Finding(("operators", "ssh_keys"), message, "an ssh-rsa key", join_limited([key.kind for key in keys]))
 
 
 @fleet_rule(
     "MC426",
     Severity.WARNING,
     "An operator's key is weak",
-    why="""Current OpenSSH refuses DSA keys, and RSA keys below 2048 bits are no longer held to be safe (NIST SP
+    why="""Current OpenSSH rejects DSA keys, and RSA keys below 2048 bits are no longer considered safe (NIST SP
     800-57).""",
-    mend="Make a new one: `ssh-keygen -t ed25519`.",
+    fix="Generate a new key: `ssh-keygen -t ed25519`.",
     failing=f"operators: {{ssh_keys: ['{_ALICE}', '{_rsa_key(1024)} bob']}}",
     passing=f"operators: {{ssh_keys: ['{_ALICE}']}}",
 )
 def operator_key_weak(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for index, key in operator_keys(fleet):
-        if key.kind == "ssh-dss" or (key.kind == "ssh-rsa" and key.bits < _LEAST_RSA_BITS):
-            expected = f"ed25519, or RSA of at least {_LEAST_RSA_BITS} bits"
-            yield Finding(("operators", "ssh_keys", str(index)), "too weak", expected, f"{key.kind}, {key.bits} bits")
+        if key.kind == "ssh-dss" or (key.kind == "ssh-rsa" and key.bits < _MIN_RSA_BITS):
+            expected = f"ed25519, or RSA of at least {_MIN_RSA_BITS} bits"
+            yield Finding(
+                ("operators", "ssh_keys", str(index)), "key is too weak", expected, f"{key.kind}, {key.bits} bits"
+            )
 
 
 @fleet_rule(
     "MC427",
     Severity.ERROR,
-    "A pinned host key is no public key",
-    why="The node would be refused for ever: what it shows can never match.",
-    mend="Run `meshctl trust NODE`.",
+    "A pinned host key is not a public key",
+    why="The pinned key can never match the device's key, so the node is always refused.",
+    fix="Run `meshctl trust NODE`.",
     failing="nodes: {b01: {host_keys: [ssh-ed25519 AAAAC3Nza]}}",
     passing="""
     nodes: {b01: {host_keys: ["ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f"]}}
@@ -165,7 +168,7 @@ def host_key_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.nodes.values():
         for index, text in enumerate(node.host_keys):
             try:
-                parse_public_key(text)
+                parse_authorized_key(text)
             except BadKey as reason:
                 path = ("nodes", node.name, "host_keys", str(index))
                 yield Finding(path, "", "an SSH public key", str(reason))
@@ -174,9 +177,9 @@ def host_key_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC428",
     Severity.WARNING,
-    "A pinned host key is of a kind its release does not have",
-    why="19.07's dropbear shows an RSA key only: with an ed25519 key pinned, the node is taken for a stranger.",
-    mend="Run `meshctl trust NODE` against the node as it is, or mend its `release`.",
+    "The release does not support the pinned host key's type",
+    why="dropbear in 19.07 has an RSA host key only: with an ed25519 key pinned, host key verification always fails.",
+    fix="Run `meshctl trust NODE` on the node as it is, or correct its `release`.",
     failing=Example(
         f"""
         operators: {{ssh_keys: ["{_ALICE}", "{RSA_KEY}"]}}
@@ -194,30 +197,38 @@ def host_key_unknown_to_release(fleet: Fleet, _context: LintContext) -> Iterator
         kinds = [key.split()[0] for key in node.host_keys if key.split()]
         if kinds and not node.release.has_ed25519 and "ssh-rsa" not in kinds:
             path = ("nodes", node.name, "host_keys")
-            yield Finding(path, f"OpenWrt {node.release} has RSA host keys only", "an ssh-rsa key", listed(kinds))
+            yield Finding(
+                path, f"OpenWrt {node.release} supports RSA host keys only", "an ssh-rsa key", join_limited(kinds)
+            )
 
 
 @fleet_rule(
     "MC429",
     Severity.WARNING,
-    "A radio is logged in to as another user than root",
-    why="OpenWrt has no other user that may change anything, and meshctl renders keys for root alone.",
-    mend="Take `ssh.user` away.",
+    "A radio's SSH user is not root",
+    why="OpenWrt has no other user that may change the configuration, and meshctl renders keys for root only.",
+    fix="Remove `ssh.user`.",
     failing="nodes: {b01: {ssh: {user: admin}}}",
     passing="nodes: {b01: {ssh: {user: root}}}",
 )
 def ssh_user_not_root(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
         if node.ssh.user != "root":
-            yield Finding(("nodes", node.name, "ssh", "user"), "cannot change the node", "root", node.ssh.user)
+            yield Finding(
+                ("nodes", node.name, "ssh", "user"),
+                "this user cannot change the node's configuration",
+                "root",
+                node.ssh.user,
+            )
 
 
 @fleet_rule(
     "MC430",
     Severity.WARNING,
-    "A computer is logged in to as root",
-    why="The daemon is installed for the user who logs in; as root a slip of the bundle's scripts has the whole robot.",
-    mend="Name the robot's own user in `computer.ssh.user`; it needs sudo for systemd only.",
+    "A computer's SSH user is root",
+    why="""The daemon is installed for the login user; as root, an error in the bundle's scripts affects the whole
+    robot.""",
+    fix="Set `computer.ssh.user` to the robot's own user; it needs sudo for systemd only.",
     failing="robots: {husky1: {computer: {ssh: {user: root}}}}",
     passing="robots: {husky1: {computer: {ssh: {user: robot}}}}",
 )
@@ -225,16 +236,16 @@ def computer_as_root(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot in fleet.robots.values():
         if robot.computer is not None and robot.computer.ssh.user == "root":
             path = ("robots", robot.name, "computer", "ssh", "user")
-            yield Finding(path, "more than is needed", "the robot's own user", "root")
+            yield Finding(path, "more privileges than needed", "the robot's own user", "root")
 
 
 @fleet_rule(
     "MC431",
     Severity.ERROR,
-    "The file of pinned host keys cannot be read",
-    why="""Every command that logs in stops at its first line that is no pin: nothing can be changed or looked at until
-    it is mended.""",
-    mend="Mend the line, or remove it and run `meshctl trust` for its node.",
+    "The file of pinned host keys is invalid",
+    why="""Every command that logs in stops at the first invalid line: no node can be changed or inspected until it is
+    fixed.""",
+    fix="Fix the line, or remove it and run `meshctl trust` for its node.",
     failing=Example("operators: {known_hosts: known_hosts}", files={"known_hosts": "base ssh-ed25519 AAAA"}),
     passing=Example("operators: {known_hosts: known_hosts}", files={"known_hosts": f"base {_ALICE}"}),
 )
@@ -252,10 +263,10 @@ def known_hosts_invalid(fleet: Fleet, context: LintContext) -> Iterator[Finding]
 @fleet_rule(
     "MC432",
     Severity.NOTE,
-    "A computer has no user to log in as",
-    why="""Whoever runs meshctl then logs in by their own name, which the robot may not know: what one operator deploys
-    the next cannot even look at.""",
-    mend="Name the robot's own user in `computer.ssh.user`.",
+    "A computer has no SSH user",
+    why="""Each operator then logs in with their own user name, which the robot may not have: what one operator deploys,
+    the next cannot access.""",
+    fix="Set `computer.ssh.user` to the robot's own user.",
     failing="robots: {husky1: {computer: {ssh: {user: <removed>}}}}",
     passing="robots: {husky1: {computer: {ssh: {user: robot}}}}",
 )
@@ -263,15 +274,15 @@ def computer_without_user(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     for robot in fleet.robots.values():
         if robot.computer is not None and not robot.computer.ssh.user:
             path = ("robots", robot.name, "computer", "ssh", "user")
-            yield Finding(path, "each operator logs in by their own name", "the robot's own user", "none")
+            yield Finding(path, "each operator logs in with their own user name", "the robot's own user", "none")
 
 
 @fleet_rule(
     "MC433",
     Severity.ERROR,
-    "A public key is named where a private one is needed",
-    why="Logging in takes the private key; the file beside it with `.pub` only proves who has it. Every login fails.",
-    mend="Take `.pub` away.",
+    "A public key is listed where a private key is needed",
+    why="Login needs the private key; with the `.pub` file every login fails.",
+    fix="Remove `.pub`.",
     failing="nodes: {base: {ssh: {key_files: [id_ed25519.pub]}}}",
     passing=Example("nodes: {base: {ssh: {key_files: [id_ed25519]}}}", files={"id_ed25519": "a private key"}),
 )
@@ -279,4 +290,4 @@ def public_key_to_log_in(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     for place, ssh in logins(fleet):
         for index, file in enumerate(ssh.key_files):
             if file.endswith(".pub"):
-                yield Finding((*place, "key_files", str(index)), "a public key", "a private key", file)
+                yield Finding((*place, "key_files", str(index)), "login needs the private key", "a private key", file)

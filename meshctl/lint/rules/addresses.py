@@ -7,15 +7,15 @@ from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address, ip_a
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, repeated
+from meshctl.lint.grouping import duplicates, group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Backend, Fleet, Mesh, Node
 
-# what every factory-fresh OpenWrt device answers at
+# address of a factory-fresh OpenWrt device
 _FACTORY = IPv4Address("192.168.1.1")
-# RFC 1918, and RFC 6598 for carriers
+# RFC 1918, and RFC 6598 (carrier-grade NAT)
 _PRIVATE = tuple(IPv4Network(text) for text in ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10"))
-# 0/8, loopback, link-local, multicast, reserved: no station has one to itself
+# 0/8, loopback, link-local, multicast, reserved
 _UNUSABLE = tuple(IPv4Network(text) for text in ("0.0.0.0/8", "127.0.0.0/8", "169.254.0.0/16", "224.0.0.0/3"))
 
 
@@ -27,17 +27,17 @@ def _meshes_of(fleet: Fleet, node: Node) -> list[Mesh]:
     "MC201",
     Severity.ERROR,
     "Two stations have the same address",
-    why="""Both answer ARP and traffic goes to whichever spoke last: a node that comes and goes, and a change that lands
-    on the wrong one.""",
-    mend="Give each node and each computer an address of its own.",
+    why="""Both answer ARP, and traffic goes to the one that answered last: nodes appear and disappear, and changes
+    reach the wrong one.""",
+    fix="Give each node and each computer a unique address.",
     failing="nodes: {b01: {address: 10.42.0.1}}",
     passing="nodes: {b01: {address: 10.42.0.102}}",
 )
 def address_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for address, owners in repeated(_stations(fleet)):
+    for address, owners in duplicates(_stations(fleet)):
         (_, first), *later = owners
         for path, _ in later:
-            yield Finding(path, f"{first} has the same address", "an address of its own", str(address))
+            yield Finding(path, f"{first} has the same address", "a unique address", str(address))
 
 
 def _stations(fleet: Fleet) -> Iterator[tuple[IPv4Address, tuple[tuple[str, ...], str]]]:
@@ -54,9 +54,9 @@ def _stations(fleet: Fleet) -> Iterator[tuple[IPv4Address, tuple[tuple[str, ...]
 @fleet_rule(
     "MC202",
     Severity.ERROR,
-    "A node's address lies outside its mesh's network",
-    why="Its neighbours have no route to it: after the change nobody reaches the node, and it rolls back.",
-    mend="Choose an address from the network of one of its meshes.",
+    "A node's address is outside its mesh's network",
+    why="Its neighbors have no route to it: after the change the node is unreachable and rolls back.",
+    fix="Use an address in the network of one of its meshes.",
     failing="nodes: {b01: {address: 10.43.0.7}}",
     passing="nodes: {b01: {address: 10.42.0.7}}",
 )
@@ -65,15 +65,15 @@ def address_outside(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         networks = [mesh.network for mesh in _meshes_of(fleet, node)]
         if networks and not any(node.address.ip in network for network in networks):
             expected = f"an address in {' or '.join(str(network) for network in networks)}"
-            yield Finding(("nodes", node.name, "address"), "not in its mesh's network", expected, str(node.address.ip))
+            yield Finding(("nodes", node.name, "address"), "outside its mesh's network", expected, str(node.address.ip))
 
 
 @fleet_rule(
     "MC203",
     Severity.ERROR,
-    "An address is the network's own or its broadcast address",
-    why="The kernel refuses it or answers nothing sent to it.",
-    mend="Choose an address between the two.",
+    "An address is the network or broadcast address",
+    why="The kernel rejects the address, or drops traffic to it.",
+    fix="Use a host address of the network.",
     failing="nodes: {b01: {address: 10.42.0.255}}",
     passing="nodes: {b01: {address: 10.42.0.254}}",
 )
@@ -86,22 +86,21 @@ def address_reserved(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 
 
 def _reserved(path: tuple[str, ...], address: IPv4Interface) -> Iterator[Finding]:
-    # by arithmetic: ipaddress takes longer over a network's two ends than all other rules over the node
+    # computed directly: ipaddress would take longer for the two ends than all other rules for the node
     host_bits = 32 - address.network.prefixlen
     ends = (0, (1 << host_bits) - 1)
     if host_bits >= 2 and int(address.ip) & ends[1] in ends:
         network = address.network
         expected = f"an address between {network.network_address} and {network.broadcast_address}"
-        yield Finding(path, "not a station's address", expected, str(address.ip))
+        yield Finding(path, "not a host address", expected, str(address.ip))
 
 
 @fleet_rule(
     "MC204",
     Severity.ERROR,
-    "A node's gateway cannot be reached",
-    why="""A gateway outside the node's network is refused by the kernel; a node that is its own gateway sends nothing
-    out.""",
-    mend="Name an address of another station in the same network.",
+    "A node's gateway is unreachable",
+    why="The kernel rejects a gateway outside the node's network; a node that is its own gateway sends nothing.",
+    fix="Use the address of another station in the same network.",
     failing="nodes: {b01: {gateway: 10.99.0.1}}",
     passing="nodes: {b01: {gateway: 10.42.0.254}}",
 )
@@ -118,8 +117,9 @@ def gateway_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     "MC205",
     Severity.ERROR,
     "The networks of two meshes overlap",
-    why="A node in both, or a robot bridging both, has two routes to one address and uses the wrong one half the time.",
-    mend="Give each mesh a network of its own, or both the same (cells of one network share a routing interface).",
+    why="""A node in both meshes, or a robot that bridges both, has two routes to one address and uses the wrong one
+    half the time.""",
+    fix="Use separate networks, or the same network for both (cells of one network share a routing interface).",
     failing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.42.0.128/25,
@@ -136,18 +136,18 @@ def gateway_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     """,
 )
 def networks_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    # sorted by first address, a network overlaps the widest one before it or none before it
+    # sorted by first address: a network overlaps either the widest network before it or none
     widest: Mesh | None = None
     for mesh in sorted(fleet.meshes.values(), key=lambda mesh: (mesh.network.network_address, mesh.network.prefixlen)):
         if widest is not None and mesh.network.overlaps(widest.network) and not _routed_as_one(mesh, widest):
             message = f"overlaps {widest.network} of mesh {widest.name}"
-            yield Finding(("meshes", mesh.name, "network"), message, "a network of its own", str(mesh.network))
+            yield Finding(("meshes", mesh.name, "network"), message, "a separate network", str(mesh.network))
         if widest is None or mesh.network.broadcast_address > widest.network.broadcast_address:
             widest = mesh
 
 
 def _routed_as_one(mesh: Mesh, other: Mesh) -> bool:
-    """Two cells under one routing interface, say one in each band: one network is what they are meant to have."""
+    """Two cells that share a routing interface, such as one per band, share a network on purpose."""
     if mesh.network != other.network or mesh.backend is not other.backend:
         return False
     if mesh.backend is Backend.BATMAN:
@@ -158,10 +158,10 @@ def _routed_as_one(mesh: Mesh, other: Mesh) -> bool:
 @fleet_rule(
     "MC206",
     Severity.WARNING,
-    "The network holds the factory address 192.168.1.1",
-    why="""A device in failsafe, or freshly reset, answers at 192.168.1.1: inside the fleet's network it takes the place
-    of the node that has that address, or is taken for part of the fleet.""",
-    mend="Use another network, such as 10.42.0.0/24.",
+    "The network contains the factory address 192.168.1.1",
+    why="""A device in failsafe mode or after a reset answers at 192.168.1.1: in the fleet's network it conflicts with
+    the node that has that address, or is mistaken for a fleet node.""",
+    fix="Use another network, such as 10.42.0.0/24.",
     failing="""
     meshes: {main: {network: 192.168.1.0/24}}
     nodes: {base: {address: 192.168.1.2}, husky1-front: {address: 192.168.1.11}, b01: {address: 192.168.1.101}}
@@ -173,16 +173,18 @@ def factory_address(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in fleet.meshes.values():
         if _FACTORY in mesh.network:
             path = ("meshes", mesh.name, "network")
-            yield Finding(path, f"holds {_FACTORY}, where factory-fresh devices answer", "another", str(mesh.network))
+            yield Finding(
+                path, f"contains {_FACTORY}, the address of factory-fresh devices", "another network", str(mesh.network)
+            )
 
 
 @fleet_rule(
     "MC207",
     Severity.WARNING,
     "The network is not private",
-    why="""Addresses that belong to others on the internet become unreachable from every robot and laptop of the team,
-    and replies leak out of the uplink.""",
-    mend="Use a network of RFC 1918, such as 10.42.0.0/24.",
+    why="""Internet hosts with these addresses become unreachable from every robot and laptop, and replies leak through
+    the uplink.""",
+    fix="Use an RFC 1918 network, such as 10.42.0.0/24.",
     failing="""
     meshes: {main: {network: 11.42.0.0/24}}
     nodes: {base: {address: 11.42.0.1}, husky1-front: {address: 11.42.0.11}, b01: {address: 11.42.0.101}}
@@ -194,15 +196,17 @@ def network_public(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in fleet.meshes.values():
         network = mesh.network
         if not any(network.subnet_of(private) for private in _PRIVATE) and not _unusable(network):
-            yield Finding(("meshes", mesh.name, "network"), "not a private network", "one of RFC 1918", str(network))
+            yield Finding(
+                ("meshes", mesh.name, "network"), "not a private network", "an RFC 1918 network", str(network)
+            )
 
 
 @fleet_rule(
     "MC208",
     Severity.ERROR,
-    "The network is not for stations",
+    "The network is not usable for stations",
     why="Loopback, link-local, multicast and reserved ranges are not routed or not accepted on an interface.",
-    mend="Use a network of RFC 1918, such as 10.42.0.0/24.",
+    fix="Use an RFC 1918 network, such as 10.42.0.0/24.",
     failing="""
     meshes: {main: {network: 127.42.0.0/24}}
     nodes: {base: {address: 127.42.0.1}, husky1-front: {address: 127.42.0.11}, b01: {address: 127.42.0.101}}
@@ -214,7 +218,7 @@ def network_unusable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in fleet.meshes.values():
         if _unusable(mesh.network):
             path = ("meshes", mesh.name, "network")
-            yield Finding(path, "no station may have such addresses", "one of RFC 1918", str(mesh.network))
+            yield Finding(path, "reserved address range", "an RFC 1918 network", str(mesh.network))
 
 
 def _unusable(network: IPv4Network) -> bool:
@@ -224,10 +228,10 @@ def _unusable(network: IPv4Network) -> bool:
 @fleet_rule(
     "MC209",
     Severity.ERROR,
-    "A robot's computer is in another network than its radios",
-    why="""The radios bridge the mesh to the computer's switch: there is no router between them, so a computer in
-    another network is cut off from the whole team.""",
-    mend="Give the computer an address in the network of its radios' mesh.",
+    "A robot's computer is in a different network than its radios",
+    why="""The radios bridge the mesh to the computer's switch. There is no router between them, so a computer in
+    another network is cut off.""",
+    fix="Give the computer an address in its radios' mesh network.",
     failing="robots: {husky1: {computer: {address: 10.99.0.5/24}}}",
     passing="robots: {husky1: {computer: {address: 10.42.0.120/24}}}",
 )
@@ -240,16 +244,16 @@ def computer_elsewhere(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
             if not any(address in network for network in networks):
                 expected = f"an address in {' or '.join(str(network) for network in networks)}"
                 path = ("robots", robot.name, "computer", "address")
-                yield Finding(path, "not in the network of its radios", expected, str(address))
+                yield Finding(path, "outside the network of its radios", expected, str(address))
 
 
 @fleet_rule(
     "MC210",
     Severity.ERROR,
     "A computer's prefix length differs from the mesh's",
-    why="""With a longer prefix the computer sends part of the team's traffic to a gateway that does not exist; with a
-    shorter one it answers for stations that are elsewhere.""",
-    mend="Write the computer's address with the prefix length of the mesh's network.",
+    why="""With a longer prefix the computer sends part of the fleet's traffic to a gateway that does not exist; with a
+    shorter one it expects remote stations on its own link.""",
+    fix="Use the prefix length of the mesh's network.",
     failing="robots: {husky1: {computer: {address: 10.42.0.120/28}}}",
     passing="robots: {husky1: {computer: {address: 10.42.0.120/24}}}",
 )
@@ -261,17 +265,17 @@ def prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             address = robot.computer.address
             if address.ip in mesh.network and address.network != mesh.network:
                 path = ("robots", robot.name, "computer", "address")
-                expected = f"/{mesh.network.prefixlen} like mesh {mesh.name}"
-                yield Finding(path, "prefix length differs", expected, f"/{address.network.prefixlen}")
+                expected = f"/{mesh.network.prefixlen} as in mesh {mesh.name}"
+                yield Finding(path, "prefix length differs from the mesh's", expected, f"/{address.network.prefixlen}")
 
 
 @fleet_rule(
     "MC211",
     Severity.WARNING,
-    "The network has no room for a replacement",
-    why="""When the last address is taken, a spare cannot be brought in beside the node it replaces, and a laptop cannot
-    join to look.""",
-    mend="Use a wider network: a few bits cost nothing.",
+    "The network has no free addresses for a replacement",
+    why="""When all addresses are used, a spare cannot join beside the node it replaces, and a laptop cannot join for
+    diagnosis.""",
+    fix="Use a larger network; a shorter prefix costs nothing.",
     failing="""
     meshes: {main: {network: 10.42.0.0/29}}
     nodes: {base: {address: 10.42.0.1}, husky1-front: {address: 10.42.0.2}, b01: {address: 10.42.0.3}}
@@ -284,11 +288,11 @@ def prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     """,
 )
 def network_full(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    # one for the spare, one for the operator's laptop
+    # a spare and the operator's laptop
     reserve = 2
     taken: dict[str, set[IPv4Address]] = {name: set() for name in fleet.meshes}
-    by_network = grouped((mesh.network, name) for name, mesh in fleet.meshes.items())
-    # an address is looked up once per length of prefix, not once per network
+    by_network = group_by_key((mesh.network, name) for name, mesh in fleet.meshes.items())
+    # one lookup per prefix length instead of one per network
     lengths = {network.prefixlen for network in by_network}
     for address, _ in _stations(fleet):
         for length in lengths:
@@ -299,32 +303,35 @@ def network_full(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if len(taken[name]) > 0 and room < reserve:
             path = ("meshes", name, "network")
             yield Finding(
-                path, f"{len(taken[name])} addresses are taken", f"room for {reserve} more", f"{max(room, 0)}"
+                path,
+                f"{len(taken[name])} addresses are in use",
+                f"at least {reserve} free addresses",
+                f"{max(room, 0)}",
             )
 
 
 @fleet_rule(
     "MC212",
     Severity.WARNING,
-    "Logs are sent where no node can reach",
-    why="The log host lies in no network of the fleet and no node has a gateway: after an accident there is no record.",
-    mend="Name the base station's computer in `system.log_host`, or give the nodes a gateway.",
+    "The log host is unreachable",
+    why="The log host is in no network of the fleet, and no node has a gateway: logs are lost.",
+    fix="Set `system.log_host` to the base station's computer, or give the nodes a gateway.",
     failing="system: {log_host: 192.0.2.9}",
     passing="system: {log_host: 10.42.0.100}",
 )
 def log_host_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     host = fleet.system.log_host
     if host and _out_of_reach(fleet, host):
-        yield Finding(("system", "log_host"), "in no network of the fleet", "an address of a mesh's network", host)
+        yield Finding(("system", "log_host"), "outside the fleet's networks", "an address of a mesh's network", host)
 
 
 @fleet_rule(
     "MC213",
     Severity.WARNING,
-    "No time server can be reached",
-    why="""Radios have no clock battery. Without a time server in reach their logs start at the build date, and nothing
-    that happened on two nodes can be put in order.""",
-    mend="Run a time server on the base station and name its address.",
+    "No time server is reachable",
+    why="""Radios have no battery-backed clock. Without a reachable time server, logs start at the image's build date,
+    and events on different nodes cannot be correlated.""",
+    fix="Run a time server on the base station and list its address.",
     failing="system: {ntp_servers: [0.openwrt.pool.ntp.org]}",
     passing="system: {ntp_servers: [10.42.0.100]}",
 )
@@ -332,19 +339,19 @@ def time_server_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Fin
     servers = fleet.system.ntp_servers
     if servers and all(_out_of_reach(fleet, server) for server in servers):
         expected = "an address of a mesh's network"
-        yield Finding(("system", "ntp_servers"), "in no network of the fleet", expected, ", ".join(servers))
+        yield Finding(("system", "ntp_servers"), "outside the fleet's networks", expected, ", ".join(servers))
 
 
 def _out_of_reach(fleet: Fleet, host: str) -> bool:
     if any(node.gateway is not None for node in fleet.managed()):
         return False
     address = as_address(host)
-    # a name needs a resolver, which is beyond a gateway as well
+    # a name needs a resolver, which also is behind a gateway
     return address is None or not any(address in mesh.network for mesh in fleet.meshes.values())
 
 
 def as_address(host: str) -> IPv4Address | IPv6Address | None:
-    """The address that a host is written as, None for a name."""
+    """The IP address that `host` is; None for a name."""
     try:
         return ip_address(host)
     except ValueError:
@@ -354,9 +361,9 @@ def as_address(host: str) -> IPv4Address | IPv6Address | None:
 @fleet_rule(
     "MC214",
     Severity.ERROR,
-    "Two nodes are reached at the same SSH host and port",
-    why="The second node would be changed into the first and back on every run; only the host key stops it.",
-    mend="Leave `ssh.host` out to use the node's own address, or give each node its own forwarded port.",
+    "Two nodes have the same SSH host and port",
+    why="Each run would configure one device as both nodes in turn; only host key verification prevents it.",
+    fix="Remove `ssh.host` to use the node's own address, or give each node its own forwarded port.",
     failing="""
     nodes:
       base: {ssh: {host: 127.0.0.1, port: 2201}}
@@ -369,23 +376,23 @@ def as_address(host: str) -> IPv4Address | IPv6Address | None:
     """,
 )
 def ssh_endpoint_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    # nodes behind different jump hosts may well share a host and port
+    # nodes behind different jump hosts may share a host and port
     endpoints = (
         ((node.ssh.host, node.ssh.port, node.ssh.jump), node.name) for node in fleet.managed() if node.ssh.host
     )
-    for (host, port, _), names in repeated(endpoints):
+    for (host, port, _), names in duplicates(endpoints):
         for name in names[1:]:
             path = ("nodes", name, "ssh", "host")
-            yield Finding(path, f"{names[0]} is reached at the same place", "one of its own", f"{host}:{port}")
+            yield Finding(path, f"{names[0]} has the same host and port", "a unique host and port", f"{host}:{port}")
 
 
 @fleet_rule(
     "MC215",
     Severity.ERROR,
     "A node's prefix length differs from its mesh's",
-    why="""With a longer prefix the node sends part of the mesh to a gateway that does not exist; with a shorter one it
-    looks on the air for stations that are elsewhere. Some nodes then reach it and others do not.""",
-    mend="Write the address without a prefix length: it takes the one of its mesh's network.",
+    why="""With a longer prefix the node sends part of the mesh's traffic to a gateway that does not exist; with a
+    shorter one it expects remote stations on its own link. Some nodes can reach it, others cannot.""",
+    fix="Omit the prefix length: it defaults to that of the mesh's network.",
     failing="nodes: {b01: {address: 10.42.0.7/16}}",
     passing="nodes: {b01: {address: 10.42.0.7}}",
 )
@@ -393,6 +400,6 @@ def node_prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     for node in fleet.managed():
         holding = [mesh for mesh in _meshes_of(fleet, node) if node.address.ip in mesh.network]
         if holding and not any(node.address.network == mesh.network for mesh in holding):
-            expected = f"/{holding[0].network.prefixlen} like mesh {holding[0].name}"
+            expected = f"/{holding[0].network.prefixlen} as in mesh {holding[0].name}"
             path = ("nodes", node.name, "address")
-            yield Finding(path, "prefix length differs", expected, f"/{node.address.network.prefixlen}")
+            yield Finding(path, "prefix length differs from the mesh's", expected, f"/{node.address.network.prefixlen}")

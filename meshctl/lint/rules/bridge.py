@@ -1,4 +1,4 @@
-"""Bridging into the robot's LAN: ports, loops, confirm windows, the firewall (MC521 to MC530)."""
+"""Bridging into the robot's LAN: ports, loops, confirm windows, extra options (MC521 to MC530)."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, listed, repeated
+from meshctl.lint.grouping import duplicates, group_by_key, join_limited
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.routing import MESHMERIZE, PARTS
 from meshctl.model import Backend, Fleet, Mesh, Node
 
-# the loop avoidance's own resynchronization holds broadcasts up to 30 s; twice that with room for the check itself
+# resynchronization of loop avoidance blocks broadcasts for up to 30 s; the rest is for the health checks
 _LOOP_AVOIDANCE_S = 60
-# what is owned by the mesh's side of the bridge
+# interfaces on the mesh side of the bridge
 _NOT_PORTS = ("bat", "mesh", "wlan", "phy", "br-")
-# options that the inventory has keys for, by package
+# UCI options set by inventory keys, by package
 _CHECKED = {
     "wireless": frozenset(
         [
@@ -75,7 +75,7 @@ def _bridged_pairs(fleet: Fleet) -> Iterator[tuple[str, Mesh, list[Node]]]:
     for robot in fleet.robots.values():
         nodes = [fleet.nodes[name] for name in dict.fromkeys(robot.nodes) if name in fleet.nodes]
         bridged = [node for node in nodes if node.state.is_managed and node.lan_ports]
-        for mesh, members in grouped((mesh, node) for node in bridged for mesh in node.meshes).items():
+        for mesh, members in group_by_key((mesh, node) for node in bridged for mesh in node.meshes).items():
             if len(members) > 1 and mesh in fleet.meshes:
                 yield robot.name, fleet.meshes[mesh], members
 
@@ -83,17 +83,17 @@ def _bridged_pairs(fleet: Fleet) -> Iterator[tuple[str, Mesh, list[Node]]]:
 @fleet_rule(
     "MC521",
     Severity.ERROR,
-    "Two radios on one switch without loop avoidance",
-    why="""Both radios bridge the mesh to the same switch: a broadcast goes in at one, out at the other, and round
-    again. Within seconds the storm fills every link of the fleet, not only this robot's.""",
-    mend="Set `batman: {bridge_loop_avoidance: true}` at the mesh, or bridge only one of the radios (`lan_ports: []`).",
+    "Two radios share a switch without loop avoidance",
+    why="""Both radios bridge the mesh to the same switch: a broadcast enters through one, leaves through the other and
+    circulates. Within seconds the broadcast storm fills every link of the fleet, not only this robot's.""",
+    fix="Set `batman: {bridge_loop_avoidance: true}` on the mesh, or bridge only one of the radios (`lan_ports: []`).",
     failing="meshes: {main: {batman: {bridge_loop_avoidance: false}}}" + _TWO_RADIOS,
     passing="meshes: {main: {batman: {bridge_loop_avoidance: true}}}" + _TWO_RADIOS,
 )
 def loop_without_avoidance(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot, mesh, nodes in _bridged_pairs(fleet):
         if mesh.backend is Backend.BATMAN and not mesh.batman.bridge_loop_avoidance:
-            names = listed([node.name for node in nodes])
+            names = join_limited([node.name for node in nodes])
             path = ("meshes", mesh.name, "batman", "bridge_loop_avoidance")
             yield Finding(path, f"{names} share the switch of {robot}", "true", "false")
 
@@ -101,17 +101,17 @@ def loop_without_avoidance(fleet: Fleet, _context: LintContext) -> Iterator[Find
 @fleet_rule(
     "MC522",
     Severity.WARNING,
-    "Two radios on one switch over a back end whose loop avoidance is unknown",
-    why="""meshctl knows batman-adv's loop avoidance only. Over another back end two bridged radios loop unless that
-    back end takes care of it.""",
-    mend="Make sure the back end avoids the loop and suppress this finding, or bridge only one of the radios.",
+    "Two radios share a switch over a back end with unknown loop avoidance",
+    why="""meshctl knows only batman-adv's loop avoidance. With another back end, two bridged radios form a loop unless
+    the back end prevents it.""",
+    fix="Make sure that the back end prevents the loop and suppress this finding, or bridge only one of the radios.",
     failing=Example(MESHMERIZE + _TWO_RADIOS, files=PARTS),
     passing=Example(MESHMERIZE, files=PARTS),
 )
 def loop_over_other_back_end(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot, mesh, nodes in _bridged_pairs(fleet):
         if mesh.backend is not Backend.BATMAN:
-            names = listed([node.name for node in nodes])
+            names = join_limited([node.name for node in nodes])
             message = f"{names} share the switch of {robot}"
             yield Finding(
                 ("meshes", mesh.name, "backend"), message, "batman-adv, or one bridged radio", mesh.backend.value
@@ -122,9 +122,9 @@ def loop_over_other_back_end(fleet: Fleet, _context: LintContext) -> Iterator[Fi
     "MC523",
     Severity.ERROR,
     "The confirm window is too short for loop avoidance",
-    why="""After a change the loop avoidance can hold broadcasts for 30 seconds while its nodes agree anew. The operator
-    cannot confirm in that time, and a good change is rolled back.""",
-    mend="Set `confirm_window_s` above 60.",
+    why="""After a change, loop avoidance can block broadcasts for 30 seconds while its nodes resynchronize. The
+    operator cannot confirm during that time, and a good change is rolled back.""",
+    fix="Set `confirm_window_s` to more than 60.",
     failing="hardware: {rocket: {confirm_window_s: 45}}",
     passing="hardware: {rocket: {confirm_window_s: 120}}",
 )
@@ -136,7 +136,7 @@ def confirm_window_short(fleet: Fleet, _context: LintContext) -> Iterator[Findin
             if node.confirm_window_s == node.hardware.confirm_window_s:
                 path = ("hardware", node.hardware.name, "confirm_window_s")
             expected = f"more than {_LOOP_AVOIDANCE_S} s"
-            yield Finding(path, "loop avoidance may need that long", expected, f"{node.confirm_window_s} s")
+            yield Finding(path, "too short for loop avoidance", expected, f"{node.confirm_window_s} s")
 
 
 def _avoids_loops(fleet: Fleet, name: str) -> bool:
@@ -148,8 +148,8 @@ def _avoids_loops(fleet: Fleet, name: str) -> bool:
     "MC524",
     Severity.WARNING,
     "The confirm window is very long",
-    why="Until it ends, a node that was cut off by a bad change stays cut off.",
-    mend="Keep it below ten minutes.",
+    why="A node that a bad change cuts off stays cut off until the window ends.",
+    fix="Use at most 600 s.",
     failing="hardware: {rocket: {confirm_window_s: 1800}}",
     passing="hardware: {rocket: {confirm_window_s: 300}}",
 )
@@ -160,7 +160,7 @@ def confirm_window_long(fleet: Fleet, _context: LintContext) -> Iterator[Finding
             if node.confirm_window_s == node.hardware.confirm_window_s:
                 path = ("hardware", node.hardware.name, "confirm_window_s")
             found = f"{node.confirm_window_s} s"
-            yield Finding(path, "a bad change lasts that long", "at most 600 s", found)
+            yield Finding(path, "a bad change stays that long", "at most 600 s", found)
 
 
 @fleet_rule(
@@ -168,14 +168,14 @@ def confirm_window_long(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     Severity.ERROR,
     "A bridge port is listed twice",
     why="netifd adds the port once and fails the second time; on 19.07 the bridge may come up without it.",
-    mend="List each port once.",
+    fix="List each port once.",
     failing="hardware: {rocket: {lan_ports: [eth0, eth0]}}",
     passing="hardware: {rocket: {lan_ports: [eth0, eth1]}}",
 )
 def port_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for place, ports in _port_lists(fleet):
-        for port, indexes in repeated((port, index) for index, port in enumerate(ports)):
-            yield Finding((*place, str(indexes[1])), "stands twice", "each port once", port)
+        for port, indexes in duplicates((port, index) for index, port in enumerate(ports)):
+            yield Finding((*place, str(indexes[1])), "listed twice", "each port once", port)
 
 
 def _port_lists(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
@@ -190,9 +190,9 @@ def _port_lists(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]
     "MC526",
     Severity.ERROR,
     "A bridge port belongs to the mesh",
-    why="""meshctl bridges the routing interface itself. A radio interface in the bridge as well carries every frame
-    twice, past the routing: a loop that no loop avoidance sees.""",
-    mend="List wired ports only, as in the device's /etc/board.json.",
+    why="""meshctl bridges the routing interface itself. An additional radio interface in the bridge carries every frame
+    twice, bypassing the routing: a loop that loop avoidance cannot detect.""",
+    fix="List wired ports only, as in /etc/board.json on the device.",
     failing="hardware: {rocket: {lan_ports: [eth0, bat0]}}",
     passing="hardware: {rocket: {lan_ports: [eth0]}}",
 )
@@ -206,9 +206,9 @@ def port_of_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC527",
     Severity.ERROR,
-    "A bridge port and a VLAN of it are both bridged",
-    why="eth0 carries eth0.1: with both in the bridge, frames of the VLAN come in twice and go round.",
-    mend="List the VLANs, or the port.",
+    "A port and one of its VLANs are both bridged",
+    why="eth0 carries eth0.1: with both in the bridge, frames of the VLAN enter twice and loop.",
+    fix="List either the VLANs or the port.",
     failing="hardware: {rocket: {lan_ports: [eth0, eth0.1], switch_vlans: {1: 3 0t}}}",
     passing="hardware: {rocket: {lan_ports: [eth0.1, eth0.2], switch_vlans: {1: 3 0t, 2: 2 0t}}}",
 )
@@ -224,8 +224,8 @@ def port_and_vlan(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC528",
     Severity.ERROR,
     "A robot's radio has no wired port",
-    why="Nothing joins the mesh with the robot's switch: the radio is on the air, and its computer hears nothing.",
-    mend="Name the ports of /etc/board.json in `lan_ports`.",
+    why="Nothing connects the mesh to the robot's switch: the radio is on the air, but the computer receives nothing.",
+    fix="List the ports from /etc/board.json in `lan_ports`.",
     failing="nodes: {husky1-front: {lan_ports: []}}",
     passing="nodes: {husky1-front: {lan_ports: [eth0]}}",
 )
@@ -236,18 +236,18 @@ def robot_without_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
         if robot.computer is not None and nodes and not any(node.lan_ports for node in nodes):
             profile = ("hardware", nodes[0].hardware.name, "lan_ports")
             cut_off.append((first_written(fleet, ("nodes", nodes[0].name, "lan_ports"), profile), robot.name))
-    # a profile without ports is one mistake, whatever the number of robots that have it
-    for path, robots in grouped(cut_off).items():
-        yield Finding(path, f"the computer of {listed(robots)} is cut off", "at least one port", "none")
+    # report a profile without ports once, however many robots use it
+    for path, robots in group_by_key(cut_off).items():
+        yield Finding(path, f"the computer of {join_limited(robots)} is cut off", "at least one port", "none")
 
 
 @fleet_rule(
     "MC529",
     Severity.WARNING,
-    "An extra UCI option changes what lint has checked",
-    why="""Options set behind the templates can change channel, power, addresses and bridges after every check here has
-    passed: the cell may split, a limit be broken, a node be lost, unseen.""",
-    mend="Use the inventory's own key for it: that one is checked.",
+    "An extra UCI option overrides a checked setting",
+    why="""`extra_uci` is applied after the templates and can change channel, power, addresses and bridges after every
+    check has passed: the cell may split, a limit may be exceeded, or a node lost, unnoticed.""",
+    fix="Use the inventory's own key, which is checked.",
     failing="nodes: {b01: {extra_uci: {wireless.radio0.channel: '13'}}}",
     passing="nodes: {b01: {extra_uci: {wireless.radio0.rts: '500'}}}",
 )
@@ -257,18 +257,18 @@ def extra_checked(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             package, _, rest = key.partition(".")
             if rest.rpartition(".")[2] in _CHECKED.get(package, ()):
                 path = ("nodes", node.name, "extra_uci", key)
-                yield Finding(path, "set behind the checks", "the inventory's own key", key)
+                yield Finding(path, "overrides a checked setting", "the inventory's own key", key)
 
 
 @fleet_rule(
     "MC530",
     Severity.WARNING,
-    "A VLAN port without the switch behind it",
-    why="""A port such as eth0.1 leads through a switch that swconfig drives, and /etc/config/network holds which of the
-    switch's ports belong to it. A node that is provisioned keeps what it has; an image built with the rendered files
-    has none, and nothing makes it any more: after its first boot the wired ports are dead.""",
-    mend="""Copy the sections `switch_vlan` of a new device's /etc/config/network into `switch_vlans` of the hardware:
-    `{1: "3 0t", 2: "2 0t"}`. Where the VLAN belongs to a switch outside the box, suppress this finding.""",
+    "A VLAN port has no switch VLAN",
+    why="""A port such as eth0.1 leads through a switch that swconfig drives, and /etc/config/network defines which
+    switch ports belong to the VLAN. A provisioned node keeps its definition; an image built from the rendered files has
+    none: after its first boot the wired ports are dead.""",
+    fix="""Copy the `switch_vlan` sections from a new device's /etc/config/network to `switch_vlans` of the hardware:
+    `{1: "3 0t", 2: "2 0t"}`. If the VLAN belongs to an external switch, suppress this finding.""",
     failing="hardware: {rocket: {lan_ports: [eth0.1]}}",
     passing="hardware: {rocket: {lan_ports: [eth0.1], switch_vlans: {1: 3 0t}}}",
 )
@@ -280,4 +280,6 @@ def vlan_without_switch(fleet: Fleet, _context: LintContext) -> Iterator[Finding
         for port in node.unswitched_ports:
             path = (*place, "lan_ports", str(node.lan_ports.index(port)))
             expected = f"VLAN {port.rpartition('.')[2]} in switch_vlans"
-            yield Finding(path, f"{port} needs it", expected, f"VLANs {listed(vlans)}" if vlans else "none")
+            yield Finding(
+                path, f"no switch VLAN for {port}", expected, f"VLANs {join_limited(vlans)}" if vlans else "none"
+            )

@@ -8,11 +8,11 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Band, Fleet, Mesh, MeshMode, Release
-from meshctl.regdb import CHANNELS, Country, Flag, Verdict, judge, legal_channels, occupied, primary, width_mhz
+from meshctl.regdb import CHANNELS, Country, Flag, Legality, check_span, legal_channels, occupied, primary, width_mhz
 
-# what keeps a station from starting a cell on its own
-_SILENT = Flag.DFS | Flag.NO_IR
-# its wifi-scripts alone have `mcast_rate` as an array (docs/facts/openwrt-checked.md)
+# flags that prevent a station from starting a cell
+_NO_INITIATE = Flag.DFS | Flag.NO_IR
+# the only build whose wifi-scripts declare `mcast_rate` as an array (docs/facts/openwrt-checked.md)
 _NO_MCAST_RATE = "25.12.0-rc1"
 _IMAGE = 'image for {"supported_devices":["ubnt,rocket-m"],"version":{"version":"%s","revision":"r1-1"}}'
 
@@ -31,24 +31,24 @@ def _country(fleet: Fleet, context: LintContext) -> Country | None:
     return context.regdb.country(fleet.country)
 
 
-def _channels(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, Country, Verdict]]:
-    """Every mesh whose channel exists, with the country's verdict on its first 20 MHz."""
+def _channels(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, Country, Legality]]:
+    """Every mesh whose channel exists, with the legality of its primary 20 MHz."""
     country = _country(fleet, context)
     if country is None:
         return
     for mesh in fleet.meshes.values():
         if mesh.channel in CHANNELS[mesh.band]:
-            yield mesh, country, judge(country, primary(mesh.band, mesh.channel))
+            yield mesh, country, check_span(country, primary(mesh.band, mesh.channel))
 
 
-def _wide(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, Country, Verdict, int]]:
-    """The meshes wider than 20 MHz whose first 20 MHz are in order, with the verdict on all of it and its width."""
+def _wide(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, Country, Legality, int]]:
+    """Meshes wider than 20 MHz with a legal primary channel, with the legality of the whole width, and the width."""
     for mesh, country, verdict in _channels(fleet, context):
         if not verdict.covered or mesh.htmode not in _known_htmodes(mesh.band):
             continue
         span = occupied(mesh.band, mesh.channel, mesh.htmode)
         if span is not None and span.width_mhz > 20:
-            yield mesh, country, judge(country, span), span.width_mhz
+            yield mesh, country, check_span(country, span), span.width_mhz
 
 
 def _known_htmodes(band: Band) -> tuple[str, ...]:
@@ -61,9 +61,9 @@ def _known_htmodes(band: Band) -> tuple[str, ...]:
     "MC321",
     Severity.ERROR,
     "The country is not in the regulatory database",
-    why="""The kernel falls back to the rules of the world, where most channels may not be used to start a cell: radios
-    come up weak or not at all.""",
-    mend="Write the ISO 3166-1 code of the country you transmit in.",
+    why="""The kernel falls back to the world regulatory domain, where most channels may not be used to start a cell:
+    radios come up weak or not at all.""",
+    fix="Use the ISO 3166-1 code of the country you transmit in.",
     failing="country: XX",
     passing="country: CA",
 )
@@ -76,8 +76,8 @@ def country_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "MC322",
     Severity.ERROR,
     "The band has no such channel",
-    why="A channel number of the other band, or of none: the interface does not come up.",
-    mend="Choose a channel of the mesh's band.",
+    why="The channel number belongs to another band or to none: the interface does not come up.",
+    fix="Choose a channel of the mesh's band.",
     failing="meshes: {main: {channel: 36}}",
     passing="meshes: {main: {channel: 11}}",
 )
@@ -85,18 +85,20 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     country = _country(fleet, context)
     for mesh in fleet.meshes.values():
         if mesh.channel not in CHANNELS[mesh.band]:
-            legal = legal_channels(country, mesh.band, "HT20", forbidden=_SILENT) if country else CHANNELS[mesh.band]
+            legal = (
+                legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE) if country else CHANNELS[mesh.band]
+            )
             path = ("meshes", mesh.name, "channel")
-            yield Finding(path, f"no channel of {mesh.band.value}", _shown(legal), str(mesh.channel))
+            yield Finding(path, f"not a channel of the {mesh.band.value} band", _shown(legal), str(mesh.channel))
 
 
 @fleet_rule(
     "MC323",
     Severity.ERROR,
-    "The channel is not legal in the country",
-    why="""The kernel disables it there: the radio does not start. Forcing it with another country code is an offence,
-    and disturbs whoever has the frequency.""",
-    mend="Choose a channel that the country allows.",
+    "The channel is not allowed in the country",
+    why="""The kernel disables the channel: the radio does not start. Setting another country code to enable it is
+    illegal and interferes with other users of the frequency.""",
+    fix="Choose a channel that the country allows.",
     failing="meshes: {main: {channel: 13}}",
     passing="""
     country: CA
@@ -106,18 +108,18 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 def channel_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if not verdict.covered:
-            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_SILENT))
+            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
             path = ("meshes", mesh.name, "channel")
-            yield Finding(path, "not allowed", f"{legal} (country {country.alpha2})", str(mesh.channel))
+            yield Finding(path, "not allowed in this country", f"{legal} (country {country.alpha2})", str(mesh.channel))
 
 
 @fleet_rule(
     "MC324",
     Severity.ERROR,
-    "The channel needs radar detection, which ad-hoc mode cannot do",
-    why="""On DFS channels one station must watch for radar and move the others away. An ad-hoc cell has no such
-    station: mac80211 refuses to join.""",
-    mend="Choose a channel without DFS.",
+    "The channel requires radar detection (DFS), which ad-hoc mode lacks",
+    why="""On DFS channels a master station must detect radar and move the others. An ad-hoc cell has no master, and
+    mac80211 refuses to join.""",
+    fix="Choose a channel without DFS.",
     failing="""
     meshes: {main: {band: 5g, channel: 52}}
     defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
@@ -128,16 +130,16 @@ def channel_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     """,
 )
 def channel_needs_radar_detection(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    yield from _radar(fleet, context, MeshMode.ADHOC, "needs radar detection")
+    yield from _radar(fleet, context, MeshMode.ADHOC, "requires radar detection")
 
 
 @fleet_rule(
     "MC325",
     Severity.WARNING,
-    "The channel must be left when a radar is heard",
-    why="""In 802.11s mode DFS channels work, but the radio is silent for a minute or more before it may start, and a
-    radar (or what sounds like one) takes the whole cell off the air in the middle of a run.""",
-    mend="Choose a channel without DFS.",
+    "The channel must be vacated when radar is detected",
+    why="""802.11s supports DFS channels, but the radio stays silent for at least a minute before it starts, and a radar
+    pulse (or a false detection) takes the whole cell off the air during a run.""",
+    fix="Choose a channel without DFS.",
     failing="""
     meshes: {main: {band: 5g, channel: 52, mode: mesh, encryption: sae}}
     defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
@@ -148,13 +150,13 @@ def channel_needs_radar_detection(fleet: Fleet, context: LintContext) -> Iterato
     """,
 )
 def channel_may_be_lost(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    yield from _radar(fleet, context, MeshMode.MESH, "must be left when a radar is heard")
+    yield from _radar(fleet, context, MeshMode.MESH, "must be vacated when radar is detected")
 
 
 def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if mesh.mode is mode and verdict.covered and Flag.DFS in verdict.flags:
-            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_SILENT))
+            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
             path = ("meshes", mesh.name, "channel")
             yield Finding(path, message, f"{legal} (country {country.alpha2})", f"{mesh.channel} (DFS)")
 
@@ -162,10 +164,10 @@ def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> 
 @fleet_rule(
     "MC326",
     Severity.ERROR,
-    "No station may start a cell on the channel",
-    why="""The country marks the channel no-IR: a station may answer there, never speak first. A mesh of such stations
-    stays silent for ever.""",
-    mend="Choose a channel without this restriction.",
+    "The channel does not allow starting a cell (no-IR)",
+    why="""The country marks the channel no-IR: stations must not initiate radiation. A mesh of such stations stays
+    silent.""",
+    fix="Choose a channel without this restriction.",
     failing="""
     meshes: {main: {band: 5g, channel: 173}}
     defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
@@ -178,19 +180,19 @@ def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> 
 def channel_passive(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if verdict.covered and Flag.NO_IR in verdict.flags and Flag.DFS not in verdict.flags:
-            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_SILENT))
+            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
             path = ("meshes", mesh.name, "channel")
             expected = f"{legal} (country {country.alpha2})"
-            yield Finding(path, "nobody may speak first there", expected, f"{mesh.channel} (no-IR)")
+            yield Finding(path, "stations may not initiate transmission", expected, f"{mesh.channel} (no-IR)")
 
 
 @fleet_rule(
     "MC327",
     Severity.ERROR,
-    "The channel does not exist at this width",
-    why="""The secondary channel would lie outside the band: the driver refuses, or the radio comes up narrower than its
-    neighbours and does not hear them.""",
-    mend="Take HT20, or a channel that has room on that side.",
+    "The channel is not available at this width",
+    why="""The secondary channel would be outside the band: the driver rejects it, or the radio comes up narrower than
+    its neighbors and cannot hear them.""",
+    fix="Use HT20, or a channel with room on that side.",
     failing="""
     meshes: {main: {band: 5g, channel: 36, htmode: HT40-}}
     defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
@@ -205,19 +207,19 @@ def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         if not verdict.covered or mesh.htmode not in _known_htmodes(mesh.band):
             continue
         if occupied(mesh.band, mesh.channel, mesh.htmode) is None:
-            legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_SILENT)
+            legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_NO_INITIATE)
             expected = f"a channel {_shown(legal)}" if legal else "a narrower htmode"
             path = ("meshes", mesh.name, "htmode")
-            yield Finding(path, f"no room beside channel {mesh.channel}", expected, mesh.htmode)
+            yield Finding(path, f"no room next to channel {mesh.channel}", expected, mesh.htmode)
 
 
 @fleet_rule(
     "MC328",
     Severity.ERROR,
     "The channel is too wide for the country",
-    why="""Part of the bonded channel lies where the country forbids it, or needs radar detection, or allows only
-    narrower ones: the kernel refuses it, or narrows it on this node alone.""",
-    mend="Take HT20, or another channel.",
+    why="""Part of the bonded channel is forbidden in the country, requires radar detection, or allows only narrower
+    channels: the kernel rejects it, or narrows it on this node alone.""",
+    fix="Use HT20, or another channel.",
     failing="""
     meshes: {main: {band: 5g, channel: 36, htmode: VHT160}}
     defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
@@ -229,11 +231,11 @@ def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 )
 def width_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict, width in _wide(fleet, context):
-        silent = verdict.flags & _SILENT if verdict.covered else Flag(0)
-        own = judge(country, primary(mesh.band, mesh.channel)).flags & _SILENT
+        silent = verdict.flags & _NO_INITIATE if verdict.covered else Flag(0)
+        own = check_span(country, primary(mesh.band, mesh.channel)).flags & _NO_INITIATE
         if verdict.allows(width) and (not silent or own):
             continue
-        legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_SILENT)
+        legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_NO_INITIATE)
         expected = f"a channel {_shown(legal)} (country {country.alpha2})" if legal else "a narrower htmode"
         path = ("meshes", mesh.name, "htmode")
         yield Finding(path, f"channel {mesh.channel} may not be {width} MHz wide", expected, mesh.htmode)
@@ -242,10 +244,10 @@ def width_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC329",
     Severity.ERROR,
-    "The htmode is not one of the band",
-    why="""OpenWrt ignores an htmode it does not know and the radio falls to the rates of 802.11g: less than half the
-    throughput, and nobody is told.""",
-    mend="Use HT20, or HT40, VHT20, VHT40, VHT80 at 5 GHz where the hardware has them.",
+    "The htmode is not valid for the band",
+    why="""OpenWrt silently ignores an unknown htmode, and the radio falls back to 802.11g rates: less than half the
+    throughput.""",
+    fix="Use HT20, or at 5 GHz HT40, VHT20, VHT40 or VHT80 if the hardware supports them.",
     failing="meshes: {main: {htmode: VHT80}}",
     passing="meshes: {main: {htmode: HT20}}",
 )
@@ -255,16 +257,16 @@ def htmode_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if mesh.htmode not in known or mesh.htmode == "NOHT":
             path = ("meshes", mesh.name, "htmode")
             wanted = f"one of {', '.join(mode for mode in known if mode != 'NOHT')}"
-            yield Finding(path, f"not an htmode of {mesh.band.value}", wanted, mesh.htmode)
+            yield Finding(path, f"not an htmode of the {mesh.band.value} band", wanted, mesh.htmode)
 
 
 @fleet_rule(
     "MC330",
     Severity.ERROR,
     "OpenWrt 25.12 drops HT40+ and HT40- in ad-hoc mode",
-    why="""25.12's scripts know only HT20 and HT40 for ad-hoc cells; with a sign behind them the radio joins without HT,
-    at less than half the throughput, beside neighbours that use it.""",
-    mend="Write HT40, or HT20.",
+    why="""The scripts of 25.12 accept only HT20 and HT40 for ad-hoc cells; with a sign, the radio joins without HT, at
+    less than half the throughput of its neighbors.""",
+    fix="Use HT40 or HT20.",
     failing=Example(
         """
         hardware: {rocket: {release: "25.12"}}
@@ -287,16 +289,16 @@ def htmode_sign_on_25_12(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     for mesh in fleet.meshes.values():
         if mesh.name in new and mesh.mode is MeshMode.ADHOC and mesh.htmode in ("HT40+", "HT40-"):
             path = ("meshes", mesh.name, "htmode")
-            yield Finding(path, "falls to no HT on OpenWrt 25.12", "HT40 or HT20", mesh.htmode)
+            yield Finding(path, "falls back to no HT on OpenWrt 25.12", "HT40 or HT20", mesh.htmode)
 
 
 @fleet_rule(
     "MC331",
     Severity.WARNING,
-    "40 MHz at 2.4 GHz",
-    why="""It takes half of a band that has room for three cells, doubles the noise that is let in, and collides with
-    every hotspot and every robot's own Wi-Fi. On long links it is slower than HT20.""",
-    mend="Use HT20 at 2.4 GHz.",
+    "40 MHz channel at 2.4 GHz",
+    why="""It takes half of a band that has room for three cells, doubles the noise bandwidth, and collides with every
+    hotspot and every robot's own Wi-Fi. On long links it is slower than HT20.""",
+    fix="Use HT20 at 2.4 GHz.",
     failing="meshes: {main: {htmode: HT40}}",
     passing="meshes: {main: {htmode: HT20}}",
 )
@@ -309,10 +311,10 @@ def wide_at_2g(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC332",
     Severity.NOTE,
-    "The channel is none of 1, 6, 11",
-    why="""Everybody else's cells are on 1, 6 and 11. One in between is disturbed by two of them and can take turns with
+    "The channel is not 1, 6 or 11",
+    why="""Most other cells use 1, 6 and 11. A channel in between is disturbed by two of them and can coordinate with
     neither.""",
-    mend="Use 1, 6 or 11 (5, 9 and 13 also fit together where 13 is allowed).",
+    fix="Use 1, 6 or 11 (where 13 is allowed, 5, 9 and 13 do not overlap either).",
     failing="meshes: {main: {channel: 4}}",
     passing="meshes: {main: {channel: 11}}",
 )
@@ -320,15 +322,16 @@ def channel_between(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, _, verdict in _channels(fleet, context):
         if mesh.band is Band.G2 and verdict.covered and mesh.channel not in (1, 5, 6, 9, 11, 13):
             found = f"{mesh.channel}"
-            yield Finding(("meshes", mesh.name, "channel"), "lies between the usual cells", "one of 1, 6, 11", found)
+            yield Finding(("meshes", mesh.name, "channel"), "between the usual channels", "one of 1, 6, 11", found)
 
 
 @fleet_rule(
     "MC333",
     Severity.WARNING,
-    "The channel is for indoor use",
-    why="The country allows it inside buildings only. A mine or a cave may count as one; the staging area does not.",
-    mend="Choose a channel without this restriction if any radio works outdoors.",
+    "The channel is for indoor use only",
+    why="""The country allows the channel inside buildings only. A mine or a cave may count as indoors; the staging area
+    does not.""",
+    fix="Choose a channel without this restriction if any radio operates outdoors.",
     failing="""
     country: DE
     meshes: {main: {band: 5g, channel: 36}}
@@ -342,19 +345,19 @@ def channel_between(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 )
 def channel_indoor(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
-        if verdict.covered and Flag.NO_OUTDOOR in verdict.flags and not verdict.flags & _SILENT:
-            outdoor = legal_channels(country, mesh.band, "HT20", forbidden=_SILENT | Flag.NO_OUTDOOR)
+        if verdict.covered and Flag.NO_OUTDOOR in verdict.flags and not verdict.flags & _NO_INITIATE:
+            outdoor = legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE | Flag.NO_OUTDOOR)
             expected = f"{_shown(outdoor)} (country {country.alpha2})"
-            yield Finding(("meshes", mesh.name, "channel"), "for indoor use only", expected, str(mesh.channel))
+            yield Finding(("meshes", mesh.name, "channel"), "indoor use only", expected, str(mesh.channel))
 
 
 @fleet_rule(
     "MC334",
     Severity.WARNING,
-    "OpenWrt 25.12.0-rc1 joins no ad-hoc cell",
-    why="""The wifi scripts of this one build take `mcast_rate` for a list and give `iw` no number, so the radio joins
-    no cell. 25.12.0-rc2 and all later builds read it correctly.""",
-    mend="Use the image of 25.12.0 or later.",
+    "OpenWrt 25.12.0-rc1 cannot join ad-hoc cells",
+    why="""The wifi scripts of this build treat `mcast_rate` as a list and pass no number to `iw`, so the radio cannot
+    join a cell. 25.12.0-rc2 and later are not affected.""",
+    fix="Use an image of 25.12.0 or later.",
     failing=Example(
         """
         hardware: {rocket: {release: "25.12", firmware: {image: rc1.bin, sha256: <sha256 of rc1.bin>, revision: r1}}}
@@ -380,4 +383,4 @@ def multicast_rate_on_25_12_0_rc1(fleet: Fleet, context: LintContext) -> Iterato
         version = context.files.image_version(profile) if is_asked else ""
         if version == _NO_MCAST_RATE:
             path = ("hardware", profile.name, "firmware", "image")
-            yield Finding(path, "joins no ad-hoc cell", "25.12.0 or later", version)
+            yield Finding(path, "cannot join ad-hoc cells", "25.12.0 or later", version)

@@ -1,4 +1,4 @@
-"""The robots' computers: processor and ROS (MC631 to MC632)."""
+"""The robots' computers: architecture and ROS distribution (MC631 to MC632)."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import listed
+from meshctl.lint.grouping import join_limited
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.references import known
+from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet
 from meshctl.model.computers import ARCHITECTURES, ROS_1, ROS_2, ROS_TOO_OLD
 
-# names that others have for the same processors
+# other names of the same architectures
 _ALIASES = {"amd64": "x86_64", "x64": "x86_64", "arm64": "aarch64", "armhf": "armv7l", "i386": "i686"}
 
 
 @fleet_rule(
     "MC631",
     Severity.WARNING,
-    "A computer's processor is of no known kind",
-    why="""The wheels of udp_mesh are chosen by it, and a deployment refuses a computer that calls itself otherwise:
-    with a slip here, no robot gets udp_mesh.""",
-    mend="Write what `uname -m` prints on the computer.",
+    "A computer's architecture is unknown",
+    why="""The udp_mesh wheels are chosen by architecture, and deployment refuses a computer that reports another one:
+    with a typo, the robot gets no udp_mesh.""",
+    fix="Use the output of `uname -m` on the computer.",
     failing="robots: {husky1: {computer: {arch: x86-64}}}",
     passing="robots: {husky1: {computer: {arch: aarch64}}}",
 )
@@ -30,19 +30,18 @@ def arch_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot in fleet.robots.values():
         arch = "" if robot.computer is None else robot.computer.arch
         if arch and arch not in ARCHITECTURES:
-            _, near = known(ARCHITECTURES, arch)
+            _, near = suggest(ARCHITECTURES, arch)
             hint = f"write {_ALIASES[arch.lower()]}" if arch.lower() in _ALIASES else near
             path = ("robots", robot.name, "computer", "arch")
-            yield Finding(path, "not a name of the kernel's", f"one of {listed(ARCHITECTURES)}", arch, hint)
+            yield Finding(path, "unknown architecture", f"one of {join_limited(ARCHITECTURES)}", arch, hint)
 
 
 @fleet_rule(
     "MC632",
     Severity.ERROR,
-    "A computer's ROS is of no known release",
-    why="""It decides which bridge is deployed. With a name that is none, `meshctl robots deploy` refuses the robot, in
-    the field if not here.""",
-    mend="Write the release's name (`echo $ROS_DISTRO` there), or remove `ros`: no bridge is deployed then.",
+    "A computer's ROS distribution is unknown",
+    why="The distribution selects the bridge to deploy. `meshctl robots deploy` refuses a robot with an unknown one.",
+    fix="Use the distribution's name (`echo $ROS_DISTRO` on the computer), or remove `ros` to deploy no bridge.",
     failing="robots: {husky1: {computer: {ros: humbel}}}",
     passing="robots: {husky1: {computer: {ros: humble}}}",
 )
@@ -51,7 +50,7 @@ def ros_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         ros = "" if robot.computer is None else robot.computer.ros
         path = ("robots", robot.name, "computer", "ros")
         if ros in ROS_TOO_OLD:
-            yield Finding(path, "its Python is older than 3.8", f"{ROS_1}, or a release of ROS 2", ros)
+            yield Finding(path, "its Python is older than 3.8", f"{ROS_1}, or a ROS 2 distribution", ros)
         elif ros not in ("", ROS_1, *ROS_2):
-            _, hint = known((ROS_1, *ROS_2), ros)
-            yield Finding(path, "no such release", f"{ROS_1}, or a release of ROS 2", ros, hint)
+            _, hint = suggest((ROS_1, *ROS_2), ros)
+            yield Finding(path, "unknown ROS distribution", f"{ROS_1}, or a ROS 2 distribution", ros, hint)

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, listed
+from meshctl.lint.grouping import group_by_key, join_limited
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Encryption, Fleet, Mesh, MeshMode, Node, Release
 from meshctl.resolve import FULL_SUPPLICANTS, supplicant_need
 
-# a passphrase shorter than this is found by trying: the handshake can be recorded by anyone in reach
-_SAFE_PASSPHRASE_LETTERS = 16
+# a shorter passphrase can be guessed offline from a recorded handshake
+_MIN_PASSPHRASE_CHARACTERS = 16
 
 
 def _members(fleet: Fleet) -> Iterator[tuple[Node, Mesh]]:
@@ -25,10 +25,11 @@ def _members(fleet: Fleet) -> Iterator[tuple[Node, Mesh]]:
 @fleet_rule(
     "MC401",
     Severity.ERROR,
-    "An encrypted ad-hoc cell on OpenWrt 25.12 is open",
-    why="""25.12's wifi script looks for the cipher before it is set, so an ad-hoc cell with a key is joined without
-    one. Everything looks right: the configuration says psk2, the node is in the mesh, and anybody else can be, too.""",
-    mend="Use `mode: mesh` with `encryption: sae`, an earlier release, or write `encryption: none` and mean it.",
+    "OpenWrt 25.12 joins an encrypted ad-hoc cell without encryption",
+    why="""The wifi script of 25.12 reads the cipher before it is set, so an ad-hoc cell with a key is joined without
+    encryption. Nothing shows it: the configuration says psk2 and the node is in the mesh, but any other device can
+    join, too.""",
+    fix="Use `mode: mesh` with `encryption: sae`, an earlier release, or an explicit `encryption: none`.",
     failing="""hardware: {rocket: {release: "25.12"}}""",
     passing="""
     hardware: {rocket: {release: "25.12"}}
@@ -36,13 +37,13 @@ def _members(fleet: Fleet) -> Iterator[tuple[Node, Mesh]]:
     """,
 )
 def encrypted_adhoc_on_25_12(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    trapped = grouped(
+    trapped = group_by_key(
         (mesh.name, node.name)
         for node, mesh in _members(fleet)
         if mesh.mode is MeshMode.ADHOC and mesh.encryption is Encryption.PSK2 and node.release >= Release.V25_12
     )
     for name, nodes in trapped.items():
-        message = f"joined open, silently, by nodes on 25.12: {listed(nodes)}"
+        message = f"silently joined without encryption by nodes on 25.12: {join_limited(nodes)}"
         yield Finding(
             ("meshes", name, "encryption"), message, "none, or mode mesh with sae", "psk2+ccmp in ad-hoc mode"
         )
@@ -53,7 +54,7 @@ def encrypted_adhoc_on_25_12(fleet: Fleet, _context: LintContext) -> Iterator[Fi
     Severity.ERROR,
     "An encrypted mesh has no key",
     why="The supplicant does not start without a key and the radio stays out of the mesh.",
-    mend="Say where the key is: `key: {env: MESH_KEY}`.",
+    fix="Reference the key: `key: {env: MESH_KEY}`.",
     failing="meshes: {main: {key: <removed>}}",
     passing="meshes: {main: {key: {env: MESH_KEY}}}",
 )
@@ -67,9 +68,9 @@ def key_missing(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC403",
     Severity.WARNING,
-    "A key is given but the mesh is not encrypted",
-    why="Whoever wrote the key believed the mesh was closed. It is open.",
-    mend="Set `encryption`, or take the key away.",
+    "A key is set but the mesh is not encrypted",
+    why="The key suggests an encrypted mesh, but the mesh is open.",
+    fix="Set `encryption`, or remove the key.",
     failing="meshes: {main: {encryption: none}}",
     passing="meshes: {main: {encryption: psk2+ccmp}}",
 )
@@ -83,31 +84,35 @@ def key_unused(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC404",
     Severity.ERROR,
-    "SAE does not exist in ad-hoc mode",
-    why="The supplicant has no SAE for ad-hoc cells; the interface does not come up.",
-    mend="Use psk2+ccmp, or `mode: mesh`.",
+    "SAE is not available in ad-hoc mode",
+    why="The supplicant does not support SAE in ad-hoc cells; the interface does not come up.",
+    fix="Use psk2+ccmp, or `mode: mesh`.",
     failing="meshes: {main: {encryption: sae}}",
     passing="meshes: {main: {encryption: sae, mode: mesh}}",
 )
 def sae_in_adhoc(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in fleet.meshes.values():
         if mesh.mode is MeshMode.ADHOC and mesh.encryption is Encryption.SAE:
-            yield Finding(("meshes", mesh.name, "encryption"), "not in ad-hoc mode", "psk2+ccmp or none", "sae")
+            yield Finding(
+                ("meshes", mesh.name, "encryption"), "not available in ad-hoc mode", "psk2+ccmp or none", "sae"
+            )
 
 
 @fleet_rule(
     "MC405",
     Severity.ERROR,
-    "WPA2 passphrases do not exist in 802.11s mode",
-    why="802.11s encrypts with SAE only; with psk2 the supplicant starts an open mesh or none at all.",
-    mend="Use `encryption: sae`.",
+    "WPA2 passphrases are not available in 802.11s mode",
+    why="802.11s supports SAE only; with psk2 the supplicant starts an open mesh or none.",
+    fix="Use `encryption: sae`.",
     failing="meshes: {main: {mode: mesh}}",
     passing="meshes: {main: {mode: mesh, encryption: sae}}",
 )
 def psk_in_mesh_mode(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in fleet.meshes.values():
         if mesh.mode is MeshMode.MESH and mesh.encryption is Encryption.PSK2:
-            yield Finding(("meshes", mesh.name, "encryption"), "not in 802.11s mode", "sae or none", "psk2+ccmp")
+            yield Finding(
+                ("meshes", mesh.name, "encryption"), "not available in 802.11s mode", "sae or none", "psk2+ccmp"
+            )
 
 
 @fleet_rule(
@@ -116,7 +121,8 @@ def psk_in_mesh_mode(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The supplicant cannot encrypt a mesh",
     why="""`wpad-basic*` and `wpad-mini` are built without IBSS_RSN and without encrypted 802.11s: the radio never
     joins.""",
-    mend="Replace it by a full one: `wpad-mesh-mbedtls`, `wpad-openssl` or another of `wpad-*` without basic or mini.",
+    fix="""Replace it with a full build: `wpad-mesh-mbedtls`, `wpad-openssl` or another `wpad-*` other than basic and
+    mini.""",
     failing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-basic-mbedtls]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-mesh-mbedtls]}}",
 )
@@ -128,11 +134,11 @@ def supplicant_too_small(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         if need is None or not small or any(name in FULL_SUPPLICANTS for name in named):
             continue
         path = packages_path(node, small[0])
-        yield Finding(path, f"cannot encrypt mesh {mesh.name}", f"one of {listed(need.any_of)}", small[0])
+        yield Finding(path, f"cannot encrypt mesh {mesh.name}", f"one of {join_limited(need.any_of)}", small[0])
 
 
 def packages_path(node: Node, package: str) -> tuple[str, ...]:
-    """Where `package` is named: at the node, or at its hardware."""
+    """The path that lists `package`: of the node, or of its hardware."""
     if package in node.packages:
         return ("nodes", node.name, "packages", str(node.packages.index(package)))
     if package in node.hardware.packages:
@@ -144,8 +150,8 @@ def packages_path(node: Node, package: str) -> tuple[str, ...]:
     "MC407",
     Severity.ERROR,
     "Two supplicants in one image",
-    why="The packages hold the same files: the ImageBuilder stops, or the one installed last wins.",
-    mend="Keep one of them.",
+    why="The packages contain the same files: the ImageBuilder fails, or the one installed last wins.",
+    fix="Keep one of them.",
     failing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, wpad-mbedtls]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl]}}",
 )
@@ -153,16 +159,19 @@ def two_supplicants(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
         named = [name for name in dict.fromkeys((*node.hardware.packages, *node.packages)) if name.startswith("wpad")]
         if len(named) > 1:
-            yield Finding(packages_path(node, named[1]), f"conflicts with {named[0]}", "one supplicant", listed(named))
+            yield Finding(
+                packages_path(node, named[1]), f"conflicts with {named[0]}", "one supplicant", join_limited(named)
+            )
 
 
 @fleet_rule(
     "MC408",
     Severity.NOTE,
     "The mesh is open",
-    why="""Anyone in reach can join the mesh, reach every node's SSH, and spoil the routing with false originator
-    messages. udp_mesh seals what robots say, but not the mesh below it.""",
-    mend="Set `encryption: psk2+ccmp` (ad-hoc, up to 24.10) or `mode: mesh` with `sae`; or suppress it with a reason.",
+    why="""Anyone in range can join the mesh, reach every node's SSH port, and disrupt routing with forged originator
+    messages. udp_mesh protects the robots' messages, but not the mesh below it.""",
+    fix="""Set `encryption: psk2+ccmp` (ad-hoc, up to 24.10), or `mode: mesh` with `sae`; or suppress this finding with
+    a reason.""",
     failing="meshes: {main: {encryption: none, key: <removed>}}",
     passing="meshes: {main: {encryption: psk2+ccmp}}",
 )
@@ -170,16 +179,16 @@ def mesh_open(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in fleet.meshes.values():
         if mesh.encryption is Encryption.NONE and mesh.key is None:
             path = ("meshes", mesh.name, "encryption")
-            yield Finding(path, "anyone in reach can join", "psk2+ccmp, or sae in 802.11s mode", "none")
+            yield Finding(path, "anyone in range can join", "psk2+ccmp, or sae in 802.11s mode", "none")
 
 
 @fleet_rule(
     "MC409",
     Severity.ERROR,
-    "The mesh's passphrase is not allowed",
-    why="""WPA takes 8 to 63 printable ASCII characters, or 64 hexadecimal digits: with anything else the supplicant
-    refuses its configuration on every node at once.""",
-    mend="Make a new one: `openssl rand -base64 24`.",
+    "The mesh's passphrase is invalid",
+    why="""WPA accepts 8 to 63 printable ASCII characters, or 64 hexadecimal digits; with anything else the supplicant
+    rejects its configuration on every node at once.""",
+    fix="Generate one: `openssl rand -base64 24`.",
     failing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "short"}),
     passing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "cedar-lantern-93-quarry"}),
 )
@@ -188,11 +197,11 @@ def passphrase_not_allowed(fleet: Fleet, context: LintContext) -> Iterator[Findi
         path = ("meshes", mesh.name, "key")
         if mesh.encryption is Encryption.PSK2 and not _is_passphrase(value):
             expected = "8 to 63 printable ASCII characters, or 64 hexadecimal digits"
-            yield Finding(path, "no passphrase", expected, f"{len(value)} characters")
+            yield Finding(path, "invalid passphrase", expected, f"{len(value)} characters")
         elif mesh.encryption is Encryption.SAE and not (1 <= len(value) <= 128 and value.isprintable()):
-            yield Finding(path, "no passphrase", "1 to 128 characters on one line", f"{len(value)} characters")
+            yield Finding(path, "invalid passphrase", "1 to 128 characters on one line", f"{len(value)} characters")
         elif "'" in value and any(node.release >= Release.V25_12 for node in fleet.members(mesh.name)):
-            # as in an SSID, see MC310
+            # same as for an SSID (MC310)
             yield Finding(path, "breaks on OpenWrt 25.12", "no apostrophe", "one")
 
 
@@ -213,16 +222,18 @@ def _is_passphrase(value: str) -> bool:
     "MC410",
     Severity.WARNING,
     "The mesh's passphrase is short",
-    why="""The handshake can be recorded by anyone in reach and tried at leisure, millions of guesses a second: a
-    passphrase of a word and a year lasts minutes.""",
-    mend="Make a new one of at least 16 characters: `openssl rand -base64 24`.",
+    why="""Anyone in range can record the handshake and test millions of guesses per second offline: a passphrase of a
+    word and a year lasts minutes.""",
+    fix="Generate one of at least 16 characters: `openssl rand -base64 24`.",
     failing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "husky2021"}),
     passing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "cedar-lantern-93-quarry"}),
 )
 def passphrase_short(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, value in _passphrases(fleet, context):
-        # SAE's handshake cannot be tried against later
+        # SAE resists offline guessing
         is_tried = mesh.encryption is Encryption.PSK2 and _is_passphrase(value)
-        if is_tried and len(value) < _SAFE_PASSPHRASE_LETTERS:
-            expected = f"at least {_SAFE_PASSPHRASE_LETTERS} characters"
-            yield Finding(("meshes", mesh.name, "key"), "can be found by trying", expected, f"{len(value)} characters")
+        if is_tried and len(value) < _MIN_PASSPHRASE_CHARACTERS:
+            expected = f"at least {_MIN_PASSPHRASE_CHARACTERS} characters"
+            yield Finding(
+                ("meshes", mesh.name, "key"), "vulnerable to offline guessing", expected, f"{len(value)} characters"
+            )

@@ -1,4 +1,4 @@
-"""Firmware images against what the inventory says of them, read from the images themselves (MC801 to MC812)."""
+"""Firmware images checked against the inventory, by their own metadata (MC801 to MC812)."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _BULLET = _METADATA % ("ubnt,bullet-m-xw", "24.10.2", "r28739-d9340319c6")
 _OLD = _METADATA % ("ubnt,rocket-m", "23.05.5", "r24106-10cc5fcd00")
 _IMAGE = "hardware: {rocket: {firmware: {image: rocket.bin, sha256: <sha256 of rocket.bin>, revision: r28739}}}"
 _OTHER_HASH = "0123456789abcdef0123456789abcdef0123456789abcdef0123456789abcdef"
-# what stays free on the flash for the configuration and packages (two erase blocks of 64 KiB and the boot loader)
+# reserved flash: boot loader, configuration and packages
 _FLASH_RESERVE_KIB = 512
 
 
 def _profiles(fleet: Fleet) -> Iterator[HardwareProfile]:
-    """The profiles with an image that some managed node has."""
+    """The profiles with an image that a managed node uses."""
     used = {node.hardware.name for node in fleet.managed()}
     return (profile for profile in fleet.hardware.values() if profile.firmware.image and profile.name in used)
 
 
 def _found(fleet: Fleet, context: LintContext, code: str, *key: str) -> Iterator[Finding]:
-    """The image check's own findings of one kind, at the profile's place."""
+    """The image check's findings with `code`, at the profile."""
     for profile in _profiles(fleet):
         for item in context.files.firmware(profile):
             if item.code == code:
@@ -51,8 +51,8 @@ def _found(fleet: Fleet, context: LintContext, code: str, *key: str) -> Iterator
     "MC801",
     Severity.ERROR,
     "A firmware image is missing",
-    why="It is found out in the field, where there is no internet to fetch it from.",
-    mend="Bring the image, or mend the path: it is relative to the file that names it.",
+    why="A missing image is otherwise noticed in the field, without internet access to download it.",
+    fix="Add the image, or correct the path, which is relative to the file that names it.",
     failing="hardware: {rocket: {firmware: {image: absent.bin, revision: r28739, sha256: HASH}}}".replace(
         "HASH", _OTHER_HASH
     ),
@@ -65,10 +65,9 @@ def image_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC802",
     Severity.ERROR,
-    "A firmware image is not the one that was written down",
-    why="""Cut off by a full disk, replaced by a newer build, or tampered with: whichever it is, nobody tested this
-    file.""",
-    mend="Fetch the image again; if it was replaced on purpose, write its new SHA-256 down.",
+    "A firmware image does not match its SHA-256",
+    why="The file is truncated, was replaced by another build, or was tampered with: it is not the tested image.",
+    fix="Download the image again; if it was replaced on purpose, update `sha256`.",
     failing=Example(
         f"hardware: {{rocket: {{firmware: {{image: rocket.bin, revision: r28739, sha256: {_OTHER_HASH}}}}}}}",
         files={"rocket.bin": ROCKET_IMAGE},
@@ -83,8 +82,8 @@ def image_wrong_hash(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "MC803",
     Severity.ERROR,
     "A firmware image is damaged",
-    why="Its own checksum does not fit its contents: sysupgrade would refuse it, at best.",
-    mend="Fetch the image again.",
+    why="The image's checksum does not match its contents: at best, sysupgrade rejects it.",
+    fix="Download the image again.",
     failing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE.replace("image for", "damaged image for")}),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
@@ -95,10 +94,10 @@ def image_damaged(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC804",
     Severity.ERROR,
-    "A firmware image says nothing of its board",
-    why="""Without metadata sysupgrade refuses the image (ath79 requires it), and nothing tells whether it is for this
-    board. A factory image is the usual case: it is for the maker's own boot loader.""",
-    mend="Use the image with `sysupgrade` in its name.",
+    "A firmware image has no metadata",
+    why="""Without metadata sysupgrade rejects the image (ath79 requires it), and its board cannot be checked. The usual
+    cause is a factory image, which is for the manufacturer's boot loader.""",
+    fix="Use the image with `sysupgrade` in its name.",
     failing=Example(_IMAGE, files={"rocket.bin": "a factory image"}),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
@@ -110,8 +109,8 @@ def image_without_metadata(fleet: Fleet, context: LintContext) -> Iterator[Findi
     "MC805",
     Severity.ERROR,
     "A firmware image is for another board",
-    why="Forced onto the wrong board it leaves a device that only a serial cable revives.",
-    mend="Use the image of this profile, or mend the profile's `board` and `target`.",
+    why="Forced onto the wrong board, the image leaves a device that only a serial console can recover.",
+    fix="Use the image for this profile, or correct the profile's `board` and `target`.",
     failing=Example(_IMAGE, files={"rocket.bin": _BULLET}),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
@@ -122,10 +121,10 @@ def image_wrong_board(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC806",
     Severity.ERROR,
-    "A firmware image is of another release than the profile",
-    why="""The configuration is rendered for the profile's release: on another one, bridges, radios or the firewall come
-    up differently, or not at all.""",
-    mend="Set the profile's `release` to the image's.",
+    "A firmware image's release differs from the profile's",
+    why="""The configuration is rendered for the profile's release: on another release, bridges, radios or the firewall
+    come up differently or not at all.""",
+    fix="Set the profile's `release` to the image's.",
     failing=Example(_IMAGE.replace("r28739", "r24106"), files={"rocket.bin": _OLD}),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
@@ -136,10 +135,10 @@ def image_wrong_release(fleet: Fleet, context: LintContext) -> Iterator[Finding]
 @fleet_rule(
     "MC807",
     Severity.ERROR,
-    "A firmware image is of another revision than written down",
-    why="""After a flash a node must report this revision to count as done: with another in the image, every flash ends
-    as failed.""",
-    mend="Write the revision that the image carries.",
+    "A firmware image's revision differs from the profile's",
+    why="""After a flash the node must report this revision: with a different one in the image, every flash counts as
+    failed.""",
+    fix="Set `revision` to that of the image.",
     failing=Example(_IMAGE.replace("revision: r28739", "revision: r24106"), files={"rocket.bin": ROCKET_IMAGE}),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
@@ -150,10 +149,10 @@ def image_wrong_revision(fleet: Fleet, context: LintContext) -> Iterator[Finding
 @fleet_rule(
     "MC808",
     Severity.ERROR,
-    "A firmware image's signature does not hold",
-    why="""The profile names a key that must have signed the image, and it did not, or the signature or the key is
-    missing. OpenWrt itself does not check it.""",
-    mend="Put the release's sha256sums and sha256sums.sig (or the image's own .sig) beside the image.",
+    "A firmware image's signature is invalid or missing",
+    why="""The profile's `usign_key` must have signed the image, but the signature does not match, or the signature or
+    the key is missing. OpenWrt does not check it.""",
+    fix="Put the release's sha256sums and sha256sums.sig (or the image's own .sig) beside the image.",
     failing=Example(
         _IMAGE.replace("image: rocket.bin", "image: rocket.bin, usign_key: absent.pub"),
         files={"rocket.bin": ROCKET_IMAGE},
@@ -167,9 +166,9 @@ def image_signature(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC809",
     Severity.WARNING,
-    "A firmware image has no hash",
-    why="Any file of that name would be flashed, also half of one.",
-    mend="Write its SHA-256 down: `sha256sum IMAGE`.",
+    "A firmware image has no SHA-256",
+    why="Any file of that name would be flashed, even a truncated one.",
+    fix="Set `sha256` to the output of `sha256sum IMAGE`.",
     failing=Example(
         "hardware: {rocket: {firmware: {image: rocket.bin, revision: r28739}}}", files={"rocket.bin": ROCKET_IMAGE}
     ),
@@ -186,8 +185,8 @@ def image_without_hash(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     "MC810",
     Severity.ERROR,
     "A firmware image does not fit the flash",
-    why="sysupgrade writes it until the flash ends: the device does not boot again.",
-    mend="Use a smaller image, or mend the profile's `flash_mib`.",
+    why="sysupgrade writes until the flash is full: the device does not boot again.",
+    fix="Use a smaller image, or correct the profile's `flash_mib`.",
     failing=Example(
         _IMAGE.replace("rocket: {", "rocket: {flash_mib: 4, "), files={"rocket.bin": "4 MiB " + ROCKET_IMAGE}
     ),
@@ -207,10 +206,10 @@ def image_too_large(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC811",
     Severity.ERROR,
-    "A package file is missing, or of the wrong kind",
-    why="""opkg (up to 24.10) installs .ipk files, apk (from 25.12) .apk files; with the wrong one, or none, the back
+    "A package file is missing or of the wrong type",
+    why="""opkg (up to 24.10) installs .ipk files, apk (from 25.12) .apk files; with a wrong or missing file, the back
     end is not installed and the node comes up without a mesh.""",
-    mend="Bring the file, built for this release.",
+    fix="Add the package file built for this release.",
     failing=Example("hardware: {rocket: {package_files: [tool.apk]}}", files={"tool.apk": "a package"}),
     passing=Example("hardware: {rocket: {package_files: [tool.ipk]}}", files={"tool.ipk": "a package"}),
 )
@@ -219,7 +218,7 @@ def package_file_wrong(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         suffix = ".apk" if profile.release.package_tool is PackageTool.APK else ".ipk"
         for index, name in enumerate(names):
             if not name.endswith(suffix):
-                message = f"OpenWrt {profile.release} does not install it"
+                message = f"OpenWrt {profile.release} does not install this type"
                 yield Finding((*place, str(index)), message, f"a file with {suffix}", name)
             elif context.files.size_bytes(Path(base, name)) is None:
                 yield Finding((*place, str(index)), "no such file", "a package file", name)
@@ -239,10 +238,10 @@ def _package_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], str, tuple[s
 @fleet_rule(
     "MC812",
     Severity.WARNING,
-    "A firmware image has no revision, so it is never flashed",
-    why="""meshctl flashes a node whose revision differs from the one written down, and knows by it that the flash is
-    done. Without one the image is checked and never used: plan, apply and status say that all is well.""",
-    mend="Write the image's revision: `ubus call system board` of a node that runs it, release.revision.",
+    "A firmware image has no revision and is never flashed",
+    why="""meshctl flashes a node whose revision differs from `revision`, and checks it after the flash. Without
+    `revision` the image is never used, and plan, apply and status report no difference.""",
+    fix="Set `revision` to release.revision of `ubus call system board` on a node that runs the image.",
     failing=Example(_IMAGE.replace(", revision: r28739", ""), files={"rocket.bin": ROCKET_IMAGE}),
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )

@@ -1,4 +1,4 @@
-"""Hardware profiles and packages: what the boxes are, and what they need to be part of the mesh (MC821 to MC834)."""
+"""Hardware profiles, their packages and targets (MC821 to MC834)."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from pathlib import PurePath
 from meshctl import firmware
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import listed
-from meshctl.lint.openwrt_names import SUBTARGETS, TARGETS, chip_target, meant_package
+from meshctl.lint.grouping import join_limited
+from meshctl.lint.openwrt_names import SUBTARGETS, TARGETS, chip_target, suggest_package
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.encryption import packages_path
 from meshctl.lint.rules.firmware import ROCKET_IMAGE
-from meshctl.lint.rules.references import known
+from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet, Release
 from meshctl.resolve import package_needs
 
-# no security fixes any more (openwrt.org/docs/guide-developer/security)
+# no security fixes (openwrt.org/docs/guide-developer/security)
 _UNMAINTAINED = (Release.V19_07, Release.V21_02, Release.V22_03, Release.V23_05)
-# OpenWrt's own warning: 8/64 devices are the least that current releases run well on
-_LEAST_MEMORY_MIB = 64
-_LEAST_FLASH_MIB = 8
+# OpenWrt's 4/32 warning: 8 MiB flash and 64 MiB RAM are the minimum
+_MIN_MEMORY_MIB = 64
+_MIN_FLASH_MIB = 8
 
 
 @fleet_rule(
     "MC821",
     Severity.ERROR,
-    "A package that the mesh needs is taken out",
-    why="Nodes come up without the mesh's module or its tools: the image builds, flashes, boots, and never joins.",
-    mend="Take the `-` away from the package, or use another mesh back end.",
+    "A package that the mesh needs is removed",
+    why="The image builds, flashes and boots without the mesh's kernel module or tools, and the node never joins.",
+    fix="Remove the `-` from the package, or use another mesh back end.",
     failing="hardware: {rocket: {packages: [-kmod-batman-adv, iw, wpad-openssl]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, iw, wpad-openssl]}}",
 )
@@ -47,16 +47,16 @@ def needed_package_removed(fleet: Fleet, _context: LintContext) -> Iterator[Find
             if dropped.issuperset(need.any_of) or (need.any_of[0] in dropped and not set(named) & set(need.any_of)):
                 package = next(name for name in need.any_of if name in dropped)
                 path = packages_path(node, f"-{package}")
-                yield Finding(path, need.reason, f"one of {listed(need.any_of)}", f"-{package}")
+                yield Finding(path, need.reason, f"one of {join_limited(need.any_of)}", f"-{package}")
 
 
 @fleet_rule(
     "MC822",
     Severity.WARNING,
-    "A ready image may lack what the mesh needs",
-    why="""The profile names a finished image, and none of the packages that the mesh needs among those in it. Nodes
-    have no internet: what is not in the image is not on the node.""",
-    mend="List what the image holds in `packages`, or bring the rest as `package_files`.",
+    "A prebuilt image may lack required packages",
+    why="""The profile names a prebuilt image, but none of the packages that the mesh needs are listed. Nodes have no
+    internet access to install them.""",
+    fix="List the image's packages in `packages`, or add the missing ones as `package_files`.",
     failing=Example(
         """
         hardware:
@@ -86,15 +86,15 @@ def image_lacks_packages(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         for need in package_needs(fleet, node):
             if not named.intersection(need.any_of) and not any(file.startswith(need.any_of) for file in brought):
                 path = ("hardware", profile.name, "packages")
-                yield Finding(path, need.reason, f"one of {listed(need.any_of)}", "none of them")
+                yield Finding(path, need.reason, f"one of {join_limited(need.any_of)}", "none of them")
 
 
 @fleet_rule(
     "MC823",
     Severity.WARNING,
-    "batctl-tiny cannot tell the state of the mesh",
-    why="It has no JSON and no tables of loop avoidance: status would show the node without neighbours and routes.",
-    mend="Use batctl-default or batctl-full.",
+    "batctl-tiny cannot report the state of the mesh",
+    why="It has no JSON output and no loop avoidance tables: status would show no neighbors and no routes.",
+    fix="Use batctl-default or batctl-full.",
     failing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-tiny, iw, wpad-openssl]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-full, iw, wpad-openssl]}}",
 )
@@ -102,15 +102,15 @@ def batctl_tiny(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
         if "batctl-tiny" in (*node.hardware.packages, *node.packages):
             path = packages_path(node, "batctl-tiny")
-            yield Finding(path, "status is blind", "batctl-default or batctl-full", "batctl-tiny")
+            yield Finding(path, "status cannot read the mesh", "batctl-default or batctl-full", "batctl-tiny")
 
 
 @fleet_rule(
     "MC824",
     Severity.WARNING,
-    "A package is both wanted and taken out",
-    why="One of two people who edited the profile is wrong about what is on the node.",
-    mend="Keep one of the two lines.",
+    "A package is both added and removed",
+    why="The two entries contradict each other, and one of them is not what the node gets.",
+    fix="Keep one of the two entries.",
     failing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, tcpdump, -tcpdump]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, tcpdump]}}",
 )
@@ -119,16 +119,16 @@ def package_contradiction(fleet: Fleet, _context: LintContext) -> Iterator[Findi
         named = (*node.hardware.packages, *node.packages)
         for name in named:
             if name.startswith("-") and name[1:] in named:
-                yield Finding(packages_path(node, name), "also wanted", "one of the two", name)
+                yield Finding(packages_path(node, name), "also added", "one of the two", name)
 
 
 @fleet_rule(
     "MC825",
     Severity.WARNING,
     "Board and profile name different devices",
-    why="""The board is what the device calls itself, the profile what the ImageBuilder calls it: the same words with a
-    comma or an underscore. When they differ, one was copied from another profile, and the image will be refused.""",
-    mend="Read the board off the device: `ubus call system board`.",
+    why="""`board` is the device's own name, `profile` the ImageBuilder's: the same words with a comma or an underscore.
+    If they differ, one was probably copied from another profile, and the image will be rejected.""",
+    fix="Read the board from the device: `ubus call system board`.",
     failing="hardware: {rocket: {profile: ubnt_bullet-m-xw}}",
     passing="hardware: {rocket: {profile: ubnt_rocket-m}}",
 )
@@ -137,16 +137,16 @@ def board_and_profile_differ(fleet: Fleet, _context: LintContext) -> Iterator[Fi
         if profile.board.replace(",", "_") != profile.profile:
             path = ("hardware", profile.name, "profile")
             expected = f"{profile.board.replace(',', '_')} for board {profile.board}"
-            yield Finding(path, "not the board's", expected, profile.profile)
+            yield Finding(path, "does not match the board", expected, profile.profile)
 
 
 @fleet_rule(
     "MC826",
     Severity.ERROR,
-    "A target is not of OpenWrt's form",
-    why="""The ImageBuilder and the image's own metadata name targets as `ath79/generic`; anything else finds no builder
-    and fits no image.""",
-    mend="Read the target off the device: `ubus call system board`, release.target.",
+    "A target is malformed",
+    why="""The ImageBuilder and the image metadata use targets such as `ath79/generic`; anything else matches no builder
+    and no image.""",
+    fix="Read the target from the device: release.target of `ubus call system board`.",
     failing="hardware: {rocket: {target: ath79}}",
     passing="hardware: {rocket: {target: ath79/generic}}",
 )
@@ -154,15 +154,16 @@ def target_form(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for profile in fleet.hardware.values():
         if re.fullmatch(r"[a-z0-9_]+/[a-z0-9_]+", profile.target) is None:
             path = ("hardware", profile.name, "target")
-            yield Finding(path, "no target", "a target and a subtarget, such as ath79/generic", profile.target)
+            yield Finding(path, "malformed target", "a target and a subtarget, such as ath79/generic", profile.target)
 
 
 @fleet_rule(
     "MC827",
     Severity.NOTE,
     "The release is no longer maintained",
-    why="No security fixes: what is found in its kernel, dropbear or wpad stays open on every radio of the fleet.",
-    mend="Move to 24.10 or later when the fleet can be tested on it.",
+    why="""It gets no security fixes: vulnerabilities in its kernel, dropbear or wpad stay open on every radio of the
+    fleet.""",
+    fix="Upgrade to 24.10 or later when the fleet can be tested on it.",
     failing="""hardware: {rocket: {release: "22.03"}}""",
     passing="""hardware: {rocket: {release: "24.10"}}""",
 )
@@ -178,9 +179,9 @@ def release_unmaintained(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     "MC828",
     Severity.WARNING,
     "The device is too small for the release",
-    why="""Releases from 22.03 on run out of memory on 32 MiB, and do not fit into 4 MiB of flash with the mesh's
+    why="""Releases from 22.03 on run out of memory with 32 MiB, and do not fit into 4 MiB of flash with the mesh's
     packages: such nodes reboot under load.""",
-    mend="Use other hardware, or an older release for these.",
+    fix="Use other hardware, or an older release for these devices.",
     failing="hardware: {rocket: {memory_mib: 32}}",
     passing="hardware: {rocket: {memory_mib: 64}}",
 )
@@ -189,11 +190,11 @@ def device_too_small(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         if profile.release < Release.V22_03:
             continue
         sizes = (
-            ("memory_mib", profile.memory_mib, _LEAST_MEMORY_MIB),
-            ("flash_mib", profile.flash_mib, _LEAST_FLASH_MIB),
+            ("memory_mib", profile.memory_mib, _MIN_MEMORY_MIB),
+            ("flash_mib", profile.flash_mib, _MIN_FLASH_MIB),
         )
         for key, size, least in sizes:
-            # an image at hand is held against the flash by a rule of its own
+            # MC810 checks the size of an existing image
             image = firmware.image_path(profile) if key == "flash_mib" else None
             if size < least and (image is None or context.files.size_bytes(image) is None):
                 path = ("hardware", profile.name, key)
@@ -203,10 +204,10 @@ def device_too_small(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC829",
     Severity.WARNING,
-    "There is no recipe for recovery",
-    why="""It is printed before a device is flashed, and wanted when the flash went wrong: at night, without internet,
-    by whoever is there.""",
-    mend="Write in `recovery` how this device is brought back: which button, when, at which address.",
+    "A hardware profile has no recovery instructions",
+    why="""meshctl prints them before a device is flashed. They are needed when the flash fails, often without internet
+    access.""",
+    fix="Describe in `recovery` how to revive the device: which button, when, at which address.",
     failing="""hardware: {rocket: {recovery: ""}}""",
     passing="hardware: {rocket: {recovery: Hold reset at power-on for 8 s and send the image to 192.168.1.20 by TFTP}}",
 )
@@ -215,15 +216,15 @@ def no_recovery(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for profile in fleet.hardware.values():
         if profile.name in used and not profile.recovery.strip():
             path = ("hardware", profile.name)
-            yield Finding(path, "nobody will know how to bring it back", "`recovery`", "none")
+            yield Finding(path, "no recovery instructions", "`recovery`", "none")
 
 
 @fleet_rule(
     "MC830",
     Severity.ERROR,
     "A hardware profile has no radio",
-    why="A node without a radio is in no mesh. The section was forgotten.",
-    mend="Describe its radios by the names of their UCI sections, usually radio0.",
+    why="A node without a radio can join no mesh.",
+    fix="Describe its radios under the names of their UCI sections, usually radio0.",
     failing=Example(
         """
         hardware: {box: {board: "x,box", profile: x_box, target: ath79/generic, release: "24.10", lan_ports: [eth0],
@@ -242,17 +243,17 @@ def profile_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Findi
 @fleet_rule(
     "MC831",
     Severity.WARNING,
-    "A robot's switch hangs on another mesh than its computer",
-    why="""A node with radios in several networks bridges its wired ports with the one that holds its address. With the
-    address in one network and the robot's computer in another, the computer is on the wrong side: it hears nothing.""",
-    mend="Give the node an address in its computer's network.",
+    "A robot's switch is bridged to another mesh than its computer's",
+    why="""A node with radios in several networks bridges its wired ports to the network of its own address. A robot's
+    computer in another network receives nothing.""",
+    fix="Give the node an address in its computer's network.",
     failing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
                encryption: psk2+ccmp, key: {env: MESH_KEY}}
     nodes: {base: {address: 10.43.0.1, radios: {radio1: {mesh: second, tx_power_dbm: 20}}}}
     """,
-    # the address may well belong to the second radio: which one is radio0 is the board's choice
+    # the address may belong to the second radio: the board defines which one is radio0
     passing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
@@ -272,17 +273,17 @@ def switch_on_other_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         meant = next((mesh for mesh in meshes if computer in mesh.network), None)
         if meant is not None and computer not in holding.network:
             path = ("nodes", node.name, "address")
-            message = f"the switch of {robot.name} would hang on mesh {holding.name}, its computer is in {meant.name}"
+            message = f"{robot.name}: switch bridged to mesh {holding.name}, but the computer is in {meant.name}"
             yield Finding(path, message, f"an address in {meant.network}", str(node.address.ip))
 
 
 @fleet_rule(
     "MC832",
     Severity.WARNING,
-    "A package's name is misspelt",
-    why="""The ImageBuilder stops at a package that no feed has, and opkg finds none on the bench. Where the mesh
-    needs the package, meshctl adds the right name beside the wrong one.""",
-    mend="Correct the name.",
+    "A package name is misspelled",
+    why="""The ImageBuilder fails on an unknown package, and opkg does not find it. If the mesh needs the package,
+    meshctl adds the correct name next to the misspelled one.""",
+    fix="Correct the name.",
     failing="hardware: {rocket: {packages: [kmod-batman-adb, batctl-default, iw, wpad-openssl]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, my-own-tool]}}",
 )
@@ -292,19 +293,20 @@ def package_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         for written in (*node.hardware.packages, *node.packages):
             name = written.removeprefix("-")
             if name not in judged:
-                judged[name] = meant_package(name)
+                judged[name] = suggest_package(name)
             meant = judged[name]
             if meant is not None:
                 hint = f"did you mean {meant}?"
-                yield Finding(packages_path(node, written), "no package of this name is known", meant, name, hint)
+                yield Finding(packages_path(node, written), "unknown package", meant, name, hint)
 
 
 @fleet_rule(
     "MC833",
     Severity.WARNING,
-    "OpenWrt has no such target",
-    why="The ImageBuilder is fetched by its target, and an image's metadata names it: with a slip, neither fits.",
-    mend="Read the target off the device: `ubus call system board`, release.target.",
+    "The OpenWrt target is unknown",
+    why="""The ImageBuilder is selected by target, and the image metadata contains it: a misspelled target matches
+    neither.""",
+    fix="Read the target from the device: release.target of `ubus call system board`.",
     failing="hardware: {rocket: {target: ath97/generic}}",
     passing="hardware: {rocket: {target: ath79/generic}}",
 )
@@ -314,25 +316,25 @@ def target_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         path = ("hardware", profile.name, "target")
         if not slash:
             continue
-        # OpenWrt gets new ones with each release: only what is near to a known one is taken for a slip
+        # releases add targets: report only names similar to a known one
         if target not in TARGETS:
-            _, hint = known(TARGETS, target)
+            _, hint = suggest(TARGETS, target)
             if hint:
-                yield Finding(path, "no such target", "a target of OpenWrt", profile.target, hint)
+                yield Finding(path, "unknown target", "a target of OpenWrt", profile.target, hint)
         elif target in SUBTARGETS and subtarget not in SUBTARGETS[target]:
             near = get_close_matches(subtarget, sorted(SUBTARGETS[target]), 1)
             for meant in near:
                 expected = f"{target}/{meant}"
-                yield Finding(path, "no such subtarget", expected, profile.target, f"did you mean {expected}?")
+                yield Finding(path, "unknown subtarget", expected, profile.target, f"did you mean {expected}?")
 
 
 @fleet_rule(
     "MC834",
     Severity.WARNING,
-    "The target is of another chip than the radio",
-    why="""The radio's path says which chip it is part of. An image for another chip does not boot; forced onto the
-    board, it leaves a device that only a serial cable revives.""",
-    mend="Read both off the device: release.target of `ubus call system board`, `uci get wireless.radio0.path`.",
+    "The target does not match the radio's chip",
+    why="""The radio's path identifies its chip. An image for another chip does not boot; forced onto the board, it
+    leaves a device that only a serial console can recover.""",
+    fix="Read both from the device: release.target of `ubus call system board`, and `uci get wireless.radio0.path`.",
     failing="""
     hardware: {rocket: {target: ramips/mt7621, radios: {radio0: {path: platform/ahb/18100000.wmac}}}}
     """,

@@ -1,4 +1,4 @@
-"""What lint says about its own comments and baseline; the engine finds these itself (MC001 to MC004)."""
+"""Findings about suppressions and the baseline, reported by the engine itself (MC001 to MC004)."""
 
 from __future__ import annotations
 
@@ -8,22 +8,23 @@ from meshctl.lint.rule import engine_rule
 NO_REASON = engine_rule(
     "MC001",
     Severity.WARNING,
-    "A suppression gives no reason",
+    "A suppression has no reason",
     name="suppression-without-reason",
-    why="""Next year nobody knows whether the finding was weighed or only in the way. A suppression without a reason
-    suppresses nothing.""",
-    mend="Write why behind two hyphens: `# meshctl: ignore MC424 -- bench only, no radio is connected`.",
+    why="""Without a reason, later readers cannot tell whether the finding was considered or merely silenced. A
+    suppression without a reason has no effect.""",
+    fix="Add the reason after two hyphens: `# meshctl: ignore MC424 -- bench only, no radio is connected`.",
     failing="apply: {canary: true}  # meshctl: ignore MC614",
     passing="apply: {canary: false}  # meshctl: ignore MC614 -- every node of this fleet is on the bench",
 )
 
-USELESS = engine_rule(
+UNUSED = engine_rule(
     "MC002",
     Severity.WARNING,
-    "A suppression suppresses nothing",
+    "A suppression matches no finding",
     name="suppression-without-finding",
-    why="What it excused was mended, or moved to another line: left standing, it hides the next real finding there.",
-    mend="Remove the comment.",
+    why="""The finding was fixed or has moved to another line. If the comment stays, it hides the next finding on that
+    line.""",
+    fix="Remove the comment.",
     failing="apply: {canary: true}  # meshctl: ignore MC614 -- every node of this fleet is on the bench",
     passing="apply: {canary: true}",
 )
@@ -31,11 +32,10 @@ USELESS = engine_rule(
 UNKNOWN_CODE = engine_rule(
     "MC003",
     Severity.WARNING,
-    "A suppression names no rule",
+    "A suppression names an unknown rule",
     name="suppression-of-unknown-rule",
-    why="""A code with a slip of the pen suppresses nothing, and its author believes otherwise. The loader's own
-    findings (INV...) cannot be suppressed.""",
-    mend="Write the code as the report shows it, such as MC424; `meshctl lint --list` shows all.",
+    why="A mistyped code suppresses nothing. The loader's own findings (INV...) cannot be suppressed.",
+    fix="Use the code from the report, such as MC424; `meshctl lint --list` lists all codes.",
     failing="apply: {canary: true}  # meshctl: ignore MC999 -- every node of this fleet is on the bench",
     passing="apply: {canary: true}",
 )
@@ -43,10 +43,10 @@ UNKNOWN_CODE = engine_rule(
 STALE_BASELINE = engine_rule(
     "MC004",
     Severity.NOTE,
-    "The baseline holds a finding that is no longer found",
+    "The baseline contains a finding that no longer occurs",
     name="stale-baseline",
-    why="It was mended. Left in the baseline, it would let the same fault come back unseen.",
-    mend="Write the baseline anew: `meshctl lint --baseline FILE --write-baseline`.",
+    why="The finding was fixed. If it stays in the baseline, the same fault can return unreported.",
+    fix="Rewrite the baseline: `meshctl lint --baseline FILE --write-baseline`.",
     failing="apply: {canary: true}",
     passing="apply: {canary: false}",
 )

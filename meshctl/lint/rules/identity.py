@@ -1,4 +1,4 @@
-"""Names and marks that must tell nodes apart: hostnames, MACs, host keys, labels, serials (MC110 to MC121)."""
+"""Unique identifiers of nodes: hostnames, MAC addresses, host keys, labels, serial numbers (MC110 to MC121)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from meshctl.device.trust import Pin, parse_pins
 from meshctl.diagnostics import Severity
 from meshctl.errors import InputError
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import listed, repeated
+from meshctl.lint.grouping import duplicates, join_limited
 from meshctl.lint.places import is_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Fleet, Node, NodeState
@@ -22,17 +22,16 @@ _MAC = re.compile(r"[0-9a-f]{2}(:[0-9a-f]{2}){5}")
 
 
 def normal_mac(mac: str) -> str:
-    """Lower case with colons."""
+    """In lower case, with colons."""
     return mac.strip().lower().replace("-", ":")
 
 
 def _collisions(fleet: Fleet, marks: Iterable[tuple[str, tuple[str, ...]]], what: str) -> Iterator[Finding]:
-    """One finding for every node but one that has a mark of another. A mark stands at a path that begins with the node.
+    """One finding for each node with the mark of another, except one. `marks` are pairs of a mark and its path.
 
-    The one without a finding is the first whose mark is not written (a host name that is the node's own name), or
-    else the first of all.
+    The exempt node is the first whose mark is a default (a hostname that is the node's name), else the first.
     """
-    for mark, paths in repeated(marks):
+    for mark, paths in duplicates(marks):
         by_node: dict[str, tuple[str, ...]] = {}
         for path in paths:
             by_node.setdefault(path[1], path)
@@ -41,15 +40,15 @@ def _collisions(fleet: Fleet, marks: Iterable[tuple[str, tuple[str, ...]]], what
         )
         for path in by_node.values():
             if path != innocent:
-                yield Finding(path, f"{innocent[1]} has the same {what}", f"a {what} of its own", mark)
+                yield Finding(path, f"{innocent[1]} has the same {what}", f"a unique {what}", mark)
 
 
 @fleet_rule(
     "MC110",
     Severity.ERROR,
     "Two nodes have the same hostname",
-    why="Logs, prompts and `batctl` name nodes by hostname: the operator restarts the wrong one.",
-    mend="Give each node a hostname of its own, or leave it out: the node's name serves.",
+    why="Logs, prompts and `batctl` identify nodes by hostname: with duplicates, the operator acts on the wrong node.",
+    fix="Give each node a unique hostname, or omit it: it defaults to the node's name.",
     failing="nodes: {b01: {hostname: base}}",
     passing="nodes: {b01: {hostname: beacon-1}}",
 )
@@ -61,10 +60,10 @@ def hostname_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC111",
     Severity.ERROR,
-    "A hostname is not valid",
-    why="""OpenWrt hands the name to the kernel and to syslog; one with an underscore, a dot or an umlaut is refused
-    there, cut, or not found by any resolver (RFC 1123).""",
-    mend="Use letters, digits and inner hyphens, at most 63 of them.",
+    "A hostname is invalid",
+    why="""The hostname goes to the kernel and to syslog. A name with an underscore, a dot or a non-ASCII letter is
+    rejected, truncated or not resolvable (RFC 1123).""",
+    fix="Use at most 63 letters, digits and inner hyphens.",
     failing="nodes: {b01: {hostname: beacon_1}}",
     passing="nodes: {b01: {hostname: beacon-1}}",
 )
@@ -72,32 +71,32 @@ def hostname_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.nodes.values():
         if _LABEL.fullmatch(node.hostname) is None:
             path = ("nodes", node.name, "hostname")
-            yield Finding(path, "not a hostname", "letters, digits and inner hyphens, at most 63", node.hostname)
+            yield Finding(path, "invalid hostname", "letters, digits and inner hyphens, at most 63", node.hostname)
 
 
 @fleet_rule(
     "MC112",
     Severity.WARNING,
-    "Names differ in nothing but capitals",
-    why="Hostnames, known_hosts and file systems of laptops treat `B01` and `b01` as one.",
-    mend="Rename one of them.",
+    "Names differ only in case",
+    why="Hostnames, known_hosts and case-insensitive file systems treat `B01` and `b01` as the same name.",
+    fix="Rename one of them.",
     failing="nodes: {B01: {address: 10.42.0.99, hostname: other, role: beacon}}",
     passing="nodes: {b99: {address: 10.42.0.99, hostname: other, role: beacon}}",
 )
 def names_by_case(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for section, every in (("nodes", fleet.nodes), ("robots", fleet.robots), ("meshes", fleet.meshes)):
-        for lowered, names in repeated((name.lower(), name) for name in every):
+        for lowered, names in duplicates((name.lower(), name) for name in every):
             for name in names[1:]:
-                yield Finding((section, name), f"differs from {names[0]} in capitals only", "another name", lowered)
+                yield Finding((section, name), f"differs from {names[0]} only in case", "another name", lowered)
 
 
 @fleet_rule(
     "MC113",
     Severity.ERROR,
     "Two nodes have the same MAC address",
-    why="""The MAC is how bootstrap knows one factory device from another and how status joins what radios hear to
-    names; two alike in one cell also break the mesh itself.""",
-    mend="Read the MAC off the device's label.",
+    why="""Bootstrap identifies factory-fresh devices by MAC address, and status maps observed MAC addresses to names.
+    Two equal MAC addresses in one cell also break the mesh.""",
+    fix="Read the MAC address from the device's label.",
     failing="""
     nodes:
       base: {mac: "00:15:6d:aa:00:01"}
@@ -114,7 +113,7 @@ def mac_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 
 
 def _macs(fleet: Fleet) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Every MAC with its place; a device's own and its radio's may be one and the same."""
+    """Every MAC address with its path; a device and its radio may have the same one."""
     for node in fleet.nodes.values():
         if node.mac:
             yield normal_mac(node.mac), ("nodes", node.name, "mac")
@@ -126,10 +125,10 @@ def _macs(fleet: Fleet) -> Iterator[tuple[str, tuple[str, ...]]]:
 @fleet_rule(
     "MC114",
     Severity.ERROR,
-    "A MAC address is no device's",
-    why="""A group address (an odd first byte), zero, or text that is no MAC never matches a real device, so bootstrap
-    would refuse the right one.""",
-    mend="Read the MAC off the device's label.",
+    "A MAC address is not a unicast address",
+    why="""A group address (odd first octet), zero or malformed text never matches a real device, so bootstrap would
+    refuse the right one.""",
+    fix="Read the MAC address from the device's label.",
     failing="""nodes: {b01: {mac: "01:15:6d:aa:00:01"}}""",
     passing="""nodes: {b01: {mac: "00:15:6d:aa:00:01"}}""",
 )
@@ -139,7 +138,7 @@ def mac_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         places += [(("nodes", node.name, "radios", radio.name, "mac"), radio.mac) for radio in node.radios]
         for path, mac in places:
             if mac and not is_device_mac(mac):
-                yield Finding(path, "not a device's MAC address", "a unicast MAC such as 00:15:6d:12:34:56", mac)
+                yield Finding(path, "not a unicast MAC address", "a unicast MAC such as 00:15:6d:12:34:56", mac)
 
 
 def is_device_mac(mac: str) -> bool:
@@ -153,10 +152,10 @@ def is_device_mac(mac: str) -> bool:
 @fleet_rule(
     "MC115",
     Severity.ERROR,
-    "Two nodes are pinned to the same SSH host key",
-    why="""Either one line was copied, and the other node will be refused, or both run an image with a key baked in, and
-    each can pass for the other.""",
-    mend="Run `meshctl trust NODE` for each; make new host keys where an image brought its own.",
+    "Two nodes have the same pinned SSH host key",
+    why="""Either a line was copied, and the other node will be refused, or both run an image with a built-in key, and
+    each can impersonate the other.""",
+    fix="Run `meshctl trust NODE` for each; generate new host keys if the image contains one.",
     failing="""
     nodes:
       base: {host_keys: ["ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f"]}
@@ -168,19 +167,19 @@ def is_device_mac(mac: str) -> bool:
     """,
 )
 def host_key_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    # a key may stand both in the inventory and in known_hosts: each node counts once
-    for key, nodes in repeated(dict.fromkeys(_host_keys(fleet, context))):
+    # a key may be in both the inventory and known_hosts: count each node once
+    for key, nodes in duplicates(dict.fromkeys(_host_keys(fleet, context))):
         first, *later = nodes
         for name in later:
             found = f"{key[:24]}...{key[-8:]}"
             pinned = [" ".join(text.split()[:2]) for text in fleet.nodes[name].host_keys]
             element = (str(pinned.index(key)),) if key in pinned else ()
             path = ("nodes", name, "host_keys", *element)
-            yield Finding(path, f"{first} has the same host key", "a key of its own", found)
+            yield Finding(path, f"{first} has the same host key", "a unique host key", found)
 
 
 def _host_keys(fleet: Fleet, context: LintContext) -> Iterator[tuple[str, str]]:
-    """Every pinned key as `TYPE BASE64`, with the node it is pinned for."""
+    """Every pinned key as `TYPE BASE64`, with its node."""
     for node in fleet.nodes.values():
         for key in node.host_keys:
             yield " ".join(key.split()[:2]), node.name
@@ -193,10 +192,9 @@ def _host_keys(fleet: Fleet, context: LintContext) -> Iterator[tuple[str, str]]:
 @fleet_rule(
     "MC116",
     Severity.ERROR,
-    "Two nodes wear the same label",
-    why="""The label is what a person reads off the box in the rack: with two alike, the wrong beacon is dropped,
-    flashed or written off.""",
-    mend="Print labels that differ.",
+    "Two nodes have the same label",
+    why="People identify boxes by their label: with duplicates, the wrong beacon is deployed, flashed or written off.",
+    fix="Give each node a unique label.",
     failing="nodes: {base: {label: B1}, b01: {label: B1}}",
     passing="nodes: {base: {label: BASE}, b01: {label: B1}}",
 )
@@ -209,8 +207,8 @@ def label_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC117",
     Severity.ERROR,
     "Two nodes have the same serial number",
-    why="One device cannot be two nodes; `replace` would take the wrong one out of the box.",
-    mend="Read the serial number off the device.",
+    why="One device cannot be two nodes; `replace` would pick the wrong one.",
+    fix="Read the serial number from the device.",
     failing="nodes: {base: {serial: A1}, b01: {serial: A1}}",
     passing="nodes: {base: {serial: A1}, b01: {serial: A2}}",
 )
@@ -222,10 +220,10 @@ def serial_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC118",
     Severity.NOTE,
-    "Deployed nodes have no physical identity",
-    why="""On the bench all devices answer at 192.168.1.1. Only a MAC or a serial number keeps bootstrap and `replace`
-    from writing one node's identity onto another box.""",
-    mend="Write down `mac` or `serial` from the sticker.",
+    "Deployed nodes have neither MAC address nor serial number",
+    why="""All factory-fresh devices answer at 192.168.1.1. Only a MAC address or a serial number prevents bootstrap and
+    `replace` from writing a node's identity to the wrong box.""",
+    fix="Add `mac` or `serial` from the device's label.",
     failing="nodes: {base: {mac: <removed>}}",
     passing="""nodes: {base: {serial: "UB-1234"}}""",
 )
@@ -237,7 +235,10 @@ def no_physical_identity(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     ]
     if bare:
         yield Finding(
-            ("nodes", bare[0]), "nothing ties them to a device", "`mac` or `serial`", f"neither for {listed(bare)}"
+            ("nodes", bare[0]),
+            "nodes cannot be matched to devices",
+            "`mac` or `serial`",
+            f"neither for {join_limited(bare)}",
         )
 
 
@@ -249,8 +250,9 @@ def _deployed(fleet: Fleet) -> Iterator[Node]:
     "MC119",
     Severity.NOTE,
     "Host keys of deployed nodes are not pinned",
-    why="Whoever answers first at the address is believed. meshctl refuses to change a node it cannot recognise.",
-    mend="Run `meshctl trust NODE` once, on the bench, where nobody can stand between.",
+    why="""Without a pinned key, any device at the address is accepted, and meshctl refuses to change a node that it
+    cannot authenticate.""",
+    fix="Run `meshctl trust NODE` once, over a trusted connection such as a cable on the bench.",
     failing="nodes: {base: {host_keys: <removed>}}",
     passing=Example(
         "nodes: {base: {host_keys: <removed>}}",
@@ -261,12 +263,12 @@ def host_key_not_pinned(fleet: Fleet, context: LintContext) -> Iterator[Finding]
     pinned = _pinned_names(fleet, context)
     strangers = [node.name for node in _deployed(fleet) if not node.host_keys and node.name not in pinned]
     if strangers and _HASHED not in pinned:
-        found = f"none for {listed(strangers)}"
+        found = f"none for {join_limited(strangers)}"
         expected = f"`host_keys`, or lines in {fleet.operators.known_hosts}"
-        yield Finding(("nodes", strangers[0]), "any device is believed", expected, found)
+        yield Finding(("nodes", strangers[0]), "host keys cannot be verified", expected, found)
 
 
-# stands for names that known_hosts holds as hashes only: any node may be among them
+# prefix of hashed names in known_hosts: any node may be among them
 _HASHED = "|1|"
 
 
@@ -279,7 +281,7 @@ def _pinned_names(fleet: Fleet, context: LintContext) -> set[str]:
 
 
 def _pins(fleet: Fleet, context: LintContext) -> tuple[Pin, ...] | None:
-    """The lines of the fleet's known_hosts, None when it cannot be read (a rule of its own says why)."""
+    """The lines of the fleet's known_hosts; None if it is invalid, which MC431 reports."""
     try:
         return parse_pins(context.files.text(known_hosts_path(fleet)) or "")
     except InputError:
@@ -287,16 +289,16 @@ def _pins(fleet: Fleet, context: LintContext) -> tuple[Pin, ...] | None:
 
 
 def known_hosts_path(fleet: Fleet) -> Path:
-    """Where the fleet's pinned host keys are: beside the inventory, unless the path is absolute."""
+    """The file of pinned host keys; a relative path starts at the inventory."""
     return Path(fleet.base or ".", os.path.expanduser(fleet.operators.known_hosts))
 
 
 @fleet_rule(
     "MC120",
     Severity.WARNING,
-    "A robot and a node share a name, and the node is not the robot's",
-    why="Commands take robots and nodes by name: `meshctl run husky1` would reach a radio that rides elsewhere.",
-    mend="Rename one of them, or put the node on the robot.",
+    "A robot and an unrelated node share a name",
+    why="Commands accept robots and nodes by name: `meshctl run husky1` would reach a radio on another robot.",
+    fix="Rename one of them, or assign the node to the robot.",
     failing="""
     nodes: {husky1: {role: beacon, address: 10.42.0.99}}
     """,
@@ -307,15 +309,15 @@ def known_hosts_path(fleet: Fleet) -> Path:
 def robot_and_node_share_name(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for name, robot in fleet.robots.items():
         if name in fleet.nodes and name not in robot.nodes:
-            yield Finding(("robots", name), "a node that is not this robot's has the same name", "another name", name)
+            yield Finding(("robots", name), "an unrelated node has the same name", "another name", name)
 
 
 @fleet_rule(
     "MC121",
     Severity.ERROR,
-    "A robot's name cannot be a peer's name",
-    why="udp_mesh knows peers by the robot's name, at most 63 bytes on the wire, and ROS topics are named after it.",
-    mend="Use letters, digits, hyphens and underscores, a letter first.",
+    "A robot's name is not a valid peer name",
+    why="udp_mesh identifies peers by the robot's name (at most 63 bytes on the wire), and ROS topic names contain it.",
+    fix="Use letters, digits, hyphens and underscores, starting with a letter.",
     failing="""
     nodes: {h2: {role: robot, address: 10.42.0.12}}
     robots: {2nd-husky: {nodes: [h2]}}
@@ -329,5 +331,5 @@ def robot_name_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     for name in fleet.robots:
         if re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]{0,62}", name) is None:
             yield Finding(
-                ("robots", name), "not a peer's name", "a letter, then letters, digits, - and _, at most 63", name
+                ("robots", name), "not a valid peer name", "a letter, then letters, digits, - and _, at most 63", name
             )

@@ -1,7 +1,7 @@
-"""Fleets in which some robots still run the fielded transport (MC751 to MC754).
+"""Fleets in which some robots still run the legacy transport, `fielded` in the inventory (MC751 to MC754).
 
-Every robot with a daemon gets a neighbour entry for each of them when its configuration is rendered; what is left to go
-wrong is that they cannot hear each other.
+The rendered daemon configuration lists every legacy robot as a neighbor; these rules check that they can reach each
+other.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Robot
 
-# what the fielded program uses unless somebody changed its source
-_FIELDED_PORT = 8700
+# the port in the source of the legacy program
+_LEGACY_PORT = 8700
 
 
-def _fielded(fleet: Fleet) -> Iterator[Robot]:
+def _legacy_robots(fleet: Fleet) -> Iterator[Robot]:
     return (robot for robot in fleet.robots.values() if robot.fielded is not None)
 
 
 @fleet_rule(
     "MC751",
     Severity.ERROR,
-    "A fielded robot cannot be heard without broadcasts",
-    why="""Robots with the fielded program announce themselves by broadcast, and nothing is sent to one that was not
-    heard: with `broadcast: false` no daemon ever talks to it.""",
-    mend="Leave `broadcast` on until the last robot has moved over.",
+    "A legacy robot cannot be discovered without broadcasts",
+    why="""Robots with the legacy udp_mesh announce themselves by broadcast, and nothing is sent to a robot that was not
+    heard: with `broadcast: false` no daemon ever contacts it.""",
+    fix="Keep `broadcast` on until the last robot is migrated.",
     failing="""
     udp_mesh: {broadcast: false}
     robots: {husky1: {computer: <removed>, fielded: 10.42.0.110}}
@@ -36,17 +36,17 @@ def _fielded(fleet: Fleet) -> Iterator[Robot]:
 )
 def fielded_without_broadcast(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     if not fleet.udp_mesh.broadcast:
-        for robot in _fielded(fleet):
-            yield Finding(("udp_mesh", "broadcast"), f"{robot.name} is never heard", "true", "false")
+        for robot in _legacy_robots(fleet):
+            yield Finding(("udp_mesh", "broadcast"), f"{robot.name} is never discovered", "true", "false")
 
 
 @fleet_rule(
     "MC752",
     Severity.WARNING,
-    "The fielded robots use another port",
-    why="""Both programs hear and are heard on one port. The fielded one's is 8700 unless somebody changed it; on
-    another port the daemons and it do not notice each other.""",
-    mend="Use port 8700, or suppress this with the reason that the fielded robots were given the same port.",
+    "The legacy robots use another port",
+    why="""Both programs send and receive on one port. The legacy udp_mesh uses 8700 unless its source was changed; on
+    another port the daemons and the legacy robots do not see each other.""",
+    fix="Use port 8700, or suppress this finding if the legacy robots were changed to the same port.",
     failing="""
     udp_mesh: {port: 8701}
     robots: {husky1: {computer: <removed>, fielded: 10.42.0.110}}
@@ -58,24 +58,24 @@ def fielded_without_broadcast(fleet: Fleet, _context: LintContext) -> Iterator[F
 )
 def fielded_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     port = fleet.udp_mesh.port
-    for robot in _fielded(fleet):
-        if port != _FIELDED_PORT:
-            yield Finding(("udp_mesh", "port"), f"{robot.name} is not there", str(_FIELDED_PORT), str(port))
+    for robot in _legacy_robots(fleet):
+        if port != _LEGACY_PORT:
+            yield Finding(("udp_mesh", "port"), f"{robot.name} is not reachable", str(_LEGACY_PORT), str(port))
             return
 
 
 @fleet_rule(
     "MC753",
     Severity.WARNING,
-    "A robot is fielded and has moved over",
-    why="""With `computer` it gets a daemon of ours, which the others find. What is left of `fielded` has every robot go
-    on covering its broadcasts for a program that is not there, and nobody can tell whether the fleet has moved.""",
-    mend="Take `fielded` out when the robot gets a `computer`, and deploy to all robots.",
+    "A robot is both legacy and migrated",
+    why="""With `computer` the robot gets a udp_mesh daemon, which the others discover. A leftover `fielded` makes every
+    robot keep its broadcasts compatible with a program that is gone, and hides whether the fleet is migrated.""",
+    fix="Remove `fielded` when the robot gets a `computer`, and deploy to all robots.",
     failing="robots: {husky1: {fielded: 10.42.0.110}}",
     passing="robots: {husky1: {computer: <removed>, fielded: 10.42.0.110}}",
 )
 def fielded_and_moved(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for robot in _fielded(fleet):
+    for robot in _legacy_robots(fleet):
         if robot.computer is not None:
             path = ("robots", robot.name, "fielded")
             yield Finding(path, "", "either `fielded` or `computer`", "both")
@@ -84,16 +84,18 @@ def fielded_and_moved(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC754",
     Severity.ERROR,
-    "A fielded robot is in another network than a computer",
-    why="Broadcasts, by which the fielded program is found, end at the network's border.",
-    mend="Write the address that the robot has in the mesh's network.",
+    "A legacy robot is in a different network than a computer",
+    why="Legacy robots are discovered by broadcast, which does not leave the network.",
+    fix="Use the robot's address in the mesh's network.",
     failing="robots: {husky1: {computer: <removed>, fielded: 10.99.0.110}}",
     passing="robots: {husky1: {computer: <removed>, fielded: 10.42.0.110}}",
 )
 def fielded_elsewhere(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     networks = {robot.computer.address.network for robot in fleet.robots.values() if robot.computer is not None}
-    for robot in _fielded(fleet):
+    for robot in _legacy_robots(fleet):
         apart = sorted(str(network) for network in networks if robot.fielded not in network)
         if apart:
             path = ("robots", robot.name, "fielded")
-            yield Finding(path, "no broadcast reaches it", f"an address in {' and '.join(apart)}", str(robot.fielded))
+            yield Finding(
+                path, "broadcasts do not reach it", f"an address in {' and '.join(apart)}", str(robot.fielded)
+            )

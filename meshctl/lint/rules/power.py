@@ -1,4 +1,4 @@
-"""Transmit power: what the box can, what the country allows, whether neighbours can answer (MC341 to MC350)."""
+"""Transmit power: hardware limits, regulatory limits, asymmetric links (MC341 to MC350)."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped
+from meshctl.lint.grouping import group_by_key
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import AntennaKind, Fleet, Mesh, Node, Radio
-from meshctl.regdb import CHANNELS, judge, primary
+from meshctl.regdb import CHANNELS, check_span, primary
 
 # 47 CFR 15.247(b)(3), (b)(4), and the same in RSS-247 5.4(d): digital modulation at 2400-2483.5 and 5725-5850 MHz
 _CONDUCTED_LIMIT_DBM = 30.0
 _FREE_GAIN_DBI = 6.0
 _CONDUCTED_COUNTRIES = frozenset({"US", "AS", "CA", "GU", "MP", "PR", "VI"})
 _CONDUCTED_BANDS_MHZ = ((2400.0, 2483.5), (5725.0, 5850.0))
-# levels are whole dBm and databases round to tenths of a mW
+# drive levels are whole dBm, and the database rounds to tenths of a mW
 _ROUNDING_DB = 0.05
-# a link whose ends differ by more than this loses its acknowledgements long before its data
+# beyond this difference a link loses acknowledgements long before data
 _ASYMMETRY_DB = 10.0
-# boxes are sold by the class above what their drivers offer: "1 W" often means 28 dBm
+# ratings are often rounded up: "1 W" can mean 28 dBm
 _CLASS_TOLERANCE_DB = 3.0
-# 46 dBm are 40 W: no radio of a robot; 500 or 1000 are milliwatts
-_LARGEST_RATED_DBM = 40.0
+# 40 dBm is 10 W, more than any robot radio; 500 or 1000 are milliwatts
+_MAX_RATED_DBM = 40.0
 
 
 def _dbm(value: float) -> str:
@@ -61,7 +61,7 @@ def _has_conducted_limit(fleet: Fleet, mesh: Mesh) -> bool:
 
 
 def _at(fleet: Fleet, node: Node, radio: Radio) -> tuple[str, ...]:
-    """Where the drive level comes from: the node's layers, or else the most that the driver offers."""
+    """The path that sets the drive level: the node's layers, or else the driver's maximum."""
     written = ("nodes", node.name, "radios", radio.name, "tx_power_dbm")
     return first_written(fleet, written, ("hardware", node.hardware.name, "radios", radio.name, "max_drive_dbm"))
 
@@ -69,10 +69,11 @@ def _at(fleet: Fleet, node: Node, radio: Radio) -> tuple[str, ...]:
 @fleet_rule(
     "MC341",
     Severity.ERROR,
-    "The radiated power is above the country's limit",
-    why="""The limit counts what leaves the antenna: drive level, amplifier, less the cable, plus the antenna's gain.
-    The kernel clamps only what it knows, the drive level, so an amplifier or a large antenna breaks the law unseen.""",
-    mend="Lower `tx_power_dbm` by what the sum is too high.",
+    "The radiated power exceeds the country's limit",
+    why="""The limit applies to the radiated power: drive level plus amplifier gain, minus cable loss, plus antenna
+    gain. The kernel limits only the drive level, so an amplifier or a high-gain antenna can exceed the limit
+    unnoticed.""",
+    fix="Lower `tx_power_dbm` by the excess.",
     failing="country: DE",
     passing="""
     country: DE
@@ -84,7 +85,7 @@ def eirp_above_country(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     if country is None:
         return
     limits = {
-        mesh.name: judge(country, primary(mesh.band, mesh.channel))
+        mesh.name: check_span(country, primary(mesh.band, mesh.channel))
         for mesh in fleet.meshes.values()
         if mesh.channel in CHANNELS[mesh.band] and not _has_conducted_limit(fleet, mesh)
     }
@@ -97,16 +98,17 @@ def eirp_above_country(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         )
         excess = radio.eirp_dbm - verdict.max_eirp_dbm
         expected = f"at most {_dbm(verdict.max_eirp_dbm)} dBm EIRP (country {country.alpha2}, channel {mesh.channel})"
-        yield Finding(_at(fleet, node, radio), f"{_dbm(round(excess, 2))} dB too much", expected, total)
+        yield Finding(_at(fleet, node, radio), f"{_dbm(round(excess, 2))} dB above the limit", expected, total)
 
 
 @fleet_rule(
     "MC342",
     Severity.ERROR,
-    "The conducted power is above the FCC's limit",
-    why="""At 2.4 and 5.8 GHz 47 CFR 15.247 allows 1 W (30 dBm) into the antenna, and 1 dB less for each dBi of antenna
-    gain above 6; so 2 W hardware may not be driven to its rating, and 1 W hardware not with a large sector antenna.""",
-    mend="Lower `tx_power_dbm` by what the sum is too high, or use an antenna of less gain.",
+    "The conducted power exceeds the FCC limit",
+    why="""At 2.4 and 5.8 GHz, 47 CFR 15.247 allows 1 W (30 dBm) into the antenna, reduced by 1 dB for each dBi of
+    antenna gain above 6. 2 W hardware must not be driven to its rating, nor 1 W hardware with a large sector
+    antenna.""",
+    fix="Lower `tx_power_dbm` by the excess, or use an antenna with less gain.",
     failing="""
     hardware: {rocket: {radios: {radio0: {rated_power_dbm: 33, amplifier_gain_db: 6, max_drive_dbm: 27}}}}
     defaults: {radios: {radio0: {tx_power_dbm: 27}}}
@@ -128,7 +130,7 @@ def conducted_above_fcc(fleet: Fleet, _context: LintContext) -> Iterator[Finding
         less = f": 30 less {_dbm(excess_gain)} for an antenna of {_dbm(gain)} dBi" if excess_gain else ""
         allowed = f"at most {_dbm(limit)} dBm conducted (country {fleet.country}{less})"
         total = f"{power_sum(radio)} = {_dbm(radio.conducted_dbm)} dBm"
-        yield Finding(_at(fleet, node, radio), f"{_dbm(round(excess, 2))} dB too much", allowed, total)
+        yield Finding(_at(fleet, node, radio), f"{_dbm(round(excess, 2))} dB above the limit", allowed, total)
 
 
 def _is_limited(fleet: Fleet, mesh: Mesh) -> bool:
@@ -138,9 +140,9 @@ def _is_limited(fleet: Fleet, mesh: Mesh) -> bool:
 @fleet_rule(
     "MC343",
     Severity.ERROR,
-    "The drive level is above what the driver offers",
-    why="The driver takes its own highest level and says nothing: the link budget on paper is not the one on the air.",
-    mend="Lower `tx_power_dbm` to the profile's `max_drive_dbm`.",
+    "The drive level exceeds the driver's maximum",
+    why="The driver silently uses its own maximum: the actual link budget is lower than planned.",
+    fix="Lower `tx_power_dbm` to the profile's `max_drive_dbm`.",
     failing="nodes: {b01: {radios: {radio0: {tx_power_dbm: 29}}}}",
     passing="nodes: {b01: {radios: {radio0: {tx_power_dbm: 25}}}}",
 )
@@ -148,16 +150,16 @@ def drive_above_driver(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     for node, radio, _ in _transmitting(fleet):
         if radio.tx_power_dbm > radio.hardware.max_drive_dbm:
             expected = f"at most {radio.hardware.max_drive_dbm} (hardware {node.hardware.name})"
-            yield Finding(_at(fleet, node, radio), "the driver offers less", expected, str(radio.tx_power_dbm))
+            yield Finding(_at(fleet, node, radio), "above the driver's maximum", expected, str(radio.tx_power_dbm))
 
 
 @fleet_rule(
     "MC344",
     Severity.WARNING,
     "The amplifier is driven beyond its rating",
-    why="""An amplifier past its rating distorts: high rates fail first, neighbouring channels are disturbed, and it may
-    not live long. A 2 W stage behind a full 1 W drive is the usual case.""",
-    mend="Lower `tx_power_dbm` until drive and amplifier together reach the rating.",
+    why="""An overdriven amplifier distorts: high rates fail first, adjacent channels are disturbed, and it may fail
+    early. A 2 W amplifier behind a full 1 W drive level is the usual case.""",
+    fix="Lower `tx_power_dbm` until drive level plus amplifier gain is within the rating.",
     failing="""
     hardware: {rocket: {radios: {radio0: {rated_power_dbm: 30, amplifier_gain_db: 10}}}}
     defaults: {radios: {radio0: {tx_power_dbm: 24}}}
@@ -174,16 +176,16 @@ def amplifier_overdriven(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         if radio.tx_power_dbm <= hardware.max_drive_dbm and driven > hardware.rated_power_dbm + _ROUNDING_DB:
             found = f"{radio.tx_power_dbm} drive + {_dbm(hardware.amplifier_gain_db)} amplifier = {_dbm(driven)} dBm"
             expected = f"at most {_dbm(hardware.rated_power_dbm)} dBm (hardware {node.hardware.name})"
-            yield Finding(_at(fleet, node, radio), "more than the box is rated for", expected, found)
+            yield Finding(_at(fleet, node, radio), "above the hardware's rating", expected, found)
 
 
 @fleet_rule(
     "MC345",
     Severity.WARNING,
     "The hardware cannot reach its rated power",
-    why="""The profile promises a class (1 W, 2 W) that its own numbers do not add up to: either the amplifier is
-    missing from the profile, and every sum above is too low, or the rating is.""",
-    mend="Mend `rated_power_dbm`, `max_drive_dbm` or `amplifier_gain_db` from the data sheet.",
+    why="""The profile's rating (1 W, 2 W) is more than drive level and amplifier gain add up to: either the amplifier
+    is missing and every power check is too low, or the rating is wrong.""",
+    fix="Correct `rated_power_dbm`, `max_drive_dbm` or `amplifier_gain_db` from the data sheet.",
     failing="hardware: {rocket: {radios: {radio0: {rated_power_dbm: 33}}}}",
     passing="hardware: {rocket: {radios: {radio0: {rated_power_dbm: 28}}}}",
 )
@@ -191,38 +193,37 @@ def rating_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     for profile in fleet.hardware.values():
         for radio in profile.radios:
             most = radio.max_drive_dbm + radio.amplifier_gain_db
-            if most + _CLASS_TOLERANCE_DB < radio.rated_power_dbm <= _LARGEST_RATED_DBM:
+            if most + _CLASS_TOLERANCE_DB < radio.rated_power_dbm <= _MAX_RATED_DBM:
                 path = ("hardware", profile.name, "radios", radio.name, "rated_power_dbm")
                 found = f"{radio.max_drive_dbm} drive + {_dbm(radio.amplifier_gain_db)} amplifier = {_dbm(most)} dBm"
                 expected = f"a sum that reaches {_dbm(radio.rated_power_dbm)} dBm"
-                yield Finding(path, "drive and amplifier fall short", expected, found)
+                yield Finding(path, "drive level plus amplifier gain is below the rating", expected, found)
 
 
 @fleet_rule(
     "MC346",
     Severity.ERROR,
     "A rated power looks like milliwatts",
-    why="""Powers are in dBm: 1 W is 30, 2 W is 33. A number far above means that every check on power compares with
-    nonsense.""",
-    mend="Write dBm: 10 times the logarithm of the milliwatts (1000 mW is 30 dBm).",
+    why="Powers are in dBm: 1 W is 30, 2 W is 33. With a much larger number, no power check is meaningful.",
+    fix="Write dBm: 10 * log10(mW). 1000 mW is 30 dBm.",
     failing="hardware: {rocket: {radios: {radio0: {rated_power_dbm: 50}}}}",
     passing="hardware: {rocket: {radios: {radio0: {rated_power_dbm: 28}}}}",
 )
 def rating_in_milliwatts(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for profile in fleet.hardware.values():
         for radio in profile.radios:
-            if radio.rated_power_dbm > _LARGEST_RATED_DBM:
+            if radio.rated_power_dbm > _MAX_RATED_DBM:
                 path = ("hardware", profile.name, "radios", radio.name, "rated_power_dbm")
-                yield Finding(path, "not a power in dBm", "at most 40", _dbm(radio.rated_power_dbm))
+                yield Finding(path, "not a plausible power in dBm", "at most 40", _dbm(radio.rated_power_dbm))
 
 
 @fleet_rule(
     "MC347",
     Severity.WARNING,
-    "A directional antenna without gain",
-    why="""A sector, panel or dish that gains nothing is a profile filled in by halves: the radiated power is
-    understated by ten and more dB, and lint cannot see a breach of the limit.""",
-    mend="Write the antenna's gain from its data sheet in `antenna_gain_dbi`.",
+    "A directional antenna has no gain",
+    why="""A sector, panel or dish antenna without gain is an incomplete profile: the radiated power is understated by
+    10 dB or more, and lint misses a violation of the limit.""",
+    fix="Set `antenna_gain_dbi` from the antenna's data sheet.",
     failing="hardware: {rocket: {radios: {radio0: {antenna: sector, antenna_gain_dbi: 0, beamwidth_deg: 120}}}}",
     passing="hardware: {rocket: {radios: {radio0: {antenna: sector, antenna_gain_dbi: 5, beamwidth_deg: 120}}}}",
 )
@@ -232,16 +233,16 @@ def directional_without_gain(fleet: Fleet, _context: LintContext) -> Iterator[Fi
             if radio.antenna is not AntennaKind.OMNI and radio.antenna_gain_dbi < 3:
                 path = ("hardware", profile.name, "radios", radio.name, "antenna_gain_dbi")
                 found = f"{_dbm(radio.antenna_gain_dbi)} dBi"
-                yield Finding(path, f"a {radio.antenna.value} has more gain", "at least 3 dBi", found)
+                yield Finding(path, f"a {radio.antenna.value} antenna has more gain", "at least 3 dBi", found)
 
 
 @fleet_rule(
     "MC348",
     Severity.WARNING,
     "Antenna kind and beamwidth contradict each other",
-    why="""Coverage and the placing of beacons are judged by these two; an omni of 90 degrees, or a sector all around,
-    is one of them copied from another profile.""",
-    mend="Give an omni 360 degrees, and a directional antenna the width of its beam.",
+    why="""Coverage and beacon placement depend on both. A 90-degree omni or a 360-degree sector is usually a copy from
+    another profile.""",
+    fix="Use 360 degrees for an omni, and the width of the beam for a directional antenna.",
     failing="hardware: {rocket: {radios: {radio0: {antenna: sector, beamwidth_deg: 360}}}}",
     passing="hardware: {rocket: {radios: {radio0: {antenna: sector, beamwidth_deg: 90}}}}",
 )
@@ -251,27 +252,27 @@ def beamwidth_contradicts(fleet: Fleet, _context: LintContext) -> Iterator[Findi
             if (radio.antenna is AntennaKind.OMNI) != (radio.beamwidth_deg == 360):
                 path = ("hardware", profile.name, "radios", radio.name, "beamwidth_deg")
                 expected = "360" if radio.antenna is AntennaKind.OMNI else "less than 360"
-                yield Finding(path, f"the antenna is a {radio.antenna.value}", expected, str(radio.beamwidth_deg))
+                yield Finding(path, f"antenna is {radio.antenna.value}", expected, str(radio.beamwidth_deg))
 
 
 @fleet_rule(
     "MC349",
     Severity.WARNING,
-    "A node is heard where it cannot be answered",
-    why="""The strong radio's frames arrive, the weak one's acknowledgements do not: the strong node sends everything
-    again and again, and the link looks good in one direction only.""",
-    mend="Bring the powers of the mesh's radios within 10 dB of each other.",
+    "The transmit powers in a mesh are too far apart",
+    why="""Frames from the strong radio arrive, but acknowledgements from the weak one do not: the strong node keeps
+    retransmitting, and the link looks good in one direction only.""",
+    fix="Bring the powers of the mesh's radios within 10 dB of each other.",
     failing="nodes: {b01: {radios: {radio0: {tx_power_dbm: 10}}}}",
     passing="nodes: {b01: {radios: {radio0: {tx_power_dbm: 20}}}}",
 )
 def powers_far_apart(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    by_mesh = grouped((mesh.name, (node, radio)) for node, radio, mesh in _transmitting(fleet))
+    by_mesh = group_by_key((mesh.name, (node, radio)) for node, radio, mesh in _transmitting(fleet))
     for name, members in by_mesh.items():
         strongest, strong = max(members, key=lambda member: member[1].conducted_dbm)
         for node, radio in members:
             if strong.conducted_dbm - radio.conducted_dbm > _ASYMMETRY_DB:
                 expected = f"at least {_dbm(strong.conducted_dbm - _ASYMMETRY_DB)} dBm conducted"
-                message = f"{strongest.name} in mesh {name} sends with {_dbm(strong.conducted_dbm)} dBm"
+                message = f"{strongest.name} in mesh {name} transmits {_dbm(strong.conducted_dbm)} dBm"
                 found = f"{_dbm(radio.conducted_dbm)} dBm"
                 yield Finding(_at(fleet, node, radio), message, expected, found)
 
@@ -280,9 +281,9 @@ def powers_far_apart(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC350",
     Severity.ERROR,
     "Two radios of a profile have the same device path",
-    why="""The path is how a node finds its radio again after a reboot: with one path twice, both sections configure the
-    same radio and the other stays off.""",
-    mend="Read the paths off a device: `uci get wireless.radio0.path`.",
+    why="""The path identifies a radio across reboots: with a duplicate, both sections configure the same radio and the
+    other stays off.""",
+    fix="Read the paths from a device: `uci get wireless.radio0.path`.",
     failing="hardware: {rocket: {radios: {radio1: {path: pci0000:00/0000:00:00.0}}}}",
     passing="hardware: {rocket: {radios: {radio1: {path: pci0000:00/0000:00:01.0}}}}",
 )
@@ -293,4 +294,4 @@ def radio_path_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             first = seen.setdefault(radio.path, radio.name)
             if first != radio.name:
                 path = ("hardware", profile.name, "radios", radio.name, "path")
-                yield Finding(path, f"{first} has the same path", "a path of its own", radio.path)
+                yield Finding(path, f"{first} has the same path", "a unique path", radio.path)

@@ -1,4 +1,4 @@
-"""Names that must stand for something: meshes, robots, nodes, jump hosts (MC101 to MC109)."""
+"""References to meshes, robots, nodes and jump hosts (MC101 to MC109)."""
 
 from __future__ import annotations
 
@@ -8,44 +8,47 @@ from functools import lru_cache
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, listed
+from meshctl.lint.grouping import group_by_key, join_limited
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Role
 
-# comparing a name with more than these takes longer than a person would wait
-_COMPARED = 500
-_SHOWN_JUMPS = 8
+# comparing with more names takes too long
+_MAX_COMPARED = 500
+_MAX_SHOWN_JUMPS = 8
 
 
-def known(names: Iterable[str], wrong: str) -> tuple[str, str]:
-    """What was expected, and the hint, for a name that none of `names` is."""
+def suggest(names: Iterable[str], wrong: str) -> tuple[str, str]:
+    """The `expected` text and the hint for `wrong`, which is not one of `names`."""
     choices = tuple(sorted(names))
     near = _nearest(choices, wrong)
-    return f"one of {listed(choices)}" if choices else "none, there are none", f"did you mean {near}?" if near else ""
+    return (
+        f"one of {join_limited(choices)}" if choices else "nothing, as none are defined",
+        f"did you mean {near}?" if near else "",
+    )
 
 
 @lru_cache(maxsize=256)
 def _nearest(choices: tuple[str, ...], wrong: str) -> str:
-    if len(choices) > _COMPARED:
+    if len(choices) > _MAX_COMPARED:
         return ""
     return next(iter(get_close_matches(wrong, choices, 1)), "")
 
 
 def _unknown(fleet: Fleet, path: tuple[str, ...], names: Sequence[str]) -> Iterator[Finding]:
-    """One finding for each element of a list that makes names which no node has."""
+    """One finding for each list element that expands to names of no node."""
     unknown = dict.fromkeys(name for name in names if name not in fleet.nodes)
-    for wrong in grouped((fleet.where(*path, name).position, name) for name in unknown).values():
-        _, hint = known(fleet.nodes, wrong[0])
+    for wrong in group_by_key((fleet.where(*path, name).position, name) for name in unknown).values():
+        _, hint = suggest(fleet.nodes, wrong[0])
         message = "no such node" if len(wrong) == 1 else "no such nodes"
-        yield Finding((*path, wrong[0]), message, "names of `nodes`", listed(wrong), hint)
+        yield Finding((*path, wrong[0]), message, "names of `nodes`", join_limited(wrong), hint)
 
 
 @fleet_rule(
     "MC101",
     Severity.ERROR,
     "A radio joins a mesh that does not exist",
-    why="The radio would be rendered without a cell: the node comes up with no radio and cannot be reached.",
-    mend="Name a mesh of `meshes`, or write `mesh: null` to leave the radio off.",
+    why="The radio would be rendered without an interface: the node comes up off the air and unreachable.",
+    fix="Use a mesh defined in `meshes`, or `mesh: null` to leave the radio off.",
     failing="nodes: {b01: {radios: {radio0: {mesh: mian}}}}",
     passing="nodes: {b01: {radios: {radio0: {mesh: main}}}}",
 )
@@ -53,7 +56,7 @@ def unknown_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.nodes.values():
         for radio in node.radios:
             if radio.mesh is not None and radio.mesh not in fleet.meshes:
-                expected, hint = known(fleet.meshes, radio.mesh)
+                expected, hint = suggest(fleet.meshes, radio.mesh)
                 path = ("nodes", node.name, "radios", radio.name, "mesh")
                 yield Finding(path, "no such mesh", expected, radio.mesh, hint)
 
@@ -61,16 +64,16 @@ def unknown_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC102",
     Severity.ERROR,
-    "A node rides on a robot that does not exist",
-    why="Status, plans and the loop check work by robot; a node of an unknown robot belongs to none of them.",
-    mend="Name a robot of `robots`.",
+    "A node belongs to a robot that does not exist",
+    why="Status, plans and the loop check group nodes by robot; a node of an unknown robot is in no group.",
+    fix="Use a robot defined in `robots`.",
     failing="nodes: {b01: {robot: husky9}}",
     passing="nodes: {b01: {robot: husky1}}",
 )
 def unknown_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.nodes.values():
         if node.robot and node.robot not in fleet.robots:
-            expected, hint = known(fleet.robots, node.robot)
+            expected, hint = suggest(fleet.robots, node.robot)
             yield Finding(("nodes", node.name, "robot"), "no such robot", expected, node.robot, hint)
 
 
@@ -79,7 +82,7 @@ def unknown_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "A robot lists a node that does not exist",
     why="The robot's radio cannot be configured, and its place in the mesh is unknown.",
-    mend="Add the node to `nodes`, or mend the name.",
+    fix="Add the node to `nodes`, or correct the name.",
     failing="robots: {husky1: {nodes: [husky1-front, husky1-raer]}}",
     passing="robots: {husky1: {nodes: [husky1-front]}}",
 )
@@ -92,8 +95,8 @@ def unknown_node_of_robot(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     "MC104",
     Severity.ERROR,
     "A robot carries a node that does not exist",
-    why="The operator would look for a beacon that nobody packed, or pack one that nothing configures.",
-    mend="Add the beacon to `nodes`, or mend the name.",
+    why="The operator would look for a beacon that does not exist, or carry one that is not configured.",
+    fix="Add the beacon to `nodes`, or correct the name.",
     failing="robots: {husky1: {carries: [b01, b0l]}}",
     passing="robots: {husky1: {carries: [b01]}}",
 )
@@ -105,16 +108,16 @@ def unknown_carried_node(fleet: Fleet, _context: LintContext) -> Iterator[Findin
 @fleet_rule(
     "MC105",
     Severity.ERROR,
-    "The way to a node goes through one that does not exist",
-    why="Every command that needs this node fails before it starts.",
-    mend="Name a node in `ssh.jump`, or take the line away to reach the node directly.",
+    "A node's jump host does not exist",
+    why="Every command for this node fails before it connects.",
+    fix="Name a node in `ssh.jump`, or remove it to connect directly.",
     failing="nodes: {b01: {ssh: {jump: bsae}}}",
     passing="nodes: {b01: {ssh: {jump: base}}}",
 )
 def unknown_jump(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.nodes.values():
         if node.ssh.jump and node.ssh.jump not in fleet.nodes:
-            _, hint = known(fleet.nodes, node.ssh.jump)
+            _, hint = suggest(fleet.nodes, node.ssh.jump)
             path = ("nodes", node.name, "ssh", "jump")
             yield Finding(path, "no such node", "a name of `nodes`", node.ssh.jump, hint)
 
@@ -122,9 +125,9 @@ def unknown_jump(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC106",
     Severity.ERROR,
-    "The way to a node leads back to itself",
-    why="A jump through nodes that jump through each other never arrives.",
-    mend="Let one of the nodes on the circle be reached directly.",
+    "Jump hosts form a cycle",
+    why="A connection through nodes that jump through each other never reaches its target.",
+    fix="Connect to one node of the cycle directly.",
     failing="""
     nodes:
       b01: {ssh: {jump: base}}
@@ -143,9 +146,9 @@ def jump_circle(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if name in way:
             names = list(way)
             circle = [*names[names.index(name) :], name]
-            found = " -> ".join(circle[:_SHOWN_JUMPS]) + (" -> ..." if len(circle) > _SHOWN_JUMPS else "")
+            found = " -> ".join(circle[:_MAX_SHOWN_JUMPS]) + (" -> ..." if len(circle) > _MAX_SHOWN_JUMPS else "")
             path = ("nodes", name, "ssh", "jump")
-            yield Finding(path, "the jumps go in a circle", "a node reached directly at the end", found)
+            yield Finding(path, "jump hosts form a cycle", "a node reached directly at the end", found)
         settled.update(way)
 
 
@@ -153,8 +156,8 @@ def jump_circle(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC107",
     Severity.WARNING,
     "A mesh has no members",
-    why="A mesh that nobody joins is a forgotten edit: a name that nodes were meant to use, or one that was left.",
-    mend="Let radios join it, or remove it.",
+    why="An unused mesh is usually a leftover or a mistyped name.",
+    fix="Let radios join it, or remove it.",
     failing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
@@ -177,8 +180,8 @@ def empty_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC108",
     Severity.WARNING,
     "A managed node joins no mesh",
-    why="A node whose radios are all off is reached by cable only, and carries nothing.",
-    mend="Give one of its radios a mesh, or set its state to `retired`.",
+    why="A node whose radios are all off is reachable by cable only and relays nothing.",
+    fix="Assign one of its radios to a mesh, or set its state to `retired`.",
     failing="nodes: {b01: {radios: {radio0: {mesh: null}}}}",
     passing="nodes: {b01: {radios: {radio0: {mesh: main}}}}",
 )
@@ -191,9 +194,9 @@ def node_without_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC109",
     Severity.NOTE,
-    "A hardware profile is used by no node",
-    why="Unused profiles age unseen: their firmware and hashes go stale and nothing checks them.",
-    mend="Remove the profile, or give it to the nodes that were meant to use it.",
+    "A hardware profile is unused",
+    why="Unused profiles go stale: nothing checks their firmware and hashes.",
+    fix="Remove the profile, or use it for the intended nodes.",
     failing="""
     hardware:
       bullet: {board: "ubnt,bullet-m-xw", profile: ubnt_bullet-m-xw, target: ath79/generic, release: "24.10",

@@ -1,4 +1,4 @@
-"""Whether every kind of node renders: templates, the firewall that results, values (MC901 to MC903)."""
+"""Trial rendering of every kind of node: templates, firewall, values (MC901 to MC903)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from meshctl.render.extra import EXTRA
 from meshctl.render.templates import NO_TEMPLATE, NOT_UCI, TEMPLATE
 from meshctl.resolve import resolve
 
-# stands for every secret: it is allowed as a passphrase, and never leaves this module
+# replaces every secret: a valid passphrase that never leaves this module
 _PLACEHOLDER = Secret("placeholder-for-lint")
-# a path from the inventory can be as long as the file
-_SHOWN_LETTERS = 200
+# a path in the inventory can be very long
+_MAX_SHOWN_CHARACTERS = 200
 _TEMPLATE_CODES = (TEMPLATE, NOT_UCI, NO_TEMPLATE, EXTRA)
 
 
@@ -27,7 +27,7 @@ def _placeholder(_ref: SecretRef) -> Secret:
 
 
 def _kinds(fleet: Fleet) -> Iterator[Node]:
-    """One managed node of every kind: nodes that differ in nothing but name and address render alike."""
+    """One managed node of every kind: nodes that differ only in name and address render alike."""
     seen = set()
     for node in fleet.managed():
         if not all(name in fleet.meshes for name in node.meshes):
@@ -46,7 +46,7 @@ def _kinds(fleet: Fleet) -> Iterator[Node]:
 
 
 def _holds_own_text(fleet: Fleet, node: Node) -> bool:
-    """Whether the operator's own text goes into its files: meshctl's own templates are tested with meshctl."""
+    """Whether the node uses templates or options of the operator; the shipped templates are tested with meshctl."""
     own_templates = (Path(fleet.base) / "templates").is_dir()
     return own_templates or bool(node.extra_uci) or any(fleet.meshes[m].operator_parts.templates for m in node.meshes)
 
@@ -54,10 +54,10 @@ def _holds_own_text(fleet: Fleet, node: Node) -> bool:
 @fleet_rule(
     "MC901",
     Severity.ERROR,
-    "A template fails, or writes no UCI",
-    why="""The template of the operator's own (or of the back end's parts) stops, or writes text that OpenWrt cannot
-    read: found out at the first `provision`, unless it is found out here.""",
-    mend="Mend the template; `meshctl render NODE` shows its place.",
+    "A template fails or does not produce UCI",
+    why="""A template of the inventory or of the back end's operator parts fails, or its output is not valid UCI:
+    `provision` would stop there.""",
+    fix="Fix the template; `meshctl render NODE` shows the location.",
     failing=Example(
         "apply: {max_down: 1}", files={"templates/common/etc/config/extra.j2": "config {{ intent.no_such_value }}\n"}
     ),
@@ -71,7 +71,7 @@ def template_fails(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if isinstance(outcome, Rendered):
             continue
         if isinstance(outcome, OSError):
-            found = f"{outcome.filename or 'it'}: {outcome.strerror}"[:_SHOWN_LETTERS]
+            found = f"{outcome.filename or 'it'}: {outcome.strerror}"[:_MAX_SHOWN_CHARACTERS]
             yield Finding(("meshes",), "templates cannot be read", "a folder of templates", found)
             return
         for item in outcome.diagnostics:
@@ -83,11 +83,11 @@ def template_fails(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC902",
     Severity.ERROR,
-    "The management network is in no firewall zone that lets it in",
-    why="""From 23.05 OpenWrt rejects what no zone allows, and meshctl's own template does so on every release. It
-    renders a zone for the management network; a template of your own, or extra text behind it, that leaves the zone out
-    or closes it shuts the operator out.""",
-    mend="Keep a zone with `list network 'lan'` and `option input 'ACCEPT'` in the firewall package.",
+    "No firewall zone accepts the management network",
+    why="""From 23.05 on, OpenWrt rejects traffic that no zone allows, and meshctl's template does so on every release.
+    It renders a zone for the management network; a template of your own or `extra_uci` that drops or closes this zone
+    locks the operator out.""",
+    fix="Keep a zone with `list network 'lan'` and `option input 'ACCEPT'` in the firewall package.",
     failing="nodes: {b01: {extra_uci: {firewall.management.input: REJECT}}}",
     passing="nodes: {b01: {extra_uci: {firewall.management.masq: '1'}}}",
 )
@@ -99,7 +99,7 @@ def management_shut_out(fleet: Fleet, _context: LintContext) -> Iterator[Finding
             if file.package is not None and file.package.name == "firewall" and not _lets_in(file.package):
                 extra = next((("extra_uci", key) for key in node.extra_uci if key.startswith("firewall.")), ())
                 expected = "a zone of network lan with input ACCEPT"
-                yield Finding(("nodes", node.name, *extra), "nobody could log in any more", expected, "none")
+                yield Finding(("nodes", node.name, *extra), "SSH login would be blocked", expected, "none")
 
 
 def _lets_in(firewall: uci.Package) -> bool:
@@ -113,7 +113,7 @@ def _lets_in(firewall: uci.Package) -> bool:
 
 
 def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Rendered | InvalidInput | OSError]]:
-    """Every kind of node with its files, or with what keeps them from being rendered."""
+    """Every kind of node with its files, or the error that prevents rendering."""
     templates = Templates.of(fleet)
     for node in _kinds(fleet):
         if not _holds_own_text(fleet, node):
@@ -121,7 +121,7 @@ def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Rendered | InvalidInput | OS
         try:
             intent = resolve(fleet, node, _placeholder)
         except InvalidInput:
-            # values that cannot be written down have rules of their own
+            # MC903 reports invalid values
             continue
         try:
             outcome: Rendered | InvalidInput | OSError = render(intent, templates)
@@ -134,10 +134,10 @@ def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Rendered | InvalidInput | OS
     "MC903",
     Severity.ERROR,
     "A value cannot be written into the node's files",
-    why="""UCI holds any text, but the programs behind it do not: netifd's scripts put values into shell commands, the
-    supplicant reads lines. `meshctl render` refuses such a value; here it is found with all the others. Where a rule of
-    its own speaks of the same place, this one is silent.""",
-    mend="Write the value as it is expected.",
+    why="""UCI can hold any text, but its consumers cannot: netifd's scripts put values into shell commands, and the
+    supplicant reads lines. `meshctl render` refuses such a value; lint reports all of them at once. This rule is silent
+    where a more specific rule reports the same place.""",
+    fix="Write the value as expected.",
     failing="nodes: {b01: {extra_uci: {'wireless.radio0 .rts': '500'}}}",
     passing="nodes: {b01: {extra_uci: {wireless.radio0.rts: '500'}}}",
     is_fallback=True,

@@ -7,24 +7,24 @@ from dataclasses import replace
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, listed
+from meshctl.lint.grouping import group_by_key, join_limited
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Backend, Fleet, Mesh, NodeState
 from meshctl.resolve import MEASURED_HEAL_S, UnreachableTarget, batman_intervals, heal_s, originator_airtime
 
-# batman-adv's header around a full Ethernet frame (openwrt-facts: 1500 + 32)
+# batman-adv's header on a full Ethernet frame (openwrt-facts: 1500 + 32)
 _BATMAN_BYTES = 32
-# what batman-adv compares the MTU with, network coding's header included: batadv_max_header_len()
+# overhead that batman-adv checks the MTU against, network coding's header included: batadv_max_header_len()
 _BATMAN_WARNS_BYTES = 60
 # IEEE 802.11-2020 9.2.4.7.1: the largest MSDU, less the eight bytes of LLC and SNAP
-_LARGEST_MTU = 2304 - 8
-# IPv4 and UDP around a fragment of udp_mesh, and its own header and tag
+_MAX_MTU = 2304 - 8
+# headers of IPv4, UDP and udp_mesh, and the AEAD tag
 _DATAGRAM_BYTES = 20 + 8 + 40
-# shares of the channel: from the first the cost is shown, from the second it is felt, the third eats the channel
-_AIRTIME_SHOWN = 0.03
-_AIRTIME_FELT = 0.10
-_AIRTIME_EATEN = 0.30
+# airtime shares from which MC516, MC502 and MC501 report
+_AIRTIME_NOTE = 0.03
+_AIRTIME_WARNING = 0.10
+_AIRTIME_ERROR = 0.30
 
 
 MESHMERIZE = """
@@ -41,11 +41,11 @@ def _batman_meshes(fleet: Fleet) -> Iterator[Mesh]:
 @fleet_rule(
     "MC501",
     Severity.ERROR,
-    "Originator messages would eat the channel",
-    why="""Every node sends its originator message once an interval and repeats everyone else's: the cost grows with the
-    square of the number of nodes, at the broadcast rate. Past a third of the channel little is left for data, messages
-    collide, and routes flap exactly when all robots stand together at the start.""",
-    mend="Ask for a longer `reconnect_s`, raise `mcast_rate_kbps`, keep `aggregated_ogms` on, or split the mesh.",
+    "Originator messages would saturate the channel",
+    why="""Every node sends one originator message per interval and repeats everyone else's, at the multicast rate: the
+    cost grows with the square of the number of nodes. Above a third of the channel little is left for data, messages
+    collide, and routes flap exactly when all robots are together at the start.""",
+    fix="Increase `reconnect_s`, raise `mcast_rate_kbps`, keep `aggregated_ogms` on, or split the mesh.",
     failing="""
     meshes: {main: {reconnect_s: 0.6}}
     nodes: {"c[01-60]": {state: carried, address: {from: 10.42.0.121}}}
@@ -58,16 +58,16 @@ def _batman_meshes(fleet: Fleet) -> Iterator[Mesh]:
     """,
 )
 def originators_eat_channel(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    yield from _airtime(fleet, _AIRTIME_EATEN, float("inf"))
+    yield from _airtime(fleet, _AIRTIME_ERROR, float("inf"))
 
 
 @fleet_rule(
     "MC502",
     Severity.WARNING,
     "Originator messages take much of the channel",
-    why="""A tenth of the air and more goes to routing before anybody says anything. It is worst where all nodes hear
-    each other: at the start, with every beacon still in its rack.""",
-    mend="Ask for a longer `reconnect_s`, raise `mcast_rate_kbps`, or keep `aggregated_ogms` on.",
+    why="""At least a tenth of the airtime goes to routing. The worst case is the start, where all nodes hear each
+    other, including every beacon in its rack.""",
+    fix="Increase `reconnect_s`, raise `mcast_rate_kbps`, or keep `aggregated_ogms` on.",
     failing="""
     meshes: {main: {reconnect_s: 5}}
     nodes: {"c[01-40]": {state: carried, address: {from: 10.42.0.121}}}
@@ -80,12 +80,12 @@ def originators_eat_channel(fleet: Fleet, _context: LintContext) -> Iterator[Fin
     """,
 )
 def originators_take_much(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    yield from _airtime(fleet, _AIRTIME_FELT, _AIRTIME_EATEN)
+    yield from _airtime(fleet, _AIRTIME_WARNING, _AIRTIME_ERROR)
 
 
 def _airtime(fleet: Fleet, least: float, most: float) -> Iterator[Finding]:
     on_air = (node for node in fleet.managed() if node.state is not NodeState.SPARE)
-    members = grouped((mesh, node.name) for node in on_air for mesh in node.meshes)
+    members = group_by_key((mesh, node.name) for node in on_air for mesh in node.meshes)
     for mesh in _batman_meshes(fleet):
         nodes = len(members.get(mesh.name, []))
         try:
@@ -95,22 +95,22 @@ def _airtime(fleet: Fleet, least: float, most: float) -> Iterator[Finding]:
         options = mesh.batman
         share = originator_airtime(nodes, interval_ms, mesh.mcast_rate_kbps, is_aggregated=options.aggregated_ogms)
         if least <= share < most:
-            message = f"{nodes} nodes, each {interval_ms} ms, at {mesh.mcast_rate_kbps} kbit/s"
+            message = f"{nodes} nodes, one message per {interval_ms} ms, at {mesh.mcast_rate_kbps} kbit/s"
             found = f"{share:.0%} of the channel"
             written = options.orig_interval_ms is not None
             key = ("batman", "orig_interval_ms") if written else ("reconnect_s",)
             path = ("meshes", mesh.name, *key)
-            expected = "" if least == _AIRTIME_SHOWN else f"less than {least:.0%}"
+            expected = "" if least == _AIRTIME_NOTE else f"less than {least:.0%}"
             yield Finding(path, message, expected, found)
 
 
 @fleet_rule(
     "MC503",
     Severity.ERROR,
-    "The wanted reconnect time cannot be had",
-    why="""The fastest interval that was measured on the kernel's batman-adv heals a cut in 0.6 s; nothing can be
-    rendered for a shorter wish.""",
-    mend="Ask for at least 0.6 s, and for no less than the robots need: every halving doubles the routing's airtime.",
+    "The reconnect time is not achievable",
+    why="""The shortest interval measured on the kernel's batman-adv heals a broken link in 0.6 s; no configuration
+    exists for a shorter time.""",
+    fix="Use at least 0.6 s, and no less than the robots need: every halving doubles the routing airtime.",
     failing="meshes: {main: {reconnect_s: 0.2}}",
     passing="meshes: {main: {reconnect_s: 2.5}}",
 )
@@ -120,15 +120,20 @@ def reconnect_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Findi
             batman_intervals(mesh)
         except UnreachableTarget as target:
             path = ("meshes", mesh.name, "reconnect_s")
-            yield Finding(path, "never measured", f"at least {target.fastest_s:g} s", f"{mesh.reconnect_s:g} s")
+            yield Finding(
+                path,
+                "shorter than any measured reconnect time",
+                f"at least {target.fastest_s:g} s",
+                f"{mesh.reconnect_s:g} s",
+            )
 
 
 @fleet_rule(
     "MC504",
     Severity.WARNING,
-    "The written interval misses the wanted reconnect time",
-    why="`orig_interval_ms` overrules `reconnect_s`: the fleet heals more slowly than the inventory promises.",
-    mend="Take `orig_interval_ms` away, or bring `reconnect_s` in line with it.",
+    "`orig_interval_ms` is too long for `reconnect_s`",
+    why="`orig_interval_ms` overrides `reconnect_s`: the fleet heals more slowly than the inventory states.",
+    fix="Remove `orig_interval_ms`, or adjust `reconnect_s`.",
     failing="meshes: {main: {reconnect_s: 2, batman: {orig_interval_ms: 1000}}}",
     passing="meshes: {main: {reconnect_s: 5, batman: {orig_interval_ms: 1000}}}",
 )
@@ -147,35 +152,35 @@ def interval_misses_target(fleet: Fleet, _context: LintContext) -> Iterator[Find
 @fleet_rule(
     "MC505",
     Severity.ERROR,
-    "Full frames do not fit and may not be split",
-    why="""batman-adv puts 32 bytes around each frame. With a smaller MTU on the radio and fragmentation off, small
-    messages pass and large ones vanish: ping works, the video does not.""",
-    mend="Set `mtu: 1560` (1532 is the minimum), or turn `fragmentation` on.",
+    "Full frames exceed the MTU, and fragmentation is off",
+    why="""batman-adv adds 32 bytes to each frame. With a smaller MTU on the radio and fragmentation off, small packets
+    pass and large ones are dropped: ping works, video does not.""",
+    fix="Set `mtu: 1560` (minimum 1532), or turn on `fragmentation`.",
     failing="meshes: {main: {mtu: 1500, batman: {fragmentation: false}}}",
     passing="meshes: {main: {mtu: 1560, batman: {fragmentation: false}}}",
 )
 def mtu_without_fragmentation(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in _batman_meshes(fleet):
         if mesh.mtu < mesh.lan_mtu + _BATMAN_BYTES and not mesh.batman.fragmentation:
-            yield _budget(fleet, mesh, "large frames vanish")
+            yield _mtu_finding(fleet, mesh, "large frames are dropped")
 
 
 @fleet_rule(
     "MC506",
     Severity.WARNING,
-    "Full frames are split in two",
-    why="Every full frame goes over the air as two, at twice the cost and twice the chance of loss.",
-    mend="Remove `mtu` (the default is 1560), or set 1532 at least.",
+    "Full frames are fragmented",
+    why="Every full frame is sent as two, at twice the cost and twice the chance of loss.",
+    fix="Remove `mtu` (the default is 1560), or set at least 1532.",
     failing="meshes: {main: {mtu: 1500}}",
     passing="meshes: {main: {mtu: 1560}}",
 )
 def mtu_with_fragmentation(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in _batman_meshes(fleet):
         if mesh.mtu < mesh.lan_mtu + _BATMAN_BYTES and mesh.batman.fragmentation:
-            yield _budget(fleet, mesh, "full frames are split")
+            yield _mtu_finding(fleet, mesh, "full frames are fragmented")
 
 
-def _budget(fleet: Fleet, mesh: Mesh, message: str) -> Finding:
+def _mtu_finding(fleet: Fleet, mesh: Mesh, message: str) -> Finding:
     expected = f"at least {mesh.lan_mtu + _BATMAN_BYTES} ({mesh.lan_mtu} LAN + {_BATMAN_BYTES} batman-adv)"
     path = first_written(fleet, ("meshes", mesh.name, "mtu"), ("meshes", mesh.name, "lan_mtu"))
     return Finding(path, message, expected, str(mesh.mtu))
@@ -184,27 +189,26 @@ def _budget(fleet: Fleet, mesh: Mesh, message: str) -> Finding:
 @fleet_rule(
     "MC507",
     Severity.ERROR,
-    "The MTU is larger than a radio can carry",
-    why="""An 802.11 frame holds at most 2304 bytes: the kernel refuses the MTU, and netifd does not bring the interface
-    up.""",
-    mend="Remove `mtu` (the default is 1560), or set 1532 to 2296.",
+    "The MTU exceeds what a radio can carry",
+    why="""An 802.11 frame carries at most 2304 bytes: the kernel rejects the MTU, and netifd does not bring up the
+    interface.""",
+    fix="Remove `mtu` (the default is 1560), or set 1532 to 2296.",
     failing="meshes: {main: {mtu: 4000}}",
     passing="meshes: {main: {mtu: 2000}}",
 )
 def mtu_too_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in fleet.meshes.values():
-        if mesh.mtu > _LARGEST_MTU:
+        if mesh.mtu > _MAX_MTU:
             path = ("meshes", mesh.name, "mtu")
-            yield Finding(path, "no 802.11 frame holds it", f"at most {_LARGEST_MTU}", str(mesh.mtu))
+            yield Finding(path, "exceeds an 802.11 frame", f"at most {_MAX_MTU}", str(mesh.mtu))
 
 
 @fleet_rule(
     "MC508",
     Severity.ERROR,
-    "A fragment of udp_mesh does not fit the LAN's MTU",
-    why="""Each fragment is split again by IP; one lost half loses the whole, and a broadcast of it may not arrive at
-    all.""",
-    mend="Lower `udp_mesh.fragment_bytes` to 1400, or to the LAN's MTU less 68.",
+    "A udp_mesh fragment exceeds the LAN's MTU",
+    why="IP splits each datagram again: losing one half loses the whole, and a split broadcast may not arrive at all.",
+    fix="Lower `udp_mesh.fragment_bytes` to 1400, or to the LAN's MTU minus 68.",
     failing="udp_mesh: {fragment_bytes: 1480}",
     passing="udp_mesh: {fragment_bytes: 1400}",
 )
@@ -214,8 +218,8 @@ def fragment_too_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     mesh = min(fleet.meshes.values(), key=lambda mesh: mesh.lan_mtu)
     room = mesh.lan_mtu - _DATAGRAM_BYTES
     if fleet.udp_mesh.fragment_bytes > room:
-        message = f"IP would split it: mesh {mesh.name} has a LAN of {mesh.lan_mtu} bytes"
-        expected = f"at most {room} ({mesh.lan_mtu} - {_DATAGRAM_BYTES} for IP, UDP and the seal)"
+        message = f"IP would fragment it: the LAN of mesh {mesh.name} has an MTU of {mesh.lan_mtu}"
+        expected = f"at most {room} ({mesh.lan_mtu} - {_DATAGRAM_BYTES} for IP, UDP and udp_mesh headers)"
         path = first_written(fleet, ("udp_mesh", "fragment_bytes"), ("meshes", mesh.name, "lan_mtu"))
         yield Finding(path, message, expected, str(fleet.udp_mesh.fragment_bytes))
 
@@ -224,9 +228,9 @@ def fragment_too_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     "MC509",
     Severity.WARNING,
     "The hop penalty is extreme",
-    why="""Without a penalty routes wander between ways of equal quality; with a large one the mesh prefers one long
-    weak link to two good ones.""",
-    mend="Keep 30, or stay between 5 and 100.",
+    why="""Without a penalty, routes flap between paths of equal quality; with a large one, the mesh prefers one long
+    weak link over two good ones.""",
+    fix="Use 30, or a value from 5 to 100.",
     failing="meshes: {main: {batman: {hop_penalty: 0}}}",
     passing="meshes: {main: {batman: {hop_penalty: 15}}}",
 )
@@ -234,15 +238,15 @@ def hop_penalty_extreme(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     for mesh in _batman_meshes(fleet):
         if not 5 <= mesh.batman.hop_penalty <= 100:
             path = ("meshes", mesh.name, "batman", "hop_penalty")
-            yield Finding(path, "routes wander or reach too far", "5 to 100", str(mesh.batman.hop_penalty))
+            yield Finding(path, "routes flap or prefer long weak links", "5 to 100", str(mesh.batman.hop_penalty))
 
 
 @fleet_rule(
     "MC510",
     Severity.WARNING,
     "Originator messages are not aggregated",
-    why="Each goes out in a frame of its own, and the frame costs more air than the message.",
-    mend="Set `aggregated_ogms: true`.",
+    why="Each message is sent in its own frame, which costs more airtime than the message.",
+    fix="Set `aggregated_ogms: true`.",
     failing="meshes: {main: {batman: {aggregated_ogms: false}}}",
     passing="meshes: {main: {batman: {aggregated_ogms: true}}}",
 )
@@ -250,16 +254,16 @@ def originators_not_aggregated(fleet: Fleet, _context: LintContext) -> Iterator[
     for mesh in _batman_meshes(fleet):
         if not mesh.batman.aggregated_ogms:
             path = ("meshes", mesh.name, "batman", "aggregated_ogms")
-            yield Finding(path, "each message takes a frame of its own", "true", "false")
+            yield Finding(path, "each message takes its own frame", "true", "false")
 
 
 @fleet_rule(
     "MC511",
     Severity.WARNING,
     "Every node announces itself as a gateway",
-    why="""`gw_mode: server` holds for all nodes of the mesh: each offers an uplink it does not have, and DHCP requests
-    go to the nearest of them.""",
-    mend="Leave `gw_mode: off`; give nodes a `gateway` where there is one.",
+    why="""`gw_mode: server` applies to all nodes of the mesh: each announces an uplink that it does not have, and DHCP
+    requests go to the nearest one.""",
+    fix="Use `gw_mode: off`; set `gateway` on nodes that have one.",
     failing="meshes: {main: {batman: {gw_mode: server}}}",
     passing="meshes: {main: {batman: {gw_mode: 'off'}}}",
 )
@@ -267,16 +271,15 @@ def all_gateways(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in _batman_meshes(fleet):
         if mesh.batman.gw_mode == "server":
             path = ("meshes", mesh.name, "batman", "gw_mode")
-            yield Finding(path, "holds for every node of the mesh", "off", mesh.batman.gw_mode)
+            yield Finding(path, "applies to every node of the mesh", "off", mesh.batman.gw_mode)
 
 
 @fleet_rule(
     "MC512",
     Severity.WARNING,
-    "ELP intervals without BATMAN_V",
-    why="""Only BATMAN_V probes links with ELP. Under BATMAN_IV the option is read and does nothing: whoever set it
-    meant another algorithm.""",
-    mend="Set `routing_algo: BATMAN_V`, or take `elp_interval_ms` away.",
+    "`elp_interval_ms` is set without BATMAN_V",
+    why="Only BATMAN_V probes links with ELP. Under BATMAN_IV the option has no effect.",
+    fix="Set `routing_algo: BATMAN_V`, or remove `elp_interval_ms`.",
     failing="meshes: {main: {batman: {elp_interval_ms: 250}}}",
     passing="meshes: {main: {batman: {routing_algo: BATMAN_V, elp_interval_ms: 250}}}",
 )
@@ -285,16 +288,16 @@ def elp_without_batman_v(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         if mesh.batman.elp_interval_ms is not None and mesh.batman.routing_algo != "BATMAN_V":
             path = ("meshes", mesh.name, "batman", "elp_interval_ms")
             found = mesh.batman.routing_algo
-            yield Finding(path, "does nothing without BATMAN_V", "routing_algo: BATMAN_V", found)
+            yield Finding(path, "no effect without BATMAN_V", "routing_algo: BATMAN_V", found)
 
 
 @fleet_rule(
     "MC513",
     Severity.ERROR,
     "Meshes of one network have different routing options",
-    why="""Cells of one network share one batman-adv interface, which has one set of options: the first mesh's hold, and
-    what is written at the other is not done.""",
-    mend="Write the same `batman` options at both meshes, or give them networks of their own.",
+    why="""Cells of one network share one batman-adv interface with one set of options: the first mesh's options apply,
+    those of the others are ignored.""",
+    fix="Use the same `batman` options for both meshes, or separate networks.",
     failing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.42.0.0/24,
@@ -309,22 +312,22 @@ def elp_without_batman_v(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     """,
 )
 def options_of_one_interface(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    sharing = grouped(((mesh.network, mesh.batman.routing_algo), mesh) for mesh in _batman_meshes(fleet))
+    sharing = group_by_key(((mesh.network, mesh.batman.routing_algo), mesh) for mesh in _batman_meshes(fleet))
     for first, *others in sharing.values():
         for mesh in others:
-            # intervals follow from reconnect_s, the shortest of the group is taken
+            # intervals follow from reconnect_s; the shortest of the group is used
             options = replace(mesh.batman, orig_interval_ms=None, elp_interval_ms=None)
             if options != replace(first.batman, orig_interval_ms=None, elp_interval_ms=None):
-                message = f"mesh {first.name} shares its routing interface and has other options"
+                message = f"mesh {first.name} shares the routing interface but has other options"
                 yield Finding(("meshes", mesh.name, "batman"), message, "the same options", "others")
 
 
 @fleet_rule(
     "MC514",
     Severity.ERROR,
-    "A node joins meshes of different back ends",
-    why="The bridge and the services of a node belong to one back end; two would fight over the LAN.",
-    mend="Use one back end for all meshes of a node.",
+    "A node joins meshes with different back ends",
+    why="The bridge and the services of a node belong to one back end; two would conflict over the LAN.",
+    fix="Use one back end for all meshes of a node.",
     failing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
@@ -344,16 +347,22 @@ def back_ends_mixed(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         names = [name for name in node.meshes if name in fleet.meshes]
         ends = dict.fromkeys(fleet.meshes[name].backend.value for name in names)
         if len(ends) > 1:
-            yield Finding(("nodes", node.name, "radios"), "meshes of one back end only", "one", listed(list(ends)))
+            yield Finding(
+                ("nodes", node.name, "radios"),
+                "meshes have different back ends",
+                "one back end",
+                join_limited(list(ends)),
+            )
 
 
 @fleet_rule(
     "MC515",
     Severity.ERROR,
-    "The operator's parts of the back end are incomplete",
-    why="""meshmerize has no public package, configuration or status: meshctl renders and observes only what the
-    operator supplies. Without a service it is never started, without an interface the robots are not bridged to it.""",
-    mend="Fill in `operator_parts`: templates, service, interface, status_command, and packages or package_files.",
+    "The operator parts of the back end are incomplete",
+    why="""meshmerize has no public package, configuration format or status output: meshctl renders and observes only
+    what the operator supplies. Without a service it is never started; without an interface it is not bridged to the
+    robots.""",
+    fix="Fill in `operator_parts`: templates, service, interface, status_command, and packages or package_files.",
     failing="meshes: {main: {backend: meshmerize, operator_parts: {service: meshmerized}}}",
     passing=Example(MESHMERIZE, files=PARTS),
 )
@@ -372,16 +381,16 @@ def operator_parts_incomplete(fleet: Fleet, _context: LintContext) -> Iterator[F
         missing = [name for name, value in given.items() if not value]
         if missing:
             path = ("meshes", mesh.name, "operator_parts")
-            yield Finding(path, "meshmerize needs more", "all parts", f"no {', no '.join(missing)}")
+            yield Finding(path, "meshmerize needs more parts", "all parts", f"no {', no '.join(missing)}")
 
 
 @fleet_rule(
     "MC516",
     Severity.NOTE,
-    "What originator messages cost",
-    why="""Routing needs some of the air. The share is for all nodes in one place, at the intervals that `reconnect_s`
-    asks for; it grows with the square of the number of nodes, so it is worth knowing before beacons are added.""",
-    mend="Nothing needs to be done; MC502 warns from a tenth of the channel on.",
+    "Airtime of originator messages",
+    why="""Routing takes part of the airtime. The share assumes all nodes in one place, at the intervals that
+    `reconnect_s` selects. It grows with the square of the number of nodes, so check it before adding beacons.""",
+    fix="No action needed; MC502 warns from a tenth of the channel on.",
     failing="""
     nodes: {"c[01-20]": {state: carried, address: {from: 10.42.0.121}}}
     robots: {husky1: {carries: ["c[01-20]", b01]}}
@@ -392,17 +401,16 @@ def operator_parts_incomplete(fleet: Fleet, _context: LintContext) -> Iterator[F
     """,
 )
 def originators_cost(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    yield from _airtime(fleet, _AIRTIME_SHOWN, _AIRTIME_FELT)
+    yield from _airtime(fleet, _AIRTIME_NOTE, _AIRTIME_WARNING)
 
 
 @fleet_rule(
     "MC517",
     Severity.NOTE,
-    "batman-adv warns of the MTU",
-    why="""Full frames fit, but batman-adv also counts the header of network coding: below the LAN's MTU + 60, it logs
-    "The MTU of interface mesh0 is too small" at each activation, and the next operator looks for a fault that is
-    none.""",
-    mend="Remove `mtu`: the default is 1560, and mac80211 radios such as ath9k carry up to 2304.",
+    "batman-adv warns about the MTU",
+    why="""Full frames fit, but batman-adv also counts the network coding header: below the LAN's MTU + 60 it logs "The
+    MTU of interface mesh0 is too small" at each activation, although nothing is wrong.""",
+    fix="Remove `mtu`: the default is 1560, and mac80211 radios such as ath9k carry up to 2304.",
     failing="meshes: {main: {mtu: 1536}}",
     passing="meshes: {main: {mtu: 1560}}",
 )
@@ -412,4 +420,4 @@ def mtu_warned_of(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if mesh.lan_mtu + _BATMAN_BYTES <= mesh.mtu < least:
             path = first_written(fleet, ("meshes", mesh.name, "mtu"), ("meshes", mesh.name, "lan_mtu"))
             expected = f"at least {least} ({mesh.lan_mtu} LAN + {_BATMAN_WARNS_BYTES})"
-            yield Finding(path, "works, with a warning at each activation", expected, str(mesh.mtu))
+            yield Finding(path, "works, but batman-adv logs a warning at each activation", expected, str(mesh.mtu))

@@ -1,4 +1,4 @@
-"""Where secrets are and how strong: never in the inventory, never in the repository (MC441 to MC453)."""
+"""Secrets: not in the inventory or the repository, and strong enough (MC441 to MC453)."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from pathlib import Path
 
 from meshctl.diagnostics import Position, Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import repeated
+from meshctl.lint.grouping import duplicates
 from meshctl.lint.rule import Example, Finding, fleet_rule, text_rule
 from meshctl.model import Fleet, Secret, SecretKind, SecretRef, SshSettings
 from meshctl.render.daemon import key_bytes, key_text
 
-# what udp_mesh takes (udp_mesh/crypto/keys.py)
+# as in udp_mesh/crypto/keys.py
 _KEY_BYTES = 32
 _SAFE_MODE_MASK = 0o077
-_LEAST_DIFFERENT_BYTES = 16
+_MIN_DISTINCT_BYTES = 16
 _TRANSPORT_KEY = "b4f8e7f0c3a94c21a1d2d9a0f5c36e7722d1b6c8e3f04a5b9c7d8e1f2a3b4c5d"
 
-_MATERIAL = (
+_KEY_MATERIAL = (
     (re.compile(r"-----BEGIN [A-Z0-9 ]*PRIVATE KEY-----"), "a private key"),
     (re.compile(r"AGE-SECRET-KEY-1[0-9A-Z]{20,}"), "an age identity"),
     (re.compile(r"untrusted comment: (?:OpenWrt )?(?:secret|private) key", re.IGNORECASE), "a usign secret key"),
-    # a key of 32 bytes where a reference should stand
+    # a 32-byte key in place of a reference
     (re.compile(r"(?i)\bkeys?\b[\"']?\s*:\s*\[?\s*[\"']?(?:[0-9a-f]{64}\b|[a-z0-9+/]{43}=)"), "a key"),
-    # a word behind a name that says what it is
+    # a value after a telling name
     (
         re.compile(
             r"(?i)\b(?:psk|passphrase|password|passwd|secret|wpa_key|mesh_key|udp_mesh_key)\b[\"']?\s*[:=]\s*[\"']?[^\s\"'{}\[\],#]{8,}"
@@ -38,7 +38,7 @@ _MATERIAL = (
 
 
 def secret_refs(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SecretRef]]:
-    """Every reference of the inventory with its place."""
+    """Every secret reference with its path."""
     for mesh in fleet.meshes.values():
         if mesh.key is not None:
             yield ("meshes", mesh.name, "key"), mesh.key
@@ -47,12 +47,12 @@ def secret_refs(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SecretRef]]:
 
 
 def _path(fleet: Fleet, where: str, base: str) -> Path:
-    # not Path.expanduser, which raises for a user that does not exist
+    # Path.expanduser raises for an unknown user
     return Path(base or fleet.base or ".", os.path.expanduser(where))
 
 
 def _secret_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], Path, str]]:
-    """Files that hold secrets in the clear: secret files, age identities, private SSH keys."""
+    """Files with plaintext secrets: secret files, age identities, private SSH keys."""
     for path, ref in secret_refs(fleet):
         match ref.kind:
             case SecretKind.FILE:
@@ -61,7 +61,7 @@ def _secret_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], Path, str]]:
                 yield (*path, "identity"), _path(fleet, ref.identity, ref.base), "the age identity"
             case SecretKind.AGE | SecretKind.ENV:
                 pass
-    # nodes of a group share one list: judge each file once
+    # nodes of a group share one list: report each file once
     seen: set[str] = set()
     for place, ssh in logins(fleet):
         for index, file in enumerate(ssh.key_files):
@@ -71,7 +71,7 @@ def _secret_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], Path, str]]:
 
 
 def logins(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SshSettings]]:
-    """How each node and each computer is logged in to, with the place of it."""
+    """The SSH settings of every node and computer, with their paths."""
     for node in fleet.nodes.values():
         yield ("nodes", node.name, "ssh"), node.ssh
     for robot in fleet.robots.values():
@@ -82,29 +82,29 @@ def logins(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SshSettings]]:
 @text_rule(
     "MC441",
     Severity.ERROR,
-    "Key material stands in the inventory",
-    why="""The inventory is kept in git, copied to laptops and pasted into chats: a key that ever stood in it is public,
-    also after it was removed.""",
-    mend="Refer to it instead (`{env: NAME}`, `{file: ...}` or `{age: ...}`), and make a new key.",
+    "The inventory contains key material",
+    why="""The inventory is kept in git, copied to laptops and pasted into chats: a key that was ever in it is public,
+    even after its removal.""",
+    fix="Replace it with a reference (`{env: NAME}`, `{file: ...}` or `{age: ...}`), and generate a new key.",
     failing="system: {log_host: 10.42.0.100}  # psk: 5f4dcc3b5aa765d61d8327deb882cf99",
     passing="system: {log_host: 10.42.0.100}  # the key is in the vault",
 )
 def key_material(file: str, text: str) -> Iterator[Finding]:
     for number, line in enumerate(text.splitlines(), 1):
-        for pattern, what in _MATERIAL:
+        for pattern, what in _KEY_MATERIAL:
             match = pattern.search(line)
             if match is not None:
                 place = Position(file, number, match.start() + 1)
-                yield Finding((), f"{what} stands in the file", "a reference to it", position=place)
+                yield Finding((), f"the file contains {what}", "a reference", position=place)
                 break
 
 
 @fleet_rule(
     "MC442",
     Severity.ERROR,
-    "A file with a secret can be read by others",
-    why="Everybody with a login on the operator's machine, and every program that runs there, has the fleet's key.",
-    mend="`chmod 600` the file.",
+    "A secret file is readable by others",
+    why="Every user and every program on the operator's machine can read the fleet's key.",
+    fix="Run `chmod 600` on the file.",
     failing=Example(
         "udp_mesh: {keys: [{file: mode-0644.key}]}",
         files={"mode-0644.key": _TRANSPORT_KEY},
@@ -124,9 +124,9 @@ def secret_readable(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC443",
     Severity.ERROR,
-    "A file with a secret lies inside the repository",
+    "A secret file is inside the repository",
     why="The next `git add .` publishes it.",
-    mend="Move it out of the repository, list it in .gitignore, or encrypt it with age.",
+    fix="Move it out of the repository, list it in .gitignore, or encrypt it with age.",
     failing=Example(
         "udp_mesh: {keys: [{file: fleet.key}]}",
         files={".git/HEAD": "ref: refs/heads/main", "fleet.key": _TRANSPORT_KEY},
@@ -145,10 +145,9 @@ def secret_in_repository(fleet: Fleet, context: LintContext) -> Iterator[Finding
 @fleet_rule(
     "MC444",
     Severity.ERROR,
-    "An encrypted file that a secret refers to is missing",
-    why="""An encrypted file is meant to travel with the inventory. Without it nobody can render anything, and it is
-    better to learn that now than in the field.""",
-    mend="Commit the file, or mend the path: it is relative to the file that names it.",
+    "An age file that a secret refers to is missing",
+    why="An encrypted file belongs next to the inventory. Without it, rendering fails.",
+    fix="Commit the file, or correct the path, which is relative to the file that names it.",
     failing="udp_mesh: {keys: [{age: absent.age, key: udp_mesh}]}",
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}]}",
 )
@@ -161,13 +160,12 @@ def secret_file_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]
 @fleet_rule(
     "MC445",
     Severity.ERROR,
-    "The transport's key is not a key",
-    why="""udp_mesh takes 32 random bytes, as 64 hexadecimal digits or in base64, and refuses to start with anything
-    else. A word or a short key would be found by trying: a few seconds of recorded traffic are enough to try
-    against.""",
-    mend="Make a new one: `udp-mesh keygen FILE` or `openssl rand -hex 32`.",
+    "The transport key is invalid",
+    why="""udp_mesh requires 32 random bytes, as 64 hexadecimal digits or base64, and refuses to start with anything
+    else. A word or a short key could be guessed offline from a few seconds of recorded traffic.""",
+    fix="Generate one: `udp-mesh keygen FILE` or `openssl rand -hex 32`.",
     failing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": "husky2021"}),
-    # as `udp-mesh keygen` writes it, with the key's id behind it
+    # as `udp-mesh keygen` writes it, followed by the key id
     passing=Example(
         "udp_mesh: {keys: [{file: mode-0600.key}]}", files={"mode-0600.key": f"{_TRANSPORT_KEY}  # 5d3c1a90\n"}
     ),
@@ -178,45 +176,45 @@ def transport_key_invalid(fleet: Fleet, context: LintContext) -> Iterator[Findin
         if secret is not None and key_bytes(key_text(secret)) is None:
             expected = f"{_KEY_BYTES} bytes: {2 * _KEY_BYTES} hexadecimal digits, or base64"
             found = f"{len(key_text(secret))} characters"
-            yield Finding(("udp_mesh", "keys", str(index)), "no key", expected, found)
+            yield Finding(("udp_mesh", "keys", str(index)), "invalid key", expected, found)
 
 
 @fleet_rule(
     "MC446",
     Severity.ERROR,
     "The transport has no key",
-    why="Without a fleet key anyone in reach can send an emergency stop, or lift one.",
-    mend="Say where the key is: `udp_mesh: {keys: [{env: UDP_MESH_KEY}]}`.",
+    why="Without a fleet key, anyone in range can send or release an emergency stop.",
+    fix="Reference the key: `udp_mesh: {keys: [{env: UDP_MESH_KEY}]}`.",
     failing="udp_mesh: {keys: []}",
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}]}",
 )
 def transport_key_missing(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     computers = any(robot.computer is not None for robot in fleet.robots.values())
     if computers and fleet.topics and not fleet.udp_mesh.keys:
-        yield Finding(("udp_mesh",), "messages would go unsealed", "a reference in `keys`", "none")
+        yield Finding(("udp_mesh",), "messages would be unprotected", "a reference in `keys`", "none")
 
 
 @fleet_rule(
     "MC447",
     Severity.WARNING,
-    "One secret is used for two things",
-    why="""The Wi-Fi passphrase is on every radio, in flash, and in the hands of whoever finds a lost beacon. If it is
-    the transport's key as well, a lost beacon opens everything.""",
-    mend="Use a secret of its own for each.",
+    "One secret is used for two purposes",
+    why="""The Wi-Fi passphrase is in the flash of every radio, including lost beacons. If it is also the transport key,
+    a lost beacon exposes both.""",
+    fix="Use a separate secret for each.",
     failing=Example("udp_mesh: {keys: [{env: MESH_KEY}]}", environment={"MESH_KEY": _TRANSPORT_KEY}),
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}]}",
 )
 def secret_shared(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    mesh_keys = {_mark(context, ref): place for place, ref in secret_refs(fleet) if place[0] == "meshes"}
+    mesh_keys = {_identity(context, ref): place for place, ref in secret_refs(fleet) if place[0] == "meshes"}
     for index, ref in enumerate(fleet.udp_mesh.keys):
-        place = mesh_keys.get(_mark(context, ref))
+        place = mesh_keys.get(_identity(context, ref))
         if place is not None:
             message = f"also the key of {place[0]}.{place[1]}"
-            yield Finding(("udp_mesh", "keys", str(index)), message, "a secret of its own", str(ref))
+            yield Finding(("udp_mesh", "keys", str(index)), message, "a separate secret", str(ref))
 
 
-def _mark(context: LintContext, ref: SecretRef) -> Hashable:
-    """What two references to one secret share: its value where that is at hand, else where it is."""
+def _identity(context: LintContext, ref: SecretRef) -> Hashable:
+    """Equal for two references to one secret: its value if available, else its location."""
     secret = context.secret(ref)
     return (ref.kind, ref.where, ref.key) if secret is None else Secret(key_text(secret))
 
@@ -224,27 +222,27 @@ def _mark(context: LintContext, ref: SecretRef) -> Hashable:
 @fleet_rule(
     "MC448",
     Severity.WARNING,
-    "One transport key is listed twice",
-    why="Two live keys are for a change of keys: the old beside the new. The same one twice rotates nothing.",
-    mend="List the new key first and the old one behind it; take the old one out when all robots have the new.",
+    "A transport key is listed twice",
+    why="Two live keys exist for key rotation: the new one and the old one. A duplicate rotates nothing.",
+    fix="List the new key first and the old one second; remove the old one when all robots have the new key.",
     failing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: UDP_MESH_KEY}]}",
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: UDP_MESH_OLD_KEY}]}",
 )
 def transport_key_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    marks = ((_mark(context, ref), index) for index, ref in enumerate(fleet.udp_mesh.keys))
-    for _, indexes in repeated(marks):
+    marks = ((_identity(context, ref), index) for index, ref in enumerate(fleet.udp_mesh.keys))
+    for _, indexes in duplicates(marks):
         for index in indexes[1:]:
             found = str(fleet.udp_mesh.keys[index])
-            yield Finding(("udp_mesh", "keys", str(index)), "the same key stands above", "another key", found)
+            yield Finding(("udp_mesh", "keys", str(index)), "duplicate of an earlier key", "another key", found)
 
 
 @fleet_rule(
     "MC449",
     Severity.ERROR,
     "More than two transport keys are live",
-    why="""udp_mesh holds two keys: the one it seals with and the one before. A third is never tried, and robots that
-    still use it fall silent.""",
-    mend="Finish the change of keys: leave the new one and at most one old one.",
+    why="""udp_mesh holds two keys: the current one and the previous one. A third is never tried, and robots that still
+    use it are cut off.""",
+    fix="Finish the key rotation: keep the new key and at most one old key.",
     failing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: SECOND}, {env: THIRD}]}",
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: SECOND}]}",
 )
@@ -257,10 +255,9 @@ def too_many_transport_keys(fleet: Fleet, _context: LintContext) -> Iterator[Fin
 @fleet_rule(
     "MC450",
     Severity.ERROR,
-    "A file of secrets lacks the secret",
-    why="""The file is here, and what the inventory looks for in it is not: rendering and provisioning stop at this
-    reference, in the field if not here.""",
-    mend="Correct `key`, or add the entry to the file.",
+    "A secret file lacks the secret",
+    why="The file exists but does not contain the referenced entry: rendering and provisioning fail at this reference.",
+    fix="Correct `key`, or add the entry to the file.",
     failing=Example(
         "udp_mesh: {keys: [{file: mode-0600.yaml, key: udp-mesh}]}",
         files={"mode-0600.yaml": f"udp_mesh: {_TRANSPORT_KEY}\n"},
@@ -280,49 +277,48 @@ def secret_absent(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         if problem:
             key = "key" if ref.key else ref.kind.value
             yield Finding(
-                (*place, key), "no secret there", f"a text under `{ref.key}`" if ref.key else "a text", problem
+                (*place, key), "no secret found", f"a text under `{ref.key}`" if ref.key else "a text", problem
             )
 
 
 @fleet_rule(
     "MC451",
     Severity.WARNING,
-    "The variable of a secret is empty",
-    why="""The variable is set, to nothing: a misspelt name on the right of `export`, or a CI job without access to its
-    secrets. Rendering refuses it like one that is not set.""",
-    mend="Export the secret, or unset the variable where secrets are not needed.",
+    "The environment variable of a secret is empty",
+    why="""The variable is set to an empty string: a misspelled name on the right of `export`, or a CI job without
+    access to its secrets. Rendering refuses it like an unset variable.""",
+    fix="Export the secret, or unset the variable where secrets are not needed.",
     failing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": ""}),
     passing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": _TRANSPORT_KEY}),
 )
 def variable_empty(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for place, ref in secret_refs(fleet):
         if ref.kind is SecretKind.ENV and context.secret_problem(ref):
-            yield Finding((*place, "env"), "set, and empty", "the secret", f"{ref.where}=")
+            yield Finding((*place, "env"), "set but empty", "the secret", f"{ref.where}=")
 
 
 @fleet_rule(
     "MC452",
     Severity.NOTE,
-    "A file with a key is not on this machine",
-    why="""Continuous integration has no keys, and need not. The operator's laptop must have them: without the file,
-    rendering or logging in fails.""",
-    mend="Copy the file to this machine, or correct the path: it is relative to the file that names it.",
+    "A key file is not on this machine",
+    why="CI does not need the keys. The operator's laptop does: without the file, rendering or login fails.",
+    fix="Copy the file to this machine, or correct the path, which is relative to the file that names it.",
     failing="nodes: {base: {ssh: {key_files: [absent_ed25519]}}}",
     passing=Example("nodes: {base: {ssh: {key_files: [id_ed25519]}}}", files={"id_ed25519": "a private key"}),
 )
 def key_file_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for place, path, what in _secret_files(fleet):
         if context.files.mode(path) is None and not context.files.is_special(path):
-            yield Finding(place, f"{what} is not here", "a file", str(path))
+            yield Finding(place, f"{what} is missing", "a file", str(path))
 
 
 @fleet_rule(
     "MC453",
     Severity.ERROR,
-    "The transport's key can be guessed",
-    why="""32 bytes of zeros, one byte repeated or a count are keys in form only: they are the first ones to be tried,
-    and anyone who finds one can stop every robot.""",
-    mend="Make a new one: `udp-mesh keygen FILE` or `openssl rand -hex 32`.",
+    "The transport key is guessable",
+    why="""32 zero bytes, a repeated byte or a counting sequence are among the first keys that an attacker tries; with
+    the key, anyone can stop every robot.""",
+    fix="Generate one: `udp-mesh keygen FILE` or `openssl rand -hex 32`.",
     failing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": "0" * 64}),
     passing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": _TRANSPORT_KEY}),
 )
@@ -335,6 +331,6 @@ def transport_key_guessable(fleet: Fleet, context: LintContext) -> Iterator[Find
 
 
 def _is_pattern(raw: bytes) -> bool:
-    """Few different bytes (32 random ones have 30, and never below 16), or all of them at one distance."""
+    """Few distinct bytes (32 random bytes have about 30, in practice never below 16), or an arithmetic sequence."""
     distances = {(second - first) % 256 for first, second in pairwise(raw)}
-    return len(set(raw)) < _LEAST_DIFFERENT_BYTES or len(distances) == 1
+    return len(set(raw)) < _MIN_DISTINCT_BYTES or len(distances) == 1

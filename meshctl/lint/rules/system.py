@@ -8,7 +8,7 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.addresses import as_address
-from meshctl.lint.rules.references import known
+from meshctl.lint.rules.references import suggest
 from meshctl.lint.zones import is_posix, posix_of, same_clock, zones
 from meshctl.model import Fleet
 
@@ -16,10 +16,10 @@ from meshctl.model import Fleet
 @fleet_rule(
     "MC231",
     Severity.WARNING,
-    "The time zone is not a POSIX time zone",
-    why="""OpenWrt's C library reads `timezone` and knows no names such as America/Denver: it falls back to UTC
-    without a word, and the radios' logs are hours apart from everyone's notes.""",
-    mend="Write the POSIX string in `timezone`, and the name in `zonename`.",
+    "The time zone is not a POSIX time zone string",
+    why="""OpenWrt's C library does not know names such as America/Denver: it silently falls back to UTC, and the
+    radios' logs are hours off.""",
+    fix="Put the POSIX string in `timezone` and the name in `zonename`.",
     failing="system: {timezone: America/Denver}",
     passing="system: {timezone: 'MST7MDT,M3.2.0,M11.1.0', zonename: America/Denver}",
 )
@@ -29,27 +29,27 @@ def timezone_not_posix(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
         posix = posix_of(written)
         expected = posix if posix is not None else "a POSIX time zone such as MST7MDT,M3.2.0,M11.1.0"
         hint = f"write `timezone: {posix}` and `zonename: {written}`" if posix is not None else ""
-        yield Finding(("system", "timezone"), "read as UTC", expected, written, hint)
+        yield Finding(("system", "timezone"), "OpenWrt would use UTC", expected, written, hint)
 
 
 @fleet_rule(
     "MC232",
     Severity.WARNING,
-    "The name of the time zone is not known",
-    why="OpenWrt links /tmp/localtime to the zone's file. With a name that no zone has, the link is not made.",
-    mend="Write a name of the time zone database, such as America/New_York.",
+    "The time zone name is unknown",
+    why="OpenWrt links /tmp/localtime to the zone's file; for an unknown name the link is missing.",
+    fix="Use a name from the time zone database, such as America/New_York.",
     failing="system: {timezone: 'MST7MDT,M3.2.0,M11.1.0', zonename: America/Dever}",
     passing="system: {timezone: 'MST7MDT,M3.2.0,M11.1.0', zonename: America/Denver}",
 )
 def zonename_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     name = fleet.system.zonename
     if name and posix_of(name) is None:
-        _, hint = known(_near_by(name), name)
-        yield Finding(("system", "zonename"), "no such zone", "a name of the time zone database", name, hint)
+        _, hint = suggest(_near_by(name), name)
+        yield Finding(("system", "zonename"), "unknown time zone", "a name of the time zone database", name, hint)
 
 
 def _near_by(name: str) -> list[str]:
-    """The zones of the name's own continent; all comparisons with every zone would take too long."""
+    """Zones of the same continent: comparing with every zone takes too long."""
     continent = name.partition("/")[0]
     same = [zone for zone in zones() if zone.partition("/")[0] == continent]
     return same or [zone for zone in zones() if zone.rpartition("/")[2][:1] == name.rpartition("/")[2][:1]]
@@ -58,30 +58,30 @@ def _near_by(name: str) -> list[str]:
 @fleet_rule(
     "MC233",
     Severity.WARNING,
-    "The time zone and its name disagree",
-    why="""Which of the two counts depends on the packages in the image: with zoneinfo the name, without it the POSIX
-    string. Nodes of two images then have two clocks.""",
-    mend="Write the POSIX string of the zone that is named.",
+    "`timezone` and `zonename` disagree",
+    why="""Images with zoneinfo packages use the name, other images the POSIX string: nodes with different images have
+    different local times.""",
+    fix="Set `timezone` to the POSIX string of `zonename`.",
     failing="system: {timezone: 'CST6CDT,M3.2.0,M11.1.0', zonename: America/Denver}",
     passing="system: {timezone: 'MST7MDT,M3.2.0,M11.1.0', zonename: America/Denver}",
 )
 def zone_disagrees(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     system = fleet.system
     posix = posix_of(system.zonename)
-    # UTC is what both are when they are not written
+    # both default to UTC
     if posix is None or system.zonename == "UTC" or not is_posix(system.timezone):
         return
     if not same_clock(posix, system.timezone):
-        yield Finding(("system", "timezone"), f"not the time of {system.zonename}", posix, system.timezone)
+        yield Finding(("system", "timezone"), f"does not match {system.zonename}", posix, system.timezone)
 
 
 @fleet_rule(
     "MC234",
     Severity.NOTE,
-    "Logs or the time come from an unknown address",
-    why="""The address lies in the fleet's network, and no node and no computer of the inventory has it. If it is a
-    slip, the logs are lost, and that shows only when they are needed.""",
-    mend="Name the address of a computer, or suppress this finding for a server that the inventory does not know.",
+    "A log host or time server has an unknown address",
+    why="""The address is in the fleet's network, but no node or computer in the inventory has it. If it is a typo, the
+    logs are lost.""",
+    fix="Use the address of a computer, or suppress this finding for a server that is not in the inventory.",
     failing="system: {log_host: 10.42.0.77}",
     passing="system: {log_host: 10.42.0.100}",
 )
@@ -98,4 +98,4 @@ def server_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for path, host in places:
         address = as_address(host)
         if address is not None and host not in stations and any(address in network for network in networks):
-            yield Finding(path, "no station of the inventory", "the address of a computer", host)
+            yield Finding(path, "no station in the inventory has this address", "the address of a computer", host)

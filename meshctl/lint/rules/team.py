@@ -1,5 +1,4 @@
-"""Robots, roles and reach: who rides where, whether every mesh reaches the base, how carefully it is changed
-(MC601 to MC619)."""
+"""Robots and roles: assignment of nodes, connectivity to the base, rollout policy (MC601 to MC619)."""
 
 from __future__ import annotations
 
@@ -7,7 +6,7 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, listed, repeated
+from meshctl.lint.grouping import duplicates, group_by_key, join_limited
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, NodeState, Role
@@ -17,9 +16,9 @@ from meshctl.model import Fleet, NodeState, Role
     "MC601",
     Severity.ERROR,
     "A mesh has no route to the base",
-    why="""Its nodes talk to each other and to nobody who could stop them: no node, and no robot with radios in several
-    meshes, joins it to the mesh of the base station.""",
-    mend="Give the base a radio in this mesh, or a robot radios in both.",
+    why="""Its nodes can reach each other but not the operator: no node, and no robot with radios in several meshes,
+    connects it to the base station's mesh.""",
+    fix="Give the base a radio in this mesh, or a robot radios in both meshes.",
     failing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 2g, channel: 11, network: 10.43.0.0/24,
@@ -45,17 +44,17 @@ def mesh_cut_off(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     reached = _reached_from_base(fleet)
     if not reached:
         return
-    members_of = grouped((mesh, node.name) for node in fleet.managed() for mesh in node.meshes)
+    members_of = group_by_key((mesh, node.name) for node in fleet.managed() for mesh in node.meshes)
     for name in fleet.meshes:
         members = members_of.get(name, ())
         if members and name not in reached:
             path = ("meshes", name)
-            message = f"{len(members)} nodes ({listed(members)}) cannot reach the base"
-            yield Finding(path, message, f"a radio in {listed(sorted(reached))} as well", "none")
+            message = f"{len(members)} nodes ({join_limited(members)}) cannot reach the base"
+            yield Finding(path, message, f"a radio in {join_limited(sorted(reached))} as well", "none")
 
 
 def _reached_from_base(fleet: Fleet) -> set[str]:
-    """The meshes that the base stands in, and those joined to them by a node or a robot in both."""
+    """The base's meshes, and those connected to them by a node or robot that is in both."""
     start = {
         mesh
         for node in fleet.managed()
@@ -66,14 +65,14 @@ def _reached_from_base(fleet: Fleet) -> set[str]:
     for robot in fleet.robots.values():
         nodes = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
         joints.append({mesh for node in nodes if node.state.is_managed for mesh in node.meshes})
-    joints_of = grouped((mesh, joint) for joint in joints for mesh in joint)
+    joints_of = group_by_key((mesh, joint) for joint in joints for mesh in joint)
     reached: set[str] = set()
     waiting = list(start)
     while waiting:
         mesh = waiting.pop()
         if mesh not in reached:
             reached.add(mesh)
-            # a joint leads on once, whichever of its meshes is reached first
+            # follow each joint once, from the first of its meshes that is reached
             for joint in joints_of.pop(mesh, []):
                 waiting.extend(joint - reached)
     return reached
@@ -82,30 +81,30 @@ def _reached_from_base(fleet: Fleet) -> set[str]:
 @fleet_rule(
     "MC602",
     Severity.ERROR,
-    "The fleet has no base",
-    why="""Plans order nodes by their distance from the operator, and keep the way to them open until the last. Without
-    a base there is no such order.""",
-    mend="Give the operator's radio `role: base`.",
+    "The fleet has no base node",
+    why="""Plans order nodes by their distance from the operator, so that the path to them stays up until the end.
+    Without a base node there is no such order.""",
+    fix="Set `role: base` on the operator's radio.",
     failing="nodes: {base: {role: robot}}",
     passing="nodes: {base: {role: base}}",
 )
 def no_base(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     managed = list(fleet.managed())
     if managed and not any(node.role is Role.BASE for node in managed):
-        yield Finding(("nodes",), "no node is the operator's", "a node with `role: base`", "none")
+        yield Finding(("nodes",), "no node has the role base", "a node with `role: base`", "none")
 
 
 @fleet_rule(
     "MC603",
     Severity.WARNING,
     "The mesh has too few beacons",
-    why="The chain will not reach as deep as planned, and there is none to spare for one that falls on its antenna.",
-    mend="Add beacons, mark repaired ones as `carried`, or lower `min_beacons`.",
+    why="The relay chain will not reach the planned depth, and there is no reserve for a failed beacon.",
+    fix="Add beacons, mark repaired ones as `carried`, or lower `min_beacons`.",
     failing="meshes: {main: {min_beacons: 3}}",
     passing="meshes: {main: {min_beacons: 1}}",
 )
 def too_few_beacons(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    ready = grouped(
+    ready = group_by_key(
         (mesh, node.name)
         for node in fleet.managed()
         if node.role is Role.BEACON and node.state is not NodeState.SPARE
@@ -122,41 +121,43 @@ def too_few_beacons(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC604",
     Severity.ERROR,
     "Two robots are the base station",
-    why="udp_mesh sends what is for the base to one peer; with two, half of the reports go to the wrong one.",
-    mend="Set `is_base: true` at one robot only.",
+    why="udp_mesh sends messages for the base to one peer; with two, half of the reports go to the wrong one.",
+    fix="Set `is_base: true` on one robot only.",
     failing="robots: {husky1: {is_base: true}}",
     passing="robots: {husky1: {is_base: false}}",
 )
 def two_bases(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     bases = [robot.name for robot in fleet.robots.values() if robot.is_base]
     for name in bases[1:]:
-        yield Finding(("robots", name, "is_base"), f"{bases[0]} is the base as well", "one base", listed(bases))
+        yield Finding(
+            ("robots", name, "is_base"), f"{bases[0]} is also the base station", "one base station", join_limited(bases)
+        )
 
 
 @fleet_rule(
     "MC605",
     Severity.ERROR,
     "Two robots claim one node",
-    why="A radio rides on one robot: the loop check, the order of changes and the status page of both would be wrong.",
-    mend="Leave the node with the robot it is mounted on.",
+    why="A radio is on one robot: the loop check, the order of changes and the status of both would be wrong.",
+    fix="Keep the node on the robot that it is mounted on.",
     failing="robots: {base-station: {nodes: [base, husky1-front]}}",
     passing="robots: {base-station: {nodes: [base]}}",
 )
 def node_of_two_robots(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    # a radio that is mounted on one robot and carried by another belongs to a robot that is brought along, say a UAV
+    # a radio mounted on one robot and carried by another belongs to a carried robot, such as a UAV
     claims = (
         ((key, name), robot.name)
         for robot in fleet.robots.values()
         for key, names in (("nodes", robot.nodes), ("carries", robot.carries))
         for name in names
     )
-    for (key, name), (first, *others) in repeated(claims):
+    for (key, name), (first, *others) in duplicates(claims):
         for robot in others:
-            message = f"{name} is claimed by {first} already"
-            yield Finding(("robots", robot, key, name), message, "one robot for each node", name)
+            message = f"{name} is already claimed by {first}"
+            yield Finding(("robots", robot, key, name), message, "one robot per node", name)
     for robot_name, name in _own_freight(fleet):
         message = f"{name} is mounted on {robot_name} itself"
-        yield Finding(("robots", robot_name, "carries", name), message, "under `nodes` or under `carries`", name)
+        yield Finding(("robots", robot_name, "carries", name), message, "either `nodes` or `carries`", name)
 
 
 def _own_freight(fleet: Fleet) -> Iterator[tuple[str, str]]:
@@ -166,17 +167,17 @@ def _own_freight(fleet: Fleet) -> Iterator[tuple[str, str]]:
 
 
 def _mounted(fleet: Fleet) -> set[str]:
-    """The nodes that some robot has under `nodes`."""
+    """The nodes that a robot lists under `nodes`."""
     return {name for robot in fleet.robots.values() for name in robot.nodes}
 
 
 @fleet_rule(
     "MC606",
     Severity.ERROR,
-    "A node and a robot disagree about who rides where",
-    why="""The node says it rides on one robot, another robot lists it: one of the two lines was not changed when the
-    radio was moved.""",
-    mend="Say it in one place: leave `robot` out at the node, or mend the robot's list.",
+    "A node and a robot disagree about the node's robot",
+    why="""The node names one robot, but another robot lists it: one of the two was not updated when the radio was
+    moved.""",
+    fix="Define it in one place: omit `robot` on the node, or correct the robot's list.",
     failing="nodes: {husky1-front: {robot: base-station}}",
     passing="nodes: {husky1-front: {robot: husky1}}",
 )
@@ -194,10 +195,10 @@ def robot_disagrees(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC607",
     Severity.WARNING,
-    "A robot carries what is no beacon",
-    why="""What a robot carries is dropped, or flies off: a beacon, or the radio of a robot that is brought along and
-    has an entry of its own. A base radio, or a robot's radio that no robot has under `nodes`, is a slip.""",
-    mend="List beacons and the radios of carried robots under `carries`, and mounted radios under `nodes`.",
+    "A robot carries a node that is not a beacon",
+    why="""Carried nodes are deployed on the way: beacons, or the radio of a carried robot (such as a UAV) that has its
+    own entry. A base radio, or a robot's radio that no robot lists under `nodes`, is probably a mistake.""",
+    fix="List beacons and radios of carried robots under `carries`, and mounted radios under `nodes`.",
     failing="""
     nodes: {extra: {role: robot, address: 10.42.0.60, robot: husky1}}
     robots: {husky1: {carries: [b01, extra]}}
@@ -217,16 +218,16 @@ def carries_no_beacon(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             is_brought = node is not None and node.role is Role.ROBOT and name in mounted and name not in robot.nodes
             if node is not None and node.role is not Role.BEACON and not is_brought:
                 path = ("robots", robot.name, "carries", name)
-                yield Finding(path, f"{name} is not dropped", "a node with role beacon", node.role.value)
+                yield Finding(path, f"{name} is not a beacon", "a node with role beacon", node.role.value)
 
 
 @fleet_rule(
     "MC608",
     Severity.WARNING,
     "A carried beacon is on no robot",
-    why="""A beacon that is `carried` may be off and raises no alarm. If no robot carries it, it is in nobody's rack,
-    and will be missed when it is wanted.""",
-    mend="List it under a robot's `carries`, or set its state to `spare`.",
+    why="""A `carried` beacon may be off and raises no alarm. If no robot carries it, its absence is noticed only when
+    it is needed.""",
+    fix="List it under a robot's `carries`, or set its state to `spare`.",
     failing="nodes: {b02: {role: beacon, state: carried, address: 10.42.0.102}}",
     passing="""
     nodes: {b02: {role: beacon, state: carried, address: 10.42.0.102}}
@@ -245,8 +246,8 @@ def carried_by_nobody(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC609",
     Severity.ERROR,
     "A robot has no radio",
-    why="Without a managed node it hears nobody, and nobody can stop it.",
-    mend="List its radio under `nodes`; a lost one does not count.",
+    why="Without a managed node the robot is unreachable and cannot be stopped.",
+    fix="List its radio under `nodes`; a lost node does not count.",
     failing="""
     nodes: {husky1-front: {state: lost}}
     """,
@@ -256,17 +257,17 @@ def robot_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     for robot in fleet.robots.values():
         known = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
         if len(known) == len(robot.nodes) and not any(node.state.is_managed for node in known):
-            found = listed([f"{node.name} ({node.state.value})" for node in known]) or "none"
+            found = join_limited([f"{node.name} ({node.state.value})" for node in known]) or "none"
             yield Finding(("robots", robot.name), "no radio is in use", "at least one managed node", found)
 
 
 @fleet_rule(
     "MC610",
     Severity.WARNING,
-    "A radio of a robot rides on none",
-    why="""A node with `role: robot` moves, and with it everything behind it; without its robot, lint cannot see loops,
-    nor plans whom a change cuts off.""",
-    mend="List it under the robot's `nodes`, or give it another role.",
+    "A robot radio belongs to no robot",
+    why="""A node with `role: robot` moves together with everything behind it. Without its robot, lint cannot detect
+    loops, and plans cannot determine what a change disconnects.""",
+    fix="List it under the robot's `nodes`, or change its role.",
     failing="nodes: {stray: {role: robot, address: 10.42.0.77}}",
     passing="""
     nodes: {stray: {role: robot, address: 10.42.0.77}}
@@ -276,15 +277,15 @@ def robot_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding
 def robot_radio_without_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
         if node.role is Role.ROBOT and not node.robot and fleet.robots:
-            yield Finding(("nodes", node.name), "rides on no robot", "a robot that lists it", "none")
+            yield Finding(("nodes", node.name), "belongs to no robot", "a robot that lists it", "none")
 
 
 @fleet_rule(
     "MC611",
     Severity.WARNING,
     "The base is not deployed",
-    why="Everything is reached through the base. As `carried` or `spare` it may be off, and status would not alarm.",
-    mend="Set its state to `deployed`.",
+    why="All nodes are reached through the base. As `carried` or `spare` it may be off without an alarm.",
+    fix="Set its state to `deployed`.",
     failing="nodes: {base: {state: spare}}",
     passing="nodes: {base: {state: deployed}}",
 )
@@ -292,15 +293,15 @@ def base_not_deployed(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     bases = [node for node in fleet.managed() if node.role is Role.BASE]
     if bases and not any(node.state is NodeState.DEPLOYED for node in bases):
         path = ("nodes", bases[0].name, "state")
-        yield Finding(path, "the way to all others", "deployed", bases[0].state.value)
+        yield Finding(path, "all other nodes are reached through it", "deployed", bases[0].state.value)
 
 
 @fleet_rule(
     "MC612",
     Severity.ERROR,
-    "A way leads through a node that is not in use",
-    why="The jump host is lost, retired or still in its box: the node behind it cannot be reached.",
-    mend="Jump through a node that is deployed.",
+    "A jump host is not in use",
+    why="The jump host is lost, retired or spare: the node behind it cannot be reached.",
+    fix="Use a deployed node as the jump host.",
     failing="""
     nodes:
       old: {role: beacon, state: lost, address: 10.42.0.66}
@@ -320,27 +321,28 @@ def jump_not_in_use(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC613",
     Severity.WARNING,
-    "Most of a mesh may be changed at once",
-    why="With more than half of the nodes down together, a bad change takes the mesh and the way to mend it.",
-    mend="Lower `apply.max_down`: one at a time is safe, a fifth of the mesh is usual.",
+    "Most of a mesh may be down at once",
+    why="""With more than half of the nodes down at the same time, a bad change takes down the mesh and the way to
+    repair it.""",
+    fix="Lower `apply.max_down`: 1 is safe, a fifth of the mesh is usual.",
     failing="apply: {max_down: 3}",
     passing="apply: {max_down: 1}",
 )
 def max_down_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    sizes = grouped((mesh, node.name) for node in fleet.managed() for mesh in node.meshes)
+    sizes = group_by_key((mesh, node.name) for node in fleet.managed() for mesh in node.meshes)
     smallest = min((len(names) for names in sizes.values()), default=0)
     if smallest > 1 and fleet.apply.max_down > max(smallest // 2, 1):
         expected = f"at most {max(smallest // 2, 1)}"
         found = f"{fleet.apply.max_down} of {smallest} nodes"
-        yield Finding(("apply", "max_down"), "a bad change takes most of a mesh", expected, found)
+        yield Finding(("apply", "max_down"), "a bad change takes down most of a mesh", expected, found)
 
 
 @fleet_rule(
     "MC614",
     Severity.WARNING,
-    "Many nodes are changed without trying one first",
-    why="Without a canary the first node that shows a mistake is one of many that have it.",
-    mend="Set `apply.canary: true`.",
+    "Changes are rolled out without a canary",
+    why="Without a canary, a mistake reaches many nodes before the first one shows it.",
+    fix="Set `apply.canary: true`.",
     failing="apply: {canary: false}",
     passing="apply: {canary: true}",
 )
@@ -352,10 +354,10 @@ def no_canary(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC615",
     Severity.WARNING,
-    "The quorum is below one half",
-    why="""A change of the whole cell is kept when the quorum forms again. Below a half, a split mesh counts as success,
-    and both parts may keep different configurations.""",
-    mend="Set `apply.quorum` to 0.6 or more.",
+    "The quorum is not more than one half",
+    why="""A change of the whole cell is kept when the quorum rejoins. At one half or less, a split mesh counts as
+    success, and its parts may keep different configurations.""",
+    fix="Set `apply.quorum` to 0.6 or more.",
     failing="apply: {quorum: 0.4}",
     passing="apply: {quorum: 0.8}",
 )
@@ -368,25 +370,25 @@ def quorum_low(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC616",
     Severity.WARNING,
-    "A run goes on after many failures",
-    why="The second node that fails the same way says what the tenth would: by then ten have to be mended by hand.",
-    mend="Set `apply.stop_after_failures` to 1 or 2.",
+    "A run continues after many failures",
+    why="""After the first failures, further ones of the same kind add no information, but each failed node has to be
+    repaired by hand.""",
+    fix="Set `apply.stop_after_failures` to 1 or 2.",
     failing="apply: {stop_after_failures: 10}",
     passing="apply: {stop_after_failures: 2}",
 )
 def stops_late(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     if fleet.apply.stop_after_failures > 5:
         found = str(fleet.apply.stop_after_failures)
-        yield Finding(("apply", "stop_after_failures"), "many nodes fail before it stops", "at most 5", found)
+        yield Finding(("apply", "stop_after_failures"), "many nodes fail before the run stops", "at most 5", found)
 
 
 @fleet_rule(
     "MC617",
     Severity.WARNING,
-    "A robot that sends or gets messages has no computer",
-    why="""udp_mesh runs on the robot's computer: a topic that names a robot without one is never sent, or never
-    arrives.""",
-    mend="Give the robot a `computer`, or `fielded` while it runs the fielded program, or take it out of the topic.",
+    "A robot in a topic has no computer",
+    why="udp_mesh runs on the robot's computer: messages from or to a robot without one are never delivered.",
+    fix="Give the robot a `computer`, or `fielded` while it runs the legacy udp_mesh, or remove it from the topic.",
     failing="robots: {husky1: {computer: <removed>}}",
     passing="robots: {husky1: {computer: {python: python3}}}",
 )
@@ -397,33 +399,33 @@ def peer_without_computer(fleet: Fleet, _context: LintContext) -> Iterator[Findi
                 robot = fleet.robots.get(name)
                 if robot is not None and robot.computer is None and robot.fielded is None:
                     path = ("topics", topic.name, key, str(index))
-                    yield Finding(path, f"{name} runs no udp_mesh", "a robot with a computer", name)
+                    yield Finding(path, f"{name} does not run udp_mesh", "a robot with a computer", name)
 
 
 @fleet_rule(
     "MC618",
     Severity.WARNING,
     "No robot is the base station",
-    why="""udp_mesh runs on computers, and none of them is the operator's: status cannot say who reaches the base, nor
-    preflight whether the emergency stop does.""",
-    mend="Set `is_base: true` at the robot that stands for the operator's computer.",
+    why="""No computer is marked as the operator's: status cannot report which robots reach the base, and preflight
+    cannot check the emergency stop.""",
+    fix="Set `is_base: true` on the robot entry of the operator's computer.",
     failing="robots: {base-station: {is_base: false}}",
     passing="robots: {base-station: {is_base: true}}",
 )
 def no_base_station(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     has_computers = any(robot.computer is not None for robot in fleet.robots.values())
     if has_computers and not any(robot.is_base for robot in fleet.robots.values()):
-        # the one that says `is_base: false`, if any does
+        # an explicit `is_base: false`, if there is one
         path = first_written(fleet, *(("robots", name, "is_base") for name in fleet.robots), ("robots",))
-        yield Finding(path, "none is the operator's", "one robot with `is_base: true`", "none")
+        yield Finding(path, "no robot is the base station", "one robot with `is_base: true`", "none")
 
 
 @fleet_rule(
     "MC619",
     Severity.ERROR,
     "The base joins no mesh",
-    why="Every way to the fleet begins at the base. Without a radio in a mesh nothing behind it can be reached.",
-    mend="Name the mesh at one of its radios.",
+    why="Every path to the fleet starts at the base. Without a radio in a mesh, nothing behind it can be reached.",
+    fix="Set `mesh` on one of its radios.",
     failing="nodes: {base: {radios: {radio0: {mesh: null}}}}",
     passing="nodes: {base: {radios: {radio0: {mesh: main}}}}",
 )

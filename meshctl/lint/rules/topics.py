@@ -1,4 +1,4 @@
-"""What the robots say: priorities, destinations, delivery (MC701 to MC718)."""
+"""Topics: priorities, destinations, delivery (MC701 to MC718)."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import grouped, listed
+from meshctl.lint.grouping import group_by_key, join_limited
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.references import known
+from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet, Outbox, Topic, TopicClass
 
 _ALL = "all"
-# what is large and can wait
+# large, and can wait
 _BULK = (TopicClass.MAP, TopicClass.VIDEO)
-# what a person or a robot waits for
+# a person or a robot waits for these
 _URGENT = (TopicClass.EMERGENCY_STOP, TopicClass.COMMAND)
-# the order in which classes should leave
+# most urgent first
 _ORDER = (
     TopicClass.EMERGENCY_STOP,
     TopicClass.COMMAND,
@@ -26,7 +26,7 @@ _ORDER = (
     TopicClass.MAP,
     TopicClass.VIDEO,
 )
-# a best-effort message of this many fragments arrives with 0.95 to its power: at 5 % loss, one in five
+# at 5 % loss 0.95**32, one in five, of such best-effort messages arrive
 _BEST_EFFORT_FRAGMENTS = 32
 # ROS 1: package/Type; ROS 2: package/msg/Type
 _TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/((msg|srv|action)/)?[A-Za-z][A-Za-z0-9_]*")
@@ -40,10 +40,10 @@ def _at(topic: Topic, *key: str) -> tuple[str, ...]:
 @fleet_rule(
     "MC701",
     Severity.ERROR,
-    "Something is as urgent as the emergency stop",
-    why="""udp_mesh sends strictly by priority, and within one level in turn: whatever shares the emergency stop's
-    level, or stands above it, is sent before it, for as long as there is any.""",
-    mend="Give the emergency stop a level of its own, 0, and everything else a larger number.",
+    "A topic is as urgent as the emergency stop",
+    why="""udp_mesh sends in strict priority order, and round-robin within a level: a topic at the emergency stop's
+    level or above is sent before it.""",
+    fix="Give the emergency stop its own level, 0, and every other topic a larger number.",
     failing="topics: {commands: {priority: 0}}",
     passing="topics: {commands: {priority: 1}}",
 )
@@ -54,17 +54,17 @@ def stop_not_first(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     level = max(stop.priority for stop in stops)
     for topic in fleet.topics:
         if topic.topic_class is not TopicClass.EMERGENCY_STOP and topic.priority <= level:
-            message = f"can hold up {stops[0].name}"
+            message = f"can delay {stops[0].name}"
             yield Finding(_at(topic, "priority"), message, f"more than {level}", str(topic.priority))
 
 
 @fleet_rule(
     "MC702",
     Severity.ERROR,
-    "Bulk is as urgent as commands",
-    why="""Maps and video fill every gap in the air. On the level of commands, or above, they fill it before the
-    supervisor's orders.""",
-    mend="Give maps and video larger numbers than every command.",
+    "Bulk data is as urgent as commands",
+    why="""Maps and video use all available airtime. At the level of commands or above, they delay the supervisor's
+    commands.""",
+    fix="Give maps and video larger numbers than every command.",
     failing="topics: {video: {priority: 1}}",
     passing="topics: {video: {priority: 9}}",
 )
@@ -75,9 +75,9 @@ def bulk_above_commands(fleet: Fleet, _context: LintContext) -> Iterator[Finding
         return
     last = max(commands, key=lambda topic: topic.priority)
     for topic in fleet.topics:
-        # on the stop's own level it is MC701's to say
+        # MC701 covers the level of the stop
         if topic.topic_class in _BULK and topic.priority <= last.priority and topic.priority > max(stops, default=-1):
-            message = f"can hold up {last.name}"
+            message = f"can delay {last.name}"
             yield Finding(_at(topic, "priority"), message, f"more than {last.priority}", str(topic.priority))
 
 
@@ -85,33 +85,33 @@ def bulk_above_commands(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     "MC703",
     Severity.WARNING,
     "Topics of different classes share a priority",
-    why="""On one level topics take turns: a large map piece delays a telemetry message by as many fragments as it has.
-    Nobody decided that.""",
-    mend="Give each class a level of its own: there are sixteen.",
+    why="""Topics of one level are sent round-robin: a large map message delays a telemetry message by as many fragments
+    as it has.""",
+    fix="Give each class its own level; there are sixteen.",
     failing="topics: {telemetry: {priority: 3}}",
     passing="topics: {telemetry: {priority: 4}}",
 )
 def classes_tie(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for level, topics in grouped((topic.priority, topic) for topic in fleet.topics).items():
+    for level, topics in group_by_key((topic.priority, topic) for topic in fleet.topics).items():
         classes = dict.fromkeys(topic.topic_class for topic in topics if topic.topic_class is not TopicClass.OTHER)
         if len(classes) > 1 and not any(topic.topic_class in _URGENT for topic in topics):
             later = next(topic for topic in topics if topic.topic_class is not topics[0].topic_class)
-            found = f"{level} for {listed([topic.name for topic in topics])}"
-            yield Finding(_at(later, "priority"), f"takes turns with {topics[0].name}", "a level of its own", found)
+            found = f"{level} for {join_limited([topic.name for topic in topics])}"
+            yield Finding(_at(later, "priority"), f"shares the level of {topics[0].name}", "a separate level", found)
 
 
 @fleet_rule(
     "MC704",
     Severity.WARNING,
-    "A class is more urgent than a class that should go before it",
-    why="""Reports of artifacts are what the run is scored by; telemetry comes again in a second, a map piece can wait a
-    minute. An order that is turned around is usually a slip of one number.""",
-    mend="Order the levels: emergency stop, command, artifact, telemetry, map, video.",
+    "A class is more urgent than one that should precede it",
+    why="""Artifact reports decide the score; telemetry repeats within a second, and a map message can wait a minute. A
+    reversed order is usually a typo.""",
+    fix="Order the levels: emergency stop, command, artifact, telemetry, map, video.",
     failing="topics: {telemetry: {priority: 10}}",
     passing="topics: {telemetry: {priority: 4}}",
 )
 def order_turned(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    # urgent classes against bulk are errors of their own (MC701, MC702)
+    # MC701 and MC702 cover urgent classes against bulk
     commands = max((t.priority for t in fleet.topics if t.topic_class is TopicClass.COMMAND), default=-1)
     ranked = [
         topic
@@ -121,7 +121,7 @@ def order_turned(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     latest: Topic | None = None
     for topic in sorted(ranked, key=lambda topic: (_ORDER.index(topic.topic_class), topic.priority)):
         if latest is not None and topic.topic_class is not latest.topic_class and topic.priority < latest.priority:
-            message = f"{topic.topic_class.value} goes before {latest.name} ({latest.topic_class.value})"
+            message = f"{topic.topic_class.value} precedes {latest.name} ({latest.topic_class.value})"
             expected = f"more than {latest.priority}"
             yield Finding(_at(topic, "priority"), message, expected, str(topic.priority))
         if latest is None or topic.priority > latest.priority:
@@ -131,10 +131,9 @@ def order_turned(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC705",
     Severity.WARNING,
-    "There is no emergency stop",
-    why="""A fleet of robots that can be told everything but to stop. If the stop goes another way, say so in a
-    suppression.""",
-    mend="Add a topic of `class: emergency_stop` with priority 0.",
+    "There is no emergency stop topic",
+    why="No topic stops the robots. If the stop uses another path, say so in a suppression.",
+    fix="Add a topic with `class: emergency_stop` and priority 0.",
     failing="topics: {estop: {class: other}}",
     passing="topics: {estop: {class: emergency_stop}}",
 )
@@ -147,8 +146,8 @@ def no_emergency_stop(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC706",
     Severity.ERROR,
     "The emergency stop is best effort",
-    why="A lost datagram is not sent again: the operator presses the button and one robot keeps walking.",
-    mend="Set `reliable: true`.",
+    why="A lost datagram is not retransmitted: a robot can miss the stop.",
+    fix="Set `reliable: true`.",
     failing="topics: {estop: {reliable: false}}",
     passing="topics: {estop: {reliable: true}}",
 )
@@ -162,8 +161,8 @@ def stop_best_effort(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC707",
     Severity.ERROR,
     "The emergency stop does not reach every robot",
-    why="A robot that was added later, or forgotten, does not stop with the others.",
-    mend="Write `destinations: [all]`.",
+    why="A robot that is missing from `destinations` does not stop with the others.",
+    fix="Set `destinations: [all]`.",
     failing="topics: {estop: {sources: [husky1], destinations: [base-station]}}",
     passing="topics: {estop: {destinations: [all]}}",
 )
@@ -174,17 +173,19 @@ def stop_not_for_all(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         missing = [name for name, robot in fleet.robots.items() if not robot.is_base and name not in topic.destinations]
         if missing:
             yield Finding(
-                _at(topic, "destinations"), f"{listed(missing)} would not stop", "all", listed(topic.destinations)
+                _at(topic, "destinations"),
+                f"{join_limited(missing)} would not stop",
+                "all",
+                join_limited(topic.destinations),
             )
 
 
 @fleet_rule(
     "MC708",
     Severity.ERROR,
-    "The emergency stop is held back",
-    why="""A rate limit or a deadline drops exactly the stop that was pressed twice, or that came late because the link
-    was bad.""",
-    mend="Take `rate_limit_bytes_per_s` and `deadline_s` away from the emergency stop.",
+    "The emergency stop has a rate limit or a deadline",
+    why="A rate limit or a deadline drops exactly the stop that was pressed twice, or that a bad link delayed.",
+    fix="Remove `rate_limit_bytes_per_s` and `deadline_s` from the emergency stop.",
     failing="topics: {estop: {deadline_s: 1}}",
     passing="topics: {estop: {keep_last: 1}}",
 )
@@ -196,15 +197,15 @@ def stop_held_back(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             yield Finding(_at(topic, "deadline_s"), "a late stop is dropped", "none", f"{topic.deadline_s:g} s")
         if topic.rate_limit_bytes_per_s is not None:
             found = f"{topic.rate_limit_bytes_per_s} bytes/s"
-            yield Finding(_at(topic, "rate_limit_bytes_per_s"), "a repeated stop waits", "none", found)
+            yield Finding(_at(topic, "rate_limit_bytes_per_s"), "a repeated stop is delayed", "none", found)
 
 
 @fleet_rule(
     "MC709",
     Severity.ERROR,
     "A destination does not exist",
-    why="Messages for a peer that nobody is wait until they expire; the reader believes they are delivered.",
-    mend="Name a robot of `robots`, or `all`.",
+    why="Messages for an unknown peer wait until they expire and are never delivered.",
+    fix="Use a robot defined in `robots`, or `all`.",
     failing="topics: {commands: {destinations: [husky1, huskey2]}}",
     passing="topics: {commands: {destinations: [husky1]}}",
 )
@@ -212,7 +213,7 @@ def destination_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     for topic in fleet.topics:
         for index, name in enumerate(topic.destinations):
             if name != _ALL and name not in fleet.robots:
-                expected, hint = known((*fleet.robots, _ALL), name)
+                expected, hint = suggest((*fleet.robots, _ALL), name)
                 yield Finding(_at(topic, "destinations", str(index)), "no such robot", expected, name, hint)
 
 
@@ -220,8 +221,8 @@ def destination_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     "MC710",
     Severity.ERROR,
     "A source does not exist",
-    why="The topic is bridged on no robot: nothing is ever sent, and nothing says so.",
-    mend="Name a robot of `robots`, or leave `sources` out for all of them.",
+    why="The topic is bridged on no robot: nothing is ever sent, and no error is reported.",
+    fix="Use a robot defined in `robots`, or omit `sources` for all robots.",
     failing="topics: {commands: {sources: [base]}}",
     passing="topics: {commands: {sources: [base-station]}}",
 )
@@ -229,16 +230,16 @@ def source_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
         for index, name in enumerate(topic.sources):
             if name not in fleet.robots:
-                expected, hint = known(fleet.robots, name)
+                expected, hint = suggest(fleet.robots, name)
                 yield Finding(_at(topic, "sources", str(index)), "no such robot", expected, name, hint)
 
 
 @fleet_rule(
     "MC711",
     Severity.WARNING,
-    "A topic goes nowhere",
-    why="Its only destination is its only source, or it has none: it takes memory and settings, and carries nothing.",
-    mend="Name other destinations, or remove the topic.",
+    "A topic has no effective destination",
+    why="Its only destination is its only source, or it has none: it uses resources and delivers nothing.",
+    fix="Name other destinations, or remove the topic.",
     failing="topics: {commands: {sources: [base-station], destinations: [base-station]}}",
     passing="topics: {commands: {sources: [base-station], destinations: [husky1]}}",
 )
@@ -247,17 +248,17 @@ def topic_to_itself(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if not topic.destinations or (
             topic.sources and set(topic.destinations) == set(topic.sources) and len(topic.sources) == 1
         ):
-            found = listed(topic.destinations) or "none"
-            yield Finding(_at(topic, "destinations"), "reaches nobody else", "another robot, or all", found)
+            found = join_limited(topic.destinations) or "none"
+            yield Finding(_at(topic, "destinations"), "reaches no other robot", "another robot, or all", found)
 
 
 @fleet_rule(
     "MC712",
     Severity.WARNING,
     "Video is sent reliably",
-    why="""Sending an old frame again delays the new one: on a bad link a reliable video falls minutes behind, and fills
-    the queue with what nobody wants to see any more.""",
-    mend="Set `reliable: false`, with `keep_last: 1`.",
+    why="""Retransmitting old frames delays new ones: on a bad link, reliable video falls minutes behind and fills the
+    queue with obsolete frames.""",
+    fix="Set `reliable: false` and `keep_last: 1`.",
     failing="topics: {video: {reliable: true}}",
     passing="topics: {video: {reliable: false}}",
 )
@@ -271,9 +272,9 @@ def video_reliable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC713",
     Severity.WARNING,
     "A best-effort message is too large to arrive",
-    why="""A message arrives when each of its fragments does. At 5 % loss a message of 32 fragments arrives one time in
+    why="""A message arrives only if every fragment does. At 5 % loss, a message of 32 fragments arrives one time in
     five.""",
-    mend="Send smaller messages, or set `reliable: true` or `repair: true`.",
+    fix="Send smaller messages, or set `reliable: true` or `repair: true`.",
     failing="topics: {video: {size_bytes: 200000}}",
     passing="topics: {video: {size_bytes: 5000}}",
 )
@@ -283,16 +284,16 @@ def best_effort_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if not topic.reliable and not topic.repair and fragments > _BEST_EFFORT_FRAGMENTS:
             expected = f"at most {_BEST_EFFORT_FRAGMENTS} fragments"
             found = f"{fragments} fragments; {0.95**fragments:.0%} arrive at 5 % loss"
-            yield Finding(_at(topic, "size_bytes"), "lost when one fragment is", expected, found)
+            yield Finding(_at(topic, "size_bytes"), "lost if any fragment is lost", expected, found)
 
 
 @fleet_rule(
     "MC714",
     Severity.WARNING,
-    "An outbox keeps what will have expired",
-    why="""Messages wait for an offline peer, but their deadline passes before a peer even counts as offline: the outbox
-    is always empty when the peer comes back.""",
-    mend="Lengthen `deadline_s`, or take the outbox away.",
+    "An outbox keeps messages that will have expired",
+    why="""Messages wait for an offline peer, but their deadline passes before the peer counts as offline: the outbox is
+    always empty when the peer returns.""",
+    fix="Increase `deadline_s`, or remove the outbox.",
     failing="topics: {commands: {outbox: last, deadline_s: 5}}",
     passing="topics: {commands: {outbox: last, deadline_s: 600}}",
 )
@@ -302,15 +303,15 @@ def outbox_expires(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if topic.outbox is not Outbox.NONE and topic.deadline_s is not None and topic.deadline_s <= offline_s:
             expected = f"more than {offline_s:g} s (udp_mesh.offline_after_s)"
             path = _at(topic, "deadline_s")
-            yield Finding(path, "expired before the peer is back", expected, f"{topic.deadline_s:g} s")
+            yield Finding(path, "expires before the peer returns", expected, f"{topic.deadline_s:g} s")
 
 
 @fleet_rule(
     "MC715",
     Severity.ERROR,
-    "An outbox holds less than one message",
-    why="Nothing fits: what was to be kept for an offline peer is dropped at once.",
-    mend="Raise `outbox_bytes` to several messages.",
+    "An outbox is smaller than one message",
+    why="No message fits: it is dropped at once instead of being kept for an offline peer.",
+    fix="Increase `outbox_bytes` to several messages.",
     failing="topics: {artifacts: {outbox: all, outbox_bytes: 10000, size_bytes: 60000}}",
     passing="topics: {artifacts: {outbox: all, outbox_bytes: 6000000, size_bytes: 60000}}",
 )
@@ -318,32 +319,32 @@ def outbox_too_small(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
         if topic.outbox is not Outbox.NONE and topic.outbox_bytes < topic.size_bytes:
             path = _at(topic, "outbox_bytes")
-            yield Finding(path, "not one message fits", f"at least {topic.size_bytes}", str(topic.outbox_bytes))
+            yield Finding(path, "no message fits", f"at least {topic.size_bytes}", str(topic.outbox_bytes))
 
 
 @fleet_rule(
     "MC716",
     Severity.WARNING,
     "A best-effort topic has an outbox",
-    why="""Best effort means: now or never. Kept messages would be sent once, without anybody learning whether they
-    arrived.""",
-    mend="Set `reliable: true`, or take the outbox away.",
+    why="Best effort means now or never: kept messages would be sent once, without an acknowledgement.",
+    fix="Set `reliable: true`, or remove the outbox.",
     failing="topics: {video: {outbox: all}}",
     passing="topics: {video: {outbox: none}}",
 )
 def outbox_best_effort(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
         if topic.outbox is not Outbox.NONE and not topic.reliable:
-            yield Finding(_at(topic, "outbox"), "kept but not delivered", "none, or reliable: true", topic.outbox.value)
+            yield Finding(
+                _at(topic, "outbox"), "kept, but not delivered reliably", "none, or reliable: true", topic.outbox.value
+            )
 
 
 @fleet_rule(
     "MC717",
     Severity.WARNING,
     "A topic's type is not a ROS type",
-    why="""The bridge looks the type up by this name to subscribe and publish: a type it cannot find ends in a bridge
-    that passes nothing.""",
-    mend="Write `package/Type` (ROS 1) or `package/msg/Type` (ROS 2).",
+    why="The bridge looks up the type by this name; without it, the bridge passes nothing.",
+    fix="Write `package/Type` (ROS 1) or `package/msg/Type` (ROS 2).",
     failing="topics: {commands: {type: String}}",
     passing="topics: {commands: {type: std_msgs/String}}",
 )
@@ -351,15 +352,15 @@ def type_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
         if topic.type_name and _TYPE.fullmatch(topic.type_name) is None:
             expected = "package/Type or package/msg/Type"
-            yield Finding(_at(topic, "type"), "the bridge cannot find it", expected, topic.type_name)
+            yield Finding(_at(topic, "type"), "not a ROS type name", expected, topic.type_name)
 
 
 @fleet_rule(
     "MC718",
     Severity.ERROR,
     "A topic's name is not a ROS name",
-    why="ROS refuses names with spaces, hyphens or a digit at the start of a part: the bridge does not start.",
-    mend="Use letters, digits and underscores, parts joined by slashes.",
+    why="ROS rejects names with spaces, hyphens or a part that starts with a digit: the bridge does not start.",
+    fix="Use letters, digits and underscores, parts joined by slashes.",
     failing="topics: {map-diffs: {priority: 8, class: map, type: std_msgs/String, rate_hz: 0.1, size_bytes: 1000}}",
     passing="topics: {map_diffs: {priority: 8, class: map, type: std_msgs/String, rate_hz: 0.1, size_bytes: 1000}}",
 )
@@ -367,4 +368,4 @@ def topic_name_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     for topic in fleet.topics:
         if _TOPIC.fullmatch(topic.name) is None:
             expected = "letters, digits and underscores, parts joined by /"
-            yield Finding(_at(topic), "ROS refuses the name", expected, topic.name)
+            yield Finding(_at(topic), "not a valid ROS name", expected, topic.name)

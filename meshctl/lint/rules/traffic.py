@@ -17,11 +17,11 @@ _ALL = "all"
 # subcarriers for 52, 80 MHz has 234, 160 MHz has 468
 _MCS7_MBPS = {20: 65.0, 40: 135.0, 80: 292.5, 160: 585.0}
 _MCS3_SHARE = 26.0 / 65.0
-# what is left of the physical rate after preambles, contention, acknowledgements and headers
+# share of the physical rate left by preambles, contention, acknowledgements and headers
 _EFFICIENCY = 0.6
-# a message crosses about two links of the one channel on its way through a chain of beacons
+# a message crosses about two links of the channel on its way through a chain of beacons
 _USUAL_HOPS = 2
-# above this share waiting times grow without bound, whatever the priorities
+# above this share queueing delays grow without bound, regardless of priorities
 _USUAL_LIMIT = 0.5
 # registered or used on robots and radios: SSH, DNS, DHCP, NTP, syslog, mDNS, ROS 1 master, Zenoh
 _KNOWN_PORTS = {
@@ -41,22 +41,22 @@ _TCP_PORTS = frozenset({22, 53, 7447, 11311})
 
 
 @dataclass(frozen=True, slots=True)
-class Load:
-    """What the topics ask of one mesh: bytes per second sent to one peer each, and to everybody."""
+class OfferedLoad:
+    """Offered load of the topics on one mesh: unicast and broadcast bytes per second."""
 
     unicast_bytes_per_s: float
     broadcast_bytes_per_s: float
     largest: Topic
 
     def share(self, mesh: Mesh, *, unicast_mbps: float, hops: float, repeats: float) -> float:
-        """The share of the channel's time: unicasts at their rate over `hops` links, broadcasts at the multicast
-        rate, sent again by `repeats` nodes."""
+        """Share of airtime: unicasts at their rate over `hops` links, broadcasts at the multicast rate, sent by
+        `repeats` nodes."""
         unicast = self.unicast_bytes_per_s * 8 / (unicast_mbps * 1e6) * hops
         broadcast = self.broadcast_bytes_per_s * 8 / (mesh.mcast_rate_kbps * 1e3) * repeats
         return unicast + broadcast
 
 
-def offered_load(fleet: Fleet) -> dict[str, Load]:
+def offered_load(fleet: Fleet) -> dict[str, OfferedLoad]:
     """The topics' load on every mesh: rate x size x sources x destinations, by the meshes of the sources' radios."""
     peers = [robot.name for robot in fleet.robots.values() if robot.computer is not None]
     meshes_of = {
@@ -78,11 +78,11 @@ def offered_load(fleet: Fleet) -> dict[str, Load]:
                 sums.setdefault(mesh, [0.0, 0.0])[is_broadcast] += total
                 if total >= largest.get(mesh, (0.0, topic))[0]:
                     largest[mesh] = (total, topic)
-    return {mesh: Load(unicast, broadcast, largest[mesh][1]) for mesh, (unicast, broadcast) in sums.items()}
+    return {mesh: OfferedLoad(unicast, broadcast, largest[mesh][1]) for mesh, (unicast, broadcast) in sums.items()}
 
 
 def _best_mbps(fleet: Fleet, mesh: Mesh) -> float:
-    """The rate of a link at its best: MCS 7 on all chains that both ends have."""
+    """Best throughput of a link: MCS 7 on all chains."""
     chains = [
         radio.hardware.chains for node in fleet.members(mesh.name) for radio in node.radios if radio.mesh == mesh.name
     ]
@@ -93,8 +93,8 @@ def _best_mbps(fleet: Fleet, mesh: Mesh) -> float:
     return _MCS7_MBPS[width] * max(chains, default=1) * _EFFICIENCY
 
 
-def _shares(fleet: Fleet) -> Iterator[tuple[Mesh, Load, float, float]]:
-    """Every loaded mesh with its share of the channel at the very best, and as it usually is."""
+def _shares(fleet: Fleet) -> Iterator[tuple[Mesh, OfferedLoad, float, float]]:
+    """Every loaded mesh with its share of airtime: best case, and usual."""
     for name, load in offered_load(fleet).items():
         mesh = fleet.meshes.get(name)
         if mesh is None:
@@ -106,18 +106,18 @@ def _shares(fleet: Fleet) -> Iterator[tuple[Mesh, Load, float, float]]:
         yield mesh, load, best, usual
 
 
-def _sum(load: Load) -> str:
+def _sum(load: OfferedLoad) -> str:
     kbps = (load.unicast_bytes_per_s * 8 / 1000, load.broadcast_bytes_per_s * 8 / 1000)
-    return f"{kbps[0]:.0f} kbit/s to single peers and {kbps[1]:.0f} kbit/s to all, most of it {load.largest.name}"
+    return f"{kbps[0]:.0f} kbit/s unicast and {kbps[1]:.0f} kbit/s broadcast, mostly {load.largest.name}"
 
 
 @fleet_rule(
     "MC731",
     Severity.ERROR,
-    "The topics offer more than the channel can carry",
-    why="""Even if all robots stood side by side at the highest rate, there is not enough air. What has no priority is
-    never delivered, and its queues fill.""",
-    mend="Send less often or smaller, limit a topic's rate, or use a wider channel.",
+    "The topics offer more load than the channel can carry",
+    why="""Even with all robots next to each other at the highest rate, there is not enough airtime. Low-priority
+    messages are never delivered, and their queues fill.""",
+    fix="Send smaller messages or fewer, limit a topic's rate, or use a wider channel.",
     failing="topics: {video: {rate_hz: 30, size_bytes: 1000000, reliable: false, repair: true}}",
     passing="topics: {video: {rate_hz: 1, size_bytes: 5000}}",
 )
@@ -126,16 +126,17 @@ def load_above_channel(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
         if best > 1.0:
             path = ("topics", load.largest.name, "rate_hz")
             message = f"mesh {mesh.name} cannot carry {_sum(load)}"
-            yield Finding(path, message, "at most 100% of the channel at its best", f"{best:.0%}")
+            yield Finding(path, message, "at most 100% of the channel in the best case", f"{best:.0%}")
 
 
 @fleet_rule(
     "MC732",
     Severity.WARNING,
     "The topics need most of the channel",
-    why="""At the usual rate, over two hops, with broadcasts repeated by every node, more than half the air is taken:
-    what waits grows with every lost frame, and far robots go silent first.""",
-    mend="Send less often or smaller, limit a topic's rate, or name destinations instead of `all` for large messages.",
+    why="""At the usual rate, over two hops, with broadcasts repeated by every node, more than half the airtime is used:
+    delays grow with every lost frame, and distant robots drop out first.""",
+    fix="""Send smaller messages or fewer, limit a topic's rate, or name destinations instead of `all` for large
+    messages.""",
     failing="topics: {map: {rate_hz: 20, size_bytes: 20000, destinations: [all]}}",
     passing="topics: {map: {rate_hz: 0.1, size_bytes: 20000, destinations: [base-station]}}",
 )
@@ -144,7 +145,7 @@ def load_high(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if best <= 1.0 and usual > _USUAL_LIMIT:
             path = ("topics", load.largest.name, "rate_hz")
             message = f"mesh {mesh.name} must carry {_sum(load)}"
-            expected = f"at most {_USUAL_LIMIT:.0%} of the channel as it usually is"
+            expected = f"at most {_USUAL_LIMIT:.0%} of the channel in the usual case"
             yield Finding(path, message, expected, f"{usual:.0%}")
 
 
@@ -152,8 +153,8 @@ def load_high(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC733",
     Severity.NOTE,
     "A bulk topic's load is not given",
-    why="Without `rate_hz` and `size_bytes` lint cannot say whether the channel carries the fleet's load.",
-    mend="Write what one source offers at most.",
+    why="Without `rate_hz` and `size_bytes`, lint cannot check whether the channel carries the fleet's load.",
+    fix="Set both to the maximum that one source offers.",
     failing="topics: {video: {rate_hz: 0}}",
     passing="topics: {video: {rate_hz: 1}}",
 )
@@ -163,16 +164,16 @@ def load_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if bulk and not (topic.rate_hz and topic.size_bytes):
             path = ("topics", topic.name)
             found = f"rate_hz {topic.rate_hz:g}, size_bytes {topic.size_bytes}"
-            yield Finding(path, "its load is unknown", "rate_hz and size_bytes", found)
+            yield Finding(path, "load unknown", "rate_hz and size_bytes", found)
 
 
 @fleet_rule(
     "MC734",
     Severity.WARNING,
-    "Video goes to everybody",
-    why="""What is sent to all leaves at the broadcast rate and is repeated by every node: one camera can take the whole
+    "Video is sent to all robots",
+    why="""Messages to `all` are sent at the multicast rate and repeated by every node: one camera can fill the whole
     mesh.""",
-    mend="Name the robots that look at it, usually the base station.",
+    fix="Name the robots that use it, usually the base station.",
     failing="topics: {video: {destinations: [all]}}",
     passing="topics: {video: {destinations: [base-station]}}",
 )
@@ -180,15 +181,16 @@ def video_to_all(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
         if topic.topic_class is TopicClass.VIDEO and _ALL in topic.destinations:
             path = ("topics", topic.name, "destinations")
-            yield Finding(path, "every node repeats it", "the robots that look at it", _ALL)
+            yield Finding(path, "every node repeats it", "the robots that use it", _ALL)
 
 
 @fleet_rule(
     "MC735",
     Severity.WARNING,
     "A topic's rate limit is below its load",
-    why="It offers more than it may send: the queue grows until messages are dropped, and what arrives is always late.",
-    mend="Raise the limit, send less, or keep only the latest with `keep_last`.",
+    why="""The topic offers more than it may send: the queue grows until messages are dropped, and messages always
+    arrive late.""",
+    fix="Raise the limit, reduce the load, or keep only the latest message with `keep_last`.",
     failing="topics: {video: {rate_hz: 10, size_bytes: 5000, rate_limit_bytes_per_s: 20000, keep_last: 0}}",
     passing="topics: {video: {rate_hz: 2, size_bytes: 5000, rate_limit_bytes_per_s: 20000}}",
 )
@@ -199,15 +201,15 @@ def limit_below_load(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if limit is not None and offered > limit and not topic.keep_last:
             path = ("topics", topic.name, "rate_limit_bytes_per_s")
             expected = f"at least {offered:g} ({topic.rate_hz:g} Hz x {topic.size_bytes} bytes)"
-            yield Finding(path, "its queue grows for ever", expected, str(limit))
+            yield Finding(path, "its queue grows without bound", expected, str(limit))
 
 
 @fleet_rule(
     "MC736",
     Severity.ERROR,
-    "The transport's port belongs to something else",
+    "The transport's port is used by another service",
     why="udp_mesh cannot bind the port, or takes it from a service that the robots need.",
-    mend="Use a free port above 1024, such as 8700.",
+    fix="Use a free port above 1024, such as 8700.",
     failing="udp_mesh: {port: 5353}",
     passing="udp_mesh: {port: 8700}",
 )
@@ -218,16 +220,16 @@ def port_taken(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         places.append(("metrics_port", settings.metrics_port, _TCP_PORTS))
     for key, port, taken in places:
         if port in taken:
-            yield Finding(("udp_mesh", key), f"belongs to {_KNOWN_PORTS[port]}", "a free port above 1024", str(port))
+            yield Finding(("udp_mesh", key), f"used by {_KNOWN_PORTS[port]}", "a free port above 1024", str(port))
 
 
 @fleet_rule(
     "MC737",
     Severity.ERROR,
-    "The log host's port is the transport's",
-    why="""The nodes' logs arrive at the daemon's port of the base station's computer: both are UDP. Log lines are
-    counted as forged datagrams, and no log is kept.""",
-    mend="Give them different ports.",
+    "The log host's port is the transport's port",
+    why="""Logs arrive at the daemon's port on the base station's computer, as both use UDP: log lines are counted as
+    forged datagrams, and no log is kept.""",
+    fix="Use different ports.",
     failing="""
     udp_mesh: {port: 5140}
     system: {log_host: 10.42.0.100, log_port: 5140}
@@ -241,15 +243,15 @@ def log_port_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     hosts = {str(robot.computer.address.ip) for robot in fleet.robots.values() if robot.computer is not None}
     if fleet.system.log_host in hosts and fleet.system.log_port == fleet.udp_mesh.port:
         path = first_written(fleet, ("system", "log_port"), ("udp_mesh", "port"))
-        yield Finding(path, "the daemon's port on that computer", "another port", str(fleet.system.log_port))
+        yield Finding(path, "also the udp_mesh port of that computer", "another port", str(fleet.system.log_port))
 
 
 @fleet_rule(
     "MC738",
     Severity.ERROR,
-    "The metrics' port is SSH's",
-    why="On one of the computers sshd listens there: whichever starts second fails, and it may be sshd.",
-    mend="Give the metrics another port, such as 9700.",
+    "The metrics port is an SSH port",
+    why="sshd listens on this port on one of the computers: the service that starts second fails, possibly sshd.",
+    fix="Use another metrics port, such as 9700.",
     failing="""
     udp_mesh: {metrics_port: 2222}
     robots: {husky1: {computer: {ssh: {port: 2222}}}}
@@ -268,17 +270,17 @@ def metrics_port_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding
             and port not in _TCP_PORTS
             and robot.computer.ssh.port == port
         ):
-            message = f"sshd of {robot.name} listens there"
+            message = f"sshd of {robot.name} listens on it"
             yield Finding(("udp_mesh", "metrics_port"), message, "another port", str(port))
 
 
 @fleet_rule(
     "MC739",
     Severity.ERROR,
-    "A lost heartbeat makes a peer offline",
-    why="""On a lossy link one heartbeat in five is lost. When a peer counts as offline after fewer than three, robots
-    come and go all the time, and every outbox with them.""",
-    mend="Set `offline_after_s` to at least three heartbeats; ten is usual.",
+    "A peer counts as offline after fewer than three heartbeats",
+    why="""On a lossy link one heartbeat in five is lost. With fewer than three heartbeats, peers flap between online
+    and offline, and their outboxes with them.""",
+    fix="Set `offline_after_s` to at least three heartbeats; ten is usual.",
     failing="udp_mesh: {heartbeat_s: 5, offline_after_s: 10}",
     passing="udp_mesh: {heartbeat_s: 1, offline_after_s: 10}",
 )
@@ -287,36 +289,36 @@ def offline_too_soon(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     if settings.offline_after_s < 3 * settings.heartbeat_s:
         path = first_written(fleet, ("udp_mesh", "offline_after_s"), ("udp_mesh", "heartbeat_s"))
         expected = f"at least {3 * settings.heartbeat_s:g} s (3 heartbeats)"
-        yield Finding(path, "offline after less than 3 heartbeats", expected, f"{settings.offline_after_s:g} s")
+        yield Finding(path, "offline after fewer than 3 heartbeats", expected, f"{settings.offline_after_s:g} s")
 
 
 @fleet_rule(
     "MC740",
     Severity.WARNING,
     "A peer counts as offline only after minutes",
-    why="Until then its messages are sent into the void, and the operator believes it is there.",
-    mend="Set `offline_after_s` to 10 or 20.",
+    why="Until then its messages are sent in vain, and the operator sees it as online.",
+    fix="Set `offline_after_s` to 10 or 20.",
     failing="udp_mesh: {offline_after_s: 300}",
     passing="udp_mesh: {offline_after_s: 10}",
 )
 def offline_too_late(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     if fleet.udp_mesh.offline_after_s > 120:
         found = f"{fleet.udp_mesh.offline_after_s:g} s"
-        yield Finding(("udp_mesh", "offline_after_s"), "a silent peer looks alive", "at most 120 s", found)
+        yield Finding(("udp_mesh", "offline_after_s"), "a silent peer appears online", "at most 120 s", found)
 
 
 @fleet_rule(
     "MC741",
     Severity.WARNING,
-    "The transport's port is one that the kernel gives away",
-    why="""From 32768 on Linux hands ports to any program that asks for one: now and then it has given this one away
-    before udp_mesh starts.""",
-    mend="Use a port from 1024 to 32767, such as 8700.",
+    "The transport's port is in the ephemeral range",
+    why="""Linux assigns ports from 32768 on to any program that asks for one: occasionally this port is taken before
+    udp_mesh starts.""",
+    fix="Use a port from 1024 to 32767, such as 8700.",
     failing="udp_mesh: {port: 40000}",
     passing="udp_mesh: {port: 8700}",
 )
 def port_ephemeral(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    # net.ipv4.ip_local_port_range of the kernel, by default
+    # the kernel's default net.ipv4.ip_local_port_range
     if 32_768 <= fleet.udp_mesh.port <= 60_999:
         found = str(fleet.udp_mesh.port)
-        yield Finding(("udp_mesh", "port"), "may be taken at boot", "1024 to 32767", found)
+        yield Finding(("udp_mesh", "port"), "may be in use at boot", "1024 to 32767", found)

@@ -68,7 +68,7 @@ def _rule(code: str) -> dict[str, Any]:
         "name": "".join(word.capitalize() for word in rule.name.split("-")),
         "shortDescription": {"text": f"{rule.title}."},
         "fullDescription": {"text": rule.why},
-        "help": {"text": f"{rule.why} {rule.mend}", "markdown": f"{rule.why}\n\n{rule.mend}"},
+        "help": {"text": f"{rule.why} {rule.fix}", "markdown": f"{rule.why}\n\n{rule.fix}"},
         "defaultConfiguration": {"level": _LEVELS[rule.severity]},
     }
 

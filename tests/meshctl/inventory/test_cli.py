@@ -40,7 +40,7 @@ def test_init_overwrites_nothing(tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text("mine\n")
     result = _meshctl("init", tmp_path)
     assert result.exit_code == 2
-    assert "exists and is left as it is" in result.stderr
+    assert "already exists; not overwritten" in result.stderr
     assert (tmp_path / "fleet.yaml").read_text() == "mine\n"
 
 

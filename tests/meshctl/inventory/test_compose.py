@@ -36,10 +36,10 @@ def test_both_parsers_refuse_the_same_with_the_same_code(text: str, monkeypatch:
 @pytest.mark.parametrize(
     ("text", "hint"),
     [
-        ("a: {b[01-03]: {}}\n", "inside braces a range needs quotes"),
-        ("a: Hold: reset\n", "quote a value that holds a colon"),
+        ("a: {b[01-03]: {}}\n", "quote a range inside braces"),
+        ("a: Hold: reset\n", "quote a value that contains a colon"),
         ("a: @x\n", "quote a value that begins with @"),
-        ("a:\n\t- b\n", "YAML is indented with spaces"),
+        ("a:\n\t- b\n", "indent YAML with spaces"),
     ],
 )
 def test_a_usual_slip_is_answered_with_its_remedy(text: str, hint: str) -> None:

@@ -41,7 +41,7 @@ def _load_bytes(content: bytes) -> Loaded:
             assert item.code.startswith("INV")
             assert str(item).isprintable()
         if loaded.fleet is not None:
-            assert all(origin.position.line for origin in loaded.fleet.origins.values())
+            assert all(origin.position.line for origin in loaded.fleet.provenance.values())
         return loaded
 
 

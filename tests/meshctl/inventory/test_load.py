@@ -229,4 +229,4 @@ def test_loading_twice_gives_the_same_fleet(tmp_path: Path) -> None:
     text = "nodes: {'b[1-3]': {hardware: rocket, address: {from: 10.42.0.1}}}\n"
     first, second = fleet_of(tmp_path, text), fleet_of(tmp_path, text)
     assert first.nodes == second.nodes
-    assert dict(first.origins) == dict(second.origins)
+    assert dict(first.provenance) == dict(second.provenance)

@@ -20,7 +20,7 @@ def final() -> Fleet:
 def test_the_text_at_an_origin_is_the_value_or_its_key(final: Fleet) -> None:
     lines = {file: Path(file).read_text().splitlines() for file in final.files}
     seen = 0
-    for path, origin in final.origins.items():
+    for path, origin in final.provenance.items():
         place = origin.position
         rest = lines[place.file][place.line - 1][place.column - 1 :]
         if path[-1].isdigit() or path[-1] == "robot" or (path[0] == "nodes" and len(path) == 2):
@@ -33,11 +33,11 @@ def test_the_text_at_an_origin_is_the_value_or_its_key(final: Fleet) -> None:
 
 
 def test_iteration_and_lookup_agree(final: Fleet) -> None:
-    paths = list(final.origins)
-    assert len(paths) == len(set(paths)) == len(final.origins)
-    assert all(final.origins[path].position.line > 0 for path in paths)
-    assert ("nodes", "husky1-b07") not in final.origins
-    assert () not in final.origins
+    paths = list(final.provenance)
+    assert len(paths) == len(set(paths)) == len(final.provenance)
+    assert all(final.provenance[path].position.line > 0 for path in paths)
+    assert ("nodes", "husky1-b07") not in final.provenance
+    assert () not in final.provenance
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_why_tells_the_layer_of_every_value(tmp_path: Path) -> None:
 
 def test_a_node_has_no_values_but_its_own_when_nobody_writes_defaults(tmp_path: Path) -> None:
     fleet = fleet_of(tmp_path, "nodes: {n: {hardware: rocket, address: 10.42.0.1}}\n")
-    assert {path for path in fleet.origins if path[0] == "nodes"} == {
+    assert {path for path in fleet.provenance if path[0] == "nodes"} == {
         ("nodes",),
         ("nodes", "n"),
         ("nodes", "n", "hardware"),

@@ -179,7 +179,7 @@ def test_explain_prints_the_rules_page(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_list_names_every_rule(capsys: pytest.CaptureFixture[str]) -> None:
     assert _lint("--list") == 0
-    assert "MC342  error    The conducted power is above the FCC's limit\n" in capsys.readouterr().out
+    assert "MC342  error    The conducted power exceeds the FCC limit\n" in capsys.readouterr().out
 
 
 def test_a_machine_without_a_regulatory_database_is_told_so(

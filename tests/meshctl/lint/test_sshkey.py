@@ -9,7 +9,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshctl.lint.sshkey import BadKey, parse_public_key
+from meshctl.lint.sshkey import BadKey, parse_authorized_key
 
 
 def _line(key: ed25519.Ed25519PublicKey | rsa.RSAPublicKey | ec.EllipticCurvePublicKey) -> str:
@@ -17,36 +17,36 @@ def _line(key: ed25519.Ed25519PublicKey | rsa.RSAPublicKey | ec.EllipticCurvePub
 
 
 def test_the_kinds_that_openssh_writes_are_read() -> None:
-    key = parse_public_key(_line(ed25519.Ed25519PrivateKey.generate().public_key()) + " alice@laptop")
+    key = parse_authorized_key(_line(ed25519.Ed25519PrivateKey.generate().public_key()) + " alice@laptop")
     assert (key.kind, key.bits, key.comment, key.is_ed25519) == ("ssh-ed25519", 256, "alice@laptop", True)
-    key = parse_public_key(_line(rsa.generate_private_key(65537, 2048).public_key()))
+    key = parse_authorized_key(_line(rsa.generate_private_key(65537, 2048).public_key()))
     assert (key.kind, key.bits, key.is_ed25519) == ("ssh-rsa", 2048, False)
     for curve, bits in ((ec.SECP256R1(), 256), (ec.SECP384R1(), 384)):
-        assert parse_public_key(_line(ec.generate_private_key(curve).public_key())).bits == bits
+        assert parse_authorized_key(_line(ec.generate_private_key(curve).public_key())).bits == bits
 
 
 def test_options_may_stand_before_the_key() -> None:
     line = _line(ed25519.Ed25519PrivateKey.generate().public_key())
-    assert parse_public_key(f'no-pty,from="10.42.0.*" {line} bob').comment == "bob"
+    assert parse_authorized_key(f'no-pty,from="10.42.0.*" {line} bob').comment == "bob"
 
 
 @pytest.mark.parametrize(
     ("line", "why"),
     [
-        ("", "no kind of key"),
-        ("hello world", "no kind of key"),
+        ("", "unknown key type"),
+        ("hello world", "unknown key type"),
         ("-----BEGIN OPENSSH PRIVATE KEY-----", "a private key"),
-        ("ssh-ed25519", "without a key"),
+        ("ssh-ed25519", "without key data"),
         ("ssh-ed25519 !!!!", "not base64"),
-        ("ssh-ed25519 AAAA", "cut off"),
+        ("ssh-ed25519 AAAA", "truncated"),
         ("ssh-rsa AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f", "not ssh-rsa"),
-        ("ssh-rsa AAAAB3NzaC1yc2E=", "cut off"),
-        ("ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAAkFC", "cut off"),
+        ("ssh-rsa AAAAB3NzaC1yc2E=", "truncated"),
+        ("ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAAkFC", "truncated"),
     ],
 )
 def test_what_is_no_whole_key_is_refused(line: str, why: str) -> None:
     with pytest.raises(BadKey, match=why):
-        parse_public_key(line)
+        parse_authorized_key(line)
 
 
 @given(st.binary(max_size=60), st.sampled_from(["ssh-rsa", "ssh-ed25519", "ssh-dss", "ecdsa-sha2-nistp256"]))
@@ -54,7 +54,7 @@ def test_any_bytes_give_a_key_or_a_refusal_without_them(blob: bytes, kind: str) 
     inside = struct.pack(">I", len(kind)) + kind.encode() + blob
     encoded = base64.b64encode(inside).decode()
     try:
-        key = parse_public_key(f"{kind} {encoded}")
+        key = parse_authorized_key(f"{kind} {encoded}")
     except BadKey as error:
         refusal = str(error)
         assert encoded not in refusal

@@ -17,7 +17,7 @@ def _lint(tail: str, directory: Path) -> tuple[list[str], list[str]]:
     path = directory / "fleet.yaml"
     path.write_text(BASE + tail, encoding="utf-8")
     examined = check_path(path, _REGDB, ENVIRONMENT)
-    return [item.code for item in examined.diagnostics], [item.diagnostic.code for item in examined.excused]
+    return [item.code for item in examined.diagnostics], [item.diagnostic.code for item in examined.suppressed]
 
 
 def test_a_comment_on_the_line_excuses_the_finding(tmp_path: Path) -> None:

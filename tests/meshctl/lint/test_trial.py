@@ -7,7 +7,7 @@ import pytest
 from meshctl.diagnostics import Diagnostic
 from meshctl.lint import Example, check_path
 from meshctl.lint.example import ENVIRONMENT, compose, environment, write
-from meshctl.lint.openwrt_names import PACKAGES, meant_package, one_slip
+from meshctl.lint.openwrt_names import PACKAGES, is_one_edit_apart, suggest_package
 from meshctl.lint.zones import is_posix, zones
 from meshctl.regdb import SHIPPED, load
 
@@ -78,8 +78,8 @@ def test_one_key_with_and_without_its_id_is_one_key(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "found"),
     [
-        ("udp_mesh: [not, text]\n", "has no entry 'udp_mesh' with a text"),
-        ("udp-mesh: abc\n", "has no entry 'udp_mesh' with a text"),
+        ("udp_mesh: [not, text]\n", "has no entry 'udp_mesh' with text"),
+        ("udp-mesh: abc\n", "has no entry 'udp_mesh' with text"),
         ("udp_mesh: {", "is not valid YAML"),
     ],
 )
@@ -234,20 +234,20 @@ def test_time_zone_and_name_are_held_against_each_other(
     [("abcd", "abd"), ("abcd", "abxcd"), ("abcd", "abxd"), ("abcd", "acbd"), ("abcd", "abcde"), ("abc", "xabc")],
 )
 def test_one_slip_is_one_letter_or_one_exchange(one: str, other: str) -> None:
-    assert one_slip(one, other)
-    assert one_slip(other, one)
+    assert is_one_edit_apart(one, other)
+    assert is_one_edit_apart(other, one)
 
 
 @pytest.mark.parametrize(
     ("one", "other"), [("abcd", "abcd"), ("abcd", "ab"), ("abcd", "axyd"), ("abcd", "dcba"), ("", "ab")]
 )
 def test_two_slips_are_not_one(one: str, other: str) -> None:
-    assert not one_slip(one, other)
-    assert not one_slip(other, one)
+    assert not is_one_edit_apart(one, other)
+    assert not is_one_edit_apart(other, one)
 
 
 def test_no_known_package_is_taken_for_another() -> None:
-    assert [name for name in PACKAGES if meant_package(name) is not None] == []
+    assert [name for name in PACKAGES if suggest_package(name) is not None] == []
 
 
 def test_flash_that_is_too_small_is_found_where_the_image_is_not_at_hand(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshctl.regdb import SHIPPED, DfsRegion, Flag, RegdbError, Rule, decode, load, shipped_version
+from meshctl.regdb import SHIPPED, DfsRegion, Flag, FrequencyRule, RegdbError, decode, load, shipped_version
 
 _DATA = SHIPPED.read_bytes()
 
@@ -17,11 +17,11 @@ def test_the_shipped_database_holds_the_rules_the_paper_needs() -> None:
     regdb = load(SHIPPED)
     us = regdb.countries["US"]
     assert us.dfs_region is DfsRegion.FCC
-    assert Rule(2_400_000, 2_472_000, 40_000, 30.0) in us.rules
-    assert Rule(5_250_000, 5_350_000, 80_000, 24.0, Flag.DFS | Flag.AUTO_BW) in us.rules
+    assert FrequencyRule(2_400_000, 2_472_000, 40_000, 30.0) in us.rules
+    assert FrequencyRule(5_250_000, 5_350_000, 80_000, 24.0, Flag.DFS | Flag.AUTO_BW) in us.rules
     germany = regdb.countries["DE"]
     assert germany.dfs_region is DfsRegion.ETSI
-    assert Rule(2_400_000, 2_483_500, 40_000, 20.0) in germany.rules
+    assert FrequencyRule(2_400_000, 2_483_500, 40_000, 20.0) in germany.rules
     assert len(regdb.countries) > 150
 
 
@@ -35,7 +35,7 @@ def _minimal(rule: bytes) -> bytes:
 def test_longer_rules_than_known_are_read_by_their_known_part() -> None:
     rule = struct.pack(">BBHIII", 20, 0b1000, 1234, 5_170_000, 5_250_000, 80_000) + b"\1\2\3\4"
     country = decode(_minimal(rule), "x").countries["XA"]
-    assert country.rules == (Rule(5_170_000, 5_250_000, 80_000, 12.34, Flag.NO_IR),)
+    assert country.rules == (FrequencyRule(5_170_000, 5_250_000, 80_000, 12.34, Flag.NO_IR),)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from meshctl.regdb import (
     Span,
     center_mhz,
     channel_at,
-    judge,
+    check_span,
     legal_channels,
     load,
     occupied,
@@ -90,7 +90,7 @@ def test_adhoc_has_no_radar_and_no_passive_channels() -> None:
 
 
 def test_the_least_power_of_joined_rules_counts() -> None:
-    verdict = judge(_US, Span(5170, 5330))
+    verdict = check_span(_US, Span(5170, 5330))
     assert verdict.covered
     assert verdict.max_eirp_dbm == 23.0
     assert verdict.flags & Flag.DFS
@@ -98,12 +98,12 @@ def test_the_least_power_of_joined_rules_counts() -> None:
 
 
 def test_a_range_outside_every_rule_is_not_covered() -> None:
-    verdict = judge(_US, Span(2457, 2477))
+    verdict = check_span(_US, Span(2457, 2477))
     assert not verdict.covered
     assert not verdict.allows(20)
 
 
 def test_channel_14_is_for_the_old_rates_in_japan_only() -> None:
     japan = _REGDB.countries["JP"]
-    assert not judge(japan, Span(2474, 2494)).covered
-    assert judge(japan, Span(2474, 2494), ofdm=False).covered
+    assert not check_span(japan, Span(2474, 2494)).covered
+    assert check_span(japan, Span(2474, 2494), ofdm=False).covered

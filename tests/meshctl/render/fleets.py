@@ -105,7 +105,7 @@ def fleet(*nodes: Node, meshes: tuple[Mesh, ...] = (), **changes: Any) -> Fleet:
         operators=Operators((RSA, ED25519)),
         system=SystemSettings(log_host="10.42.0.100", ntp_servers=("10.42.0.100",)),
         apply=ApplyPolicy(),
-        origins=origins(known, members),
+        provenance=origins(known, members),
         files=("fleet.yaml",),
     )
     return replace(usual, **changes)

@@ -12,13 +12,13 @@ from meshctl.diagnostics import InvalidInput
 from meshctl.inventory import load_fleet
 from meshctl.model import Secret, SecretRef
 from meshctl.render import daemon_config, daemon_keys, render_fleet
-from meshctl.render.compare import stand_in
+from meshctl.render.compare import placeholder_secret
 from meshctl.resources import shipped
 from tests.meshctl.render import fleets
 from udp_mesh.daemon.configuration import load
 
 EXAMPLES = sorted(path.parent.name for path in shipped("inventory").glob("*/fleet.yaml"))
-SECRETS: Callable[[SecretRef], Secret] = stand_in
+SECRETS: Callable[[SecretRef], Secret] = placeholder_secret
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

@@ -38,7 +38,7 @@ def render(folder: Path, templates: Templates | None = None) -> Rendered:
 
 def quick(folder: Path) -> Templates:
     templates = Templates((folder / "templates", shipped("templates")))
-    templates._bounded = sandbox.Renderer(cpu_s=1, memory_bytes=512 << 20, wait_s=60)
+    templates._bounded = sandbox.SandboxRenderer(cpu_s=1, memory_bytes=512 << 20, wait_s=60)
     return templates
 
 
@@ -121,8 +121,8 @@ def test_the_tree_is_the_git_work_tree_without_git_s_own_files(tmp_path: Path) -
     (tmp_path / "repository/.git").mkdir(parents=True)
     (tmp_path / "repository/fleets/a").mkdir(parents=True)
     boundary = Boundary.of(tmp_path / "repository/fleets/a", {})
-    assert boundary.objection(tmp_path / "repository/common.yaml") == ""
-    assert "git" in boundary.objection(tmp_path / "repository/.git/config")
-    assert "outside" in boundary.objection(tmp_path / "other.yaml")
-    assert "outside" in Boundary.of(tmp_path / "plain", {}).objection(tmp_path / "repository/common.yaml")
-    assert boundary.objection(Path("/dev/zero")).startswith("outside")
+    assert boundary.refusal(tmp_path / "repository/common.yaml") == ""
+    assert "git" in boundary.refusal(tmp_path / "repository/.git/config")
+    assert "outside" in boundary.refusal(tmp_path / "other.yaml")
+    assert "outside" in Boundary.of(tmp_path / "plain", {}).refusal(tmp_path / "repository/common.yaml")
+    assert boundary.refusal(Path("/dev/zero")).startswith("outside")
