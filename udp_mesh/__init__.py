@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from udp_mesh.daemon.api_node import Node as Node
     from udp_mesh.daemon.api_node import SendRefusedError as SendRefusedError
     from udp_mesh.daemon.outbox import DirectoryStore as DirectoryStore
-    from udp_mesh.links.attachments import LinkWish as LinkWish
+    from udp_mesh.links.attachments import LinkConfig as LinkConfig
 
 __version__ = "0.1.0"
 
 _EXPORTS = {
     "Node": "udp_mesh.daemon.api_node",
     "SendRefusedError": "udp_mesh.daemon.api_node",
-    "LinkWish": "udp_mesh.links.attachments",
+    "LinkConfig": "udp_mesh.links.attachments",
     "DirectoryStore": "udp_mesh.daemon.outbox",
     "Settings": "udp_mesh.core.settings",
     "Topic": "udp_mesh.core.settings",

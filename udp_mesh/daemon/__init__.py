@@ -2,6 +2,6 @@
 
 `toml_source` and `configuration` read the file, `driver` moves bytes between sockets and the core, `outbox` keeps
 messages on disk, `recording` writes what happens to a file, `api` and `service` answer local programs on a Unix
-socket, `metrics` and `notify` tell Prometheus and systemd, `program` is the whole daemon, `library` the same
+socket, `metrics` and `sd_notify` tell Prometheus and systemd, `main` is the whole daemon, `api_node` the same
 transport inside another program.
 """

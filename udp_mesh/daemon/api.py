@@ -21,25 +21,25 @@ from udp_mesh.client.mesh_client import Frame, Header, encode_frame
 from udp_mesh.daemon.framing import BadFrame, RequestReader
 from udp_mesh.daemon.listener import Listener
 
-CLIENT_BACKLOG_BYTES = 32 << 20
+MAX_CLIENT_BACKLOG_BYTES = 32 << 20
 """Bytes written to one client and not yet read by it: a stopped subscriber. A few of the largest usual messages."""
-BACKLOGS_BYTES = 256 << 20
+MAX_TOTAL_BACKLOG_BYTES = 256 << 20
 """The same for all clients together: past it, who holds more than an equal part of that gets no more."""
-HALF_SENT_BYTES = 256 << 20
+MAX_PARTIAL_REQUEST_BYTES = 256 << 20
 """Bytes of requests that are not there whole, of all clients together: past it, who holds more than an equal part of
 that has its request refused. Several of the largest messages at a time."""
-REPLIES_BACKLOG_BYTES = 4 << 20
+MAX_REPLY_BACKLOG_BYTES = 4 << 20
 """Bytes of replies beyond that: a program that asks without end and never reads the answers."""
 MAX_CLIENTS = 256
 """Connections at a time: a program that leaks them must not take the daemon's descriptors."""
-SPARE_CLIENTS = 8
+MAX_SPARE_CLIENTS = 8
 """Connections beyond that, for one look at what is wrong: they may ask `LOOKS`, once and soon. For one more of them the
 oldest gives way."""
-LOOKS = ("status", "metrics")
-SPARE_S = 2.0
-HALF_SENT_S = 30.0
+SPARE_OPS = ("status", "metrics")
+SPARE_TIMEOUT_S = 2.0
+PARTIAL_REQUEST_TIMEOUT_S = 30.0
 """A request that stops coming for this long is given up, and its connection closed."""
-DESCRIPTORS_KEPT = 40
+RESERVED_DESCRIPTORS = 40
 """Files for the daemon's own needs, whatever its limit: links, kernel's notices, outbox, recording, configuration, a
 scraper."""
 
@@ -55,7 +55,7 @@ class RequestError(Exception):
         self.code = code
 
 
-class Requests(Protocol):
+class RequestHandler(Protocol):
     """Who answers."""
 
     def request(self, client: Client, header: Header, payload: bytes) -> None:
@@ -75,7 +75,7 @@ class Client(asyncio.Protocol):
         self.user: int | None = None
         """Whose program it is; None where the kernel does not say."""
         self._deadline: asyncio.TimerHandle | None = None
-        self._held_before = 0
+        self._partial_before = 0
         self._reader = RequestReader(server.max_payload_bytes)
         self._transport: asyncio.Transport | None = None
         self._dropped = 0
@@ -94,18 +94,18 @@ class Client(asyncio.Protocol):
         else:
             self._write({"id": request_id, "ok": False, "code": code, "error": text})
 
-    def tell(self, header: Header, payload: bytes = b"") -> None:
+    def send_event(self, header: Header, payload: bytes = b"") -> None:
         """An event; dropped and counted where the program does not read."""
         if self._transport is not None:
-            self.tell_encoded(encode_frame(header, payload))
+            self.send_encoded(encode_frame(header, payload))
 
-    def tell_encoded(self, frame: bytes) -> None:
+    def send_encoded(self, frame: bytes) -> None:
         """As `tell`, for a frame that several clients get."""
         transport = self._transport
         if transport is None:
             return
-        waiting = self.backlog()
-        if waiting and (waiting + len(frame) > CLIENT_BACKLOG_BYTES or self._server.too_much_for(waiting)):
+        waiting = self.backlog_bytes()
+        if waiting and (waiting + len(frame) > MAX_CLIENT_BACKLOG_BYTES or self._server.exceeds_backlog_share(waiting)):
             self._dropped += 1
             self._server.dropped_for_slow_clients += 1
             return
@@ -113,11 +113,11 @@ class Client(asyncio.Protocol):
             self._report_dropped()
         transport.write(frame)
 
-    def half_sent(self) -> int:
+    def partial_request_bytes(self) -> int:
         """Bytes of a request that is not here whole."""
-        return self._reader.held
+        return self._reader.buffered_bytes
 
-    def backlog(self) -> int:
+    def backlog_bytes(self) -> int:
         """Bytes written and not yet read."""
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
 
@@ -137,15 +137,15 @@ class Client(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
-        self.user = _user_of(transport.get_extra_info("socket"))
-        self._server.connected(self)
+        self.user = _peer_uid(transport.get_extra_info("socket"))
+        self._server.on_connected(self)
         if self.spare:
-            self._deadline = asyncio.get_running_loop().call_later(SPARE_S, self.turn_away)
+            self._deadline = asyncio.get_running_loop().call_later(SPARE_TIMEOUT_S, self.reject)
 
-    def turn_away(self) -> None:
+    def reject(self) -> None:
         """There is no room for it."""
         self._server.spares.pop(self, None)
-        self.refuse(None, "too-many-clients", self._server.too_many())
+        self.refuse(None, "too-many-clients", self._server.too_many_clients_text())
         self.close()
 
     def data_received(self, data: bytes) -> None:
@@ -154,38 +154,44 @@ class Client(asyncio.Protocol):
                 self.refuse(*frame)
             else:
                 self._handle(frame)
-        if self._server.too_much_half_sent(self.half_sent()):
-            text = f"local programs have begun to send more than {HALF_SENT_BYTES >> 20} MiB at a time: try again"
-            self.refuse(*self._reader.give_up("busy", text))
-        self._watch_half_sent()
+        if self._server.exceeds_partial_request_share(self.partial_request_bytes()):
+            limit_mib = MAX_PARTIAL_REQUEST_BYTES >> 20
+            text = f"local programs have begun to send more than {limit_mib} MiB at a time: try again"
+            self.refuse(*self._reader.discard_partial("busy", text))
+        self._watch_partial_request()
         transport = self._transport
-        if transport is not None and transport.get_write_buffer_size() > CLIENT_BACKLOG_BYTES + REPLIES_BACKLOG_BYTES:
+        if (
+            transport is not None
+            and transport.get_write_buffer_size() > MAX_CLIENT_BACKLOG_BYTES + MAX_REPLY_BACKLOG_BYTES
+        ):
             transport.pause_reading()
 
-    def _watch_half_sent(self) -> None:
+    def _watch_partial_request(self) -> None:
         """While a request is not here whole, some of the rest must come now and then."""
         if self.spare:
             return
-        held = self.half_sent()
+        held = self.partial_request_bytes()
         if held and self._deadline is None:
-            self._held_before = held
-            self._deadline = asyncio.get_running_loop().call_later(HALF_SENT_S, self._look_at_half_sent)
+            self._partial_before = held
+            self._deadline = asyncio.get_running_loop().call_later(
+                PARTIAL_REQUEST_TIMEOUT_S, self._check_partial_request
+            )
         elif not held and self._deadline is not None:
             self._deadline.cancel()
             self._deadline = None
 
-    def _look_at_half_sent(self) -> None:
+    def _check_partial_request(self) -> None:
         self._deadline = None
-        if self.half_sent() == self._held_before:
-            self.refuse(None, "too-slow", f"a request stopped coming for {HALF_SENT_S:g} s")
+        if self.partial_request_bytes() == self._partial_before:
+            self.refuse(None, "too-slow", f"a request stopped coming for {PARTIAL_REQUEST_TIMEOUT_S:g} s")
             self.close()
         else:
-            self._watch_half_sent()
+            self._watch_partial_request()
 
     def _handle(self, frame: Frame) -> None:
         header, payload = frame
-        if self.spare and header.get("op") not in LOOKS:
-            self.refuse(header.get("id"), "too-many-clients", self._server.too_many())
+        if self.spare and header.get("op") not in SPARE_OPS:
+            self.refuse(header.get("id"), "too-many-clients", self._server.too_many_clients_text())
             self.close()
             return
         try:
@@ -215,7 +221,13 @@ class LocalServer:
     """The listening socket and its connections."""
 
     def __init__(
-        self, requests: Requests, path: Path, *, mode: int, group: str | None, max_payload_bytes: Callable[[], int]
+        self,
+        requests: RequestHandler,
+        path: Path,
+        *,
+        mode: int,
+        group: str | None,
+        max_payload_bytes: Callable[[], int],
     ) -> None:
         self.requests = requests
         self.clients: set[Client] = set()
@@ -223,24 +235,24 @@ class LocalServer:
         """Connections beyond the most, the oldest first."""
         self.max_payload_bytes = max_payload_bytes
         self.dropped_for_slow_clients = 0
-        self._listener = Listener(path, mode=mode, group=group, take=self._take)
-        self._most = MAX_CLIENTS
+        self._listener = Listener(path, mode=mode, group=group, on_connection=self._on_connection)
+        self._max_clients = MAX_CLIENTS
         self._connecting: dict[Client, asyncio.Task[None]] = {}
         """Accepted, their transports not yet made: they count already, since the loop may accept more meanwhile."""
 
     async def start(self) -> None:
         """Listens. Raises OSError: in use by another daemon, no such directory, no such group, not allowed."""
-        self._most = max(1, descriptors_for(MAX_CLIENTS + DESCRIPTORS_KEPT) - DESCRIPTORS_KEPT)
+        self._max_clients = max(1, raise_descriptor_limit(MAX_CLIENTS + RESERVED_DESCRIPTORS) - RESERVED_DESCRIPTORS)
         self._listener.open()
 
-    def _take(self, connection: socket.socket) -> None:
+    def _on_connection(self, connection: socket.socket) -> None:
         """A program has connected."""
         making = sum(not client.spare for client in self._connecting)
-        spare = len(self.clients) + making >= self._most
-        if spare and len(self._connecting) - making >= 2 * SPARE_CLIENTS:
+        spare = len(self.clients) + making >= self._max_clients
+        if spare and len(self._connecting) - making >= 2 * MAX_SPARE_CLIENTS:
             # What cannot be written at once to a fresh connection is not worth waiting for.
             with connection, contextlib.suppress(OSError):
-                rejected = {"event": "rejected", "code": "too-many-clients", "error": self.too_many()}
+                rejected = {"event": "rejected", "code": "too-many-clients", "error": self.too_many_clients_text()}
                 connection.send(encode_frame(rejected, b""))
             return
         client = Client(self, spare=spare)
@@ -254,29 +266,29 @@ class LocalServer:
         finally:
             self._connecting.pop(client, None)
 
-    def connected(self, client: Client) -> None:
+    def on_connected(self, client: Client) -> None:
         """A program's connection can be used."""
         self._connecting.pop(client, None)
         if client.spare:
             self.spares[client] = None
-            if len(self.spares) > SPARE_CLIENTS:
-                next(iter(self.spares)).turn_away()
+            if len(self.spares) > MAX_SPARE_CLIENTS:
+                next(iter(self.spares)).reject()
         else:
             self.clients.add(client)
 
-    def too_many(self) -> str:
+    def too_many_clients_text(self) -> str:
         """Why a program is turned away."""
-        return f"at most {self._most} programs connect at a time"
+        return f"at most {self._max_clients} programs connect at a time"
 
-    def too_much_for(self, waiting: int) -> bool:
+    def exceeds_backlog_share(self, waiting: int) -> bool:
         """Whether a client for which so many bytes wait must not get more for all others' sake."""
-        return self._too_much(waiting, BACKLOGS_BYTES, Client.backlog)
+        return self._exceeds_share(waiting, MAX_TOTAL_BACKLOG_BYTES, Client.backlog_bytes)
 
-    def too_much_half_sent(self, held: int) -> bool:
+    def exceeds_partial_request_share(self, held: int) -> bool:
         """Whether a client that has sent so much of a request must not send the rest of it for all others' sake."""
-        return self._too_much(held, HALF_SENT_BYTES, Client.half_sent)
+        return self._exceeds_share(held, MAX_PARTIAL_REQUEST_BYTES, Client.partial_request_bytes)
 
-    def _too_much(self, own: int, limit: int, of_each: Callable[[Client], int]) -> bool:
+    def _exceeds_share(self, own: int, limit: int, of_each: Callable[[Client], int]) -> bool:
         """Whether this is more than an equal part of a limit that all together exceed."""
         return own > limit // max(1, len(self.clients)) and sum(map(of_each, self.clients)) > limit
 
@@ -289,7 +301,7 @@ class LocalServer:
         await asyncio.sleep(0)
 
 
-def _user_of(connection: socket.socket | None) -> int | None:
+def _peer_uid(connection: socket.socket | None) -> int | None:
     """The user id of the program at the other end (unix(7), SO_PEERCRED)."""
     if connection is None:
         return None
@@ -302,7 +314,7 @@ def _user_of(connection: socket.socket | None) -> int | None:
     return int(user)
 
 
-def descriptors_for(wanted: int) -> int:
+def raise_descriptor_limit(wanted: int) -> int:
     """How many files this process may open, after asking for as many as `wanted` where the limit is lower."""
     try:
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -311,8 +323,8 @@ def descriptors_for(wanted: int) -> int:
         return wanted
     if soft == resource.RLIM_INFINITY or soft >= wanted:
         return wanted
-    most = wanted if hard == resource.RLIM_INFINITY else min(hard, wanted)
+    raised = wanted if hard == resource.RLIM_INFINITY else min(hard, wanted)
     with contextlib.suppress(OSError, ValueError):
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-        return most
+        resource.setrlimit(resource.RLIMIT_NOFILE, (raised, hard))
+        return raised
     return soft

@@ -33,7 +33,7 @@ from udp_mesh.core.events import (
 from udp_mesh.core.settings import Settings
 from udp_mesh.daemon.driver import Driver
 from udp_mesh.daemon.outbox import DirectoryStore
-from udp_mesh.links.attachments import EVERY_INTERFACE, LinkWish
+from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
 from udp_mesh.wire.limits import BOOT_ID_BYTES
 
 Outcome = MessageDelivered | MessageExpired | MessagePeerLost
@@ -57,7 +57,7 @@ class Node:
         self,
         settings: Settings,
         *,
-        links: Sequence[LinkWish] = EVERY_INTERFACE,
+        links: Sequence[LinkConfig] = EVERY_INTERFACE,
         store: DirectoryStore | None = None,
         urgent_dscp: int = 46,
     ) -> None:

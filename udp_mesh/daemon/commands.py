@@ -26,7 +26,7 @@ from udp_mesh.daemon.configuration import (
     read_rates,
     topic_from_values,
 )
-from udp_mesh.daemon.file_access import FILE_S, is_below, off_loop
+from udp_mesh.daemon.file_access import FILE_TIMEOUT_S, is_below, off_loop
 from udp_mesh.daemon.neighbours import (
     NODE_NAME,
     TOPIC_NAME,
@@ -83,7 +83,7 @@ def _values(header: Header, key: str) -> dict[str, object]:
     return value
 
 
-def _refusal(error: ConfigurationError) -> RequestError:
+def _request_error(error: ConfigurationError) -> RequestError:
     text = "; ".join(str(problem).removeprefix("command:1: ") for problem in error.problems)
     return RequestError("bad-configuration", text)
 
@@ -125,7 +125,7 @@ def unsubscribe(service: Service, client: Client, header: Header, _: bytes) -> H
 
 
 def events(service: Service, client: Client, _header: Header, _: bytes) -> Header:
-    service.watch(client)
+    service.subscribe_events(client)
     return {}
 
 
@@ -169,14 +169,14 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
         ],
         "refusals": [
             {
-                "link": refusal.link,
-                "to": refusal.to,
-                "reason": refusal.reason,
-                "datagrams": refusal.datagrams,
-                "for_s": round(refusal.last - refusal.since, 3),
-                "last_ago_s": round(driver.now() - refusal.last, 3),
+                "link": error.link,
+                "to": error.to,
+                "reason": error.reason,
+                "datagrams": error.datagrams,
+                "for_s": round(error.last - error.since, 3),
+                "last_ago_s": round(driver.now() - error.last, 3),
             }
-            for refusal in driver.refusals.standing()
+            for error in driver.send_errors.active()
         ],
         "link_failures": driver.link_failures,
         "recording": None if recorder is None else {"path": str(recorder.path), "bytes": recorder.bytes},
@@ -233,7 +233,7 @@ def set_topic(service: Service, _client: Client, header: Header, _: bytes) -> He
     try:
         topic = topic_from_values(name, values, current)
     except ConfigurationError as error:
-        raise _refusal(error) from error
+        raise _request_error(error) from error
     others = tuple(other for other in settings.topics if other.name != name)
     if len(others) >= MAX_TOPICS:
         raise RequestError("too-many", f"expected at most {MAX_TOPICS} topics")
@@ -259,7 +259,7 @@ def set_rates(service: Service, _client: Client, header: Header, _: bytes) -> He
     source = Source("command", {})
     rates = read_rates(Table(_values(header, "values"), source, ("rates",)), service.settings.rates)
     if source.problems:
-        raise _refusal(ConfigurationError(source.problems))
+        raise _request_error(ConfigurationError(source.problems))
     return _changed(service, replace(service.settings, rates=rates))
 
 
@@ -271,7 +271,7 @@ def set_neighbour(service: Service, _client: Client, header: Header, _: bytes) -
         Table({key: value for key, value in values.items() if value is not None}, source, ("neighbour",)), settings.port
     )
     if neighbour is None:
-        raise RequestError("bad-request", str(_refusal(ConfigurationError(source.problems))))
+        raise RequestError("bad-request", str(_request_error(ConfigurationError(source.problems))))
     others = tuple(other for other in settings.neighbours if other.address != neighbour.address)
     if len(others) >= MAX_NEIGHBOURS:
         raise RequestError("too-many", f"expected at most {MAX_NEIGHBOURS} neighbours")
@@ -296,9 +296,9 @@ async def _from_files(work: Callable[[], Result]) -> Result:
     try:
         return await off_loop(work)
     except ConfigurationError as error:
-        raise _refusal(error) from error
+        raise _request_error(error) from error
     except TimeoutError as error:
-        raise RequestError("too-slow", f"the file was not read within {FILE_S:g} s") from error
+        raise RequestError("too-slow", f"the file was not read within {FILE_TIMEOUT_S:g} s") from error
 
 
 async def set_keys(service: Service, _client: Client, header: Header, _: bytes) -> Header:
@@ -319,7 +319,7 @@ async def reload(service: Service, _client: Client, _header: Header, _: bytes) -
 
 async def record_start(service: Service, client: Client, header: Header, _: bytes) -> Header:
     path, payloads = Path(_text(header, "path")), bool(header.get("payloads"))
-    service.may_record()
+    service.check_not_recording()
     directory = service.configuration.daemon.state_directory
     if client.user not in (0, os.geteuid()) and not await _from_files(lambda: is_below(path, directory)):
         # The daemon may write where that program may not.

@@ -38,15 +38,15 @@ from udp_mesh.daemon.neighbours import (
     read_neighbours,
 )
 from udp_mesh.daemon.toml_source import ConfigurationError, Problem, Source, Table, parse
-from udp_mesh.links.attachments import EVERY_INTERFACE, LinkWish
+from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
 from udp_mesh.wire.limits import MAX_MESSAGE_BYTES
 
 log = logging.getLogger(__name__)
 
 DEFAULT_PATH = Path("/etc/udp-mesh/udp-mesh.toml")
 DEFAULT_SOCKET = Path("/run/udp-mesh/udp-mesh.sock")
-DEFAULT_STATE = Path("/var/lib/udp-mesh")
-MAX_SOCKET_BYTES = 107
+DEFAULT_STATE_DIRECTORY = Path("/var/lib/udp-mesh")
+MAX_SOCKET_PATH_BYTES = 107
 """Of a Unix socket's path, without the NUL behind it."""
 MAX_FILE_BYTES = 1 << 20
 """A configuration of a megabyte is a mistake (a wrong path), not a configuration."""
@@ -76,7 +76,7 @@ class DaemonSettings:
     socket_group: str | None = None
     user: str | None = None
     """Whom to become once sockets are open (None: stay)."""
-    state_directory: Path = DEFAULT_STATE
+    state_directory: Path = DEFAULT_STATE_DIRECTORY
     metrics_address: Address | None = None
     """Where Prometheus may ask over TCP: a loopback address (None: only through the local socket)."""
     conditions_period_s: float = 1.0
@@ -93,7 +93,7 @@ class Configuration:
     """Everything a daemon is told."""
 
     settings: Settings
-    links: tuple[LinkWish, ...] = EVERY_INTERFACE
+    links: tuple[LinkConfig, ...] = EVERY_INTERFACE
     daemon: DaemonSettings = field(default_factory=DaemonSettings)
     file: Path | None = None
 
@@ -205,7 +205,7 @@ def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
             limits=limits,
         )
     except ValueError as error:
-        raise ConfigurationError([problem_of(source, error)]) from error
+        raise ConfigurationError([problem_from(source, error)]) from error
     return Configuration(settings, links, daemon)
 
 
@@ -213,7 +213,7 @@ def _window(packets: int | None) -> Literal["adaptive"] | int:
     return "adaptive" if packets is None else packets
 
 
-def problem_of(source: Source, error: ValueError) -> Problem:
+def problem_from(source: Source, error: ValueError) -> Problem:
     """What a value's own check found, as a problem at its key's line where the text names one."""
     text = str(error)
     parts = re.fullmatch(r"(?P<key>[^:]+): (?:expected )?(?P<expected>.*?)(?:, found (?P<found>.*))?", text)
@@ -277,7 +277,7 @@ def read_rates(table: Table, current: Rates | None = None) -> Rates:
     try:
         return dataclasses.replace(base, **changes)  # type: ignore[arg-type]
     except ValueError as error:
-        table.source.problems.append(problem_of(table.source, error))
+        table.source.problems.append(problem_from(table.source, error))
         return base
 
 
@@ -307,8 +307,8 @@ def _read_daemon(table: Table) -> DaemonSettings:
     if metrics_text is not None and (metrics is None or not ipaddress.ip_address(metrics[0]).is_loopback):
         table.report("metrics_address", "a loopback address with a port (127.0.0.1:9871)", metrics_text)
     socket_path = _read_path(table, "socket", default.socket)
-    if len(os.fsencode(socket_path)) > MAX_SOCKET_BYTES:
-        table.report("socket", f"a path of at most {MAX_SOCKET_BYTES} bytes (unix(7))", str(socket_path))
+    if len(os.fsencode(socket_path)) > MAX_SOCKET_PATH_BYTES:
+        table.report("socket", f"a path of at most {MAX_SOCKET_PATH_BYTES} bytes (unix(7))", str(socket_path))
     settings = DaemonSettings(
         socket=socket_path,
         socket_mode=mode,

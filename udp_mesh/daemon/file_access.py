@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-FILE_S = 5.0
+FILE_TIMEOUT_S = 5.0
 """Until a request that needs a file is refused: a healthy disk takes milliseconds."""
 
 _KINDS = (
@@ -54,7 +54,7 @@ def is_exposed(path: Path) -> bool:
         return False
 
 
-async def off_loop(work: Callable[[], Result], *, timeout_s: float = FILE_S) -> Result:
+async def off_loop(work: Callable[[], Result], *, timeout_s: float = FILE_TIMEOUT_S) -> Result:
     """What `work` returns or raises, done in a thread that nothing waits for in the end. Raises TimeoutError."""
     loop = asyncio.get_running_loop()
     done: asyncio.Future[Result] = loop.create_future()

@@ -32,15 +32,15 @@ class RequestReader:
         self._buffer = bytearray()
         self._needed = _LENGTHS.size
         """Bytes from the start of the frame at the front that must be here before it is looked at again."""
-        self._passed_over = 0
+        self._skip_bytes = 0
         """Bytes still to come of a frame that was refused."""
         self._max_payload_bytes = max_payload_bytes
 
     def feed(self, data: bytes) -> list[Frame | BadFrame]:
         """What these bytes complete, in order."""
-        if self._passed_over:
-            count = min(self._passed_over, len(data))
-            self._passed_over -= count
+        if self._skip_bytes:
+            count = min(self._skip_bytes, len(data))
+            self._skip_bytes -= count
             data = data[count:]
         buffer = self._buffer
         buffer += data
@@ -51,33 +51,33 @@ class RequestReader:
             body = start + _LENGTHS.size
             payload = body + head_bytes
             end = payload + payload_bytes
-            most = self._max_payload_bytes()
+            max_bytes = self._max_payload_bytes()
             if head_bytes > MAX_HEADER_BYTES:
                 expected = f"a header of at most {MAX_HEADER_BYTES} bytes"
                 found.append(BadFrame(None, "bad-frame", f"expected {expected}, found {head_bytes}"))
-            elif payload_bytes > most:
+            elif payload_bytes > max_bytes:
                 if len(buffer) < payload:
                     self._needed = payload - start
                     break
-                text = f"expected a payload of at most {most} bytes, found {payload_bytes}"
+                text = f"expected a payload of at most {max_bytes} bytes, found {payload_bytes}"
                 found.append(_refused(bytes(buffer[body:payload]), "too-large", text))
             elif len(buffer) < end:
                 self._needed = end - start
                 break
             else:
-                found.append(_taken(bytes(buffer[body:payload]), bytes(memoryview(buffer)[payload:end])))
+                found.append(_parsed(bytes(buffer[body:payload]), bytes(memoryview(buffer)[payload:end])))
             self._needed = _LENGTHS.size
-            self._passed_over = max(0, end - len(buffer))
+            self._skip_bytes = max(0, end - len(buffer))
             start = min(end, len(buffer))
         del buffer[:start]
         return found
 
     @property
-    def held(self) -> int:
+    def buffered_bytes(self) -> int:
         """Bytes of the frame that is not here whole."""
         return len(self._buffer)
 
-    def give_up(self, code: str, text: str) -> BadFrame:
+    def discard_partial(self, code: str, text: str) -> BadFrame:
         """Let go of the frame that is not here whole; the rest of it is read past. Only after its first eight bytes."""
         buffer = self._buffer
         head_bytes, payload_bytes = _LENGTHS.unpack_from(buffer)
@@ -87,13 +87,13 @@ class RequestReader:
             if len(buffer) >= payload
             else BadFrame(None, code, text)
         )
-        self._passed_over = payload + payload_bytes - len(buffer)
+        self._skip_bytes = payload + payload_bytes - len(buffer)
         self._needed = _LENGTHS.size
         buffer.clear()
         return refused
 
 
-def _taken(head: bytes, payload: bytes) -> Frame | BadFrame:
+def _parsed(head: bytes, payload: bytes) -> Frame | BadFrame:
     try:
         return _header(head), payload
     except MeshError as error:

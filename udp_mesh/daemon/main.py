@@ -20,7 +20,7 @@ from typing import Any
 from udp_mesh.daemon.api import LocalServer, RequestError
 from udp_mesh.daemon.commands import COMMANDS, render_metrics
 from udp_mesh.daemon.configuration import Configuration, load
-from udp_mesh.daemon.file_access import FILE_S, off_loop
+from udp_mesh.daemon.file_access import FILE_TIMEOUT_S, off_loop
 from udp_mesh.daemon.metrics_server import MetricsServer
 from udp_mesh.daemon.privileges import drop_privileges
 from udp_mesh.daemon.sd_notify import Notifier
@@ -83,7 +83,7 @@ async def _serve(service: Service, notifier: Notifier) -> None:
         task.add_done_callback(reloads.discard)
 
     loop.add_signal_handler(signal.SIGHUP, reload)
-    loop.set_exception_handler(_report_bug)
+    loop.set_exception_handler(_log_unhandled_error)
     # A daemon that hangs on a robot far away: SIGUSR1 writes where to its log.
     faulthandler.register(signal.SIGUSR1)
     gc.collect()
@@ -102,7 +102,7 @@ async def _serve(service: Service, notifier: Notifier) -> None:
             notifier.alive(_status(service))
 
 
-def _report_bug(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+def _log_unhandled_error(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """What nobody expected is written down, and the daemon goes on: a robot's link matters more than a clean end."""
     log.error("bug message=%s", context.get("message"), exc_info=context.get("exception"))
 
@@ -119,7 +119,7 @@ async def _reload(service: Service, notifier: Notifier) -> None:
     except RequestError as error:
         log.error("reload-refused %s", error)
     except TimeoutError:
-        log.error("reload-refused the files were not read within %g s", FILE_S)
+        log.error("reload-refused the files were not read within %g s", FILE_TIMEOUT_S)
     else:
         log.info("reloaded changes=%d %s", len(changes), "; ".join(changes))
     notifier.ready(_status(service))

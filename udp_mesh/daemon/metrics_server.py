@@ -9,11 +9,11 @@ from collections.abc import Callable
 from udp_mesh.core.settings import Address
 from udp_mesh.daemon.metrics import CONTENT_TYPE
 
-REQUEST_BYTES = 8192
+MAX_REQUEST_BYTES = 8192
 """A scraper's request is a few hundred bytes; more is refused."""
-REQUEST_S = 5.0
+REQUEST_TIMEOUT_S = 5.0
 """A connection that says nothing is closed."""
-CONNECTIONS = 8
+MAX_CONNECTIONS = 8
 """At a time, for the daemon's descriptors' sake. For one more the oldest gives way: a scraper asks at once, and
 who holds connections without asking must not keep it out."""
 
@@ -31,16 +31,18 @@ class MetricsServer:
         """Raises OSError where the port is taken."""
         host, port = self._address
         # asyncio accepts as many at a time as may wait
-        self._server = await asyncio.start_server(self._answer, host, port, limit=REQUEST_BYTES, backlog=CONNECTIONS)
+        self._server = await asyncio.start_server(
+            self._answer, host, port, limit=MAX_REQUEST_BYTES, backlog=MAX_CONNECTIONS
+        )
 
     async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._open[writer] = None
-        if len(self._open) > CONNECTIONS:
+        if len(self._open) > MAX_CONNECTIONS:
             oldest = next(iter(self._open))
             del self._open[oldest]
             oldest.transport.abort()
         try:
-            async with asyncio.timeout(REQUEST_S):
+            async with asyncio.timeout(REQUEST_TIMEOUT_S):
                 request = await reader.readuntil(b"\r\n\r\n")
                 method, _, rest = request.partition(b"\r\n")[0].partition(b" ")
                 path = rest.partition(b" ")[0].partition(b"?")[0]

@@ -7,7 +7,7 @@ import re
 
 from udp_mesh.core.settings import Address, Neighbour, is_name
 from udp_mesh.daemon.toml_source import Table
-from udp_mesh.links.attachments import LinkWish
+from udp_mesh.links.attachments import LinkConfig
 from udp_mesh.wire.limits import MAX_NAME_BYTES, MAX_TOPIC_BYTES
 
 NODE_NAME = f"a name of 1 to {MAX_NAME_BYTES} bytes without space or slash"
@@ -24,7 +24,7 @@ def is_topic_name(name: str) -> bool:
     return is_name(name, MAX_TOPIC_BYTES)
 
 
-def read_link(table: Table) -> LinkWish:
+def read_link(table: Table) -> LinkConfig:
     """An entry of `[[links]]`; problems go to the table's source."""
     interface, address = table.text("interface"), table.text("address")
     kind = table.choice("kind", "broadcast", ("broadcast", "neighbours"))
@@ -38,7 +38,7 @@ def read_link(table: Table) -> LinkWish:
                 table.report("address", "an address of one interface (name a link-local one's `interface`)", address)
         except ValueError:
             table.report("address", "an IPv4 or IPv6 address", address)
-    return LinkWish(interface, address, kind == "broadcast", mtu)
+    return LinkConfig(interface, address, kind == "broadcast", mtu)
 
 
 def read_neighbours(top: Table, port: int) -> tuple[Neighbour, ...]:

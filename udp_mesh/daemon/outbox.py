@@ -28,7 +28,7 @@ from udp_mesh.core.interfaces import StoredMessage
 log = logging.getLogger(__name__)
 
 SUFFIX = ".message"
-TELL_AGAIN_S = 60.0
+LOG_AGAIN_S = 60.0
 """Between two lines of the log that say the disk is full."""
 _CHECKSUM_BYTES = 8
 
@@ -45,7 +45,7 @@ class DirectoryStore:
         # what both the caller's thread and the writing one change
         self._lock = threading.Lock()
         self._sizes: dict[int, int] = {}
-        self._told_at = float("-inf")
+        self._logged_at = float("-inf")
         self.bytes = 0
         """Bytes of all files kept, those still to be written included."""
         self.refused = 0
@@ -59,11 +59,11 @@ class DirectoryStore:
         self._unsynced: set[Path] = set()
         self._disk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="outbox")
 
-    def prove(self) -> None:
+    def check_writable(self) -> None:
         """Say now, not with the first message, that the directory cannot be used."""
-        self._disk.submit(self._prove)
+        self._disk.submit(self._check_writable)
 
-    def _prove(self) -> None:
+    def _check_writable(self) -> None:
         try:
             self._make_directory()
             with tempfile.TemporaryFile(dir=self._directory):
@@ -91,8 +91,8 @@ class DirectoryStore:
         with self._lock:
             more = size - self._sizes.get(message.key, 0)
             if self.bytes + more > self._limit_bytes:
-                why = f"directory={self._directory} bytes={self.bytes} limit={self._limit_bytes}"
-                self._refuse("outbox-full", why)
+                details = f"directory={self._directory} bytes={self.bytes} limit={self._limit_bytes}"
+                self._refuse("outbox-full", details)
                 return False
             self.bytes += more
             self._sizes[message.key] = size
@@ -119,13 +119,13 @@ class DirectoryStore:
             return
         self._unsynced.add(path)
 
-    def _refuse(self, event: str, why: str) -> None:
+    def _refuse(self, event: str, details: str) -> None:
         """Counted each time, logged now and then: a disk stays full for long."""
         self.refused += 1
         now = time.monotonic()
-        if now - self._told_at >= TELL_AGAIN_S:
-            self._told_at = now
-            log.error("%s held-in-memory=%d %s", event, self.refused, why)
+        if now - self._logged_at >= LOG_AGAIN_S:
+            self._logged_at = now
+            log.error("%s held-in-memory=%d %s", event, self.refused, details)
 
     def remove(self, key: int) -> None:
         with self._lock:

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 FORMAT_VERSION = 1
 BATCH_BYTES = 64 << 10
 """Lines handed over together: a hand-over costs as much as ten lines."""
-BACKLOG_BYTES = 32 << 20
+MAX_BACKLOG_BYTES = 32 << 20
 """Lines that wait for a disk which stands still: what is recorded at 10 Mbit/s in half a minute."""
 
 
@@ -45,10 +45,10 @@ class Recorder:
         self._limit_bytes = limit_bytes
         self._lines: list[bytes] = []
         self._lines_bytes = 0
-        self._left_out = 0
+        self._dropped_lines = 0
         # what both the caller's thread and the writing one change
         self._lock = threading.Lock()
-        self._handed_over_bytes = 0
+        self._submitted_bytes = 0
         self._ended = False
         self._closed: Future[None] | None = None
         self._file = path.open("xb")
@@ -100,7 +100,7 @@ class Recorder:
 
     def conditions(self, conditions: Conditions) -> None:
         self._write({"t": self._at(conditions.now), "kind": "conditions", **conditions_json(conditions)})
-        self._hand_over()
+        self._submit()
 
     def _at(self, now: float) -> float:
         return round(now - self._start, 6)
@@ -108,10 +108,10 @@ class Recorder:
     def _write(self, fields: Json) -> None:
         if not self.open:
             return
-        waiting = self._handed_over_bytes + self._lines_bytes
+        waiting = self._submitted_bytes + self._lines_bytes
         # few long gaps tell more than many short ones
-        if self._left_out and waiting <= BACKLOG_BYTES // 2:
-            left_out, self._left_out = self._left_out, 0
+        if self._dropped_lines and waiting <= MAX_BACKLOG_BYTES // 2:
+            left_out, self._dropped_lines = self._dropped_lines, 0
             log.error("recording-gap path=%s lines=%d", self.path, left_out)
             self._write({"t": fields["t"], "kind": "gap", "lines": left_out})
         line = json.dumps(fields, separators=(",", ":")).encode() + b"\n"
@@ -120,27 +120,27 @@ class Recorder:
             self.close()
             return
         # a line larger than all that may wait is taken when none does
-        if self._left_out or (waiting and waiting + len(line) > BACKLOG_BYTES):
-            self._left_out += 1
+        if self._dropped_lines or (waiting and waiting + len(line) > MAX_BACKLOG_BYTES):
+            self._dropped_lines += 1
             return
         self.bytes += len(line)
         self.lines += 1
         self._lines.append(line)
         self._lines_bytes += len(line)
         if self._lines_bytes >= BATCH_BYTES:
-            self._hand_over()
+            self._submit()
 
-    def _hand_over(self) -> None:
+    def _submit(self) -> None:
         if not self._lines or not self.open:
             return
         batch = b"".join(self._lines)
         self._lines.clear()
         self._lines_bytes = 0
         with self._lock:
-            self._handed_over_bytes += len(batch)
-        self._disk.submit(self._put, batch)
+            self._submitted_bytes += len(batch)
+        self._disk.submit(self._append, batch)
 
-    def _put(self, batch: bytes) -> None:
+    def _append(self, batch: bytes) -> None:
         try:
             if not self._file.closed:
                 self._file.write(batch)
@@ -150,12 +150,12 @@ class Recorder:
             self._ended = True
             self._close()
         with self._lock:
-            self._handed_over_bytes -= len(batch)
+            self._submitted_bytes -= len(batch)
 
     def close(self) -> Future[None]:
         """Ends it; done when everything is written."""
         if self._closed is None:
-            self._hand_over()
+            self._submit()
             self._ended = True
             self._closed = self._disk.submit(self._close)
             self._disk.shutdown(wait=False)

@@ -97,8 +97,8 @@ class Service:
         self.driver.start()
         topics = (*self.settings.topics, self.settings.undeclared)
         if any(topic is not None and topic.outbox_on_disk for topic in topics):
-            self.store.prove()
-        self._conditions_due()
+            self.store.check_writable()
+        self._publish_conditions()
 
     async def close(self) -> None:
         """Ends the driver, the waiting requests and the recording."""
@@ -156,7 +156,7 @@ class Service:
         self._subscriptions[client] = kept
         self._routes.clear()
 
-    def watch(self, client: Client) -> None:
+    def subscribe_events(self, client: Client) -> None:
         """This program wants every event that is not a message."""
         self._watchers.add(client)
 
@@ -170,20 +170,20 @@ class Service:
         outcome = self.driver.send(topic, payload, destination=destination, type_name=type_name)
         if isinstance(outcome, Rejected):
             raise RequestError(outcome.reason.value.replace(" ", "-"), f"{outcome.reason.value}: {outcome.detail}")
-        how = self.topic(topic)
+        settings = self.topic(topic)
         count = self._count(topic)
         count.sent_messages += 1
         count.sent_bytes += len(payload)
         count.last_sent = self.driver.now()
-        if self.recorder is not None and how is not None:
+        if self.recorder is not None and settings is not None:
             self.recorder.sent(
                 self.driver.now(),
                 message=outcome,
                 topic=topic,
-                priority=how.priority,
+                priority=settings.priority,
                 size=len(payload),
                 destination=destination,
-                reliable=how.reliable,
+                reliable=settings.reliable,
             )
         if client is not None:
             self._outcomes[outcome] = client
@@ -266,14 +266,14 @@ class Service:
 
     # Recording
 
-    def may_record(self) -> None:
+    def check_not_recording(self) -> None:
         """Raises RequestError where a recording is running."""
         if self.recorder is not None and self.recorder.open:
             raise RequestError("already-recording", f"already recording to {self.recorder.path}")
 
     def start_recording(self, path: Path, payloads: bool) -> None:
         """Raises RequestError where one is running or the file cannot be made."""
-        self.may_record()
+        self.check_not_recording()
         try:
             self.recorder = Recorder(
                 path,
@@ -303,29 +303,29 @@ class Service:
             self.recorder.event(self.driver.now(), event)
         match event:
             case MessageReceived():
-                self._arrived(event)
+                self._on_message(event)
             case MessageDelivered() | MessageExpired() | MessagePeerLost():
                 client = self._outcomes.get(event.message_id)
                 if client is not None:
                     fields = event_json(event)
                     outcome = event_name(event).removeprefix("message-")
-                    client.tell({**fields, "event": "outcome", "outcome": outcome})
+                    client.send_event({**fields, "event": "outcome", "outcome": outcome})
             case _:
                 fields = event_json(event)
                 log.info("%s %s", fields["event"], " ".join(f"{k}={v}" for k, v in fields.items() if k != "event"))
                 for client in self._watchers:
-                    client.tell(fields)
+                    client.send_event(fields)
 
-    def _arrived(self, event: MessageReceived) -> None:
+    def _on_message(self, event: MessageReceived) -> None:
         topic = event.topic
         if topic.startswith(RESERVED_PREFIX):
-            self._arrived_reserved(event)
+            self._on_reserved_message(event)
             return
         count = self._count(topic)
         count.received_messages += 1
         count.received_bytes += len(event.payload)
         count.last_received = self.driver.now()
-        self._hand_out(
+        self._distribute(
             {
                 "event": "message",
                 "source": event.source,
@@ -337,7 +337,7 @@ class Service:
             event.payload,
         )
 
-    def _arrived_reserved(self, event: MessageReceived) -> None:
+    def _on_reserved_message(self, event: MessageReceived) -> None:
         if event.topic == PING_TOPIC and len(event.payload) == TOKEN_BYTES:
             self.driver.send(PONG_TOPIC, event.payload, destination=event.source)
         elif event.topic == PONG_TOPIC:
@@ -345,7 +345,7 @@ class Service:
             if waiting is not None and not waiting.done():
                 waiting.set_result(self.driver.now())
 
-    def _hand_out(self, header: Header, payload: bytes) -> None:
+    def _distribute(self, header: Header, payload: bytes) -> None:
         topic = str(header["topic"])
         clients = self._routes.get(topic)
         if clients is None:
@@ -360,12 +360,12 @@ class Service:
         if clients:
             frame = encode_frame(header, payload)
             for client in clients:
-                client.tell_encoded(frame)
+                client.send_encoded(frame)
 
-    def _conditions_due(self) -> None:
+    def _publish_conditions(self) -> None:
         """Once per period: the conditions as a topic for local programs, and into the recording."""
         period_s = self.configuration.daemon.conditions_period_s
-        self._conditions_timer = asyncio.get_running_loop().call_later(period_s, self._conditions_due)
+        self._conditions_timer = asyncio.get_running_loop().call_later(period_s, self._publish_conditions)
         if self.store.needs_flush:
             # What a peer left behind when it went out of reach: nobody waits for it.
             self._spawn(self._flusher.flush())
@@ -384,7 +384,7 @@ class Service:
             }
             for client, patterns in self._subscriptions.items():
                 if CONDITIONS_TOPIC in patterns:
-                    client.tell(header)
+                    client.send_event(header)
 
     def _count(self, topic: str) -> TopicCount:
         count = self.counts.get(topic)

@@ -228,7 +228,7 @@ class Table:
             return default
         if isinstance(value, str) and value in allowed:
             return value
-        self.report(key, " or ".join(f'"{name}"' for name in allowed), value, meant(value, allowed))
+        self.report(key, " or ".join(f'"{name}"' for name in allowed), value, did_you_mean(value, allowed))
         return default
 
     def texts(self, key: str) -> tuple[str, ...]:
@@ -278,11 +278,11 @@ class Table:
         """Reports every key nobody asked for."""
         for key, value in self._values.items():
             if key not in self._known:
-                hint = meant(key, self._known)
+                hint = did_you_mean(key, self._known)
                 self.source.report((*self.path, key), "a known key", f"{key} = {show(value)}", hint)
 
 
-def meant(found: object, known: Iterable[str]) -> str:
+def did_you_mean(found: object, known: Iterable[str]) -> str:
     near = difflib.get_close_matches(str(found), list(known), n=1, cutoff=0.6)
     return f"did you mean {near[0]!r}?" if near else ""
 

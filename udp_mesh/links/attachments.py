@@ -21,7 +21,7 @@ Address: TypeAlias = tuple[str, int]
 MAX_MTU = 65_535
 """The loopback's 65,536 is one byte more than an IP packet can have."""
 
-LEAST_MTU = 200
+MIN_MTU = 200
 """Bytes of IP packet that leave room for headers and a useful piece of payload: narrower interfaces are not used."""
 
 
@@ -31,7 +31,7 @@ meshes that prune multicast always let it pass (RFC 4541, 3)."""
 
 
 @dataclass(frozen=True, slots=True)
-class LinkWish:
+class LinkConfig:
     """What the operator wants: interfaces by pattern, or one own address; broadcast, or fixed neighbours only."""
 
     interface: str | None = None
@@ -56,55 +56,61 @@ class Attachment:
     to the one before hears nothing."""
 
 
-EVERY_INTERFACE = (LinkWish(interface="*"),)
+EVERY_INTERFACE = (LinkConfig(interface="*"),)
 """The default: each running interface that can broadcast."""
 
 
-def choose(interfaces: Iterable[Interface], wishes: Iterable[LinkWish], port: int) -> tuple[Attachment, ...]:
+def select_attachments(
+    interfaces: Iterable[Interface], configs: Iterable[LinkConfig], port: int
+) -> tuple[Attachment, ...]:
     """The attachments that exist now, one per interface (or wished address), the first wish that fits an interface
     wins."""
     running = [interface for interface in interfaces if interface.running]
     chosen: dict[str, Attachment] = {}
-    for wish in wishes:
-        for attachment in _of_address(running, wish, port) if wish.address else _of_interface(running, wish, port):
+    for config in configs:
+        for attachment in (
+            _by_address(running, config, port) if config.address else _by_interface(running, config, port)
+        ):
             chosen.setdefault(attachment.name, attachment)
     return tuple(chosen.values())
 
 
-def _of_interface(running: list[Interface], wish: LinkWish, port: int) -> Iterable[Attachment]:
+def _by_interface(running: list[Interface], config: LinkConfig, port: int) -> Iterable[Attachment]:
     for interface in running:
-        if not fnmatch.fnmatchcase(interface.name, wish.interface or "*"):
+        if not fnmatch.fnmatchcase(interface.name, config.interface or "*"):
             continue
-        if interface.loopback and wish.interface != interface.name:
+        if interface.loopback and config.interface != interface.name:
             continue
-        usable = [address for address in interface.addresses if not wish.broadcast or _to_all(interface, address)]
-        if wish.broadcast:
+        usable = [
+            address for address in interface.addresses if not config.broadcast or _broadcast_address(interface, address)
+        ]
+        if config.broadcast:
             # Everybody on the link is reached from the link-local address, which every IPv6 interface has.
             usable = [one for one in usable if ":" not in one.host or ipaddress.ip_address(one.host).is_link_local]
         if usable:
             address = min(usable, key=_preference)
-            to_all = _to_all(interface, address) if wish.broadcast else None
+            to_all = _broadcast_address(interface, address) if config.broadcast else None
             broadcast = None if to_all is None else (to_all, port)
             own = (address.host, port)
-            mtu = _mtu(interface, wish)
+            mtu = _mtu(interface, config)
             yield Attachment(interface.name, interface.name, own, broadcast, mtu, interface.index)
 
 
-def _of_address(running: list[Interface], wish: LinkWish, port: int) -> Iterable[Attachment]:
-    wanted = ipaddress.ip_address(wish.address or "")
+def _by_address(running: list[Interface], config: LinkConfig, port: int) -> Iterable[Attachment]:
+    wanted = ipaddress.ip_address(config.address or "")
     for interface in running:
         for address in interface.addresses:
             # Every address of 127.0.0.0/8 is the loopback's own.
-            own = ipaddress.ip_address(address.host) == wanted or (interface.loopback and _within(wanted, address))
+            own = ipaddress.ip_address(address.host) == wanted or (interface.loopback and _in_network(wanted, address))
             if own:
-                to_all = _to_all(interface, address) if wish.broadcast else None
+                to_all = _broadcast_address(interface, address) if config.broadcast else None
                 broadcast = None if to_all is None else (to_all, port)
-                mtu = _mtu(interface, wish)
+                mtu = _mtu(interface, config)
                 yield Attachment(str(wanted), interface.name, (str(wanted), port), broadcast, mtu, interface.index)
                 return
 
 
-def _to_all(interface: Interface, address: InterfaceAddress) -> str | None:
+def _broadcast_address(interface: Interface, address: InterfaceAddress) -> str | None:
     """What reaches everybody on the link from this address (None: nothing does)."""
     if ":" in address.host:
         return ALL_NODES if interface.can_multicast and not interface.loopback else None
@@ -118,9 +124,9 @@ def _preference(address: InterfaceAddress) -> int:
     return 2 if ipaddress.ip_address(address.host).is_link_local else 1
 
 
-def _within(wanted: ipaddress.IPv4Address | ipaddress.IPv6Address, address: InterfaceAddress) -> bool:
+def _in_network(wanted: ipaddress.IPv4Address | ipaddress.IPv6Address, address: InterfaceAddress) -> bool:
     return wanted in ipaddress.ip_network(f"{address.host}/{address.prefix_length}", strict=False)
 
 
-def _mtu(interface: Interface, wish: LinkWish) -> int:
-    return min(wish.mtu or interface.mtu, interface.mtu, MAX_MTU)
+def _mtu(interface: Interface, config: LinkConfig) -> int:
+    return min(config.mtu or interface.mtu, interface.mtu, MAX_MTU)

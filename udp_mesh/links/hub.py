@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from udp_mesh.links.attachments import LEAST_MTU, Attachment, LinkWish, choose
+from udp_mesh.links.attachments import MIN_MTU, Attachment, LinkConfig, select_attachments
 from udp_mesh.links.netlink import interfaces
 from udp_mesh.links.udp import UdpLink
 
@@ -28,15 +28,17 @@ class Changes:
 class LinkHub:
     """The open links by name."""
 
-    def __init__(self, wishes: Sequence[LinkWish], port: int, *, urgent_dscp: int = 0) -> None:
-        self.wishes = tuple(wishes)
+    def __init__(self, configs: Sequence[LinkConfig], port: int, *, urgent_dscp: int = 0) -> None:
+        self.configs = tuple(configs)
         self.links: dict[str, UdpLink] = {}
         self._port = port
         self._urgent_dscp = urgent_dscp
 
     def refresh(self) -> Changes:
         """Brings the sockets up to date with the kernel. Raises NetlinkError where it cannot be asked."""
-        wanted = {attachment.name: attachment for attachment in choose(interfaces(), self.wishes, self._port)}
+        wanted = {
+            attachment.name: attachment for attachment in select_attachments(interfaces(), self.configs, self._port)
+        }
         gone = [link for name, link in self.links.items() if wanted.get(name) != link.attachment]
         for link in gone:
             link.close()
@@ -54,8 +56,8 @@ class LinkHub:
         return Changes(tuple(opened), tuple(gone), failed)
 
     def _open(self, attachment: Attachment) -> UdpLink | str:
-        if attachment.mtu < LEAST_MTU:
-            return f"expected an MTU of at least {LEAST_MTU} bytes, found {attachment.mtu} on {attachment.device}"
+        if attachment.mtu < MIN_MTU:
+            return f"expected an MTU of at least {MIN_MTU} bytes, found {attachment.mtu} on {attachment.device}"
         try:
             return UdpLink(attachment, urgent_dscp=self._urgent_dscp)
         except OSError as error:

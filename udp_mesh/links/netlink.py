@@ -125,7 +125,7 @@ def parse(data: bytes) -> tuple[Interface, ...]:
                 continue
             broadcast = attributes.get(IFA_BROADCAST)
             if broadcast is None and family == socket.AF_INET and attributes.get(IFA_ADDRESS) == local:
-                broadcast = _last_of_network(local, prefix_length)
+                broadcast = _network_broadcast(local, prefix_length)
             addresses.setdefault(index, []).append(
                 InterfaceAddress(
                     socket.inet_ntop(family, local),
@@ -138,7 +138,7 @@ def parse(data: bytes) -> tuple[Interface, ...]:
     )
 
 
-def _last_of_network(address: bytes, prefix_length: int) -> bytes | None:
+def _network_broadcast(address: bytes, prefix_length: int) -> bytes | None:
     """What reaches all of an IPv4 network. The kernel has a route for it also where nobody gave the address a broadcast
     address (`ip addr add` without `brd`; linux net/ipv4/fib_frontend.c, fib_add_ifaddr); networks of one or two
     addresses have none (RFC 3021)."""

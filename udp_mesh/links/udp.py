@@ -28,7 +28,7 @@ RECEIVE_BUFFER_BYTES = 4 << 20
 """Kernel receive buffer: 30 ms of a gigabit, so that a busy core loses nothing; capped by net.core.rmem_max."""
 SEND_BUFFER_BYTES = 1 << 20
 """Kernel send buffer: a few runs; what waits here is beyond the scheduler's reach, so no more."""
-MAX_REFUSED = 256
+MAX_SEND_ERRORS = 256
 """Destinations and reasons told apart of what the kernel refuses: more than a team."""
 _DATAGRAM_BYTES = 1 << 16
 _INT = struct.Struct("=i")
@@ -60,7 +60,7 @@ class UdpLink:
         """Whether runs are still handed to the kernel whole."""
         self.datagrams_lost_on_send = 0
         """Datagrams the kernel refused (unreachable, forbidden, device gone, too long)."""
-        self.refused: dict[tuple[Address, int], int] = {}
+        self.send_errors: dict[tuple[Address, int], int] = {}
         """The same by destination and errno, until whoever tells of it has cleared it."""
         self.system_calls = 0
         self._buffer = memoryview(bytearray(_DATAGRAM_BYTES))
@@ -73,12 +73,12 @@ class UdpLink:
         self._urgent = [(level, name, _INT.pack(urgent_dscp << 2))] if urgent_dscp else []
         self._socket = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
         try:
-            self._set_up()
+            self._configure()
         except OSError:
             self._socket.close()
             raise
 
-    def _set_up(self) -> None:
+    def _configure(self) -> None:
         own, attachment = self._socket, self.attachment
         own.setsockopt(socket.SOL_SOCKET, SO_BINDTODEVICE, attachment.device.encode() + b"\0")
         own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
@@ -105,7 +105,7 @@ class UdpLink:
     def fileno(self) -> int:
         return self._socket.fileno()
 
-    def receive(self, deliver: Deliver, limit: int, fresh_from: float = float("inf")) -> int:
+    def receive(self, deliver: Deliver, limit: int, stop_after: float = float("inf")) -> int:
         """Hands up to about `limit` waiting datagrams to `deliver`; returns how many. Our own broadcasts are left out.
 
         One that came after `fresh_from` (seconds since 1970) is taken for the last: what came with it is left to the
@@ -137,7 +137,7 @@ class UdpLink:
             if size <= segment:
                 deliver(buffer[:size], address, arrived)
                 count += 1
-                if arrived > fresh_from:
+                if arrived > stop_after:
                     break
                 continue
             for start in range(0, size, segment):
@@ -196,14 +196,14 @@ class UdpLink:
             # An IPv4 address on an IPv6 socket, or the other way round: a peer not yet heard at its new address.
             number = errno.EAFNOSUPPORT if isinstance(error, socket.gaierror) else error.errno or errno.EIO
             if len(run) > 1 and number in (errno.EIO, errno.EINVAL, errno.EMSGSIZE, errno.EOPNOTSUPP):
-                return self._send_singly(run, destination, number)
+                return self._send_unsegmented(run, destination, number)
             # Unreachable, forbidden, too long, the device gone: as lost as on a radio, and answered by the same means.
             self.datagrams_lost_on_send += len(run)
-            if len(self.refused) < MAX_REFUSED or (destination, number) in self.refused:
-                self.refused[destination, number] = self.refused.get((destination, number), 0) + len(run)
+            if len(self.send_errors) < MAX_SEND_ERRORS or (destination, number) in self.send_errors:
+                self.send_errors[destination, number] = self.send_errors.get((destination, number), 0) + len(run)
         return len(run)
 
-    def _send_singly(self, run: Sequence[Outgoing], destination: Address, number: int) -> int | None:
+    def _send_unsegmented(self, run: Sequence[Outgoing], destination: Address, number: int) -> int | None:
         lost_before, done = self.datagrams_lost_on_send, 0
         while done < len(run) and self._send_run([run[done]], destination) is not None:
             done += 1

@@ -19,7 +19,7 @@ from udp_mesh.daemon.configuration import (
 )
 from udp_mesh.daemon.neighbours import parse_address
 from udp_mesh.daemon.toml_source import ConfigurationError, locate
-from udp_mesh.links.attachments import EVERY_INTERFACE, LinkWish
+from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
 
 FULL = """\
 name = "ugv1"
@@ -116,7 +116,7 @@ def test_every_part_of_the_file_arrives(tmp_path: Path) -> None:
     )
     assert settings.rates.offline_s == 5.0
     assert settings.limits.message_bytes == 1_000_000
-    assert configuration.links == (LinkWish("wlan*"), LinkWish(None, "127.0.0.2", broadcast=False, mtu=1400))
+    assert configuration.links == (LinkConfig("wlan*"), LinkConfig(None, "127.0.0.2", broadcast=False, mtu=1400))
     assert configuration.daemon.socket_mode == 0o666
     assert configuration.daemon.metrics_address == ("127.0.0.1", 9871)
 
