@@ -32,7 +32,7 @@ MAX_DEPTH = 1000
 PUBLISHER_ID_BYTES = 16
 MAX_TOKENS = 4096
 """Tokens of one robot: a node has some dozens of topics; more is a peer inventing names."""
-MAX_KEPT = 1 << 16
+MAX_DIGESTS = 1 << 16
 """Samples remembered so that none is put twice: more than all publishers that keep some can tell again at once."""
 MAX_TOKEN_BYTES = 1024
 MAX_ANNOUNCEMENT_BYTES = 4 << 20
@@ -95,17 +95,17 @@ class TokenExchange:
     """Tokens on our side, and those of each robot of the mesh."""
 
     def __init__(self) -> None:
-        self._seen: set[str] = set()
+        self._local: set[str] = set()
         self._carried: set[str] = set()
-        self._told: dict[str, set[str]] = {}
+        self._announced: dict[str, set[str]] = {}
         self._declared: set[str] = set()
         self._depths: dict[str, int] = {}
 
-    def seen(self, token: str, alive: bool) -> None:
+    def on_token(self, token: str, alive: bool) -> None:
         """A token came or went on our side."""
-        (self._seen.add if alive else self._seen.discard)(token)
+        (self._local.add if alive else self._local.discard)(token)
 
-    def carried(self, key: str, alive: bool) -> None:
+    def on_companion(self, key: str, alive: bool) -> None:
         """A companion came or went: its token is some bridge's."""
         (self._carried.add if alive else self._carried.discard)(carried_token(key))
 
@@ -115,28 +115,28 @@ class TokenExchange:
 
     def keeping_keys(self) -> list[str]:
         """Keys of our side's own publishers that keep samples."""
-        own = (kept_samples(token) for token in self._seen - self._carried - self._declared)
+        own = (kept_samples(token) for token in self._local - self._carried - self._declared)
         return sorted({key for key, depth in own if depth})
 
     def announcement(self, *, answer: bool = False) -> bytes:
         """All tokens that are our side's own. `answer` asks who hears it for theirs."""
-        own = sorted(self._seen - self._carried - self._declared)
+        own = sorted(self._local - self._carried - self._declared)
         return json.dumps({"tokens": own[:MAX_TOKENS], "answer": answer}).encode()
 
-    def heard(self, source: str, announcement: bytes) -> tuple[TokenChange, bool]:
+    def on_announcement(self, source: str, announcement: bytes) -> tuple[TokenChange, bool]:
         """A robot announced its tokens; also whether it asks for ours. Raises AnnouncementError."""
-        self._told[source], answer = _read(announcement)
+        self._announced[source], answer = _read(announcement)
         return self._change(), answer
 
-    def gone(self, source: str) -> TokenChange:
+    def on_robot_gone(self, source: str) -> TokenChange:
         """A robot is away: so are its publishers."""
-        self._told.pop(source, None)
+        self._announced.pop(source, None)
         return self._change()
 
     def _change(self) -> TokenChange:
-        wanted: set[str] = set().union(*self._told.values())
+        wanted: set[str] = set().union(*self._announced.values())
         # What is our own here needs no copy; what we set up ourselves is also seen here.
-        wanted -= self._seen - self._declared
+        wanted -= self._local - self._declared
         change = TokenChange(sorted(wanted - self._declared), sorted(self._declared - wanted))
         self._declared = wanted
         self._depths = {}
@@ -163,7 +163,7 @@ def _read(data: bytes) -> tuple[set[str], bool]:
     return set(tokens), fields.get("answer") is True
 
 
-class Kept:
+class SampleDeduplicator:
     """What came of publishers that keep samples: so that what is told again is put once."""
 
     def __init__(self) -> None:
@@ -179,6 +179,6 @@ class Kept:
         known = name in self._digests
         self._digests.pop(name, None)
         self._digests[name] = None
-        if len(self._digests) > MAX_KEPT:
+        if len(self._digests) > MAX_DIGESTS:
             self._digests.popitem(last=False)
         return not known

@@ -11,7 +11,7 @@ import threading
 import time
 from typing import Callable, Mapping
 
-from udp_mesh.bridges.daemon_client import MeshPort
+from udp_mesh.bridges.daemon_client import DaemonClient
 from udp_mesh.bridges.names import Route
 from udp_mesh.bridges.protocol import TOPIC_SETTINGS
 from udp_mesh.bridges.relay import Effect, Note, Relay, ToMesh, ToRos
@@ -21,32 +21,32 @@ from udp_mesh.client.mesh_client import Frame, as_message
 log = logging.getLogger(__name__)
 
 
-class Joint:
+class BridgeRuntime:
     """The daemon behind `port` and the ROS graph behind `to_ros`, joined by the relay."""
 
     def __init__(
         self,
-        port: MeshPort,
+        daemon: DaemonClient,
         relay: Relay,
         to_ros: Callable[[ToRos], None],
         wanted: Mapping[str, Mapping[str, object]] | None = None,
     ) -> None:
         """`to_ros` returns at once; `wanted` are topics that the daemon shall have besides, with their settings."""
-        self._port = port
+        self._daemon = daemon
         self._relay = relay
         self._to_ros = to_ros
-        self._wanted = {relay.exchange_topic: TOPIC_SETTINGS, **(wanted or {})}
+        self._wanted = {relay.protocol_topic: TOPIC_SETTINGS, **(wanted or {})}
         self._lock = threading.Lock()
 
-    def daemon_up(self) -> None:
+    def on_daemon_up(self) -> None:
         """The port calls this after each connect. Raises MeshError."""
-        self.learn()
-        online = [peer for peer, is_online in self._port.peers().items() if is_online]
+        self.refresh_topics()
+        online = [peer for peer, is_online in self._daemon.peers().items() if is_online]
         with self._lock:
-            effects = self._relay.started(online)
+            effects = self._relay.on_daemon_up(online)
         self._run(effects)
 
-    def from_daemon(self, frame: Frame) -> None:
+    def on_frame(self, frame: Frame) -> None:
         """The port calls this for each frame."""
         message, header = as_message(frame), frame[0]
         effects: list[Effect] = []
@@ -55,7 +55,7 @@ class Joint:
                 now = time.monotonic()
                 effects = self._relay.from_mesh(message.source, message.topic, message.type, message.payload, now)
             elif header.get("event") == "peer-online":
-                effects = self._relay.peer_online(str(header["peer"]))
+                effects = self._relay.on_peer_online(str(header["peer"]))
         self._run(effects)
 
     def from_ros(
@@ -72,17 +72,17 @@ class Joint:
             effects = self._relay.tick(now)
         self._run(effects)
 
-    def learn(self) -> dict[str, tuple[str, ...]]:
+    def refresh_topics(self) -> dict[str, tuple[str, ...]]:
         """The daemon's topics with their destinations, those wanted among them. Raises MeshError."""
-        topics = self._port.ensure_topics(self._wanted)
+        topics = self._daemon.ensure_topics(self._wanted)
         with self._lock:
-            self._relay.topics_are(topics)
+            self._relay.set_destinations(topics)
         return topics
 
     def _run(self, effects: list[Effect]) -> None:
         for effect in effects:
             if isinstance(effect, ToMesh):
-                self._port.publish(effect.topic, effect.payload, effect.peer, effect.type)
+                self._daemon.publish(effect.topic, effect.payload, effect.peer, effect.type)
             elif isinstance(effect, ToRos):
                 self._to_ros(effect)
             elif isinstance(effect, Note):

@@ -35,7 +35,7 @@ PRIORITIES = dict(
 """Zenoh's levels by number: 1 is the most urgent."""
 
 
-class _Plain:
+class _PlainPublisher:
     """A publisher that numbers what it puts, so that bridges know whose it is."""
 
     def __init__(self, session: Any, sample: Envelope) -> None:
@@ -56,7 +56,7 @@ class _Plain:
         self._publisher.undeclare()
 
 
-class _Keeping:
+class _CachingPublisher:
     """A publisher that keeps its last samples; with miss detection on Zenoh numbers them itself."""
 
     def __init__(self, session: Any, sample: Envelope, depth: int) -> None:
@@ -91,7 +91,7 @@ class Publishers:
         """`depth_of(key)`: how many samples each publisher of a key keeps for late subscribers; 0: none."""
         self._session = session
         self._depth_of = depth_of
-        self._publishers: OrderedDict[tuple[object, ...], _Plain | _Keeping] = OrderedDict()
+        self._publishers: OrderedDict[tuple[object, ...], _PlainPublisher | _CachingPublisher] = OrderedDict()
 
     def put(self, sample: Envelope) -> None:
         """Puts it under its own key. Raises zenoh.ZError."""
@@ -100,13 +100,13 @@ class Publishers:
         wanted = (sample.key, sample.priority, sample.block, sample.express, depth, whose)
         found = self._publishers.pop(wanted, None)
         if found is None:
-            found = _Keeping(self._session, sample, depth) if depth else _Plain(self._session, sample)
+            found = _CachingPublisher(self._session, sample, depth) if depth else _PlainPublisher(self._session, sample)
         self._publishers[wanted] = found
         if len(self._publishers) > MAX_PUBLISHERS:
             self._publishers.popitem(last=False)[1].undeclare()
         found.put(sample)
 
-    def forget(self) -> None:
+    def withdraw_stale(self) -> None:
         """Takes back the publishers whose keys keep nothing any more, or another number of samples."""
         for wanted in [
             wanted for wanted in self._publishers if wanted[4] and wanted[4] != self._depth_of(str(wanted[0]))

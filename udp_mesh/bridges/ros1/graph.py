@@ -47,21 +47,21 @@ class _Opaque:
     def __init__(self, message: Outgoing) -> None:
         fields = {"_type": message.key.name, "_md5sum": message.key.checksum, "_full_text": message.definition}
         self._class = type("Opaque", (rospy.AnyMsg,), fields)
-        self._depth = _depth(len(message.payload))
+        self._depth = _queue_depth(len(message.payload))
         self._publisher = rospy.Publisher(message.name, self._class, queue_size=self._depth, latch=message.latched)
 
     def connections(self) -> int:
         return int(self._publisher.get_num_connections())
 
     def publish(self, payload: bytes) -> None:
-        depth = _depth(len(payload))
+        depth = _queue_depth(len(payload))
         if depth < self._depth:
-            self._bound(depth)
+            self._shorten_queues(depth)
         opaque = self._class()
         opaque._buff = payload
         self._publisher.publish(opaque)
 
-    def _bound(self, depth: int) -> None:
+    def _shorten_queues(self, depth: int) -> None:
         """Messages have become larger: fewer may wait for a slow subscriber, those that are connected included."""
         self._depth = depth
         self._publisher.impl.set_queue_size(depth)
@@ -75,7 +75,7 @@ class _Opaque:
         self._publisher.unregister()
 
 
-def _depth(payload_bytes: int) -> int:
+def _queue_depth(payload_bytes: int) -> int:
     return max(1, min(QUEUE_MESSAGES, QUEUE_BYTES // max(1, payload_bytes)))
 
 
@@ -170,11 +170,11 @@ class Graph:
 
     # The master
 
-    def renew(self) -> bool:
+    def reregister(self) -> bool:
         """Registers everything again if the master was restarted; True if it did. Raises one of MASTER_ERRORS."""
         master = _master()
         pid = master.getPid()
-        if pid == self._pid and _knows_us(master):
+        if pid == self._pid and _is_registered(master):
             return False
         uri = rospy.get_node_uri()
         ourselves = xmlrpc.client.ServerProxy(uri)
@@ -196,7 +196,7 @@ def _master() -> Any:
     return rosgraph.Master(rospy.get_name())
 
 
-def _knows_us(master: Any) -> bool:
+def _is_registered(master: Any) -> bool:
     try:
         return bool(master.lookupNode(rospy.get_name()) == rospy.get_node_uri())
     except rosgraph.MasterException:

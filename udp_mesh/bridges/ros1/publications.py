@@ -17,7 +17,7 @@ from udp_mesh.bridges.types import TypeKey
 
 FIRST_HOLD_S = 2.0
 """How long the first messages of a new topic wait for subscribers who were there before it."""
-LOOK_S = 0.05
+POLL_S = 0.05
 """Between two looks whether those subscribers have connected."""
 MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 1000, 16 << 20
 """Per topic, until it is advertised: seconds of telemetry, half a second of images; the oldest are dropped."""
@@ -54,7 +54,7 @@ class _Topic:
         self.waiting: Deque[Outgoing] = deque()
         self.waiting_bytes = 0
 
-    def fits(self, message: Outgoing) -> bool:
+    def matches(self, message: Outgoing) -> bool:
         return self.advertised is not None and self.kind == (message.key, message.latched)
 
 
@@ -99,12 +99,12 @@ class Publications:
                     continue
             for topic in due:
                 self._serve(topic)
-            stop.wait(LOOK_S)
+            stop.wait(POLL_S)
 
     def _serve(self, topic: _Topic) -> None:
         with self._changed:
             self._flush(topic)
-            if not topic.waiting or topic.fits(topic.waiting[0]):
+            if not topic.waiting or topic.matches(topic.waiting[0]):
                 return
             first, last = topic.waiting[0], topic.advertised
             topic.advertised = None
@@ -122,12 +122,12 @@ class Publications:
     def _flush(self, topic: _Topic) -> None:
         """Publishes what waits at the head, as far as it is of the advertised type."""
         advertised = topic.advertised
-        if advertised is None or not topic.waiting or not topic.fits(topic.waiting[0]):
+        if advertised is None or not topic.waiting or not topic.matches(topic.waiting[0]):
             return
         if topic.subscribers and advertised.connections() < topic.subscribers and self._clock() < topic.until:
             return
         topic.subscribers = 0
-        while topic.waiting and topic.fits(topic.waiting[0]):
+        while topic.waiting and topic.matches(topic.waiting[0]):
             payload = topic.waiting.popleft().payload
             topic.waiting_bytes -= len(payload)
             advertised.publish(payload)

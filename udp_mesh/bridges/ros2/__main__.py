@@ -17,11 +17,11 @@ import time
 from collections import deque
 from typing import Any, Deque, Sequence
 
-from udp_mesh.bridges.daemon_client import MeshPort
+from udp_mesh.bridges.daemon_client import DaemonClient
 from udp_mesh.bridges.names import Route, ros_word, routes
 from udp_mesh.bridges.relay import Relay, ToRos
-from udp_mesh.bridges.ros2.quality import Quality, parse_quality, quality_text, ros2_name, shared
-from udp_mesh.bridges.runtime import Joint
+from udp_mesh.bridges.ros2.quality import Quality, common, parse_quality, quality_text, ros2_name
+from udp_mesh.bridges.runtime import BridgeRuntime
 from udp_mesh.bridges.types import TypeKey
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 
@@ -36,8 +36,8 @@ except ModuleNotFoundError as error:
 
 log = logging.getLogger(__name__)
 
-EXCHANGE_TOPIC = "bridge/ros2"
-LOOK_S = 1.0
+PROTOCOL_TOPIC = "bridge/ros2"
+REFRESH_S = 1.0
 MAX_ARRIVED = 1000
 """Messages of the mesh that wait for the executor: the oldest are dropped."""
 
@@ -69,16 +69,16 @@ def quality_of(info: Any) -> Quality:
 class Bridge:
     """The running bridge."""
 
-    def __init__(self, node: Any, port: MeshPort, own: str) -> None:
-        self._node, self._port, self._own = node, port, own
-        relay = Relay(own, EXCHANGE_TOPIC, ros_version=2, nonce=os.urandom(16))
-        self._joint = Joint(port, relay, self._to_ros)
+    def __init__(self, node: Any, daemon: DaemonClient, own: str) -> None:
+        self._node, self._daemon, self._own = node, daemon, own
+        relay = Relay(own, PROTOCOL_TOPIC, ros_version=2, nonce=os.urandom(16))
+        self._runtime = BridgeRuntime(daemon, relay, self._to_ros)
         self._arrived: Deque[ToRos] = deque(maxlen=MAX_ARRIVED)
         self._subscriptions: dict[str, tuple[TypeKey, Any]] = {}
         self._publishers: dict[str, tuple[TypeKey, Any]] = {}
-        self._told: set[str] = set()
+        self._warned: set[str] = set()
         self._wake = node.create_guard_condition(self.publish_arrived)
-        node.create_timer(LOOK_S, self.look)
+        node.create_timer(REFRESH_S, self.refresh)
 
     def _to_ros(self, message: ToRos) -> None:
         self._arrived.append(message)
@@ -86,20 +86,20 @@ class Bridge:
 
     # The port's thread
 
-    def daemon_up(self) -> None:
+    def on_daemon_up(self) -> None:
         """The port calls this after each connect. Raises MeshError."""
-        self._joint.daemon_up()
+        self._runtime.on_daemon_up()
 
-    def from_daemon(self, frame: Frame) -> None:
+    def on_frame(self, frame: Frame) -> None:
         """The port calls this for each frame."""
-        self._joint.from_daemon(frame)
+        self._runtime.on_frame(frame)
 
     # The executor's thread
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """Every LOOK_S: topics, peers, and what is published under our names."""
         try:
-            topics, peers = self._joint.learn(), self._port.peers()
+            topics, peers = self._runtime.refresh_topics(), self._daemon.peers()
         except MeshError as error:
             log.debug("daemon-unreachable %s", error)
             return
@@ -108,14 +108,14 @@ class Bridge:
         for name in [name for name in self._subscriptions if name not in table]:
             self._node.destroy_subscription(self._subscriptions.pop(name)[1])
         for name, route in table.items():
-            self._look_at_publishers(name, route)
+            self._refresh_subscription(name, route)
 
-    def _look_at_publishers(self, name: str, route: Route) -> None:
+    def _refresh_subscription(self, name: str, route: Route) -> None:
         infos = self._node.get_publishers_info_by_topic(name)
         if not infos:
             return
         type_name = str(infos[0].topic_type)
-        quality = shared(quality_of(info) for info in infos if info.topic_type == type_name)
+        quality = common(quality_of(info) for info in infos if info.topic_type == type_name)
         key = TypeKey(type_name, quality_text(quality))
         known = self._subscriptions.get(name)
         if known is not None and known[0] == key:
@@ -127,7 +127,7 @@ class Bridge:
             self._node.destroy_subscription(known[1])
 
         def arrived(data: bytes) -> None:
-            self._joint.from_ros(route, name, key, "", quality.latched, bytes(data))
+            self._runtime.from_ros(route, name, key, "", quality.latched, bytes(data))
 
         # The graph does not tell depths; ten messages bridge what the executor is busy with.
         wanted = profile(quality._replace(depth=10))
@@ -152,11 +152,11 @@ class Bridge:
                 self._node.destroy_publisher(known[1])
             known = (message.key, self._node.create_publisher(message_class, name, profile(quality)))
             self._publishers[name] = known
-        if self._is_of_hash(name, quality.type_hash):
+        if self._has_matching_hash(name, quality.type_hash):
             # rclpy takes bytes for a message that is serialized already.
             known[1].publish(message.payload)
 
-    def _is_of_hash(self, name: str, type_hash: str) -> bool:
+    def _has_matching_hash(self, name: str, type_hash: str) -> bool:
         """Whether our publisher's type is the source's, as far as ROS tells: CDR of another definition is garbage."""
         hashes = {
             quality_of(info).type_hash
@@ -165,19 +165,19 @@ class Bridge:
         } - {""}
         if not type_hash or not hashes or type_hash in hashes:
             return True
-        self._tell_once(name, "{}: the type is defined otherwise on its source: not published".format(name))
+        self._warn_once(name, "{}: the type is defined otherwise on its source: not published".format(name))
         return False
 
     def _class(self, name: str) -> Any:
         try:
             return get_message(name)
         except (AttributeError, ModuleNotFoundError, ValueError) as error:
-            self._tell_once(name, "type-unknown type={} {}".format(name, error))
+            self._warn_once(name, "type-unknown type={} {}".format(name, error))
             return None
 
-    def _tell_once(self, about: str, text: str) -> None:
-        if about not in self._told:
-            self._told.add(about)
+    def _warn_once(self, about: str, text: str) -> None:
+        if about not in self._warned:
+            self._warned.add(about)
             log.warning("%s", text)
 
 
@@ -187,21 +187,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket")
     options, ros_arguments = parser.parse_known_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
-    port = MeshPort(options.socket, ["*"])
+    daemon = DaemonClient(options.socket, ["*"])
     stop = threading.Event()
     rclpy.init(args=ros_arguments)
     try:
-        own = _own_name(port)
+        own = _wait_for_node_name(daemon)
         if own is None:
             return 0
         node = Node("mesh_bridge", namespace=ros2_name("/" + ros_word(own)))
-        bridge = Bridge(node, port, own)
+        bridge = Bridge(node, daemon, own)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        thread = threading.Thread(target=port.run, args=(stop, bridge.daemon_up, bridge.from_daemon), daemon=True)
+        thread = threading.Thread(target=daemon.run, args=(stop, bridge.on_daemon_up, bridge.on_frame), daemon=True)
         thread.start()
         while rclpy.ok() and thread.is_alive():
-            executor.spin_once(timeout_sec=LOOK_S)
+            executor.spin_once(timeout_sec=REFRESH_S)
         failed = rclpy.ok()
         stop.set()
         thread.join(5.0)
@@ -216,17 +216,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 1 if failed else 0
 
 
-def _own_name(port: MeshPort) -> str | None:
+def _wait_for_node_name(daemon: DaemonClient) -> str | None:
     """The daemon's name, asked for until it answers; None where ROS ends before."""
-    told = False
+    logged = False
     while rclpy.ok():
         try:
-            return port.own_name()
+            return daemon.node_name()
         except MeshError as error:
-            if not told:
+            if not logged:
                 log.info("waiting-for what=daemon %s", error)
-                told = True
-        time.sleep(LOOK_S)
+                logged = True
+        time.sleep(REFRESH_S)
     return None
 
 

@@ -44,7 +44,7 @@ def parse_quality(text: str) -> Quality | None:
     return Quality(parts[0], parts[1], int(parts[2]), parts[3]) if _TYPE_HASH.fullmatch(parts[3]) else None
 
 
-def shared(qualities: Iterable[Quality]) -> Quality:
+def common(qualities: Iterable[Quality]) -> Quality:
     """What all publishers of a topic offer: a subscription that asks for more than one of them offers does not hear it.
     Expects at least one quality."""
     found = list(qualities)
