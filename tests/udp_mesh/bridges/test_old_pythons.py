@@ -47,7 +47,7 @@ assert quality.parse_quality(quality.quality_text(quality.Quality())) == quality
 frames = mesh_client.FrameReader().feed(mesh_client.encode_frame({"op": "x"}, b"payload"))
 assert frames == [({"op": "x"}, b"payload")]
 exchanges = rmw_zenoh.TokenExchange(), rmw_zenoh.TokenExchange()
-assert exchanges[0].heard("bob", exchanges[1].announcement())[0] == ([], [])
+assert exchanges[0].on_announcement("bob", exchanges[1].announcement())[0] == ([], [])
 print(" ".join(sorted({name.partition(".")[0] for name in set(sys.modules) - before})))
 """
 
