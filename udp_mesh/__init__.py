@@ -1,9 +1,9 @@
-"""udp_mesh moves prioritized messages between robots over nothing but unicast and broadcast UDP.
+"""Prioritized messages between robots over unicast and broadcast UDP.
 
 The flow: bytes -> frame -> session -> scheduler -> message (docs/design.md, docs/wire-format.md).
 
-`from udp_mesh import Node, Settings, Topic, Key` is the library; the names are loaded when they are first used, so
-that the client and the bridges, which import this package on older Pythons, load nothing of it.
+Use it as a library with `from udp_mesh import Node, Settings, Topic, Key`. Names are imported on first use, so that
+the client and the bridges, which import this package on older Pythons, load nothing else.
 """
 
 import importlib

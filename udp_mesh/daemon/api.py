@@ -1,9 +1,9 @@
 """The local API's transport: a Unix socket, frames in, frames out (docs/local-api.md).
 
-A connection hands each request to the service and writes what the service gives back. What a slow reader does not
-fetch is bounded: past `CLIENT_BACKLOG_BYTES` messages for it are dropped, and it is told how many once it reads
-again; past `REPLIES_BACKLOG_BYTES` more its own requests wait. Other readers and the mesh never wait for it. A message
-for a program that has read everything is never dropped, however large.
+A connection passes each request to the service and writes the replies. Data for a slow reader is bounded: beyond
+`MAX_CLIENT_BACKLOG_BYTES`, messages for it are dropped and their number is reported once it reads again; beyond another
+`MAX_REPLY_BACKLOG_BYTES`, its own requests wait. Other readers and the mesh never wait for it. A message for a client
+that has read everything is never dropped, however large.
 """
 
 from __future__ import annotations
@@ -22,33 +22,32 @@ from udp_mesh.daemon.framing import BadFrame, RequestReader
 from udp_mesh.daemon.listener import Listener
 
 MAX_CLIENT_BACKLOG_BYTES = 32 << 20
-"""Bytes written to one client and not yet read by it: a stopped subscriber. A few of the largest usual messages."""
+"""Bytes written to one client and not yet read by it: room for a few of the largest usual messages."""
 MAX_TOTAL_BACKLOG_BYTES = 256 << 20
-"""The same for all clients together: past it, who holds more than an equal part of that gets no more."""
+"""The same for all clients together; beyond it, a client that holds more than an equal share gets no more."""
 MAX_PARTIAL_REQUEST_BYTES = 256 << 20
-"""Bytes of requests that are not there whole, of all clients together: past it, who holds more than an equal part of
-that has its request refused. Several of the largest messages at a time."""
+"""Bytes of incomplete requests of all clients together: several of the largest messages. Beyond it, the request of a
+client that holds more than an equal share is refused."""
 MAX_REPLY_BACKLOG_BYTES = 4 << 20
-"""Bytes of replies beyond that: a program that asks without end and never reads the answers."""
+"""Bytes of replies on top of that, for a client that sends requests and never reads the replies."""
 MAX_CLIENTS = 256
-"""Connections at a time: a program that leaks them must not take the daemon's descriptors."""
+"""Concurrent connections: a program that leaks them must not exhaust the daemon's file descriptors."""
 MAX_SPARE_CLIENTS = 8
-"""Connections beyond that, for one look at what is wrong: they may ask `LOOKS`, once and soon. For one more of them the
-oldest gives way."""
+"""Connections beyond that, for diagnosis only: each may send one of `SPARE_OPS` within `SPARE_TIMEOUT_S`. A further one
+evicts the oldest."""
 SPARE_OPS = ("status", "metrics")
 SPARE_TIMEOUT_S = 2.0
 PARTIAL_REQUEST_TIMEOUT_S = 30.0
-"""A request that stops coming for this long is given up, and its connection closed."""
+"""A connection whose incomplete request makes no progress for this long is closed."""
 RESERVED_DESCRIPTORS = 40
-"""Files for the daemon's own needs, whatever its limit: links, kernel's notices, outbox, recording, configuration, a
-scraper."""
+"""Descriptors the daemon itself needs whatever its limit: links, netlink, outbox, recording, configuration, metrics."""
 
 
 _CREDENTIALS = struct.Struct("iII")
 
 
 class RequestError(Exception):
-    """A request that is refused; `code` is a word for programs, the text is for people."""
+    """A refused request; `code` is for programs, the text for people."""
 
     def __init__(self, code: str, text: str) -> None:
         super().__init__(text)
@@ -56,51 +55,51 @@ class RequestError(Exception):
 
 
 class RequestHandler(Protocol):
-    """Who answers."""
+    """Handles requests."""
 
     def request(self, client: Client, header: Header, payload: bytes) -> None:
-        """Answers now or later through `client`; raises RequestError to refuse."""
+        """Replies now or later through `client`. Raises RequestError to refuse."""
         ...
 
     def client_gone(self, client: Client) -> None: ...
 
 
 class Client(asyncio.Protocol):
-    """One connected program."""
+    """One connected client."""
 
     def __init__(self, server: LocalServer, *, spare: bool = False) -> None:
         self._server = server
         self.spare = spare
-        """Beyond the connections there may be: it gets one look."""
+        """Connected beyond the limit; it may send one diagnostic request."""
         self.user: int | None = None
-        """Whose program it is; None where the kernel does not say."""
+        """The client's user id; None if the kernel does not report it."""
         self._deadline: asyncio.TimerHandle | None = None
         self._partial_before = 0
         self._reader = RequestReader(server.max_payload_bytes)
         self._transport: asyncio.Transport | None = None
         self._dropped = 0
 
-    # What the service calls
+    # Called by the service
 
     def reply(self, request_id: object, payload: bytes = b"", **fields: object) -> None:
-        """Answers a request; one without an id wanted no answer."""
+        """Replies to a request; a request without an id gets no reply."""
         if request_id is not None:
             self._write({"id": request_id, "ok": True, **fields}, payload)
 
     def refuse(self, request_id: object, code: str, text: str) -> None:
-        """Refuses a request; one without an id hears of it as an event."""
+        """Refuses a request; for a request without an id, sends a `rejected` event."""
         if request_id is None:
             self._write({"event": "rejected", "code": code, "error": text})
         else:
             self._write({"id": request_id, "ok": False, "code": code, "error": text})
 
     def send_event(self, header: Header, payload: bytes = b"") -> None:
-        """An event; dropped and counted where the program does not read."""
+        """Sends an event; drops and counts it if the client does not read."""
         if self._transport is not None:
             self.send_encoded(encode_frame(header, payload))
 
     def send_encoded(self, frame: bytes) -> None:
-        """As `tell`, for a frame that several clients get."""
+        """Like `send_event`, for a frame that is sent to several clients."""
         transport = self._transport
         if transport is None:
             return
@@ -114,11 +113,11 @@ class Client(asyncio.Protocol):
         transport.write(frame)
 
     def partial_request_bytes(self) -> int:
-        """Bytes of a request that is not here whole."""
+        """Bytes of the incomplete request."""
         return self._reader.buffered_bytes
 
     def backlog_bytes(self) -> int:
-        """Bytes written and not yet read."""
+        """Bytes written and not yet read by the client."""
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
 
     def close(self) -> None:
@@ -133,7 +132,7 @@ class Client(asyncio.Protocol):
         if self._transport is not None:
             self._transport.write(encode_frame(header, payload))
 
-    # What asyncio calls
+    # Called by asyncio
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
@@ -143,7 +142,7 @@ class Client(asyncio.Protocol):
             self._deadline = asyncio.get_running_loop().call_later(SPARE_TIMEOUT_S, self.reject)
 
     def reject(self) -> None:
-        """There is no room for it."""
+        """Refuses this connection because the limit is reached."""
         self._server.spares.pop(self, None)
         self.refuse(None, "too-many-clients", self._server.too_many_clients_text())
         self.close()
@@ -156,7 +155,7 @@ class Client(asyncio.Protocol):
                 self._handle(frame)
         if self._server.exceeds_partial_request_share(self.partial_request_bytes()):
             limit_mib = MAX_PARTIAL_REQUEST_BYTES >> 20
-            text = f"local programs have begun to send more than {limit_mib} MiB at a time: try again"
+            text = f"incomplete requests of all clients exceed {limit_mib} MiB: try again later"
             self.refuse(*self._reader.discard_partial("busy", text))
         self._watch_partial_request()
         transport = self._transport
@@ -167,7 +166,7 @@ class Client(asyncio.Protocol):
             transport.pause_reading()
 
     def _watch_partial_request(self) -> None:
-        """While a request is not here whole, some of the rest must come now and then."""
+        """Starts or cancels the timeout for an incomplete request."""
         if self.spare:
             return
         held = self.partial_request_bytes()
@@ -183,7 +182,7 @@ class Client(asyncio.Protocol):
     def _check_partial_request(self) -> None:
         self._deadline = None
         if self.partial_request_bytes() == self._partial_before:
-            self.refuse(None, "too-slow", f"a request stopped coming for {PARTIAL_REQUEST_TIMEOUT_S:g} s")
+            self.refuse(None, "too-slow", f"request incomplete: no data for {PARTIAL_REQUEST_TIMEOUT_S:g} s")
             self.close()
         else:
             self._watch_partial_request()
@@ -202,7 +201,7 @@ class Client(asyncio.Protocol):
             self.close()
 
     def resume_writing(self) -> None:
-        # What was written is read, all but a few kilobytes.
+        # All but a few kilobytes have been read.
         if self._transport is not None:
             self._transport.resume_reading()
         if self._dropped:
@@ -232,25 +231,25 @@ class LocalServer:
         self.requests = requests
         self.clients: set[Client] = set()
         self.spares: dict[Client, None] = {}
-        """Connections beyond the most, the oldest first."""
+        """Connections beyond the limit, oldest first."""
         self.max_payload_bytes = max_payload_bytes
         self.dropped_for_slow_clients = 0
         self._listener = Listener(path, mode=mode, group=group, on_connection=self._on_connection)
         self._max_clients = MAX_CLIENTS
         self._connecting: dict[Client, asyncio.Task[None]] = {}
-        """Accepted, their transports not yet made: they count already, since the loop may accept more meanwhile."""
+        """Accepted connections without a transport yet. They count: the loop may accept more in the meantime."""
 
     async def start(self) -> None:
-        """Listens. Raises OSError: in use by another daemon, no such directory, no such group, not allowed."""
+        """Listens. Raises OSError: in use by another daemon, no such directory or group, permission denied."""
         self._max_clients = max(1, raise_descriptor_limit(MAX_CLIENTS + RESERVED_DESCRIPTORS) - RESERVED_DESCRIPTORS)
         self._listener.open()
 
     def _on_connection(self, connection: socket.socket) -> None:
-        """A program has connected."""
+        """Handles a new connection."""
         making = sum(not client.spare for client in self._connecting)
         spare = len(self.clients) + making >= self._max_clients
         if spare and len(self._connecting) - making >= 2 * MAX_SPARE_CLIENTS:
-            # What cannot be written at once to a fresh connection is not worth waiting for.
+            # Do not wait for a new connection that cannot be written to at once.
             with connection, contextlib.suppress(OSError):
                 rejected = {"event": "rejected", "code": "too-many-clients", "error": self.too_many_clients_text()}
                 connection.send(encode_frame(rejected, b""))
@@ -267,7 +266,7 @@ class LocalServer:
             self._connecting.pop(client, None)
 
     def on_connected(self, client: Client) -> None:
-        """A program's connection can be used."""
+        """Registers a connection once its transport exists."""
         self._connecting.pop(client, None)
         if client.spare:
             self.spares[client] = None
@@ -277,23 +276,23 @@ class LocalServer:
             self.clients.add(client)
 
     def too_many_clients_text(self) -> str:
-        """Why a program is turned away."""
-        return f"at most {self._max_clients} programs connect at a time"
+        """The error text for a connection beyond the limit."""
+        return f"too many clients: at most {self._max_clients} may connect at a time"
 
     def exceeds_backlog_share(self, waiting: int) -> bool:
-        """Whether a client for which so many bytes wait must not get more for all others' sake."""
+        """Whether a client with this backlog exceeds its share of the total limit."""
         return self._exceeds_share(waiting, MAX_TOTAL_BACKLOG_BYTES, Client.backlog_bytes)
 
     def exceeds_partial_request_share(self, held: int) -> bool:
-        """Whether a client that has sent so much of a request must not send the rest of it for all others' sake."""
+        """Whether a client with this much of an incomplete request exceeds its share of the total limit."""
         return self._exceeds_share(held, MAX_PARTIAL_REQUEST_BYTES, Client.partial_request_bytes)
 
     def _exceeds_share(self, own: int, limit: int, of_each: Callable[[Client], int]) -> bool:
-        """Whether this is more than an equal part of a limit that all together exceed."""
+        """Whether the total exceeds `limit` and `own` exceeds an equal share of it."""
         return own > limit // max(1, len(self.clients)) and sum(map(of_each, self.clients)) > limit
 
     async def close(self) -> None:
-        """Stops listening, lets what is written be read, closes every connection, removes the socket's file."""
+        """Stops listening, flushes and closes every connection, removes the socket file."""
         self._listener.close()
         await asyncio.gather(*self._connecting.values())
         for client in [*self.clients, *self.spares]:
@@ -302,7 +301,7 @@ class LocalServer:
 
 
 def _peer_uid(connection: socket.socket | None) -> int | None:
-    """The user id of the program at the other end (unix(7), SO_PEERCRED)."""
+    """The user id of the process at the other end (unix(7), SO_PEERCRED)."""
     if connection is None:
         return None
     try:
@@ -315,11 +314,11 @@ def _peer_uid(connection: socket.socket | None) -> int | None:
 
 
 def raise_descriptor_limit(wanted: int) -> int:
-    """How many files this process may open, after asking for as many as `wanted` where the limit is lower."""
+    """The number of files this process may open, after raising the soft limit toward `wanted`."""
     try:
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     except OSError:
-        # a sandbox that does not tell
+        # A sandbox may hide the limit.
         return wanted
     if soft == resource.RLIM_INFINITY or soft >= wanted:
         return wanted

@@ -1,12 +1,11 @@
-"""Moves bytes and time between the sockets and the core, on an asyncio loop, in batches.
+"""Moves datagrams, timers and events between the sockets and the core, on an asyncio loop, in batches.
 
 1. A socket becomes readable: all waiting datagrams go to the core (`_drain`).
-2. `_pump`: timers that are due, datagrams that may leave now (in runs, through segmentation offload), events to the
-   listener, one timer for what comes next.
-3. The kernel reports a change of interfaces: the links are brought up to date, the core is told.
+2. `_pump`: due timers, datagrams that may leave now (in runs, through segmentation offload), events to the listener,
+   and one timer for the core's next deadline.
+3. The kernel reports an interface change: sockets are opened and closed, and the core learns its new links.
 
-A full socket never blocks the other links: its datagrams wait in a short queue, and past that they are lost as on a
-radio.
+A full socket never blocks the other links: its datagrams wait in a short queue; beyond that they are dropped.
 """
 
 from __future__ import annotations
@@ -32,21 +31,21 @@ log = logging.getLogger(__name__)
 MAX_DRAIN_DATAGRAMS = 256
 """Datagrams read per wake-up before timers and sending get their turn (3 ms of work)."""
 LAST_ARRIVAL_S = 0.0003
-"""A datagram that came so shortly before the look is the only one, but at rates at which a look more costs nothing."""
+"""A datagram this recent is taken to be the last one waiting; reading again would cost as much as receiving."""
 MAX_CLOCK_GAP_S = 50e-6
-"""Two clocks read within this belong together."""
+"""Two clock readings within this interval count as simultaneous."""
 MAX_DRAIN_S = 0.5
 """Reading a batch takes milliseconds; even on a busy machine it takes no longer than this."""
 MAX_PUMP_BYTES = 1 << 18
 """Bytes sent before the sockets get their turn again."""
 MAX_BLOCKED_DATAGRAMS = 256
-"""Datagrams that wait for one full socket; more are lost."""
+"""Datagrams queued for one full socket; more are dropped."""
 INTERFACE_DEBOUNCE_S = 0.05
-"""After a notice of the kernel more follow (link, then addresses): one refresh answers them all."""
+"""One kernel notice is followed by others (link, then addresses): one refresh handles them all."""
 RECOVERY_S = 0.1
-"""After an exception nobody expected, until the next attempt."""
+"""Delay before the next attempt after an unexpected exception."""
 RETRY_LINK_S = 2.0
-"""Until a socket that could not be opened is tried again."""
+"""Delay before a socket that could not be opened is retried."""
 
 
 class Driver:
@@ -77,7 +76,7 @@ class Driver:
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = 0.0
         self._due = float("-inf")
-        """When the node wanted attention, as of the last look: the loop may have come here without its timer."""
+        """The core's next deadline as last read; the loop may run `_pump` for other reasons than its timer."""
         self._refresh_timer: asyncio.TimerHandle | None = None
         self._interface_error = ""
         self._send_error_timer: asyncio.TimerHandle | None = None
@@ -88,17 +87,17 @@ class Driver:
         self._now = 0.0
         self._link_name = ""
 
-    # Life
+    # Lifecycle
 
     def start(self) -> None:
-        """Opens the links that exist and begins. Raises OSError where the kernel cannot be asked for interfaces."""
+        """Opens the links that exist and starts. Raises OSError if the kernel cannot list its interfaces."""
         self._monitor = InterfaceMonitor()
         self._loop.add_reader(self._monitor.fileno(), self._interfaces_changed)
         self.refresh_links()
         self._pump()
 
     def close(self) -> None:
-        """Says good-bye, sends the last datagrams, reports the last events, closes everything."""
+        """Sends goodbyes and the last datagrams, reports the last events, closes everything."""
         if self.closed:
             return
         self.node.close(self._advance_clock())
@@ -115,12 +114,12 @@ class Driver:
             self._unwatch(link)
         self.hub.close()
 
-    # What the application asks
+    # Called by the application
 
     def send(
         self, topic: str, payload: bytes, *, destination: str | None = None, type_name: str = ""
     ) -> MessageId | Rejected:
-        """`Node.send`, now; the datagrams leave in this turn of the loop."""
+        """`Node.send`, now; the datagrams leave in this loop iteration."""
         outcome = self.node.send(
             topic, payload, destination=destination, now=self._advance_clock(), type_name=type_name
         )
@@ -134,7 +133,7 @@ class Driver:
         return changes
 
     def apply_links(self, links: Sequence[LinkConfig]) -> None:
-        """Other links from now on; those wished for before and now stay open."""
+        """Replaces the link configuration; links in both the old and the new one stay open."""
         self.hub.configs = tuple(links)
         self.refresh_links()
         self._schedule_pump()
@@ -143,11 +142,11 @@ class Driver:
         return self.node.conditions(self._advance_clock())
 
     def now(self) -> float:
-        """The clock that conditions and events are told by, in seconds."""
+        """The clock of conditions and events, in seconds."""
         return self._clock()
 
     def _advance_clock(self) -> float:
-        """Now, to be told to the core: arrivals seen later count as not before this."""
+        """Returns the current time to pass to the core; later arrivals are not dated before it."""
         self._now = self._clock()
         return self._now
 
@@ -192,7 +191,7 @@ class Driver:
             at = self._clock() + INTERFACE_DEBOUNCE_S
             if self._refresh_timer is not None:
                 if self._refresh_timer.when() <= at:
-                    # Some drivers send notices without end: they must not put off the look for ever.
+                    # Some drivers send notices continuously: these must not postpone the refresh forever.
                     return
                 self._refresh_timer.cancel()
             self._refresh_timer = self._loop.call_at(at, self._refresh_and_pump)
@@ -208,7 +207,7 @@ class Driver:
             self._interface_error = str(error)
         finally:
             if not completed:
-                # The kernel would not list its interfaces (out of memory), or a bug: what is open stays open and heard.
+                # The kernel cannot list its interfaces (out of memory), or a bug: keep the open sockets.
                 self._watch_all()
                 self._refresh_timer = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
         self._pump()
@@ -217,7 +216,7 @@ class Driver:
         self._loop.remove_reader(link.fileno())
         self._loop.remove_writer(link.fileno())
 
-    # In
+    # Receive
 
     def _readable(self, link: UdpLink) -> None:
         self._drain(link)
@@ -227,7 +226,7 @@ class Driver:
             self._pump()
 
     def _drain(self, link: UdpLink) -> None:
-        """Hands what waits to the core, each datagram with the time it arrived; then `_now` is the time of the look."""
+        """Passes waiting datagrams to the core, each with its arrival time; then sets `_now` to the time of reading."""
         self._drained_at = self._read_clocks()
         self._link_name = link.attachment.name
         assert self._wall_offset is not None
@@ -235,10 +234,10 @@ class Driver:
         self._now = max(self._now, self._drained_at)
 
     def _read_clocks(self) -> float:
-        """Now; and how far the wall clock, by which the kernel stamps arrivals, is ahead of ours.
+        """Reads the clock, and updates the offset of the wall clock, which the kernel uses for arrival timestamps.
 
-        A reading between which this process lost the processor would date arrivals too early: the last one is kept
-        then.
+        If this process was preempted between the readings, the previous offset is kept: a wrong one would date arrivals
+        too early.
         """
         before = self._clock()
         wall = time.time()
@@ -248,8 +247,8 @@ class Driver:
         return after
 
     def _deliver(self, data: memoryview, source: Address, arrived: float) -> None:
-        # Never before what the core was told already. After the look only by as much as reading it all can take; more
-        # is a step of the wall clock, and then (as without a stamp) it came when it was looked at.
+        # Never earlier than the time already passed to the core, and at most `MAX_DRAIN_S` after the drain started: a
+        # later stamp means that the wall clock was set, and then (as without a stamp) the time of reading is used.
         assert self._wall_offset is not None
         at = arrived - self._wall_offset if arrived else self._drained_at
         if at < self._now:
@@ -259,7 +258,7 @@ class Driver:
         self._now = at
         self.node.receive(data, self._link_name, source, at)
 
-    # Out
+    # Send
 
     def _schedule_pump(self) -> None:
         if not self._pump_requested and not self.closed:
@@ -275,7 +274,7 @@ class Driver:
             self._pump_once()
             completed = True
         finally:
-            # A bug that raises is the loop's to report; the robot's messages go on.
+            # The loop reports the exception; messages must keep flowing.
             if not completed and not self.closed:
                 self._due = float("-inf")
                 self._schedule(self._clock() + RECOVERY_S)
@@ -298,7 +297,7 @@ class Driver:
             self._schedule(due)
 
     def _schedule(self, at: float) -> None:
-        """One timer, at `at`: to move it costs a tenth of waking for nothing."""
+        """Sets the only timer; moving it costs a tenth of a needless wake-up."""
         if self._timer is not None:
             if self._timer_at == at:
                 return
@@ -311,7 +310,7 @@ class Driver:
         self._pump()
 
     def _transmit_all(self) -> bool:
-        """Sends what may leave now, up to `PUMP_BYTES`; True where there may be more."""
+        """Sends what may leave now, up to `MAX_PUMP_BYTES`; True if there may be more."""
         sent = 0
         while sent < MAX_PUMP_BYTES:
             batch = self.node.datagrams_to_send(self._advance_clock())
@@ -340,7 +339,7 @@ class Driver:
             return
         if not waiting:
             self._loop.add_writer(link.fileno(), self._writable, link)
-        # Urgent first, here too; what falls off the end is the latest of the rest.
+        # Urgent datagrams first; beyond the limit, the latest of the others are dropped.
         waiting = sorted([*waiting, *datagrams[done:]], key=lambda datagram: not datagram.urgent)
         self._blocked[name] = waiting[:MAX_BLOCKED_DATAGRAMS]
         self.lost_on_full_socket += len(waiting[MAX_BLOCKED_DATAGRAMS:])
@@ -353,7 +352,7 @@ class Driver:
             self._pump()
 
     def _send(self, link: UdpLink, datagrams: Sequence[Datagram]) -> int:
-        """How many are done with, those that the kernel refused included."""
+        """Sends from the front and returns how many are done, those refused by the kernel included."""
         done = link.send(datagrams)
         if link.send_errors:
             self.send_errors.add(link.attachment.name, link.send_errors, self._clock())

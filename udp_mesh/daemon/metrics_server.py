@@ -1,5 +1,4 @@
-"""Answers Prometheus over TCP on a loopback address: one request, one page, closed (RFC 9112, as little as it
-takes)."""
+"""A minimal HTTP server for Prometheus on a loopback address: one request, one response, close (RFC 9112)."""
 
 from __future__ import annotations
 
@@ -10,12 +9,12 @@ from udp_mesh.core.settings import Address
 from udp_mesh.daemon.metrics import CONTENT_TYPE
 
 MAX_REQUEST_BYTES = 8192
-"""A scraper's request is a few hundred bytes; more is refused."""
+"""Maximum request size; a scraper's request is a few hundred bytes."""
 REQUEST_TIMEOUT_S = 5.0
-"""A connection that says nothing is closed."""
+"""An idle connection is closed after this."""
 MAX_CONNECTIONS = 8
-"""At a time, for the daemon's descriptors' sake. For one more the oldest gives way: a scraper asks at once, and
-who holds connections without asking must not keep it out."""
+"""Concurrent connections, to bound the daemon's descriptors. A further one evicts the oldest: a scraper sends its
+request at once, and idle connections must not keep it out."""
 
 
 class MetricsServer:
@@ -28,9 +27,9 @@ class MetricsServer:
         self._open: dict[asyncio.StreamWriter, None] = {}
 
     async def start(self) -> None:
-        """Raises OSError where the port is taken."""
+        """Raises OSError if the port is in use."""
         host, port = self._address
-        # asyncio accepts as many at a time as may wait
+        # asyncio accepts up to `backlog` connections at a time.
         self._server = await asyncio.start_server(
             self._answer, host, port, limit=MAX_REQUEST_BYTES, backlog=MAX_CONNECTIONS
         )
@@ -54,7 +53,7 @@ class MetricsServer:
                 writer.write(head.encode() + b"Connection: close\r\n\r\n" + (b"" if method == b"HEAD" else body))
                 await writer.drain()
         except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            # A scraper that went away or never asked: nothing to answer.
+            # The scraper went away or sent no request.
             return
         finally:
             self._open.pop(writer, None)

@@ -1,8 +1,8 @@
-"""What the kernel refuses to send -> what the operator is told: soon, then once a minute, and when it is over. Pure.
+"""Send errors of the kernel -> log lines: soon after the first, then once a minute, and when they stop. Pure.
 
-`SendErrors.add` takes what a link counted, `review` says what is to be told now, `active` is what the status shows. One
-refusal stands for one link and one reason, however many peers it concerns: a firewall's rule, a route that forbids, an
-interface that is gone.
+`SendErrors.add` takes a link's error counts, `review` returns what to log now, `active` what the status shows. One
+entry covers one link and one errno, however many peers it affects: a firewall rule, a prohibiting route, a removed
+interface.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from udp_mesh.daemon.status import show_address
 from udp_mesh.links.attachments import Address
 
 REVIEW_S = 1.0
-"""Between reviews while anything is refused, and before it is told: an interface that goes down refuses, too, for the
-moment until that is known."""
+"""Interval between reviews while there are errors, and delay before the first log line: an interface that goes down
+causes errors until the kernel reports it."""
 LOG_AGAIN_S = 60.0
-"""A rule that stays must not fill the log."""
+"""Interval between log lines for an error that persists."""
 LOG_NEW_DESTINATIONS_S = 5.0
-"""It concerns more peers than were told: sooner than that, but not a line for each."""
+"""The same if the error affects more peers than were logged: sooner, but not a line for each."""
 RESOLVED_AFTER_S = 15.0
-"""So long without a refusal, and it is over: longer than from one sparse heartbeat to the next."""
+"""An error that did not occur for this long has ended: longer than the interval of sparse heartbeats."""
 MAX_DESTINATIONS = 64
-"""Remembered of one refusal: a team's worth, whatever addresses a stranger claims."""
+"""Destinations stored per error: a whole team, whatever addresses unverified peers claim."""
 
 MAX_SHOWN_DESTINATIONS = 4
-"""Destinations named in one line of the log."""
+"""Destinations named in one log line."""
 
 
 @dataclass(slots=True)
 class SendError:
-    """Datagrams that the kernel would not send on one link, for one reason, from `since` to `last` and perhaps on."""
+    """Datagrams that the kernel refused to send on one link with one errno, from `since` to `last`."""
 
     link: str
     reason: str
@@ -43,18 +43,18 @@ class SendError:
     destinations: dict[Address, None] = field(default_factory=dict)
     logged_at: float | None = None
     logged_destinations: int = 0
-    """Destinations it had when it was told last."""
+    """Number of destinations when it was last logged."""
 
     @property
     def to(self) -> str:
-        """To whom: the first few, and how many more."""
+        """The first few destinations and the number of further ones."""
         more = len(self.destinations) - MAX_SHOWN_DESTINATIONS
         shown = [str(show_address(destination)) for destination in islice(self.destinations, MAX_SHOWN_DESTINATIONS)]
         return ",".join(shown) + (f",and-{more}-more" if more > 0 else "")
 
 
 class SendErrors:
-    """What is being refused now."""
+    """The send errors that occur now."""
 
     def __init__(self) -> None:
         self._by_link_and_errno: dict[tuple[str, int], SendError] = {}
@@ -63,7 +63,7 @@ class SendErrors:
         return bool(self._by_link_and_errno)
 
     def add(self, link: str, counts: Mapping[tuple[Address, int], int], now: float) -> None:
-        """Counts what a link was refused: (destination, errno) -> datagrams."""
+        """Adds a link's error counts: (destination, errno) -> datagrams."""
         for (destination, number), datagrams in counts.items():
             error = self._by_link_and_errno.get((link, number))
             if error is None:
@@ -74,13 +74,13 @@ class SendErrors:
                 error.destinations[destination] = None
 
     def link_closed(self, link: str) -> None:
-        """Its last refusals were because of that, if they were not told before."""
+        """Drops errors of a closed link that were not logged: its closing caused them."""
         for key, error in list(self._by_link_and_errno.items()):
             if error.link == link and error.logged_at is None:
                 del self._by_link_and_errno[key]
 
     def review(self, now: float) -> tuple[list[SendError], list[SendError]]:
-        """What is to be told now: refusals that go on, and those that are over (forgotten with this)."""
+        """The errors to log now: those that persist, and those that ended (and are removed)."""
         ongoing, resolved = [], []
         for key, error in list(self._by_link_and_errno.items()):
             if now - error.last >= RESOLVED_AFTER_S:
@@ -94,5 +94,5 @@ class SendErrors:
         return ongoing, resolved
 
     def active(self) -> tuple[SendError, ...]:
-        """Those told and not over."""
+        """The errors that were logged and have not ended."""
         return tuple(error for error in self._by_link_and_errno.values() if error.logged_at is not None)

@@ -1,7 +1,7 @@
-"""Keeps the open sockets equal to the attachments that exist: interfaces come and go while the node runs.
+"""Opens and closes sockets to match the attachments that exist: interfaces come and go while the node runs.
 
-`refresh` -> dump the kernel's interfaces -> choose -> close what is gone, open what is new, reopen what changed. A
-socket that cannot be opened is reported and tried again at the next refresh.
+`refresh` -> dump the kernel's interfaces -> select attachments -> close sockets of those gone, open new ones, reopen
+changed ones. A socket that cannot be opened is reported and retried at the next refresh.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from udp_mesh.links.udp import UdpLink
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """What a refresh did. A reopened link is in `gone` and in `opened`."""
+    """The result of a refresh. A reopened link is in `gone` and in `opened`."""
 
     opened: tuple[UdpLink, ...] = ()
     gone: tuple[UdpLink, ...] = ()
-    """Closed already; `attachment` says what they were."""
+    """Already closed; `attachment` says what they were."""
     failed: dict[str, str] = field(default_factory=dict)
-    """Link name -> why its socket could not be opened."""
+    """Link name -> reason why its socket could not be opened."""
 
 
 class LinkHub:
@@ -35,7 +35,7 @@ class LinkHub:
         self._urgent_dscp = urgent_dscp
 
     def refresh(self) -> Changes:
-        """Brings the sockets up to date with the kernel. Raises NetlinkError where it cannot be asked."""
+        """Opens and closes sockets to match the kernel's interfaces. Raises NetlinkError if they cannot be listed."""
         wanted = {
             attachment.name: attachment for attachment in select_attachments(interfaces(), self.configs, self._port)
         }

@@ -313,8 +313,8 @@ def test_every_command_shows_an_example_that_it_would_take(
 @pytest.mark.parametrize(
     ("daemon", "complaint"),
     [
-        ('user = "nobody-here"', "daemon.user: expected a user of this machine, found 'nobody-here'"),
-        ('socket_group = "no-such-group"', "daemon.socket_group: expected a group of this machine"),
+        ('user = "nobody-here"', "daemon.user: no such user: 'nobody-here'"),
+        ('socket_group = "no-such-group"', "daemon.socket_group: no such group"),
     ],
 )
 def test_a_daemon_that_cannot_start_says_why(

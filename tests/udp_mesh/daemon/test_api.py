@@ -163,7 +163,7 @@ def test_one_program_too_many_is_told_why() -> None:
             with MeshClient(str(path), timeout_s=WAIT_S) as client:
                 client.request("peers")
 
-        with pytest.raises(MeshError, match="at most 256 programs connect at a time") as refused:
+        with pytest.raises(MeshError, match="too many clients: at most 256 may connect at a time") as refused:
             await asyncio.to_thread(ask)
         assert refused.value.code == "too-many-clients"
         programs.pop().close()

@@ -63,7 +63,7 @@ def test_a_file_behind_a_link_is_read(tmp_path: Path) -> None:
     assert read_regular(tmp_path / "link", 5) == b"x" * 6
 
 
-@pytest.mark.parametrize(("text", "found"), [("00" * 32, "nothing but zeros"), (f"{KEY}\n{KEY}", "the same key twice")])
+@pytest.mark.parametrize(("text", "found"), [("00" * 32, "only zeros"), (f"{KEY}\n{KEY}", "the same key twice")])
 def test_keys_that_protect_nothing_are_refused(tmp_path: Path, text: str, found: str) -> None:
     path = tmp_path / "fleet.key"
     path.write_text(text)

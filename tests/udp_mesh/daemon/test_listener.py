@@ -46,7 +46,7 @@ def test_what_is_no_socket_is_left_alone_and_named(tmp_path: Path, what: str) ->
         path.write_text("kept")
     else:
         path.mkdir()
-    with pytest.raises(OSError, match=f"api.sock: expected nothing there, .* found a {what}"):
+    with pytest.raises(OSError, match=f"api.sock: expected no file or a stale socket, found a {what}"):
         Listener(path, mode=0o600, group=None, on_connection=socket.socket.close).open()
     assert path.exists()
 
@@ -106,7 +106,7 @@ def test_a_socket_that_became_another_daemons_is_left_alone(monkeypatch: pytest.
 def test_a_socket_that_cannot_be_given_its_group_leaves_no_file() -> None:
     with tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder:
         path = Path(folder) / "api.sock"
-        with pytest.raises(OSError, match="expected a group of this machine"):
+        with pytest.raises(OSError, match="no such group"):
             Listener(path, mode=0o660, group="no-such-group", on_connection=socket.socket.close).open()
         assert not path.exists()
 
@@ -136,7 +136,7 @@ def test_without_descriptors_accepting_rests_instead_of_trying_without_end(
         await accepted(path, taken)
         assert refused == 5
         assert [record.getMessage() for record in caplog.records] == [
-            "local-socket-trouble reason=no connection can be accepted: Too many open files"
+            "local-socket-trouble reason=cannot accept connections: Too many open files"
         ]
 
     listening(work)
