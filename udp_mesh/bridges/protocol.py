@@ -1,8 +1,8 @@
-"""What ROS bridges tell each other, as JSON on a mesh topic of their own. Pure.
+"""Messages between ROS bridges, as JSON on a mesh topic of their own. Pure.
 
-`Hello` says which latched messages its sender holds, so that the receiver sends those it lacks; bridges greet when they
-start and when a peer comes online. `Want` asks for definitions, `Definition` brings one. Every message repeats what is,
-so a lost or a doubled one does no harm.
+`Hello` lists the latched messages its sender has, so that the receiver sends the missing ones; bridges send it when
+they start and when a peer comes online. `Want` requests definitions, `Definition` carries one. Messages state facts
+rather than changes, so loss and duplication are harmless.
 """
 
 from __future__ import annotations
@@ -13,30 +13,30 @@ from typing import Any, NamedTuple, Union
 from udp_mesh.bridges.types import MAX_DEFINITION_BYTES, TypeKey
 
 MAX_MESSAGE_BYTES = 1 << 20
-"""One message: a definition, or greetings over thousands of latched messages."""
+"""Maximum size of a message: a definition, or a `Hello` that lists thousands of latched messages."""
 MAX_WANTED_TYPES = 256
-"""Definitions asked for at once: bounds what one message can make a peer send."""
+"""Definitions requested at a time: bounds what one message can make a peer send."""
 
 TOPIC_SETTINGS = {"priority": 1, "reliable": True, "compression": True, "deadline_s": 60.0}
-"""How the topic travels: small, and everything of a new type waits for it."""
+"""Settings of the bridges' topic: its messages are small, and everything of a new type waits for them."""
 
 
 class Hello(NamedTuple):
-    """`holds`: by mesh topic and publisher, the number of the last latched message that came from whom this is sent to
-    (`types.Mark`). `answer`: greet me back."""
+    """`holds`: by mesh topic and publisher, the number of the last latched message received from the addressee
+    (`types.Mark`). `answer`: whether to reply with a `Hello`."""
 
     holds: dict[str, dict[str, int]]
     answer: bool
 
 
 class Want(NamedTuple):
-    """Asks for definitions."""
+    """Requests definitions."""
 
     keys: list[TypeKey]
 
 
 class Definition(NamedTuple):
-    """Brings one."""
+    """Carries one definition."""
 
     key: TypeKey
     text: str
@@ -46,7 +46,7 @@ BridgeMessage = Union[Hello, Want, Definition]
 
 
 class ProtocolError(ValueError):
-    """These bytes are no message of a bridge; says why."""
+    """These bytes are not a valid message of a bridge."""
 
 
 def encode(message: BridgeMessage) -> bytes:
@@ -60,7 +60,7 @@ def encode(message: BridgeMessage) -> bytes:
 
 
 def decode(data: bytes) -> BridgeMessage:
-    """The message in these bytes. Raises ExchangeError."""
+    """Decodes a message. Raises ProtocolError."""
     if len(data) > MAX_MESSAGE_BYTES:
         raise ProtocolError("expected at most {} bytes, found {}".format(MAX_MESSAGE_BYTES, len(data)))
     try:

@@ -1,10 +1,10 @@
-"""Decides what a ROS bridge does with everything that happens, as effects for its edges. Pure; no clock, no ROS.
+"""Decides what a ROS bridge does, as effects for the runtime to execute. Pure: no clock, no ROS.
 
-1. From ROS: the definition goes out once per destination, then the message, its type in the type field. The last of
-   every latched publisher is kept for robots that join later.
-2. From the mesh: a message whose definition is here is published; others wait, and their source is asked.
-3. From other bridges: greetings are answered with the latched messages they lack, questions with definitions.
-4. Peers that come online are greeted. `tick` asks again.
+1. From ROS: the definition is sent once per destination, then the message with its type in the type field. The last
+   message of every latched publisher is stored for robots that join later.
+2. From the mesh: a message whose definition is known is published; others wait while the source is asked for it.
+3. From other bridges: a `Hello` is answered with the missing latched messages, a `Want` with definitions.
+4. Peers that come online get a `Hello`. `tick` repeats unanswered requests.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from udp_mesh.bridges.protocol import Definition, Hello, ProtocolError, Want, de
 from udp_mesh.bridges.types import Definitions, Mark, MessageKind, TypeKey, kind_text, parse_kind
 
 MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 64, 32 << 20
-"""Per source, while a definition is on its way: a second's worth; more is dropped, the oldest first."""
+"""Per source, while a definition is requested: a second's worth of messages; beyond it, the oldest is dropped."""
 MAX_LATCHED, MAX_LATCHED_BYTES = 4096, 64 << 20
-"""Latched messages kept for late robots: a publisher that latches under ever new names."""
+"""Latched messages stored for late joiners, in case a node latches under ever new names."""
 MAX_LATCHED_PER_ROUTE = 32
-"""Publishers that latch on one topic (tf_static); past it the oldest is forgotten, as are the names of programs that
-came, latched and went."""
+"""Latching publishers per topic (tf_static); beyond it, the oldest is dropped, such as programs that latched and
+exited."""
 MAX_TRACKED_PUBLISHERS = 4 * MAX_LATCHED_PER_ROUTE
-"""Publishers whose last latched message is remembered, per source and topic: more than a source can repeat by its two
-routes to us, or an old one would be published over a new one."""
+"""Publishers per source and topic whose last latched message is remembered: more than a source can repeat over its two
+routes to us, since an old message would otherwise be published after a newer one."""
 REQUEST_RETRY_S = 1.0
-"""Between two questions for one definition."""
+"""Interval between requests for the same definition."""
 DEFINITION_TIMEOUT_S = 30.0
-"""How long a message waits for its definition, and later ones of its topic behind it: a bridge may just be starting."""
+"""How long a message, and later ones of its topic, wait for its definition: the other bridge may be starting."""
 MAX_NOTED = 1000
-"""Things told once: names are a peer's to invent."""
+"""Distinct warnings logged; peers can invent names without bound."""
 
 
 class ToMesh(NamedTuple):
-    """Publish on the mesh; `peer` None: the topic's destinations, or all."""
+    """Publish on the mesh; `peer` None means the topic's destinations, or all."""
 
     topic: str
     payload: bytes
@@ -45,7 +45,7 @@ class ToMesh(NamedTuple):
 
 
 class ToRos(NamedTuple):
-    """Publish in ROS. `definition` is None where the source did not say (a fielded robot)."""
+    """Publish in ROS. `definition` is None if the source did not send one (a legacy robot)."""
 
     name: str
     key: TypeKey
@@ -55,7 +55,7 @@ class ToRos(NamedTuple):
 
 
 class Note(NamedTuple):
-    """Tell the operator."""
+    """Log a warning."""
 
     text: str
 
@@ -71,11 +71,11 @@ class _Waiting(NamedTuple):
 
 
 class Relay:
-    """One bridge's state. ROS 1 types have two parts (`pkg/Type`), and a message can only be published with its
-    definition; ROS 2 types have three (`pkg/msg/Type`), and must be installed on both sides."""
+    """State of one bridge. ROS 1 types have two parts (`pkg/Type`) and are published with their definition; ROS 2 types
+    have three (`pkg/msg/Type`) and must be installed on both sides."""
 
     def __init__(self, own: str, protocol_topic: str, *, ros_version: Literal[1, 2], nonce: bytes) -> None:
-        """`nonce`: random, so that the numbers of another start of this bridge are not taken for later or earlier."""
+        """`nonce`: random, so that message numbers of different runs of this bridge are never compared."""
         self.own = own
         self._nonce = nonce
         self._number = 0
@@ -94,7 +94,7 @@ class Relay:
         self._noted: set[Route | str] = set()
 
     def set_destinations(self, destinations: Mapping[str, Iterable[str]]) -> None:
-        """The daemon's topics, each with the peers it goes to (none: all)."""
+        """Sets the daemon's topics, each with its destinations (none: all)."""
         self._destinations = destinations
 
     # From ROS
@@ -102,11 +102,11 @@ class Relay:
     def from_ros(
         self, route: Route, publisher: str, key: TypeKey, definition: str, latched: bool, payload: bytes
     ) -> list[Effect]:
-        """A node published. `publisher` tells apart several that latch on one topic."""
+        """Handles a message from ROS. `publisher` distinguishes several that latch on one topic."""
         effects: list[Effect] = []
         if "/" not in key.name:
-            # A publisher of any type, which says none before its first message: nobody could read it.
-            return self._note_once(route, "{} publishes type {!r} on {}".format(publisher, key.name, route.topic))
+            # A publisher of any type (AnyMsg) has no type before its first message: receivers could not decode it.
+            return self._note_once(route, "{}: unsupported type {!r} on {}".format(publisher, key.name, route.topic))
         if self._needs_definitions:
             if definition or key not in self._definitions:
                 self._definitions.put(key, definition)
@@ -136,14 +136,15 @@ class Relay:
     # From the mesh
 
     def from_mesh(self, source: str, topic: str, type_text: str, payload: bytes, now: float) -> list[Effect]:
-        """A message arrived."""
+        """Handles a message from the mesh."""
         if topic == self.protocol_topic:
             return self._from_bridge(source, payload)
         kind = parse_kind(type_text)
         if kind is None or kind.key.name.count("/") != self._slashes:
             return []
         if ros_word(source) == ros_word(self.own):
-            return self._note_once(source, "{} reads like our own name: its messages are not published".format(source))
+            text = "{}: same ROS name as this robot: its messages are not published".format(source)
+            return self._note_once(source, text)
         if kind.mark is not None and not self._is_newer(source, topic, kind.mark):
             return []
         message = _Waiting(topic, kind, payload, now)
@@ -155,7 +156,7 @@ class Relay:
         return self._request_definition(source, kind.key, now)
 
     def _is_newer(self, source: str, topic: str, mark: Mark) -> bool:
-        """Whether no later latched message of its publisher came before it, nor itself."""
+        """Whether neither this message nor a later one of its publisher was received before."""
         held = self._last_numbers.setdefault(source, {}).setdefault(topic, OrderedDict())
         if held.get(mark.publisher, -1) >= mark.number:
             return False
@@ -187,13 +188,13 @@ class Relay:
         self._requested_at[source, key] = now
         return [self._to_bridges(Want([key]), source)]
 
-    # Between bridges
+    # From other bridges
 
     def _from_bridge(self, source: str, payload: bytes) -> list[Effect]:
         try:
             message = decode(payload)
         except ProtocolError as error:
-            return [Note("a message from {} on {}: {}".format(source, self.protocol_topic, error))]
+            return [Note("invalid message from {} on {}: {}".format(source, self.protocol_topic, error))]
         if isinstance(message, Definition):
             if not self._definitions.put(message.key, message.text):
                 return []
@@ -208,7 +209,7 @@ class Relay:
         return [self._to_bridges(Definition(key, text), peer) for key, text in found if text is not None]
 
     def _missing_latched(self, peer: str, holds: Mapping[str, Mapping[str, int]]) -> list[Effect]:
-        """Our latched messages that the peer has not."""
+        """Our latched messages that the peer does not have."""
         effects: list[Effect] = []
         for (route, _), (kind, payload) in self._latched.items():
             allowed = list(self._destinations.get(route.topic, ()))
@@ -219,7 +220,7 @@ class Relay:
         return effects
 
     def _publish_waiting(self) -> list[Effect]:
-        """Publishes what waited for a definition, in order per source and topic."""
+        """Publishes messages whose definition arrived, in order per source and topic."""
         effects: list[Effect] = []
         for source, waiting in list(self._waiting.items()):
             blocked: set[str] = set()
@@ -240,7 +241,7 @@ class Relay:
         return effects
 
     def greeting(self, peer: str | None, *, answer: bool) -> Effect:
-        """A greeting for one peer, or (None) for all."""
+        """A `Hello` for one peer, or (None) for all."""
         held = self._last_numbers.get(peer, {}) if peer is not None else {}
         return self._to_bridges(Hello({topic: dict(numbers) for topic, numbers in held.items()}, answer), peer)
 
@@ -250,15 +251,15 @@ class Relay:
     # Peers and time
 
     def on_daemon_up(self, online: Iterable[str]) -> list[Effect]:
-        """The daemon is there (again): greet everyone who is online."""
+        """Sends a `Hello` to every online peer after each connect to the daemon."""
         return [self.greeting(peer, answer=True) for peer in online]
 
     def on_peer_online(self, peer: str) -> list[Effect]:
-        """Greets it: each side then sends the latched messages that the other lacks."""
+        """Sends a `Hello`, so that each side then sends the latched messages the other lacks."""
         return [self.greeting(peer, answer=True)]
 
     def tick(self, now: float) -> list[Effect]:
-        """Asks again for definitions that did not come, and gives up on what waited too long."""
+        """Repeats requests for definitions, and drops messages that waited too long."""
         effects = self._expire_waiting(now) if self._waiting else []
         for source, waiting in self._waiting.items():
             for key in OrderedDict.fromkeys(message.kind.key for message in waiting):
@@ -271,7 +272,7 @@ class Relay:
             late = [message for message in waiting if self._is_expired(message, now)]
             if late:
                 names = sorted({message.kind.key.name for message in late})
-                notes.append(Note("{} did not tell what {} is: not published".format(source, ", ".join(names))))
+                notes.append(Note("{}: no definition received for {}: not published".format(source, ", ".join(names))))
                 self.dropped += len(late)
                 self._waiting[source] = deque(message for message in waiting if not self._is_expired(message, now))
         self._requested_at = {asked: at for asked, at in self._requested_at.items() if now - at <= DEFINITION_TIMEOUT_S}

@@ -1,7 +1,7 @@
-"""What every ROS bridge does between the daemon and the relay: frames and messages in, effects carried out.
+"""The part between daemon and relay that all ROS bridges share: passes frames and messages in, executes effects.
 
-Several threads come here: the port's, and those of the middleware. The relay is entered under one lock; its effects run
-outside of it.
+Called by several threads: the daemon client's and the middleware's. The relay is protected by one lock; its effects are
+executed outside of it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 
 class BridgeRuntime:
-    """The daemon behind `port` and the ROS graph behind `to_ros`, joined by the relay."""
+    """Joins the daemon behind `daemon` and the ROS graph behind `to_ros` through the relay."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class BridgeRuntime:
         to_ros: Callable[[ToRos], None],
         wanted: Mapping[str, Mapping[str, object]] | None = None,
     ) -> None:
-        """`to_ros` returns at once; `wanted` are topics that the daemon shall have besides, with their settings."""
+        """`to_ros` must not block; `wanted` are additional topics to declare, with their settings."""
         self._daemon = daemon
         self._relay = relay
         self._to_ros = to_ros
@@ -39,7 +39,7 @@ class BridgeRuntime:
         self._lock = threading.Lock()
 
     def on_daemon_up(self) -> None:
-        """The port calls this after each connect. Raises MeshError."""
+        """Called by the daemon client after each connect. Raises MeshError."""
         self.refresh_topics()
         online = [peer for peer, is_online in self._daemon.peers().items() if is_online]
         with self._lock:
@@ -47,7 +47,7 @@ class BridgeRuntime:
         self._run(effects)
 
     def on_frame(self, frame: Frame) -> None:
-        """The port calls this for each frame."""
+        """Called by the daemon client for each frame."""
         message, header = as_message(frame), frame[0]
         effects: list[Effect] = []
         with self._lock:
@@ -61,19 +61,19 @@ class BridgeRuntime:
     def from_ros(
         self, route: Route, publisher: str, key: TypeKey, definition: str, latched: bool, payload: bytes
     ) -> None:
-        """A node published."""
+        """Handles a message from a ROS node."""
         with self._lock:
             effects = self._relay.from_ros(route, publisher, key, definition, latched, payload)
         self._run(effects)
 
     def tick(self, now: float) -> None:
-        """What is due at `now` (monotonic seconds)."""
+        """Handles what is due at `now` (monotonic seconds)."""
         with self._lock:
             effects = self._relay.tick(now)
         self._run(effects)
 
     def refresh_topics(self) -> dict[str, tuple[str, ...]]:
-        """The daemon's topics with their destinations, those wanted among them. Raises MeshError."""
+        """Declares the wanted topics; returns the daemon's topics with their destinations. Raises MeshError."""
         topics = self._daemon.ensure_topics(self._wanted)
         with self._lock:
             self._relay.set_destinations(topics)

@@ -1,12 +1,12 @@
 """The Zenoh bridge: `python -m udp_mesh.bridges.zenoh_bridge --route 'demo/**=telemetry' --ros2 /chatter=talk ...`.
 
-1. A sample under a routed key expression is sealed whole (`envelope`) and published on the route's mesh topic.
-2. What other Zenoh bridges sent is put under its own key, with its encoding, attachment and quality of service.
-3. The liveliness tokens of routed ROS 2 topics are kept equal on both sides (`rmw_zenoh`).
-4. Robots and subscribers that come late get what transient local publishers keep: a robot that comes is told it again.
+1. A sample under a routed key expression is encoded (`envelope`) and published on the route's mesh topic.
+2. A sample from another Zenoh bridge is put under its own key, with its encoding, attachment and quality of service.
+3. The liveliness tokens of routed ROS 2 topics are synchronized between both sides (`rmw_zenoh`).
+4. Late joiners get the cached samples of transient local publishers: these are sent again when a robot comes online.
 
-Nothing that came from the mesh goes back: each bridge has a token `udp_mesh/bridge/<session>`, says its session in
-every sample it puts, and drops samples of every session that has such a token. Needs `eclipse-zenoh`.
+Samples from the mesh are never sent back: each bridge declares a token `udp_mesh/bridge/<session>`, names its session
+in every sample it puts, and drops samples of every session that has such a token. Requires `eclipse-zenoh`.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ log = logging.getLogger(__name__)
 
 PROTOCOL_TOPIC = "bridge/zenoh"
 PROTOCOL_TOPIC_SETTINGS = {"priority": 1, "reliable": True, "compression": True, "keep_last": 1, "outbox": "last"}
-"""Announcements are whole, so only the last one counts, also for a peer that is away."""
+"""Announcements are complete, so only the last one matters, also for an offline peer."""
 BRIDGE = "udp_mesh/bridge"
 REFRESH_S = 1.0
 HISTORY_TIMEOUT_S = 10.0
-"""How long publishers have to tell what they keep."""
+"""How long publishers may take to answer a query for cached samples."""
 
 
 class KeyRoute(NamedTuple):
@@ -86,8 +86,8 @@ def parse_ros2_route(text: str) -> KeyRoute:
 
 
 class Bridge:
-    """The running bridge. Zenoh's callbacks come on its threads, the mesh's on the port's; `_lock` guards what both
-    use."""
+    """The running bridge. Zenoh calls back on its own threads, the daemon client on another; `_lock` guards the shared
+    state."""
 
     def __init__(self, daemon: DaemonClient, session: Any, routes: Sequence[KeyRoute]) -> None:
         self._daemon = daemon
@@ -105,7 +105,7 @@ class Bridge:
         self._declarations: list[Any] = []
 
     def start(self) -> None:
-        """Declares everything. The token by which other bridges know us comes before the first sample."""
+        """Declares everything. The token that identifies this bridge comes before the first sample."""
         live = self._session.liveliness()
         self._declarations.append(live.declare_token("{}/{}".format(BRIDGE, self._own)))
         self._declarations.append(live.declare_subscriber(BRIDGE + "/*", self._on_bridge_token, history=True))
@@ -153,7 +153,7 @@ class Bridge:
             self._daemon.publish(route.topic, sealed, peer, TYPE)
 
     def _send_history(self, keys: Sequence[str], peer: str | None = None) -> None:
-        """What our side's publishers keep, to one robot or to all: those who have it leave it."""
+        """Sends cached samples of our side's publishers to one robot or to all, which drop those they already have."""
         for route in self._routes:
             if route.tokens is None or (route.peers and peer is not None and peer not in route.peers):
                 continue
@@ -167,7 +167,7 @@ class Bridge:
             if reply.ok is not None and not self._is_from_bridge(reply.ok):
                 self._send(reply.ok, route, peers, again=True)
 
-        # A reply's key is the publisher's, not the one asked for.
+        # A reply's key is the publisher's, not the queried one.
         selector = "{}/{}?_anyke".format(key, HISTORY)
         self._session.get(selector, answered, consolidation=zenoh.ConsolidationMode.NONE, timeout=HISTORY_TIMEOUT_S)
 
@@ -183,7 +183,7 @@ class Bridge:
         self.announce()
         key = kept_samples(token)[0]
         if alive and key in keys:
-            # It may have published before we listened.
+            # It may have published before our subscription.
             self._send_history([key])
 
     def _on_companion(self, sample: Any) -> None:
@@ -192,19 +192,19 @@ class Bridge:
         self.announce()
 
     def announce(self, peer: str | None = None, *, answer: bool = False) -> None:
-        """Tells all other bridges our side's tokens if they changed, or one of them in any case."""
+        """Announces our side's tokens: to all bridges if they changed, or to one bridge in any case."""
         with self._lock:
             announcement = self._token_exchange.announcement(answer=answer)
             if peer is None and not answer and announcement == self._announced:
                 return
-            # Under the lock: of two announcements the later one must leave last.
+            # Under the lock, so that the later of two announcements leaves last.
             if self._daemon.publish(PROTOCOL_TOPIC, announcement, peer, TYPE) and peer is None:
                 self._announced = announcement
 
     # Mesh -> Zenoh
 
     def on_daemon_up(self) -> None:
-        """The port calls this after each connect."""
+        """Called by the daemon client after each connect."""
         self.ensure_topic()
         self.announce(answer=True)
         self._send_history(self._keeping_keys())
@@ -214,7 +214,7 @@ class Bridge:
             return self._token_exchange.keeping_keys()
 
     def on_frame(self, frame: Frame) -> None:
-        """The port calls this for each frame."""
+        """Called by the daemon client for each frame."""
         message, header = as_message(frame), frame[0]
         if message is not None and message.type == TYPE:
             try:
@@ -237,7 +237,7 @@ class Bridge:
         with self._lock:
             kept = self._token_exchange.depth(sample.key) > 0
             is_new = not kept or self._deduplicator.is_new(sample.key, sample.attachment, sample.payload)
-        # What the network brings twice is put twice, as it came; what is told again is not.
+        # A sample the network duplicated is put twice, as it came; a cached sample sent again is not.
         if is_new or not sample.again:
             self._publishers.put(sample)
 
@@ -252,7 +252,7 @@ class Bridge:
     def _apply(self, change: TokenChange) -> None:
         live = self._session.liveliness()
         for token in change.declare:
-            # The companion first: no bridge may take the token for one of its side's own.
+            # The companion first, so that no bridge takes the token for one of its own side.
             companion = live.declare_token(carried_key(self._own, token))
             self._tokens[token] = (companion, live.declare_token(token))
         for token in change.withdraw:
@@ -262,18 +262,30 @@ class Bridge:
         self._publishers.withdraw_stale()
 
     def ensure_topic(self) -> None:
-        """The daemon may have been started anew without the bridges' topic. Raises MeshError."""
+        """Declares the bridges' topic, which a restarted daemon may lack. Raises MeshError."""
         self._daemon.ensure_topics({PROTOCOL_TOPIC: PROTOCOL_TOPIC_SETTINGS})
 
 
 def arguments() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="udp_mesh.bridges.zenoh_bridge", description="Zenoh over the mesh")
-    parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket")
-    parser.add_argument("--config", help="a Zenoh configuration file (JSON5)")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=JSON", help="one value of it")
-    parser.add_argument("--route", action="append", default=[], type=parse_route, metavar="KEYEXPR=TOPIC[@PEER,...]")
+    parser = argparse.ArgumentParser(prog="udp_mesh.bridges.zenoh_bridge", description="Carry Zenoh over the mesh.")
+    parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket (default: %(default)s)")
+    parser.add_argument("--config", help="Zenoh configuration file (JSON5)")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=JSON", help="override a Zenoh setting")
     parser.add_argument(
-        "--ros2", action="append", default=[], type=parse_ros2_route, metavar="[DOMAIN:]/ros/topic=TOPIC[@PEER,...]"
+        "--route",
+        action="append",
+        default=[],
+        type=parse_route,
+        metavar="KEYEXPR=TOPIC[@PEER,...]",
+        help="carry samples under a key expression on a mesh topic (repeatable)",
+    )
+    parser.add_argument(
+        "--ros2",
+        action="append",
+        default=[],
+        type=parse_ros2_route,
+        metavar="[DOMAIN:]/ros/topic=TOPIC[@PEER,...]",
+        help="carry a ROS 2 topic of rmw_zenoh on a mesh topic (repeatable)",
     )
     return parser
 
@@ -306,7 +318,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             except MeshError as error:
                 log.debug("daemon-unreachable %s", error)
         if not stop.is_set():
-            # The port's thread ended by a mistake of ours, and said which: whoever started us starts us anew.
+            # The daemon client's thread failed and logged its exception; the supervisor restarts this process.
             return 1
         thread.join(5.0)
     return 0

@@ -231,7 +231,7 @@ def test_a_number_that_would_do_nothing_is_wrong_usage(words: list[str], capsys:
 def test_no_daemon_has_an_exit_code_of_its_own(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["status", "--socket", str(tmp_path / "none.sock")]) == Exit.UNREACHABLE
     complaint = capsys.readouterr().err
-    assert "no udp-mesh daemon at" in complaint
+    assert "cannot connect to the daemon at" in complaint
     assert "`udp-mesh run` starts one" in complaint
 
 

@@ -1,8 +1,8 @@
-"""The ROS 1 bridge: the daemon's connection and the ROS graph, joined by the relay.
+"""The ROS 1 bridge: the daemon and the ROS graph, joined by the relay.
 
-Three kinds of threads meet here: rospy's (one per connection), the port's, and `main`'s, which every TICK_S looks after
-what changed: topics, peers, the master. Of these only `main`'s waits for the master, so that what flows goes on flowing
-while there is none.
+Three kinds of threads run here: rospy's (one per connection), the daemon client's, and the main thread, which runs the
+relay's timers every TICK_S and refreshes topics, peers and the connection to the master every REFRESH_S. Only the main
+thread waits for the master, so that existing traffic continues while the master is down.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ log = logging.getLogger(__name__)
 
 PROTOCOL_TOPIC = "bridge/ros1"
 ANY = "any"
-"""The fielded system's topic for messages of any type, at priority 1."""
+"""The legacy system's topic for messages of any type, at priority 1."""
 TICK_S = 0.1
 REFRESH_S = 1.0
-"""Between two looks at the daemon's topics, its peers and the master."""
+"""Interval between refreshes of the daemon's topics and peers and of the master."""
 
 
 class Bridge:
@@ -60,21 +60,21 @@ class Bridge:
         self._graph = Graph(self._runtime.from_ros, "/{}/".format(ros_word(own)), self._set_window)
 
     def start(self, stop: threading.Event) -> None:
-        """Begins to publish; until `stop`."""
+        """Starts publishing, until `stop` is set."""
         self._graph.start(stop)
 
     def _to_ros(self, message: ToRos) -> None:
         self._graph.publish(message)
 
-    # What happens
+    # Callbacks
 
     def on_daemon_up(self) -> None:
-        """The port calls this after each connect. Raises MeshError."""
+        """Called by the daemon client after each connect. Raises MeshError."""
         self._runtime.on_daemon_up()
         self._refresh_requested.set()
 
     def on_frame(self, frame: Frame) -> None:
-        """The port calls this for each frame."""
+        """Called by the daemon client for each frame."""
         self._runtime.on_frame(frame)
         header = frame[0]
         event = header.get("event")
@@ -89,10 +89,10 @@ class Bridge:
         except MeshError as error:
             log.warning("window-unchanged packets=%d %s", packets, error)
 
-    # What is looked after, by one thread
+    # The main thread
 
     def run(self, stop: threading.Event) -> None:
-        """Until `stop`: every TICK_S, and every LOOK_S or when something came, a look around."""
+        """Runs timers every TICK_S and refreshes every REFRESH_S or on request, until `stop` is set."""
         refreshed_at = 0.0
         while not stop.wait(TICK_S):
             now = time.monotonic()
@@ -103,7 +103,7 @@ class Bridge:
                 self._refresh()
 
     def _refresh(self) -> None:
-        """Topics may be added, peers may come, the master may go: listen on what is there now."""
+        """Registers with a restarted master, and subscribes to the names of the current topics and peers."""
         try:
             self._graph.reregister()
             self._master_gone = False
@@ -137,7 +137,7 @@ class Bridge:
 
 
 def main() -> int:
-    """Runs until ROS or a signal ends it. Waits for a master and for the daemon."""
+    """Runs until ROS or a signal stops it. Waits for a master and for the daemon."""
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
     try:
         _wait_for(lambda: bool(rosgraph.is_master_online()), "master")
@@ -174,12 +174,12 @@ def main() -> int:
     thread.start()
     bridge.run(stop)
     thread.join(5.0)
-    # Where ROS did not end us, a thread of ours did by a mistake, and said which: roslaunch starts us anew.
+    # Not ROS but an unexpected exception, already logged, stopped the bridge: roslaunch restarts it.
     return 0 if rospy.is_shutdown() else 1
 
 
 def _wait_for(condition: Callable[[], bool], what: str) -> None:
-    """Asks once a second until it is so, and says once that it waits."""
+    """Polls once a second until the condition is true; logs once that it waits."""
     logged = False
     while not condition():
         if not logged:

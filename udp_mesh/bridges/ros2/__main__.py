@@ -1,9 +1,9 @@
-"""The ROS 2 bridge's edge: rclpy's raw subscriptions and publishers, joined to the daemon by the relay.
+"""The ROS 2 bridge: rclpy's raw subscriptions and publishers, joined to the daemon by the relay.
 
-All of rclpy is touched by the executor's thread alone: a timer looks every LOOK_S at the ROS graph (which types are
-published under our names?) and at the daemon (topics, peers); what the port's thread brings waits in a queue, and a
-guard condition wakes the executor for it. Types must be installed on both robots: rclpy makes publishers and
-subscriptions from their classes only.
+Only the executor's thread calls rclpy. Every REFRESH_S a timer reads the ROS graph (types published under our names)
+and the daemon (topics, peers). Messages from the daemon client's thread wait in a queue, and a guard condition wakes
+the executor for them. Types must be installed on both robots: rclpy needs their classes to create publishers and
+subscriptions.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ log = logging.getLogger(__name__)
 PROTOCOL_TOPIC = "bridge/ros2"
 REFRESH_S = 1.0
 MAX_ARRIVED = 1000
-"""Messages of the mesh that wait for the executor: the oldest are dropped."""
+"""Messages from the mesh waiting for the executor; the oldest are dropped."""
 
 
 def profile(quality: Quality) -> Any:
-    """rclpy's profile of a quality."""
+    """A quality as rclpy's QoSProfile."""
     reliable, latched = quality.reliability == "reliable", quality.latched
     return QoSProfile(
         depth=quality.depth,
@@ -53,10 +53,10 @@ def profile(quality: Quality) -> Any:
 
 
 def quality_of(info: Any) -> Quality:
-    """The quality an endpoint of the graph offers; its depth is not told by the graph."""
+    """The quality offered by an endpoint; the graph does not report its depth."""
     reliable = info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
     latched = info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    # Since Iron; "INVALID" where the middleware does not tell it.
+    # Since Iron; "INVALID" if the middleware does not report it.
     type_hash = str(getattr(info, "topic_type_hash", ""))
     return Quality(
         "reliable" if reliable else "best_effort",
@@ -84,20 +84,20 @@ class Bridge:
         self._arrived.append(message)
         self._wake.trigger()
 
-    # The port's thread
+    # The daemon client's thread
 
     def on_daemon_up(self) -> None:
-        """The port calls this after each connect. Raises MeshError."""
+        """Called by the daemon client after each connect. Raises MeshError."""
         self._runtime.on_daemon_up()
 
     def on_frame(self, frame: Frame) -> None:
-        """The port calls this for each frame."""
+        """Called by the daemon client for each frame."""
         self._runtime.on_frame(frame)
 
     # The executor's thread
 
     def refresh(self) -> None:
-        """Every LOOK_S: topics, peers, and what is published under our names."""
+        """Every REFRESH_S: updates topics, peers and subscriptions."""
         try:
             topics, peers = self._runtime.refresh_topics(), self._daemon.peers()
         except MeshError as error:
@@ -129,7 +129,7 @@ class Bridge:
         def arrived(data: bytes) -> None:
             self._runtime.from_ros(route, name, key, "", quality.latched, bytes(data))
 
-        # The graph does not tell depths; ten messages bridge what the executor is busy with.
+        # The graph does not report depths; ten messages cover the time the executor is busy.
         wanted = profile(quality._replace(depth=10))
         self._subscriptions[name] = (
             key,
@@ -137,7 +137,7 @@ class Bridge:
         )
 
     def publish_arrived(self) -> None:
-        """What the mesh brought since the last call."""
+        """Publishes the messages that arrived from the mesh since the last call."""
         while self._arrived:
             self._publish(self._arrived.popleft())
 
@@ -153,11 +153,11 @@ class Bridge:
             known = (message.key, self._node.create_publisher(message_class, name, profile(quality)))
             self._publishers[name] = known
         if self._has_matching_hash(name, quality.type_hash):
-            # rclpy takes bytes for a message that is serialized already.
+            # rclpy takes bytes as a serialized message.
             known[1].publish(message.payload)
 
     def _has_matching_hash(self, name: str, type_hash: str) -> bool:
-        """Whether our publisher's type is the source's, as far as ROS tells: CDR of another definition is garbage."""
+        """Whether our publisher's type hash equals the source's, if both are known: CDR of another type is garbage."""
         hashes = {
             quality_of(info).type_hash
             for info in self._node.get_publishers_info_by_topic(name)
@@ -165,7 +165,7 @@ class Bridge:
         } - {""}
         if not type_hash or not hashes or type_hash in hashes:
             return True
-        self._warn_once(name, "{}: the type is defined otherwise on its source: not published".format(name))
+        self._warn_once(name, "{}: the source has another definition of the type: not published".format(name))
         return False
 
     def _class(self, name: str) -> Any:
@@ -182,9 +182,9 @@ class Bridge:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs until ROS or a signal ends it. Waits for the daemon."""
-    parser = argparse.ArgumentParser(prog="udp_mesh.bridges.ros2", description="ROS 2 over the mesh")
-    parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket")
+    """Runs until ROS or a signal stops it. Waits for the daemon."""
+    parser = argparse.ArgumentParser(prog="udp_mesh.bridges.ros2", description="Carry ROS 2 topics over the mesh.")
+    parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket (default: %(default)s)")
     options, ros_arguments = parser.parse_known_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
     daemon = DaemonClient(options.socket, ["*"])
@@ -212,12 +212,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     finally:
         stop.set()
         rclpy.try_shutdown()
-    # The port's thread ended by a mistake of ours, and said which: whoever started us starts us anew.
+    # The daemon client's thread failed and logged its exception; the supervisor restarts this process.
     return 1 if failed else 0
 
 
 def _wait_for_node_name(daemon: DaemonClient) -> str | None:
-    """The daemon's name, asked for until it answers; None where ROS ends before."""
+    """The daemon's node name, polled until the daemon answers; None if ROS shuts down first."""
     logged = False
     while rclpy.ok():
         try:
