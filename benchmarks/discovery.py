@@ -30,7 +30,7 @@ from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
 from udp_mesh.crypto import channel
-from udp_mesh.sim.event_queue import Agenda
+from udp_mesh.sim.event_queue import EventQueue
 
 # All receivers of a broadcast open it with one key and decode the same bytes to the same frozen frames: one processor,
 # which plays them all, does it once, and 1,000 robots that know each other fit into its memory.
@@ -54,7 +54,7 @@ class OpenField:
     """A team that hears itself; `cut` separates the robots of even from those of odd number."""
 
     def __init__(self, count: int) -> None:
-        self.agenda = Agenda()
+        self.event_queue = EventQueue()
         self.known_pairs = 0
         """Ordered pairs of robots of which the first reports the second online."""
         self.cut = False
@@ -81,7 +81,7 @@ class OpenField:
         self._wake_s = [float("inf")] * count
         for index, node in enumerate(self.nodes):
             node.link_up(LinkInfo(LINK, LinkKind.BROADCAST, self.addresses[index], ("10.0.255.255", 8700)), 0.0)
-            self.agenda.at(rng.random() * SWITCHED_ON_WITHIN_S, partial(self._switch_on, index))
+            self.event_queue.at(rng.random() * SWITCHED_ON_WITHIN_S, partial(self._switch_on, index))
 
     @property
     def all_pairs(self) -> int:
@@ -90,26 +90,26 @@ class OpenField:
     def report(self, index: int) -> None:
         """Telemetry to the base, from now on."""
         if self.busy:
-            self.nodes[index].send("telemetry", bytes(200), destination="robot0000", now=self.agenda.now)
+            self.nodes[index].send("telemetry", bytes(200), destination="robot0000", now=self.event_queue.now)
             self._settle(index)
-            self.agenda.after(TELEMETRY_S, partial(self.report, index))
+            self.event_queue.after(TELEMETRY_S, partial(self.report, index))
 
     def run_until_known(self, pairs: Callable[[int], bool]) -> float | None:
         """Run until the number of known pairs satisfies `pairs`; returns how long that took."""
-        begun = self.agenda.now
+        begun = self.event_queue.now
         while not pairs(self.known_pairs):
-            if self.agenda.now - begun > LONGEST_S:
+            if self.event_queue.now - begun > LONGEST_S:
                 return None
-            self.agenda.run_until(self.agenda.now + 0.05)
-        return self.agenda.now - begun
+            self.event_queue.run_until(self.event_queue.now + 0.05)
+        return self.event_queue.now - begun
 
     def _switch_on(self, index: int) -> None:
         self._is_on[index] = True
-        self.nodes[index].handle_timer(self.agenda.now)
+        self.nodes[index].handle_timer(self.event_queue.now)
         self._settle(index)
 
     def _settle(self, index: int) -> None:
-        node, now = self.nodes[index], self.agenda.now
+        node, now = self.nodes[index], self.event_queue.now
         while datagrams := node.datagrams_to_send(now):
             for datagram in datagrams:
                 self._transmit(index, datagram)
@@ -124,12 +124,12 @@ class OpenField:
         timer_s = node.next_timer()
         if timer_s is not None and timer_s < self._wake_s[index]:
             self._wake_s[index] = max(timer_s, now + 1e-6)
-            self.agenda.at(self._wake_s[index], partial(self._wake, index))
+            self.event_queue.at(self._wake_s[index], partial(self._wake, index))
 
     def _transmit(self, index: int, datagram: Datagram) -> None:
         size = len(datagram.data) + IP_UDP_BYTES
         took_s = size * 8 / CHANNEL_BITS_PER_S + TRANSMISSION_S
-        self._free_at = max(self._free_at, self.agenda.now) + took_s
+        self._free_at = max(self._free_at, self.event_queue.now) + took_s
         self.sent[index][0] += 1
         self.sent[index][1] += size
         to = self._by_address.get(datagram.destination) if datagram.destination else None
@@ -139,7 +139,7 @@ class OpenField:
             targets = range(len(self.nodes))
         else:
             targets = (to,)
-        self.agenda.at(self._free_at, partial(self._arrive, targets, datagram.data, index))
+        self.event_queue.at(self._free_at, partial(self._arrive, targets, datagram.data, index))
 
     def _count_broadcast(self, took_s: float) -> None:
         self.broadcast_s += took_s
@@ -150,7 +150,7 @@ class OpenField:
         self.busiest_second_s = max(self.busiest_second_s, self._second_s)
 
     def _arrive(self, targets: Sequence[int], data: bytes, source: int) -> None:
-        now, address, nodes = self.agenda.now, self.addresses[source], self.nodes
+        now, address, nodes = self.event_queue.now, self.addresses[source], self.nodes
         for index in targets:
             if index != source and self._is_on[index] and not (self.cut and (index ^ source) & 1):
                 nodes[index].receive(data, LINK, address, now)
@@ -159,16 +159,16 @@ class OpenField:
                 elif nodes[index].next_timer() != self._wake_s[index] and index not in self._arrived:
                     # As a driver does, which looks after a batch of datagrams.
                     self._arrived.add(index)
-                    self.agenda.after(0.005, partial(self._look, index))
+                    self.event_queue.after(0.005, partial(self._look, index))
 
     def _look(self, index: int) -> None:
         self._arrived.discard(index)
         self._settle(index)
 
     def _wake(self, index: int) -> None:
-        if self.agenda.now >= self._wake_s[index]:
+        if self.event_queue.now >= self._wake_s[index]:
             self._wake_s[index] = float("inf")
-            self.nodes[index].handle_timer(self.agenda.now)
+            self.nodes[index].handle_timer(self.event_queue.now)
             self._settle(index)
 
 
@@ -182,13 +182,13 @@ def measure(count: int) -> dict[str, Any]:
     result: dict[str, Any] = {"nodes": count, "met_s": met_s, "meeting_busiest_share": field.busiest_second_s}
     # heartbeats of a large team are far apart: count over a round of them
     count_s = max(10.0, count / 30)
-    field.agenda.run_until(field.agenda.now + 5.0)
+    field.event_queue.run_until(field.event_queue.now + 5.0)
     result["idle"] = _rates(field, count_s)
     field.busy = True
     rng = random.Random(2)
     for index in range(1, count):
-        field.agenda.after(rng.random() * TELEMETRY_S, partial(field.report, index))
-    field.agenda.run_until(field.agenda.now + 5.0)
+        field.event_queue.after(rng.random() * TELEMETRY_S, partial(field.report, index))
+    field.event_queue.run_until(field.event_queue.now + 5.0)
     result["busy"] = _rates(field, 10.0)
     field.busy = False
     field.cut = True
@@ -207,7 +207,7 @@ def measure(count: int) -> dict[str, Any]:
 def _rates(field: OpenField, count_s: float) -> dict[str, float]:
     before = [tuple(sent) for sent in field.sent[1:]]
     broadcast_before = field.broadcast_s
-    field.agenda.run_until(field.agenda.now + count_s)
+    field.event_queue.run_until(field.event_queue.now + count_s)
     datagrams = sum(now[0] - then[0] for now, then in zip(field.sent[1:], before, strict=True))
     size = sum(now[1] - then[1] for now, then in zip(field.sent[1:], before, strict=True))
     robots = len(field.nodes) - 1

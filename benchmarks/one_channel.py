@@ -93,7 +93,7 @@ class OneChannel:
         self.channel = channel
         self.airtime_s = self.base_airtime_s = 0.0
         self.team = Team(settings, channel=channel, loss=lambda a, b, now: loss, seed=seed, on_event=self._on_event)
-        agenda = self.team.agenda
+        agenda = self.team.event_queue
         for number, name in enumerate((*self.senders, *self.guests)):
             # robots do not report at one moment
             if telemetry:
@@ -104,9 +104,9 @@ class OneChannel:
     def run(self) -> None:
         """To the end; `airtime_s` is then what everybody sent while counting, `base_airtime_s` what the base sent."""
         counts = self.team.medium.counts
-        self.team.agenda.run_until(COUNT_FROM_S)
+        self.team.event_queue.run_until(COUNT_FROM_S)
         all_before, base_before = counts.airtime_s, counts.airtime_s_of["base"]
-        self.team.agenda.run_until(COUNT_FROM_S + COUNT_S)
+        self.team.event_queue.run_until(COUNT_FROM_S + COUNT_S)
         self.airtime_s = counts.airtime_s - all_before
         self.base_airtime_s = counts.airtime_s_of["base"] - base_before
 
@@ -115,7 +115,7 @@ class OneChannel:
 
     @property
     def _counting(self) -> bool:
-        return self.team.agenda.now >= COUNT_FROM_S
+        return self.team.event_queue.now >= COUNT_FROM_S
 
     def _fill(self, name: str) -> None:
         for _ in range(WAITING_BULKS):
@@ -130,12 +130,12 @@ class OneChannel:
             raise RuntimeError(f"{name}: {topic} was refused: {outcome.reason.value} {outcome.detail}")
 
     def _report(self, name: str) -> None:
-        now = self.team.agenda.now
+        now = self.team.event_queue.now
         if now >= COUNT_FROM_S + COUNT_S - 1.0:
             return
         self.seen[name].offered += self._counting
         self._send(name, TELEMETRY, _SENT.pack(now).ljust(TELEMETRY_BYTES, b"\0"))
-        self.team.agenda.after(TELEMETRY_S, partial(self._report, name))
+        self.team.event_queue.after(TELEMETRY_S, partial(self._report, name))
 
     def _on_event(self, now: float, robot: str, event: Event) -> None:
         match event:
@@ -220,16 +220,16 @@ def hops(loss: float, *, bulk: bool) -> dict[str, Any]:
 
     def report() -> None:
         send(TELEMETRY, TELEMETRY_BYTES)
-        made.agenda.after(1.0, report)
+        made.event_queue.after(1.0, report)
 
     settings = {name: Settings(name, unkeyed=True, topics=TOPICS) for name in ("base", "rover")}
     made = Team(settings, relays=row[1:3], channel=Channel(attempts=4), loss=lost, seed=1, on_event=note)
-    made.agenda.at(MET_OVER_HOPS_S, report)
+    made.event_queue.at(MET_OVER_HOPS_S, report)
     if bulk:
         for _ in range(WAITING_BULKS):
-            made.agenda.at(MET_OVER_HOPS_S, partial(send, BULK, BULK_BYTES))
+            made.event_queue.at(MET_OVER_HOPS_S, partial(send, BULK, BULK_BYTES))
     # half a second more for what was sent last
-    made.agenda.run_until(MET_OVER_HOPS_S + HOPS_S - 0.5)
+    made.event_queue.run_until(MET_OVER_HOPS_S + HOPS_S - 0.5)
     intervals_s = [later - earlier for earlier, later in itertools.pairwise(arrivals_s)]
     return {
         "set": "hops",

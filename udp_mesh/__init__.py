@@ -1,9 +1,9 @@
-"""udp_mesh moves prioritized messages between robots over nothing but unicast and broadcast UDP.
+"""Prioritized messages between robots over unicast and broadcast UDP.
 
 The flow: bytes -> frame -> session -> scheduler -> message (docs/design.md, docs/wire-format.md).
 
-`from udp_mesh import Node, Settings, Topic, Key` is the library; the names are loaded when they are first used, so
-that the client and the bridges, which import this package on older Pythons, load nothing of it.
+Use it as a library with `from udp_mesh import Node, Settings, Topic, Key`. Names are imported on first use, so that
+the client and the bridges, which import this package on older Pythons, load nothing else.
 """
 
 import importlib
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from udp_mesh.daemon.api_node import Node as Node
     from udp_mesh.daemon.api_node import SendRefusedError as SendRefusedError
     from udp_mesh.daemon.outbox import DirectoryStore as DirectoryStore
-    from udp_mesh.links.attachments import LinkWish as LinkWish
+    from udp_mesh.links.attachments import LinkConfig as LinkConfig
 
 __version__ = "0.1.0"
 
 _EXPORTS = {
     "Node": "udp_mesh.daemon.api_node",
     "SendRefusedError": "udp_mesh.daemon.api_node",
-    "LinkWish": "udp_mesh.links.attachments",
+    "LinkConfig": "udp_mesh.links.attachments",
     "DirectoryStore": "udp_mesh.daemon.outbox",
     "Settings": "udp_mesh.core.settings",
     "Topic": "udp_mesh.core.settings",

@@ -1,5 +1,6 @@
-"""Bridges: processes beside the daemon that carry a middleware's messages over the mesh, unread.
+"""Bridges: processes beside the daemon that carry a middleware's messages over the mesh without parsing them.
 
-Shared by all: `names`, `types`, `exchange` (what bridges tell each other), `relay` (who gets what), all pure;
-`port`, the connection to the daemon. Python 3.8 and the standard library, for old ROS interpreters; docs/bridges.md.
+Shared and pure: `names`, `types`, `protocol` (messages between bridges), `relay` (routing decisions). `daemon_client`
+is the connection to the daemon, `runtime` joins it to the relay. Python 3.8 and the standard library only, for old ROS
+interpreters; docs/bridges.md.
 """

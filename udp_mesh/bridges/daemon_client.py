@@ -1,9 +1,9 @@
-"""A bridge's connection to the daemon: kept up through restarts of the daemon, on a thread of its own.
+"""A bridge's connection to the daemon, on a thread of its own; it survives restarts of the daemon.
 
-`run` connects, subscribes, says `on_up`, hands every frame to `on_frame`, and starts over when the daemon is gone.
+`run` connects, subscribes, calls `on_up`, passes every frame to `on_frame`, and reconnects when the daemon goes away.
 `publish` may be called from any thread; `request` uses a second connection, so that no reply waits behind messages.
 
-What the daemon refuses is counted, and told once per REPORT_S: thirty images a second must not become as many lines.
+Refused messages are counted and logged once per LOG_INTERVAL_S: thirty images a second must not become thirty lines.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from udp_mesh.client.mesh_client import Frame, Header, MeshClient, MeshError
 log = logging.getLogger(__name__)
 
 CONDITIONS_TOPIC = "~mesh/conditions"
-READ_S = 0.5
-"""How long a read waits before it looks whether to stop."""
+READ_TIMEOUT_S = 0.5
+"""Timeout of a read, after which the stop flag is checked."""
 RECONNECT_S = 1.0
-"""Between two attempts to reach the daemon: its restart takes about that long."""
-REPORT_S = 10.0
-"""Between two lines about messages that were refused."""
+"""Delay between attempts to connect: a daemon's restart takes about that long."""
+LOG_INTERVAL_S = 10.0
+"""Interval between log lines about refused messages."""
 
 
-class MeshPort:
-    """The daemon as a bridge sees it."""
+class DaemonClient:
+    """The daemon, as seen by a bridge."""
 
     def __init__(self, path: str, patterns: Sequence[str]) -> None:
         self._path = path
@@ -36,13 +36,13 @@ class MeshPort:
         self._commands: MeshClient | None = None
         self._command_lock = threading.Lock()
         self.refused = 0
-        """Messages that could not be handed over: no daemon, or the daemon refused them."""
-        self._told_at: float | None = None
-        self._untold = 0
+        """Messages that were not accepted: no daemon, or the daemon refused them."""
+        self._logged_at: float | None = None
+        self._unlogged = 0
 
     def run(self, stop: threading.Event, on_up: Callable[[], None], on_frame: Callable[[Frame], None]) -> None:
-        """Until `stop`. `on_up` is called after every connect, on this thread, as is `on_frame`."""
-        told = False
+        """Runs until `stop` is set. Calls `on_up` after every connect, and `on_frame`, on this thread."""
+        unreachable = False
         while not stop.is_set():
             try:
                 with MeshClient(self._path) as client:
@@ -50,50 +50,50 @@ class MeshPort:
                     client.request("events")
                     self._client = client
                     log.info("daemon-connected socket=%s", self._path)
-                    told = False
+                    unreachable = False
                     on_up()
                     while not stop.is_set():
-                        frame = client.next_frame(READ_S)
+                        frame = client.next_frame(READ_TIMEOUT_S)
                         if frame is not None:
-                            self._take(frame, on_frame)
+                            self._on_frame(frame, on_frame)
             except MeshError as error:
-                if not told:
+                if not unreachable:
                     log.warning("daemon-unreachable %s", error)
-                    told = True
+                    unreachable = True
             finally:
                 self._client = None
             stop.wait(RECONNECT_S)
-        self._drop_commands()
+        self._close_commands()
 
-    def _take(self, frame: Frame, on_frame: Callable[[Frame], None]) -> None:
+    def _on_frame(self, frame: Frame, on_frame: Callable[[Frame], None]) -> None:
         header = frame[0]
         if header.get("event") == "rejected":
-            self._refuse("{}: {}".format(header.get("code"), header.get("error")))
+            self._count_refused("{}: {}".format(header.get("code"), header.get("error")))
         elif header.get("event") == "dropped":
-            log.warning("messages-lost count=%s this program read too slowly", header.get("messages"))
+            log.warning("messages-lost count=%s the bridge reads too slowly", header.get("messages"))
         else:
             on_frame(frame)
 
-    def _refuse(self, reason: str) -> None:
+    def _count_refused(self, reason: str) -> None:
         self.refused += 1
-        self._untold += 1
+        self._unlogged += 1
         now = time.monotonic()
-        if self._told_at is None or now - self._told_at >= REPORT_S:
-            self._told_at = now
-            log.warning("messages-refused count=%d %s", self._untold, reason)
-            self._untold = 0
+        if self._logged_at is None or now - self._logged_at >= LOG_INTERVAL_S:
+            self._logged_at = now
+            log.warning("messages-refused count=%d %s", self._unlogged, reason)
+            self._unlogged = 0
 
     def publish(self, topic: str, payload: bytes, peer: str | None, type_text: str) -> bool:
-        """Hands a message over; False where there is no daemon now. What the daemon refuses is logged."""
+        """Publishes a message; False if there is no daemon now. A refusal by the daemon is logged."""
         client = self._client
         if client is None:
-            self._refuse("{}: no daemon".format(topic))
+            self._count_refused("{}: the daemon is not connected".format(topic))
             return False
         try:
             client.publish(topic, payload, to=peer, type=type_text, wait=False)
             return True
         except MeshError as error:
-            self._refuse("{}: {}".format(topic, error))
+            self._count_refused("{}: {}".format(topic, error))
             return False
 
     def request(self, op: str, **fields: Any) -> Header:
@@ -109,18 +109,18 @@ class MeshPort:
                     self._commands = None
                 raise
 
-    def _drop_commands(self) -> None:
+    def _close_commands(self) -> None:
         with self._command_lock:
             if self._commands is not None:
                 self._commands.close()
                 self._commands = None
 
-    # What bridges ask the daemon
+    # Requests
 
     def ensure_topics(self, wanted: Mapping[str, Mapping[str, object]]) -> dict[str, tuple[str, ...]]:
-        """Declares topics the daemon does not know; returns all it knows, each with its destinations.
+        """Declares topics unknown to the daemon; returns all declared topics with their destinations.
 
-        The daemon's file goes first: a topic it lists stays as it is. Raises MeshError.
+        The daemon's configuration takes precedence: topics listed there are not changed. Raises MeshError.
         """
         found = self.topics()
         for topic, values in wanted.items():
@@ -134,14 +134,14 @@ class MeshPort:
         rows = self.request("topics")["topics"]
         return {row["name"]: tuple(row.get("destinations", ())) for row in rows if row["configured"]}
 
-    def takes_undeclared(self) -> bool:
-        """Whether the daemon carries topics nobody declared. Raises MeshError."""
+    def accepts_undeclared(self) -> bool:
+        """Whether the daemon accepts undeclared topics. Raises MeshError."""
         return self.request("topics")["undeclared"] is not None
 
     def peers(self) -> dict[str, bool]:
-        """Peers the daemon knows: whether each is online. Raises MeshError."""
+        """The daemon's peers, and whether each is online. Raises MeshError."""
         return {row["name"]: bool(row["online"]) for row in self.request("peers")["peers"]}
 
-    def own_name(self) -> str:
-        """The daemon's name. Raises MeshError."""
+    def node_name(self) -> str:
+        """The daemon's node name. Raises MeshError."""
         return str(self.request("status")["conditions"]["name"])

@@ -1,8 +1,8 @@
-"""A Zenoh sample as bytes for the mesh, and back: key, kind, quality of service, encoding, attachment, payload. Pure.
+"""A Zenoh sample <-> bytes: key, kind, quality of service, encoding, attachment, payload. Pure.
 
-Big-endian: version u8 (1), flags u8, priority u8 (1 to 7, Zenoh's), key length u16, encoding length u16, attachment
-length u32, then key, encoding, attachment, payload. Neither payload nor attachment is read: CDR and the attachment of
-`rmw_zenoh` (sequence number, time, publisher) arrive as they left.
+Big-endian: version u8 (1), flags u8, priority u8 (1 to 7, as in Zenoh), key length u16, encoding length u16, attachment
+length u32, then key, encoding, attachment, payload. Payload and attachment are opaque: CDR and the attachment of
+`rmw_zenoh` (sequence number, time, publisher) arrive unchanged.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 VERSION = 1
 TYPE = "zenoh"
-"""The mesh's type field of every such message: other bridges leave it alone, and this one leaves the others'."""
+"""The mesh type field of these messages: other bridges ignore them, and this one ignores other types."""
 _HEAD = struct.Struct(">BBBHHI")
 _DELETE, _EXPRESS, _BLOCK, _ATTACHED, _AGAIN = 1, 2, 4, 8, 16
 _FLAGS = _DELETE | _EXPRESS | _BLOCK | _ATTACHED | _AGAIN
@@ -20,12 +20,12 @@ PRIORITIES = range(1, 8)
 
 
 class EnvelopeError(ValueError):
-    """These bytes hold no sample; says why."""
+    """These bytes are not a valid sample."""
 
 
 class Envelope(NamedTuple):
-    """One sample. `block`: Zenoh waits rather than drops under congestion; `attachment`: None is not the empty one;
-    `again`: told to a late robot, which may have it already."""
+    """One sample. `block`: Zenoh waits instead of dropping under congestion; `attachment`: None differs from empty;
+    `again`: sent again for a late joiner, so others may have it already."""
 
     key: str
     payload: bytes
@@ -39,7 +39,7 @@ class Envelope(NamedTuple):
 
 
 def seal(sample: Envelope) -> bytes:
-    """The bytes of a sample. Raises EnvelopeError where its key or encoding is longer than the format holds."""
+    """Encodes a sample. Raises EnvelopeError if its key or encoding exceeds the format's limit."""
     key, encoding = sample.key.encode(), sample.encoding.encode()
     if len(key) > 0xFFFF or len(encoding) > 0xFFFF:
         raise EnvelopeError("key and encoding: expected at most 65535 bytes each")
@@ -56,7 +56,7 @@ def seal(sample: Envelope) -> bytes:
 
 
 def open_envelope(data: bytes) -> Envelope:
-    """The sample in these bytes. Raises EnvelopeError."""
+    """Decodes a sample. Raises EnvelopeError."""
     if len(data) < _HEAD.size:
         raise EnvelopeError("expected at least {} bytes, found {}".format(_HEAD.size, len(data)))
     version, flags, priority, key_bytes, encoding_bytes, attachment_bytes = _HEAD.unpack_from(data)
@@ -66,14 +66,14 @@ def open_envelope(data: bytes) -> Envelope:
     attachment_at = encoding_at + encoding_bytes
     payload_at = attachment_at + attachment_bytes
     if payload_at > len(data) or not key_bytes or (attachment_bytes and not flags & _ATTACHED):
-        raise EnvelopeError("its parts' lengths do not fit {} bytes".format(len(data)))
+        raise EnvelopeError("field lengths do not match a total of {} bytes".format(len(data)))
     try:
         key = data[_HEAD.size : encoding_at].decode("utf-8")
         encoding = data[encoding_at:attachment_at].decode("utf-8")
     except UnicodeDecodeError as error:
-        raise EnvelopeError("key or encoding is no UTF-8") from error
+        raise EnvelopeError("key or encoding is not valid UTF-8") from error
     if any(sign in key for sign in "*$?#"):
-        raise EnvelopeError("expected one key, found the expression {!r}".format(key))
+        raise EnvelopeError("expected one key, found the key expression {!r}".format(key))
     attachment = data[attachment_at:payload_at] if flags & _ATTACHED else None
     return Envelope(
         key,

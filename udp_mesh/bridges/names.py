@@ -1,7 +1,7 @@
-"""Names of the fielded system: mesh peer and topic <-> ROS name. Pure.
+"""Names of the legacy system: mesh peer and topic <-> ROS name. Pure.
 
-To send to one robot, a node publishes on `/<self>/mesh_comm/<peer>/<topic>`, to all on `/<self>/mesh_comm/<topic>`;
-what arrives comes out on `/<source>/mesh_comm/<self>/<topic>`. So nothing that came in has a name that goes out.
+A node publishes on `/<self>/mesh_comm/<peer>/<topic>` for one robot and on `/<self>/mesh_comm/<topic>` for all;
+received messages are published on `/<source>/mesh_comm/<self>/<topic>`, which never matches an outgoing name.
 """
 
 from __future__ import annotations
@@ -14,38 +14,38 @@ _NOT_ROS = re.compile(r"[^A-Za-z0-9_]")
 
 
 class Route(NamedTuple):
-    """Where a message of one ROS name goes: a mesh topic, to one peer or (None) to the topic's destinations."""
+    """Destination of messages on one ROS name: a mesh topic, and one peer or (None) the topic's destinations."""
 
     topic: str
     peer: str | None
 
 
 def ros_word(name: str) -> str:
-    """A mesh name as one part of a ROS name: `ugv-1` is `ugv_1`, `3d` is `n3d` (a part starts with a letter)."""
+    """A mesh name as one segment of a ROS name: `ugv-1` is `ugv_1`, `3d` is `n3d` (a segment starts with a letter)."""
     word = _NOT_ROS.sub("_", name) or "_"
     return word if word[0].isalpha() else "n" + word
 
 
 def ros_path(topic: str) -> str:
-    """A mesh topic as the end of a ROS name, part by part; a leading slash is dropped."""
+    """A mesh topic as the end of a ROS name, segment by segment; a leading slash is dropped."""
     return "/".join(ros_word(part) for part in topic.split("/") if part) or "_"
 
 
 def inbound_name(own: str, source: str, topic: str) -> str:
-    """Where a message from `source` comes out."""
+    """The ROS name on which messages from `source` are published."""
     return "/{}/{}/{}/{}".format(ros_word(source), PREFIX, ros_word(own), ros_path(topic))
 
 
 def outbound_name(own: str, route: Route) -> str:
-    """Where a node publishes what shall take this route."""
+    """The ROS name on which local nodes publish for this route."""
     peer = "" if route.peer is None else ros_word(route.peer) + "/"
     return "/{}/{}/{}{}".format(ros_word(own), PREFIX, peer, ros_path(route.topic))
 
 
 def routes(own: str, topics: Iterable[str], peers: Iterable[str]) -> dict[str, Route]:
-    """Every ROS name to listen on. Where a broadcast topic `x/y` and topic `y` to peer `x` share a name, the peer wins.
+    """Every ROS name to subscribe to. If a broadcast topic `x/y` and topic `y` to peer `x` share a name, the peer wins.
 
-    A robot whose name reads like our own in ROS is left out: its messages could not be told from ours.
+    A robot whose ROS name equals our own is left out, since its messages could not be distinguished from ours.
     """
     found: dict[str, Route] = {}
     names = list(topics)
@@ -61,7 +61,7 @@ def routes(own: str, topics: Iterable[str], peers: Iterable[str]) -> dict[str, R
 
 
 def undeclared_route(own: str, name: str, peers: Iterable[str]) -> Route | None:
-    """The route of a published name whose topic nobody declared; None for a name outside our own prefix."""
+    """The route of a published name whose topic is not declared; None for a name outside our own prefix."""
     start = "/{}/{}/".format(ros_word(own), PREFIX)
     if not name.startswith(start):
         return None
@@ -73,16 +73,16 @@ def undeclared_route(own: str, name: str, peers: Iterable[str]) -> Route | None:
 
 
 class ListedTopic(NamedTuple):
-    """One entry of the fielded parameter `topic_list`."""
+    """One entry of the legacy parameter `topic_list`."""
 
     topic: str
     priority: int
 
 
 def parse_topic_list(entries: Iterable[object]) -> tuple[list[ListedTopic], list[str]]:
-    """Entries `priority|pkg/Type|topic` -> topics, and a sentence for each entry that is none.
+    """Entries `priority|pkg/Type|topic` -> topics, and a description of each invalid entry.
 
-    The type is not needed: every message says its own. Priorities beyond 15 become 15, the mesh's last level.
+    The type is ignored: every message carries its own. Priorities above 15 become 15, the least urgent level.
     """
     found: list[ListedTopic] = []
     problems: list[str] = []

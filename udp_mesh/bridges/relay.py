@@ -1,10 +1,10 @@
-"""Decides what a ROS bridge does with everything that happens, as effects for its edges. Pure; no clock, no ROS.
+"""Decides what a ROS bridge does, as effects for the runtime to execute. Pure: no clock, no ROS.
 
-1. From ROS: the definition goes out once per destination, then the message, its type in the type field. The last of
-   every latched publisher is kept for robots that join later.
-2. From the mesh: a message whose definition is here is published; others wait, and their source is asked.
-3. From other bridges: greetings are answered with the latched messages they lack, questions with definitions.
-4. Peers that come online are greeted. `tick` asks again.
+1. From ROS: the definition is sent once per destination, then the message with its type in the type field. The last
+   message of every latched publisher is stored for robots that join later.
+2. From the mesh: a message whose definition is known is published; others wait while the source is asked for it.
+3. From other bridges: a `Hello` is answered with the missing latched messages, a `Want` with definitions.
+4. Peers that come online get a `Hello`. `tick` repeats unanswered requests.
 """
 
 from __future__ import annotations
@@ -14,29 +14,29 @@ from collections import OrderedDict, deque
 from typing import Deque, Iterable, Literal, Mapping, NamedTuple, Union
 
 from udp_mesh.bridges.names import Route, inbound_name, ros_word
-from udp_mesh.bridges.protocol import Definition, ExchangeError, Hello, Want, decode, encode
+from udp_mesh.bridges.protocol import Definition, Hello, ProtocolError, Want, decode, encode
 from udp_mesh.bridges.types import Definitions, Mark, MessageKind, TypeKey, kind_text, parse_kind
 
 MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 64, 32 << 20
-"""Per source, while a definition is on its way: a second's worth; more is dropped, the oldest first."""
+"""Per source, while a definition is requested: a second's worth of messages; beyond it, the oldest is dropped."""
 MAX_LATCHED, MAX_LATCHED_BYTES = 4096, 64 << 20
-"""Latched messages kept for late robots: a publisher that latches under ever new names."""
+"""Latched messages stored for late joiners, in case a node latches under ever new names."""
 MAX_LATCHED_PER_ROUTE = 32
-"""Publishers that latch on one topic (tf_static); past it the oldest is forgotten, as are the names of programs that
-came, latched and went."""
-MAX_HELD = 4 * MAX_LATCHED_PER_ROUTE
-"""Publishers whose last latched message is remembered, per source and topic: more than a source can repeat by its two
-routes to us, or an old one would be published over a new one."""
-ASK_AGAIN_S = 1.0
-"""Between two questions for one definition."""
-GIVE_UP_S = 30.0
-"""How long a message waits for its definition, and later ones of its topic behind it: a bridge may just be starting."""
+"""Latching publishers per topic (tf_static); beyond it, the oldest is dropped, such as programs that latched and
+exited."""
+MAX_TRACKED_PUBLISHERS = 4 * MAX_LATCHED_PER_ROUTE
+"""Publishers per source and topic whose last latched message is remembered: more than a source can repeat over its two
+routes to us, since an old message would otherwise be published after a newer one."""
+REQUEST_RETRY_S = 1.0
+"""Interval between requests for the same definition."""
+DEFINITION_TIMEOUT_S = 30.0
+"""How long a message, and later ones of its topic, wait for its definition: the other bridge may be starting."""
 MAX_NOTED = 1000
-"""Things told once: names are a peer's to invent."""
+"""Distinct warnings logged; peers can invent names without bound."""
 
 
 class ToMesh(NamedTuple):
-    """Publish on the mesh; `peer` None: the topic's destinations, or all."""
+    """Publish on the mesh; `peer` None means the topic's destinations, or all."""
 
     topic: str
     payload: bytes
@@ -45,7 +45,7 @@ class ToMesh(NamedTuple):
 
 
 class ToRos(NamedTuple):
-    """Publish in ROS. `definition` is None where the source did not say (a fielded robot)."""
+    """Publish in ROS. `definition` is None if the source did not send one (a legacy robot)."""
 
     name: str
     key: TypeKey
@@ -55,7 +55,7 @@ class ToRos(NamedTuple):
 
 
 class Note(NamedTuple):
-    """Tell the operator."""
+    """Log a warning."""
 
     text: str
 
@@ -71,30 +71,30 @@ class _Waiting(NamedTuple):
 
 
 class Relay:
-    """One bridge's state. ROS 1 types have two parts (`pkg/Type`), and a message can only be published with its
-    definition; ROS 2 types have three (`pkg/msg/Type`), and must be installed on both sides."""
+    """State of one bridge. ROS 1 types have two parts (`pkg/Type`) and are published with their definition; ROS 2 types
+    have three (`pkg/msg/Type`) and must be installed on both sides."""
 
-    def __init__(self, own: str, exchange_topic: str, *, ros_version: Literal[1, 2], nonce: bytes) -> None:
-        """`nonce`: random, so that the numbers of another start of this bridge are not taken for later or earlier."""
+    def __init__(self, own: str, protocol_topic: str, *, ros_version: Literal[1, 2], nonce: bytes) -> None:
+        """`nonce`: random, so that message numbers of different runs of this bridge are never compared."""
         self.own = own
         self._nonce = nonce
         self._number = 0
-        self.exchange_topic = exchange_topic
+        self.protocol_topic = protocol_topic
         self.dropped = 0
         self._needs_definitions = ros_version == 1
         self._slashes = ros_version
         self._definitions = Definitions()
-        self._told: set[tuple[TypeKey, str | None]] = set()
+        self._sent_definitions: set[tuple[TypeKey, str | None]] = set()
         self._latched: OrderedDict[tuple[Route, str], tuple[MessageKind, bytes]] = OrderedDict()
         self._latched_bytes = 0
-        self._holds: dict[str, dict[str, OrderedDict[str, int]]] = {}
+        self._last_numbers: dict[str, dict[str, OrderedDict[str, int]]] = {}
         self._waiting: dict[str, Deque[_Waiting]] = {}
-        self._asked_at: dict[tuple[str, TypeKey], float] = {}
+        self._requested_at: dict[tuple[str, TypeKey], float] = {}
         self._destinations: Mapping[str, Iterable[str]] = {}
         self._noted: set[Route | str] = set()
 
-    def topics_are(self, destinations: Mapping[str, Iterable[str]]) -> None:
-        """The daemon's topics, each with the peers it goes to (none: all)."""
+    def set_destinations(self, destinations: Mapping[str, Iterable[str]]) -> None:
+        """Sets the daemon's topics, each with its destinations (none: all)."""
         self._destinations = destinations
 
     # From ROS
@@ -102,16 +102,16 @@ class Relay:
     def from_ros(
         self, route: Route, publisher: str, key: TypeKey, definition: str, latched: bool, payload: bytes
     ) -> list[Effect]:
-        """A node published. `publisher` tells apart several that latch on one topic."""
+        """Handles a message from ROS. `publisher` distinguishes several that latch on one topic."""
         effects: list[Effect] = []
         if "/" not in key.name:
-            # A publisher of any type, which says none before its first message: nobody could read it.
-            return self._note_once(route, "{} publishes type {!r} on {}".format(publisher, key.name, route.topic))
+            # A publisher of any type (AnyMsg) has no type before its first message: receivers could not decode it.
+            return self._note_once(route, "{}: unsupported type {!r} on {}".format(publisher, key.name, route.topic))
         if self._needs_definitions:
             if definition or key not in self._definitions:
                 self._definitions.put(key, definition)
-            if (key, route.peer) not in self._told:
-                self._told.add((key, route.peer))
+            if (key, route.peer) not in self._sent_definitions:
+                self._sent_definitions.add((key, route.peer))
                 effects.append(self._to_bridges(Definition(key, definition), route.peer))
         kind = MessageKind(key)
         if latched:
@@ -136,36 +136,37 @@ class Relay:
     # From the mesh
 
     def from_mesh(self, source: str, topic: str, type_text: str, payload: bytes, now: float) -> list[Effect]:
-        """A message arrived."""
-        if topic == self.exchange_topic:
+        """Handles a message from the mesh."""
+        if topic == self.protocol_topic:
             return self._from_bridge(source, payload)
         kind = parse_kind(type_text)
         if kind is None or kind.key.name.count("/") != self._slashes:
             return []
         if ros_word(source) == ros_word(self.own):
-            return self._note_once(source, "{} reads like our own name: its messages are not published".format(source))
-        if kind.mark is not None and not self._is_news(source, topic, kind.mark):
+            text = "{}: same ROS name as this robot: its messages are not published".format(source)
+            return self._note_once(source, text)
+        if kind.mark is not None and not self._is_newer(source, topic, kind.mark):
             return []
         message = _Waiting(topic, kind, payload, now)
         waiting = self._waiting.get(source)
         blocked = waiting is not None and any(other.topic == topic for other in waiting)
-        if not blocked and self._known(kind.key):
+        if not blocked and self._is_publishable(kind.key):
             return [self._publication(source, message)]
-        self._wait(source, message)
-        return self._ask(source, kind.key, now)
+        self._enqueue(source, message)
+        return self._request_definition(source, kind.key, now)
 
-    def _is_news(self, source: str, topic: str, mark: Mark) -> bool:
-        """Whether no later latched message of its publisher came before it, nor itself."""
-        held = self._holds.setdefault(source, {}).setdefault(topic, OrderedDict())
+    def _is_newer(self, source: str, topic: str, mark: Mark) -> bool:
+        """Whether neither this message nor a later one of its publisher was received before."""
+        held = self._last_numbers.setdefault(source, {}).setdefault(topic, OrderedDict())
         if held.get(mark.publisher, -1) >= mark.number:
             return False
         held.pop(mark.publisher, None)
         held[mark.publisher] = mark.number
-        while len(held) > MAX_HELD:
+        while len(held) > MAX_TRACKED_PUBLISHERS:
             held.popitem(last=False)
         return True
 
-    def _known(self, key: TypeKey) -> bool:
+    def _is_publishable(self, key: TypeKey) -> bool:
         return not self._needs_definitions or not key.checksum or key in self._definitions
 
     def _publication(self, source: str, message: _Waiting) -> ToRos:
@@ -173,42 +174,42 @@ class Relay:
         name = inbound_name(self.own, source, message.topic)
         return ToRos(name, key, self._definitions.get(key), message.kind.mark is not None, message.payload)
 
-    def _wait(self, source: str, message: _Waiting) -> None:
+    def _enqueue(self, source: str, message: _Waiting) -> None:
         waiting = self._waiting.setdefault(source, deque())
         waiting.append(message)
         while len(waiting) > MAX_WAITING_MESSAGES or sum(len(each.payload) for each in waiting) > MAX_WAITING_BYTES:
             waiting.popleft()
             self.dropped += 1
 
-    def _ask(self, source: str, key: TypeKey, now: float) -> list[Effect]:
-        asked_at = self._asked_at.get((source, key))
-        if self._known(key) or (asked_at is not None and now - asked_at < ASK_AGAIN_S):
+    def _request_definition(self, source: str, key: TypeKey, now: float) -> list[Effect]:
+        asked_at = self._requested_at.get((source, key))
+        if self._is_publishable(key) or (asked_at is not None and now - asked_at < REQUEST_RETRY_S):
             return []
-        self._asked_at[source, key] = now
+        self._requested_at[source, key] = now
         return [self._to_bridges(Want([key]), source)]
 
-    # Between bridges
+    # From other bridges
 
     def _from_bridge(self, source: str, payload: bytes) -> list[Effect]:
         try:
             message = decode(payload)
-        except ExchangeError as error:
-            return [Note("a message from {} on {}: {}".format(source, self.exchange_topic, error))]
+        except ProtocolError as error:
+            return [Note("invalid message from {} on {}: {}".format(source, self.protocol_topic, error))]
         if isinstance(message, Definition):
             if not self._definitions.put(message.key, message.text):
                 return []
-            return self._resume()
+            return self._publish_waiting()
         if isinstance(message, Want):
-            return self._tell(message.keys, source)
+            return self._send_definitions(message.keys, source)
         effects = [self.greeting(source, answer=False)] if message.answer else []
-        return effects + self._missing(source, message.holds)
+        return effects + self._missing_latched(source, message.holds)
 
-    def _tell(self, keys: Iterable[TypeKey], peer: str) -> list[Effect]:
+    def _send_definitions(self, keys: Iterable[TypeKey], peer: str) -> list[Effect]:
         found = ((key, self._definitions.get(key)) for key in keys)
         return [self._to_bridges(Definition(key, text), peer) for key, text in found if text is not None]
 
-    def _missing(self, peer: str, holds: Mapping[str, Mapping[str, int]]) -> list[Effect]:
-        """Our latched messages that the peer has not."""
+    def _missing_latched(self, peer: str, holds: Mapping[str, Mapping[str, int]]) -> list[Effect]:
+        """Our latched messages that the peer does not have."""
         effects: list[Effect] = []
         for (route, _), (kind, payload) in self._latched.items():
             allowed = list(self._destinations.get(route.topic, ()))
@@ -218,14 +219,14 @@ class Relay:
                 effects.append(ToMesh(route.topic, payload, peer, kind_text(kind)))
         return effects
 
-    def _resume(self) -> list[Effect]:
-        """Publishes what waited for a definition, in order per source and topic."""
+    def _publish_waiting(self) -> list[Effect]:
+        """Publishes messages whose definition arrived, in order per source and topic."""
         effects: list[Effect] = []
         for source, waiting in list(self._waiting.items()):
             blocked: set[str] = set()
             left: Deque[_Waiting] = deque()
             for message in waiting:
-                if message.topic not in blocked and self._known(message.kind.key):
+                if message.topic not in blocked and self._is_publishable(message.kind.key):
                     effects.append(self._publication(source, message))
                 else:
                     blocked.add(message.topic)
@@ -234,49 +235,51 @@ class Relay:
                 self._waiting[source] = left
             else:
                 del self._waiting[source]
-        self._asked_at = {asked: at for asked, at in self._asked_at.items() if not self._known(asked[1])}
+        self._requested_at = {
+            asked: at for asked, at in self._requested_at.items() if not self._is_publishable(asked[1])
+        }
         return effects
 
     def greeting(self, peer: str | None, *, answer: bool) -> Effect:
-        """A greeting for one peer, or (None) for all."""
-        held = self._holds.get(peer, {}) if peer is not None else {}
+        """A `Hello` for one peer, or (None) for all."""
+        held = self._last_numbers.get(peer, {}) if peer is not None else {}
         return self._to_bridges(Hello({topic: dict(numbers) for topic, numbers in held.items()}, answer), peer)
 
     def _to_bridges(self, message: Hello | Want | Definition, peer: str | None) -> ToMesh:
-        return ToMesh(self.exchange_topic, encode(message), peer, "bridge")
+        return ToMesh(self.protocol_topic, encode(message), peer, "bridge")
 
     # Peers and time
 
-    def started(self, online: Iterable[str]) -> list[Effect]:
-        """The daemon is there (again): greet everyone who is online."""
+    def on_daemon_up(self, online: Iterable[str]) -> list[Effect]:
+        """Sends a `Hello` to every online peer after each connect to the daemon."""
         return [self.greeting(peer, answer=True) for peer in online]
 
-    def peer_online(self, peer: str) -> list[Effect]:
-        """Greets it: each side then sends the latched messages that the other lacks."""
+    def on_peer_online(self, peer: str) -> list[Effect]:
+        """Sends a `Hello`, so that each side then sends the latched messages the other lacks."""
         return [self.greeting(peer, answer=True)]
 
     def tick(self, now: float) -> list[Effect]:
-        """Asks again for definitions that did not come, and gives up on what waited too long."""
-        effects = self._give_up(now) if self._waiting else []
+        """Repeats requests for definitions, and drops messages that waited too long."""
+        effects = self._expire_waiting(now) if self._waiting else []
         for source, waiting in self._waiting.items():
             for key in OrderedDict.fromkeys(message.kind.key for message in waiting):
-                effects += self._ask(source, key, now)
+                effects += self._request_definition(source, key, now)
         return effects
 
-    def _give_up(self, now: float) -> list[Effect]:
+    def _expire_waiting(self, now: float) -> list[Effect]:
         notes: list[Effect] = []
         for source, waiting in self._waiting.items():
-            late = [message for message in waiting if self._is_late(message, now)]
+            late = [message for message in waiting if self._is_expired(message, now)]
             if late:
                 names = sorted({message.kind.key.name for message in late})
-                notes.append(Note("{} did not tell what {} is: not published".format(source, ", ".join(names))))
+                notes.append(Note("{}: no definition received for {}: not published".format(source, ", ".join(names))))
                 self.dropped += len(late)
-                self._waiting[source] = deque(message for message in waiting if not self._is_late(message, now))
-        self._asked_at = {asked: at for asked, at in self._asked_at.items() if now - at <= GIVE_UP_S}
-        return notes + self._resume() if notes else notes
+                self._waiting[source] = deque(message for message in waiting if not self._is_expired(message, now))
+        self._requested_at = {asked: at for asked, at in self._requested_at.items() if now - at <= DEFINITION_TIMEOUT_S}
+        return notes + self._publish_waiting() if notes else notes
 
-    def _is_late(self, message: _Waiting, now: float) -> bool:
-        return now - message.since > GIVE_UP_S and not self._known(message.kind.key)
+    def _is_expired(self, message: _Waiting, now: float) -> bool:
+        return now - message.since > DEFINITION_TIMEOUT_S and not self._is_publishable(message.kind.key)
 
     def _note_once(self, about: Route | str, text: str) -> list[Effect]:
         if about in self._noted or len(self._noted) >= MAX_NOTED:

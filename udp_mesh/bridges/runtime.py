@@ -1,7 +1,7 @@
-"""What every ROS bridge does between the daemon and the relay: frames and messages in, effects carried out.
+"""The part between daemon and relay that all ROS bridges share: passes frames and messages in, executes effects.
 
-Several threads come here: the port's, and those of the middleware. The relay is entered under one lock; its effects run
-outside of it.
+Called by several threads: the daemon client's and the middleware's. The relay is protected by one lock; its effects are
+executed outside of it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import threading
 import time
 from typing import Callable, Mapping
 
-from udp_mesh.bridges.daemon_client import MeshPort
+from udp_mesh.bridges.daemon_client import DaemonClient
 from udp_mesh.bridges.names import Route
 from udp_mesh.bridges.protocol import TOPIC_SETTINGS
 from udp_mesh.bridges.relay import Effect, Note, Relay, ToMesh, ToRos
@@ -21,33 +21,33 @@ from udp_mesh.client.mesh_client import Frame, as_message
 log = logging.getLogger(__name__)
 
 
-class Joint:
-    """The daemon behind `port` and the ROS graph behind `to_ros`, joined by the relay."""
+class BridgeRuntime:
+    """Joins the daemon behind `daemon` and the ROS graph behind `to_ros` through the relay."""
 
     def __init__(
         self,
-        port: MeshPort,
+        daemon: DaemonClient,
         relay: Relay,
         to_ros: Callable[[ToRos], None],
         wanted: Mapping[str, Mapping[str, object]] | None = None,
     ) -> None:
-        """`to_ros` returns at once; `wanted` are topics that the daemon shall have besides, with their settings."""
-        self._port = port
+        """`to_ros` must not block; `wanted` are additional topics to declare, with their settings."""
+        self._daemon = daemon
         self._relay = relay
         self._to_ros = to_ros
-        self._wanted = {relay.exchange_topic: TOPIC_SETTINGS, **(wanted or {})}
+        self._wanted = {relay.protocol_topic: TOPIC_SETTINGS, **(wanted or {})}
         self._lock = threading.Lock()
 
-    def daemon_up(self) -> None:
-        """The port calls this after each connect. Raises MeshError."""
-        self.learn()
-        online = [peer for peer, is_online in self._port.peers().items() if is_online]
+    def on_daemon_up(self) -> None:
+        """Called by the daemon client after each connect. Raises MeshError."""
+        self.refresh_topics()
+        online = [peer for peer, is_online in self._daemon.peers().items() if is_online]
         with self._lock:
-            effects = self._relay.started(online)
+            effects = self._relay.on_daemon_up(online)
         self._run(effects)
 
-    def from_daemon(self, frame: Frame) -> None:
-        """The port calls this for each frame."""
+    def on_frame(self, frame: Frame) -> None:
+        """Called by the daemon client for each frame."""
         message, header = as_message(frame), frame[0]
         effects: list[Effect] = []
         with self._lock:
@@ -55,34 +55,34 @@ class Joint:
                 now = time.monotonic()
                 effects = self._relay.from_mesh(message.source, message.topic, message.type, message.payload, now)
             elif header.get("event") == "peer-online":
-                effects = self._relay.peer_online(str(header["peer"]))
+                effects = self._relay.on_peer_online(str(header["peer"]))
         self._run(effects)
 
     def from_ros(
         self, route: Route, publisher: str, key: TypeKey, definition: str, latched: bool, payload: bytes
     ) -> None:
-        """A node published."""
+        """Handles a message from a ROS node."""
         with self._lock:
             effects = self._relay.from_ros(route, publisher, key, definition, latched, payload)
         self._run(effects)
 
     def tick(self, now: float) -> None:
-        """What is due at `now` (monotonic seconds)."""
+        """Handles what is due at `now` (monotonic seconds)."""
         with self._lock:
             effects = self._relay.tick(now)
         self._run(effects)
 
-    def learn(self) -> dict[str, tuple[str, ...]]:
-        """The daemon's topics with their destinations, those wanted among them. Raises MeshError."""
-        topics = self._port.ensure_topics(self._wanted)
+    def refresh_topics(self) -> dict[str, tuple[str, ...]]:
+        """Declares the wanted topics; returns the daemon's topics with their destinations. Raises MeshError."""
+        topics = self._daemon.ensure_topics(self._wanted)
         with self._lock:
-            self._relay.topics_are(topics)
+            self._relay.set_destinations(topics)
         return topics
 
     def _run(self, effects: list[Effect]) -> None:
         for effect in effects:
             if isinstance(effect, ToMesh):
-                self._port.publish(effect.topic, effect.payload, effect.peer, effect.type)
+                self._daemon.publish(effect.topic, effect.payload, effect.peer, effect.type)
             elif isinstance(effect, ToRos):
                 self._to_ros(effect)
             elif isinstance(effect, Note):

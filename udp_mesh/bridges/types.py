@@ -1,10 +1,10 @@
-"""What a bridge says about a message without reading it: its type, in the mesh's type field. Pure.
+"""A message's type as the bridges put it into the mesh's type field. Pure.
 
-`pkg/Type CHECKSUM [latched:PUBLISHER:NUMBER]`: ROS 1 puts the md5sum there, ROS 2 the QoS. The definition crosses
-separately, once per type (`exchange`), and is kept here by type and checksum. A fielded robot sends `pkg/Type` alone.
+`pkg/Type CHECKSUM [latched:PUBLISHER:NUMBER]`: the checksum is the md5sum in ROS 1 and the QoS in ROS 2. The definition
+is sent separately, once per type (`protocol`), and stored by type and checksum. A legacy robot sends `pkg/Type` alone.
 
-The mesh may deliver a topic's messages in another order than they were sent. Of what is latched the last one must stay,
-so latched messages are numbered per publisher.
+The mesh may reorder the messages of a topic. Since the last latched message must win, latched messages are numbered per
+publisher.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from collections import OrderedDict
 from typing import NamedTuple
 
 MAX_TYPES = 1024
-"""Definitions kept: a robot has some dozens; more is a peer inventing names."""
+"""Definitions stored: a robot has some dozens, but a peer can invent names."""
 MAX_DEFINITION_BYTES = 1 << 18
-"""One definition: the largest of common ROS packages are some 10 kB."""
+"""Size of one definition: the largest of common ROS packages have some 10 kB."""
 MAX_DEFINITIONS_BYTES = 16 << 20
-"""All definitions together: as above."""
+"""Size of all definitions together."""
 _LATCHED = re.compile(r"latched:([0-9a-f]{1,16}):([0-9]{1,18})")
 
 
 class TypeKey(NamedTuple):
-    """What a definition is kept by. `checksum` is "" from a fielded robot."""
+    """The key of a definition. `checksum` is "" for a legacy robot's message."""
 
     name: str
     checksum: str
 
 
 class Mark(NamedTuple):
-    """A latched message's place: the later of one publisher's has the larger number. `publisher` is a hex word, another
+    """Identifies a latched message: later ones of a publisher have larger numbers. `publisher` is a hex word, a new
     one after each start of the bridge."""
 
     publisher: str
@@ -38,14 +38,14 @@ class Mark(NamedTuple):
 
 
 class MessageKind(NamedTuple):
-    """A message's type field. `mark`: late subscribers get the last one of each publisher; None: not latched."""
+    """A parsed type field. `mark` is None unless the message is latched: late joiners get each publisher's last one."""
 
     key: TypeKey
     mark: Mark | None = None
 
 
 def kind_text(kind: MessageKind) -> str:
-    """The mesh's type field."""
+    """Encodes the mesh's type field."""
     words = [kind.key.name]
     if kind.key.checksum:
         words.append(kind.key.checksum)
@@ -55,7 +55,7 @@ def kind_text(kind: MessageKind) -> str:
 
 
 def parse_kind(text: str) -> MessageKind | None:
-    """The kind in a type field; None for a type that no ROS bridge wrote."""
+    """Parses a type field; None for a type that was not written by a ROS bridge."""
     words = text.split(" ")
     if not 1 <= len(words) <= 3 or not all(words) or "/" not in words[0].strip("/"):
         return None
@@ -67,7 +67,7 @@ def parse_kind(text: str) -> MessageKind | None:
 
 
 class Definitions:
-    """Definitions by type, the longest unused forgotten first."""
+    """Definitions by type; the least recently used is dropped first."""
 
     def __init__(self) -> None:
         self._texts: OrderedDict[TypeKey, str] = OrderedDict()
@@ -83,7 +83,7 @@ class Definitions:
         return self._texts[key]
 
     def put(self, key: TypeKey, definition: str) -> bool:
-        """Keeps it; False where it is too long."""
+        """Stores a definition; False if it is too long."""
         size = len(definition.encode())
         if size > MAX_DEFINITION_BYTES:
             return False

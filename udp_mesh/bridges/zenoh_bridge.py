@@ -1,12 +1,12 @@
 """The Zenoh bridge: `python -m udp_mesh.bridges.zenoh_bridge --route 'demo/**=telemetry' --ros2 /chatter=talk ...`.
 
-1. A sample under a routed key expression is sealed whole (`envelope`) and published on the route's mesh topic.
-2. What other Zenoh bridges sent is put under its own key, with its encoding, attachment and quality of service.
-3. The liveliness tokens of routed ROS 2 topics are kept equal on both sides (`rmw_zenoh`).
-4. Robots and subscribers that come late get what transient local publishers keep: a robot that comes is told it again.
+1. A sample under a routed key expression is encoded (`envelope`) and published on the route's mesh topic.
+2. A sample from another Zenoh bridge is put under its own key, with its encoding, attachment and quality of service.
+3. The liveliness tokens of routed ROS 2 topics are synchronized between both sides (`rmw_zenoh`).
+4. Late joiners get the cached samples of transient local publishers: these are sent again when a robot comes online.
 
-Nothing that came from the mesh goes back: each bridge has a token `udp_mesh/bridge/<session>`, says its session in
-every sample it puts, and drops samples of every session that has such a token. Needs `eclipse-zenoh`.
+Samples from the mesh are never sent back: each bridge declares a token `udp_mesh/bridge/<session>`, names its session
+in every sample it puts, and drops samples of every session that has such a token. Requires `eclipse-zenoh`.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ try:
 except ModuleNotFoundError as error:
     raise SystemExit("udp_mesh.bridges.zenoh_bridge: {} (pip install eclipse-zenoh)".format(error)) from error
 
-from udp_mesh.bridges.daemon_client import MeshPort
+from udp_mesh.bridges.daemon_client import DaemonClient
 from udp_mesh.bridges.envelope import TYPE, Envelope, EnvelopeError, open_envelope, seal
 from udp_mesh.bridges.rmw_zenoh import (
     CARRIED,
     HISTORY,
     AnnouncementError,
-    Kept,
+    SampleDeduplicator,
     TokenChange,
     TokenExchange,
     carried_key,
@@ -43,13 +43,13 @@ from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError, Messag
 
 log = logging.getLogger(__name__)
 
-EXCHANGE_TOPIC = "bridge/zenoh"
-EXCHANGE_SETTINGS = {"priority": 1, "reliable": True, "compression": True, "keep_last": 1, "outbox": "last"}
-"""Announcements are whole, so only the last one counts, also for a peer that is away."""
+PROTOCOL_TOPIC = "bridge/zenoh"
+PROTOCOL_TOPIC_SETTINGS = {"priority": 1, "reliable": True, "compression": True, "keep_last": 1, "outbox": "last"}
+"""Announcements are complete, so only the last one matters, also for an offline peer."""
 BRIDGE = "udp_mesh/bridge"
-LOOK_S = 1.0
-HISTORY_S = 10.0
-"""How long publishers have to tell what they keep."""
+REFRESH_S = 1.0
+HISTORY_TIMEOUT_S = 10.0
+"""How long publishers may take to answer a query for cached samples."""
 
 
 class KeyRoute(NamedTuple):
@@ -86,34 +86,34 @@ def parse_ros2_route(text: str) -> KeyRoute:
 
 
 class Bridge:
-    """The running bridge. Zenoh's callbacks come on its threads, the mesh's on the port's; `_lock` guards what both
-    use."""
+    """The running bridge. Zenoh calls back on its own threads, the daemon client on another; `_lock` guards the shared
+    state."""
 
-    def __init__(self, port: MeshPort, session: Any, routes: Sequence[KeyRoute]) -> None:
-        self._port = port
+    def __init__(self, daemon: DaemonClient, session: Any, routes: Sequence[KeyRoute]) -> None:
+        self._daemon = daemon
         self._session = session
         self._own = str(session.info.zid())
         self._routes = routes
         # Zenoh may call back from within a declaration.
         self._lock = threading.RLock()
         self._bridges = {self._own}
-        self._exchange = TokenExchange()
+        self._token_exchange = TokenExchange()
         self._announced = b""
-        self._publishers = Publishers(session, self._exchange.depth)
-        self._held = Kept()
+        self._publishers = Publishers(session, self._token_exchange.depth)
+        self._deduplicator = SampleDeduplicator()
         self._tokens: dict[str, tuple[Any, Any]] = {}
-        self._kept: list[Any] = []
+        self._declarations: list[Any] = []
 
     def start(self) -> None:
-        """Declares everything. The token by which other bridges know us comes before the first sample."""
+        """Declares everything. The token that identifies this bridge comes before the first sample."""
         live = self._session.liveliness()
-        self._kept.append(live.declare_token("{}/{}".format(BRIDGE, self._own)))
-        self._kept.append(live.declare_subscriber(BRIDGE + "/*", self._bridge_seen, history=True))
-        self._kept.append(live.declare_subscriber(CARRIED + "/**", self._carried_seen, history=True))
+        self._declarations.append(live.declare_token("{}/{}".format(BRIDGE, self._own)))
+        self._declarations.append(live.declare_subscriber(BRIDGE + "/*", self._on_bridge_token, history=True))
+        self._declarations.append(live.declare_subscriber(CARRIED + "/**", self._on_companion, history=True))
         for route in self._routes:
             if route.tokens is not None:
-                self._kept.append(live.declare_subscriber(route.tokens, self._token_seen, history=True))
-            self._kept.append(
+                self._declarations.append(live.declare_subscriber(route.tokens, self._on_token, history=True))
+            self._declarations.append(
                 self._session.declare_subscriber(
                     route.keys,
                     lambda sample, route=route: self._from_zenoh(sample, route),
@@ -124,14 +124,14 @@ class Bridge:
     # Zenoh -> mesh
 
     def _from_zenoh(self, sample: Any, route: KeyRoute) -> None:
-        if not self._is_bridges(sample):
-            self._tell(sample, route, route.peers or (None,))
+        if not self._is_from_bridge(sample):
+            self._send(sample, route, route.peers or (None,))
 
-    def _is_bridges(self, sample: Any) -> bool:
+    def _is_from_bridge(self, sample: Any) -> bool:
         source = sample.source_info
         return source is not None and str(source.source_id.zid) in self._bridges
 
-    def _tell(self, sample: Any, route: KeyRoute, peers: Sequence[str | None], *, again: bool = False) -> None:
+    def _send(self, sample: Any, route: KeyRoute, peers: Sequence[str | None], *, again: bool = False) -> None:
         attachment = sample.attachment
         envelope = Envelope(
             str(sample.key_expr),
@@ -150,10 +150,10 @@ class Bridge:
             log.warning("sample-dropped key=%.80s %s", envelope.key, error)
             return
         for peer in peers:
-            self._port.publish(route.topic, sealed, peer, TYPE)
+            self._daemon.publish(route.topic, sealed, peer, TYPE)
 
-    def _tell_history(self, keys: Sequence[str], peer: str | None = None) -> None:
-        """What our side's publishers keep, to one robot or to all: those who have it leave it."""
+    def _send_history(self, keys: Sequence[str], peer: str | None = None) -> None:
+        """Sends cached samples of our side's publishers to one robot or to all, which drop those they already have."""
         for route in self._routes:
             if route.tokens is None or (route.peers and peer is not None and peer not in route.peers):
                 continue
@@ -164,61 +164,61 @@ class Bridge:
 
     def _query(self, key: str, route: KeyRoute, peers: Sequence[str | None]) -> None:
         def answered(reply: Any) -> None:
-            if reply.ok is not None and not self._is_bridges(reply.ok):
-                self._tell(reply.ok, route, peers, again=True)
+            if reply.ok is not None and not self._is_from_bridge(reply.ok):
+                self._send(reply.ok, route, peers, again=True)
 
-        # A reply's key is the publisher's, not the one asked for.
+        # A reply's key is the publisher's, not the queried one.
         selector = "{}/{}?_anyke".format(key, HISTORY)
-        self._session.get(selector, answered, consolidation=zenoh.ConsolidationMode.NONE, timeout=HISTORY_S)
+        self._session.get(selector, answered, consolidation=zenoh.ConsolidationMode.NONE, timeout=HISTORY_TIMEOUT_S)
 
-    def _bridge_seen(self, sample: Any) -> None:
+    def _on_bridge_token(self, sample: Any) -> None:
         zid = str(sample.key_expr).rpartition("/")[2]
         (self._bridges.add if sample.kind == zenoh.SampleKind.PUT else self._bridges.discard)(zid)
 
-    def _token_seen(self, sample: Any) -> None:
+    def _on_token(self, sample: Any) -> None:
         token, alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
         with self._lock:
-            self._exchange.seen(token, alive)
-            keys = self._exchange.keeping_keys()
+            self._token_exchange.on_token(token, alive)
+            keys = self._token_exchange.keeping_keys()
         self.announce()
         key = kept_samples(token)[0]
         if alive and key in keys:
-            # It may have published before we listened.
-            self._tell_history([key])
+            # It may have published before our subscription.
+            self._send_history([key])
 
-    def _carried_seen(self, sample: Any) -> None:
+    def _on_companion(self, sample: Any) -> None:
         with self._lock:
-            self._exchange.carried(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+            self._token_exchange.on_companion(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
         self.announce()
 
     def announce(self, peer: str | None = None, *, answer: bool = False) -> None:
-        """Tells all other bridges our side's tokens if they changed, or one of them in any case."""
+        """Announces our side's tokens: to all bridges if they changed, or to one bridge in any case."""
         with self._lock:
-            announcement = self._exchange.announcement(answer=answer)
+            announcement = self._token_exchange.announcement(answer=answer)
             if peer is None and not answer and announcement == self._announced:
                 return
-            # Under the lock: of two announcements the later one must leave last.
-            if self._port.publish(EXCHANGE_TOPIC, announcement, peer, TYPE) and peer is None:
+            # Under the lock, so that the later of two announcements leaves last.
+            if self._daemon.publish(PROTOCOL_TOPIC, announcement, peer, TYPE) and peer is None:
                 self._announced = announcement
 
     # Mesh -> Zenoh
 
-    def daemon_up(self) -> None:
-        """The port calls this after each connect."""
-        self.look()
+    def on_daemon_up(self) -> None:
+        """Called by the daemon client after each connect."""
+        self.ensure_topic()
         self.announce(answer=True)
-        self._tell_history(self._keeping())
+        self._send_history(self._keeping_keys())
 
-    def _keeping(self) -> list[str]:
+    def _keeping_keys(self) -> list[str]:
         with self._lock:
-            return self._exchange.keeping_keys()
+            return self._token_exchange.keeping_keys()
 
-    def from_daemon(self, frame: Frame) -> None:
-        """The port calls this for each frame."""
+    def on_frame(self, frame: Frame) -> None:
+        """Called by the daemon client for each frame."""
         message, header = as_message(frame), frame[0]
         if message is not None and message.type == TYPE:
             try:
-                if message.topic == EXCHANGE_TOPIC:
+                if message.topic == PROTOCOL_TOPIC:
                     self._from_bridge(message)
                 else:
                     self._put(open_envelope(message.payload))
@@ -228,52 +228,64 @@ class Bridge:
                 log.warning("zenoh-refused source=%s topic=%s %s", message.source, message.topic, error)
         elif header.get("event") in ("peer-online", "peer-restarted"):
             self.announce(str(header["peer"]))
-            self._tell_history(self._keeping(), str(header["peer"]))
+            self._send_history(self._keeping_keys(), str(header["peer"]))
         elif header.get("event") == "peer-offline":
             with self._lock:
-                self._set_up(self._exchange.gone(str(header["peer"])))
+                self._apply(self._token_exchange.on_robot_gone(str(header["peer"])))
 
     def _put(self, sample: Envelope) -> None:
         with self._lock:
-            kept = self._exchange.depth(sample.key) > 0
-            is_new = not kept or self._held.is_new(sample.key, sample.attachment, sample.payload)
-        # What the network brings twice is put twice, as it came; what is told again is not.
+            kept = self._token_exchange.depth(sample.key) > 0
+            is_new = not kept or self._deduplicator.is_new(sample.key, sample.attachment, sample.payload)
+        # A sample the network duplicated is put twice, as it came; a cached sample sent again is not.
         if is_new or not sample.again:
             self._publishers.put(sample)
 
     def _from_bridge(self, message: Message) -> None:
         with self._lock:
-            change, answer = self._exchange.heard(message.source, message.payload)
-            self._set_up(change)
+            change, answer = self._token_exchange.on_announcement(message.source, message.payload)
+            self._apply(change)
         if answer:
             self.announce(message.source)
-            self._tell_history(self._keeping(), message.source)
+            self._send_history(self._keeping_keys(), message.source)
 
-    def _set_up(self, change: TokenChange) -> None:
+    def _apply(self, change: TokenChange) -> None:
         live = self._session.liveliness()
         for token in change.declare:
-            # The companion first: no bridge may take the token for one of its side's own.
+            # The companion first, so that no bridge takes the token for one of its own side.
             companion = live.declare_token(carried_key(self._own, token))
             self._tokens[token] = (companion, live.declare_token(token))
         for token in change.withdraw:
             companion, copy = self._tokens.pop(token)
             copy.undeclare()
             companion.undeclare()
-        self._publishers.forget()
+        self._publishers.withdraw_stale()
 
-    def look(self) -> None:
-        """The daemon may have been started anew without the bridges' topic. Raises MeshError."""
-        self._port.ensure_topics({EXCHANGE_TOPIC: EXCHANGE_SETTINGS})
+    def ensure_topic(self) -> None:
+        """Declares the bridges' topic, which a restarted daemon may lack. Raises MeshError."""
+        self._daemon.ensure_topics({PROTOCOL_TOPIC: PROTOCOL_TOPIC_SETTINGS})
 
 
 def arguments() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="udp_mesh.bridges.zenoh_bridge", description="Zenoh over the mesh")
-    parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket")
-    parser.add_argument("--config", help="a Zenoh configuration file (JSON5)")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=JSON", help="one value of it")
-    parser.add_argument("--route", action="append", default=[], type=parse_route, metavar="KEYEXPR=TOPIC[@PEER,...]")
+    parser = argparse.ArgumentParser(prog="udp_mesh.bridges.zenoh_bridge", description="Carry Zenoh over the mesh.")
+    parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket (default: %(default)s)")
+    parser.add_argument("--config", help="Zenoh configuration file (JSON5)")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=JSON", help="override a Zenoh setting")
     parser.add_argument(
-        "--ros2", action="append", default=[], type=parse_ros2_route, metavar="[DOMAIN:]/ros/topic=TOPIC[@PEER,...]"
+        "--route",
+        action="append",
+        default=[],
+        type=parse_route,
+        metavar="KEYEXPR=TOPIC[@PEER,...]",
+        help="carry samples under a key expression on a mesh topic (repeatable)",
+    )
+    parser.add_argument(
+        "--ros2",
+        action="append",
+        default=[],
+        type=parse_ros2_route,
+        metavar="[DOMAIN:]/ros/topic=TOPIC[@PEER,...]",
+        help="carry a ROS 2 topic of rmw_zenoh on a mesh topic (repeatable)",
     )
     return parser
 
@@ -295,18 +307,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     with session:
-        port = MeshPort(options.socket, ["*"])
-        bridge = Bridge(port, session, [*options.route, *options.ros2])
+        daemon = DaemonClient(options.socket, ["*"])
+        bridge = Bridge(daemon, session, [*options.route, *options.ros2])
         bridge.start()
-        thread = threading.Thread(target=port.run, args=(stop, bridge.daemon_up, bridge.from_daemon), daemon=True)
+        thread = threading.Thread(target=daemon.run, args=(stop, bridge.on_daemon_up, bridge.on_frame), daemon=True)
         thread.start()
-        while not stop.wait(LOOK_S) and thread.is_alive():
+        while not stop.wait(REFRESH_S) and thread.is_alive():
             try:
-                bridge.look()
+                bridge.ensure_topic()
             except MeshError as error:
                 log.debug("daemon-unreachable %s", error)
         if not stop.is_set():
-            # The port's thread ended by a mistake of ours, and said which: whoever started us starts us anew.
+            # The daemon client's thread failed and logged its exception; the supervisor restarts this process.
             return 1
         thread.join(5.0)
     return 0

@@ -1,8 +1,8 @@
-"""Puts what came from the mesh into a Zenoh network: one publisher per key and quality of service, the longest unused
-taken back.
+"""Publishes samples from the mesh in a Zenoh network: one publisher per key and quality of service, the least recently
+used undeclared first.
 
-Where ROS 2 publishers with transient local durability stand behind a key, each of them has a publisher here that keeps
-its last samples, as `rmw_zenoh`'s own do: subscribers that come later find them.
+Each ROS 2 publisher with transient local durability has a counterpart here that caches its last samples for late
+joiners, as `rmw_zenoh` does.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from udp_mesh.bridges.envelope import Envelope
 from udp_mesh.bridges.rmw_zenoh import publisher_id
 
 MAX_PUBLISHERS = 1024
-"""A peer that puts under ever new keys."""
+"""Publishers of one session; a peer can invent keys without bound."""
 PRIORITIES = dict(
     enumerate(
         (
@@ -32,11 +32,11 @@ PRIORITIES = dict(
         start=1,
     )
 )
-"""Zenoh's levels by number: 1 is the most urgent."""
+"""Zenoh's priorities by number: 1 is the most urgent."""
 
 
-class _Plain:
-    """A publisher that numbers what it puts, so that bridges know whose it is."""
+class _PlainPublisher:
+    """A publisher that numbers its samples, so that bridges can identify their session."""
 
     def __init__(self, session: Any, sample: Envelope) -> None:
         self._publisher = session.declare_publisher(sample.key, **_quality(sample))
@@ -56,8 +56,8 @@ class _Plain:
         self._publisher.undeclare()
 
 
-class _Keeping:
-    """A publisher that keeps its last samples; with miss detection on Zenoh numbers them itself."""
+class _CachingPublisher:
+    """A publisher that caches its last samples; with miss detection on, Zenoh numbers them itself."""
 
     def __init__(self, session: Any, sample: Envelope, depth: int) -> None:
         self._publisher: Any = zenoh.ext.declare_advanced_publisher(
@@ -85,29 +85,29 @@ def _quality(sample: Envelope) -> dict[str, Any]:
 
 
 class Publishers:
-    """All publishers of one session. One thread at a time."""
+    """All publishers of one session. Not thread-safe."""
 
     def __init__(self, session: Any, depth_of: Callable[[str], int]) -> None:
-        """`depth_of(key)`: how many samples each publisher of a key keeps for late subscribers; 0: none."""
+        """`depth_of(key)`: number of samples that each publisher of a key caches for late joiners; 0: none."""
         self._session = session
         self._depth_of = depth_of
-        self._publishers: OrderedDict[tuple[object, ...], _Plain | _Keeping] = OrderedDict()
+        self._publishers: OrderedDict[tuple[object, ...], _PlainPublisher | _CachingPublisher] = OrderedDict()
 
     def put(self, sample: Envelope) -> None:
-        """Puts it under its own key. Raises zenoh.ZError."""
+        """Puts a sample under its own key. Raises zenoh.ZError."""
         depth = self._depth_of(sample.key)
         whose = publisher_id(sample.attachment) if depth else b""
         wanted = (sample.key, sample.priority, sample.block, sample.express, depth, whose)
         found = self._publishers.pop(wanted, None)
         if found is None:
-            found = _Keeping(self._session, sample, depth) if depth else _Plain(self._session, sample)
+            found = _CachingPublisher(self._session, sample, depth) if depth else _PlainPublisher(self._session, sample)
         self._publishers[wanted] = found
         if len(self._publishers) > MAX_PUBLISHERS:
             self._publishers.popitem(last=False)[1].undeclare()
         found.put(sample)
 
-    def forget(self) -> None:
-        """Takes back the publishers whose keys keep nothing any more, or another number of samples."""
+    def withdraw_stale(self) -> None:
+        """Undeclares publishers whose key has no cache any more, or one of another depth."""
         for wanted in [
             wanted for wanted in self._publishers if wanted[4] and wanted[4] != self._depth_of(str(wanted[0]))
         ]:

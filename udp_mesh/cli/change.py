@@ -7,7 +7,7 @@ import re
 import tomllib
 from typing import Any
 
-from udp_mesh.cli.output import Exit, complain, say, say_json
+from udp_mesh.cli.output import Exit, print_error, print_json, print_text
 from udp_mesh.client.mesh_client import MeshClient
 
 
@@ -61,9 +61,9 @@ def _change(arguments: argparse.Namespace, op: str, **fields: Any) -> int:
     with MeshClient(arguments.socket) as mesh:
         changes = mesh.request(op, **fields)["changes"]
     if arguments.json:
-        say_json({"changes": changes})
+        print_json({"changes": changes})
     else:
-        say("\n".join(changes) if changes else "nothing to change")
+        print_text("\n".join(changes) if changes else "nothing to change")
     return Exit.OK
 
 
@@ -74,7 +74,7 @@ def _values(assignments: list[str]) -> dict[str, Any] | None:
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         if not equals or not key:
-            complain(f"expected key=value, found {assignment!r}")
+            print_error(f"expected key=value, found {assignment!r}")
             return None
         try:
             values[key] = tomllib.loads(f"value = {text}")["value"]

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import NoReturn
 
-from udp_mesh.cli.output import Exit, fields_text, say, say_json, say_json_line, say_part, say_screen
+from udp_mesh.cli.output import Exit, fields_text, print_json, print_json_line, print_text, write_raw, write_text
 from udp_mesh.cli.views import Json, peers_view, status_view, topics_view
 from udp_mesh.client.mesh_client import MeshClient, MeshError
 from udp_mesh.report.terminal_escapes import clean
@@ -35,11 +35,11 @@ def _show(arguments: argparse.Namespace, op: str, view: Callable[[Json], str]) -
     if arguments.watch is not None:
         _watch(arguments, op, view)
     with MeshClient(arguments.socket) as mesh:
-        reply = _asked(mesh, op)
+        reply = _request(mesh, op)
     if arguments.json:
-        say_json(reply)
+        print_json(reply)
     else:
-        say(view(reply))
+        print_text(view(reply))
     return Exit.OK
 
 
@@ -51,44 +51,44 @@ def _watch(arguments: argparse.Namespace, op: str, view: Callable[[Json], str]) 
         try:
             with MeshClient(arguments.socket) as mesh:
                 while True:
-                    reply = _asked(mesh, op)
+                    reply = _request(mesh, op)
                     seen, is_away = True, False
                     if arguments.json:
-                        say_json_line(reply)
+                        print_json_line(reply)
                     else:
-                        _page(view(reply))
+                        _redraw(view(reply))
                     time.sleep(period_s)
         except MeshError as error:
             if error.code != "unreachable" or not seen:
                 raise
             if not is_away and not arguments.json:
-                _page(f"{error}; waiting for it")
+                _redraw(f"{error}; waiting for it")
             is_away = True
         time.sleep(period_s)
 
 
-def _asked(mesh: MeshClient, op: str) -> Json:
+def _request(mesh: MeshClient, op: str) -> Json:
     reply = mesh.request(op)
     del reply["id"], reply["ok"]
     return reply
 
 
-def _page(text: str) -> None:
+def _redraw(text: str) -> None:
     """On a terminal in the place of the page before."""
     if sys.stdout.isatty():
         columns, lines = shutil.get_terminal_size()
-        say_screen(screen(text, columns, lines))
+        write_raw(screen_text(text, columns, lines))
     else:
-        say(text)
+        print_text(text)
 
 
-def screen(text: str, columns: int, lines: int) -> str:
+def screen_text(text: str, columns: int, lines: int) -> str:
     """The text in the place of what stood on a terminal before, without a flicker; what does not fit is cut off, and
     the last line says so."""
     rows = clean(text).split("\n")
-    most = max(lines - 1, 1)
-    if len(rows) > most:
-        rows = [*rows[: most - 1], f"... {len(rows) - most + 1} more lines (`| less` without --watch has all)"]
+    max_rows = max(lines - 1, 1)
+    if len(rows) > max_rows:
+        rows = [*rows[: max_rows - 1], f"... {len(rows) - max_rows + 1} more lines (`| less` without --watch has all)"]
     return HOME + "".join(f"{row[:columns]}{END_OF_LINE}\n" for row in rows) + BELOW
 
 
@@ -100,12 +100,14 @@ def events(arguments: argparse.Namespace) -> int:
             frame = mesh.next_frame()
             if frame is not None:
                 fields = frame[0]
-                say_json_line(fields) if arguments.json else say(f"{fields.pop('event')} {fields_text(fields)}")
+                print_json_line(fields) if arguments.json else print_text(
+                    f"{fields.pop('event')} {fields_text(fields)}"
+                )
 
 
 def metrics(arguments: argparse.Namespace) -> int:
     """The page for Prometheus."""
     with MeshClient(arguments.socket) as mesh:
         _, page = mesh.request_frame("metrics")
-        say_part(page.decode())
+        write_text(page.decode())
     return Exit.OK

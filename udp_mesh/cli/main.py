@@ -12,7 +12,7 @@ from pathlib import Path
 
 from udp_mesh import __version__
 from udp_mesh.cli import change, inspect, serve, traffic
-from udp_mesh.cli.output import Exit, OutputFailed, complain, give_up, prepare, written
+from udp_mesh.cli.output import Exit, OutputFailed, checked_stdout, discard_stdout, prepare_streams, print_error
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, MeshError
 from udp_mesh.daemon.configuration import CONDITIONS_TOPIC, DEFAULT_PATH, MAX_PING_S
 
@@ -32,7 +32,7 @@ examples:
   udp-mesh set topic video priority=9 reliable=false keep_last=1
 """
 
-ENDLESS: tuple[Command, ...] = (
+RUNS_UNTIL_INTERRUPTED: tuple[Command, ...] = (
     serve.run_daemon,
     inspect.status,
     inspect.peers,
@@ -45,10 +45,10 @@ ENDLESS: tuple[Command, ...] = (
 FORWARDED = {"report": "udp_mesh.report", "sim": "udp_mesh.sim"}
 """Commands with arguments of their own: the package's `main(argv)` gets them."""
 
-MOST_TIMES = 1_000_000_000
+MAX_COUNT = 1_000_000_000
 
 
-class Help(argparse.RawDescriptionHelpFormatter):
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
     """Keeps paths and examples whole: argparse breaks lines at hyphens."""
 
     def _split_lines(self, text: str, width: int) -> list[str]:
@@ -57,7 +57,7 @@ class Help(argparse.RawDescriptionHelpFormatter):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the process's exit code."""
-    prepare()
+    prepare_streams()
     command: Command | None = None
     try:
         arguments = list(sys.argv[1:] if argv is None else argv)
@@ -68,24 +68,24 @@ def main(argv: Sequence[str] | None = None) -> int:
         return command(parsed)
     except MeshError as error:
         hint = _hint(error)
-        complain(f"{error} ({hint})" if hint else str(error))
+        print_error(f"{error} ({hint})" if hint else str(error))
         return Exit.UNREACHABLE if error.code == "unreachable" else Exit.FAILED
     except BrokenPipeError:
         # The reader of our output has gone: nobody is left to be told.
-        give_up()
+        discard_stdout()
         return Exit.FAILED
     except OutputFailed as error:
-        give_up()
-        complain(f"standard output: {error}")
+        discard_stdout()
+        print_error(f"standard output: {error}")
         return Exit.FAILED
     except KeyboardInterrupt:
-        return Exit.OK if command in ENDLESS else Exit.INTERRUPTED
+        return Exit.OK if command in RUNS_UNTIL_INTERRUPTED else Exit.INTERRUPTED
 
 
 def _forward(package: str, arguments: list[str]) -> int:
     """A package's own command; it speaks of its files itself, so what is left is standard output."""
     command: Callable[[list[str]], int] = importlib.import_module(package).main
-    with written():
+    with checked_stdout():
         code = command(arguments)
         sys.stdout.flush()
     return code
@@ -114,7 +114,7 @@ def build_parser() -> argparse.ArgumentParser:
         prog="udp-mesh",
         description="Prioritized messages between robots over lossy, breaking links.",
         epilog=EPILOG,
-        formatter_class=Help,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"udp-mesh {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
@@ -138,7 +138,7 @@ def _parser(
         help=help_text,
         description=f"{help_text[:1].upper()}{help_text[1:]}.",
         epilog=f"example: {example}",
-        formatter_class=Help,
+        formatter_class=HelpFormatter,
     )
 
 
@@ -165,7 +165,7 @@ def _command(
     return parser
 
 
-def _commands_of(
+def _command_group(
     commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, help_text: str, example: str
 ) -> argparse._SubParsersAction[argparse.ArgumentParser]:
     """A command that has commands of its own."""
@@ -228,7 +228,7 @@ def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _add_change(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    setters = _commands_of(
+    setters = _command_group(
         commands, "set", "change the running daemon until its next reload or restart", "udp-mesh set window 3"
     )
     topic = _command(
@@ -276,7 +276,7 @@ def _add_change(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         example="udp-mesh set keys /etc/udp-mesh/new.key",
     )
     keys.add_argument("file", type=Path, help="one or two keys, one per line; the daemon reads it")
-    droppers = _commands_of(
+    droppers = _command_group(
         commands, "drop", "remove a topic or neighbour from the running daemon", "udp-mesh drop topic video"
     )
     _command(droppers, "topic", change.drop_topic, "forget a topic", example="udp-mesh drop topic video").add_argument(
@@ -307,7 +307,7 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     publish.add_argument("--file", type=Path, help="send this file's bytes (- for standard input)")
     publish.add_argument("--to", metavar="PEER", help="one peer (default: the topic's destinations, or all)")
     publish.add_argument("--type", default="", help="the message's type name, carried along")
-    publish.add_argument("--count", type=_times, default=1, help="send it so many times")
+    publish.add_argument("--count", type=_count, default=1, help="send it so many times")
     publish.add_argument("--rate", type=_positive, default=1.0, metavar="HZ", help="with --count, so many a second")
     publish.add_argument(
         "--wait", type=_positive, nargs="?", const=60.0, metavar="SECONDS", help="wait for the outcome (default: 60 s)"
@@ -316,14 +316,14 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         commands, "echo", traffic.echo, "print messages that arrive", example="udp-mesh echo 'map/*' status"
     )
     echo.add_argument("topics", nargs="+", metavar="TOPIC", help=f"names or patterns; {CONDITIONS_TOPIC} too")
-    echo.add_argument("--count", type=_times, help="stop after so many")
+    echo.add_argument("--count", type=_count, help="stop after so many")
     echo.add_argument("--timeout", type=_positive, metavar="SECONDS", help="stop when nothing comes for so long")
     echo.add_argument("--raw", action="store_true", help="write the payloads' bytes and nothing else")
     ping = _command(
         commands, "ping", traffic.ping, "measure round trips to a peer", example="udp-mesh ping base --count 5"
     )
     ping.add_argument("peer", help="its name, as in `udp-mesh peers`")
-    ping.add_argument("-c", "--count", type=_times, default=4, help="so many (default: %(default)s)")
+    ping.add_argument("-c", "--count", type=_count, default=4, help="so many (default: %(default)s)")
     ping.add_argument(
         "--interval", type=_positive, default=1.0, metavar="SECONDS", help="between two (default: %(default)g)"
     )
@@ -335,7 +335,7 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     bench.add_argument("peer", help="its name, as in `udp-mesh peers`")
     bench.add_argument(
-        "--size", type=_times, default=200_000, metavar="BYTES", help="per message (default: %(default)s)"
+        "--size", type=_count, default=200_000, metavar="BYTES", help="per message (default: %(default)s)"
     )
     bench.add_argument(
         "--seconds",
@@ -350,7 +350,7 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="SECONDS",
         help="give up when none is delivered for so long (default: %(default)g)",
     )
-    recorders = _commands_of(
+    recorders = _command_group(
         commands,
         "record",
         "record messages and conditions for `udp-mesh report`",
@@ -385,9 +385,9 @@ def _ping_s(text: str) -> float:
     return value
 
 
-def _times(text: str) -> int:
+def _count(text: str) -> int:
     """A count that does something: at least one."""
-    if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= MOST_TIMES:
+    if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= MAX_COUNT:
         raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, found {text!r}")
     return int(text)
 

@@ -33,7 +33,7 @@ class OutputFailed(Exception):
     """Standard output takes no more (a full disk); its reader's going away is a BrokenPipeError."""
 
 
-def prepare() -> None:
+def prepare_streams() -> None:
     """Makes standard output and standard error such that whatever is written to them is no error of ours: a closed one
     swallows it, and characters that a terminal's encoding lacks are shown by their numbers."""
     if sys.stdout is None:
@@ -45,7 +45,7 @@ def prepare() -> None:
         reconfigure(errors="backslashreplace")
 
 
-def give_up() -> None:
+def discard_stdout() -> None:
     """Nothing more is written to standard output, not even what Python holds for it at its end."""
     with suppress(OSError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
@@ -54,7 +54,7 @@ def give_up() -> None:
 
 
 @contextmanager
-def written() -> Iterator[None]:
+def checked_stdout() -> Iterator[None]:
     """Where what fails is standard output: OutputFailed, or BrokenPipeError."""
     try:
         yield
@@ -64,34 +64,34 @@ def written() -> Iterator[None]:
         raise OutputFailed(error.strerror) from error
 
 
-def say(text: str) -> None:
-    say_part(text + "\n")
+def print_text(text: str) -> None:
+    write_text(text + "\n")
 
 
-def say_part(text: str) -> None:
+def write_text(text: str) -> None:
     """Without the end of a line."""
-    say_screen(clean(text))
+    write_raw(clean(text))
 
 
-def say_screen(text: str) -> None:
+def write_raw(text: str) -> None:
     """With control sequences of our own, around text that was cleaned before."""
-    with written():
+    with checked_stdout():
         sys.stdout.write(text)
         sys.stdout.flush()
 
 
-def say_bytes(raw: bytes) -> None:
-    with written():
+def write_bytes(raw: bytes) -> None:
+    with checked_stdout():
         sys.stdout.buffer.write(raw)
         sys.stdout.buffer.flush()
 
 
-def say_json(value: object) -> None:
-    say(json_safe(json.dumps(value, indent=2, ensure_ascii=_is_ascii_safer())))
+def print_json(value: object) -> None:
+    print_text(json_safe(json.dumps(value, indent=2, ensure_ascii=_is_ascii_safer())))
 
 
-def say_json_line(value: object) -> None:
-    say(json_safe(json.dumps(value, separators=(",", ":"), ensure_ascii=_is_ascii_safer())))
+def print_json_line(value: object) -> None:
+    print_text(json_safe(json.dumps(value, separators=(",", ":"), ensure_ascii=_is_ascii_safer())))
 
 
 def _is_ascii_safer() -> bool:
@@ -99,7 +99,7 @@ def _is_ascii_safer() -> bool:
     return (sys.stdout.encoding or "").lower().replace("-", "") != "utf8"
 
 
-def complain(text: str) -> None:
+def print_error(text: str) -> None:
     sys.stderr.write(f"udp-mesh: {clean(text)}\n")
 
 

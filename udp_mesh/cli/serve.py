@@ -8,7 +8,7 @@ import logging
 import os
 from pathlib import Path
 
-from udp_mesh.cli.output import Exit, complain, say, say_json
+from udp_mesh.cli.output import Exit, print_error, print_json, print_text
 from udp_mesh.crypto import Key
 from udp_mesh.crypto.keys import SECRET_BYTES
 from udp_mesh.daemon.configuration import RESERVED_PREFIX, load
@@ -25,11 +25,11 @@ def run_daemon(arguments: argparse.Namespace) -> int:
     try:
         configuration = load(arguments.config)
     except ConfigurationError as error:
-        return _report(error)
+        return _print_problems(error)
     try:
         asyncio.run(run(configuration))
     except OSError as error:
-        complain(f"cannot start: {_reason(error)}")
+        print_error(f"cannot start: {_reason(error)}")
         return Exit.FAILED
     return Exit.OK
 
@@ -49,13 +49,13 @@ def check(arguments: argparse.Namespace) -> int:
         configuration = load(arguments.config)
     except ConfigurationError as error:
         if arguments.json:
-            say_json({"ok": False, "problems": [plain(problem) for problem in error.problems]})
+            print_json({"ok": False, "problems": [plain(problem) for problem in error.problems]})
             return Exit.CONFIGURATION
-        return _report(error)
+        return _print_problems(error)
     settings = configuration.settings
     topics = [topic for topic in settings.topics if not topic.name.startswith(RESERVED_PREFIX)]
     if arguments.json:
-        say_json(
+        print_json(
             {
                 "ok": True,
                 "name": settings.name,
@@ -75,13 +75,15 @@ def check(arguments: argparse.Namespace) -> int:
         )
     else:
         protection = "UNKEYED" if settings.unkeyed else f"{len(settings.keys)} key(s)"
-        say(f"{arguments.config}: good: {settings.name}, port {settings.port}, {len(topics)} topics, {protection}")
+        print_text(
+            f"{arguments.config}: good: {settings.name}, port {settings.port}, {len(topics)} topics, {protection}"
+        )
     return Exit.OK
 
 
-def _report(error: ConfigurationError) -> int:
+def _print_problems(error: ConfigurationError) -> int:
     for problem in error.problems:
-        complain(str(problem))
+        print_error(str(problem))
     return Exit.CONFIGURATION
 
 
@@ -93,9 +95,9 @@ def keygen(arguments: argparse.Namespace) -> int:
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except OSError as error:
-        complain(f"{path}: {error.strerror}")
+        print_error(f"{path}: {error.strerror}")
         return Exit.FAILED
     with os.fdopen(descriptor, "w") as file:
         file.write(line)
-    say(f"{path}: key {key.key_id.hex()}")
+    print_text(f"{path}: key {key.key_id.hex()}")
     return Exit.OK

@@ -11,14 +11,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
-from udp_mesh.cli.output import Exit, complain, milliseconds, rate, say, say_bytes, say_json, say_json_line, size
+from udp_mesh.cli.output import (
+    Exit,
+    milliseconds,
+    print_error,
+    print_json,
+    print_json_line,
+    print_text,
+    rate,
+    size,
+    write_bytes,
+)
 from udp_mesh.cli.views import Json
 from udp_mesh.client.mesh_client import MAX_PAYLOAD_BYTES, MeshClient, MeshError, as_message
 from udp_mesh.daemon.configuration import BENCH_TOPIC, CONDITIONS_TOPIC
 
-BENCH_BACKLOG_BYTES = 16 << 20
+MAX_BENCH_BACKLOG_BYTES = 16 << 20
 BENCH_BACKLOG_S = 2.0
-BENCH_LEAST_BACKLOG = 4
+MIN_BENCH_BACKLOG = 4
 """What the benchmark keeps accepted and undelivered: so much time of what arrives, never fewer messages and never more
 bytes. That keeps any link busy, and a slow one is done soon after the time asked for."""
 
@@ -26,7 +36,7 @@ bytes. That keeps any link busy, and a slow one is done soon after the time aske
 def publish(arguments: argparse.Namespace) -> int:
     """Sends one message, or the same one `--count` times at `--rate` a second."""
     if arguments.file is not None and arguments.text not in (None, "-"):
-        complain(f"expected the message or --file, found both: {arguments.text!r} and --file {arguments.file}")
+        print_error(f"expected the message or --file, found both: {arguments.text!r} and --file {arguments.file}")
         return Exit.USAGE
     payload = _payload(arguments)
     if payload is None:
@@ -36,7 +46,9 @@ def publish(arguments: argparse.Namespace) -> int:
         if arguments.wait is not None:
             topic = _topic(mesh, arguments.topic)
             if topic is not None and not topic["reliable"]:
-                complain(f"nobody is told what became of a message of {arguments.topic}, which is best effort (--wait)")
+                print_error(
+                    f"nobody is told what became of a message of {arguments.topic}, which is best effort (--wait)"
+                )
                 return Exit.USAGE
             destinations = _destinations(mesh, arguments.to, topic)
         numbers = []
@@ -50,7 +62,7 @@ def publish(arguments: argparse.Namespace) -> int:
             numbers.append(number)
         if arguments.wait is None:
             if arguments.json:
-                say_json_line({"topic": arguments.topic, "accepted": len(numbers)})
+                print_json_line({"topic": arguments.topic, "accepted": len(numbers)})
             return Exit.OK
         return _await_outcomes(mesh, {(number, peer) for number in numbers for peer in destinations}, arguments)
 
@@ -61,25 +73,25 @@ def _payload(arguments: argparse.Namespace) -> bytes | None:
         return os.fsencode(arguments.text)
     if arguments.text == "-" or arguments.file is None or str(arguments.file) == "-":
         if sys.stdin is None:
-            complain("expected a message or --file: standard input is closed")
+            print_error("expected a message or --file: standard input is closed")
             return None
         if sys.stdin.isatty():
-            complain("the message is what you type now; Ctrl-D ends it")
-        return _bounded(sys.stdin.buffer, "standard input")
+            print_error("the message is what you type now; Ctrl-D ends it")
+        return _read_bounded(sys.stdin.buffer, "standard input")
     path: Path = arguments.file
     try:
         with path.open("rb") as file:
-            return _bounded(file, str(path))
+            return _read_bounded(file, str(path))
     except OSError as error:
-        complain(f"{path}: {error.strerror}")
+        print_error(f"{path}: {error.strerror}")
         return None
 
 
-def _bounded(file: BinaryIO, name: str) -> bytes | None:
+def _read_bounded(file: BinaryIO, name: str) -> bytes | None:
     """What is in it, where that can be a message."""
     payload = file.read(MAX_PAYLOAD_BYTES + 1)
     if len(payload) > MAX_PAYLOAD_BYTES:
-        complain(f"{name}: expected at most {MAX_PAYLOAD_BYTES} bytes, found more")
+        print_error(f"{name}: expected at most {MAX_PAYLOAD_BYTES} bytes, found more")
         return None
     return payload
 
@@ -110,7 +122,7 @@ def _await_outcomes(mesh: MeshClient, waiting: set[tuple[int, str]], arguments: 
         if frame is None:
             names = ", ".join(sorted({peer for _, peer in waiting}))
             hint = "" if arguments.to else " (one to all that fits a datagram has none: name a peer with --to)"
-            complain(f"{len(waiting)} outcome(s) are missing after {arguments.wait:g} s, of {names}{hint}")
+            print_error(f"{len(waiting)} outcome(s) are missing after {arguments.wait:g} s, of {names}{hint}")
             return Exit.NOT_DELIVERED
         fields = frame[0]
         if fields.get("event") != "outcome":
@@ -119,10 +131,10 @@ def _await_outcomes(mesh: MeshClient, waiting: set[tuple[int, str]], arguments: 
         if fields["outcome"] != "delivered":
             code = Exit.NOT_DELIVERED
         if arguments.json:
-            say_json_line(fields)
+            print_json_line(fields)
         else:
             detail = milliseconds(fields["latency_s"]) if "latency_s" in fields else fields.get("reason", "")
-            say(f"{fields['outcome']} {fields['peer']} {detail}".rstrip())
+            print_text(f"{fields['outcome']} {fields['peer']} {detail}".rstrip())
     return code
 
 
@@ -134,25 +146,27 @@ def echo(arguments: argparse.Namespace) -> int:
         while arguments.count is None or shown < arguments.count:
             frame = mesh.next_frame(arguments.timeout)
             if frame is None:
-                complain(f"nothing within {arguments.timeout:g} s")
+                print_error(f"nothing within {arguments.timeout:g} s")
                 return Exit.FAILED
             header, payload = frame
             if header.get("topic") == CONDITIONS_TOPIC:
-                say_json_line(header)
+                print_json_line(header)
                 shown += 1
                 continue
             message = as_message(frame)
             if message is None:
                 if header.get("event") == "dropped":
-                    complain(f"too slow: {header['messages']} messages were dropped")
+                    print_error(f"too slow: {header['messages']} messages were dropped")
                 continue
             shown += 1
             if arguments.raw:
-                say_bytes(payload)
+                write_bytes(payload)
             elif arguments.json:
-                say_json_line({**header, "bytes": len(payload), "payload": base64.b64encode(payload).decode()})
+                print_json_line({**header, "bytes": len(payload), "payload": base64.b64encode(payload).decode()})
             else:
-                say(f"{message.source} {message.topic} p{message.priority} {size(len(payload))}  {_preview(payload)}")
+                print_text(
+                    f"{message.source} {message.topic} p{message.priority} {size(len(payload))}  {_preview(payload)}"
+                )
     return Exit.OK
 
 
@@ -167,28 +181,28 @@ def _preview(payload: bytes) -> str:
 def ping(arguments: argparse.Namespace) -> int:
     """Round trips through both daemons, at the most urgent priority; Ctrl-C ends it with what was measured."""
     times: list[float] = []
-    asked = 0
+    attempts = 0
     try:
         with MeshClient(arguments.socket, timeout_s=arguments.timeout + 5) as mesh:
             for turn in range(arguments.count):
                 if turn:
                     time.sleep(arguments.interval)
-                asked += 1
+                attempts += 1
                 _ping_once(mesh, arguments, times)
         code = Exit.OK if len(times) == arguments.count else Exit.FAILED
     except KeyboardInterrupt:
         # the one under way was not waited for to its end
-        asked = max(asked - 1, len(times))
+        attempts = max(attempts - 1, len(times))
         code = Exit.INTERRUPTED
     except MeshError:
         if times:
-            _sum_up(arguments, times, asked)
+            _print_summary(arguments, times, attempts)
         raise
-    _sum_up(arguments, times, asked)
+    _print_summary(arguments, times, attempts)
     return code
 
 
-def _sum_up(arguments: argparse.Namespace, times: list[float], asked: int) -> None:
+def _print_summary(arguments: argparse.Namespace, times: list[float], attempts: int) -> None:
     if arguments.json:
         return
     spread = (
@@ -197,7 +211,7 @@ def _sum_up(arguments: argparse.Namespace, times: list[float], asked: int) -> No
         if times
         else ""
     )
-    say(f"{len(times)} of {asked} answered{spread}")
+    print_text(f"{len(times)} of {attempts} answered{spread}")
 
 
 def _ping_once(mesh: MeshClient, arguments: argparse.Namespace, times: list[float]) -> None:
@@ -208,26 +222,26 @@ def _ping_once(mesh: MeshClient, arguments: argparse.Namespace, times: list[floa
         if error.code in ("unreachable", "timeout"):
             raise
         if arguments.json:
-            say_json_line({"peer": arguments.peer, "error": error.code})
+            print_json_line({"peer": arguments.peer, "error": error.code})
         if error.code != "no-answer":
             raise
         if not arguments.json:
-            say(str(error))
+            print_text(str(error))
         return
     times.append(reply["round_trip_s"])
     if arguments.json:
-        say_json_line({"peer": arguments.peer, "round_trip_s": times[-1]})
+        print_json_line({"peer": arguments.peer, "round_trip_s": times[-1]})
     else:
-        say(f"{arguments.peer}: {milliseconds(times[-1])}")
+        print_text(f"{arguments.peer}: {milliseconds(times[-1])}")
 
 
 def _backlog(size_bytes: int, delivered_per_s: float) -> int:
     """Messages of the benchmark that may be under way."""
-    return max(BENCH_LEAST_BACKLOG, min(BENCH_BACKLOG_BYTES // size_bytes, int(BENCH_BACKLOG_S * delivered_per_s)))
+    return max(MIN_BENCH_BACKLOG, min(MAX_BENCH_BACKLOG_BYTES // size_bytes, int(BENCH_BACKLOG_S * delivered_per_s)))
 
 
 @dataclass(slots=True)
-class _Run:
+class _BenchRun:
     """What a benchmark has sent, and what of it arrived until when."""
 
     begun: float
@@ -246,10 +260,10 @@ def bench(arguments: argparse.Namespace) -> int:
     code = Exit.OK
     with MeshClient(arguments.socket) as mesh:
         begun = time.monotonic()
-        run = _Run(begun, begun)
+        run = _BenchRun(begun, begun)
         try:
             if not _fill(mesh, arguments, run):
-                complain(f"no message was delivered within {arguments.timeout:g} s")
+                print_error(f"no message was delivered within {arguments.timeout:g} s")
                 code = Exit.NOT_DELIVERED
         except KeyboardInterrupt:
             code = Exit.INTERRUPTED
@@ -264,16 +278,16 @@ def bench(arguments: argparse.Namespace) -> int:
             "seconds": round(run.seconds, 3),
             "bits_per_s": round(bits_per_s),
         }
-        say_json(result)
+        print_json(result)
     else:
-        say(
+        print_text(
             f"{run.delivered} of {run.sent} messages of {size(arguments.size)} delivered in {run.seconds:.2f} s: "
             f"{rate(bits_per_s)}"
         )
     return Exit.NOT_DELIVERED if code == Exit.OK and run.delivered < run.sent else code
 
 
-def _fill(mesh: MeshClient, arguments: argparse.Namespace, run: _Run) -> bool:
+def _fill(mesh: MeshClient, arguments: argparse.Namespace, run: _BenchRun) -> bool:
     """Sends for the time asked for and waits for the rest; False where nothing arrives any more."""
     payload = bytes(arguments.size)
     while True:
@@ -300,13 +314,13 @@ def record_start(arguments: argparse.Namespace) -> int:
     path = arguments.file.absolute()
     with MeshClient(arguments.socket) as mesh:
         mesh.request("record-start", path=str(path), payloads=arguments.payloads)
-    say_json({"path": str(path)}) if arguments.json else say(f"recording to {path}")
-    if _is_nowhere(path):
-        complain(f"{path} is not to be seen here: the daemon has a /tmp of its own (PrivateTmp= of its service)")
+    print_json({"path": str(path)}) if arguments.json else print_text(f"recording to {path}")
+    if _is_missing(path):
+        print_error(f"{path} is not to be seen here: the daemon has a /tmp of its own (PrivateTmp= of its service)")
     return Exit.OK
 
 
-def _is_nowhere(path: Path) -> bool:
+def _is_missing(path: Path) -> bool:
     try:
         path.stat()
     except FileNotFoundError:
@@ -321,7 +335,7 @@ def record_stop(arguments: argparse.Namespace) -> int:
     with MeshClient(arguments.socket) as mesh:
         reply = mesh.request("record-stop")
     if arguments.json:
-        say_json({key: reply[key] for key in ("path", "bytes", "lines")})
+        print_json({key: reply[key] for key in ("path", "bytes", "lines")})
     else:
-        say(f"{reply['path']}: {reply['lines']} lines, {size(reply['bytes'])}")
+        print_text(f"{reply['path']}: {reply['lines']} lines, {size(reply['bytes'])}")
     return Exit.OK

@@ -124,7 +124,7 @@ def topics_view(reply: Json) -> str:
         [
             topic["name"],
             str(topic["priority"]) if topic["configured"] else "-",
-            _how(topic) if topic["configured"] else "not configured here",
+            _delivery(topic) if topic["configured"] else "not configured here",
             f"{topic['sent_messages']}",
             size(topic["sent_bytes"]),
             f"{topic['received_messages']}",
@@ -139,7 +139,7 @@ def topics_view(reply: Json) -> str:
     return table(["topic", "priority", "how", "sent", "", "received", ""], rows) + f"\n{foot}"
 
 
-def _how(topic: Json) -> str:
+def _delivery(topic: Json) -> str:
     words = ["reliable" if topic["reliable"] else "best effort"]
     if topic["keep_last"] is not None:
         words.append(f"last {topic['keep_last']}")

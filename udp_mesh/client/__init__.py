@@ -1,5 +1,4 @@
-"""Talks to a running daemon from any Python since 3.8, with the standard library alone: `mesh_client` is one file to
-copy."""
+"""A client of the daemon for any Python since 3.8, standard library only: `mesh_client` is a single file to copy."""
 
 from udp_mesh.client.mesh_client import MeshClient, MeshError, Message
 

@@ -1,4 +1,4 @@
-"""A client of the udp-mesh daemon in one file: standard library, Python 3.8 or later. Copy it where you need it.
+"""A client of the udp-mesh daemon in a single file: standard library, Python 3.8 or later. Copy it where you need it.
 
     with MeshClient() as mesh:
         mesh.subscribe("status")
@@ -8,7 +8,7 @@
 
 On the daemon's Unix socket both sides send frames: two big-endian 32-bit lengths, a JSON object of the first length
 (the header), raw bytes of the second (the payload). A request has "op" and a number "id"; its reply repeats the id
-and has "ok". What the daemon sends on its own has "event". docs/local-api.md lists them all.
+and has "ok". Unsolicited frames of the daemon have "event". docs/local-api.md lists them all.
 
 Threads: `publish(..., wait=False)` may be called from any thread; everything else from one thread at a time.
 """
@@ -26,9 +26,9 @@ from typing import Any, Deque, Dict, Iterator, List, NamedTuple, Optional, Tuple
 
 DEFAULT_SOCKET = "/run/udp-mesh/udp-mesh.sock"
 MAX_HEADER_BYTES = 1 << 16
-"""Of a request: the daemon takes no longer one."""
+"""Maximum header size of a request, enforced by the daemon."""
 MAX_REPLY_HEADER_BYTES = 1 << 26
-"""Of what the daemon sends: the status of a thousand peers takes some megabytes."""
+"""Maximum header size of a reply or event: the status of a thousand peers takes some megabytes."""
 MAX_PAYLOAD_BYTES = 1 << 30
 _LENGTHS = struct.Struct(">II")
 _READ_BYTES = 1 << 18
@@ -38,7 +38,7 @@ Frame = Tuple[Header, bytes]
 
 
 class MeshError(Exception):
-    """The daemon refused a request, or cannot be reached. `code` is a word such as "unknown-topic" or "unreachable"."""
+    """The daemon refused a request or cannot be reached. `code` is a word such as "unknown-topic" or "unreachable"."""
 
     def __init__(self, code: str, text: str) -> None:
         super().__init__(text)
@@ -46,7 +46,7 @@ class MeshError(Exception):
 
 
 class Message(NamedTuple):
-    """One message that arrived."""
+    """One received message."""
 
     source: str
     topic: str
@@ -57,13 +57,13 @@ class Message(NamedTuple):
 
 
 def encode_frame(header: Header, payload: Union[bytes, memoryview] = b"") -> bytes:
-    """The bytes of one frame."""
+    """Encodes one frame."""
     head = json.dumps(header, separators=(",", ":")).encode()
     return b"".join((_LENGTHS.pack(len(head), len(payload)), head, payload))
 
 
 class FrameReader:
-    """Bytes in any pieces -> frames. Raises MeshError where they are none."""
+    """Decodes a byte stream into frames. Raises MeshError for an invalid frame."""
 
     def __init__(self, max_payload_bytes: int = MAX_PAYLOAD_BYTES) -> None:
         self._buffer = bytearray()
@@ -71,7 +71,7 @@ class FrameReader:
         self._needed = _LENGTHS.size
 
     def feed(self, data: bytes) -> List[Frame]:
-        """The frames that these bytes complete."""
+        """Returns the frames that these bytes complete."""
         buffer = self._buffer
         buffer += data
         frames: List[Frame] = []
@@ -79,7 +79,8 @@ class FrameReader:
         while len(buffer) - start >= self._needed:
             head_bytes, payload_bytes = _LENGTHS.unpack_from(buffer, start)
             if head_bytes > MAX_REPLY_HEADER_BYTES or payload_bytes > self._max_payload_bytes:
-                raise MeshError("bad-frame", "a frame of {} and {} bytes is too long".format(head_bytes, payload_bytes))
+                text = "frame too long: header of {} bytes, payload of {} bytes".format(head_bytes, payload_bytes)
+                raise MeshError("bad-frame", text)
             body = start + _LENGTHS.size
             end = body + head_bytes + payload_bytes
             if len(buffer) < end:
@@ -96,13 +97,13 @@ class FrameReader:
 
 
 def parse_header(raw: bytes) -> Header:
-    """The header in these bytes. Raises MeshError ("bad-frame") where they are no JSON object."""
+    """Parses a header. Raises MeshError ("bad-frame") if it is not a JSON object."""
     try:
         header = json.loads(raw.decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        raise MeshError("bad-frame", "a frame's header is no JSON: {}".format(error)) from error
+        raise MeshError("bad-frame", "invalid JSON in a frame's header: {}".format(error)) from error
     if not isinstance(header, dict):
-        raise MeshError("bad-frame", "a frame's header is no JSON object")
+        raise MeshError("bad-frame", "a frame's header is not a JSON object")
     return header
 
 
@@ -117,7 +118,7 @@ class MeshClient:
     """One connection to the daemon."""
 
     def __init__(self, path: str = DEFAULT_SOCKET, timeout_s: float = 10.0) -> None:
-        """Connects. Raises MeshError ("unreachable") where no daemon listens at `path`."""
+        """Connects. Raises MeshError ("unreachable") if no daemon listens at `path`."""
         self.path = path
         self.timeout_s = timeout_s
         self._reader = FrameReader()
@@ -130,9 +131,9 @@ class MeshClient:
             self._socket.connect(path)
         except OSError as error:
             self._socket.close()
-            # connect(2) says "refused" of a file that is no socket, too
-            reason = "it is no socket" if os.path.exists(path) and not _is_socket(path) else error.strerror or error
-            raise MeshError("unreachable", "no udp-mesh daemon at {}: {}".format(path, reason)) from error
+            # connect(2) also fails with "refused" for a file that is not a socket.
+            reason = "not a socket" if os.path.exists(path) and not _is_socket(path) else error.strerror or error
+            raise MeshError("unreachable", "cannot connect to the daemon at {}: {}".format(path, reason)) from error
         # A process-wide default timeout (rospy sets one) must not apply here.
         self._socket.settimeout(None)
         self._poll = select.poll()
@@ -148,17 +149,17 @@ class MeshClient:
         self._socket.close()
 
     def fileno(self) -> int:
-        """For `select`: readable means `next_frame(0)` may return something."""
+        """For `select`: if readable, `next_frame(0)` may return something."""
         return self._socket.fileno()
 
     # Requests
 
     def request(self, op: str, payload: bytes = b"", **fields: Any) -> Header:
-        """The reply's header. Raises MeshError where the daemon refuses, or does not answer within `timeout_s`."""
+        """Sends a request and returns the reply's header. Raises MeshError if it is refused or times out."""
         return self.request_frame(op, payload, **fields)[0]
 
     def request_frame(self, op: str, payload: bytes = b"", **fields: Any) -> Frame:
-        """As `request`, with the reply's payload."""
+        """Like `request`, but also returns the reply's payload."""
         number = self._next_id
         self._next_id += 1
         try:
@@ -171,7 +172,7 @@ class MeshClient:
         deadline = time.monotonic() + self.timeout_s
         while number not in self._replies:
             if not self._read(deadline - time.monotonic()):
-                raise MeshError("timeout", "the daemon did not answer {!r} within {:g} s".format(op, self.timeout_s))
+                raise MeshError("timeout", "no reply to {!r} from the daemon within {:g} s".format(op, self.timeout_s))
         header, body = self._replies.pop(number)
         if not header.get("ok"):
             raise MeshError(str(header.get("code", "error")), str(header.get("error", "refused")))
@@ -186,9 +187,9 @@ class MeshClient:
         notify: bool = False,
         wait: bool = True,
     ) -> Optional[int]:
-        """Hands a message to the daemon; returns its number once it is accepted.
+        """Publishes a message; returns its number once the daemon accepted it.
 
-        `to` names one peer (None: the topic's destinations, or all). With `notify` an event "outcome" follows per
+        `to` names one peer (None: the topic's destinations, or all). With `notify`, an event "outcome" follows per
         destination of a reliable topic. With `wait=False` nothing is returned, and a refusal arrives as an event
         "rejected".
         """
@@ -205,13 +206,13 @@ class MeshClient:
         return int(self.request("publish", payload, **fields)["message"])
 
     def subscribe(self, *topics: str) -> None:
-        """From now on messages of these topics arrive here; patterns such as "map/*" and "*" work."""
+        """Subscribes to topics; patterns such as "map/*" and "*" are allowed."""
         self.request("subscribe", topics=list(topics))
 
-    # What arrives
+    # Receive
 
     def messages(self, timeout_s: Optional[float] = None) -> Iterator[Message]:
-        """Messages as they arrive; other events are dropped. Ends after `timeout_s` without one (None: never)."""
+        """Yields messages as they arrive; drops other events. Ends after `timeout_s` without one (None: never)."""
         while True:
             frame = self.next_frame(timeout_s)
             if frame is None:
@@ -234,7 +235,7 @@ class MeshClient:
         frame = encode_frame(header, payload)
         head_bytes = _LENGTHS.unpack_from(frame)[0]
         if head_bytes > MAX_HEADER_BYTES:
-            text = "a request's header of {} bytes: the daemon takes {} at most".format(head_bytes, MAX_HEADER_BYTES)
+            text = "request header too long: expected at most {} bytes, found {}".format(MAX_HEADER_BYTES, head_bytes)
             raise MeshError("bad-request", text)
         try:
             with self._write_lock:
@@ -243,7 +244,7 @@ class MeshClient:
             raise MeshError("unreachable", "the daemon closed the connection: {}".format(error.strerror)) from error
 
     def _drain(self) -> None:
-        """Takes in what the daemon said before it closed the connection."""
+        """Reads what the daemon sent before it closed the connection."""
         try:
             while self._poll.poll(0) and self._read_once():
                 pass
@@ -251,14 +252,16 @@ class MeshClient:
             return
 
     def _gone(self, reason: str) -> MeshError:
-        """The daemon closed the connection; perhaps it said why."""
+        """The error for a closed connection, with the daemon's reason if it sent one."""
         for header, _ in self._events:
             if header.get("event") == "rejected" and header.get("code") == "too-many-clients":
-                return MeshError("too-many-clients", "the daemon refused: {}".format(header.get("error")))
+                return MeshError(
+                    "too-many-clients", "the daemon refused the connection: {}".format(header.get("error"))
+                )
         return MeshError("unreachable", reason)
 
     def _read(self, timeout_s: Optional[float]) -> bool:
-        """Reads once; False where nothing came in time."""
+        """Reads once; False on timeout."""
         if not self._poll.poll(None if timeout_s is None else max(0.0, timeout_s) * 1000):
             return False
         try:
@@ -269,7 +272,7 @@ class MeshClient:
         return True
 
     def _read_once(self) -> bool:
-        """Takes in what is there; False where the connection has ended."""
+        """Reads and decodes the available data; False at the end of the connection."""
         data = self._socket.recv(_READ_BYTES)
         if not data:
             return False
@@ -283,7 +286,7 @@ class MeshClient:
 
 
 def as_message(frame: Frame) -> Optional[Message]:
-    """The message in an event's frame; None for any other event."""
+    """The message in an event's frame; None for other events."""
     header, payload = frame
     if header.get("event") != "message":
         return None

@@ -1,7 +1,7 @@
-"""The transport as a running program: configuration -> driver over the core and the links -> local API.
+"""The transport as a daemon: configuration -> driver over the core and the links -> local API.
 
-`toml_source` and `configuration` read the file, `driver` moves bytes between sockets and the core, `outbox` keeps
-messages on disk, `recording` writes what happens to a file, `api` and `service` answer local programs on a Unix
-socket, `metrics` and `notify` tell Prometheus and systemd, `program` is the whole daemon, `library` the same
-transport inside another program.
+`toml_source` and `configuration` read the file, `driver` moves bytes between sockets and the core, `outbox` stores
+messages on disk, `recording` writes events to a file, `api` and `service` answer local clients on a Unix socket,
+`metrics` and `sd_notify` report to Prometheus and systemd. `main` runs the daemon; `api_node` runs the same transport
+inside another program.
 """

@@ -1,9 +1,9 @@
 """The local API's transport: a Unix socket, frames in, frames out (docs/local-api.md).
 
-A connection hands each request to the service and writes what the service gives back. What a slow reader does not
-fetch is bounded: past `CLIENT_BACKLOG_BYTES` messages for it are dropped, and it is told how many once it reads
-again; past `REPLIES_BACKLOG_BYTES` more its own requests wait. Other readers and the mesh never wait for it. A message
-for a program that has read everything is never dropped, however large.
+A connection passes each request to the service and writes the replies. Data for a slow reader is bounded: beyond
+`MAX_CLIENT_BACKLOG_BYTES`, messages for it are dropped and their number is reported once it reads again; beyond another
+`MAX_REPLY_BACKLOG_BYTES`, its own requests wait. Other readers and the mesh never wait for it. A message for a client
+that has read everything is never dropped, however large.
 """
 
 from __future__ import annotations
@@ -21,91 +21,90 @@ from udp_mesh.client.mesh_client import Frame, Header, encode_frame
 from udp_mesh.daemon.framing import BadFrame, RequestReader
 from udp_mesh.daemon.listener import Listener
 
-CLIENT_BACKLOG_BYTES = 32 << 20
-"""Bytes written to one client and not yet read by it: a stopped subscriber. A few of the largest usual messages."""
-BACKLOGS_BYTES = 256 << 20
-"""The same for all clients together: past it, who holds more than an equal part of that gets no more."""
-HALF_SENT_BYTES = 256 << 20
-"""Bytes of requests that are not there whole, of all clients together: past it, who holds more than an equal part of
-that has its request refused. Several of the largest messages at a time."""
-REPLIES_BACKLOG_BYTES = 4 << 20
-"""Bytes of replies beyond that: a program that asks without end and never reads the answers."""
+MAX_CLIENT_BACKLOG_BYTES = 32 << 20
+"""Bytes written to one client and not yet read by it: room for a few of the largest usual messages."""
+MAX_TOTAL_BACKLOG_BYTES = 256 << 20
+"""The same for all clients together; beyond it, a client that holds more than an equal share gets no more."""
+MAX_PARTIAL_REQUEST_BYTES = 256 << 20
+"""Bytes of incomplete requests of all clients together: several of the largest messages. Beyond it, the request of a
+client that holds more than an equal share is refused."""
+MAX_REPLY_BACKLOG_BYTES = 4 << 20
+"""Bytes of replies on top of that, for a client that sends requests and never reads the replies."""
 MAX_CLIENTS = 256
-"""Connections at a time: a program that leaks them must not take the daemon's descriptors."""
-SPARE_CLIENTS = 8
-"""Connections beyond that, for one look at what is wrong: they may ask `LOOKS`, once and soon. For one more of them the
-oldest gives way."""
-LOOKS = ("status", "metrics")
-SPARE_S = 2.0
-HALF_SENT_S = 30.0
-"""A request that stops coming for this long is given up, and its connection closed."""
-DESCRIPTORS_KEPT = 40
-"""Files for the daemon's own needs, whatever its limit: links, kernel's notices, outbox, recording, configuration, a
-scraper."""
+"""Concurrent connections: a program that leaks them must not exhaust the daemon's file descriptors."""
+MAX_SPARE_CLIENTS = 8
+"""Connections beyond that, for diagnosis only: each may send one of `SPARE_OPS` within `SPARE_TIMEOUT_S`. A further one
+evicts the oldest."""
+SPARE_OPS = ("status", "metrics")
+SPARE_TIMEOUT_S = 2.0
+PARTIAL_REQUEST_TIMEOUT_S = 30.0
+"""A connection whose incomplete request makes no progress for this long is closed."""
+RESERVED_DESCRIPTORS = 40
+"""Descriptors the daemon itself needs whatever its limit: links, netlink, outbox, recording, configuration, metrics."""
 
 
 _CREDENTIALS = struct.Struct("iII")
 
 
 class RequestError(Exception):
-    """A request that is refused; `code` is a word for programs, the text is for people."""
+    """A refused request; `code` is for programs, the text for people."""
 
     def __init__(self, code: str, text: str) -> None:
         super().__init__(text)
         self.code = code
 
 
-class Requests(Protocol):
-    """Who answers."""
+class RequestHandler(Protocol):
+    """Handles requests."""
 
     def request(self, client: Client, header: Header, payload: bytes) -> None:
-        """Answers now or later through `client`; raises RequestError to refuse."""
+        """Replies now or later through `client`. Raises RequestError to refuse."""
         ...
 
     def client_gone(self, client: Client) -> None: ...
 
 
 class Client(asyncio.Protocol):
-    """One connected program."""
+    """One connected client."""
 
     def __init__(self, server: LocalServer, *, spare: bool = False) -> None:
         self._server = server
         self.spare = spare
-        """Beyond the connections there may be: it gets one look."""
+        """Connected beyond the limit; it may send one diagnostic request."""
         self.user: int | None = None
-        """Whose program it is; None where the kernel does not say."""
+        """The client's user id; None if the kernel does not report it."""
         self._deadline: asyncio.TimerHandle | None = None
-        self._held_before = 0
+        self._partial_before = 0
         self._reader = RequestReader(server.max_payload_bytes)
         self._transport: asyncio.Transport | None = None
         self._dropped = 0
 
-    # What the service calls
+    # Called by the service
 
     def reply(self, request_id: object, payload: bytes = b"", **fields: object) -> None:
-        """Answers a request; one without an id wanted no answer."""
+        """Replies to a request; a request without an id gets no reply."""
         if request_id is not None:
             self._write({"id": request_id, "ok": True, **fields}, payload)
 
     def refuse(self, request_id: object, code: str, text: str) -> None:
-        """Refuses a request; one without an id hears of it as an event."""
+        """Refuses a request; for a request without an id, sends a `rejected` event."""
         if request_id is None:
             self._write({"event": "rejected", "code": code, "error": text})
         else:
             self._write({"id": request_id, "ok": False, "code": code, "error": text})
 
-    def tell(self, header: Header, payload: bytes = b"") -> None:
-        """An event; dropped and counted where the program does not read."""
+    def send_event(self, header: Header, payload: bytes = b"") -> None:
+        """Sends an event; drops and counts it if the client does not read."""
         if self._transport is not None:
-            self.tell_encoded(encode_frame(header, payload))
+            self.send_encoded(encode_frame(header, payload))
 
-    def tell_encoded(self, frame: bytes) -> None:
-        """As `tell`, for a frame that several clients get."""
+    def send_encoded(self, frame: bytes) -> None:
+        """Like `send_event`, for a frame that is sent to several clients."""
         transport = self._transport
         if transport is None:
             return
-        waiting = self.backlog()
-        if waiting and (waiting + len(frame) > CLIENT_BACKLOG_BYTES or self._server.too_much_for(waiting)):
+        waiting = self.backlog_bytes()
+        if waiting and (waiting + len(frame) > MAX_CLIENT_BACKLOG_BYTES or self._server.exceeds_backlog_share(waiting)):
             self._dropped += 1
             self._server.dropped_for_slow_clients += 1
             return
@@ -113,12 +112,12 @@ class Client(asyncio.Protocol):
             self._report_dropped()
         transport.write(frame)
 
-    def half_sent(self) -> int:
-        """Bytes of a request that is not here whole."""
-        return self._reader.held
+    def partial_request_bytes(self) -> int:
+        """Bytes of the incomplete request."""
+        return self._reader.buffered_bytes
 
-    def backlog(self) -> int:
-        """Bytes written and not yet read."""
+    def backlog_bytes(self) -> int:
+        """Bytes written and not yet read by the client."""
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
 
     def close(self) -> None:
@@ -133,19 +132,19 @@ class Client(asyncio.Protocol):
         if self._transport is not None:
             self._transport.write(encode_frame(header, payload))
 
-    # What asyncio calls
+    # Called by asyncio
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
-        self.user = _user_of(transport.get_extra_info("socket"))
-        self._server.connected(self)
+        self.user = _peer_uid(transport.get_extra_info("socket"))
+        self._server.on_connected(self)
         if self.spare:
-            self._deadline = asyncio.get_running_loop().call_later(SPARE_S, self.turn_away)
+            self._deadline = asyncio.get_running_loop().call_later(SPARE_TIMEOUT_S, self.reject)
 
-    def turn_away(self) -> None:
-        """There is no room for it."""
+    def reject(self) -> None:
+        """Refuses this connection because the limit is reached."""
         self._server.spares.pop(self, None)
-        self.refuse(None, "too-many-clients", self._server.too_many())
+        self.refuse(None, "too-many-clients", self._server.too_many_clients_text())
         self.close()
 
     def data_received(self, data: bytes) -> None:
@@ -154,38 +153,44 @@ class Client(asyncio.Protocol):
                 self.refuse(*frame)
             else:
                 self._handle(frame)
-        if self._server.too_much_half_sent(self.half_sent()):
-            text = f"local programs have begun to send more than {HALF_SENT_BYTES >> 20} MiB at a time: try again"
-            self.refuse(*self._reader.give_up("busy", text))
-        self._watch_half_sent()
+        if self._server.exceeds_partial_request_share(self.partial_request_bytes()):
+            limit_mib = MAX_PARTIAL_REQUEST_BYTES >> 20
+            text = f"incomplete requests of all clients exceed {limit_mib} MiB: try again later"
+            self.refuse(*self._reader.discard_partial("busy", text))
+        self._watch_partial_request()
         transport = self._transport
-        if transport is not None and transport.get_write_buffer_size() > CLIENT_BACKLOG_BYTES + REPLIES_BACKLOG_BYTES:
+        if (
+            transport is not None
+            and transport.get_write_buffer_size() > MAX_CLIENT_BACKLOG_BYTES + MAX_REPLY_BACKLOG_BYTES
+        ):
             transport.pause_reading()
 
-    def _watch_half_sent(self) -> None:
-        """While a request is not here whole, some of the rest must come now and then."""
+    def _watch_partial_request(self) -> None:
+        """Starts or cancels the timeout for an incomplete request."""
         if self.spare:
             return
-        held = self.half_sent()
+        held = self.partial_request_bytes()
         if held and self._deadline is None:
-            self._held_before = held
-            self._deadline = asyncio.get_running_loop().call_later(HALF_SENT_S, self._look_at_half_sent)
+            self._partial_before = held
+            self._deadline = asyncio.get_running_loop().call_later(
+                PARTIAL_REQUEST_TIMEOUT_S, self._check_partial_request
+            )
         elif not held and self._deadline is not None:
             self._deadline.cancel()
             self._deadline = None
 
-    def _look_at_half_sent(self) -> None:
+    def _check_partial_request(self) -> None:
         self._deadline = None
-        if self.half_sent() == self._held_before:
-            self.refuse(None, "too-slow", f"a request stopped coming for {HALF_SENT_S:g} s")
+        if self.partial_request_bytes() == self._partial_before:
+            self.refuse(None, "too-slow", f"request incomplete: no data for {PARTIAL_REQUEST_TIMEOUT_S:g} s")
             self.close()
         else:
-            self._watch_half_sent()
+            self._watch_partial_request()
 
     def _handle(self, frame: Frame) -> None:
         header, payload = frame
-        if self.spare and header.get("op") not in LOOKS:
-            self.refuse(header.get("id"), "too-many-clients", self._server.too_many())
+        if self.spare and header.get("op") not in SPARE_OPS:
+            self.refuse(header.get("id"), "too-many-clients", self._server.too_many_clients_text())
             self.close()
             return
         try:
@@ -196,7 +201,7 @@ class Client(asyncio.Protocol):
             self.close()
 
     def resume_writing(self) -> None:
-        # What was written is read, all but a few kilobytes.
+        # All but a few kilobytes have been read.
         if self._transport is not None:
             self._transport.resume_reading()
         if self._dropped:
@@ -215,32 +220,38 @@ class LocalServer:
     """The listening socket and its connections."""
 
     def __init__(
-        self, requests: Requests, path: Path, *, mode: int, group: str | None, max_payload_bytes: Callable[[], int]
+        self,
+        requests: RequestHandler,
+        path: Path,
+        *,
+        mode: int,
+        group: str | None,
+        max_payload_bytes: Callable[[], int],
     ) -> None:
         self.requests = requests
         self.clients: set[Client] = set()
         self.spares: dict[Client, None] = {}
-        """Connections beyond the most, the oldest first."""
+        """Connections beyond the limit, oldest first."""
         self.max_payload_bytes = max_payload_bytes
         self.dropped_for_slow_clients = 0
-        self._listener = Listener(path, mode=mode, group=group, take=self._take)
-        self._most = MAX_CLIENTS
+        self._listener = Listener(path, mode=mode, group=group, on_connection=self._on_connection)
+        self._max_clients = MAX_CLIENTS
         self._connecting: dict[Client, asyncio.Task[None]] = {}
-        """Accepted, their transports not yet made: they count already, since the loop may accept more meanwhile."""
+        """Accepted connections without a transport yet. They count: the loop may accept more in the meantime."""
 
     async def start(self) -> None:
-        """Listens. Raises OSError: in use by another daemon, no such directory, no such group, not allowed."""
-        self._most = max(1, descriptors_for(MAX_CLIENTS + DESCRIPTORS_KEPT) - DESCRIPTORS_KEPT)
+        """Listens. Raises OSError: in use by another daemon, no such directory or group, permission denied."""
+        self._max_clients = max(1, raise_descriptor_limit(MAX_CLIENTS + RESERVED_DESCRIPTORS) - RESERVED_DESCRIPTORS)
         self._listener.open()
 
-    def _take(self, connection: socket.socket) -> None:
-        """A program has connected."""
+    def _on_connection(self, connection: socket.socket) -> None:
+        """Handles a new connection."""
         making = sum(not client.spare for client in self._connecting)
-        spare = len(self.clients) + making >= self._most
-        if spare and len(self._connecting) - making >= 2 * SPARE_CLIENTS:
-            # What cannot be written at once to a fresh connection is not worth waiting for.
+        spare = len(self.clients) + making >= self._max_clients
+        if spare and len(self._connecting) - making >= 2 * MAX_SPARE_CLIENTS:
+            # Do not wait for a new connection that cannot be written to at once.
             with connection, contextlib.suppress(OSError):
-                rejected = {"event": "rejected", "code": "too-many-clients", "error": self.too_many()}
+                rejected = {"event": "rejected", "code": "too-many-clients", "error": self.too_many_clients_text()}
                 connection.send(encode_frame(rejected, b""))
             return
         client = Client(self, spare=spare)
@@ -254,34 +265,34 @@ class LocalServer:
         finally:
             self._connecting.pop(client, None)
 
-    def connected(self, client: Client) -> None:
-        """A program's connection can be used."""
+    def on_connected(self, client: Client) -> None:
+        """Registers a connection once its transport exists."""
         self._connecting.pop(client, None)
         if client.spare:
             self.spares[client] = None
-            if len(self.spares) > SPARE_CLIENTS:
-                next(iter(self.spares)).turn_away()
+            if len(self.spares) > MAX_SPARE_CLIENTS:
+                next(iter(self.spares)).reject()
         else:
             self.clients.add(client)
 
-    def too_many(self) -> str:
-        """Why a program is turned away."""
-        return f"at most {self._most} programs connect at a time"
+    def too_many_clients_text(self) -> str:
+        """The error text for a connection beyond the limit."""
+        return f"too many clients: at most {self._max_clients} may connect at a time"
 
-    def too_much_for(self, waiting: int) -> bool:
-        """Whether a client for which so many bytes wait must not get more for all others' sake."""
-        return self._too_much(waiting, BACKLOGS_BYTES, Client.backlog)
+    def exceeds_backlog_share(self, waiting: int) -> bool:
+        """Whether a client with this backlog exceeds its share of the total limit."""
+        return self._exceeds_share(waiting, MAX_TOTAL_BACKLOG_BYTES, Client.backlog_bytes)
 
-    def too_much_half_sent(self, held: int) -> bool:
-        """Whether a client that has sent so much of a request must not send the rest of it for all others' sake."""
-        return self._too_much(held, HALF_SENT_BYTES, Client.half_sent)
+    def exceeds_partial_request_share(self, held: int) -> bool:
+        """Whether a client with this much of an incomplete request exceeds its share of the total limit."""
+        return self._exceeds_share(held, MAX_PARTIAL_REQUEST_BYTES, Client.partial_request_bytes)
 
-    def _too_much(self, own: int, limit: int, of_each: Callable[[Client], int]) -> bool:
-        """Whether this is more than an equal part of a limit that all together exceed."""
+    def _exceeds_share(self, own: int, limit: int, of_each: Callable[[Client], int]) -> bool:
+        """Whether the total exceeds `limit` and `own` exceeds an equal share of it."""
         return own > limit // max(1, len(self.clients)) and sum(map(of_each, self.clients)) > limit
 
     async def close(self) -> None:
-        """Stops listening, lets what is written be read, closes every connection, removes the socket's file."""
+        """Stops listening, flushes and closes every connection, removes the socket file."""
         self._listener.close()
         await asyncio.gather(*self._connecting.values())
         for client in [*self.clients, *self.spares]:
@@ -289,8 +300,8 @@ class LocalServer:
         await asyncio.sleep(0)
 
 
-def _user_of(connection: socket.socket | None) -> int | None:
-    """The user id of the program at the other end (unix(7), SO_PEERCRED)."""
+def _peer_uid(connection: socket.socket | None) -> int | None:
+    """The user id of the process at the other end (unix(7), SO_PEERCRED)."""
     if connection is None:
         return None
     try:
@@ -302,17 +313,17 @@ def _user_of(connection: socket.socket | None) -> int | None:
     return int(user)
 
 
-def descriptors_for(wanted: int) -> int:
-    """How many files this process may open, after asking for as many as `wanted` where the limit is lower."""
+def raise_descriptor_limit(wanted: int) -> int:
+    """The number of files this process may open, after raising the soft limit toward `wanted`."""
     try:
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     except OSError:
-        # a sandbox that does not tell
+        # A sandbox may hide the limit.
         return wanted
     if soft == resource.RLIM_INFINITY or soft >= wanted:
         return wanted
-    most = wanted if hard == resource.RLIM_INFINITY else min(hard, wanted)
+    raised = wanted if hard == resource.RLIM_INFINITY else min(hard, wanted)
     with contextlib.suppress(OSError, ValueError):
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-        return most
+        resource.setrlimit(resource.RLIMIT_NOFILE, (raised, hard))
+        return raised
     return soft

@@ -6,8 +6,8 @@
         async for message in node.messages():
             ...
 
-A node opens its links on entry, says good-bye on exit. What it receives and what happens wait in bounded queues until
-they are read; `deliver` waits for a reliable message's end.
+A node opens its links on entry and sends a goodbye on exit. Received messages and events wait in bounded queues until
+they are read; `deliver` waits for the outcome of a reliable message.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from udp_mesh.core.events import (
 from udp_mesh.core.settings import Settings
 from udp_mesh.daemon.driver import Driver
 from udp_mesh.daemon.outbox import DirectoryStore
-from udp_mesh.links.attachments import EVERY_INTERFACE, LinkWish
+from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
 from udp_mesh.wire.limits import BOOT_ID_BYTES
 
 Outcome = MessageDelivered | MessageExpired | MessagePeerLost
 
 MAX_UNREAD = 65_536
-"""Messages or events nobody reads: the oldest is dropped and counted, as the reader's own fault."""
+"""Messages or events not yet read by the application; beyond it, the oldest is dropped and counted."""
 
 
 class SendRefusedError(Exception):
-    """The core took nothing on; `reason` says why."""
+    """The core refused a message; `reason` says why."""
 
     def __init__(self, rejected: Rejected) -> None:
         super().__init__(f"{rejected.reason.value}: {rejected.detail}")
@@ -51,13 +51,13 @@ class SendRefusedError(Exception):
 
 
 class Node:
-    """One node in this process, alive inside its `async with`."""
+    """One node in this process, running inside its `async with` block."""
 
     def __init__(
         self,
         settings: Settings,
         *,
-        links: Sequence[LinkWish] = EVERY_INTERFACE,
+        links: Sequence[LinkConfig] = EVERY_INTERFACE,
         store: DirectoryStore | None = None,
         urgent_dscp: int = 46,
     ) -> None:
@@ -74,7 +74,7 @@ class Node:
         self.unread_dropped = 0
 
     async def __aenter__(self) -> Node:
-        """Opens the links. Raises OSError where the kernel cannot be asked for interfaces."""
+        """Opens the links. Raises OSError if the kernel cannot list its interfaces."""
         self._driver = Driver(
             self._settings,
             self._links,
@@ -98,20 +98,20 @@ class Node:
     def driver(self) -> Driver:
         """The running driver. Raises RuntimeError outside of `async with`."""
         if self._driver is None:
-            raise RuntimeError("a node lives inside its `async with`")
+            raise RuntimeError("the node is not running: use it inside `async with`")
         return self._driver
 
     async def send(self, topic: str, payload: bytes, *, to: str | None = None, type_name: str = "") -> MessageId:
-        """Accepts a message for one peer, or for the topic's destinations, or for all. Raises SendRefusedError."""
+        """Accepts a message for one peer, for the topic's destinations, or for all. Raises SendRefusedError."""
         outcome = self.driver.send(topic, payload, destination=to, type_name=type_name)
         if isinstance(outcome, Rejected):
             raise SendRefusedError(outcome)
-        # A sender in a loop must let the datagrams leave.
+        # Yield, so that datagrams leave even if the caller sends in a loop.
         await asyncio.sleep(0)
         return outcome
 
     async def deliver(self, topic: str, payload: bytes, *, to: str, type_name: str = "") -> Outcome:
-        """Sends a message of a reliable topic to one peer and waits for its end. Raises SendRefusedError."""
+        """Sends a message of a reliable topic to one peer and waits for its outcome. Raises SendRefusedError."""
         outcome = self.driver.send(topic, payload, destination=to, type_name=type_name)
         if isinstance(outcome, Rejected):
             raise SendRefusedError(outcome)
@@ -123,7 +123,7 @@ class Node:
             del self._outcomes[outcome, to]
 
     async def messages(self) -> AsyncIterator[MessageReceived]:
-        """Messages in the order they became complete, until the node is closed."""
+        """Messages in order of completion, until the node is closed."""
         while True:
             while self._messages:
                 yield self._messages.popleft()
@@ -133,7 +133,7 @@ class Node:
             await self._arrived.wait()
 
     async def events(self) -> AsyncIterator[Event]:
-        """Everything but received messages: peers, outcomes, conflicts, starvation."""
+        """All other events: peers, outcomes, conflicts, starvation."""
         while True:
             while self._events:
                 yield self._events.popleft()
@@ -143,7 +143,7 @@ class Node:
             await self._happened.wait()
 
     def apply(self, settings: Settings) -> list[str]:
-        """Changes topics, window, rates, limits, keys, neighbours; drops no message. Raises ValueError."""
+        """Changes topics, window, rates, limits, keys, neighbors. Drops no message. Raises ValueError."""
         return self.driver.apply(settings)
 
     def conditions(self) -> Conditions:

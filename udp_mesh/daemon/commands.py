@@ -1,7 +1,7 @@
 """The requests of the local API: each a function of the service, the client, the header's fields and the payload.
 
-A command returns the reply's fields, or something to await for them; it raises RequestError to refuse.
-docs/local-api.md shows every request with its reply.
+A command returns the reply's fields or an awaitable for them; it raises RequestError to refuse. docs/local-api.md lists
+every request with its reply.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from udp_mesh.daemon.configuration import (
     read_rates,
     topic_from_values,
 )
-from udp_mesh.daemon.file_access import FILE_S, is_below, off_loop
+from udp_mesh.daemon.file_access import FILE_TIMEOUT_S, is_below, off_loop
 from udp_mesh.daemon.neighbours import (
     NODE_NAME,
     TOPIC_NAME,
@@ -42,26 +42,26 @@ from udp_mesh.wire.header import VERSION as WIRE_VERSION
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
 
 MAX_NEIGHBOURS = 1024
-"""Fixed neighbours: each gets every heartbeat. As many as there may be peers."""
+"""Fixed neighbors, each of which gets every heartbeat; equal to the maximum number of peers."""
 MAX_TOPICS = 4096
-"""Topics declared by commands: a program that invents names."""
+"""Topics declared by requests, so that a client cannot declare them without bound."""
 
 Result = TypeVar("Result")
 
-# Reading a request's fields
+# Parse a request's fields
 
 
 def _text(header: Header, key: str) -> str:
     value = header.get(key)
     if not isinstance(value, str) or not value:
-        raise RequestError("bad-request", f"{key}: expected text, found {value!r}")
+        raise RequestError("bad-request", f"{key}: expected a non-empty string, found {value!r}")
     try:
         value.encode()
     except UnicodeEncodeError as error:
-        # JSON can name half of a surrogate pair, which is no text
-        raise RequestError("bad-request", f"{key}: expected Unicode text, found {value!r}") from error
+        # JSON can encode a lone surrogate, which is not valid Unicode.
+        raise RequestError("bad-request", f"{key}: expected a valid Unicode string, found {value!r}") from error
     if "\0" in value:
-        raise RequestError("bad-request", f"{key}: expected text without the character NUL, found {value!r}")
+        raise RequestError("bad-request", f"{key}: expected a string without NUL characters, found {value!r}")
     return value
 
 
@@ -72,7 +72,7 @@ def _optional_text(header: Header, key: str) -> str | None:
 def _texts(header: Header, key: str) -> list[str]:
     value = header.get(key)
     if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise RequestError("bad-request", f"{key}: expected a list of text, found {value!r}")
+        raise RequestError("bad-request", f"{key}: expected a list of strings, found {value!r}")
     return value
 
 
@@ -83,7 +83,7 @@ def _values(header: Header, key: str) -> dict[str, object]:
     return value
 
 
-def _refusal(error: ConfigurationError) -> RequestError:
+def _request_error(error: ConfigurationError) -> RequestError:
     text = "; ".join(str(problem).removeprefix("command:1: ") for problem in error.problems)
     return RequestError("bad-configuration", text)
 
@@ -95,7 +95,7 @@ def publish(service: Service, client: Client, header: Header, payload: bytes) ->
     topic, destination = _text(header, "topic"), _optional_text(header, "to")
     notify = client if header.get("notify") else None
     type_name = _text(header, "type") if header.get("type") else ""
-    # What no receiver takes is refused here, by name.
+    # Refuse here, with a clear error, what every receiver would drop.
     if not is_topic_name(topic):
         raise RequestError("bad-request", f"topic: expected {TOPIC_NAME}, found {topic!r}")
     if destination is not None and not is_node_name(destination):
@@ -125,14 +125,14 @@ def unsubscribe(service: Service, client: Client, header: Header, _: bytes) -> H
 
 
 def events(service: Service, client: Client, _header: Header, _: bytes) -> Header:
-    service.watch(client)
+    service.subscribe_events(client)
     return {}
 
 
 def ping(service: Service, _client: Client, header: Header, _: bytes) -> Awaitable[Header]:
     peer, timeout_s = _text(header, "peer"), header.get("timeout_s", 2.0)
     if not isinstance(timeout_s, int | float) or not 0 < timeout_s <= MAX_PING_S:
-        raise RequestError("bad-request", f"timeout_s: expected up to {MAX_PING_S:g}, found {timeout_s!r}")
+        raise RequestError("bad-request", f"timeout_s: expected at most {MAX_PING_S:g}, found {timeout_s!r}")
 
     async def answer() -> Header:
         return {"round_trip_s": round(await service.ping(peer, float(timeout_s)), 6)}
@@ -140,7 +140,7 @@ def ping(service: Service, _client: Client, header: Header, _: bytes) -> Awaitab
     return answer()
 
 
-# What is
+# Query
 
 
 def status(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
@@ -169,14 +169,14 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
         ],
         "refusals": [
             {
-                "link": refusal.link,
-                "to": refusal.to,
-                "reason": refusal.reason,
-                "datagrams": refusal.datagrams,
-                "for_s": round(refusal.last - refusal.since, 3),
-                "last_ago_s": round(driver.now() - refusal.last, 3),
+                "link": error.link,
+                "to": error.to,
+                "reason": error.reason,
+                "datagrams": error.datagrams,
+                "for_s": round(error.last - error.since, 3),
+                "last_ago_s": round(driver.now() - error.last, 3),
             }
-            for refusal in driver.refusals.standing()
+            for error in driver.send_errors.active()
         ],
         "link_failures": driver.link_failures,
         "recording": None if recorder is None else {"path": str(recorder.path), "bytes": recorder.bytes},
@@ -201,7 +201,7 @@ def metrics_page(service: Service, client: Client, header: Header, _: bytes) -> 
 
 
 def render_metrics(service: Service) -> str:
-    """The page for Prometheus."""
+    """The metrics in Prometheus text format."""
     driver = service.driver
     extra = {
         "wakeups": driver.wakeups,
@@ -219,7 +219,7 @@ def render_metrics(service: Service) -> str:
     return metrics.render(driver.conditions(), visible, extra, about=about, uptime_s=driver.now() - service.started)
 
 
-# What shall be
+# Change
 
 
 def _changed(service: Service, settings: Settings) -> Header:
@@ -233,10 +233,10 @@ def set_topic(service: Service, _client: Client, header: Header, _: bytes) -> He
     try:
         topic = topic_from_values(name, values, current)
     except ConfigurationError as error:
-        raise _refusal(error) from error
+        raise _request_error(error) from error
     others = tuple(other for other in settings.topics if other.name != name)
     if len(others) >= MAX_TOPICS:
-        raise RequestError("too-many", f"expected at most {MAX_TOPICS} topics")
+        raise RequestError("too-many", f"at most {MAX_TOPICS} topics may be declared")
     return _changed(service, replace(settings, topics=(*others, topic)))
 
 
@@ -244,7 +244,7 @@ def drop_topic(service: Service, _client: Client, header: Header, _: bytes) -> H
     name, settings = _text(header, "topic"), service.settings
     others = tuple(other for other in settings.topics if other.name != name)
     if name.startswith(RESERVED_PREFIX) or len(others) == len(settings.topics):
-        raise RequestError("unknown-topic", f"no topic {name!r} is configured")
+        raise RequestError("unknown-topic", f"topic {name!r} is not configured")
     return _changed(service, replace(settings, topics=others))
 
 
@@ -259,7 +259,7 @@ def set_rates(service: Service, _client: Client, header: Header, _: bytes) -> He
     source = Source("command", {})
     rates = read_rates(Table(_values(header, "values"), source, ("rates",)), service.settings.rates)
     if source.problems:
-        raise _refusal(ConfigurationError(source.problems))
+        raise _request_error(ConfigurationError(source.problems))
     return _changed(service, replace(service.settings, rates=rates))
 
 
@@ -271,10 +271,10 @@ def set_neighbour(service: Service, _client: Client, header: Header, _: bytes) -
         Table({key: value for key, value in values.items() if value is not None}, source, ("neighbour",)), settings.port
     )
     if neighbour is None:
-        raise RequestError("bad-request", str(_refusal(ConfigurationError(source.problems))))
+        raise RequestError("bad-request", str(_request_error(ConfigurationError(source.problems))))
     others = tuple(other for other in settings.neighbours if other.address != neighbour.address)
     if len(others) >= MAX_NEIGHBOURS:
-        raise RequestError("too-many", f"expected at most {MAX_NEIGHBOURS} neighbours")
+        raise RequestError("too-many", f"at most {MAX_NEIGHBOURS} neighbors may be configured")
     return _changed(service, replace(settings, neighbours=(*others, neighbour)))
 
 
@@ -283,7 +283,7 @@ def drop_neighbour(service: Service, _client: Client, header: Header, _: bytes) 
     address = parse_address(text, settings.port)
     others = tuple(other for other in settings.neighbours if other.address != address)
     if len(others) == len(settings.neighbours):
-        raise RequestError("unknown-neighbour", f"no neighbour {text} is configured")
+        raise RequestError("unknown-neighbour", f"neighbor {text} is not configured")
     return _changed(service, replace(settings, neighbours=others))
 
 
@@ -292,17 +292,17 @@ def neighbours(service: Service, _client: Client, _header: Header, _: bytes) -> 
 
 
 async def _from_files(work: Callable[[], Result]) -> Result:
-    """What is read from files; a disk that does not answer costs the request alone. Raises RequestError."""
+    """Reads files without blocking the loop: a disk that hangs fails only this request. Raises RequestError."""
     try:
         return await off_loop(work)
     except ConfigurationError as error:
-        raise _refusal(error) from error
+        raise _request_error(error) from error
     except TimeoutError as error:
-        raise RequestError("too-slow", f"the file was not read within {FILE_S:g} s") from error
+        raise RequestError("too-slow", f"timed out after {FILE_TIMEOUT_S:g} s while reading the file") from error
 
 
 async def set_keys(service: Service, _client: Client, header: Header, _: bytes) -> Header:
-    """Takes the keys of a key file, so that no key crosses the socket."""
+    """Loads keys from a file, so that no key crosses the socket."""
     path = Path(_text(header, "file"))
     keys = await _from_files(lambda: read_keys(path))
     changes = service.apply(replace(service.settings, keys=keys, unkeyed=False))
@@ -319,11 +319,11 @@ async def reload(service: Service, _client: Client, _header: Header, _: bytes) -
 
 async def record_start(service: Service, client: Client, header: Header, _: bytes) -> Header:
     path, payloads = Path(_text(header, "path")), bool(header.get("payloads"))
-    service.may_record()
+    service.check_not_recording()
     directory = service.configuration.daemon.state_directory
     if client.user not in (0, os.geteuid()) and not await _from_files(lambda: is_below(path, directory)):
-        # The daemon may write where that program may not.
-        raise RequestError("cannot-record", f"{path}: other users' programs record below {directory} only")
+        # The daemon may have permission to write where the client does not.
+        raise RequestError("cannot-record", f"{path}: clients of other users may only record below {directory}")
     service.start_recording(path, payloads)
     return {}
 
@@ -331,7 +331,7 @@ async def record_start(service: Service, client: Client, header: Header, _: byte
 async def record_stop(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
     recorder = await service.stop_recording()
     if recorder is None:
-        raise RequestError("not-recording", "nothing is being recorded")
+        raise RequestError("not-recording", "no recording is running")
     return {"path": str(recorder.path), "bytes": recorder.bytes, "lines": recorder.lines}
 
 

@@ -1,8 +1,8 @@
-"""The daemon's configuration: TOML file -> `Configuration`, with every problem named by file and line.
+"""The daemon's configuration: TOML file -> `Configuration`, with every problem reported by file and line.
 
-`load` reads the file and the key file it names; `read` is the pure part. The values the core takes are in `settings`,
-what only the daemon needs stands beside it. Reading the same file again on SIGHUP gives the next `Configuration`; a
-file with problems changes nothing. The keys of the file are described in docs/udp-mesh.md.
+`load` reads the file and the key file it names; `read` is the pure part. `settings` holds the core's values, `daemon`
+those of the process. SIGHUP reads the same file again; a file with problems changes nothing. docs/udp-mesh.md describes
+the keys.
 """
 
 from __future__ import annotations
@@ -38,68 +38,68 @@ from udp_mesh.daemon.neighbours import (
     read_neighbours,
 )
 from udp_mesh.daemon.toml_source import ConfigurationError, Problem, Source, Table, parse
-from udp_mesh.links.attachments import EVERY_INTERFACE, LinkWish
+from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
 from udp_mesh.wire.limits import MAX_MESSAGE_BYTES
 
 log = logging.getLogger(__name__)
 
 DEFAULT_PATH = Path("/etc/udp-mesh/udp-mesh.toml")
 DEFAULT_SOCKET = Path("/run/udp-mesh/udp-mesh.sock")
-DEFAULT_STATE = Path("/var/lib/udp-mesh")
-MAX_SOCKET_BYTES = 107
-"""Of a Unix socket's path, without the NUL behind it."""
+DEFAULT_STATE_DIRECTORY = Path("/var/lib/udp-mesh")
+MAX_SOCKET_PATH_BYTES = 107
+"""Maximum length of a Unix socket's path, without the terminating NUL."""
 MAX_FILE_BYTES = 1 << 20
-"""A configuration of a megabyte is a mistake (a wrong path), not a configuration."""
+"""A larger configuration file is a mistake, such as a wrong path."""
 
 RESERVED_PREFIX = "~mesh/"
-"""Topics of the daemon's own: ping, pong and the benchmark."""
+"""Prefix of the daemon's own topics: ping, pong, benchmark."""
 PING_TOPIC, PONG_TOPIC, BENCH_TOPIC = "~mesh/ping", "~mesh/pong", "~mesh/bench"
 RESERVED_TOPICS = (
-    # Reliable: what is asked is whether, and how soon, an urgent message gets there and back, not whether one datagram
-    # does. The share of lost datagrams is in the conditions.
+    # Reliable: a ping measures whether and how fast an urgent message makes the round trip, not whether one datagram
+    # does. The conditions report the share of lost datagrams.
     Topic(PING_TOPIC, priority=0, deadline_s=10.0),
     Topic(PONG_TOPIC, priority=0, deadline_s=10.0),
     Topic(BENCH_TOPIC, priority=15, reliable=True),
 )
 MAX_PING_S = 60.0
-"""A ping's answer is waited for no longer."""
+"""Maximum timeout of a ping."""
 CONDITIONS_TOPIC = "~mesh/conditions"
-"""What local subscribers get of the network's conditions; it never leaves the machine."""
+"""Topic that carries the network conditions to local subscribers; it never leaves the machine."""
 
 
 @dataclass(frozen=True, slots=True)
 class DaemonSettings:
-    """What the process needs besides the core's settings."""
+    """Settings of the process, besides the core's."""
 
     socket: Path = DEFAULT_SOCKET
     socket_mode: int = 0o660
     socket_group: str | None = None
     user: str | None = None
-    """Whom to become once sockets are open (None: stay)."""
-    state_directory: Path = DEFAULT_STATE
+    """User to switch to once the sockets are open (None: stay)."""
+    state_directory: Path = DEFAULT_STATE_DIRECTORY
     metrics_address: Address | None = None
-    """Where Prometheus may ask over TCP: a loopback address (None: only through the local socket)."""
+    """Loopback address of the Prometheus endpoint (None: metrics only through the local socket)."""
     conditions_period_s: float = 1.0
     outbox_disk_bytes: int = 1 << 30
-    """All outboxes on disk together: a partner that stays away for days."""
+    """Limit of all outboxes on disk together: room for a peer that stays away for days."""
     record_bytes: int = 1 << 30
-    """One recording: a forgotten one must not fill the disk."""
+    """Limit of one recording, so that a forgotten one does not fill the disk."""
     urgent_dscp: int = 46
-    """DSCP of urgent datagrams: 46 (EF, RFC 3246) takes wifi's video queue, ahead of best effort."""
+    """DSCP of urgent datagrams: 46 (EF, RFC 3246) maps to wifi's video queue, ahead of best effort."""
 
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """Everything a daemon is told."""
+    """The daemon's complete configuration."""
 
     settings: Settings
-    links: tuple[LinkWish, ...] = EVERY_INTERFACE
+    links: tuple[LinkConfig, ...] = EVERY_INTERFACE
     daemon: DaemonSettings = field(default_factory=DaemonSettings)
     file: Path | None = None
 
 
 def load(path: Path) -> Configuration:
-    """The configuration in this file, with the keys of the key file it names. Raises ConfigurationError."""
+    """Loads a configuration file and the key file it names. Raises ConfigurationError."""
     text = _read_text(path)
     top = parse(text, str(path))
     key_file, unkeyed = top.text("key_file"), top.boolean("unkeyed", False)
@@ -108,7 +108,7 @@ def load(path: Path) -> Configuration:
         top.source.report(("unkeyed",), "either key_file or unkeyed", "both")
     if key_file is not None:
         try:
-            # Relative to the configuration, so that a bundle can be moved as a whole.
+            # Relative to the configuration file, so that a bundle can be moved as a whole.
             keys = read_keys(path.parent / key_file)
         except ConfigurationError as error:
             line = top.source.line(("key_file",))
@@ -122,13 +122,13 @@ def load(path: Path) -> Configuration:
             ]
     elif not unkeyed:
         top.source.report(
-            ("key_file",), "a file with the fleet's key", "none", "unkeyed = true runs without protection"
+            ("key_file",), "a file with the fleet's key", "none", "set unkeyed = true to run without protection"
         )
     return dataclasses.replace(read(top, keys), file=path)
 
 
 def read_keys(path: Path) -> tuple[Key, ...]:
-    """The one or two keys of a key file, one per line, the sealing one first. Raises ConfigurationError."""
+    """The one or two keys of a key file, one per line, the sealing key first. Raises ConfigurationError."""
     keys: list[Key] = []
     problems: list[Problem] = []
     for number, line in enumerate(_read_text(path).splitlines(), start=1):
@@ -142,7 +142,7 @@ def read_keys(path: Path) -> tuple[Key, ...]:
             problems.append(Problem(str(path), number, "", expected, found))
             continue
         if not any(key.secret):
-            problems.append(Problem(str(path), number, "", "a random key (udp-mesh keygen)", "nothing but zeros"))
+            problems.append(Problem(str(path), number, "", "a random key (udp-mesh keygen)", "only zeros"))
         keys.append(key)
     if not problems and not 1 <= len(keys) <= 2:
         problems.append(Problem(str(path), 1, "", "one or two keys, one per line", f"{len(keys)}"))
@@ -151,7 +151,7 @@ def read_keys(path: Path) -> tuple[Key, ...]:
     if problems:
         raise ConfigurationError(problems)
     if is_exposed(path):
-        log.warning("key-file-exposed path=%s every user of this computer can read it: chmod 600", path)
+        log.warning("key-file-exposed path=%s readable by every user of this computer: run chmod 600", path)
     return tuple(keys)
 
 
@@ -171,7 +171,7 @@ def _read_text(path: Path) -> str:
 
 
 def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
-    """The configuration in a parsed file. Raises ConfigurationError with every problem found in it."""
+    """The configuration in a parsed file. Raises ConfigurationError with every problem found."""
     source = top.source
     top.text("key_file")
     unkeyed = top.boolean("unkeyed", False)
@@ -205,7 +205,7 @@ def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
             limits=limits,
         )
     except ValueError as error:
-        raise ConfigurationError([problem_of(source, error)]) from error
+        raise ConfigurationError([problem_from(source, error)]) from error
     return Configuration(settings, links, daemon)
 
 
@@ -213,8 +213,8 @@ def _window(packets: int | None) -> Literal["adaptive"] | int:
     return "adaptive" if packets is None else packets
 
 
-def problem_of(source: Source, error: ValueError) -> Problem:
-    """What a value's own check found, as a problem at its key's line where the text names one."""
+def problem_from(source: Source, error: ValueError) -> Problem:
+    """Converts a ValueError of the settings into a problem, at its key's line if the text names one."""
     text = str(error)
     parts = re.fullmatch(r"(?P<key>[^:]+): (?:expected )?(?P<expected>.*?)(?:, found (?P<found>.*))?", text)
     if parts is None:
@@ -224,7 +224,7 @@ def problem_of(source: Source, error: ValueError) -> Problem:
 
 
 def read_topic(name: str, table: Table) -> Topic:
-    """How one topic travels: an entry of `[topics]`, or what a command sets. Problems go to the table's source."""
+    """A topic from an entry of `[topics]` or from a request. Reports problems to the table's source."""
     good_name = False
     if name.startswith(RESERVED_PREFIX):
         table.source.report(table.path, f"a topic outside {RESERVED_PREFIX}", name)
@@ -250,9 +250,9 @@ def read_topic(name: str, table: Table) -> Topic:
     table.finish()
     for destination in topic.destinations:
         if not is_node_name(destination):
-            table.report("destinations", f"names of nodes, each {NODE_NAME}", destination)
+            table.report("destinations", f"node names, each {NODE_NAME}", destination)
     if topic.outbox_on_disk and topic.outbox is Outbox.NONE:
-        table.report("outbox_on_disk", 'outbox = "last" or "all" beside it', topic.outbox_on_disk)
+        table.report("outbox_on_disk", 'outbox = "last" or "all" as well', topic.outbox_on_disk)
     return dataclasses.replace(topic, name=name) if good_name else topic
 
 
@@ -261,7 +261,7 @@ def _or(value: int | None, default: int) -> int:
 
 
 def read_rates(table: Table, current: Rates | None = None) -> Rates:
-    """The protocol's times and thresholds; what the table leaves out stays as in `current`."""
+    """The protocol's times and thresholds; keys missing from the table keep the value in `current`."""
     base = current or Rates()
     changes: dict[str, float | int] = {}
     for entry in dataclasses.fields(Rates):
@@ -277,7 +277,7 @@ def read_rates(table: Table, current: Rates | None = None) -> Rates:
     try:
         return dataclasses.replace(base, **changes)  # type: ignore[arg-type]
     except ValueError as error:
-        table.source.problems.append(problem_of(table.source, error))
+        table.source.problems.append(problem_from(table.source, error))
         return base
 
 
@@ -307,8 +307,8 @@ def _read_daemon(table: Table) -> DaemonSettings:
     if metrics_text is not None and (metrics is None or not ipaddress.ip_address(metrics[0]).is_loopback):
         table.report("metrics_address", "a loopback address with a port (127.0.0.1:9871)", metrics_text)
     socket_path = _read_path(table, "socket", default.socket)
-    if len(os.fsencode(socket_path)) > MAX_SOCKET_BYTES:
-        table.report("socket", f"a path of at most {MAX_SOCKET_BYTES} bytes (unix(7))", str(socket_path))
+    if len(os.fsencode(socket_path)) > MAX_SOCKET_PATH_BYTES:
+        table.report("socket", f"a path of at most {MAX_SOCKET_PATH_BYTES} bytes (unix(7))", str(socket_path))
     settings = DaemonSettings(
         socket=socket_path,
         socket_mode=mode,
@@ -333,7 +333,7 @@ def _read_path(table: Table, key: str, default: Path) -> Path:
 
 
 def topic_from_values(name: str, values: dict[str, object], current: Topic | None) -> Topic:
-    """A topic from a command's fields; fields left out stay as in `current`. Raises ConfigurationError."""
+    """A topic from a request's fields; missing fields keep the value in `current`. Raises ConfigurationError."""
     merged: dict[str, object] = {}
     if current is not None:
         for entry in dataclasses.fields(Topic):

@@ -1,12 +1,11 @@
-"""Moves bytes and time between the sockets and the core, on an asyncio loop, in batches.
+"""Moves datagrams, timers and events between the sockets and the core, on an asyncio loop, in batches.
 
 1. A socket becomes readable: all waiting datagrams go to the core (`_drain`).
-2. `_pump`: timers that are due, datagrams that may leave now (in runs, through segmentation offload), events to the
-   listener, one timer for what comes next.
-3. The kernel reports a change of interfaces: the links are brought up to date, the core is told.
+2. `_pump`: due timers, datagrams that may leave now (in runs, through segmentation offload), events to the listener,
+   and one timer for the core's next deadline.
+3. The kernel reports an interface change: sockets are opened and closed, and the core learns its new links.
 
-A full socket never blocks the other links: its datagrams wait in a short queue, and past that they are lost as on a
-radio.
+A full socket never blocks the other links: its datagrams wait in a short queue; beyond that they are dropped.
 """
 
 from __future__ import annotations
@@ -21,32 +20,32 @@ from udp_mesh.core.events import Event, MessageId, Rejected
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
 from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
-from udp_mesh.daemon.send_errors import REVIEW_S, Refusals
-from udp_mesh.links.attachments import Address, LinkWish
+from udp_mesh.daemon.send_errors import REVIEW_S, SendErrors
+from udp_mesh.links.attachments import Address, LinkConfig
 from udp_mesh.links.hub import LinkHub
 from udp_mesh.links.netlink import InterfaceMonitor
 from udp_mesh.links.udp import UdpLink
 
 log = logging.getLogger(__name__)
 
-DRAIN_DATAGRAMS = 256
+MAX_DRAIN_DATAGRAMS = 256
 """Datagrams read per wake-up before timers and sending get their turn (3 ms of work)."""
-FRESH_S = 0.0003
-"""A datagram that came so shortly before the look is the only one, but at rates at which a look more costs nothing."""
-CLOCK_READING_S = 50e-6
-"""Two clocks read within this belong together."""
-LONGEST_LOOK_S = 0.5
-"""Reading `DRAIN_DATAGRAMS` takes milliseconds, on a machine that does something else meanwhile no more than this."""
-PUMP_BYTES = 1 << 18
+LAST_ARRIVAL_S = 0.0003
+"""A datagram this recent is taken to be the last one waiting; reading again would cost as much as receiving."""
+MAX_CLOCK_GAP_S = 50e-6
+"""Two clock readings within this interval count as simultaneous."""
+MAX_DRAIN_S = 0.5
+"""Reading a batch takes milliseconds; even on a busy machine it takes no longer than this."""
+MAX_PUMP_BYTES = 1 << 18
 """Bytes sent before the sockets get their turn again."""
-BLOCKED_DATAGRAMS = 256
-"""Datagrams that wait for one full socket; more are lost."""
-INTERFACE_SETTLE_S = 0.05
-"""After a notice of the kernel more follow (link, then addresses): one refresh answers them all."""
+MAX_BLOCKED_DATAGRAMS = 256
+"""Datagrams queued for one full socket; more are dropped."""
+INTERFACE_DEBOUNCE_S = 0.05
+"""One kernel notice is followed by others (link, then addresses): one refresh handles them all."""
 RECOVERY_S = 0.1
-"""After an exception nobody expected, until the next attempt."""
+"""Delay before the next attempt after an unexpected exception."""
 RETRY_LINK_S = 2.0
-"""Until a socket that could not be opened is tried again."""
+"""Delay before a socket that could not be opened is retried."""
 
 
 class Driver:
@@ -55,7 +54,7 @@ class Driver:
     def __init__(
         self,
         settings: Settings,
-        links: Sequence[LinkWish],
+        links: Sequence[LinkConfig],
         *,
         boot_id: bytes,
         rng: RandomSource,
@@ -68,7 +67,7 @@ class Driver:
         self.node = Node(settings, boot_id=boot_id, rng=rng, now=self._clock(), store=store)
         self.hub = LinkHub(links, settings.port, urgent_dscp=urgent_dscp)
         self.link_failures: dict[str, str] = {}
-        self.refusals = Refusals()
+        self.send_errors = SendErrors()
         self.lost_on_full_socket = 0
         self.wakeups = 0
         self._on_event = on_event
@@ -77,35 +76,35 @@ class Driver:
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = 0.0
         self._due = float("-inf")
-        """When the node wanted attention, as of the last look: the loop may have come here without its timer."""
-        self._refresh: asyncio.TimerHandle | None = None
-        self._interfaces_unknown = ""
-        self._review: asyncio.TimerHandle | None = None
+        """The core's next deadline as last read; the loop may run `_pump` for other reasons than its timer."""
+        self._refresh_timer: asyncio.TimerHandle | None = None
+        self._interface_error = ""
+        self._send_error_timer: asyncio.TimerHandle | None = None
         self._pump_requested = False
         self.closed = False
         self._wall_offset: float | None = None
-        self._looked_at = 0.0
+        self._drained_at = 0.0
         self._now = 0.0
         self._link_name = ""
 
-    # Life
+    # Lifecycle
 
     def start(self) -> None:
-        """Opens the links that exist and begins. Raises OSError where the kernel cannot be asked for interfaces."""
+        """Opens the links that exist and starts. Raises OSError if the kernel cannot list its interfaces."""
         self._monitor = InterfaceMonitor()
         self._loop.add_reader(self._monitor.fileno(), self._interfaces_changed)
         self.refresh_links()
         self._pump()
 
     def close(self) -> None:
-        """Says good-bye, sends the last datagrams, reports the last events, closes everything."""
+        """Sends goodbyes and the last datagrams, reports the last events, closes everything."""
         if self.closed:
             return
-        self.node.close(self._tell())
+        self.node.close(self._advance_clock())
         self._transmit_all()
         self._report_events()
         self.closed = True
-        for handle in (self._timer, self._refresh, self._review):
+        for handle in (self._timer, self._refresh_timer, self._send_error_timer):
             if handle is not None:
                 handle.cancel()
         if self._monitor is not None:
@@ -115,37 +114,39 @@ class Driver:
             self._unwatch(link)
         self.hub.close()
 
-    # What the application asks
+    # Called by the application
 
     def send(
         self, topic: str, payload: bytes, *, destination: str | None = None, type_name: str = ""
     ) -> MessageId | Rejected:
-        """`Node.send`, now; the datagrams leave in this turn of the loop."""
-        outcome = self.node.send(topic, payload, destination=destination, now=self._tell(), type_name=type_name)
-        self._pump_soon()
+        """`Node.send`, now; the datagrams leave in this loop iteration."""
+        outcome = self.node.send(
+            topic, payload, destination=destination, now=self._advance_clock(), type_name=type_name
+        )
+        self._schedule_pump()
         return outcome
 
     def apply(self, settings: Settings) -> list[str]:
         """`Node.apply`, now. Raises ValueError for a changed name or port."""
-        changes = self.node.apply(settings, self._tell())
-        self._pump_soon()
+        changes = self.node.apply(settings, self._advance_clock())
+        self._schedule_pump()
         return changes
 
-    def apply_links(self, wishes: Sequence[LinkWish]) -> None:
-        """Other links from now on; those wished for before and now stay open."""
-        self.hub.wishes = tuple(wishes)
+    def apply_links(self, links: Sequence[LinkConfig]) -> None:
+        """Replaces the link configuration; links in both the old and the new one stay open."""
+        self.hub.configs = tuple(links)
         self.refresh_links()
-        self._pump_soon()
+        self._schedule_pump()
 
     def conditions(self) -> Conditions:
-        return self.node.conditions(self._tell())
+        return self.node.conditions(self._advance_clock())
 
     def now(self) -> float:
-        """The clock that conditions and events are told by, in seconds."""
+        """The clock of conditions and events, in seconds."""
         return self._clock()
 
-    def _tell(self) -> float:
-        """Now, to be told to the core: arrivals seen later count as not before this."""
+    def _advance_clock(self) -> float:
+        """Returns the current time to pass to the core; later arrivals are not dated before it."""
         self._now = self._clock()
         return self._now
 
@@ -153,17 +154,17 @@ class Driver:
 
     def refresh_links(self) -> None:
         """Brings sockets and core up to date with the kernel's interfaces."""
-        self._refresh = None
+        self._refresh_timer = None
         open_before = list(self.hub.links.values())
         for link in open_before:
             self._unwatch(link)
         changes = self.hub.refresh()
-        now = self._tell()
+        now = self._advance_clock()
         reopened = {link.attachment.name for link in changes.opened}
         for link in changes.gone:
             name = link.attachment.name
             self._blocked.pop(name, None)
-            self.refusals.link_gone(name)
+            self.send_errors.link_closed(name)
             if name not in reopened:
                 log.info("link-down link=%s", name)
                 self.node.link_down(name, now)
@@ -176,7 +177,7 @@ class Driver:
         self.link_failures = changes.failed
         self._watch_all()
         if changes.failed:
-            self._refresh = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
+            self._refresh_timer = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
 
     def _watch_all(self) -> None:
         for link in self.hub.links.values():
@@ -187,79 +188,79 @@ class Driver:
     def _interfaces_changed(self) -> None:
         assert self._monitor is not None
         if self._monitor.drain():
-            at = self._clock() + INTERFACE_SETTLE_S
-            if self._refresh is not None:
-                if self._refresh.when() <= at:
-                    # Some drivers send notices without end: they must not put off the look for ever.
+            at = self._clock() + INTERFACE_DEBOUNCE_S
+            if self._refresh_timer is not None:
+                if self._refresh_timer.when() <= at:
+                    # Some drivers send notices continuously: these must not postpone the refresh forever.
                     return
-                self._refresh.cancel()
-            self._refresh = self._loop.call_at(at, self._refresh_and_pump)
+                self._refresh_timer.cancel()
+            self._refresh_timer = self._loop.call_at(at, self._refresh_and_pump)
 
     def _refresh_and_pump(self) -> None:
         completed = False
         try:
             self.refresh_links()
-            completed, self._interfaces_unknown = True, ""
+            completed, self._interface_error = True, ""
         except OSError as error:
-            if str(error) != self._interfaces_unknown:
+            if str(error) != self._interface_error:
                 log.error("interfaces-unknown error=%s", error)
-            self._interfaces_unknown = str(error)
+            self._interface_error = str(error)
         finally:
             if not completed:
-                # The kernel would not list its interfaces (out of memory), or a bug: what is open stays open and heard.
+                # The kernel cannot list its interfaces (out of memory), or a bug: keep the open sockets.
                 self._watch_all()
-                self._refresh = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
+                self._refresh_timer = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
         self._pump()
 
     def _unwatch(self, link: UdpLink) -> None:
         self._loop.remove_reader(link.fileno())
         self._loop.remove_writer(link.fileno())
 
-    # In
+    # Receive
 
     def _readable(self, link: UdpLink) -> None:
         self._drain(link)
         if self.node.is_quiet:
-            self._look_at_timer()
+            self._reschedule()
         else:
             self._pump()
 
     def _drain(self, link: UdpLink) -> None:
-        """Hands what waits to the core, each datagram with the time it arrived; then `_now` is the time of the look."""
-        self._looked_at = self._read_clocks()
+        """Passes waiting datagrams to the core, each with its arrival time; then sets `_now` to the time of reading."""
+        self._drained_at = self._read_clocks()
         self._link_name = link.attachment.name
         assert self._wall_offset is not None
-        link.receive(self._deliver, DRAIN_DATAGRAMS, self._looked_at + self._wall_offset - FRESH_S)
-        self._now = max(self._now, self._looked_at)
+        link.receive(self._deliver, MAX_DRAIN_DATAGRAMS, self._drained_at + self._wall_offset - LAST_ARRIVAL_S)
+        self._now = max(self._now, self._drained_at)
 
     def _read_clocks(self) -> float:
-        """Now; and how far the wall clock, by which the kernel stamps arrivals, is ahead of ours.
+        """Reads the clock, and updates the offset of the wall clock, which the kernel uses for arrival timestamps.
 
-        A reading between which this process lost the processor would date arrivals too early: the last one is kept
-        then.
+        If this process was preempted between the readings, the previous offset is kept: a wrong one would date arrivals
+        too early.
         """
         before = self._clock()
         wall = time.time()
         after = self._clock()
-        if after - before < CLOCK_READING_S or self._wall_offset is None:
+        if after - before < MAX_CLOCK_GAP_S or self._wall_offset is None:
             self._wall_offset = wall - after
         return after
 
     def _deliver(self, data: memoryview, source: Address, arrived: float) -> None:
-        # Never before what the core was told already. After the look only by as much as reading it all can take; more
-        # is a step of the wall clock, and then (as without a stamp) it came when it was looked at.
+        # Never earlier than the time already passed to the core, and at most `MAX_DRAIN_S` after the drain started: a
+        # later stamp means that the wall clock was set, and then (as without a stamp) the time of reading is used.
         assert self._wall_offset is not None
-        at = arrived - self._wall_offset if arrived else self._looked_at
+        at = arrived - self._wall_offset if arrived else self._drained_at
         if at < self._now:
             at = self._now
-        elif at > self._looked_at + LONGEST_LOOK_S:
-            at = self._looked_at
+        elif at > self._drained_at + MAX_DRAIN_S:
+            at = self._drained_at
         self._now = at
         self.node.receive(data, self._link_name, source, at)
 
-    # Out
+    # Send
 
-    def _pump_soon(self) -> None:
+    def _schedule_pump(self) -> None:
         if not self._pump_requested and not self.closed:
             self._pump_requested = True
             self._loop.call_soon(self._pump)
@@ -273,30 +274,30 @@ class Driver:
             self._pump_once()
             completed = True
         finally:
-            # A bug that raises is the loop's to report; the robot's messages go on.
+            # The loop reports the exception; messages must keep flowing.
             if not completed and not self.closed:
                 self._due = float("-inf")
                 self._schedule(self._clock() + RECOVERY_S)
 
     def _pump_once(self) -> None:
-        now = self._tell()
+        now = self._advance_clock()
         if self._due <= now:
             self.node.handle_timer(now)
         more = self._transmit_all()
         self._report_events()
         if more:
-            self._pump_soon()
+            self._schedule_pump()
         self.wakeups += 1
-        self._look_at_timer()
+        self._reschedule()
 
-    def _look_at_timer(self) -> None:
+    def _reschedule(self) -> None:
         due = self.node.next_timer()
         self._due = float("inf") if due is None else due
         if due is not None:
             self._schedule(due)
 
     def _schedule(self, at: float) -> None:
-        """One timer, at `at`: to move it costs a tenth of waking for nothing."""
+        """Sets the only timer; moving it costs a tenth of a needless wake-up."""
         if self._timer is not None:
             if self._timer_at == at:
                 return
@@ -309,10 +310,10 @@ class Driver:
         self._pump()
 
     def _transmit_all(self) -> bool:
-        """Sends what may leave now, up to `PUMP_BYTES`; True where there may be more."""
+        """Sends what may leave now, up to `MAX_PUMP_BYTES`; True if there may be more."""
         sent = 0
-        while sent < PUMP_BYTES:
-            batch = self.node.datagrams_to_send(self._tell())
+        while sent < MAX_PUMP_BYTES:
+            batch = self.node.datagrams_to_send(self._advance_clock())
             if not batch:
                 return False
             start = 0
@@ -338,10 +339,10 @@ class Driver:
             return
         if not waiting:
             self._loop.add_writer(link.fileno(), self._writable, link)
-        # Urgent first, here too; what falls off the end is the latest of the rest.
+        # Urgent datagrams first; beyond the limit, the latest of the others are dropped.
         waiting = sorted([*waiting, *datagrams[done:]], key=lambda datagram: not datagram.urgent)
-        self._blocked[name] = waiting[:BLOCKED_DATAGRAMS]
-        self.lost_on_full_socket += len(waiting[BLOCKED_DATAGRAMS:])
+        self._blocked[name] = waiting[:MAX_BLOCKED_DATAGRAMS]
+        self.lost_on_full_socket += len(waiting[MAX_BLOCKED_DATAGRAMS:])
 
     def _writable(self, link: UdpLink) -> None:
         waiting = self._blocked.get(link.attachment.name, [])
@@ -351,24 +352,24 @@ class Driver:
             self._pump()
 
     def _send(self, link: UdpLink, datagrams: Sequence[Datagram]) -> int:
-        """How many are done with, those that the kernel refused included."""
+        """Sends from the front and returns how many are done, those refused by the kernel included."""
         done = link.send(datagrams)
-        if link.refused:
-            self.refusals.add(link.attachment.name, link.refused, self._clock())
-            link.refused.clear()
-            if self._review is None and not self.closed:
-                self._review = self._loop.call_later(REVIEW_S, self._review_refusals)
+        if link.send_errors:
+            self.send_errors.add(link.attachment.name, link.send_errors, self._clock())
+            link.send_errors.clear()
+            if self._send_error_timer is None and not self.closed:
+                self._send_error_timer = self._loop.call_later(REVIEW_S, self._log_send_errors)
         return done
 
-    def _review_refusals(self) -> None:
-        going_on, over = self.refusals.review(self._clock())
+    def _log_send_errors(self) -> None:
+        going_on, over = self.send_errors.review(self._clock())
         for one in going_on:
             log.warning(
                 "send-refused link=%s to=%s datagrams=%d reason=%s", one.link, one.to, one.datagrams, one.reason
             )
         for one in over:
             log.info("send-refused-no-more link=%s datagrams=%d reason=%s", one.link, one.datagrams, one.reason)
-        self._review = self._loop.call_later(REVIEW_S, self._review_refusals) if self.refusals else None
+        self._send_error_timer = self._loop.call_later(REVIEW_S, self._log_send_errors) if self.send_errors else None
 
     def _report_events(self) -> None:
         while (event := self.node.next_event()) is not None:

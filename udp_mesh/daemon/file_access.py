@@ -1,7 +1,7 @@
-"""Files named by requests and configurations, read so that none of them can hold the daemon up.
+"""Reads files named by requests and configurations without ever blocking the daemon.
 
-Only regular files are read: a pipe would wait for a writer, a device may do anything. A disk that does not answer (a
-network's) holds up a thread of its own, and the request is refused in time.
+Only regular files are read: opening a pipe waits for a writer, and a device may do anything. A disk that hangs (a
+network file system) blocks a thread of its own, and the request is refused after `FILE_TIMEOUT_S`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-FILE_S = 5.0
-"""Until a request that needs a file is refused: a healthy disk takes milliseconds."""
+FILE_TIMEOUT_S = 5.0
+"""A request that needs a file is refused after this; a healthy disk takes milliseconds."""
 
 _KINDS = (
     (stat.S_ISFIFO, "a pipe"),
@@ -29,9 +29,9 @@ Result = TypeVar("Result")
 
 
 def read_regular(path: Path, limit_bytes: int) -> bytes:
-    """Up to `limit_bytes` + 1 bytes of a regular file, one behind a link too. Raises OSError for anything else."""
+    """Reads up to `limit_bytes` + 1 bytes of a regular file, following links. Raises OSError for other files."""
     _must_be_regular(path, path.stat().st_mode)
-    # What it is may have changed since: opening must not wait, and what was opened is looked at again.
+    # The file may be replaced in between: open without blocking, and check the opened file again.
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     with open(descriptor, "rb") as file:
         _must_be_regular(path, os.fstat(descriptor).st_mode)
@@ -43,7 +43,7 @@ def _must_be_regular(path: Path, mode: int) -> None:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(mode):
         found = next((name for is_kind, name in _KINDS if is_kind(mode)), "something else")
-        raise OSError(errno.EINVAL, f"not a regular file but {found}", str(path))
+        raise OSError(errno.EINVAL, f"{found}, not a regular file", str(path))
 
 
 def is_exposed(path: Path) -> bool:
@@ -54,8 +54,8 @@ def is_exposed(path: Path) -> bool:
         return False
 
 
-async def off_loop(work: Callable[[], Result], *, timeout_s: float = FILE_S) -> Result:
-    """What `work` returns or raises, done in a thread that nothing waits for in the end. Raises TimeoutError."""
+async def off_loop(work: Callable[[], Result], *, timeout_s: float = FILE_TIMEOUT_S) -> Result:
+    """Runs `work` in a daemon thread, which may outlive the call. Raises TimeoutError, or what `work` raises."""
     loop = asyncio.get_running_loop()
     done: asyncio.Future[Result] = loop.create_future()
 
@@ -74,7 +74,7 @@ async def off_loop(work: Callable[[], Result], *, timeout_s: float = FILE_S) -> 
         try:
             loop.call_soon_threadsafe(settle, answer)
         except RuntimeError:
-            # The loop is closed: nobody waits any more.
+            # The loop is closed and the result no longer needed.
             return
 
     threading.Thread(target=run, name="file", daemon=True).start()
@@ -83,7 +83,7 @@ async def off_loop(work: Callable[[], Result], *, timeout_s: float = FILE_S) -> 
 
 
 def is_below(path: Path, directory: Path) -> bool:
-    """Whether a file to be made would be in a directory or below it, links followed."""
+    """Whether a new file at this path would be in or below a directory, with links resolved."""
     try:
         return path.parent.resolve(strict=True).is_relative_to(directory.resolve())
     except OSError:

@@ -1,10 +1,10 @@
 """The local socket's file and the connections it accepts.
 
-1. `open` binds the path with its mode and group; nobody may connect before these are right.
-2. Each connection goes to `take`. Where the process has no descriptor left, accepting rests for a while, which costs
-   nothing and is said once: a loop that tried again at once would be all the daemon does.
-3. `LOOK_S` apart the file is looked at: one that was deleted (somebody tidied /run) is made again, since no program
-   could connect otherwise until the next start. One that became another daemon's is left alone, also at the end.
+1. `open` binds the path with its mode and group; no client can connect before these are set.
+2. Each connection goes to `on_connection`. If the process has no descriptor left, accepting pauses for
+   `ACCEPT_RETRY_S`, since retrying at once would be a busy loop. The error is logged once.
+3. Every `FILE_CHECK_S` the file is checked: if it was deleted (someone cleaned up /run), it is created again, since no
+   client could connect otherwise. If it now belongs to another daemon, it is left alone, on close too.
 """
 
 from __future__ import annotations
@@ -20,57 +20,59 @@ from pathlib import Path
 log = logging.getLogger(__name__)
 
 BACKLOG = 256
-"""Connections that wait to be accepted: all robot's programs starting at once."""
-ACCEPTED_AT_ONCE = 16
-"""Connections taken per turn of the loop: their protocols, and refusals, get their turn before the next."""
-REST_S = 1.0
-"""Until the next attempt after the kernel refused a connection for want of descriptors or memory."""
-LOOK_S = 5.0
-"""Between two looks at the socket's file: a stat(2) each."""
-SAY_AGAIN_S = 60.0
-"""Trouble that stays must not fill the log."""
+"""Connections waiting to be accepted: all programs of a robot starting at once."""
+MAX_ACCEPTS_PER_TURN = 16
+"""Connections accepted per loop iteration, so that their protocols and refusals run before the next ones."""
+ACCEPT_RETRY_S = 1.0
+"""Delay before the next attempt after the kernel refused a connection for lack of descriptors or memory."""
+FILE_CHECK_S = 5.0
+"""Interval between two checks of the socket's file, one stat(2) each."""
+LOG_AGAIN_S = 60.0
+"""Minimum interval between two log lines with the same error."""
 
 
 class Listener:
     """One listening Unix socket on the running loop."""
 
-    def __init__(self, path: Path, *, mode: int, group: str | None, take: Callable[[socket.socket], None]) -> None:
+    def __init__(
+        self, path: Path, *, mode: int, group: str | None, on_connection: Callable[[socket.socket], None]
+    ) -> None:
         self._path = path
         self._mode = mode
         self._group = group
-        self._take = take
+        self._on_connection = on_connection
         self._socket: socket.socket | None = None
         self._file: tuple[int, int] | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._trouble: str | None = None
-        self._said_at = 0.0
+        self._last_error: str | None = None
+        self._logged_at = 0.0
 
     def open(self) -> None:
-        """Listens. Raises OSError: in use by another daemon, no such directory, no such group, not allowed."""
+        """Listens. Raises OSError: in use by another daemon, no such directory or group, permission denied."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        if _answers(self._path):
-            raise OSError(f"another daemon answers at {self._path}")
+        if _is_answered(self._path):
+            raise OSError(f"{self._path}: another daemon is already listening")
         if self._path.exists() and not self._path.is_socket():
             what = "a directory" if self._path.is_dir() else "a file"
-            raise OSError(f"{self._path}: expected nothing there, or a socket left behind, found {what}")
-        self._socket = self._bound()
+            raise OSError(f"{self._path}: expected no file or a stale socket, found {what}")
+        self._socket = self._bind()
         self._file = _identity(self._path)
-        self._listen()
-        self._look_later()
+        self._start_accepting()
+        self._schedule_check()
 
     def close(self) -> None:
-        """Stops listening; removes the file where it is still ours."""
+        """Stops listening; removes the file if it is still this daemon's."""
         if self._timer is not None:
             self._timer.cancel()
         if self._socket is None:
             return
-        self._ignore()
+        self._stop_accepting()
         self._socket.close()
         self._socket = None
         if _identity(self._path) == self._file:
             self._path.unlink(missing_ok=True)
 
-    def _bound(self) -> socket.socket:
+    def _bind(self) -> socket.socket:
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
         made = False
         try:
@@ -92,70 +94,70 @@ class Listener:
                 self._path.unlink(missing_ok=True)
             if error.strerror is None:
                 raise
-            # bind(2) does not say where.
+            # bind(2) does not report the path.
             raise OSError(error.errno, error.strerror, str(self._path)) from error
         return listener
 
     # Accepting
 
-    def _listen(self) -> None:
+    def _start_accepting(self) -> None:
         if self._socket is not None:
             asyncio.get_running_loop().add_reader(self._socket.fileno(), self._accept)
 
-    def _ignore(self) -> None:
+    def _stop_accepting(self) -> None:
         if self._socket is not None:
             asyncio.get_running_loop().remove_reader(self._socket.fileno())
 
     def _accept(self) -> None:
-        for _ in range(ACCEPTED_AT_ONCE):
+        for _ in range(MAX_ACCEPTS_PER_TURN):
             assert self._socket is not None
             try:
                 connection, _address = self._socket.accept()
             except (BlockingIOError, InterruptedError, ConnectionAbortedError):
                 break
             except OSError as error:
-                self._say(f"no connection can be accepted: {error.strerror}")
-                self._ignore()
-                asyncio.get_running_loop().call_later(REST_S, self._listen)
+                self._log_error(f"cannot accept connections: {error.strerror}")
+                self._stop_accepting()
+                asyncio.get_running_loop().call_later(ACCEPT_RETRY_S, self._start_accepting)
                 return
             connection.setblocking(False)
-            self._take(connection)
+            self._on_connection(connection)
 
-    # The file
+    # The socket's file
 
-    def _look_later(self) -> None:
-        self._timer = asyncio.get_running_loop().call_later(LOOK_S, self._look)
+    def _schedule_check(self) -> None:
+        self._timer = asyncio.get_running_loop().call_later(FILE_CHECK_S, self._check_file)
 
-    def _look(self) -> None:
-        self._look_later()
+    def _check_file(self) -> None:
+        self._schedule_check()
         found = _identity(self._path)
         if found == self._file:
             return
         if found is not None:
-            self._say(f"{self._path} has become another program's: nobody reaches this daemon there")
+            self._log_error(f"{self._path} was replaced by another program: clients cannot reach this daemon")
             return
         try:
-            fresh = self._bound()
+            fresh = self._bind()
         except OSError as error:
-            self._say(f"{self._path} is gone and cannot be made again: {error.strerror or error}")
+            self._log_error(f"{self._path} was deleted and cannot be created again: {error.strerror or error}")
             return
-        self._ignore()
+        self._stop_accepting()
         if self._socket is not None:
             self._socket.close()
         self._socket, self._file = fresh, _identity(self._path)
-        self._listen()
+        self._start_accepting()
         log.warning("local-socket-made-again path=%s", self._path)
 
-    def _say(self, trouble: str) -> None:
-        """What is wrong, at most once in `SAY_AGAIN_S`."""
+    def _log_error(self, reason: str) -> None:
+        """Logs an error, the same one at most once per `LOG_AGAIN_S`."""
         now = asyncio.get_running_loop().time()
-        if trouble != self._trouble or now - self._said_at >= SAY_AGAIN_S:
-            log.error("local-socket-trouble reason=%s", trouble)
-            self._trouble, self._said_at = trouble, now
+        if reason != self._last_error or now - self._logged_at >= LOG_AGAIN_S:
+            log.error("local-socket-trouble reason=%s", reason)
+            self._last_error, self._logged_at = reason, now
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Device and inode of what is there now."""
+    """Device and inode of the file at this path."""
     try:
         found = path.stat()
     except OSError:
@@ -163,7 +165,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def _answers(path: Path) -> bool:
+def _is_answered(path: Path) -> bool:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(1.0)
         try:
@@ -177,4 +179,4 @@ def _group_id(name: str) -> int:
     try:
         return grp.getgrnam(name).gr_gid
     except KeyError as error:
-        raise OSError(f"daemon.socket_group: expected a group of this machine, found {name!r}") from error
+        raise OSError(f"daemon.socket_group: no such group: {name!r}") from error

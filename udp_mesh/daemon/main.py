@@ -1,8 +1,8 @@
-"""The daemon from start to end.
+"""The daemon from start to stop.
 
-1. The links, the local socket and the metrics' port are opened, then privileges are dropped.
-2. systemd hears that the daemon is ready; from then on it hears a sign of life twice per watchdog period.
-3. SIGHUP reads the configuration again; SIGTERM and SIGINT end the daemon: good-byes are sent, files are closed.
+1. Opens the links, the local socket and the metrics port, then drops privileges.
+2. Notifies systemd that the service is ready, then sends a watchdog keep-alive twice per period.
+3. On SIGHUP, reads the configuration again; on SIGTERM or SIGINT, sends goodbyes, closes its files and exits.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 from udp_mesh.daemon.api import LocalServer, RequestError
 from udp_mesh.daemon.commands import COMMANDS, render_metrics
 from udp_mesh.daemon.configuration import Configuration, load
-from udp_mesh.daemon.file_access import FILE_S, off_loop
+from udp_mesh.daemon.file_access import FILE_TIMEOUT_S, off_loop
 from udp_mesh.daemon.metrics_server import MetricsServer
 from udp_mesh.daemon.privileges import drop_privileges
 from udp_mesh.daemon.sd_notify import Notifier
@@ -31,13 +31,13 @@ from udp_mesh.wire.limits import BOOT_ID_BYTES
 log = logging.getLogger(__name__)
 
 GC_THRESHOLDS = (20_000, 50, 50)
-"""The transport makes few cycles; the default of 700 collects hundreds of times a second under load."""
+"""The transport creates few cycles; the default of 700 collects hundreds of times a second under load."""
 
 
 async def run(configuration: Configuration) -> None:
-    """Runs the daemon until SIGTERM or SIGINT. Raises OSError where it cannot start."""
+    """Runs the daemon until SIGTERM or SIGINT. Raises OSError if it cannot start."""
     if configuration.settings.unkeyed:
-        log.warning("UNKEYED everything is sent without protection: anyone on the network can read, forge and inject")
+        log.warning("UNKEYED traffic is not protected: anyone on the network can read, forge and inject messages")
     service = Service(configuration, boot_id=os.urandom(BOOT_ID_BYTES), rng=random.SystemRandom(), wall_clock=time.time)
     service.commands.update(COMMANDS)
     daemon = configuration.daemon
@@ -83,8 +83,8 @@ async def _serve(service: Service, notifier: Notifier) -> None:
         task.add_done_callback(reloads.discard)
 
     loop.add_signal_handler(signal.SIGHUP, reload)
-    loop.set_exception_handler(_report_bug)
-    # A daemon that hangs on a robot far away: SIGUSR1 writes where to its log.
+    loop.set_exception_handler(_log_unhandled_error)
+    # For a daemon that hangs on a distant robot: SIGUSR1 logs all stacks.
     faulthandler.register(signal.SIGUSR1)
     gc.collect()
     gc.freeze()
@@ -92,7 +92,7 @@ async def _serve(service: Service, notifier: Notifier) -> None:
     notifier.ready(_status(service))
     log.info("ready name=%s port=%d boot=%s", service.settings.name, service.settings.port, service.boot_id.hex())
     if not service.driver.hub.links:
-        log.warning("no-link no configured interface is up with an address; links are taken as they come")
+        log.warning("no-link no configured interface is up with an address; links will be opened when they appear")
     period_s = notifier.watchdog_s
     while not stop.is_set():
         try:
@@ -102,13 +102,13 @@ async def _serve(service: Service, notifier: Notifier) -> None:
             notifier.alive(_status(service))
 
 
-def _report_bug(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """What nobody expected is written down, and the daemon goes on: a robot's link matters more than a clean end."""
+def _log_unhandled_error(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Logs an unexpected exception and keeps running: the robot's link matters more than a clean exit."""
     log.error("bug message=%s", context.get("message"), exc_info=context.get("exception"))
 
 
 async def _reload(service: Service, notifier: Notifier) -> None:
-    """On SIGHUP: a file with problems changes nothing, and each problem is logged."""
+    """On SIGHUP: reloads the configuration; a file with problems changes nothing and each problem is logged."""
     notifier.reloading()
     try:
         file = service.configured_file()
@@ -119,7 +119,7 @@ async def _reload(service: Service, notifier: Notifier) -> None:
     except RequestError as error:
         log.error("reload-refused %s", error)
     except TimeoutError:
-        log.error("reload-refused the files were not read within %g s", FILE_S)
+        log.error("reload-refused timed out after %g s while reading the files", FILE_TIMEOUT_S)
     else:
         log.info("reloaded changes=%d %s", len(changes), "; ".join(changes))
     notifier.ready(_status(service))

@@ -1,4 +1,4 @@
-"""Conditions -> the text format of Prometheus (exposition format 0.0.4). Pure."""
+"""Conditions -> Prometheus text format (exposition format 0.0.4). Pure."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 Sample = tuple[Mapping[str, str], float]
 
 _PEER_GAUGES = (
-    ("peer_online", "1 where the peer is online.", lambda peer: float(peer.online)),
+    ("peer_online", "1 if the peer is online, else 0.", lambda peer: float(peer.online)),
     (
         "peer_unanswered_seconds",
-        "So long nothing sent to the peer was answered.",
+        "Time for which the peer has not answered anything sent to it.",
         lambda peer: peer.unanswered_for_s,
     ),
-    ("peer_round_trip_seconds", "Smoothed round trip.", lambda peer: peer.round_trip_s),
-    ("peer_least_round_trip_seconds", "Least round trip lately.", lambda peer: peer.least_round_trip_s),
-    ("peer_loss_ratio", "Share of packets lost on the way to the peer.", lambda peer: peer.loss),
+    ("peer_round_trip_seconds", "Smoothed round-trip time.", lambda peer: peer.round_trip_s),
+    ("peer_least_round_trip_seconds", "Recent minimum round-trip time.", lambda peer: peer.least_round_trip_s),
+    ("peer_loss_ratio", "Share of packets to the peer that are lost.", lambda peer: peer.loss),
     ("peer_sent_bits_per_second", "Wire bits sent to the peer.", lambda peer: peer.sent_bits_per_s),
     ("peer_delivered_bits_per_second", "Payload bits the peer acknowledged.", lambda peer: peer.delivered_bits_per_s),
     ("peer_received_bits_per_second", "Wire bits received from the peer.", lambda peer: peer.received_bits_per_s),
-    ("peer_arrived_bits_per_second", "Wire bits the peer says arrive.", lambda peer: peer.arrived_bits_per_s),
-    ("peer_sends_bits_per_second", "Wire bits the peer says it sends to all.", lambda peer: peer.peer_sends_bits_per_s),
-    ("peer_capacity_bits_per_second", "Estimated rate of the link.", lambda peer: peer.capacity_bits_per_s),
-    ("peer_window_packets", "Packets that may be in flight.", lambda peer: peer.window_packets),
+    ("peer_arrived_bits_per_second", "Wire bits the peer reports as received.", lambda peer: peer.arrived_bits_per_s),
+    ("peer_sends_bits_per_second", "Wire bits the peer reports as sent.", lambda peer: peer.peer_sends_bits_per_s),
+    ("peer_capacity_bits_per_second", "Estimated link capacity.", lambda peer: peer.capacity_bits_per_s),
+    ("peer_window_packets", "Congestion window in packets.", lambda peer: peer.window_packets),
     ("peer_in_flight_packets", "Packets in flight.", lambda peer: float(peer.in_flight_packets)),
-    ("peer_outbox_messages", "Messages held for the peer while it is away.", lambda peer: float(peer.outbox_messages)),
-    ("peer_outbox_bytes", "Bytes held for the peer while it is away.", lambda peer: float(peer.outbox_bytes)),
+    ("peer_outbox_messages", "Messages stored for the offline peer.", lambda peer: float(peer.outbox_messages)),
+    ("peer_outbox_bytes", "Bytes stored for the offline peer.", lambda peer: float(peer.outbox_bytes)),
 )
 _QUEUE_GAUGES = (
     ("queue_messages", "Messages waiting.", lambda queue: float(queue.messages)),
     ("queue_bytes", "Bytes waiting.", lambda queue: float(queue.bytes)),
     ("queue_oldest_seconds", "Age of the oldest message waiting.", lambda queue: queue.oldest_s),
-    ("queue_starved_seconds", "Time waited while only more urgent ones were sent.", lambda queue: queue.starved_s),
-    ("queue_held_seconds", "Time held back for other robots' urgent messages.", lambda queue: queue.held_s),
+    ("queue_starved_seconds", "Time waited while more urgent messages were sent.", lambda queue: queue.starved_s),
+    ("queue_held_seconds", "Time paused for other robots' urgent messages.", lambda queue: queue.held_s),
 )
 
 
@@ -50,10 +50,10 @@ def render(
     about: Mapping[str, str],
     uptime_s: float,
 ) -> str:
-    """The page that Prometheus reads; `extra` are counters of the daemon's own, `about` what never changes in a run."""
+    """The Prometheus page; `extra` are counters of the daemon itself, `about` the labels of the info metric."""
     lines: list[str] = []
-    _family(lines, "info", "gauge", "Always 1; its labels say what runs here.", [(about, 1)])
-    _family(lines, "uptime_seconds", "gauge", "Since the daemon started.", [({}, round(uptime_s, 3))])
+    _family(lines, "info", "gauge", "Always 1; the labels describe the node.", [(about, 1)])
+    _family(lines, "uptime_seconds", "gauge", "Time since the daemon started.", [({}, round(uptime_s, 3))])
     for item in dataclasses.fields(conditions.counters):
         value = getattr(conditions.counters, item.name)
         _family(lines, f"{item.name}_total", "counter", item.name.replace("_", " ").capitalize() + ".", [({}, value)])
@@ -61,15 +61,15 @@ def render(
         help_text = f"{name.replace('_', ' ').capitalize()} held."
         _family(lines, name, "gauge", help_text, [({}, getattr(conditions, name))])
     for name, help_text, value in (
-        ("sent_bits_per_second", "Wire bits sent to everybody.", conditions.sent_bits_per_s),
-        ("heard_bits_per_second", "Wire bits that all nodes heard here send together.", conditions.heard_bits_per_s),
+        ("sent_bits_per_second", "Wire bits sent to all peers.", conditions.sent_bits_per_s),
+        ("heard_bits_per_second", "Wire bits sent by all nodes heard here.", conditions.heard_bits_per_s),
     ):
         _family(lines, name, "gauge", help_text, [({}, value)])
     for name, help_text, read in _PEER_GAUGES:
         samples = [({"peer": peer.name}, value) for peer in conditions.peers if (value := read(peer)) is not None]
         _family(lines, name, "gauge", help_text, samples)
     retransmitted = [({"peer": peer.name}, float(peer.retransmitted_packets)) for peer in conditions.peers]
-    _family(lines, "peer_retransmitted_packets_total", "counter", "Packets sent again.", retransmitted)
+    _family(lines, "peer_retransmitted_packets_total", "counter", "Retransmitted packets.", retransmitted)
     for name, help_text, read_queue in _QUEUE_GAUGES:
         samples = [
             ({"peer": peer.name, "priority": str(queue.priority)}, read_queue(queue))

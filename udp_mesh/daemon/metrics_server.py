@@ -1,5 +1,4 @@
-"""Answers Prometheus over TCP on a loopback address: one request, one page, closed (RFC 9112, as little as it
-takes)."""
+"""A minimal HTTP server for Prometheus on a loopback address: one request, one response, close (RFC 9112)."""
 
 from __future__ import annotations
 
@@ -9,13 +8,13 @@ from collections.abc import Callable
 from udp_mesh.core.settings import Address
 from udp_mesh.daemon.metrics import CONTENT_TYPE
 
-REQUEST_BYTES = 8192
-"""A scraper's request is a few hundred bytes; more is refused."""
-REQUEST_S = 5.0
-"""A connection that says nothing is closed."""
-CONNECTIONS = 8
-"""At a time, for the daemon's descriptors' sake. For one more the oldest gives way: a scraper asks at once, and
-who holds connections without asking must not keep it out."""
+MAX_REQUEST_BYTES = 8192
+"""Maximum request size; a scraper's request is a few hundred bytes."""
+REQUEST_TIMEOUT_S = 5.0
+"""An idle connection is closed after this."""
+MAX_CONNECTIONS = 8
+"""Concurrent connections, to bound the daemon's descriptors. A further one evicts the oldest: a scraper sends its
+request at once, and idle connections must not keep it out."""
 
 
 class MetricsServer:
@@ -28,19 +27,21 @@ class MetricsServer:
         self._open: dict[asyncio.StreamWriter, None] = {}
 
     async def start(self) -> None:
-        """Raises OSError where the port is taken."""
+        """Raises OSError if the port is in use."""
         host, port = self._address
-        # asyncio accepts as many at a time as may wait
-        self._server = await asyncio.start_server(self._answer, host, port, limit=REQUEST_BYTES, backlog=CONNECTIONS)
+        # asyncio accepts up to `backlog` connections at a time.
+        self._server = await asyncio.start_server(
+            self._answer, host, port, limit=MAX_REQUEST_BYTES, backlog=MAX_CONNECTIONS
+        )
 
     async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._open[writer] = None
-        if len(self._open) > CONNECTIONS:
+        if len(self._open) > MAX_CONNECTIONS:
             oldest = next(iter(self._open))
             del self._open[oldest]
             oldest.transport.abort()
         try:
-            async with asyncio.timeout(REQUEST_S):
+            async with asyncio.timeout(REQUEST_TIMEOUT_S):
                 request = await reader.readuntil(b"\r\n\r\n")
                 method, _, rest = request.partition(b"\r\n")[0].partition(b" ")
                 path = rest.partition(b" ")[0].partition(b"?")[0]
@@ -52,7 +53,7 @@ class MetricsServer:
                 writer.write(head.encode() + b"Connection: close\r\n\r\n" + (b"" if method == b"HEAD" else body))
                 await writer.drain()
         except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            # A scraper that went away or never asked: nothing to answer.
+            # The scraper went away or sent no request.
             return
         finally:
             self._open.pop(writer, None)

@@ -1,4 +1,4 @@
-"""Who and where, in a configuration: names of nodes and topics, `[[links]]`, `[[neighbours]]`, addresses."""
+"""Names of nodes and topics, `[[links]]`, `[[neighbours]]` and addresses in a configuration."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ import re
 
 from udp_mesh.core.settings import Address, Neighbour, is_name
 from udp_mesh.daemon.toml_source import Table
-from udp_mesh.links.attachments import LinkWish
+from udp_mesh.links.attachments import LinkConfig
 from udp_mesh.wire.limits import MAX_NAME_BYTES, MAX_TOPIC_BYTES
 
-NODE_NAME = f"a name of 1 to {MAX_NAME_BYTES} bytes without space or slash"
-TOPIC_NAME = f"a topic of 1 to {MAX_TOPIC_BYTES} bytes without space"
+NODE_NAME = f"a name of 1 to {MAX_NAME_BYTES} bytes without spaces or slashes"
+TOPIC_NAME = f"a topic of 1 to {MAX_TOPIC_BYTES} bytes without spaces"
 
 
 def is_node_name(name: str) -> bool:
-    """Whether a node can have this name."""
+    """Whether this is a valid node name."""
     return is_name(name, MAX_NAME_BYTES) and "/" not in name
 
 
 def is_topic_name(name: str) -> bool:
-    """Whether a topic can have this name."""
+    """Whether this is a valid topic name."""
     return is_name(name, MAX_TOPIC_BYTES)
 
 
-def read_link(table: Table) -> LinkWish:
-    """An entry of `[[links]]`; problems go to the table's source."""
+def read_link(table: Table) -> LinkConfig:
+    """An entry of `[[links]]`; reports problems to the table's source."""
     interface, address = table.text("interface"), table.text("address")
     kind = table.choice("kind", "broadcast", ("broadcast", "neighbours"))
     mtu = table.integer("mtu", None, 200, 65_535)
@@ -35,28 +35,28 @@ def read_link(table: Table) -> LinkWish:
     if address is not None:
         try:
             if ipaddress.ip_address(address).is_link_local and ":" in address:
-                table.report("address", "an address of one interface (name a link-local one's `interface`)", address)
+                table.report("address", "an address that is not link-local (set `interface` instead)", address)
         except ValueError:
             table.report("address", "an IPv4 or IPv6 address", address)
-    return LinkWish(interface, address, kind == "broadcast", mtu)
+    return LinkConfig(interface, address, kind == "broadcast", mtu)
 
 
 def read_neighbours(top: Table, port: int) -> tuple[Neighbour, ...]:
-    """All of `[[neighbours]]`; problems go to the table's source."""
+    """All of `[[neighbours]]`; reports problems to the table's source."""
     found: dict[Address, Neighbour] = {}
     for entry in top.tables("neighbours"):
         neighbour = read_neighbour(entry, port)
         if neighbour is None:
             continue
         if neighbour.address in found:
-            entry.report("address", "each neighbour once", neighbour.address[0])
+            entry.report("address", "each neighbor once", neighbour.address[0])
         found[neighbour.address] = neighbour
     return tuple(found.values())
 
 
 def read_neighbour(table: Table, port: int) -> Neighbour | None:
-    """A fixed neighbour: an entry of `[[neighbours]]`, or what a command sets. Problems go to the table's source, and
-    None comes back."""
+    """A fixed neighbor from an entry of `[[neighbours]]` or from a request; None, with a problem reported to the
+    table's source, if it is invalid."""
     text, name = table.text("address"), table.text("name")
     link, legacy = table.text("link"), table.boolean("legacy", False)
     table.finish()
@@ -67,7 +67,7 @@ def read_neighbour(table: Table, port: int) -> Neighbour | None:
         table.report("name", NODE_NAME, name)
         return None
     if legacy and name is None:
-        table.source.report(table.path, "a name, since a legacy neighbour's own claim is not authenticated", "none")
+        table.source.report(table.path, "a name (a legacy neighbor's own name is not authenticated)", "none")
         return None
     address = parse_address(text, port)
     if address is None:
@@ -75,10 +75,10 @@ def read_neighbour(table: Table, port: int) -> Neighbour | None:
         return None
     if ":" in address[0]:
         if legacy:
-            table.report("address", "an IPv4 address, the only ones the fielded format knows", text)
+            table.report("address", "an IPv4 address (the legacy format has no IPv6)", text)
             return None
         if link is None and ipaddress.ip_address(address[0]).is_link_local:
-            table.report("address", 'link = "INTERFACE" beside a link-local address', text)
+            table.report("address", 'link = "INTERFACE" with a link-local address', text)
             return None
     return Neighbour(address, name, link, legacy)
 
@@ -96,7 +96,7 @@ def parse_address(text: str, port: int) -> Address | None:
     except ValueError:
         return None
     if "%" in host:
-        # The interface of a link-local address is the neighbour's `link`.
+        # The interface of a link-local address goes into the neighbor's `link`.
         return None
     if not re.fullmatch("[0-9]{1,5}", number) or not 1 <= int(number) <= 65_535:
         return None

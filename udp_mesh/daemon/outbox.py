@@ -1,10 +1,10 @@
-"""Messages held on disk for peers that are away: one file per message in one directory.
+"""Messages stored on disk for offline peers: one file per message in one directory.
 
-`put` takes a message and hands it to a thread that writes it, in the order put, under a temporary name that it then
-renames: once `flush` returns, everything put before is on the disk (fsync of files and directory) and survives a power
-cut; the daemon answers a publisher of such a topic after it. However slow the disk, nobody else waits for it. `load`
-reads what is kept, and sets aside what is damaged. The directory is bounded: past `limit_bytes` a message is refused
-and counted rather than filling the disk.
+`put` passes a message to a thread that writes the files in order, each under a temporary name that is then renamed.
+Once `flush` returns, everything put before is on disk (fsync of files and directory) and survives a power cut; only
+then does the daemon reply to a publisher of such a topic. However slow the disk, no other caller waits for it. `load`
+reads the stored messages and renames damaged files. The directory is bounded: beyond `limit_bytes` a message is refused
+and counted, so the disk does not fill up.
 
 A file is a line with the message's fields as JSON and the CRC-32 of these and the payload, then the payload.
 """
@@ -28,42 +28,42 @@ from udp_mesh.core.interfaces import StoredMessage
 log = logging.getLogger(__name__)
 
 SUFFIX = ".message"
-TELL_AGAIN_S = 60.0
-"""Between two lines of the log that say the disk is full."""
+LOG_AGAIN_S = 60.0
+"""Minimum interval between two log lines about a full disk."""
 _CHECKSUM_BYTES = 8
 
 
 class DirectoryStore:
-    """The core's `Store` over a directory (made with the first message, readable by its owner only).
+    """The core's `Store` over a directory (created with the first message, readable only by its owner).
 
-    What waits to be written is bounded as the directory is, since both count from `put` on.
+    Messages waiting to be written are bounded like the directory, since both count from `put` on.
     """
 
     def __init__(self, directory: Path, limit_bytes: int) -> None:
         self._directory = directory
         self._limit_bytes = limit_bytes
-        # what both the caller's thread and the writing one change
+        # Guards what the caller's thread and the writer thread both change.
         self._lock = threading.Lock()
         self._sizes: dict[int, int] = {}
-        self._told_at = float("-inf")
+        self._logged_at = float("-inf")
         self.bytes = 0
-        """Bytes of all files kept, those still to be written included."""
+        """Bytes of all stored files, including those still to be written."""
         self.refused = 0
-        """Messages not kept because the directory is full or the disk failed: they are held in memory only."""
+        """Messages not stored because the directory is full or the disk failed: they are held in memory only."""
         self.puts = 0
-        """How many were taken since the start: who sees it grow has something to flush."""
+        """Messages accepted since the start; if it grew, there is something to flush."""
         self._flushed_puts = 0
-        # the caller's alone: what is not written yet needs not be when it is delivered first
+        # Used by the caller's thread only. A write that has not started is canceled when its message is delivered.
         self._writes: dict[int, Future[None]] = {}
-        # the writing thread's alone
+        # Used by the writer thread only.
         self._unsynced: set[Path] = set()
         self._disk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="outbox")
 
-    def prove(self) -> None:
-        """Say now, not with the first message, that the directory cannot be used."""
-        self._disk.submit(self._prove)
+    def check_writable(self) -> None:
+        """Reports an unusable directory now rather than with the first message."""
+        self._disk.submit(self._check_writable)
 
-    def _prove(self) -> None:
+    def _check_writable(self) -> None:
         try:
             self._make_directory()
             with tempfile.TemporaryFile(dir=self._directory):
@@ -75,8 +75,8 @@ class DirectoryStore:
         self._directory.mkdir(parents=True, exist_ok=True, mode=0o700)
 
     def put(self, message: StoredMessage) -> bool:
-        """Have it written; False where the bound refuses, which is counted and logged. What the disk refuses later is
-        counted and logged likewise, and not held (`holds`)."""
+        """Queues the message to be written. Returns False, counted and logged, if it exceeds the limit; a later disk
+        error is counted and logged as well, and `holds` is then false."""
         head = json.dumps(
             {
                 "key": message.key,
@@ -91,8 +91,8 @@ class DirectoryStore:
         with self._lock:
             more = size - self._sizes.get(message.key, 0)
             if self.bytes + more > self._limit_bytes:
-                why = f"directory={self._directory} bytes={self.bytes} limit={self._limit_bytes}"
-                self._refuse("outbox-full", why)
+                details = f"directory={self._directory} bytes={self.bytes} limit={self._limit_bytes}"
+                self._refuse("outbox-full", details)
                 return False
             self.bytes += more
             self._sizes[message.key] = size
@@ -110,7 +110,7 @@ class DirectoryStore:
                 file.write(payload)
             temporary.rename(path)
         except OSError as error:
-            # A full disk: what is half written must not keep it full.
+            # The disk is full: remove the partial file.
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
             with self._lock:
@@ -119,13 +119,13 @@ class DirectoryStore:
             return
         self._unsynced.add(path)
 
-    def _refuse(self, event: str, why: str) -> None:
-        """Counted each time, logged now and then: a disk stays full for long."""
+    def _refuse(self, event: str, details: str) -> None:
+        """Counts every refusal but limits the log lines: a disk stays full for long."""
         self.refused += 1
         now = time.monotonic()
-        if now - self._told_at >= TELL_AGAIN_S:
-            self._told_at = now
-            log.error("%s held-in-memory=%d %s", event, self.refused, why)
+        if now - self._logged_at >= LOG_AGAIN_S:
+            self._logged_at = now
+            log.error("%s held-in-memory=%d %s", event, self.refused, details)
 
     def remove(self, key: int) -> None:
         with self._lock:
@@ -146,7 +146,7 @@ class DirectoryStore:
             log.error("outbox-remove-failed path=%s error=%s", path, error)
 
     def holds(self, key: int) -> bool:
-        """Whether it is on disk, or about to be."""
+        """Whether it is on disk or queued to be written."""
         with self._lock:
             return key in self._sizes
 
@@ -155,7 +155,7 @@ class DirectoryStore:
         for path in sorted(self._directory.glob(f"*{SUFFIX}")):
             message = _read(path)
             if message is None or self._path(message.key) != path:
-                # Kept for a person to look at, out of the way of the next start.
+                # Keep the file for inspection, but do not load it again.
                 log.error("outbox-damaged path=%s", path)
                 with contextlib.suppress(OSError):
                     path.rename(path.with_suffix(".damaged"))
@@ -174,7 +174,7 @@ class DirectoryStore:
         return self._flushed_puts < self.puts
 
     def flush(self) -> Future[None]:
-        """Done when the disk holds everything put so far and not removed."""
+        """Returns a future that is done when everything put so far and not removed is on disk."""
         self._flushed_puts = self.puts
         self._writes = {key: write for key, write in self._writes.items() if not write.done()}
         return self._disk.submit(self._sync_all)
@@ -202,14 +202,14 @@ class DirectoryStore:
 
 
 class Flusher:
-    """Flushes one round at a time: whoever comes meanwhile shares the next."""
+    """Runs one flush at a time; callers that arrive meanwhile share the next one."""
 
     def __init__(self, store: DirectoryStore) -> None:
         self._store = store
         self._turn = asyncio.Lock()
 
     async def flush(self) -> None:
-        """Returns when the disk has all that was put before: that may be in the hands of the round under way."""
+        """Returns when everything put before the call is on disk."""
         async with self._turn:
             if self._store.needs_flush:
                 await asyncio.wrap_future(self._store.flush())
@@ -228,7 +228,7 @@ def _checksum(head: bytes, payload: bytes) -> int:
 
 
 def _read(path: Path) -> StoredMessage | None:
-    """The message in a file; None where it is damaged."""
+    """The message in a file; None if it is damaged."""
     try:
         line, _, payload = path.read_bytes().partition(b"\n")
         head, _, checksum = line.rpartition(b" ")

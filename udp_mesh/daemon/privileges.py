@@ -1,4 +1,4 @@
-"""From root to an ordinary user, once the sockets are open (setresuid(2)); for starts without systemd's `User=`."""
+"""Drops root privileges once the sockets are open (setresuid(2)); for starts without systemd's `User=`."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from pathlib import Path
 
 
 def drop_privileges(user: str, owned: tuple[Path, ...]) -> None:
-    """Gives `owned` directories to the user and becomes them for good.
+    """Gives the `owned` directories to the user and switches to it irrevocably.
 
-    Raises OSError where the user does not exist, or this process may not (it is not root).
+    Raises OSError if the user does not exist or this process is not root.
     """
     try:
         entry = pwd.getpwnam(user)
     except KeyError as error:
-        raise OSError(f"daemon.user: expected a user of this machine, found {user!r}") from error
+        raise OSError(f"daemon.user: no such user: {user!r}") from error
     if os.geteuid() == entry.pw_uid:
         return
     for path in owned:

@@ -1,10 +1,10 @@
-"""What happens, written to a file for `udp-mesh report`: one JSON object per line (docs/recording-format.md).
+"""Writes events to a file for `udp-mesh report`: one JSON object per line (docs/recording-format.md).
 
-The first line names the node and the start, in seconds since 1970. Every other line has `t`, seconds since the start
-on the monotonic clock, and `kind`: `sent`, `received`, every event's name, and `conditions` once per period. Lines
-go to a thread that writes them, at the latest with each `conditions`, so that a killed daemon loses a period at most,
-and nobody waits for the disk. Where it does not keep up, lines are left out, and a `gap` says how many. A full file
-ends the recording, not the daemon.
+The first line names the node and the start time in seconds since 1970. Every other line has `t`, seconds since the
+start on the monotonic clock, and `kind`: `sent`, `received`, an event's name, or `conditions` once per period. A thread
+writes the lines, at the latest with each `conditions`, so that a killed daemon loses one period at most and no caller
+waits for the disk. If the disk does not keep up, lines are dropped and a `gap` line counts them. Reaching the size
+limit ends the recording, not the daemon.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ log = logging.getLogger(__name__)
 
 FORMAT_VERSION = 1
 BATCH_BYTES = 64 << 10
-"""Lines handed over together: a hand-over costs as much as ten lines."""
-BACKLOG_BYTES = 32 << 20
-"""Lines that wait for a disk which stands still: what is recorded at 10 Mbit/s in half a minute."""
+"""Lines submitted together: submitting costs as much as ten lines."""
+MAX_BACKLOG_BYTES = 32 << 20
+"""Lines waiting for a disk that hangs: half a minute of recording at 10 Mbit/s."""
 
 
 class Recorder:
@@ -36,7 +36,7 @@ class Recorder:
     def __init__(
         self, path: Path, *, node: str, boot_id: bytes, wall_s: float, now: float, limit_bytes: int, payloads: bool
     ) -> None:
-        """Raises OSError where the file cannot be made; an existing file is never overwritten (FileExistsError)."""
+        """Raises OSError if the file cannot be created; never overwrites a file (FileExistsError)."""
         self.path = path
         self.bytes = 0
         self.lines = 0
@@ -45,10 +45,10 @@ class Recorder:
         self._limit_bytes = limit_bytes
         self._lines: list[bytes] = []
         self._lines_bytes = 0
-        self._left_out = 0
-        # what both the caller's thread and the writing one change
+        self._dropped_lines = 0
+        # Guards what the caller's thread and the writer thread both change.
         self._lock = threading.Lock()
-        self._handed_over_bytes = 0
+        self._submitted_bytes = 0
         self._ended = False
         self._closed: Future[None] | None = None
         self._file = path.open("xb")
@@ -70,7 +70,7 @@ class Recorder:
     def sent(
         self, now: float, *, message: int, topic: str, priority: int, size: int, destination: str | None, reliable: bool
     ) -> None:
-        """A message that the core accepted; `destination` None is the topic's destinations, or all."""
+        """Records a message accepted by the core; `destination` None means the topic's destinations, or all."""
         self._write(
             {
                 "t": self._at(now),
@@ -85,7 +85,7 @@ class Recorder:
         )
 
     def event(self, now: float, event: Event) -> None:
-        """What the core told; what became of the daemon's own messages is left out, as they are."""
+        """Records an event of the core, except outcomes of the daemon's own messages."""
         if isinstance(event, MessageDelivered | MessageExpired | MessagePeerLost) and event.topic.startswith(
             RESERVED_PREFIX
         ):
@@ -100,7 +100,7 @@ class Recorder:
 
     def conditions(self, conditions: Conditions) -> None:
         self._write({"t": self._at(conditions.now), "kind": "conditions", **conditions_json(conditions)})
-        self._hand_over()
+        self._submit()
 
     def _at(self, now: float) -> float:
         return round(now - self._start, 6)
@@ -108,10 +108,10 @@ class Recorder:
     def _write(self, fields: Json) -> None:
         if not self.open:
             return
-        waiting = self._handed_over_bytes + self._lines_bytes
-        # few long gaps tell more than many short ones
-        if self._left_out and waiting <= BACKLOG_BYTES // 2:
-            left_out, self._left_out = self._left_out, 0
+        waiting = self._submitted_bytes + self._lines_bytes
+        # A few long gaps are more useful than many short ones.
+        if self._dropped_lines and waiting <= MAX_BACKLOG_BYTES // 2:
+            left_out, self._dropped_lines = self._dropped_lines, 0
             log.error("recording-gap path=%s lines=%d", self.path, left_out)
             self._write({"t": fields["t"], "kind": "gap", "lines": left_out})
         line = json.dumps(fields, separators=(",", ":")).encode() + b"\n"
@@ -119,28 +119,28 @@ class Recorder:
             log.error("recording-full path=%s bytes=%d", self.path, self.bytes)
             self.close()
             return
-        # a line larger than all that may wait is taken when none does
-        if self._left_out or (waiting and waiting + len(line) > BACKLOG_BYTES):
-            self._left_out += 1
+        # A line larger than the whole backlog is accepted when the backlog is empty.
+        if self._dropped_lines or (waiting and waiting + len(line) > MAX_BACKLOG_BYTES):
+            self._dropped_lines += 1
             return
         self.bytes += len(line)
         self.lines += 1
         self._lines.append(line)
         self._lines_bytes += len(line)
         if self._lines_bytes >= BATCH_BYTES:
-            self._hand_over()
+            self._submit()
 
-    def _hand_over(self) -> None:
+    def _submit(self) -> None:
         if not self._lines or not self.open:
             return
         batch = b"".join(self._lines)
         self._lines.clear()
         self._lines_bytes = 0
         with self._lock:
-            self._handed_over_bytes += len(batch)
-        self._disk.submit(self._put, batch)
+            self._submitted_bytes += len(batch)
+        self._disk.submit(self._append, batch)
 
-    def _put(self, batch: bytes) -> None:
+    def _append(self, batch: bytes) -> None:
         try:
             if not self._file.closed:
                 self._file.write(batch)
@@ -150,12 +150,12 @@ class Recorder:
             self._ended = True
             self._close()
         with self._lock:
-            self._handed_over_bytes -= len(batch)
+            self._submitted_bytes -= len(batch)
 
     def close(self) -> Future[None]:
-        """Ends it; done when everything is written."""
+        """Ends the recording; the future is done when everything is written."""
         if self._closed is None:
-            self._hand_over()
+            self._submit()
             self._ended = True
             self._closed = self._disk.submit(self._close)
             self._disk.shutdown(wait=False)

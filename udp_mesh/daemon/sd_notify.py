@@ -1,4 +1,4 @@
-"""Tells systemd how the service fares (sd_notify(3)): ready, reloading, stopping, status, alive."""
+"""Notifies systemd of the service's state (sd_notify(3)): ready, reloading, stopping, status, watchdog."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 
 class Notifier:
-    """Sends to `$NOTIFY_SOCKET`; without one (not started by systemd) it does nothing."""
+    """Sends to `$NOTIFY_SOCKET`; does nothing if it is not set (not started by systemd)."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         path = environment.get("NOTIFY_SOCKET", "")
@@ -18,13 +18,13 @@ class Notifier:
         if path:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
         self.watchdog_s = _watchdog_s(environment)
-        """How often systemd wants a sign of life (None: never)."""
+        """Interval between watchdog keep-alives (None: no watchdog)."""
 
     def ready(self, status: str) -> None:
         self._send(f"READY=1\nSTATUS={status}")
 
     def reloading(self) -> None:
-        # Type=notify-reload wants the time of the reload on the monotonic clock.
+        # Type=notify-reload requires the time of the reload on the monotonic clock.
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
@@ -39,7 +39,7 @@ class Notifier:
         try:
             self._socket.sendto(text.encode(), self._address)
         except OSError:
-            # systemd is busy or gone: the next sign of life says it again.
+            # systemd is busy or gone; the next keep-alive repeats the status.
             return
 
     def close(self) -> None:
@@ -53,5 +53,5 @@ def _watchdog_s(environment: Mapping[str, str]) -> float | None:
     pid = environment.get("WATCHDOG_PID", "")
     if not text.isdigit() or (pid and pid != str(os.getpid())):
         return None
-    # Half the period leaves room for one late sign.
+    # Half the period leaves room for one late keep-alive.
     return int(text) / 1e6 / 2

@@ -1,8 +1,8 @@
-"""What the kernel refuses to send -> what the operator is told: soon, then once a minute, and when it is over. Pure.
+"""Send errors of the kernel -> log lines: soon after the first, then once a minute, and when they stop. Pure.
 
-`Refusals.add` takes what a link counted, `review` says what is to be told now, `standing` is what the status shows. One
-refusal stands for one link and one reason, however many peers it concerns: a firewall's rule, a route that forbids, an
-interface that is gone.
+`SendErrors.add` takes a link's error counts, `review` returns what to log now, `active` what the status shows. One
+entry covers one link and one errno, however many peers it affects: a firewall rule, a prohibiting route, a removed
+interface.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from udp_mesh.daemon.status import show_address
 from udp_mesh.links.attachments import Address
 
 REVIEW_S = 1.0
-"""Between reviews while anything is refused, and before it is told: an interface that goes down refuses, too, for the
-moment until that is known."""
-TELL_AGAIN_S = 60.0
-"""A rule that stays must not fill the log."""
-TELL_MORE_S = 5.0
-"""It concerns more peers than were told: sooner than that, but not a line for each."""
-OVER_S = 15.0
-"""So long without a refusal, and it is over: longer than from one sparse heartbeat to the next."""
-DESTINATIONS = 64
-"""Remembered of one refusal: a team's worth, whatever addresses a stranger claims."""
+"""Interval between reviews while there are errors, and delay before the first log line: an interface that goes down
+causes errors until the kernel reports it."""
+LOG_AGAIN_S = 60.0
+"""Interval between log lines for an error that persists."""
+LOG_NEW_DESTINATIONS_S = 5.0
+"""The same if the error affects more peers than were logged: sooner, but not a line for each."""
+RESOLVED_AFTER_S = 15.0
+"""An error that did not occur for this long has ended: longer than the interval of sparse heartbeats."""
+MAX_DESTINATIONS = 64
+"""Destinations stored per error: a whole team, whatever addresses unverified peers claim."""
 
-SHOWN = 4
-"""Destinations named in one line of the log."""
+MAX_SHOWN_DESTINATIONS = 4
+"""Destinations named in one log line."""
 
 
 @dataclass(slots=True)
-class Refusal:
-    """Datagrams that the kernel would not send on one link, for one reason, from `since` to `last` and perhaps on."""
+class SendError:
+    """Datagrams that the kernel refused to send on one link with one errno, from `since` to `last`."""
 
     link: str
     reason: str
@@ -41,58 +41,58 @@ class Refusal:
     last: float
     datagrams: int = 0
     destinations: dict[Address, None] = field(default_factory=dict)
-    told_at: float | None = None
-    told_of: int = 0
-    """Destinations it had when it was told last."""
+    logged_at: float | None = None
+    logged_destinations: int = 0
+    """Number of destinations when it was last logged."""
 
     @property
     def to(self) -> str:
-        """To whom: the first few, and how many more."""
-        more = len(self.destinations) - SHOWN
-        shown = [str(show_address(destination)) for destination in islice(self.destinations, SHOWN)]
+        """The first few destinations and the number of further ones."""
+        more = len(self.destinations) - MAX_SHOWN_DESTINATIONS
+        shown = [str(show_address(destination)) for destination in islice(self.destinations, MAX_SHOWN_DESTINATIONS)]
         return ",".join(shown) + (f",and-{more}-more" if more > 0 else "")
 
 
-class Refusals:
-    """What is being refused now."""
+class SendErrors:
+    """The send errors that occur now."""
 
     def __init__(self) -> None:
-        self._standing: dict[tuple[str, int], Refusal] = {}
+        self._by_link_and_errno: dict[tuple[str, int], SendError] = {}
 
     def __bool__(self) -> bool:
-        return bool(self._standing)
+        return bool(self._by_link_and_errno)
 
-    def add(self, link: str, refused: Mapping[tuple[Address, int], int], now: float) -> None:
-        """Counts what a link was refused: (destination, errno) -> datagrams."""
-        for (destination, number), datagrams in refused.items():
-            refusal = self._standing.get((link, number))
-            if refusal is None:
-                refusal = self._standing[link, number] = Refusal(link, os.strerror(number), now, now)
-            refusal.datagrams += datagrams
-            refusal.last = now
-            if len(refusal.destinations) < DESTINATIONS:
-                refusal.destinations[destination] = None
+    def add(self, link: str, counts: Mapping[tuple[Address, int], int], now: float) -> None:
+        """Adds a link's error counts: (destination, errno) -> datagrams."""
+        for (destination, number), datagrams in counts.items():
+            error = self._by_link_and_errno.get((link, number))
+            if error is None:
+                error = self._by_link_and_errno[link, number] = SendError(link, os.strerror(number), now, now)
+            error.datagrams += datagrams
+            error.last = now
+            if len(error.destinations) < MAX_DESTINATIONS:
+                error.destinations[destination] = None
 
-    def link_gone(self, link: str) -> None:
-        """Its last refusals were because of that, if they were not told before."""
-        for key, refusal in list(self._standing.items()):
-            if refusal.link == link and refusal.told_at is None:
-                del self._standing[key]
+    def link_closed(self, link: str) -> None:
+        """Drops errors of a closed link that were not logged: its closing caused them."""
+        for key, error in list(self._by_link_and_errno.items()):
+            if error.link == link and error.logged_at is None:
+                del self._by_link_and_errno[key]
 
-    def review(self, now: float) -> tuple[list[Refusal], list[Refusal]]:
-        """What is to be told now: refusals that go on, and those that are over (forgotten with this)."""
-        going_on, over = [], []
-        for key, refusal in list(self._standing.items()):
-            if now - refusal.last >= OVER_S:
-                del self._standing[key]
-                over.append(refusal)
-            elif refusal.told_at is None or now - refusal.told_at >= (
-                TELL_MORE_S if len(refusal.destinations) > refusal.told_of else TELL_AGAIN_S
+    def review(self, now: float) -> tuple[list[SendError], list[SendError]]:
+        """The errors to log now: those that persist, and those that ended (and are removed)."""
+        ongoing, resolved = [], []
+        for key, error in list(self._by_link_and_errno.items()):
+            if now - error.last >= RESOLVED_AFTER_S:
+                del self._by_link_and_errno[key]
+                resolved.append(error)
+            elif error.logged_at is None or now - error.logged_at >= (
+                LOG_NEW_DESTINATIONS_S if len(error.destinations) > error.logged_destinations else LOG_AGAIN_S
             ):
-                refusal.told_at, refusal.told_of = now, len(refusal.destinations)
-                going_on.append(refusal)
-        return going_on, over
+                error.logged_at, error.logged_destinations = now, len(error.destinations)
+                ongoing.append(error)
+        return ongoing, resolved
 
-    def standing(self) -> tuple[Refusal, ...]:
-        """Those told and not over."""
-        return tuple(refusal for refusal in self._standing.values() if refusal.told_at is not None)
+    def active(self) -> tuple[SendError, ...]:
+        """The errors that were logged and have not ended."""
+        return tuple(error for error in self._by_link_and_errno.values() if error.logged_at is not None)

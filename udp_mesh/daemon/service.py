@@ -1,8 +1,8 @@
-"""Between the core and the local programs: requests in, messages and events out.
+"""Connects the core and the local clients: requests in, messages and events out.
 
-An event of the driver goes to the recorder, to the programs that subscribed, to whoever waits for it (a ping, a
-publisher who asked for the outcome). A request is looked up in `commands.COMMANDS`. Everything runs on the loop's one
-thread.
+An event of the driver goes to the recorder, to the subscribed clients, and to the request that waits for it (a ping, a
+publisher that asked for the outcome). Requests are looked up in `commands.COMMANDS`. Everything runs on the loop's
+single thread.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ from udp_mesh.daemon.status import TopicCount, conditions_json, event_json, even
 log = logging.getLogger(__name__)
 
 MAX_OUTCOMES = 65_536
-"""Messages whose outcome somebody waits for: publishers that ask and never read."""
+"""Messages whose outcome a client asked for, in case clients never read."""
 MAX_COUNTED_TOPICS = 4096
-"""Topics with counts of their own: a key holder inventing names."""
+"""Topics with counters of their own; a holder of the key could invent names without bound."""
 MAX_PATTERNS = 1024
-"""Patterns one program subscribes to: each is held against each new topic."""
+"""Patterns per client: each is matched against each new topic."""
 TOKEN_BYTES = 8
 
 
 class Service:
-    """One running daemon: the driver, the configuration it runs with, the programs connected to it."""
+    """One running daemon: the driver, its current configuration, the connected clients."""
 
     def __init__(
         self, configuration: Configuration, *, boot_id: bytes, rng: RandomSource, wall_clock: Callable[[], float]
@@ -93,15 +93,15 @@ class Service:
         return self.configuration.settings
 
     def start(self) -> None:
-        """Begins to send and receive."""
+        """Starts sending and receiving."""
         self.driver.start()
         topics = (*self.settings.topics, self.settings.undeclared)
         if any(topic is not None and topic.outbox_on_disk for topic in topics):
-            self.store.prove()
-        self._conditions_due()
+            self.store.check_writable()
+        self._publish_conditions()
 
     async def close(self) -> None:
-        """Ends the driver, the waiting requests and the recording."""
+        """Stops the driver, cancels waiting requests and ends the recording."""
         if self._conditions_timer is not None:
             self._conditions_timer.cancel()
         for task in list(self._tasks):
@@ -111,7 +111,7 @@ class Service:
         await self.stop_recording()
         await asyncio.get_running_loop().run_in_executor(None, self.store.close)
 
-    # Requests (the local API calls these)
+    # Requests (called by the local API)
 
     def request(self, client: Client, header: Header, payload: bytes) -> None:
         op = header.get("op")
@@ -144,10 +144,10 @@ class Service:
 
     def subscribe(self, client: Client, patterns: list[str]) -> None:
         wanted = self._subscriptions.setdefault(client, [])
-        # A program that subscribes again and again wants each pattern once.
+        # A client may subscribe to the same pattern repeatedly; store it once.
         new = [pattern for pattern in dict.fromkeys(patterns) if pattern not in wanted]
         if len(wanted) + len(new) > MAX_PATTERNS:
-            raise RequestError("too-many", f"expected at most {MAX_PATTERNS} patterns of one program")
+            raise RequestError("too-many", f"a client may subscribe to at most {MAX_PATTERNS} patterns")
         wanted.extend(new)
         self._routes.clear()
 
@@ -156,40 +156,40 @@ class Service:
         self._subscriptions[client] = kept
         self._routes.clear()
 
-    def watch(self, client: Client) -> None:
-        """This program wants every event that is not a message."""
+    def subscribe_events(self, client: Client) -> None:
+        """Sends all events except messages to this client."""
         self._watchers.add(client)
 
     def publish(
         self, topic: str, payload: bytes, destination: str | None, type_name: str, client: Client | None
     ) -> int | Awaitable[int]:
-        """Accepts a message; later, where it must first be on disk. Raises RequestError."""
+        """Accepts a message; returns an awaitable if it must be on disk first. Raises RequestError."""
         if topic.startswith(RESERVED_PREFIX) and topic != BENCH_TOPIC:
-            raise RequestError("reserved-topic", f"{topic} belongs to the daemon")
+            raise RequestError("reserved-topic", f"topic {topic} is reserved for the daemon")
         stored = self.store.puts
         outcome = self.driver.send(topic, payload, destination=destination, type_name=type_name)
         if isinstance(outcome, Rejected):
             raise RequestError(outcome.reason.value.replace(" ", "-"), f"{outcome.reason.value}: {outcome.detail}")
-        how = self.topic(topic)
+        settings = self.topic(topic)
         count = self._count(topic)
         count.sent_messages += 1
         count.sent_bytes += len(payload)
         count.last_sent = self.driver.now()
-        if self.recorder is not None and how is not None:
+        if self.recorder is not None and settings is not None:
             self.recorder.sent(
                 self.driver.now(),
                 message=outcome,
                 topic=topic,
-                priority=how.priority,
+                priority=settings.priority,
                 size=len(payload),
                 destination=destination,
-                reliable=how.reliable,
+                reliable=settings.reliable,
             )
         if client is not None:
             self._outcomes[outcome] = client
             if len(self._outcomes) > MAX_OUTCOMES:
                 self._outcomes.popitem(last=False)
-        # one that is not stored never waits for those that are
+        # A message that is not stored does not wait for those that are.
         return self._flushed(outcome) if self.store.puts > stored else outcome
 
     async def _flushed(self, message: int) -> int:
@@ -197,14 +197,14 @@ class Service:
         return message
 
     def topic(self, name: str) -> Topic | None:
-        """How a topic travels here (None: it is refused)."""
+        """The settings of a topic (None: it is refused)."""
         for topic in self.settings.topics:
             if topic.name == name:
                 return topic
         return self.settings.undeclared
 
     async def ping(self, peer: str, timeout_s: float) -> float:
-        """Seconds to the peer's daemon and back, through its core and ours. Raises RequestError."""
+        """Measures the round trip to the peer's daemon, through both cores, in seconds. Raises RequestError."""
         token = os.urandom(TOKEN_BYTES)
         answer: asyncio.Future[float] = asyncio.get_running_loop().create_future()
         self._pings[token] = answer
@@ -220,10 +220,10 @@ class Service:
         finally:
             del self._pings[token]
 
-    # Change at run time
+    # Runtime changes
 
     def apply(self, settings: Settings) -> list[str]:
-        """Runs on with these settings; returns what changed. Raises RequestError where the core refuses them."""
+        """Applies settings and returns the changes. Raises RequestError if the core refuses them."""
         try:
             changes = self.driver.apply(settings)
         except ValueError as error:
@@ -234,29 +234,29 @@ class Service:
         return changes
 
     def reload(self) -> list[str]:
-        """Reads the configuration's file again and applies it; raises ConfigurationError, RequestError."""
+        """Reads the configuration file again and applies it. Raises ConfigurationError, RequestError."""
         return self.apply_file(load(self.configured_file()))
 
     def configured_file(self) -> Path:
-        """The configuration's file. Raises RequestError where there is none."""
+        """The configuration file. Raises RequestError if there is none."""
         if self.configuration.file is None:
             raise RequestError("no-file", "this daemon was started without a configuration file")
         return self.configuration.file
 
     def apply_file(self, fresh: Configuration) -> list[str]:
-        """Applies what was read again, all or nothing; raises RequestError.
+        """Applies a reloaded configuration, all or nothing. Raises RequestError.
 
-        Changes made by commands since the last reload give way to the file. What only a restart can change is said.
+        It overrides changes made by requests since the last reload. The result also lists what requires a restart.
         """
         running = self.configuration
         notes: list[str] = []
         settings = fresh.settings
         for name in ("name", "port"):
             if getattr(settings, name) != getattr(running.settings, name):
-                notes.append(f"{name}: takes effect with the next start")
+                notes.append(f"{name}: takes effect after a restart")
                 settings = replace(settings, **{name: getattr(running.settings, name)})
         if fresh.daemon != running.daemon:
-            notes.append("daemon: takes effect with the next start")
+            notes.append("daemon: takes effect after a restart")
         changes = self.apply(settings)
         if fresh.links != running.links:
             self.driver.apply_links(fresh.links)
@@ -266,14 +266,14 @@ class Service:
 
     # Recording
 
-    def may_record(self) -> None:
-        """Raises RequestError where a recording is running."""
+    def check_not_recording(self) -> None:
+        """Raises RequestError if a recording is running."""
         if self.recorder is not None and self.recorder.open:
             raise RequestError("already-recording", f"already recording to {self.recorder.path}")
 
     def start_recording(self, path: Path, payloads: bool) -> None:
-        """Raises RequestError where one is running or the file cannot be made."""
-        self.may_record()
+        """Raises RequestError if a recording is running or the file cannot be created."""
+        self.check_not_recording()
         try:
             self.recorder = Recorder(
                 path,
@@ -289,7 +289,7 @@ class Service:
         self.recorder.conditions(self.driver.conditions())
 
     async def stop_recording(self) -> Recorder | None:
-        """Ends the recording; returns it when it is written whole (None: there was none)."""
+        """Ends the recording and returns it once it is completely written (None: there was none)."""
         recorder, self.recorder = self.recorder, None
         if recorder is not None:
             recorder.conditions(self.driver.conditions())
@@ -303,29 +303,29 @@ class Service:
             self.recorder.event(self.driver.now(), event)
         match event:
             case MessageReceived():
-                self._arrived(event)
+                self._on_message(event)
             case MessageDelivered() | MessageExpired() | MessagePeerLost():
                 client = self._outcomes.get(event.message_id)
                 if client is not None:
                     fields = event_json(event)
                     outcome = event_name(event).removeprefix("message-")
-                    client.tell({**fields, "event": "outcome", "outcome": outcome})
+                    client.send_event({**fields, "event": "outcome", "outcome": outcome})
             case _:
                 fields = event_json(event)
                 log.info("%s %s", fields["event"], " ".join(f"{k}={v}" for k, v in fields.items() if k != "event"))
                 for client in self._watchers:
-                    client.tell(fields)
+                    client.send_event(fields)
 
-    def _arrived(self, event: MessageReceived) -> None:
+    def _on_message(self, event: MessageReceived) -> None:
         topic = event.topic
         if topic.startswith(RESERVED_PREFIX):
-            self._arrived_reserved(event)
+            self._on_reserved_message(event)
             return
         count = self._count(topic)
         count.received_messages += 1
         count.received_bytes += len(event.payload)
         count.last_received = self.driver.now()
-        self._hand_out(
+        self._distribute(
             {
                 "event": "message",
                 "source": event.source,
@@ -337,7 +337,7 @@ class Service:
             event.payload,
         )
 
-    def _arrived_reserved(self, event: MessageReceived) -> None:
+    def _on_reserved_message(self, event: MessageReceived) -> None:
         if event.topic == PING_TOPIC and len(event.payload) == TOKEN_BYTES:
             self.driver.send(PONG_TOPIC, event.payload, destination=event.source)
         elif event.topic == PONG_TOPIC:
@@ -345,7 +345,7 @@ class Service:
             if waiting is not None and not waiting.done():
                 waiting.set_result(self.driver.now())
 
-    def _hand_out(self, header: Header, payload: bytes) -> None:
+    def _distribute(self, header: Header, payload: bytes) -> None:
         topic = str(header["topic"])
         clients = self._routes.get(topic)
         if clients is None:
@@ -360,14 +360,14 @@ class Service:
         if clients:
             frame = encode_frame(header, payload)
             for client in clients:
-                client.tell_encoded(frame)
+                client.send_encoded(frame)
 
-    def _conditions_due(self) -> None:
-        """Once per period: the conditions as a topic for local programs, and into the recording."""
+    def _publish_conditions(self) -> None:
+        """Once per period: sends the conditions to subscribed clients and to the recording."""
         period_s = self.configuration.daemon.conditions_period_s
-        self._conditions_timer = asyncio.get_running_loop().call_later(period_s, self._conditions_due)
+        self._conditions_timer = asyncio.get_running_loop().call_later(period_s, self._publish_conditions)
         if self.store.needs_flush:
-            # What a peer left behind when it went out of reach: nobody waits for it.
+            # Messages stored because a peer went offline; no publisher waits for them.
             self._spawn(self._flusher.flush())
         wanted = any(CONDITIONS_TOPIC in patterns for patterns in self._subscriptions.values())
         if not wanted and self.recorder is None:
@@ -384,7 +384,7 @@ class Service:
             }
             for client, patterns in self._subscriptions.items():
                 if CONDITIONS_TOPIC in patterns:
-                    client.tell(header)
+                    client.send_event(header)
 
     def _count(self, topic: str) -> TopicCount:
         count = self.counts.get(topic)
@@ -400,4 +400,4 @@ def _reserved(event: Event) -> bool:
 
 
 REJECTION_CODES = tuple(reason.value.replace(" ", "-") for reason in RejectReason)
-"""The `code` of a refused `publish`."""
+"""Values of `code` for a refused `publish`."""

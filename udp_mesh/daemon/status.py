@@ -1,6 +1,6 @@
-"""What the daemon knows, as JSON values: conditions -> peers, events -> dictionaries, settings -> topics. Pure.
+"""The daemon's state as JSON values: conditions -> peers, events -> dictionaries, settings -> topics. Pure.
 
-Times the core tells on its own clock become ages here ("heard_ago_s"), since no reader shares that clock.
+Times on the core's clock become ages ("heard_ago_s"), since no reader shares that clock.
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ def show_address(address: Address | None) -> str | None:
 
 
 def plain(value: object) -> object:
-    """A value of ours as JSON: dataclasses as objects, enums as their values, addresses as text; payloads are left
-    out."""
+    """A value as JSON: dataclasses as objects, enums as their values, addresses as text, bytes as hex."""
     match value:
         case Enum():
             return value.value
@@ -57,7 +56,7 @@ def event_name(event: Event) -> str:
 
 
 def event_json(event: Event) -> Json:
-    """An event's fields under its name; a received message's payload is only counted."""
+    """An event's fields and its name; of a received message's payload only the size."""
     fields: Json = {"event": event_name(event)}
     for item in dataclasses.fields(event):
         value = getattr(event, item.name)
@@ -104,14 +103,14 @@ def conditions_json(conditions: Conditions) -> Json:
 
 @dataclasses.dataclass(slots=True)
 class TopicCount:
-    """What passed through this daemon of one topic."""
+    """Counters of one topic."""
 
     sent_messages: int = 0
     sent_bytes: int = 0
     received_messages: int = 0
     received_bytes: int = 0
     last_sent: float | None = None
-    """On the core's clock, as `last_received`; None before the first."""
+    """On the core's clock, like `last_received`; None before the first message."""
     last_received: float | None = None
 
 
@@ -122,8 +121,8 @@ def topic_json(topic: Topic) -> Json:
 
 
 def topics_json(settings: Settings, counts: Mapping[str, TopicCount], now: float) -> list[Json]:
-    """Configured topics in order of priority, then topics that only arrived; each with its counts and the age of its
-    last message each way."""
+    """Configured topics by priority, then topics that were only received; each with its counters and the age of its
+    last message in each direction."""
     configured = [topic for topic in settings.topics if not topic.name.startswith(RESERVED_PREFIX)]
     rows = [
         {**topic_json(topic), "configured": True, **_count_json(counts.get(topic.name, TopicCount()), now)}

@@ -1,8 +1,8 @@
-"""TOML with places: text -> tables that know the line of every key, and collect every problem instead of the first.
+"""TOML with source lines: text -> tables that know the line of every key and collect all problems.
 
-`parse` reads the text, `Table` hands out checked values by key and remembers which keys it knows, `Table.finish`
-reports the others with the nearest known name. `tomllib` gives no lines, so `locate` finds them by scanning the text
-for tables and keys.
+`parse` reads the text, `Table` returns checked values and tracks which keys were read, `Table.finish` reports the
+others with the closest known name. `tomllib` provides no lines, so `locate` finds them by scanning the text for tables
+and keys.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing wrong with a configuration: where, what was expected, what was found, perhaps what was meant."""
+    """One problem of a configuration: where, what was expected, what was found, and perhaps a hint."""
 
     file: str
     line: int
-    """0 where the file as a whole is meant."""
+    """0 for a problem of the whole file."""
     key: str
     expected: str
     found: str
@@ -34,7 +34,7 @@ class Problem:
 
 
 class ConfigurationError(Exception):
-    """The configuration cannot be used; `problems` has all that is wrong with it."""
+    """An invalid configuration; `problems` lists everything that is wrong."""
 
     def __init__(self, problems: Iterable[Problem]) -> None:
         self.problems = tuple(problems)
@@ -45,7 +45,7 @@ Path = tuple[str | int, ...]
 
 
 def locate(text: str) -> dict[Path, int]:
-    """Line of every table and of every key that starts a line; keys inside an inline table are found at its line."""
+    """Line of every table and of every key that starts a line; keys in an inline table have its line."""
     lines: dict[Path, int] = {}
     table: Path = ()
     counts: dict[Path, int] = {}
@@ -84,7 +84,7 @@ def _split_key(dotted: str) -> Iterator[str]:
 
 
 def _enter(keys: tuple[str, ...], counts: Mapping[Path, int]) -> Path:
-    """The path of a plain table, inside the latest element where its parent is an array of tables."""
+    """The path of a plain table, inside the latest element if its parent is an array of tables."""
     path: Path = ()
     for key in keys:
         path = (*path, key)
@@ -94,7 +94,7 @@ def _enter(keys: tuple[str, ...], counts: Mapping[Path, int]) -> Path:
 
 
 def _scan_value(line: str, brackets: int, string: str) -> tuple[int, str]:
-    """Open brackets and open multi-line string after this line, so that their inside is not taken for keys."""
+    """Open brackets and the open multi-line string after this line, so that their content is not taken for keys."""
     place = 0
     while place < len(line):
         if string:
@@ -124,7 +124,7 @@ class Source:
     problems: list[Problem] = field(default_factory=list)
 
     def line(self, path: Path) -> int:
-        """The line of this key, or of the nearest table around it."""
+        """The line of this key, or of the nearest enclosing table."""
         while path and path not in self.lines:
             path = path[:-1]
         return self.lines.get(path, 1)
@@ -137,18 +137,18 @@ class Source:
 
 
 def parse(text: str, file: str) -> Table:
-    """The top table of a TOML text. Raises ConfigurationError where it is no TOML."""
+    """The root table of a TOML text. Raises ConfigurationError on a syntax error."""
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigurationError([_syntax_problem(text, file, str(error))]) from error
     except RecursionError as error:
-        raise ConfigurationError([Problem(file, 0, "", "values within a few brackets", "hundreds of them")]) from error
+        raise ConfigurationError([Problem(file, 0, "", "less deeply nested values", "hundreds of brackets")]) from error
     return Table(values, Source(file, locate(text)), ())
 
 
 def _syntax_problem(text: str, file: str, error: str) -> Problem:
-    """What `tomllib` says, in the form of all other problems. The text itself is not shown: it may be a key."""
+    """An error of `tomllib` as a problem. The text itself is not quoted: it may contain a key."""
     at = re.search(r"\(at line (?P<line>\d+), column (?P<column>\d+)\)$", error)
     line = int(at["line"]) if at else text.count("\n") + 1
     place = f"at column {at['column']}" if at else "at the end of the file"
@@ -158,10 +158,10 @@ def _syntax_problem(text: str, file: str, error: str) -> Problem:
             expected = "a value (text in quotes, a number, true, false, [...] or {...})"
             return Problem(file, line, "", expected, "something else", place)
         case "Cannot overwrite a value":
-            return Problem(file, line, "", "each key once", "one that stands above as well", place)
+            return Problem(file, line, "", "each key once", "a duplicate key", place)
         case _ if declared := re.fullmatch(r"Cannot declare \((?P<keys>.*)\) twice", reason):
             table = ".".join(re.findall(r"'((?:[^'\\]|\\.)*)'", declared["keys"]))
-            return Problem(file, line, "", "each table once", f"[{table}], which stands above as well", place)
+            return Problem(file, line, "", "each table once", f"a duplicate table [{table}]", place)
         case _ if reason.startswith("Expected "):
             return Problem(file, line, "", reason.removeprefix("Expected "), "something else", place)
         case _:
@@ -169,7 +169,7 @@ def _syntax_problem(text: str, file: str, error: str) -> Problem:
 
 
 class Table:
-    """One table; every getter takes a key's default, checks what is there, and reports rather than raises."""
+    """One table; each getter checks the value of a key, reports problems and returns the default instead of raising."""
 
     def __init__(self, values: Mapping[str, object], source: Source, path: Path) -> None:
         self._values = values
@@ -190,7 +190,7 @@ class Table:
     def text(self, key: str, default: str | None = None, expected: str = "a string") -> str | None:
         value = self._take(key)
         if isinstance(value, str) and "\0" in value:
-            self.report(key, "a string without the character NUL", value.replace("\0", "\\u0000"))
+            self.report(key, "a string without NUL characters", value.replace("\0", "\\u0000"))
             return default
         if value is None or isinstance(value, str):
             return default if value is None else value
@@ -228,7 +228,7 @@ class Table:
             return default
         if isinstance(value, str) and value in allowed:
             return value
-        self.report(key, " or ".join(f'"{name}"' for name in allowed), value, meant(value, allowed))
+        self.report(key, " or ".join(f'"{name}"' for name in allowed), value, did_you_mean(value, allowed))
         return default
 
     def texts(self, key: str) -> tuple[str, ...]:
@@ -241,7 +241,7 @@ class Table:
         return ()
 
     def integer_or_word(self, key: str, word: str, low: int, high: int) -> int | None:
-        """An integer, or None for `word` and for nothing."""
+        """An integer, or None if the value is `word` or missing."""
         value = self._take(key)
         if value is None or value == word:
             return None
@@ -251,7 +251,7 @@ class Table:
         return None
 
     def table(self, key: str) -> Table:
-        """The table of this key; an empty one where there is none."""
+        """The table of this key; empty if there is none."""
         value = self._take(key)
         if value is None:
             value = {}
@@ -275,20 +275,20 @@ class Table:
         return [(name, self.table(name)) for name in self._values]
 
     def finish(self) -> None:
-        """Reports every key nobody asked for."""
+        """Reports every key that was not read."""
         for key, value in self._values.items():
             if key not in self._known:
-                hint = meant(key, self._known)
+                hint = did_you_mean(key, self._known)
                 self.source.report((*self.path, key), "a known key", f"{key} = {show(value)}", hint)
 
 
-def meant(found: object, known: Iterable[str]) -> str:
+def did_you_mean(found: object, known: Iterable[str]) -> str:
     near = difflib.get_close_matches(str(found), list(known), n=1, cutoff=0.6)
     return f"did you mean {near[0]!r}?" if near else ""
 
 
 def show(value: object) -> str:
-    """A value as a person would write it, cut to a line."""
+    """A value as written in the file, truncated to one line."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, dict):

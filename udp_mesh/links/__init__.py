@@ -1,6 +1,5 @@
-"""Where datagrams enter and leave: the kernel's interfaces -> attachments -> UDP sockets.
+"""UDP sockets on the kernel's interfaces: interfaces -> attachments -> sockets.
 
-`netlink` asks the kernel which interfaces and addresses exist and hears of changes, `attachments` chooses from them
-what the operator wished for, `udp` is one socket per attachment, `hub` keeps the open sockets equal to the chosen
-attachments.
+`netlink` lists interfaces and addresses and reports changes, `attachments` selects those that match the configuration,
+`udp` is one socket per attachment, `hub` opens and closes sockets to match the selected attachments.
 """

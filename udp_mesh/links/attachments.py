@@ -1,9 +1,9 @@
-"""The kernel's interfaces and the operator's wishes -> the attachments this node uses. Pure.
+"""The kernel's interfaces and the link configuration -> the attachments of this node. Pure.
 
-A wish names an interface (a pattern such as `wlan*`; all broadcast interfaces if nothing is wished for) or one own
-address. An attachment is what the transport's core calls a link: a name, an own address, perhaps an address that
-reaches everybody on it, an MTU. IPv4 goes first; where an interface has no IPv4 broadcast address, its link-local IPv6
-address and the group of all nodes on the link stand in for it.
+A link configuration selects interfaces by pattern (such as `wlan*`; by default all broadcast interfaces) or one local
+address. An attachment is what the core calls a link: a name, a local address, an MTU and, unless the link has fixed
+neighbors only, a broadcast address. IPv4 is preferred; if an interface has no IPv4 broadcast address, its link-local
+IPv6 address and the all-nodes multicast group are used instead.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from udp_mesh.links.netlink import Interface, InterfaceAddress
 Address: TypeAlias = tuple[str, int]
 
 MAX_MTU = 65_535
-"""The loopback's 65,536 is one byte more than an IP packet can have."""
+"""The loopback's MTU of 65,536 is one byte more than an IP packet can have."""
 
-LEAST_MTU = 200
-"""Bytes of IP packet that leave room for headers and a useful piece of payload: narrower interfaces are not used."""
+MIN_MTU = 200
+"""Smallest MTU that leaves room for headers and a useful payload: interfaces with less are not used."""
 
 
 ALL_NODES = "ff02::1"
-"""Every IPv6 node on the link (RFC 4291, 2.7.1): what a broadcast is for IPv4. It needs no joining, and switches and
-meshes that prune multicast always let it pass (RFC 4541, 3)."""
+"""All IPv6 nodes on the link (RFC 4291, 2.7.1), the counterpart of an IPv4 broadcast. It needs no joining, and switches
+and meshes that prune multicast always forward it (RFC 4541, 3)."""
 
 
 @dataclass(frozen=True, slots=True)
-class LinkWish:
-    """What the operator wants: interfaces by pattern, or one own address; broadcast, or fixed neighbours only."""
+class LinkConfig:
+    """One entry of the link configuration: interfaces by pattern, or one local address."""
 
     interface: str | None = None
     address: str | None = None
     broadcast: bool = True
     mtu: int | None = None
-    """Overrides the interface's (a tunnel or mesh below may carry less)."""
+    """Overrides the interface's MTU (a tunnel or mesh below may carry less)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """One socket's place: bound to `device`, at `address`; with fixed neighbours nothing reaches all, `broadcast` is
-    None."""
+    """Where one socket is opened: bound to `device`, at `address`; `broadcast` is None on a link with fixed neighbors
+    only."""
 
     name: str
     device: str
@@ -52,75 +52,81 @@ class Attachment:
     broadcast: Address | None
     mtu: int
     index: int
-    """The kernel's number of the device: one made anew under the same name and addresses is another, and a socket bound
-    to the one before hears nothing."""
+    """The kernel's index of the device. A device that was deleted and created again has another index, even with the
+    same name and addresses, and a socket bound to the old one receives nothing."""
 
 
-EVERY_INTERFACE = (LinkWish(interface="*"),)
+EVERY_INTERFACE = (LinkConfig(interface="*"),)
 """The default: each running interface that can broadcast."""
 
 
-def choose(interfaces: Iterable[Interface], wishes: Iterable[LinkWish], port: int) -> tuple[Attachment, ...]:
-    """The attachments that exist now, one per interface (or wished address), the first wish that fits an interface
-    wins."""
+def select_attachments(
+    interfaces: Iterable[Interface], configs: Iterable[LinkConfig], port: int
+) -> tuple[Attachment, ...]:
+    """The attachments that exist now, one per interface (or configured address); the first entry that matches an
+    interface wins."""
     running = [interface for interface in interfaces if interface.running]
     chosen: dict[str, Attachment] = {}
-    for wish in wishes:
-        for attachment in _of_address(running, wish, port) if wish.address else _of_interface(running, wish, port):
+    for config in configs:
+        for attachment in (
+            _by_address(running, config, port) if config.address else _by_interface(running, config, port)
+        ):
             chosen.setdefault(attachment.name, attachment)
     return tuple(chosen.values())
 
 
-def _of_interface(running: list[Interface], wish: LinkWish, port: int) -> Iterable[Attachment]:
+def _by_interface(running: list[Interface], config: LinkConfig, port: int) -> Iterable[Attachment]:
     for interface in running:
-        if not fnmatch.fnmatchcase(interface.name, wish.interface or "*"):
+        if not fnmatch.fnmatchcase(interface.name, config.interface or "*"):
             continue
-        if interface.loopback and wish.interface != interface.name:
+        if interface.loopback and config.interface != interface.name:
             continue
-        usable = [address for address in interface.addresses if not wish.broadcast or _to_all(interface, address)]
-        if wish.broadcast:
-            # Everybody on the link is reached from the link-local address, which every IPv6 interface has.
+        usable = [
+            address for address in interface.addresses if not config.broadcast or _broadcast_address(interface, address)
+        ]
+        if config.broadcast:
+            # All nodes on the link are reached from the link-local address, which every IPv6 interface has.
             usable = [one for one in usable if ":" not in one.host or ipaddress.ip_address(one.host).is_link_local]
         if usable:
             address = min(usable, key=_preference)
-            to_all = _to_all(interface, address) if wish.broadcast else None
+            to_all = _broadcast_address(interface, address) if config.broadcast else None
             broadcast = None if to_all is None else (to_all, port)
             own = (address.host, port)
-            mtu = _mtu(interface, wish)
+            mtu = _mtu(interface, config)
             yield Attachment(interface.name, interface.name, own, broadcast, mtu, interface.index)
 
 
-def _of_address(running: list[Interface], wish: LinkWish, port: int) -> Iterable[Attachment]:
-    wanted = ipaddress.ip_address(wish.address or "")
+def _by_address(running: list[Interface], config: LinkConfig, port: int) -> Iterable[Attachment]:
+    wanted = ipaddress.ip_address(config.address or "")
     for interface in running:
         for address in interface.addresses:
-            # Every address of 127.0.0.0/8 is the loopback's own.
-            own = ipaddress.ip_address(address.host) == wanted or (interface.loopback and _within(wanted, address))
+            # The loopback owns every address of 127.0.0.0/8.
+            own = ipaddress.ip_address(address.host) == wanted or (interface.loopback and _in_network(wanted, address))
             if own:
-                to_all = _to_all(interface, address) if wish.broadcast else None
+                to_all = _broadcast_address(interface, address) if config.broadcast else None
                 broadcast = None if to_all is None else (to_all, port)
-                mtu = _mtu(interface, wish)
+                mtu = _mtu(interface, config)
                 yield Attachment(str(wanted), interface.name, (str(wanted), port), broadcast, mtu, interface.index)
                 return
 
 
-def _to_all(interface: Interface, address: InterfaceAddress) -> str | None:
-    """What reaches everybody on the link from this address (None: nothing does)."""
+def _broadcast_address(interface: Interface, address: InterfaceAddress) -> str | None:
+    """The address that reaches all nodes on the link from this address (None: there is none)."""
     if ":" in address.host:
         return ALL_NODES if interface.can_multicast and not interface.loopback else None
     return address.broadcast if interface.can_broadcast else None
 
 
 def _preference(address: InterfaceAddress) -> int:
-    """IPv4 first, then routable IPv6, then link-local; of equals the first."""
+    """IPv4 first, then routable IPv6, then link-local; the first among equals."""
     if ":" not in address.host:
         return 0
     return 2 if ipaddress.ip_address(address.host).is_link_local else 1
 
 
-def _within(wanted: ipaddress.IPv4Address | ipaddress.IPv6Address, address: InterfaceAddress) -> bool:
+def _in_network(wanted: ipaddress.IPv4Address | ipaddress.IPv6Address, address: InterfaceAddress) -> bool:
     return wanted in ipaddress.ip_network(f"{address.host}/{address.prefix_length}", strict=False)
 
 
-def _mtu(interface: Interface, wish: LinkWish) -> int:
-    return min(wish.mtu or interface.mtu, interface.mtu, MAX_MTU)
+def _mtu(interface: Interface, config: LinkConfig) -> int:
+    return min(config.mtu or interface.mtu, interface.mtu, MAX_MTU)

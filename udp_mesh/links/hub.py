@@ -1,7 +1,7 @@
-"""Keeps the open sockets equal to the attachments that exist: interfaces come and go while the node runs.
+"""Opens and closes sockets to match the attachments that exist: interfaces come and go while the node runs.
 
-`refresh` -> dump the kernel's interfaces -> choose -> close what is gone, open what is new, reopen what changed. A
-socket that cannot be opened is reported and tried again at the next refresh.
+`refresh` -> dump the kernel's interfaces -> select attachments -> close sockets of those gone, open new ones, reopen
+changed ones. A socket that cannot be opened is reported and retried at the next refresh.
 """
 
 from __future__ import annotations
@@ -9,34 +9,36 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from udp_mesh.links.attachments import LEAST_MTU, Attachment, LinkWish, choose
+from udp_mesh.links.attachments import MIN_MTU, Attachment, LinkConfig, select_attachments
 from udp_mesh.links.netlink import interfaces
 from udp_mesh.links.udp import UdpLink
 
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """What a refresh did. A reopened link is in `gone` and in `opened`."""
+    """The result of a refresh. A reopened link is in `gone` and in `opened`."""
 
     opened: tuple[UdpLink, ...] = ()
     gone: tuple[UdpLink, ...] = ()
-    """Closed already; `attachment` says what they were."""
+    """Already closed; `attachment` says what they were."""
     failed: dict[str, str] = field(default_factory=dict)
-    """Link name -> why its socket could not be opened."""
+    """Link name -> reason why its socket could not be opened."""
 
 
 class LinkHub:
     """The open links by name."""
 
-    def __init__(self, wishes: Sequence[LinkWish], port: int, *, urgent_dscp: int = 0) -> None:
-        self.wishes = tuple(wishes)
+    def __init__(self, configs: Sequence[LinkConfig], port: int, *, urgent_dscp: int = 0) -> None:
+        self.configs = tuple(configs)
         self.links: dict[str, UdpLink] = {}
         self._port = port
         self._urgent_dscp = urgent_dscp
 
     def refresh(self) -> Changes:
-        """Brings the sockets up to date with the kernel. Raises NetlinkError where it cannot be asked."""
-        wanted = {attachment.name: attachment for attachment in choose(interfaces(), self.wishes, self._port)}
+        """Opens and closes sockets to match the kernel's interfaces. Raises NetlinkError if they cannot be listed."""
+        wanted = {
+            attachment.name: attachment for attachment in select_attachments(interfaces(), self.configs, self._port)
+        }
         gone = [link for name, link in self.links.items() if wanted.get(name) != link.attachment]
         for link in gone:
             link.close()
@@ -54,8 +56,8 @@ class LinkHub:
         return Changes(tuple(opened), tuple(gone), failed)
 
     def _open(self, attachment: Attachment) -> UdpLink | str:
-        if attachment.mtu < LEAST_MTU:
-            return f"expected an MTU of at least {LEAST_MTU} bytes, found {attachment.mtu} on {attachment.device}"
+        if attachment.mtu < MIN_MTU:
+            return f"expected an MTU of at least {MIN_MTU} bytes, found {attachment.mtu} on {attachment.device}"
         try:
             return UdpLink(attachment, urgent_dscp=self._urgent_dscp)
         except OSError as error:

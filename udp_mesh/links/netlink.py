@@ -1,8 +1,8 @@
-"""Interfaces and addresses as the kernel has them (rtnetlink, RFC 3549, linux/rtnetlink.h).
+"""The kernel's interfaces and addresses (rtnetlink, RFC 3549, linux/rtnetlink.h).
 
-A dump request -> the kernel's messages -> `parse` -> `Interface` values. `InterfaceMonitor` hears that something
-changed; what changed is found by dumping again, so that a lost notice cannot leave a wrong picture. Broadcast
-addresses come from the kernel and are right for any netmask.
+A dump request -> the kernel's messages -> `parse` -> `Interface` values. `InterfaceMonitor` reports that something
+changed; a new dump then shows what, so a lost notice cannot leave a stale state. Broadcast addresses come from the
+kernel and are correct for any netmask.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ GROUPS = 0x1 | 0x10 | 0x100
 
 _RECEIVE_BYTES = 1 << 16
 _DUMP_TIMEOUT_S = 5.0
-"""The kernel answers a dump at once; a limit so that a broken sandbox cannot hang the start."""
+"""The kernel answers a dump at once; the timeout keeps a broken sandbox from blocking the start."""
 
 
 class NetlinkError(OSError):
-    """The kernel refused a dump, or what it sent is cut short."""
+    """The kernel refused a dump, or its answer is truncated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,21 +83,20 @@ def _dump(kernel: socket.socket, request: int) -> bytes:
 
 
 def split_messages(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(type, payload) of each netlink message in one or more reads. Raises NetlinkError where a length is
-    impossible."""
+    """(type, payload) of each netlink message in one or more reads. Raises NetlinkError for an invalid length."""
     place = 0
     while place < len(data):
         if place + _NLMSG.size > len(data):
-            raise NetlinkError(0, "netlink message cut short")
+            raise NetlinkError(0, "truncated netlink message")
         length, kind, _, _, _ = _NLMSG.unpack_from(data, place)
         if length < _NLMSG.size or place + length > len(data):
-            raise NetlinkError(0, f"netlink message of impossible length {length}")
+            raise NetlinkError(0, f"netlink message has invalid length {length}")
         yield kind, data[place + _NLMSG.size : place + length]
         place += (length + 3) & ~3
 
 
 def parse(data: bytes) -> tuple[Interface, ...]:
-    """The interfaces that link and address messages describe."""
+    """The interfaces described by link and address messages."""
     found: dict[int, Interface] = {}
     addresses: dict[int, list[InterfaceAddress]] = {}
     for kind, payload in split_messages(data):
@@ -116,16 +115,16 @@ def parse(data: bytes) -> tuple[Interface, ...]:
         elif kind == RTM_NEWADDR and len(payload) >= _IFADDR.size:
             family, prefix_length, flags, _, index = _IFADDR.unpack_from(payload)
             if flags & (IFA_F_TENTATIVE | IFA_F_DADFAILED):
-                # An IPv6 address not yet ours to use (RFC 4862, 5.4); the kernel tells when it is.
+                # An IPv6 address that cannot be used yet (RFC 4862, 5.4); the kernel sends a notice when it can.
                 continue
             attributes = dict(_attributes(payload, _IFADDR.size))
-            # IFA_LOCAL is the address itself; on point-to-point links IFA_ADDRESS is the far end's.
+            # IFA_LOCAL is the local address; on point-to-point links IFA_ADDRESS is the remote one.
             local = attributes.get(IFA_LOCAL, attributes.get(IFA_ADDRESS))
             if local is None or len(local) != {socket.AF_INET: 4, socket.AF_INET6: 16}.get(family):
                 continue
             broadcast = attributes.get(IFA_BROADCAST)
             if broadcast is None and family == socket.AF_INET and attributes.get(IFA_ADDRESS) == local:
-                broadcast = _last_of_network(local, prefix_length)
+                broadcast = _network_broadcast(local, prefix_length)
             addresses.setdefault(index, []).append(
                 InterfaceAddress(
                     socket.inet_ntop(family, local),
@@ -138,10 +137,10 @@ def parse(data: bytes) -> tuple[Interface, ...]:
     )
 
 
-def _last_of_network(address: bytes, prefix_length: int) -> bytes | None:
-    """What reaches all of an IPv4 network. The kernel has a route for it also where nobody gave the address a broadcast
-    address (`ip addr add` without `brd`; linux net/ipv4/fib_frontend.c, fib_add_ifaddr); networks of one or two
-    addresses have none (RFC 3021)."""
+def _network_broadcast(address: bytes, prefix_length: int) -> bytes | None:
+    """The broadcast address of an IPv4 network. The kernel routes it even if the address was added without one
+    (`ip addr add` without `brd`; linux net/ipv4/fib_frontend.c, fib_add_ifaddr). Networks of one or two addresses have
+    none (RFC 3021)."""
     if prefix_length >= 31:
         return None
     return (int.from_bytes(address, "big") | (0xFFFFFFFF >> prefix_length)).to_bytes(4, "big")
@@ -161,7 +160,7 @@ def _attributes(payload: bytes, start: int) -> Iterator[tuple[int, bytes]]:
 
 
 class InterfaceMonitor:
-    """A socket that becomes readable when an interface or address comes, goes or changes."""
+    """A socket that becomes readable when an interface or address is added, removed or changed."""
 
     def __init__(self) -> None:
         self._socket = socket.socket(
@@ -173,7 +172,7 @@ class InterfaceMonitor:
         return self._socket.fileno()
 
     def drain(self) -> bool:
-        """Reads all notices; True where something may have changed (also when the kernel says it lost notices)."""
+        """Reads all notices; True if something may have changed (also if the kernel lost notices)."""
         changed = False
         while True:
             try:
@@ -181,7 +180,7 @@ class InterfaceMonitor:
             except BlockingIOError:
                 return changed
             except OSError:
-                # ENOBUFS: notices were lost. A dump shows the state all the same.
+                # ENOBUFS: notices were lost. A dump shows the current state anyway.
                 return True
             changed = True
 

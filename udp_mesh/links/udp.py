@@ -1,9 +1,8 @@
-"""One UDP socket: datagrams out in runs (segmentation offload), datagrams in in runs (receive offload), never waiting.
+"""One UDP socket: sends and receives datagrams in runs (segmentation and receive offload), never blocks.
 
-Out: consecutive datagrams of one size to one destination become one system call with UDP_SEGMENT (linux/udp.h); where
-the kernel or a device refuses that, the socket falls back to one call per datagram and remembers it. In: one call may
-return up to 64 datagrams of one sender, told apart by the size that UDP_GRO reports. Measured reasons stand in the
-transport's fact sheet.
+Send: consecutive datagrams of one size to one destination become one system call with UDP_SEGMENT (linux/udp.h). If the
+kernel or a device refuses that, the socket falls back to one call per datagram for good. Receive: one call may return
+up to 64 datagrams of one sender, split by the size in UDP_GRO. Measurements are in the transport's fact sheet.
 """
 
 from __future__ import annotations
@@ -21,26 +20,26 @@ SOL_UDP, UDP_SEGMENT, UDP_GRO = 17, 103, 104
 SO_BINDTODEVICE, SO_RCVBUFFORCE, SO_TIMESTAMPNS = 25, 33, 35
 
 MAX_SEGMENTS = 64
-"""UDP_MAX_SEGMENTS of older kernels (newer take 128)."""
+"""UDP_MAX_SEGMENTS of older kernels (newer ones allow 128)."""
 MAX_RUN_BYTES = 65_000
-"""One run must fit one IP packet of 65,535 B before it is cut."""
+"""A run must fit one IP packet of 65,535 B before segmentation."""
 RECEIVE_BUFFER_BYTES = 4 << 20
-"""Kernel receive buffer: 30 ms of a gigabit, so that a busy core loses nothing; capped by net.core.rmem_max."""
+"""Kernel receive buffer: 30 ms at a gigabit, so that a busy core loses nothing; capped by net.core.rmem_max."""
 SEND_BUFFER_BYTES = 1 << 20
-"""Kernel send buffer: a few runs; what waits here is beyond the scheduler's reach, so no more."""
-MAX_REFUSED = 256
-"""Destinations and reasons told apart of what the kernel refuses: more than a team."""
+"""Kernel send buffer: a few runs. The scheduler cannot reorder what is in it, so it is small."""
+MAX_SEND_ERRORS = 256
+"""Distinct (destination, errno) pairs counted for send errors: more than a team."""
 _DATAGRAM_BYTES = 1 << 16
 _INT = struct.Struct("=i")
 _TIMESPEC = struct.Struct("@ll")
 _ANCILLARY_BYTES = socket.CMSG_SPACE(4) + socket.CMSG_SPACE(_TIMESPEC.size)
 
 Deliver: TypeAlias = Callable[[memoryview, Address, float], None]
-"""Takes a datagram, its sender, and when the kernel took it in (seconds since 1970, 0.0 where it does not say)."""
+"""Called with a datagram, its sender, and its kernel timestamp (seconds since 1970; 0.0 if there is none)."""
 
 
 class Outgoing(Protocol):
-    """What is sent: the core's datagram. `destination` None means the link's broadcast address."""
+    """A datagram of the core. `destination` None means the link's broadcast address."""
 
     @property
     def destination(self) -> Address | None: ...
@@ -54,14 +53,14 @@ class UdpLink:
     """The open socket of one attachment."""
 
     def __init__(self, attachment: Attachment, *, urgent_dscp: int = 0) -> None:
-        """Raises OSError where the address or port is taken, or the device is not ours to use."""
+        """Raises OSError if the address or port is in use, or the device may not be used."""
         self.attachment = attachment
         self.segmentation = True
-        """Whether runs are still handed to the kernel whole."""
+        """Whether segmentation offload is in use."""
         self.datagrams_lost_on_send = 0
-        """Datagrams the kernel refused (unreachable, forbidden, device gone, too long)."""
-        self.refused: dict[tuple[Address, int], int] = {}
-        """The same by destination and errno, until whoever tells of it has cleared it."""
+        """Datagrams the kernel refused (unreachable, prohibited, device gone, too long)."""
+        self.send_errors: dict[tuple[Address, int], int] = {}
+        """The same by destination and errno, until the caller clears it."""
         self.system_calls = 0
         self._buffer = memoryview(bytearray(_DATAGRAM_BYTES))
         family = socket.AF_INET6 if ":" in attachment.address[0] else socket.AF_INET
@@ -73,31 +72,31 @@ class UdpLink:
         self._urgent = [(level, name, _INT.pack(urgent_dscp << 2))] if urgent_dscp else []
         self._socket = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
         try:
-            self._set_up()
+            self._configure()
         except OSError:
             self._socket.close()
             raise
 
-    def _set_up(self) -> None:
+    def _configure(self) -> None:
         own, attachment = self._socket, self.attachment
         own.setsockopt(socket.SOL_SOCKET, SO_BINDTODEVICE, attachment.device.encode() + b"\0")
         own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
-        # Without CAP_NET_ADMIN the buffer stays within net.core.rmem_max.
+        # Without CAP_NET_ADMIN, net.core.rmem_max limits the buffer.
         with contextlib.suppress(PermissionError):
             own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
-        # When a datagram came, not when we found time for it: round trips measure the network, not this machine's load.
+        # The arrival time rather than the time of reading: round trips must measure the network, not this machine.
         own.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         if own.family == socket.AF_INET6:
-            # IPv4 has a socket of its own; our own datagrams to all nodes need not come back.
+            # IPv4 has a socket of its own, and our own multicasts need not come back.
             own.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
             own.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_LOOP, 0)
-        # Before Linux 5.0 datagrams come one by one.
+        # Not available before Linux 5.0: datagrams then arrive one by one.
         with contextlib.suppress(OSError):
             own.setsockopt(SOL_UDP, UDP_GRO, 1)
         if attachment.broadcast is not None:
             own.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-            # Broadcasts reach only sockets bound to no address; the device keeps other interfaces' traffic out.
+            # Only an unbound address receives broadcasts; the device keeps other interfaces' traffic out.
             own.bind(("", attachment.address[1]))
         else:
             own.bind(attachment.address)
@@ -105,12 +104,12 @@ class UdpLink:
     def fileno(self) -> int:
         return self._socket.fileno()
 
-    def receive(self, deliver: Deliver, limit: int, fresh_from: float = float("inf")) -> int:
-        """Hands up to about `limit` waiting datagrams to `deliver`; returns how many. Our own broadcasts are left out.
+    def receive(self, deliver: Deliver, limit: int, stop_after: float = float("inf")) -> int:
+        """Passes about `limit` waiting datagrams to `deliver`, except our own broadcasts; returns their number.
 
-        One that came after `fresh_from` (seconds since 1970) is taken for the last: what came with it is left to the
-        next look, since to ask for more that is not there costs as much as to receive.
-        The bytes handed over are overwritten by the next call: who keeps them copies them.
+        Stops after a datagram that arrived after `stop_after` (seconds since 1970), which is taken to be the last one:
+        another read would cost as much as a datagram. The buffer passed is overwritten by the next call: the callee
+        must copy what it keeps.
         """
         count, buffer, own = 0, self._buffer, self.attachment.address
         receive = self._socket.recvmsg_into
@@ -121,7 +120,7 @@ class UdpLink:
             except BlockingIOError:
                 break
             except OSError:
-                # A pending error of the socket (an ICMP answer, the device going down): reading it clears it.
+                # A pending socket error (an ICMP error, the device going down): reading it clears it.
                 break
             self.system_calls += 1
             address = (source[0], source[1])
@@ -137,7 +136,7 @@ class UdpLink:
             if size <= segment:
                 deliver(buffer[:size], address, arrived)
                 count += 1
-                if arrived > fresh_from:
+                if arrived > stop_after:
                     break
                 continue
             for start in range(0, size, segment):
@@ -146,14 +145,13 @@ class UdpLink:
         return count
 
     def send(self, datagrams: Sequence[Outgoing]) -> int:
-        """Sends from the front; returns how many are done with (sent, or lost as on a radio). Fewer: the socket is
-        full."""
+        """Sends from the front; returns how many are done (sent or lost). Fewer than all means the socket is full."""
         done, total = 0, len(datagrams)
         while done < total:
             first = datagrams[done]
             destination = first.destination or self.attachment.broadcast
             if destination is None:
-                # A broadcast on a link of fixed neighbours: nobody to send it to.
+                # A broadcast on a link with fixed neighbors only: there is no destination.
                 done += 1
                 continue
             end = self._run_end(datagrams, done) if self.segmentation else done + 1
@@ -164,7 +162,7 @@ class UdpLink:
         return done
 
     def _run_end(self, datagrams: Sequence[Outgoing], start: int) -> int:
-        """Where the run from `start` ends: same destination and urgency, equal sizes, the last one may be shorter."""
+        """The end of the run from `start`: same destination and urgency, same size; the last one may be shorter."""
         first = datagrams[start]
         size, destination, urgent = len(first.data), first.destination, first.urgent
         end = start + 1
@@ -180,7 +178,7 @@ class UdpLink:
         return end
 
     def _send_run(self, run: Sequence[Outgoing], destination: Address) -> int | None:
-        """How many of the run are done with; None where the socket is full."""
+        """The number of datagrams of the run that are done; None if the socket is full."""
         ancillary = list(self._urgent) if run[0].urgent else []
         if len(run) > 1:
             ancillary.append((SOL_UDP, UDP_SEGMENT, struct.pack("=H", len(run[0].data))))
@@ -193,23 +191,23 @@ class UdpLink:
         except BlockingIOError:
             return None
         except OSError as error:
-            # An IPv4 address on an IPv6 socket, or the other way round: a peer not yet heard at its new address.
+            # An IPv4 address on an IPv6 socket or vice versa: a peer not yet heard at its new address.
             number = errno.EAFNOSUPPORT if isinstance(error, socket.gaierror) else error.errno or errno.EIO
             if len(run) > 1 and number in (errno.EIO, errno.EINVAL, errno.EMSGSIZE, errno.EOPNOTSUPP):
-                return self._send_singly(run, destination, number)
-            # Unreachable, forbidden, too long, the device gone: as lost as on a radio, and answered by the same means.
+                return self._send_unsegmented(run, destination, number)
+            # Unreachable, prohibited, too long, device gone: treated like a loss on the radio.
             self.datagrams_lost_on_send += len(run)
-            if len(self.refused) < MAX_REFUSED or (destination, number) in self.refused:
-                self.refused[destination, number] = self.refused.get((destination, number), 0) + len(run)
+            if len(self.send_errors) < MAX_SEND_ERRORS or (destination, number) in self.send_errors:
+                self.send_errors[destination, number] = self.send_errors.get((destination, number), 0) + len(run)
         return len(run)
 
-    def _send_singly(self, run: Sequence[Outgoing], destination: Address, number: int) -> int | None:
+    def _send_unsegmented(self, run: Sequence[Outgoing], destination: Address, number: int) -> int | None:
         lost_before, done = self.datagrams_lost_on_send, 0
         while done < len(run) and self._send_run([run[done]], destination) is not None:
             done += 1
         if number != errno.EMSGSIZE and self.datagrams_lost_on_send - lost_before < done:
-            # What goes singly and not in a run: no segmentation on this device or path. (EMSGSIZE: one above the
-            # path's MTU; and EINVAL is the answer of a route that swallows everything, too.)
+            # Works one by one but not as a run: no segmentation on this device or path. (EMSGSIZE: one datagram exceeds
+            # the path MTU. EINVAL is also the error of a blackhole route.)
             self.segmentation = False
         return done or None
 

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-SHOWN_PROBLEMS = 5
+MAX_SHOWN_PROBLEMS = 5
 """Of one recording's lines; the page counts them all."""
 
 
@@ -33,10 +33,10 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--out", type=Path, default=Path("report.html"), help="the page (default: report.html)")
     parser.add_argument("--title", default="udp_mesh run", help="its heading (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the page's numbers as JSON, too")
-    chosen = parser.parse_args(list(arguments))
+    options = parser.parse_args(list(arguments))
     try:
-        recordings = [read(path) for path in chosen.recording]
-        write_page(recordings, chosen.out, chosen.title)
+        recordings = [read(path) for path in options.recording]
+        write_page(recordings, options.out, options.title)
     except RecordingError as error:
         print(f"udp-mesh: {clean(str(error))}", file=sys.stderr)
         return 2
@@ -44,14 +44,14 @@ def main(arguments: Sequence[str]) -> int:
         print(f"udp-mesh: {error.filename}: {error.strerror}", file=sys.stderr)
         return 2
     for recording in recordings:
-        for problem in recording.problems[:SHOWN_PROBLEMS]:
+        for problem in recording.problems[:MAX_SHOWN_PROBLEMS]:
             print(f"udp-mesh: warning: {clean(str(problem))}", file=sys.stderr)
-        more = len(recording.problems) - SHOWN_PROBLEMS
+        more = len(recording.problems) - MAX_SHOWN_PROBLEMS
         if more > 0:
             print(f"udp-mesh: warning: ... and {more} more lines that cannot be read", file=sys.stderr)
-    if chosen.json:
-        value = {"page": str(chosen.out), "recordings": [summary(recording) for recording in recordings]}
+    if options.json:
+        value = {"page": str(options.out), "recordings": [summary(recording) for recording in recordings]}
         print(json.dumps(value, indent=2))
     else:
-        print(chosen.out)
+        print(options.out)
     return 0

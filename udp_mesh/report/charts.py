@@ -11,14 +11,14 @@ from html import escape
 
 WIDTH, HEIGHT = 760, 260
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 16, 14, 36
-_ROW_NAME = 9
+_MAX_ROW_NAME = 9
 """Characters that fit left of a row; pointing at it shows the rest."""
 # readable on white, told apart by people who do not see red and green (after Okabe and Ito)
-COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442", "#555555")
+COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442", "#555555")
 
 
-def colour(index: int) -> str:
-    return COLOURS[index % len(COLOURS)]
+def color(index: int) -> str:
+    return COLORS[index % len(COLORS)]
 
 
 def _svg(parts: Sequence[str], height: int = HEIGHT) -> str:
@@ -88,11 +88,11 @@ def density(bars: Sequence[float], low: float, high: float, curve: tuple[float, 
         x, y = axes.at_x(low + index * width), axes.at_y(value)
         w = axes.at_x(low + (index + 1) * width) - x
         parts.append(
-            f'<rect x="{x:.1f}" y="{y:.1f}" width="{w:.1f}" height="{axes.at_y(0) - y:.1f}" fill="{COLOURS[0]}"/>'
+            f'<rect x="{x:.1f}" y="{y:.1f}" width="{w:.1f}" height="{axes.at_y(0) - y:.1f}" fill="{COLORS[0]}"/>'
         )
     if curved:
         path = " ".join(f"{axes.at_x(v):.1f},{axes.at_y(d):.1f}" for v, d in zip(points, curved, strict=True))
-        parts.append(f'<polyline points="{path}" fill="none" stroke="{COLOURS[5]}" stroke-width="1.5"/>')
+        parts.append(f'<polyline points="{path}" fill="none" stroke="{COLORS[5]}" stroke-width="1.5"/>')
     return _svg(parts)
 
 
@@ -105,13 +105,13 @@ def spans(rows: Mapping[str, Sequence[tuple[float, float]]], end: float, x_label
     ]
     for index, (name, bars) in enumerate(rows.items()):
         y = _TOP + 24 * index
-        shown = name if len(name) <= _ROW_NAME else f"{name[: _ROW_NAME - 1]}…"
+        shown = name if len(name) <= _MAX_ROW_NAME else f"{name[: _MAX_ROW_NAME - 1]}…"
         parts.append(f"<g><title>{escape(name)}</title>{_text(_LEFT - 6, y + 16, shown, 'end')}</g>")
         for start, stop in bars:
             x = axes.at_x(start)
             parts.append(
                 f'<rect x="{x:.1f}" y="{y + 4}" width="{max(axes.at_x(stop) - x, 0.5):.1f}" height="16" '
-                f'fill="{colour(index)}"/>'
+                f'fill="{color(index)}"/>'
             )
     return _svg(parts, height)
 
@@ -128,7 +128,7 @@ def stacked(layers: Mapping[str, Sequence[float]], end: float, x_label: str, y_l
         xs = [axes.at_x((i + 0.5) * end / max(length, 1)) for i in range(length)]
         outline = [f"{x:.1f},{axes.at_y(v):.1f}" for x, v in zip(xs, above, strict=True)]
         outline += [f"{x:.1f},{axes.at_y(v):.1f}" for x, v in reversed(list(zip(xs, below, strict=True)))]
-        parts.append(f'<polygon points="{" ".join(outline)}" fill="{colour(index)}"/>')
+        parts.append(f'<polygon points="{" ".join(outline)}" fill="{color(index)}"/>')
         below = above
     return _svg(parts)
 
@@ -146,7 +146,7 @@ def over_time(series: Mapping[str, Sequence[tuple[float, float]]], end: float, x
             drawn += f"{'M' if t - before > longest else 'L'}{axes.at_x(t):.1f} {axes.at_y(value):.1f}"
             before = t
         parts.append(
-            f'<path d="{drawn}" fill="none" stroke="{colour(index)}" stroke-width="1.5" stroke-linecap="round"/>'
+            f'<path d="{drawn}" fill="none" stroke="{color(index)}" stroke-width="1.5" stroke-linecap="round"/>'
         )
     return _svg(parts)
 
@@ -171,7 +171,7 @@ def paths(tracks: Mapping[str, Sequence[tuple[float, float, bool]]], marks: Mapp
             # one that stands is a dot
             drawn = "L".join([points_text[0], *(text for text, _ in itertools.groupby(points_text))])
             parts.append(
-                f'<path d="M{drawn}" fill="none" stroke="{colour(index) if on else "#bbb"}" '
+                f'<path d="M{drawn}" fill="none" stroke="{color(index) if on else "#bbb"}" '
                 f'stroke-width="{3 if on else 1.5}" stroke-linejoin="round" stroke-linecap="round"/>'
             )
     for name, (x, y) in marks.items():
@@ -182,6 +182,6 @@ def paths(tracks: Mapping[str, Sequence[tuple[float, float, bool]]], marks: Mapp
 
 def legend(names: Sequence[str]) -> str:
     items = "".join(
-        f'<span><i style="background:{colour(index)}"></i>{escape(name)}</span>' for index, name in enumerate(names)
+        f'<span><i style="background:{color(index)}"></i>{escape(name)}</span>' for index, name in enumerate(names)
     )
     return f'<p class="legend">{items}</p>'

@@ -13,8 +13,8 @@ from typing import Any
 from udp_mesh.report.recording import Recording, Sample
 
 # what counts as a periodic topic: enough messages, with a middle interval that most keep to
-_LEAST_MESSAGES = 20
-_PUNCTUAL = 0.05
+_MIN_MESSAGES = 20
+_PUNCTUAL_SHARE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ def intervals(recording: Recording) -> list[Intervals]:
         arrived[item.source, item.topic].append(item.t)
     found = []
     for (source, topic), times in arrived.items():
-        if len(times) < _LEAST_MESSAGES:
+        if len(times) < _MIN_MESSAGES:
             continue
         values = [later - earlier for earlier, later in itertools.pairwise(sorted(times))]
         median_s = sorted(values)[len(values) // 2]
@@ -69,7 +69,7 @@ def intervals(recording: Recording) -> list[Intervals]:
         near = [value for value in values if 0.5 * median_s <= value <= 1.5 * median_s]
         mean_s = sum(near) / len(near) if near else 0.0
         deviation_s = math.sqrt(sum((value - mean_s) ** 2 for value in near) / len(near)) if near else 0.0
-        punctual = sum(abs(value - median_s) <= _PUNCTUAL * median_s for value in values) / len(values)
+        punctual = sum(abs(value - median_s) <= _PUNCTUAL_SHARE * median_s for value in values) / len(values)
         found.append(Intervals(source, topic, tuple(values), median_s, deviation_s, len(values) - len(near), punctual))
     return sorted(found, key=lambda each: (-len(each.values_s), each.source, each.topic))
 
@@ -111,7 +111,7 @@ def throughput(recording: Recording, bins: int = 120) -> tuple[float, list[Throu
 
 
 @dataclass(frozen=True, slots=True)
-class Sending:
+class SentTopic:
     """What this node sent of one topic and what became of it; outcomes count destinations, and a broadcast in one
     datagram has none. `latencies_s` are those of what was delivered, in rising order."""
 
@@ -130,7 +130,7 @@ class Sending:
         return self.latencies_s[min(len(self.latencies_s) - 1, int(share * len(self.latencies_s)))]
 
 
-def sendings(recording: Recording) -> list[Sending]:
+def sent_topics(recording: Recording) -> list[SentTopic]:
     """Of every topic that was sent, or had outcomes, the most urgent first."""
     counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
     ends: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
@@ -145,7 +145,7 @@ def sendings(recording: Recording) -> list[Sending]:
         if outcome.latency_s is not None:
             latencies[outcome.topic].append(outcome.latency_s)
     return [
-        Sending(
+        SentTopic(
             topic,
             counts[topic][0],
             counts[topic][1],
@@ -158,7 +158,7 @@ def sendings(recording: Recording) -> list[Sending]:
     ]
 
 
-def course(
+def time_series(
     recording: Recording, read: Callable[[Sample], float | None], bins: int = 240
 ) -> dict[str, list[tuple[float, float]]]:
     """Per peer what its samples say over time: the mean of each of the equal bins that has any, in the bin's middle."""
@@ -182,7 +182,7 @@ def summary(recording: Recording) -> dict[str, Any]:
         "started": recording.started,
         "seconds": recording.end_s,
         "lines_unreadable": len(recording.problems),
-        "lines_left_out": recording.left_out,
+        "lines_left_out": recording.missing_lines,
         "received": [
             {"topic": each.topic, "priority": each.priority, "messages": each.messages, "bytes": each.total_bytes}
             for each in received
@@ -198,7 +198,7 @@ def summary(recording: Recording) -> dict[str, Any]:
                 "latency_p50_s": each.latency_s(0.5),
                 "latency_p99_s": each.latency_s(0.99),
             }
-            for each in sendings(recording)
+            for each in sent_topics(recording)
         ],
         "online": [
             {"peer": each.peer, "share": round(each.share, 6), "spans_s": [list(span) for span in each.spans_s]}

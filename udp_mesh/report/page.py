@@ -50,12 +50,12 @@ def _section(recording: Recording, named: bool) -> str:
     parts = [f"<h2>As seen by {escape(recording.name)}</h2>"] if named else []
     if recording.problems:
         parts.append(f"<p>{len(recording.problems)} lines could not be read and were left out.</p>")
-    if recording.left_out:
+    if recording.missing_lines:
         parts.append(
-            f"<p>The disk did not keep up when this was recorded: {recording.left_out} lines are missing, and what "
-            "they told is not counted.</p>"
+            f"<p>The disk did not keep up when this was recorded: {recording.missing_lines} lines are missing, and "
+            "what they said is not counted.</p>"
         )
-    parts += [_totals(recording), _sendings(recording), _throughput(recording), _connectivity(recording)]
+    parts += [_totals(recording), _sent_topics(recording), _throughput(recording), _connectivity(recording)]
     parts += [_links(recording), _map(recording)]
     parts += [_intervals(each) for each in figures.intervals(recording)[:_SHOWN_INTERVALS]]
     return "".join(parts)
@@ -77,8 +77,8 @@ def _totals(recording: Recording) -> str:
     )
 
 
-def _sendings(recording: Recording) -> str:
-    sent = figures.sendings(recording)
+def _sent_topics(recording: Recording) -> str:
+    sent = figures.sent_topics(recording)
     if not sent:
         return ""
     rows = "".join(
@@ -127,7 +127,7 @@ def _links(recording: Recording) -> str:
     )
     parts = []
     for heading, unit, read in readings:
-        series = figures.course(recording, read)
+        series = figures.time_series(recording, read)
         if series:
             chart = charts.over_time(series, recording.end_s, "seconds", unit)
             parts.append(f"<h3>{heading}</h3>{charts.legend(list(series))}{chart}")

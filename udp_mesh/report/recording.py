@@ -106,7 +106,7 @@ class Recording:
     places: list[Place] = field(default_factory=list)
     sent: list[Sent] = field(default_factory=list)
     outcomes: list[Outcome] = field(default_factory=list)
-    left_out: int = 0
+    missing_lines: int = 0
     end_s: float = 0.0
     """The latest time of a line."""
     problems: list[str] = field(default_factory=list)
@@ -170,7 +170,7 @@ def parse(lines: Iterable[bytes], file: str) -> Recording:
         try:
             if isinstance(entry, str):
                 raise _UnreadableError("one JSON object", entry)
-            _take(recording, entry, online)
+            _add(recording, entry, online)
         except _UnreadableError as error:
             recording.problems.append(f"{file}:{number}: {error}")
     return recording
@@ -198,7 +198,7 @@ def _objects(lines: Iterable[bytes]) -> Iterator[tuple[int, Any]]:
         yield number, entry if isinstance(entry, dict) else "another JSON value"
 
 
-def _take(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) -> None:
+def _add(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) -> None:
     """Adds what the line says. `online` is what is known of each peer so far: a recording may begin, or have a gap,
     when peers are online that no event of its own announced."""
     t, kind = _number(entry, "t", 0.0, MAX_T_S), entry.get("kind")
@@ -207,10 +207,10 @@ def _take(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) 
     match kind:
         case "received":
             recording.arrivals.append(
-                Arrival(t, at, _text(entry, "source"), _text(entry, "topic"), _whole(entry, "priority"), _size(entry))
+                Arrival(t, at, _text(entry, "source"), _text(entry, "topic"), _integer(entry, "priority"), _size(entry))
             )
         case "sent":
-            recording.sent.append(Sent(t, _text(entry, "topic"), _whole(entry, "priority"), _size(entry)))
+            recording.sent.append(Sent(t, _text(entry, "topic"), _integer(entry, "priority"), _size(entry)))
         case "message-delivered" | "message-expired" | "message-peer-lost":
             latency_s = _number(entry, "latency_s", 0.0, MAX_T_S) if kind == "message-delivered" else None
             outcome = kind.removeprefix("message-")
@@ -226,7 +226,7 @@ def _take(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) 
             x, y = (_number(entry, key, -MAX_PLACE_M, MAX_PLACE_M) for key in ("x", "y"))
             recording.places.append(Place(t, at, x, y))
         case "gap":
-            recording.left_out += _whole(entry, "lines")
+            recording.missing_lines += _integer(entry, "lines")
         case _:
             # another kind, which no picture shows
             return
@@ -259,19 +259,19 @@ def _text(entry: dict[str, Any], key: str) -> str:
     return value.encode(errors="replace").decode()
 
 
-def _number(entry: dict[str, Any], key: str, least: float, most: float) -> float:
+def _number(entry: dict[str, Any], key: str, minimum: float, maximum: float) -> float:
     value = entry.get(key)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not least <= value <= most:
-        raise _UnreadableError(f"a number from {least:g} to {most:g} as {key}", value)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not minimum <= value <= maximum:
+        raise _UnreadableError(f"a number from {minimum:g} to {maximum:g} as {key}", value)
     try:
         return float(value)
     except OverflowError as error:
-        raise _UnreadableError(f"a number from {least:g} to {most:g} as {key}", "a larger one") from error
+        raise _UnreadableError(f"a number from {minimum:g} to {maximum:g} as {key}", "a larger one") from error
 
 
-def _whole(entry: dict[str, Any], key: str) -> int:
+def _integer(entry: dict[str, Any], key: str) -> int:
     return int(_number(entry, key, 0, MAX_BYTES))
 
 
 def _size(entry: dict[str, Any]) -> int:
-    return _whole(entry, "bytes")
+    return _integer(entry, "bytes")

@@ -12,7 +12,7 @@ from typing import Any
 
 from udp_mesh.report.page import write_page
 from udp_mesh.report.recording import parse
-from udp_mesh.sim.run import Played, play
+from udp_mesh.sim.run import RunResult, play
 from udp_mesh.sim.scenario import MAX_DURATION_S, Scenario, ScenarioError, load
 
 SHIPPED = Path(__file__).with_name("scenarios")
@@ -35,22 +35,22 @@ def run_command(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="write recording.jsonl, summary.json and report.html")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    chosen = parser.parse_args(list(arguments))
-    if chosen.list or chosen.scenario is None:
+    options = parser.parse_args(list(arguments))
+    if options.list or options.scenario is None:
         print(*shipped(), sep="\n")
-        return 0 if chosen.list else 2
+        return 0 if options.list else 2
     try:
-        scenario = load(find(chosen.scenario))
-        if chosen.seed is not None:
-            scenario = replace(scenario, seed=chosen.seed)
-        if chosen.duration is not None:
-            scenario = replace(scenario, duration_s=chosen.duration)
-        if chosen.out is not None:
+        scenario = load(find(options.scenario))
+        if options.seed is not None:
+            scenario = replace(scenario, seed=options.seed)
+        if options.duration is not None:
+            scenario = replace(scenario, duration_s=options.duration)
+        if options.out is not None:
             # before the run, which may take long
-            _make_writable(chosen.out)
-        played = play(scenario, _progress(scenario))
-        if chosen.out is not None:
-            write(played, chosen.out)
+            _check_writable(options.out)
+        result = play(scenario, _progress(scenario))
+        if options.out is not None:
+            write(result, options.out)
     except ScenarioError as error:
         print("\n".join(f"udp-mesh: {problem}" for problem in str(error).splitlines()), file=sys.stderr)
         return 2
@@ -60,8 +60,8 @@ def run_command(arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
-    summary = played.summary()
-    print(json.dumps(summary, indent=2) if chosen.json else text(summary))
+    summary = result.summary()
+    print(json.dumps(summary, indent=2) if options.json else text(summary))
     return 0
 
 
@@ -81,7 +81,7 @@ def _duration_s(text: str) -> float:
     return value
 
 
-def _make_writable(directory: Path) -> None:
+def _check_writable(directory: Path) -> None:
     """Raises OSError where nothing could be written there."""
     directory.mkdir(parents=True, exist_ok=True)
     probe = directory / "recording.jsonl"
@@ -105,12 +105,12 @@ def find(name: str) -> Path:
     raise ScenarioError(f"{name}: expected a file or one of {', '.join(shipped())}, found neither")
 
 
-def write(played: Played, directory: Path) -> None:
+def write(result: RunResult, directory: Path) -> None:
     directory.mkdir(parents=True, exist_ok=True)
-    (directory / "recording.jsonl").write_text("\n".join(played.lines) + "\n", "utf-8")
-    (directory / "summary.json").write_text(json.dumps(played.summary(), indent=2) + "\n", "utf-8")
-    recorded = parse((line.encode() for line in played.lines), "recording.jsonl")
-    write_page([recorded], directory / "report.html", title=played.scenario.name)
+    (directory / "recording.jsonl").write_text("\n".join(result.lines) + "\n", "utf-8")
+    (directory / "summary.json").write_text(json.dumps(result.summary(), indent=2) + "\n", "utf-8")
+    recorded = parse((line.encode() for line in result.lines), "recording.jsonl")
+    write_page([recorded], directory / "report.html", title=result.scenario.name)
 
 
 def _progress(scenario: Scenario) -> Callable[[float], None]:

@@ -6,7 +6,7 @@ import heapq
 from collections.abc import Callable
 
 
-class Agenda:
+class EventQueue:
     """`now` moves only by `run_until`; everything simulated shares one agenda."""
 
     def __init__(self) -> None:

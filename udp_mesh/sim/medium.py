@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 
-from udp_mesh.sim.event_queue import Agenda
+from udp_mesh.sim.event_queue import EventQueue
 
 # IP and UDP headers, and what 802.11 and batman-adv add to a frame
 IP_UDP_BYTES = 28
@@ -110,7 +110,7 @@ class Medium:
 
     def __init__(
         self,
-        agenda: Agenda,
+        event_queue: EventQueue,
         channel: Channel,
         stations: Iterable[str],
         loss: Loss,
@@ -118,15 +118,15 @@ class Medium:
         rng: random.Random,
     ) -> None:
         self.counts = Counts()
-        self._agenda = agenda
+        self._event_queue = event_queue
         self._channel = channel
         self._stations = {name: _Station(name) for name in stations}
         self._loss = loss
         self._deliver = deliver
         self._rng = rng
         self._frames = 0
-        self._routed_s = -1.0
-        self._ways: dict[str, dict[str, str]] = {}
+        self._routed_at_s = -1.0
+        self._next_hops: dict[str, dict[str, str]] = {}
         self._heard: dict[str, dict[str, float]] = {}
 
     def set_on(self, station: str, on: bool) -> None:
@@ -136,19 +136,19 @@ class Medium:
         if not on:
             found.urgent.frames.clear()
             found.other.frames.clear()
-        self._routed_s = -1.0
+        self._routed_at_s = -1.0
 
     def links(self) -> dict[str, dict[str, float]]:
         """Who hears whom now, and the chance that a frame is lost."""
-        self._look_around()
+        self._update_routes()
         return self._heard
 
     def hops(self, a: str, b: str) -> int | None:
         """Transmissions that a datagram takes on today's routes, None where there is no way."""
-        self._look_around()
+        self._update_routes()
         count = 0
         while a != b:
-            step = self._ways.get(b, {}).get(a)
+            step = self._next_hops.get(b, {}).get(a)
             if step is None or count > len(self._stations):
                 return None
             a, count = step, count + 1
@@ -181,23 +181,23 @@ class Medium:
         first, window = queue.slots
         if queue.backoff_slots is None:
             queue.backoff_slots = self._rng.randrange(window)
-        queue.counting_from_s = max(self._agenda.now, queue.station.quiet_until_s) + first * SLOT_S
-        self._agenda.at(queue.counting_from_s + queue.backoff_slots * SLOT_S, partial(self._turn, queue))
+        queue.counting_from_s = max(self._event_queue.now, queue.station.quiet_until_s) + first * SLOT_S
+        self._event_queue.at(queue.counting_from_s + queue.backoff_slots * SLOT_S, partial(self._transmit, queue))
 
-    def _turn(self, queue: _Queue) -> None:
+    def _transmit(self, queue: _Queue) -> None:
         queue.is_waiting = False
         station = queue.station
         if not queue.frames or not station.is_on:
             queue.backoff_slots = None
             return
-        if station.quiet_until_s > self._agenda.now:
+        if station.quiet_until_s > self._event_queue.now:
             assert queue.backoff_slots is not None
             counted = (station.quiet_from_s - queue.counting_from_s) / SLOT_S
             queue.backoff_slots -= min(queue.backoff_slots, max(0, int(counted + _ROUNDING)))
             self._contend(queue)
             return
         queue.backoff_slots = None
-        self._look_around()
+        self._update_routes()
         frame = queue.frames.popleft()
         if frame.to is None:
             self._broadcast(station, frame)
@@ -209,36 +209,36 @@ class Medium:
         """The air around a station is taken for `times` transmissions; returns their end."""
         size = len(frame.data) + IP_UDP_BYTES + FRAME_BYTES
         took_s = times * (size * 8 / self._channel.rate + self._channel.overhead_s)
-        end_s = self._agenda.now + took_s
-        self._keep_quiet(station, end_s)
+        end_s = self._event_queue.now + took_s
+        self._defer(station, end_s)
         for name in self._heard[station.name]:
-            self._keep_quiet(self._stations[name], end_s)
+            self._defer(self._stations[name], end_s)
         self.counts.transmissions += times
         self.counts.bytes += size * times
         self.counts.airtime_s += took_s
         self.counts.airtime_s_of[station.name] = self.counts.airtime_s_of.get(station.name, 0.0) + took_s
         return end_s + self._channel.hop_delay_s
 
-    def _keep_quiet(self, station: _Station, end_s: float) -> None:
-        if station.quiet_until_s <= self._agenda.now:
-            station.quiet_from_s = self._agenda.now
+    def _defer(self, station: _Station, end_s: float) -> None:
+        if station.quiet_until_s <= self._event_queue.now:
+            station.quiet_from_s = self._event_queue.now
         station.quiet_until_s = max(station.quiet_until_s, end_s)
 
     def _forward(self, station: _Station, frame: Frame) -> None:
         assert frame.to is not None
-        step = self._ways.get(frame.to, {}).get(station.name)
+        step = self._next_hops.get(frame.to, {}).get(station.name)
         if step is None:
             self.counts.unroutable += 1
             return
         # the link as it is now, which the route may not know yet
-        loss = self._loss(station.name, step, self._agenda.now) if self._stations[step].is_on else 1.0
+        loss = self._loss(station.name, step, self._event_queue.now) if self._stations[step].is_on else 1.0
         attempts, arrived = 0, False
         while attempts < self._channel.attempts and not arrived:
             attempts += 1
             arrived = self._rng.random() >= loss
         at_s = self._occupy(station, frame, attempts)
         if arrived:
-            self._agenda.at(at_s, lambda: self._arrive(self._stations[step], frame))
+            self._event_queue.at(at_s, lambda: self._arrive(self._stations[step], frame))
         else:
             self.counts.losses += 1
 
@@ -247,7 +247,7 @@ class Medium:
         for name, loss in self._heard[station.name].items():
             if self._rng.random() >= loss**self._channel.broadcast_repeats:
                 other = self._stations[name]
-                self._agenda.at(at_s, partial(self._arrive, other, frame))
+                self._event_queue.at(at_s, partial(self._arrive, other, frame))
 
     def _arrive(self, station: _Station, frame: Frame) -> None:
         if not station.is_on:
@@ -262,12 +262,12 @@ class Medium:
             if len(self._heard[station.name]) > 1:
                 self._enqueue(station, frame)
 
-    def _look_around(self) -> None:
+    def _update_routes(self) -> None:
         """Measure every link and find the routes anew, at most every `route_s`."""
-        now = self._agenda.now
-        if self._routed_s >= 0 and now - self._routed_s < self._channel.route_s:
+        now = self._event_queue.now
+        if self._routed_at_s >= 0 and now - self._routed_at_s < self._channel.route_s:
             return
-        self._routed_s = now
+        self._routed_at_s = now
         on = [name for name, station in self._stations.items() if station.is_on]
         self._heard = {name: {} for name in self._stations}
         for index, a in enumerate(on):
@@ -275,9 +275,9 @@ class Medium:
                 loss = self._loss(a, b, now)
                 if loss < 1.0:
                     self._heard[a][b] = self._heard[b][a] = loss
-        self._ways = {to: self._steps_towards(to) for to in on}
+        self._next_hops = {to: self._next_hops_to(to) for to in on}
 
-    def _steps_towards(self, to: str) -> dict[str, str]:
+    def _next_hops_to(self, to: str) -> dict[str, str]:
         """For every station its next hop on the way of fewest expected transmissions (Dijkstra from the end)."""
         cost = {to: 0.0}
         steps: dict[str, str] = {}

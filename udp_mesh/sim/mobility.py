@@ -13,7 +13,7 @@ Point = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class Trajectory:
     """A path through the plane: at `times_s[i]` the thing is at `points[i]`, in between on the straight line."""
 
     times_s: tuple[float, ...]
@@ -42,7 +42,7 @@ class Wall:
 
 
 @dataclass(frozen=True, slots=True)
-class Air:
+class PathLoss:
     """How loss grows with distance: `least_loss` up to `good_m`, then in a straight line to 1 at `range_m`."""
 
     good_m: float = 80.0
@@ -57,26 +57,26 @@ class Air:
             return 1.0
         beyond = max(0.0, distance_m - self.good_m) / max(self.range_m - self.good_m, 1e-9)
         loss = self.least_loss + (1.0 - self.least_loss) * beyond
-        return min(1.0, loss + sum(wall.loss for wall in self.walls if _cross(a, b, wall.a, wall.b)))
+        return min(1.0, loss + sum(wall.loss for wall in self.walls if _segments_cross(a, b, wall.a, wall.b)))
 
 
 def _side(a: Point, b: Point, c: Point) -> float:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-def _cross(a: Point, b: Point, c: Point, d: Point) -> bool:
+def _segments_cross(a: Point, b: Point, c: Point, d: Point) -> bool:
     """Whether the pieces a-b and c-d properly cross."""
     return _side(a, b, c) * _side(a, b, d) < 0 and _side(c, d, a) * _side(c, d, b) < 0
 
 
-def standing(point: Point) -> Course:
+def stationary(point: Point) -> Trajectory:
     """The course of what does not move."""
-    return Course((0.0,), (point,))
+    return Trajectory((0.0,), (point,))
 
 
-def course(way_points: Sequence[tuple[float, Point]]) -> Course:
+def trajectory(way_points: Sequence[tuple[float, Point]]) -> Trajectory:
     """A course through (seconds, place) pairs; raises ValueError unless the times rise."""
     times = tuple(time_s for time_s, _ in way_points)
     if not times or any(later <= earlier for earlier, later in itertools.pairwise(times)):
         raise ValueError("way points: expected at least one, with rising times")
-    return Course(times, tuple(point for _, point in way_points))
+    return Trajectory(times, tuple(point for _, point in way_points))

@@ -25,7 +25,7 @@ from udp_mesh.core.events import (
 from udp_mesh.core.settings import Settings
 from udp_mesh.report import recording
 from udp_mesh.sim.medium import Counts
-from udp_mesh.sim.mobility import Course
+from udp_mesh.sim.mobility import Trajectory
 from udp_mesh.sim.scenario import MAX_MESSAGE_BYTES, Flow, Incident, Scenario
 from udp_mesh.sim.team import Ledger, Team
 
@@ -44,7 +44,7 @@ class TopicTotal:
 
 
 @dataclass(slots=True)
-class Played:
+class RunResult:
     """`lines` is the observer's recording; `offered` counts messages handed over per topic."""
 
     scenario: Scenario
@@ -78,27 +78,28 @@ class Played:
             "topics": {
                 name: {
                     "offered": self.offered.get(name, 0), "arrived": total.messages, "bytes": total.bytes,
-                    "latency_p50_s": _rank(total.latencies_s, 0.5), "latency_p99_s": _rank(total.latencies_s, 0.99),
+                    "latency_p50_s": _percentile(total.latencies_s, 0.5),
+                    "latency_p99_s": _percentile(total.latencies_s, 0.99),
                 }
                 for name, total in sorted(self.topics.items())
             },
         }  # fmt: skip
 
 
-def _rank(values: list[float], share: float) -> float | None:
+def _percentile(values: list[float], share: float) -> float | None:
     return round(sorted(values)[min(len(values) - 1, int(len(values) * share))], 6) if values else None
 
 
-class _Play:
+class _Run:
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self.rng = random.Random(scenario.seed)
-        self.courses: dict[str, Course] = {**scenario.robots, **scenario.relays}
+        self.trajectories: dict[str, Trajectory] = {**scenario.robots, **scenario.relays}
         self.settings = {
             name: Settings(name, unkeyed=True, topics=scenario.topics, window=scenario.window)
             for name in scenario.robots
         }
-        self.filling = self.rng.randbytes(MAX_MESSAGE_BYTES)
+        self.random_bytes = self.rng.randbytes(MAX_MESSAGE_BYTES)
         self.lines = [recording.header(scenario.observer, 0.0)]
         self.topics = {topic.name: TopicTotal() for topic in scenario.topics}
         self.offered = {topic.name: 0 for topic in scenario.topics}
@@ -109,22 +110,22 @@ class _Play:
         )  # fmt: skip
 
     def _loss(self, a: str, b: str, now: float) -> float:
-        return self.scenario.air.loss(self.courses[a].at(now), self.courses[b].at(now))
+        return self.scenario.air.loss(self.trajectories[a].at(now), self.trajectories[b].at(now))
 
     def run(self, progress: Callable[[float], None]) -> None:
-        agenda = self.team.agenda
+        event_queue = self.team.event_queue
         for relay, appear_s in self.scenario.appear_s.items():
             self.team.medium.set_on(relay, False)
-            agenda.at(appear_s, partial(self.team.medium.set_on, relay, True))
+            event_queue.at(appear_s, partial(self.team.medium.set_on, relay, True))
         for incident in self.scenario.incidents:
-            agenda.at(incident.at_s, partial(self._happen, incident))
+            event_queue.at(incident.at_s, partial(self._apply_incident, incident))
         for flow in self.scenario.flows:
             for source in flow.sources:
-                agenda.at(flow.start_s + self.rng.random() * flow.period_s, partial(self._send, flow, source))
-        agenda.at(0.0, partial(self._sample, progress))
-        agenda.run_until(self.scenario.duration_s)
+                event_queue.at(flow.start_s + self.rng.random() * flow.period_s, partial(self._send, flow, source))
+        event_queue.at(0.0, partial(self._sample, progress))
+        event_queue.run_until(self.scenario.duration_s)
 
-    def _happen(self, incident: Incident) -> None:
+    def _apply_incident(self, incident: Incident) -> None:
         match incident.what:
             case "off" | "on":
                 self.team.medium.set_on(incident.who, incident.what == "on")
@@ -136,7 +137,7 @@ class _Play:
                 raise ValueError(f"unknown incident {incident.what}")
 
     def _send(self, flow: Flow, source: str) -> None:
-        now = self.team.agenda.now
+        now = self.team.event_queue.now
         if now >= flow.stop_s:
             return
         if self.team.is_running(source) and source != flow.destination:
@@ -146,10 +147,10 @@ class _Play:
                 size = int(size * self.rng.lognormvariate(-(flow.spread**2) / 2, flow.spread))
             size = max(_SENT.size, min(size, MAX_MESSAGE_BYTES))
             start = self.rng.randrange(MAX_MESSAGE_BYTES - size + 1)
-            payload = _SENT.pack(now) + self.filling[start : start + size - _SENT.size]
+            payload = _SENT.pack(now) + self.random_bytes[start : start + size - _SENT.size]
             self.offered[flow.topic] += 1
             self.team.send(source, flow.topic, payload, flow.destination or None)
-        self.team.agenda.after(flow.period_s, partial(self._send, flow, source))
+        self.team.event_queue.after(flow.period_s, partial(self._send, flow, source))
 
     def _on_event(self, now: float, robot: str, event: Event) -> None:
         match event:
@@ -160,38 +161,38 @@ class _Play:
                 total.latencies_s.append(now - _SENT.unpack_from(payload)[0])
                 if robot == self.scenario.observer:
                     self.observer_bytes[topic] += len(payload)
-                    self._note(recording.Arrival(now, robot, source, topic, priority, len(payload)))
+                    self._record(recording.Arrival(now, robot, source, topic, priority, len(payload)))
             case PeerOnline(peer) | PeerOffline(peer):
                 if robot == self.scenario.observer:
-                    self._note(recording.Presence(now, robot, peer, isinstance(event, PeerOnline)))
+                    self._record(recording.Presence(now, robot, peer, isinstance(event, PeerOnline)))
             case _:
                 # outcomes are in the ledger
                 return
 
-    def _note(self, item: recording.Arrival | recording.Presence | recording.Sample | recording.Place) -> None:
+    def _record(self, item: recording.Arrival | recording.Presence | recording.Sample | recording.Place) -> None:
         self.lines.append(recording.line(item))
 
     def _sample(self, progress: Callable[[float], None]) -> None:
-        now, observer = self.team.agenda.now, self.scenario.observer
+        now, observer = self.team.event_queue.now, self.scenario.observer
         progress(now)
         if self.team.is_running(observer):
             for peer in self.team.conditions(observer).peers:
                 hops = self.team.medium.hops(peer.name, observer) if peer.name in self.scenario.robots else None
-                self._note(
+                self._record(
                     recording.Sample(
                         now, observer, peer.name, peer.round_trip_s, peer.loss, peer.received_bits_per_s, hops
                     )
                 )
-        for name, course in self.courses.items():
+        for name, course in self.trajectories.items():
             if self.scenario.appear_s.get(name, 0.0) <= now:
-                self._note(recording.Place(now, name, *course.at(now)))
-        self.team.agenda.after(SAMPLE_S, partial(self._sample, progress))
+                self._record(recording.Place(now, name, *course.at(now)))
+        self.team.event_queue.after(SAMPLE_S, partial(self._sample, progress))
 
 
-def play(scenario: Scenario, progress: Callable[[float], None] = lambda now: None) -> Played:
+def play(scenario: Scenario, progress: Callable[[float], None] = lambda now: None) -> RunResult:
     """Play to the end; `progress` is told the virtual time about once per virtual second."""
-    made = _Play(scenario)
-    made.run(progress)
-    return Played(
-        scenario, made.lines, made.topics, made.offered, made.team.ledger, made.team.medium.counts, made.observer_bytes
+    run = _Run(scenario)
+    run.run(progress)
+    return RunResult(
+        scenario, run.lines, run.topics, run.offered, run.team.ledger, run.team.medium.counts, run.observer_bytes
     )

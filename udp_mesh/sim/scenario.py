@@ -17,10 +17,10 @@ import yaml
 
 from udp_mesh.core.settings import Outbox, Settings, Topic
 from udp_mesh.sim.medium import Channel
-from udp_mesh.sim.mobility import Air, Course, Wall, course, standing
+from udp_mesh.sim.mobility import PathLoss, Trajectory, Wall, stationary, trajectory
 
-EVERYBODY = "*"
-_PROBLEMS_SHOWN = 20
+ALL_ROBOTS = "*"
+_MAX_SHOWN_PROBLEMS = 20
 _MAX_BYTES = 1 << 20
 MAX_MESSAGE_BYTES = 1 << 22
 """Of one simulated message."""
@@ -81,11 +81,11 @@ class Scenario:
     name: str
     seed: int
     duration_s: float
-    robots: Mapping[str, Course]
-    relays: Mapping[str, Course]
+    robots: Mapping[str, Trajectory]
+    relays: Mapping[str, Trajectory]
     appear_s: Mapping[str, float]
     channel: Channel
-    air: Air
+    air: PathLoss
     topics: tuple[Topic, ...]
     flows: tuple[Flow, ...]
     incidents: tuple[Incident, ...]
@@ -93,7 +93,7 @@ class Scenario:
     window: Literal["adaptive"] | int
 
 
-class _At:
+class _Entry:
     """One YAML node with the file's name: typed access, problems collected in `problems`."""
 
     def __init__(self, node: yaml.Node | None, file: str, what: str, problems: list[str]) -> None:
@@ -101,10 +101,10 @@ class _At:
 
     def problem(self, expected: str, found: object = None) -> None:
         line = 1 if self.node is None else self.node.start_mark.line + 1
-        seen = self._seen() if found is None else repr(found)
+        seen = self._found() if found is None else repr(found)
         self.problems.append(f"{self.file}:{line}: {self.what or 'scenario'}: expected {expected}, found {seen}")
 
-    def _seen(self) -> str:
+    def _found(self) -> str:
         match self.node:
             case None:
                 return "nothing"
@@ -114,35 +114,35 @@ class _At:
                 return "a list"
         return "a mapping"
 
-    def mapping(self, known: tuple[str, ...] | None) -> dict[str, _At]:
+    def mapping(self, known: tuple[str, ...] | None) -> dict[str, _Entry]:
         """The entries of a mapping; keys that are not `known` (None: any key) are problems."""
         if self.node is None:
             return {}
         if not isinstance(self.node, yaml.MappingNode):
             self.problem("a mapping")
             return {}
-        entries: dict[str, _At] = {}
+        entries: dict[str, _Entry] = {}
         for key, value in self.node.value:
             name = str(key.value) if isinstance(key, yaml.ScalarNode) else ""
-            entry = _At(value, self.file, f"{self.what}.{name}" if self.what else name, self.problems)
+            entry = _Entry(value, self.file, f"{self.what}.{name}" if self.what else name, self.problems)
             if known is not None and name not in known:
                 near = difflib.get_close_matches(name, known, n=1)
                 meant = f" (did you mean '{near[0]}'?)" if near else ""
-                _At(key, self.file, self.what, self.problems).problem(f"one of {', '.join(known)}{meant}", name)
+                _Entry(key, self.file, self.what, self.problems).problem(f"one of {', '.join(known)}{meant}", name)
             elif name in entries:
                 entry.problem("each key once", name)
             else:
                 entries[name] = entry
         return entries
 
-    def items(self) -> Iterator[_At]:
+    def items(self) -> Iterator[_Entry]:
         if self.node is None:
             return
         if not isinstance(self.node, yaml.SequenceNode):
             self.problem("a list")
             return
         for number, child in enumerate(self.node.value):
-            yield _At(child, self.file, f"{self.what}[{number}]", self.problems)
+            yield _Entry(child, self.file, f"{self.what}[{number}]", self.problems)
 
     def text(self, default: str = "", one_of: tuple[str, ...] | None = None) -> str:
         if self.node is None:
@@ -152,20 +152,20 @@ class _At:
             return default
         return str(self.node.value)
 
-    def number(self, default: float, least: float = 0.0, most: float = 1e9) -> float:
+    def number(self, default: float, minimum: float = 0.0, maximum: float = 1e9) -> float:
         if self.node is None:
             return default
         try:
             value = float(self.node.value) if isinstance(self.node, yaml.ScalarNode) else math.nan
         except ValueError:
             value = math.nan
-        if not least <= value <= most:
-            self.problem(f"a number of at {f'most {most:g}' if value > most else f'least {least:g}'}")
+        if not minimum <= value <= maximum:
+            self.problem(f"a number of at {f'most {maximum:g}' if value > maximum else f'least {minimum:g}'}")
             return default
         return value
 
-    def whole(self, default: int, least: int = 0, most: int = 1_000_000_000) -> int:
-        value = self.number(default, least, most)
+    def integer(self, default: int, minimum: int = 0, maximum: int = 1_000_000_000) -> int:
+        value = self.number(default, minimum, maximum)
         if value != int(value):
             self.problem("a whole number")
         return int(value)
@@ -203,10 +203,10 @@ def parse(raw: bytes, file: str) -> Scenario:
         found = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise ScenarioError(f"{file}:{line}: expected YAML, found otherwise: {found}") from error
     problems: list[str] = []
-    scenario = _scenario(_At(root, file, "", problems), Path(file).stem)
+    scenario = _scenario(_Entry(root, file, "", problems), Path(file).stem)
     if problems:
-        more = [f"... and {len(problems) - _PROBLEMS_SHOWN} more"] if len(problems) > _PROBLEMS_SHOWN else []
-        raise ScenarioError("\n".join([*problems[:_PROBLEMS_SHOWN], *more]))
+        more = [f"... and {len(problems) - _MAX_SHOWN_PROBLEMS} more"] if len(problems) > _MAX_SHOWN_PROBLEMS else []
+        raise ScenarioError("\n".join([*problems[:_MAX_SHOWN_PROBLEMS], *more]))
     return scenario
 
 
@@ -216,24 +216,24 @@ _KEYS = (
 )  # fmt: skip
 
 
-def _scenario(at: _At, name: str) -> Scenario:
+def _scenario(at: _Entry, name: str) -> Scenario:
     if at.node is None:
         at.problem("a mapping")
     keys = at.mapping(_KEYS)
-    nothing = _At(None, at.file, "", at.problems)
+    nothing = _Entry(None, at.file, "", at.problems)
 
-    def get(key: str) -> _At:
+    def get(key: str) -> _Entry:
         return keys.get(key, nothing)
 
     robot_entries = get("robots").mapping(None)
-    robots = {key: _course(value, ()) for key, value in robot_entries.items()}
+    robots = {key: _trajectory(value, ()) for key, value in robot_entries.items()}
     for key, value in robot_entries.items():
         try:
             Settings(key, unkeyed=True)
         except ValueError as error:
             value.problem("the name of a node", str(error))
     relay_entries = get("relays").mapping(None)
-    relays = {key: _course(value, ("appear_s",)) for key, value in relay_entries.items()}
+    relays = {key: _trajectory(value, ("appear_s",)) for key, value in relay_entries.items()}
     appear_s = {}
     for key, value in relay_entries.items():
         if key in robots:
@@ -249,53 +249,53 @@ def _scenario(at: _At, name: str) -> Scenario:
     window = get("window").text("adaptive")
     return Scenario(
         name=get("name").text(name),
-        seed=get("seed").whole(1),
-        duration_s=get("duration_s").number(60.0, least=1e-3, most=MAX_DURATION_S),
+        seed=get("seed").integer(1),
+        duration_s=get("duration_s").number(60.0, minimum=1e-3, maximum=MAX_DURATION_S),
         robots=robots,
         relays=relays,
         appear_s=appear_s,
         channel=_channel(get("channel")),
-        air=_air(get("air")),
+        air=_path_loss(get("air")),
         topics=topics,
         flows=tuple(_flow(item, topic_names, tuple(robots)) for item in get("flows").items()),
         incidents=tuple(_incident(item, tuple(robots), tuple(relays)) for item in get("incidents").items()),
         observer=get("observer").text(next(iter(robots), ""), tuple(robots)),
-        window="adaptive" if window == "adaptive" else get("window").whole(3, least=1, most=4096),
+        window="adaptive" if window == "adaptive" else get("window").integer(3, minimum=1, maximum=4096),
     )
 
 
-def _pair(at: _At) -> tuple[float, float]:
-    values = [item.number(0.0, least=-1e6, most=1e6) for item in at.items()]
+def _pair(at: _Entry) -> tuple[float, float]:
+    values = [item.number(0.0, minimum=-1e6, maximum=1e6) for item in at.items()]
     if len(values) != 2:
         at.problem("[x, y] in metres")
         return (0.0, 0.0)
     return (values[0], values[1])
 
 
-def _course(at: _At, more: tuple[str, ...]) -> Course:
+def _trajectory(at: _Entry, more: tuple[str, ...]) -> Trajectory:
     """`[x, y]`, or `{at: [x, y]}`, or `{path: [[seconds, x, y], ...]}`."""
     if isinstance(at.node, yaml.SequenceNode):
-        return standing(_pair(at))
+        return stationary(_pair(at))
     entries = at.mapping(("at", "path", *more))
     if "at" in entries:
-        return standing(_pair(entries["at"]))
+        return stationary(_pair(entries["at"]))
     points = []
     for item in entries["path"].items() if "path" in entries else ():
-        values = [value.number(0.0, least=-1e6, most=1e6) for value in item.items()]
+        values = [value.number(0.0, minimum=-1e6, maximum=1e6) for value in item.items()]
         if len(values) == 3:
             points.append((values[0], (values[1], values[2])))
         else:
             item.problem("[seconds, x, y]")
     try:
-        return course(points)
+        return trajectory(points)
     except ValueError:
         at.problem("`at: [x, y]` or `path: [[seconds, x, y], ...]` with rising times")
-        return standing((0.0, 0.0))
+        return stationary((0.0, 0.0))
 
 
-def _numbers(at: _At, made: Any) -> dict[str, Any]:
+def _numbers(at: _Entry, made: Any) -> dict[str, Any]:
     known = tuple(item.name for item in fields(made) if item.name != "walls")
-    entries = at.mapping((*known, "walls") if isinstance(made, Air) else known)
+    entries = at.mapping((*known, "walls") if isinstance(made, PathLoss) else known)
     values: dict[str, Any] = {}
     for name in known:
         if name in entries:
@@ -303,35 +303,35 @@ def _numbers(at: _At, made: Any) -> dict[str, Any]:
             if isinstance(default, bool):
                 values[name] = entries[name].flag()
                 continue
-            least, most = _RANGES[name]
+            minimum, maximum = _RANGES[name]
             if isinstance(default, int):
-                values[name] = entries[name].whole(default, int(least), int(most))
+                values[name] = entries[name].integer(default, int(minimum), int(maximum))
             else:
-                values[name] = entries[name].number(default, least, most)
+                values[name] = entries[name].number(default, minimum, maximum)
     return values
 
 
-def _channel(at: _At) -> Channel:
+def _channel(at: _Entry) -> Channel:
     return Channel(**_numbers(at, Channel()))
 
 
-def _air(at: _At) -> Air:
+def _path_loss(at: _Entry) -> PathLoss:
     walls = []
     entries = at.mapping(None)
     for item in entries["walls"].items() if "walls" in entries else ():
         parts = item.mapping(("a", "b", "loss"))
         if "a" in parts and "b" in parts:
-            loss = parts["loss"].number(1.0, most=1.0) if "loss" in parts else 1.0
+            loss = parts["loss"].number(1.0, maximum=1.0) if "loss" in parts else 1.0
             walls.append(Wall(_pair(parts["a"]), _pair(parts["b"]), loss))
         else:
             item.problem("a and b, each [x, y]")
-    air = Air(**_numbers(at, Air()), walls=tuple(walls))
+    air = PathLoss(**_numbers(at, PathLoss()), walls=tuple(walls))
     if air.range_m < air.good_m:
         at.problem(f"range_m of at least good_m, {air.good_m:g}", air.range_m)
     return air
 
 
-def _topic(name: str, at: _At, robots: tuple[str, ...]) -> Topic:
+def _topic(name: str, at: _Entry, robots: tuple[str, ...]) -> Topic:
     keys = (
         "priority", "reliable", "keep_last", "deadline_s", "rate_limit_bytes_per_s", "compression", "destinations",
         "outbox", "repair",
@@ -343,15 +343,15 @@ def _topic(name: str, at: _At, robots: tuple[str, ...]) -> Topic:
             case "reliable" | "compression" | "repair":
                 values[key] = entry.flag()
             case "deadline_s":
-                values[key] = entry.number(1.0, least=1e-3)
+                values[key] = entry.number(1.0, minimum=1e-3)
             case "outbox":
                 values[key] = Outbox(entry.text("none", tuple(kind.value for kind in Outbox)))
             case "destinations":
                 values[key] = tuple(item.text(one_of=robots) for item in entry.items())
             case "priority":
-                values[key] = entry.whole(8, most=15)
+                values[key] = entry.integer(8, maximum=15)
             case _:
-                values[key] = entry.whole(1, least=1)
+                values[key] = entry.integer(1, minimum=1)
     try:
         return Topic(name, **values)
     except ValueError as error:
@@ -359,12 +359,12 @@ def _topic(name: str, at: _At, robots: tuple[str, ...]) -> Topic:
         return Topic("unusable")
 
 
-def _flow(at: _At, topics: tuple[str, ...], robots: tuple[str, ...]) -> Flow:
+def _flow(at: _Entry, topics: tuple[str, ...], robots: tuple[str, ...]) -> Flow:
     keys = ("topic", "sources", "destination", "period_s", "size_bytes", "spread", "start_s", "stop_s")
     entries = at.mapping(keys)
-    nothing = _At(None, at.file, at.what, at.problems)
+    nothing = _Entry(None, at.file, at.what, at.problems)
 
-    def get(key: str) -> _At:
+    def get(key: str) -> _Entry:
         return entries.get(key, nothing)
 
     for key in ("topic", "period_s", "size_bytes"):
@@ -375,15 +375,15 @@ def _flow(at: _At, topics: tuple[str, ...], robots: tuple[str, ...]) -> Flow:
         topic=get("topic").text("", topics),
         sources=sources,
         destination=get("destination").text("", robots),
-        period_s=get("period_s").number(1.0, least=1e-3),
-        size_bytes=get("size_bytes").whole(1, least=1, most=MAX_MESSAGE_BYTES),
-        spread=get("spread").number(0.0, most=5.0),
+        period_s=get("period_s").number(1.0, minimum=1e-3),
+        size_bytes=get("size_bytes").integer(1, minimum=1, maximum=MAX_MESSAGE_BYTES),
+        spread=get("spread").number(0.0, maximum=5.0),
         start_s=get("start_s").number(0.0),
         stop_s=get("stop_s").number(math.inf),
     )
 
 
-def _incident(at: _At, robots: tuple[str, ...], relays: tuple[str, ...]) -> Incident:
+def _incident(at: _Entry, robots: tuple[str, ...], relays: tuple[str, ...]) -> Incident:
     entries = at.mapping(("at_s", "what", "who"))
     for key in ("at_s", "what", "who"):
         if key not in entries:

@@ -24,13 +24,13 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
-from udp_mesh.sim.event_queue import Agenda
+from udp_mesh.sim.event_queue import EventQueue
 from udp_mesh.sim.medium import Channel, Frame, Loss, Medium
 
 LINK = "mesh0"
 BROADCAST = "10.255.255.255"
 # a node's timer may lie in the past when it just acted; virtual time must still move on
-_LEAST_STEP_S = 1e-6
+_MIN_STEP_S = 1e-6
 
 OnEvent = Callable[[float, str, Event], None]
 """(now, robot, what its node told)."""
@@ -72,7 +72,7 @@ class _Member:
     link: LinkInfo
     run: int = 0
     is_running: bool = True
-    wake_s: float = float("inf")
+    wakes_at_s: float = float("inf")
 
 
 class Team:
@@ -88,12 +88,12 @@ class Team:
         seed: int,
         on_event: OnEvent | None = None,
     ) -> None:
-        self.agenda = Agenda()
+        self.event_queue = EventQueue()
         self.ledger = Ledger()
         self._rng = random.Random(seed)
         self._on_event = on_event or (lambda now, robot, event: None)
         names = [*robots, *relays]
-        self.medium = Medium(self.agenda, channel, names, loss, self._deliver, random.Random(self._rng.random()))
+        self.medium = Medium(self.event_queue, channel, names, loss, self._deliver, random.Random(self._rng.random()))
         self._addresses: dict[str, str] = {}
         self._members: dict[str, _Member] = {}
         for number, (name, settings) in enumerate(robots.items(), 1):
@@ -101,13 +101,13 @@ class Team:
             self._members[name] = self._started(name, address, settings, run=0)
             self._addresses[address] = name
         for member in self._members.values():
-            self._settle(member)
+            self._pump(member)
 
     def _started(self, name: str, address: str, settings: Settings, run: int) -> _Member:
         link = LinkInfo(LINK, LinkKind.BROADCAST, (address, settings.port), (BROADCAST, settings.port))
         boot_id = self._rng.randbytes(16)
-        node = Node(settings, boot_id=boot_id, rng=random.Random(self._rng.random()), now=self.agenda.now)
-        node.link_up(link, self.agenda.now)
+        node = Node(settings, boot_id=boot_id, rng=random.Random(self._rng.random()), now=self.event_queue.now)
+        node.link_up(link, self.event_queue.now)
         return _Member(name, address, node, link, run)
 
     # ---- what a scenario does
@@ -117,12 +117,12 @@ class Team:
         member = self._members[robot]
         if not member.is_running:
             raise ValueError(f"{robot} is switched off")
-        result = member.node.send(topic, payload, destination=destination, now=self.agenda.now)
+        result = member.node.send(topic, payload, destination=destination, now=self.event_queue.now)
         if isinstance(result, Rejected):
             self.ledger.rejected[result.reason.value] += 1
         else:
             self.ledger.accepted += 1
-        self._settle(member)
+        self._pump(member)
         return result
 
     def is_running(self, robot: str) -> bool:
@@ -136,7 +136,7 @@ class Team:
         """A new run of the same robot."""
         old = self._members[robot]
         self._members[robot] = self._started(robot, old.address, settings, old.run + 1)
-        self._settle(self._members[robot])
+        self._pump(self._members[robot])
 
     def change_address(self, robot: str, address: str) -> None:
         """The same run is found elsewhere from now on."""
@@ -145,17 +145,17 @@ class Team:
         self._addresses[address] = robot
         member.address = address
         member.link = replace(member.link, address=(address, member.link.address[1]))
-        member.node.link_up(member.link, self.agenda.now)
-        self._settle(member)
+        member.node.link_up(member.link, self.event_queue.now)
+        self._pump(member)
 
     def apply(self, robot: str, settings: Settings) -> list[str]:
         """Change a running robot's settings."""
-        changes = self._members[robot].node.apply(settings, self.agenda.now)
-        self._settle(self._members[robot])
+        changes = self._members[robot].node.apply(settings, self.event_queue.now)
+        self._pump(self._members[robot])
         return changes
 
     def conditions(self, robot: str) -> Conditions:
-        return self._members[robot].node.conditions(self.agenda.now)
+        return self._members[robot].node.conditions(self.event_queue.now)
 
     # ---- what follows from it
 
@@ -164,11 +164,11 @@ class Team:
         source = self._members.get(frame.source)
         if member is None or source is None or not member.is_running:
             return
-        member.node.receive(frame.data, LINK, (source.address, source.link.address[1]), self.agenda.now)
-        self._settle(member)
+        member.node.receive(frame.data, LINK, (source.address, source.link.address[1]), self.event_queue.now)
+        self._pump(member)
 
-    def _settle(self, member: _Member) -> None:
-        now = self.agenda.now
+    def _pump(self, member: _Member) -> None:
+        now = self.event_queue.now
         while datagrams := member.node.datagrams_to_send(now):
             for datagram in datagrams:
                 to_all = datagram.destination is None or datagram.destination[0] == BROADCAST
@@ -179,13 +179,17 @@ class Team:
             self.ledger.note(member.name, member.run, event)
             self._on_event(now, member.name, event)
         timer_s = member.node.next_timer()
-        if timer_s is not None and timer_s < member.wake_s:
-            member.wake_s = max(timer_s, now + _LEAST_STEP_S)
-            self.agenda.at(member.wake_s, partial(self._wake, member))
+        if timer_s is not None and timer_s < member.wakes_at_s:
+            member.wakes_at_s = max(timer_s, now + _MIN_STEP_S)
+            self.event_queue.at(member.wakes_at_s, partial(self._wake, member))
 
     def _wake(self, member: _Member) -> None:
-        if self.agenda.now < member.wake_s or not member.is_running or self._members[member.name] is not member:
+        if (
+            self.event_queue.now < member.wakes_at_s
+            or not member.is_running
+            or self._members[member.name] is not member
+        ):
             return
-        member.wake_s = float("inf")
-        member.node.handle_timer(self.agenda.now)
-        self._settle(member)
+        member.wakes_at_s = float("inf")
+        member.node.handle_timer(self.event_queue.now)
+        self._pump(member)

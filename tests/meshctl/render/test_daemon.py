@@ -19,7 +19,7 @@ from meshctl.render.daemon import daemon_config, daemon_keys
 from tests.meshctl.render import fleets
 from udp_mesh.core import settings as core
 from udp_mesh.daemon.configuration import Configuration, load
-from udp_mesh.links.attachments import LinkWish
+from udp_mesh.links.attachments import LinkConfig
 
 NEW, OLD = SecretRef(SecretKind.ENV, "NEW"), SecretRef(SecretKind.ENV, "OLD")
 KEYS = {NEW: "11" * 32, OLD: base64.b64encode(bytes(range(32))).decode()}
@@ -62,7 +62,7 @@ def test_the_daemon_loads_what_the_inventory_says(tmp_path: Path) -> None:
     assert (settings.name, settings.port, settings.window, settings.fragment_bytes) == ("uav", 8701, "adaptive", 1400)
     assert [key.secret for key in settings.keys] == [b"\x11" * 32, bytes(range(32))]
     assert (settings.rates.heartbeat_s, settings.rates.offline_s) == (0.5, 10.0)
-    assert found.links == (LinkWish(None, "10.42.0.102", broadcast=True),)
+    assert found.links == (LinkConfig(None, "10.42.0.102", broadcast=True),)
     assert found.daemon.metrics_address == ("127.0.0.1", 9871)
     topics = {topic.name: topic for topic in settings.topics}
     assert topics["estop"] == core.Topic("estop", 0)
@@ -84,7 +84,7 @@ def test_the_daemon_loads_what_the_inventory_says(tmp_path: Path) -> None:
 def test_without_broadcast_every_other_robot_is_a_neighbour(tmp_path: Path) -> None:
     found = loaded(fleet(broadcast=False, window=3), "base", tmp_path)
     assert found.settings.window == 3
-    assert found.links == (LinkWish(None, "10.42.0.100", broadcast=False),)
+    assert found.links == (LinkConfig(None, "10.42.0.100", broadcast=False),)
     assert [(peer.name, peer.address) for peer in found.settings.neighbours] == [
         ("spot", ("10.42.0.101", 8700)),
         ("uav", ("10.42.0.102", 8700)),
@@ -97,7 +97,7 @@ def test_every_daemon_of_a_mixed_fleet_knows_the_fielded_robots(robot: str, tmp_
     robots = {**source.robots, "husky2": Robot("husky2", (), fielded=IPv4Address("10.42.0.120"))}
     found = loaded(replace(source, robots=robots), robot, tmp_path)
     assert found.settings.neighbours == (core.Neighbour(("10.42.0.120", 8700), "husky2", legacy=True),)
-    assert found.links == (LinkWish(None, f"10.42.0.{100 if robot == 'base' else 101}", broadcast=True),)
+    assert found.links == (LinkConfig(None, f"10.42.0.{100 if robot == 'base' else 101}", broadcast=True),)
 
 
 def test_a_robot_does_not_send_to_itself_but_never_broadcasts_instead(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from udp_mesh.bridges.envelope import Envelope, EnvelopeError, open_envelope, seal
 from udp_mesh.bridges.rmw_zenoh import (
     AnnouncementError,
-    Kept,
+    SampleDeduplicator,
     TokenExchange,
     carried_key,
     kept_samples,
@@ -81,7 +81,7 @@ def test_a_token_of_anything_but_a_publisher_keeps_nothing() -> None:
 
 
 def test_what_is_told_again_is_new_once() -> None:
-    kept = Kept()
+    kept = SampleDeduplicator()
     assert [kept.is_new("k", b"a", b"p") for _ in range(2)] == [True, False]
     assert kept.is_new("k", b"", b"ap")
     assert kept.is_new("ka", None, b"p")
@@ -89,23 +89,23 @@ def test_what_is_told_again_is_new_once() -> None:
 
 def test_a_token_is_set_up_once_and_withdrawn_with_its_last_announcer() -> None:
     alice, carol, bob = TokenExchange(), TokenExchange(), TokenExchange()
-    alice.seen(TOKEN, True)
-    carol.seen(TOKEN, True)
-    assert bob.heard("alice", alice.announcement())[0] == ([TOKEN], [])
-    assert bob.heard("carol", carol.announcement())[0] == ([], [])
-    assert bob.gone("alice") == ([], [])
-    carol.seen(TOKEN, False)
-    assert bob.heard("carol", carol.announcement())[0] == ([], [TOKEN])
+    alice.on_token(TOKEN, True)
+    carol.on_token(TOKEN, True)
+    assert bob.on_announcement("alice", alice.announcement())[0] == ([TOKEN], [])
+    assert bob.on_announcement("carol", carol.announcement())[0] == ([], [])
+    assert bob.on_robot_gone("alice") == ([], [])
+    carol.on_token(TOKEN, False)
+    assert bob.on_announcement("carol", carol.announcement())[0] == ([], [TOKEN])
 
 
 def test_what_a_bridge_set_up_is_announced_by_none() -> None:
     alice, bob, twin = TokenExchange(), TokenExchange(), TokenExchange()
-    alice.seen(TOKEN, True)
-    change, _ = bob.heard("alice", alice.announcement())
+    alice.on_token(TOKEN, True)
+    change, _ = bob.on_announcement("alice", alice.announcement())
     for token in change.declare:
         for exchange in (bob, twin):
-            exchange.carried(carried_key("session", token), True)
-            exchange.seen(token, True)
+            exchange.on_companion(carried_key("session", token), True)
+            exchange.on_token(token, True)
     assert TOKEN.encode() not in bob.announcement()
     assert TOKEN.encode() not in twin.announcement()
 
@@ -114,12 +114,12 @@ def test_what_a_bridge_set_up_is_announced_by_none() -> None:
 def test_any_bytes_are_an_announcement_or_an_error(data: bytes) -> None:
     exchange = TokenExchange()
     try:
-        exchange.heard("alice", data)
+        exchange.on_announcement("alice", data)
     except AnnouncementError:
-        assert exchange.gone("alice") == ([], [])
+        assert exchange.on_robot_gone("alice") == ([], [])
 
 
 def test_an_announcement_sets_up_nothing_but_publishers_tokens() -> None:
     for token in ("demo/x", "@ros2_lv/**", "@ros2_lv//x", "@ros2_lv/x/", "@ros2_lv/" + "x" * 2000):
         with pytest.raises(AnnouncementError):
-            TokenExchange().heard("alice", b'{"tokens": ["' + token.encode() + b'"]}')
+            TokenExchange().on_announcement("alice", b'{"tokens": ["' + token.encode() + b'"]}')

@@ -39,7 +39,7 @@ key = types.TypeKey("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1")
 sent = alice.from_ros(names.Route("status", "bob"), "/node", key, "string data", True, b"hello")
 got = [effect for each in sent for effect in bob.from_mesh("alice", each.topic, each.type, each.payload, 0.0)]
 assert got == [relay.ToRos("/alice/mesh_comm/bob/status", key, "string data", True, b"hello")], got
-greeting = alice.from_mesh("bob", "bridge/ros1", "bridge", bob.peer_online("alice")[0].payload, 1.0)
+greeting = alice.from_mesh("bob", "bridge/ros1", "bridge", bob.on_peer_online("alice")[0].payload, 1.0)
 assert greeting and bob.tick(2.0) == []
 sample = envelope.Envelope("a/b", b"payload", "", b"attached", 5, True, False, False)
 assert envelope.open_envelope(envelope.seal(sample)) == sample
@@ -47,7 +47,7 @@ assert quality.parse_quality(quality.quality_text(quality.Quality())) == quality
 frames = mesh_client.FrameReader().feed(mesh_client.encode_frame({"op": "x"}, b"payload"))
 assert frames == [({"op": "x"}, b"payload")]
 exchanges = rmw_zenoh.TokenExchange(), rmw_zenoh.TokenExchange()
-assert exchanges[0].heard("bob", exchanges[1].announcement())[0] == ([], [])
+assert exchanges[0].on_announcement("bob", exchanges[1].announcement())[0] == ([], [])
 print(" ".join(sorted({name.partition(".")[0] for name in set(sys.modules) - before})))
 """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udp_mesh.bridges.ros2.quality import Quality, parse_quality, quality_text, ros2_name, shared
+from udp_mesh.bridges.ros2.quality import Quality, common, parse_quality, quality_text, ros2_name
 
 QUALITIES = st.builds(
     Quality,
@@ -37,7 +37,7 @@ def test_a_quality_nobody_wrote_is_none() -> None:
 
 @given(st.lists(QUALITIES, min_size=1, max_size=5))
 def test_a_subscription_asks_for_no_more_than_every_publisher_offers(qualities: list[Quality]) -> None:
-    asked = shared(qualities)
+    asked = common(qualities)
     assert (asked.reliability == "reliable") == all(quality.reliability == "reliable" for quality in qualities)
     assert asked.latched == all(quality.latched for quality in qualities)
 

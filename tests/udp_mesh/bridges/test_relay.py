@@ -6,12 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from udp_mesh.bridges.names import Route
-from udp_mesh.bridges.protocol import Definition, ExchangeError, Hello, Want, decode, encode
+from udp_mesh.bridges.protocol import Definition, Hello, ProtocolError, Want, decode, encode
 from udp_mesh.bridges.relay import (
-    ASK_AGAIN_S,
-    GIVE_UP_S,
+    DEFINITION_TIMEOUT_S,
     MAX_LATCHED_PER_ROUTE,
     MAX_WAITING_MESSAGES,
+    REQUEST_RETRY_S,
     Effect,
     Note,
     Relay,
@@ -65,8 +65,8 @@ def test_messages_wait_in_order_for_a_lost_definition_which_is_asked_for() -> No
     alice, bob = relay("alice"), relay("bob")
     asked = carry(to_bob(alice, b"1")[1:], "alice", bob, now=0.0)
     assert carry(to_bob(alice, b"2"), "alice", bob, now=0.1) == []
-    assert bob.tick(ASK_AGAIN_S / 2) == []
-    assert bob.tick(ASK_AGAIN_S) == asked
+    assert bob.tick(REQUEST_RETRY_S / 2) == []
+    assert bob.tick(REQUEST_RETRY_S) == asked
     answered = carry(asked, "bob", alice)
     published = carry(answered, "alice", bob)
     assert [effect.payload for effect in published if isinstance(effect, ToRos)] == [b"1", b"2"]
@@ -85,20 +85,20 @@ def test_a_robot_that_comes_late_gets_what_was_latched_and_only_what_it_lacks() 
     to_bob(alice, b"old", latched=True)
     to_bob(alice, b"new", latched=True)
     to_bob(alice, b"other", latched=True, publisher="/other")
-    missing = carry(bob.peer_online("alice"), "bob", alice)
+    missing = carry(bob.on_peer_online("alice"), "bob", alice)
     assert sorted(effect.payload for effect in missing if isinstance(effect, ToMesh) and effect.topic == "status") == [
         b"new",
         b"other",
     ]
     waiting = carry(missing, "alice", bob)
     carry(carry(waiting, "bob", alice), "alice", bob)
-    again = carry(bob.peer_online("alice"), "bob", alice)
+    again = carry(bob.on_peer_online("alice"), "bob", alice)
     assert [effect for effect in again if isinstance(effect, ToMesh) and effect.topic == "status"] == []
 
 
 def test_a_latched_message_that_is_repeated_is_published_once() -> None:
     alice, bob = relay("alice"), relay("bob")
-    greeting = bob.peer_online("alice")
+    greeting = bob.on_peer_online("alice")
     assert len(carry(to_bob(alice, b"map", latched=True), "alice", bob)) == 1
     repeated = [effect for effect in carry(greeting, "bob", alice) if isinstance(effect, ToMesh)]
     assert any(effect.payload == b"map" for effect in repeated)
@@ -122,9 +122,9 @@ def test_programs_that_latched_and_went_do_not_outlive_who_came_after() -> None:
     for number in range(3 * MAX_LATCHED_PER_ROUTE):
         carry(to_bob(alice, b"%d" % number, latched=True, publisher=f"/rostopic_{number}"), "alice", bob)
     # Bob has all of it; nothing old is repeated over the last one.
-    repeated = carry(bob.peer_online("alice"), "bob", alice)
+    repeated = carry(bob.on_peer_online("alice"), "bob", alice)
     assert [effect for effect in repeated if isinstance(effect, ToMesh) and effect.topic == "status"] == []
-    late = carry(relay("bob").peer_online("alice"), "bob", alice)
+    late = carry(relay("bob").on_peer_online("alice"), "bob", alice)
     told = [effect.payload for effect in late if isinstance(effect, ToMesh) and effect.topic == "status"]
     assert len(told) == MAX_LATCHED_PER_ROUTE
     assert told[-1] == b"%d" % (3 * MAX_LATCHED_PER_ROUTE - 1)
@@ -135,7 +135,7 @@ def test_a_definition_that_never_comes_blocks_its_topic_for_a_while_only() -> No
     carry(to_bob(alice, b"known"), "alice", bob)
     assert bob.from_mesh("alice", "status", "made/Up 0123", b"x", 0.0) != []
     assert carry(to_bob(alice, b"waits"), "alice", bob, now=1.0) == []
-    freed = bob.tick(GIVE_UP_S + 0.5)
+    freed = bob.tick(DEFINITION_TIMEOUT_S + 0.5)
     assert [effect.payload for effect in freed if isinstance(effect, ToRos)] == [b"waits"]
     assert [type(effect) for effect in freed if not isinstance(effect, (ToRos, ToMesh))] == [Note]
     assert bob.dropped == 1
@@ -159,7 +159,7 @@ def test_a_publisher_without_a_definition_does_not_blot_out_one_that_has_it() ->
 
 def test_latched_messages_go_to_whom_they_were_for() -> None:
     alice = relay("alice")
-    alice.topics_are({"map": ("base",)})
+    alice.set_destinations({"map": ("base",)})
     to_bob(alice, b"for bob", latched=True)
     alice.from_ros(Route("map", None), "/node", STRING, "", True, b"for base")
     hello = encode(Hello({}, False))
@@ -206,7 +206,7 @@ def test_ros_2_messages_need_no_definition() -> None:
 def test_any_bytes_on_the_bridges_topic_are_a_message_or_an_error(data: bytes) -> None:
     try:
         decode(data)
-    except ExchangeError:
+    except ProtocolError:
         assert [type(effect) for effect in relay("bob").from_mesh("a", EXCHANGE, "", data, 0.0)] == [Note]
 
 

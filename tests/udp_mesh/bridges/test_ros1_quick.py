@@ -14,7 +14,7 @@ from udp_mesh.client.mesh_client import Message
 
 pytestmark = pytest.mark.xdist_group("ros1")
 
-EXCHANGE_TOPIC = "bridge/ros1"
+PROTOCOL_TOPIC = "bridge/ros1"
 STRING = TypeKey("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1")
 MADE = TypeKey("made_up/Thing", "0123456789abcdef" * 2)
 
@@ -31,7 +31,7 @@ def test_a_real_ros_publishes_into_the_mesh_and_hears_what_comes_of_it_typed_and
         kept.callback(node.close)
         client = kept.enter_context(bob.client())
         client.subscribe("*")
-        client.request("set-topic", topic=EXCHANGE_TOPIC, values=TOPIC_SETTINGS)
+        client.request("set-topic", topic=PROTOCOL_TOPIC, values=TOPIC_SETTINGS)
         heard: list[Message] = []
 
         def sent() -> Message | None:
@@ -42,7 +42,7 @@ def test_a_real_ros_publishes_into_the_mesh_and_hears_what_comes_of_it_typed_and
         message = poll(sent, "the message at bob's daemon")
         assert message.type == kind_text(MessageKind(STRING))
         assert message.payload == b"\5\0\0\0ready"
-        told = [decode(each.payload) for each in heard if each.topic == EXCHANGE_TOPIC]
+        told = [decode(each.payload) for each in heard if each.topic == PROTOCOL_TOPIC]
         assert Definition(STRING, "string data\n") in [
             each._replace(text=each.text.rstrip() + "\n") for each in told if isinstance(each, Definition)
         ]
@@ -52,6 +52,6 @@ def test_a_real_ros_publishes_into_the_mesh_and_hears_what_comes_of_it_typed_and
         # Of a type that is installed nowhere; its definition comes after it.
         node.subscribe("/bob/mesh_comm/alice/map", "*")
         client.publish("map", b"\1\2", to="alice", type=kind_text(MessageKind(MADE)))
-        client.publish(EXCHANGE_TOPIC, encode(Definition(MADE, "uint8[2] thing\n")), to="alice", type="bridge")
+        client.publish(PROTOCOL_TOPIC, encode(Definition(MADE, "uint8[2] thing\n")), to="alice", type="bridge")
         thing = node.expect("hex", "0102")
         assert (thing["type"], thing["md5sum"], thing["definition"]) == (*MADE, "uint8[2] thing\n")

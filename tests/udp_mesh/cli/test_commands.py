@@ -21,7 +21,7 @@ from tests.udp_mesh.cli.conftest import Pair, Run
 from tests.udp_mesh.daemon.processes import RunningDaemon, configuration
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
 from udp_mesh.cli import serve
-from udp_mesh.cli.inspect import screen
+from udp_mesh.cli.inspect import screen_text
 from udp_mesh.cli.main import FORWARDED, build_parser, main
 from udp_mesh.cli.output import Exit, milliseconds
 from udp_mesh.client.mesh_client import FrameReader, encode_frame
@@ -77,13 +77,13 @@ def test_a_watch_waits_for_a_daemon_that_starts_anew() -> None:
 
 def test_a_watched_page_keeps_to_its_terminal() -> None:
     page = "\n".join(f"{number:03} " + "x" * 100 for number in range(60))
-    shown = screen(page, 40, 24).removeprefix("\x1b[H").removesuffix("\x1b[J").split("\x1b[K\n")
+    shown = screen_text(page, 40, 24).removeprefix("\x1b[H").removesuffix("\x1b[J").split("\x1b[K\n")
     assert len(shown) == 24
     assert shown[-1] == ""
     assert max(map(len, shown)) == 40
     assert shown[0].startswith("000 x")
     assert shown[-2].startswith("... 38 more lines")
-    assert screen("one\ntwo", 40, 24) == "\x1b[Hone\x1b[K\ntwo\x1b[K\n\x1b[J"
+    assert screen_text("one\ntwo", 40, 24) == "\x1b[Hone\x1b[K\ntwo\x1b[K\n\x1b[J"
 
 
 @pytest.mark.parametrize("period", ["0", "-1", "nan", "inf", "soon"])
@@ -231,7 +231,7 @@ def test_a_number_that_would_do_nothing_is_wrong_usage(words: list[str], capsys:
 def test_no_daemon_has_an_exit_code_of_its_own(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["status", "--socket", str(tmp_path / "none.sock")]) == Exit.UNREACHABLE
     complaint = capsys.readouterr().err
-    assert "no udp-mesh daemon at" in complaint
+    assert "cannot connect to the daemon at" in complaint
     assert "`udp-mesh run` starts one" in complaint
 
 
@@ -313,8 +313,8 @@ def test_every_command_shows_an_example_that_it_would_take(
 @pytest.mark.parametrize(
     ("daemon", "complaint"),
     [
-        ('user = "nobody-here"', "daemon.user: expected a user of this machine, found 'nobody-here'"),
-        ('socket_group = "no-such-group"', "daemon.socket_group: expected a group of this machine"),
+        ('user = "nobody-here"', "daemon.user: no such user: 'nobody-here'"),
+        ('socket_group = "no-such-group"', "daemon.socket_group: no such group"),
     ],
 )
 def test_a_daemon_that_cannot_start_says_why(

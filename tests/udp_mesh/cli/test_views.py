@@ -7,7 +7,7 @@ import pytest
 
 from tests.udp_mesh.core.pair import pair
 from udp_mesh.cli import output
-from udp_mesh.cli.inspect import screen
+from udp_mesh.cli.inspect import screen_text
 from udp_mesh.cli.views import peers_view
 from udp_mesh.daemon.status import peer_json
 
@@ -37,15 +37,15 @@ HOSTILE = "\x1b[2J\x1b]52;c;aGk=\x07\x9b2J\u202egnp.exe\nbob  online\x7f"
 def test_a_name_or_type_that_steers_terminals_is_shown_and_not_obeyed(capsys: pytest.CaptureFixture[str]) -> None:
     lines = output.table(("peer", "state"), [(HOSTILE, "online")]).splitlines()
     assert len(lines) == 2, "a line end in a name begins no row"
-    output.say(HOSTILE)
-    output.say_json({"name": HOSTILE})
-    output.say_json_line({"name": HOSTILE})
-    output.complain(HOSTILE)
-    drawn = screen(HOSTILE, 80, 24)
+    output.print_text(HOSTILE)
+    output.print_json({"name": HOSTILE})
+    output.print_json_line({"name": HOSTILE})
+    output.print_error(HOSTILE)
+    drawn = screen_text(HOSTILE, 80, 24)
     shown = "".join([*lines, *capsys.readouterr()])
     for sequence in ("\x1b", "\x07", "\x9b", "\u202e", "\x7f"):
         assert sequence not in shown
     for sequence in ("\x1b[2J", "\x1b]", "\x07", "\x9b", "\u202e"):
         assert sequence not in drawn
-    output.say_json_line({"name": HOSTILE})
+    output.print_json_line({"name": HOSTILE})
     assert json.loads(capsys.readouterr().out) == {"name": HOSTILE}

@@ -50,7 +50,7 @@ def test_a_length_or_header_that_is_none_is_an_error(raw: bytes) -> None:
 
 
 def test_no_daemon_is_an_error_that_names_the_socket(tmp_path: Path) -> None:
-    with pytest.raises(MeshError, match=r"no udp-mesh daemon at .*mesh.sock: No such file") as caught:
+    with pytest.raises(MeshError, match=r"cannot connect to the daemon at .*mesh.sock: No such file") as caught:
         MeshClient(str(tmp_path / "mesh.sock"))
     assert caught.value.code == "unreachable"
 
@@ -60,7 +60,7 @@ def test_what_is_no_socket_is_called_so(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.chdir(tmp_path)
     for path in (tmp_path, tmp_path / "file"):
         (tmp_path / "file").touch()
-        with pytest.raises(MeshError, match=r"no udp-mesh daemon at .*: it is no socket$"):
+        with pytest.raises(MeshError, match=r"cannot connect to the daemon at .*: not a socket$"):
             MeshClient(str(path))
     with socket.socket(socket.AF_UNIX) as left_over:
         left_over.bind("s")

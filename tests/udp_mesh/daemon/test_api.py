@@ -81,7 +81,7 @@ def test_the_largest_message_reaches_a_program_that_has_read_everything() -> Non
     async def work(server: LocalServer, path: Path) -> None:
         (program,) = await connected(server, path, 1)
         (client,) = server.clients
-        client.tell({"event": "message"}, bytes(Limits().message_bytes))
+        client.send_event({"event": "message"}, bytes(Limits().message_bytes))
         found = await read(program, bool)
         assert found == [{"event": "message"}]
         assert server.dropped_for_slow_clients == 0
@@ -93,7 +93,7 @@ def test_the_largest_message_reaches_a_program_that_has_read_everything() -> Non
 def test_programs_that_do_not_read_hold_little_together_and_take_nothing_from_one_that_does(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(api, "BACKLOGS_BYTES", 10_000_000)
+    monkeypatch.setattr(api, "MAX_TOTAL_BACKLOG_BYTES", 10_000_000)
     frame = encode_frame({"event": "message"}, bytes(500_000))
     rounds = 60
 
@@ -105,11 +105,11 @@ def test_programs_that_do_not_read_hold_little_together_and_take_nothing_from_on
         (reader,) = [client for client in server.clients if client not in idle]
         for _ in range(rounds):
             for client in server.clients:
-                client.tell_encoded(frame)
-            await until(lambda: not reader.backlog())
+                client.send_encoded(frame)
+            await until(lambda: not reader.backlog_bytes())
         assert len(await reading) == rounds
         # all that waits, and at most one frame each beyond its part
-        assert sum(client.backlog() for client in idle) < 10_000_000 + 9 * 1_000_000
+        assert sum(client.backlog_bytes() for client in idle) < 10_000_000 + 9 * 1_000_000
         told = await read(lazy[0], lambda found: "dropped" in [header["event"] for header in found])
         assert len(told) + told[-1]["messages"] - 1 == rounds
         for one in (*lazy, program):
@@ -121,7 +121,7 @@ def test_programs_that_do_not_read_hold_little_together_and_take_nothing_from_on
 def test_programs_that_send_half_of_their_requests_hold_little_together_and_take_nothing_from_one_that_sends_all(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(api, "HALF_SENT_BYTES", 4_000_000)
+    monkeypatch.setattr(api, "MAX_PARTIAL_REQUEST_BYTES", 4_000_000)
     request = encode_frame({"op": "publish", "id": 1}, bytes(1 << 20))
 
     async def work(server: LocalServer, path: Path) -> None:
@@ -132,7 +132,7 @@ def test_programs_that_send_half_of_their_requests_hold_little_together_and_take
         async def look() -> None:
             nonlocal most
             while True:
-                most = max(most, sum(client.half_sent() for client in server.clients))
+                most = max(most, sum(client.partial_request_bytes() for client in server.clients))
                 await asyncio.sleep(0)
 
         looking = asyncio.create_task(look())
@@ -163,7 +163,7 @@ def test_one_program_too_many_is_told_why() -> None:
             with MeshClient(str(path), timeout_s=WAIT_S) as client:
                 client.request("peers")
 
-        with pytest.raises(MeshError, match="at most 256 programs connect at a time") as refused:
+        with pytest.raises(MeshError, match="too many clients: at most 256 may connect at a time") as refused:
             await asyncio.to_thread(ask)
         assert refused.value.code == "too-many-clients"
         programs.pop().close()

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
-from udp_mesh import Key, LinkWish, Neighbour, Node, SendRefusedError, Settings, Topic
+from udp_mesh import Key, LinkConfig, Neighbour, Node, SendRefusedError, Settings, Topic
 from udp_mesh.core.events import MessageDelivered, MessageExpired, PeerOffline, PeerOnline
 from udp_mesh.core.settings import Rates
 
@@ -25,7 +25,7 @@ def make(name: str, own: int, other: int, port: int) -> Node:
         neighbours=(Neighbour((f"127.0.4.{other}", port)),),
         rates=Rates(heartbeat_s=0.2, heartbeat_sparse_s=0.2, offline_s=1.0),
     )
-    return Node(settings, links=(LinkWish(address=f"127.0.4.{own}", broadcast=False),))
+    return Node(settings, links=(LinkConfig(address=f"127.0.4.{own}", broadcast=False),))
 
 
 async def online(node: Node, peer: str) -> None:

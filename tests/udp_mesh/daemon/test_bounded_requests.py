@@ -63,7 +63,7 @@ def test_a_file_behind_a_link_is_read(tmp_path: Path) -> None:
     assert read_regular(tmp_path / "link", 5) == b"x" * 6
 
 
-@pytest.mark.parametrize(("text", "found"), [("00" * 32, "nothing but zeros"), (f"{KEY}\n{KEY}", "the same key twice")])
+@pytest.mark.parametrize(("text", "found"), [("00" * 32, "only zeros"), (f"{KEY}\n{KEY}", "the same key twice")])
 def test_keys_that_protect_nothing_are_refused(tmp_path: Path, text: str, found: str) -> None:
     path = tmp_path / "fleet.key"
     path.write_text(text)
@@ -108,7 +108,7 @@ def test_a_long_number_is_an_id_like_any_other() -> None:
 def test_status_is_answered_whoever_holds_all_connections(alice: RunningDaemon) -> None:
     idle = []
     try:
-        for _ in range(api.MAX_CLIENTS + 3 * api.SPARE_CLIENTS):
+        for _ in range(api.MAX_CLIENTS + 3 * api.MAX_SPARE_CLIENTS):
             one = socket.socket(socket.AF_UNIX)
             one.connect(str(alice.socket))
             idle.append(one)
@@ -139,7 +139,7 @@ def test_status_is_answered_whoever_holds_all_connections(alice: RunningDaemon) 
 
 
 def test_the_metrics_are_served_whoever_holds_connections_without_asking(alice: RunningDaemon) -> None:
-    idle = [socket.create_connection(("127.0.0.1", METRICS_PORT)) for _ in range(3 * metrics_server.CONNECTIONS)]
+    idle = [socket.create_connection(("127.0.0.1", METRICS_PORT)) for _ in range(3 * metrics_server.MAX_CONNECTIONS)]
     try:
         for one in idle:
             one.send(b"GET /met")
@@ -147,7 +147,7 @@ def test_the_metrics_are_served_whoever_holds_connections_without_asking(alice: 
         with socket.create_connection(("127.0.0.1", METRICS_PORT), timeout=10.0) as scraper:
             scraper.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
             assert scraper.recv(64).startswith(b"HTTP/1.1 200 OK")
-        assert time.monotonic() - begun < metrics_server.REQUEST_S
+        assert time.monotonic() - begun < metrics_server.REQUEST_TIMEOUT_S
     finally:
         for one in idle:
             one.close()
@@ -182,16 +182,16 @@ def test_other_users_record_below_the_state_directory_only(tmp_path: Path) -> No
 
 
 def test_a_request_that_stops_coming_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(api, "HALF_SENT_S", 0.05)
+    monkeypatch.setattr(api, "PARTIAL_REQUEST_TIMEOUT_S", 0.05)
 
-    class Requests:
+    class Handler:
         def request(self, client: api.Client, header: dict[str, object], payload: bytes) -> None:
             client.reply(header.get("id"))
 
         def client_gone(self, client: api.Client) -> None: ...
 
     async def work(path: Path) -> None:
-        server = api.LocalServer(Requests(), path, mode=0o600, group=None, max_payload_bytes=lambda: 1000)
+        server = api.LocalServer(Handler(), path, mode=0o600, group=None, max_payload_bytes=lambda: 1000)
         await server.start()
         reader, writer = await asyncio.open_unix_connection(str(path))
         whole = encode_frame({"op": "x", "id": 1}, b"")

@@ -19,7 +19,7 @@ from udp_mesh.daemon.configuration import (
 )
 from udp_mesh.daemon.neighbours import parse_address
 from udp_mesh.daemon.toml_source import ConfigurationError, locate
-from udp_mesh.links.attachments import EVERY_INTERFACE, LinkWish
+from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
 
 FULL = """\
 name = "ugv1"
@@ -116,7 +116,7 @@ def test_every_part_of_the_file_arrives(tmp_path: Path) -> None:
     )
     assert settings.rates.offline_s == 5.0
     assert settings.limits.message_bytes == 1_000_000
-    assert configuration.links == (LinkWish("wlan*"), LinkWish(None, "127.0.0.2", broadcast=False, mtu=1400))
+    assert configuration.links == (LinkConfig("wlan*"), LinkConfig(None, "127.0.0.2", broadcast=False, mtu=1400))
     assert configuration.daemon.socket_mode == 0o666
     assert configuration.daemon.metrics_address == ("127.0.0.1", 9871)
 
@@ -131,7 +131,10 @@ def test_a_key_file_is_all_that_is_needed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ('name = "a b"', 'udp-mesh.toml:2: name: expected a name of 1 to 63 bytes without space or slash, found "a b"'),
+        (
+            'name = "a b"',
+            'udp-mesh.toml:2: name: expected a name of 1 to 63 bytes without spaces or slashes, found "a b"',
+        ),
         ("name = 5", "udp-mesh.toml:2: name: expected a string, found 5"),
         ("\nprot = 8700", "udp-mesh.toml:3: prot: expected a known key, found prot = 8700 (did you mean 'port'?)"),
         ("port = 70000", "udp-mesh.toml:2: port: expected an integer from 1 to 65535, found 70000"),
@@ -154,22 +157,22 @@ def test_a_key_file_is_all_that_is_needed(tmp_path: Path) -> None:
         ),
         (
             "[topics]\nmap = { outbox_on_disk = true }",
-            'udp-mesh.toml:3: topics.map.outbox_on_disk: expected outbox = "last" or "all" beside it, found true',
+            'udp-mesh.toml:3: topics.map.outbox_on_disk: expected outbox = "last" or "all" as well, found true',
         ),
         (
             '[[neighbours]]\naddress = "fe80::1"',
-            'udp-mesh.toml:3: neighbours.0.address: expected link = "INTERFACE" beside a link-local address, '
+            'udp-mesh.toml:3: neighbours.0.address: expected link = "INTERFACE" with a link-local address, '
             'found "fe80::1"',
         ),
         (
             '[[neighbours]]\naddress = "fd00::1"\nlegacy = true\nname = "old"',
-            "udp-mesh.toml:3: neighbours.0.address: expected an IPv4 address, the only ones the fielded format knows, "
+            "udp-mesh.toml:3: neighbours.0.address: expected an IPv4 address (the legacy format has no IPv6), "
             'found "fd00::1"',
         ),
         (
             '[[links]]\naddress = "fe80::1"',
-            "udp-mesh.toml:3: links.0.address: expected an address of one interface "
-            '(name a link-local one\'s `interface`), found "fe80::1"',
+            "udp-mesh.toml:3: links.0.address: expected an address that is not link-local (set `interface` instead), "
+            'found "fe80::1"',
         ),
         (
             "[limits]\nmessage_bytes = 99999999999",
@@ -202,7 +205,7 @@ def test_a_key_file_is_all_that_is_needed(tmp_path: Path) -> None:
         ),
         (
             'name = "a"\nname = "b"',
-            "udp-mesh.toml:3: expected each key once, found one that stands above as well (at column 11)",
+            "udp-mesh.toml:3: expected each key once, found a duplicate key (at column 11)",
         ),
         ('name = """a', "udp-mesh.toml:3: expected TOML, found unterminated string (at the end of the file)"),
         (
@@ -220,7 +223,7 @@ def test_a_key_file_is_all_that_is_needed(tmp_path: Path) -> None:
         ),
         (
             '[daemon]\nuser = "a\\u0000"',
-            'udp-mesh.toml:3: daemon.user: expected a string without the character NUL, found "a\\u0000"',
+            'udp-mesh.toml:3: daemon.user: expected a string without NUL characters, found "a\\u0000"',
         ),
         (
             f'[daemon]\nsocket = "/{"s" * 200}"',
@@ -228,22 +231,23 @@ def test_a_key_file_is_all_that_is_needed(tmp_path: Path) -> None:
         ),
         (
             '[topics]\nmap = { destinations = ["base", "a b"] }',
-            "udp-mesh.toml:3: topics.map.destinations: expected names of nodes, each a name of 1 to 63 bytes without "
-            'space or slash, found "a b"',
+            "udp-mesh.toml:3: topics.map.destinations: expected node names, each a name of 1 to 63 bytes without "
+            'spaces or slashes, found "a b"',
         ),
         (
             '[[neighbours]]\naddress = "10.0.0.1"\nname = "a/b"',
-            'udp-mesh.toml:4: neighbours.0.name: expected a name of 1 to 63 bytes without space or slash, found "a/b"',
+            "udp-mesh.toml:4: neighbours.0.name: expected a name of 1 to 63 bytes without spaces or slashes, "
+            'found "a/b"',
         ),
         (
             '[[neighbours]]\naddress = "10.0.0.1"\n[[neighbours]]\naddress = "10.0.0.1:8700"',
-            'udp-mesh.toml:5: neighbours.1.address: expected each neighbour once, found "10.0.0.1"',
+            'udp-mesh.toml:5: neighbours.1.address: expected each neighbor once, found "10.0.0.1"',
         ),
         ('[daemon]\nsocket = ""', 'udp-mesh.toml:3: daemon.socket: expected a path, found ""'),
         ('[daemon]\nstate_directory = ""', 'udp-mesh.toml:3: daemon.state_directory: expected a path, found ""'),
         (
             "[topics.map]\npriority = 1\n[topics.map]\npriority = 2",
-            "udp-mesh.toml:4: expected each table once, found [topics.map], which stands above as well (at column 12)",
+            "udp-mesh.toml:4: expected each table once, found a duplicate table [topics.map] (at column 12)",
         ),
         ("unkeyed = true", "udp-mesh.toml:2: unkeyed: expected either key_file or unkeyed, found both"),
     ],
@@ -260,7 +264,7 @@ def test_every_mistake_is_named_at_once(tmp_path: Path) -> None:
 def test_a_missing_key_is_named_with_the_way_out(tmp_path: Path) -> None:
     assert problems(tmp_path, 'name = "a"\n') == [
         "udp-mesh.toml:1: key_file: expected a file with the fleet's key, found none "
-        "(unkeyed = true runs without protection)"
+        "(set unkeyed = true to run without protection)"
     ]
 
 

@@ -11,7 +11,7 @@ from tests.udp_mesh.links.sockets import WAIT_S, free_port
 from udp_mesh import Node
 from udp_mesh.core.events import MessageDelivered
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.daemon.driver import BLOCKED_DATAGRAMS
+from udp_mesh.daemon.driver import MAX_BLOCKED_DATAGRAMS
 from udp_mesh.links.attachments import Address
 from udp_mesh.links.netlink import NetlinkError
 from udp_mesh.links.udp import Deliver, Outgoing, UdpLink
@@ -45,9 +45,9 @@ def test_a_socket_that_stays_full_holds_a_bounded_queue_and_counts_what_it_loses
         monkeypatch.setattr(UdpLink, "send", lambda _self, _datagrams: 0)
         (name,) = alice.driver.hub.links
         address = bob.driver.hub.links["127.0.4.2"].attachment.address
-        alice.driver._transmit(name, [Datagram(name, address, b"x", urgent=False)] * (3 * BLOCKED_DATAGRAMS))
-        assert len(alice.driver._blocked[name]) == BLOCKED_DATAGRAMS
-        assert alice.driver.lost_on_full_socket == 2 * BLOCKED_DATAGRAMS
+        alice.driver._transmit(name, [Datagram(name, address, b"x", urgent=False)] * (3 * MAX_BLOCKED_DATAGRAMS))
+        assert len(alice.driver._blocked[name]) == MAX_BLOCKED_DATAGRAMS
+        assert alice.driver.lost_on_full_socket == 2 * MAX_BLOCKED_DATAGRAMS
         monkeypatch.undo()
         assert isinstance(await alice.deliver("status", b"now there is room", to="bob"), MessageDelivered)
         assert not alice.driver._blocked[name]
@@ -70,7 +70,7 @@ def test_urgent_datagrams_go_first_where_the_socket_is_full_and_are_not_what_is_
         (name,) = driver.hub.links
         address = bob.driver.hub.links["127.0.4.2"].attachment.address
         monkeypatch.setattr(UdpLink, "send", send)
-        driver._transmit(name, [Datagram(name, address, b"bulk", urgent=False)] * BLOCKED_DATAGRAMS)
+        driver._transmit(name, [Datagram(name, address, b"bulk", urgent=False)] * MAX_BLOCKED_DATAGRAMS)
         driver._transmit(name, [Datagram(name, address, b"urgent %d" % n, urgent=True) for n in range(3)])
         room = 4
         driver._writable(driver.hub.links[name])
@@ -88,11 +88,11 @@ def test_a_step_of_the_wall_clock_does_not_disturb_the_transport(
     async def body(alice: Node, bob: Node) -> None:
         real = UdpLink.receive
 
-        def receive(self: UdpLink, deliver: Deliver, limit: int, fresh_from: float) -> int:
+        def receive(self: UdpLink, deliver: Deliver, limit: int, stop_after: float) -> int:
             def step(data: memoryview, source: Address, arrived: float) -> None:
                 deliver(data, source, arrived + step_s)
 
-            return real(self, step, limit, fresh_from - step_s)
+            return real(self, step, limit, stop_after - step_s)
 
         monkeypatch.setattr(UdpLink, "receive", receive)
         assert isinstance(await alice.deliver("map", PAYLOAD, to="bob"), MessageDelivered)
@@ -104,7 +104,7 @@ def test_a_step_of_the_wall_clock_does_not_disturb_the_transport(
 
 def test_links_that_are_no_longer_wished_for_close_and_return() -> None:
     async def body(alice: Node, bob: Node) -> None:
-        wishes = alice.driver.hub.wishes
+        wishes = alice.driver.hub.configs
         alice.driver.apply_links(())
         assert alice.driver.hub.links == {}
         await alice.send("map", b"waits", to="bob")
@@ -184,14 +184,14 @@ def test_notices_without_end_do_not_put_off_the_look_at_interfaces(monkeypatch: 
         assert driver._monitor is not None
         monkeypatch.setattr(driver._monitor, "drain", lambda: True)
         driver._interfaces_changed()
-        first = driver._refresh
+        first = driver._refresh_timer
         assert first is not None
         await asyncio.sleep(0.001)
         driver._interfaces_changed()
-        assert driver._refresh is first
+        assert driver._refresh_timer is first
         # but one that waits for another attempt later comes at once
         first.cancel()
-        later = driver._refresh = asyncio.get_running_loop().call_later(3600.0, driver._refresh_and_pump)
+        later = driver._refresh_timer = asyncio.get_running_loop().call_later(3600.0, driver._refresh_and_pump)
         driver._interfaces_changed()
         assert later.cancelled()
 

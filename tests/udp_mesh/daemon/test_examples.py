@@ -18,7 +18,7 @@ import pytest
 import udp_mesh
 from tests.udp_mesh.daemon.processes import poll
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
-from udp_mesh import Key, LinkWish, Neighbour, Node, Rates, Settings
+from udp_mesh import Key, LinkConfig, Neighbour, Node, Rates, Settings
 from udp_mesh.client import MeshClient, MeshError
 
 PAGES = Path(udp_mesh.__file__).parents[1]
@@ -51,7 +51,7 @@ def test_the_librarys_example_reaches_a_base_that_comes_later(page: str, wanted:
     exec(imported, names)
     names |= {
         "Settings": settings,
-        "Node": functools.partial(Node, links=(LinkWish(address="127.0.6.1", broadcast=False),)),
+        "Node": functools.partial(Node, links=(LinkConfig(address="127.0.6.1", broadcast=False),)),
         "text": KEY.secret.hex(),
     }
     exec(f"async def shown():\n{textwrap.indent(body, '    ')}", names)
@@ -61,7 +61,7 @@ def test_the_librarys_example_reaches_a_base_that_comes_later(page: str, wanted:
         base = settings("base", keys=(KEY,))
         async with asyncio.timeout(WAIT_S):
             task = asyncio.create_task(shown())
-            async with Node(base, links=(LinkWish(address="127.0.6.2", broadcast=False),)) as node:
+            async with Node(base, links=(LinkConfig(address="127.0.6.2", broadcast=False),)) as node:
                 arrived = asyncio.ensure_future(anext(node.messages()))
                 # whichever ends first: an example that fails must not be waited for
                 await asyncio.wait((arrived, task), return_when=asyncio.FIRST_COMPLETED)

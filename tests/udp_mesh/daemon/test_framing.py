@@ -78,7 +78,7 @@ def test_a_frame_that_is_given_up_in_the_middle_is_read_past_and_the_next_one_se
     stream = encode_frame({"op": "publish", "id": 3}, bytes(LIMIT_BYTES)) + encode_frame(GOOD, b"payload")
     reader = RequestReader(lambda: LIMIT_BYTES)
     assert reader.feed(stream[:at]) == []
-    assert reader.held == at
-    assert reader.give_up("busy", "try again") == BadFrame(3 if at == 60 else None, "busy", "try again")
-    assert reader.held == 0
+    assert reader.buffered_bytes == at
+    assert reader.discard_partial("busy", "try again") == BadFrame(3 if at == 60 else None, "busy", "try again")
+    assert reader.buffered_bytes == 0
     assert [frame for byte in stream[at:] for frame in reader.feed(bytes([byte]))] == [(GOOD, b"payload")]

@@ -26,7 +26,7 @@ def listening(work: Callable[[Listener, Path, list[socket.socket]], Awaitable[No
     async def run() -> None:
         with tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder:
             path, taken = Path(folder) / "api.sock", list[socket.socket]()
-            one = Listener(path, mode=0o600, group=None, take=taken.append)
+            one = Listener(path, mode=0o600, group=None, on_connection=taken.append)
             one.open()
             try:
                 async with asyncio.timeout(WAIT_S):
@@ -46,8 +46,8 @@ def test_what_is_no_socket_is_left_alone_and_named(tmp_path: Path, what: str) ->
         path.write_text("kept")
     else:
         path.mkdir()
-    with pytest.raises(OSError, match=f"api.sock: expected nothing there, .* found a {what}"):
-        Listener(path, mode=0o600, group=None, take=socket.socket.close).open()
+    with pytest.raises(OSError, match=f"api.sock: expected no file or a stale socket, found a {what}"):
+        Listener(path, mode=0o600, group=None, on_connection=socket.socket.close).open()
     assert path.exists()
 
 
@@ -73,7 +73,7 @@ async def accepted(path: Path, taken: list[socket.socket]) -> None:
 
 
 def test_a_deleted_socket_is_made_again_with_its_mode(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(listener, "LOOK_S", 0.02)
+    monkeypatch.setattr(listener, "FILE_CHECK_S", 0.02)
 
     async def work(_: Listener, path: Path, taken: list[socket.socket]) -> None:
         await accepted(path, taken)
@@ -85,7 +85,7 @@ def test_a_deleted_socket_is_made_again_with_its_mode(monkeypatch: pytest.Monkey
 
 
 def test_a_socket_that_became_another_daemons_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(listener, "LOOK_S", 0.02)
+    monkeypatch.setattr(listener, "FILE_CHECK_S", 0.02)
 
     async def work(first: Listener, path: Path, taken: list[socket.socket]) -> None:
         await accepted(path, taken)
@@ -106,15 +106,15 @@ def test_a_socket_that_became_another_daemons_is_left_alone(monkeypatch: pytest.
 def test_a_socket_that_cannot_be_given_its_group_leaves_no_file() -> None:
     with tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder:
         path = Path(folder) / "api.sock"
-        with pytest.raises(OSError, match="expected a group of this machine"):
-            Listener(path, mode=0o660, group="no-such-group", take=socket.socket.close).open()
+        with pytest.raises(OSError, match="no such group"):
+            Listener(path, mode=0o660, group="no-such-group", on_connection=socket.socket.close).open()
         assert not path.exists()
 
 
 def test_without_descriptors_accepting_rests_instead_of_trying_without_end(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(listener, "REST_S", 0.02)
+    monkeypatch.setattr(listener, "ACCEPT_RETRY_S", 0.02)
 
     async def work(one: Listener, path: Path, taken: list[socket.socket]) -> None:
         real, refused = cast(socket.socket, one._socket), 0
@@ -136,7 +136,7 @@ def test_without_descriptors_accepting_rests_instead_of_trying_without_end(
         await accepted(path, taken)
         assert refused == 5
         assert [record.getMessage() for record in caplog.records] == [
-            "local-socket-trouble reason=no connection can be accepted: Too many open files"
+            "local-socket-trouble reason=cannot accept connections: Too many open files"
         ]
 
     listening(work)

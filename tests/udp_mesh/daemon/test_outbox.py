@@ -216,7 +216,7 @@ def test_a_directory_that_cannot_be_used_is_told_before_anything_is_to_be_kept(
     (tmp_path / "state").write_text("a file")
     for directory in (tmp_path / "state" / "outbox", tmp_path / "usable"):
         store = DirectoryStore(directory, 1 << 20)
-        store.prove()
+        store.check_writable()
         store.close()
     (line,) = [record.getMessage() for record in caplog.records]
     assert line.startswith(f"outbox-unusable directory={tmp_path}/state/outbox error=")

@@ -65,7 +65,7 @@ def test_a_recording_ends_at_its_limit(tmp_path: Path) -> None:
 def test_what_a_disk_that_stands_still_does_not_take_is_left_out_and_the_gap_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recording, "BACKLOG_BYTES", 3 * recording.BATCH_BYTES)
+    monkeypatch.setattr(recording, "MAX_BACKLOG_BYTES", 3 * recording.BATCH_BYTES)
     made = recorder(tmp_path / "run.jsonl", limit_bytes=1 << 24)
     go_on = threading.Event()
     made._disk.submit(go_on.wait, WAIT_S)

@@ -23,11 +23,14 @@ def pair() -> Iterator[Pair]:
 @pytest.mark.parametrize(
     ("fields", "complaint"),
     [
-        ({"topic": "a b"}, "topic: expected a topic of 1 to 255 bytes without space, found 'a b'"),
+        ({"topic": "a b"}, "topic: expected a topic of 1 to 255 bytes without spaces, found 'a b'"),
         ({"topic": "x" * 256}, "topic: expected a topic of 1 to 255 bytes"),
         ({"topic": "status", "type": "a\nb"}, "type: expected printable text of at most 255 bytes, found 'a\\nb'"),
         ({"topic": "status", "type": "x" * 256}, "type: expected printable text of at most 255 bytes"),
-        ({"topic": "status", "to": "a b"}, "to: expected a name of 1 to 63 bytes without space or slash, found 'a b'"),
+        (
+            {"topic": "status", "to": "a b"},
+            "to: expected a name of 1 to 63 bytes without spaces or slashes, found 'a b'",
+        ),
         ({"topic": "status", "type": "x" * MAX_HEADER_BYTES}, "the daemon takes 65536 at most"),
     ],
 )
@@ -50,7 +53,7 @@ def test_a_name_that_no_robot_takes_is_refused_and_what_follows_is_delivered(
     ("fields", "complaint"),
     [
         ({"address": "bob"}, "neighbour.address: expected an IP address"),
-        ({"address": "fe80::1"}, 'expected link = "INTERFACE" beside a link-local address'),
+        ({"address": "fe80::1"}, 'expected link = "INTERFACE" with a link-local address'),
         ({"address": "fd00::1", "name": "x", "legacy": True}, "expected an IPv4 address"),
         ({"address": "10.0.0.1", "legacy": True}, "expected a name"),
         ({"address": "10.0.0.1", "name": "a b"}, "neighbour.name: expected a name of 1 to 63 bytes"),

@@ -1,4 +1,4 @@
-"""Which attachments a node uses: a function of the kernel's interfaces and the operator's wishes."""
+"""Which attachments a node uses: a function of the kernel's interfaces and the operator's configs."""
 
 import socket
 import struct
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from udp_mesh.links.attachments import ALL_NODES, EVERY_INTERFACE, Attachment, LinkWish, choose
+from udp_mesh.links.attachments import ALL_NODES, EVERY_INTERFACE, Attachment, LinkConfig, select_attachments
 from udp_mesh.links.netlink import Interface, InterfaceAddress, NetlinkError, parse, split_messages
 
 LO = Interface("lo", 1, 65_536, True, True, False, False, (InterfaceAddress("127.0.0.1", 8, None),))
@@ -26,53 +26,53 @@ TUN0 = Interface("tun0", 5, 1400, True, False, False, False, (InterfaceAddress("
 ALL = (LO, BAT0, WLAN0, WLAN1, TUN0)
 
 
-def names(*wishes: LinkWish) -> list[str]:
-    return [attachment.name for attachment in choose(ALL, wishes, 8700)]
+def names(*configs: LinkConfig) -> list[str]:
+    return [attachment.name for attachment in select_attachments(ALL, configs, 8700)]
 
 
 def test_by_default_every_running_interface_that_can_broadcast_is_used() -> None:
-    assert choose(ALL, EVERY_INTERFACE, 8700) == (
+    assert select_attachments(ALL, EVERY_INTERFACE, 8700) == (
         Attachment("bat0", "bat0", ("10.7.20.5", 8700), ("10.7.31.255", 8700), 1500, 2),
         Attachment("wlan0", "wlan0", ("192.168.1.20", 8700), ("192.168.1.31", 8700), 1500, 3),
     )
 
 
 def test_an_interface_made_anew_under_the_same_name_and_address_is_another() -> None:
-    (before,) = choose((WLAN0,), EVERY_INTERFACE, 8700)
-    (after,) = choose((replace(WLAN0, index=9),), EVERY_INTERFACE, 8700)
+    (before,) = select_attachments((WLAN0,), EVERY_INTERFACE, 8700)
+    (after,) = select_attachments((replace(WLAN0, index=9),), EVERY_INTERFACE, 8700)
     assert before != after
 
 
 def test_defect_6_broadcast_addresses_are_right_for_netmasks_within_an_octet() -> None:
-    found = {attachment.name: attachment.broadcast for attachment in choose(ALL, EVERY_INTERFACE, 8700)}
+    found = {attachment.name: attachment.broadcast for attachment in select_attachments(ALL, EVERY_INTERFACE, 8700)}
     assert found == {"bat0": ("10.7.31.255", 8700), "wlan0": ("192.168.1.31", 8700)}
 
 
 @pytest.mark.parametrize(
     ("wish", "expected"),
     [
-        (LinkWish("wlan*"), ["wlan0"]),
-        (LinkWish("tun0"), []),
-        (LinkWish("tun0", broadcast=False), ["tun0"]),
-        (LinkWish("lo", broadcast=False), ["lo"]),
-        (LinkWish("*", broadcast=False), ["bat0", "wlan0", "tun0"]),
-        (LinkWish(address="10.7.20.5"), ["10.7.20.5"]),
-        (LinkWish(address="127.0.0.77", broadcast=False), ["127.0.0.77"]),
-        (LinkWish(address="10.7.20.6"), []),
+        (LinkConfig("wlan*"), ["wlan0"]),
+        (LinkConfig("tun0"), []),
+        (LinkConfig("tun0", broadcast=False), ["tun0"]),
+        (LinkConfig("lo", broadcast=False), ["lo"]),
+        (LinkConfig("*", broadcast=False), ["bat0", "wlan0", "tun0"]),
+        (LinkConfig(address="10.7.20.5"), ["10.7.20.5"]),
+        (LinkConfig(address="127.0.0.77", broadcast=False), ["127.0.0.77"]),
+        (LinkConfig(address="10.7.20.6"), []),
     ],
 )
-def test_a_wish_is_met_by_the_interfaces_that_fit(wish: LinkWish, expected: list[str]) -> None:
+def test_a_wish_is_met_by_the_interfaces_that_fit(wish: LinkConfig, expected: list[str]) -> None:
     assert names(wish) == expected
 
 
 def test_the_first_wish_that_fits_an_interface_wins() -> None:
-    (bat0, wlan0) = choose(ALL, (LinkWish("bat0", broadcast=False, mtu=1300), LinkWish("*")), 8700)
+    (bat0, wlan0) = select_attachments(ALL, (LinkConfig("bat0", broadcast=False, mtu=1300), LinkConfig("*")), 8700)
     assert (bat0.name, bat0.broadcast, bat0.mtu) == ("bat0", None, 1300)
     assert (wlan0.name, wlan0.broadcast) == ("wlan0", ("192.168.1.31", 8700))
 
 
 def test_a_wished_mtu_never_exceeds_the_interface() -> None:
-    assert [attachment.mtu for attachment in choose(ALL, (LinkWish("bat0", mtu=9000),), 8700)] == [1500]
+    assert [attachment.mtu for attachment in select_attachments(ALL, (LinkConfig("bat0", mtu=9000),), 8700)] == [1500]
 
 
 # RTM_NEWADDR: 10.1.2.3/20 on interface 7.
@@ -133,23 +133,23 @@ WLAN6 = Interface(
 
 def test_where_ipv4_has_no_broadcast_address_all_ipv6_nodes_of_the_link_are_addressed() -> None:
     expected = Attachment("wlan6", "wlan6", ("fe80::6", 8700), (ALL_NODES, 8700), 1500, 6)
-    assert choose((LO, WLAN6), EVERY_INTERFACE, 8700) == (expected,)
+    assert select_attachments((LO, WLAN6), EVERY_INTERFACE, 8700) == (expected,)
     # an interface with both is used with IPv4, as ever
     both = replace(WLAN6, addresses=(*WLAN6.addresses, *WLAN0.addresses))
-    assert choose((both,), EVERY_INTERFACE, 8700)[0].broadcast == ("192.168.1.31", 8700)
+    assert select_attachments((both,), EVERY_INTERFACE, 8700)[0].broadcast == ("192.168.1.31", 8700)
     # without multicast (a tunnel) neighbours must be named
-    assert choose((replace(WLAN6, can_multicast=False),), EVERY_INTERFACE, 8700) == ()
+    assert select_attachments((replace(WLAN6, can_multicast=False),), EVERY_INTERFACE, 8700) == ()
 
 
 def test_fixed_neighbours_over_ipv6_are_spoken_to_from_the_routable_address() -> None:
-    (found,) = choose((WLAN6,), (LinkWish("wlan6", broadcast=False),), 8700)
+    (found,) = select_attachments((WLAN6,), (LinkConfig("wlan6", broadcast=False),), 8700)
     assert (found.address, found.broadcast) == (("2001:db8::6", 8700), None)
 
 
 def test_an_ipv6_address_wished_for_reaches_all_nodes_of_its_link() -> None:
-    (found,) = choose((LO, WLAN6), (LinkWish(address="2001:db8::6"),), 8700)
+    (found,) = select_attachments((LO, WLAN6), (LinkConfig(address="2001:db8::6"),), 8700)
     assert (found.device, found.broadcast) == ("wlan6", (ALL_NODES, 8700))
-    assert choose((LO, WLAN6), (LinkWish(address="::1"),), 8700) == ()
+    assert select_attachments((LO, WLAN6), (LinkConfig(address="::1"),), 8700) == ()
 
 
 def test_an_address_not_yet_checked_for_duplicates_is_not_used() -> None:

@@ -6,7 +6,7 @@ import sys
 
 SCRIPT = """
 import select, subprocess, time
-from udp_mesh.links.attachments import EVERY_INTERFACE, LinkWish
+from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
 from udp_mesh.links.hub import LinkHub
 from udp_mesh.links.netlink import InterfaceMonitor
 
@@ -91,7 +91,7 @@ assert hub.links["mesh0"] is not first
 # Broadcasts reach the other side of the veth, and not ourselves.
 class Out:
     destination, data, urgent = None, b"to all", False
-far = LinkHub([LinkWish("far0")], 8700)
+far = LinkHub([LinkConfig("far0")], 8700)
 ip("addr add 10.7.20.9/20 broadcast + dev far0")
 for scope in ("all", "far0"):
     # Both ends of the pair live here: the kernel takes the other end's address for a forgery otherwise.

@@ -84,13 +84,13 @@ def test_what_the_kernel_refuses_is_counted_by_destination_and_reason(pair: tupl
     alice, bob = pair
     nowhere, to = ("255.255.255.255", 9), bob.attachment.address
     alice.send([Out(b"a", nowhere), Out(b"b", nowhere), Out(bytes(70_000), to), Out(b"c", to)])
-    assert alice.refused == {(nowhere, errno.EACCES): 2, (to, errno.EMSGSIZE): 1}
+    assert alice.send_errors == {(nowhere, errno.EACCES): 2, (to, errno.EMSGSIZE): 1}
 
 
 def test_an_address_of_the_other_family_is_refused_as_such(pair: tuple[UdpLink, UdpLink]) -> None:
     alice, _ = pair
     assert alice.send([Out(b"a", ("::1", 9))]) == 1
-    assert alice.refused == {(("::1", 9), errno.EAFNOSUPPORT): 1}
+    assert alice.send_errors == {(("::1", 9), errno.EAFNOSUPPORT): 1}
 
 
 def test_a_destination_that_takes_nothing_at_all_does_not_end_segmentation(pair: tuple[UdpLink, UdpLink]) -> None:
@@ -188,7 +188,7 @@ def test_a_datagram_that_came_just_now_is_taken_for_the_last_and_the_next_look_f
     def deliver(data: memoryview, source: Address, arrived: float) -> None:
         found.append(len(data))
 
-    assert bob.receive(deliver, 64, fresh_from=0.0) == 1
+    assert bob.receive(deliver, 64, stop_after=0.0) == 1
     assert bob.system_calls == 1
     assert bob.receive(deliver, 64) == 2
     assert found == [10, 20, 30]

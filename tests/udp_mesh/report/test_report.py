@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from udp_mesh.report import main
 from udp_mesh.report import recording as report_recording
 from udp_mesh.report.charts import density, over_time, paths, spans, stacked, ticks
-from udp_mesh.report.figures import connections, course, histogram, intervals, sendings, summary, throughput
+from udp_mesh.report.figures import connections, histogram, intervals, sent_topics, summary, throughput, time_series
 from udp_mesh.report.page import page
 from udp_mesh.report.recording import (
     Arrival,
@@ -98,7 +98,7 @@ def test_a_recording_that_begins_while_peers_are_online_shows_them() -> None:
     (spot,) = connections(recording)
     assert (spot.spans_s, spot.share) == (((0.0, 4.0),), 0.8)
     # what is said of a peer that is away is of before
-    assert [t for t, _ in course(recording, lambda sample: sample.loss, bins=5)["spot1"]] == [0.5, 2.5]
+    assert [t for t, _ in time_series(recording, lambda sample: sample.loss, bins=5)["spot1"]] == [0.5, 2.5]
 
 
 def test_what_became_of_what_was_sent_is_counted_per_topic() -> None:
@@ -111,7 +111,7 @@ def test_what_became_of_what_was_sent_is_counted_per_topic() -> None:
         {"t": 3, "kind": "message-peer-lost", "peer": "c", "topic": "map"},
     ]
     recording = parse([header("a", 0.0).encode(), *(json.dumps(entry).encode() for entry in entries)], "r")
-    estop, bulk = sendings(recording)
+    estop, bulk = sent_topics(recording)
     assert (estop.topic, estop.messages, estop.delivered, estop.latency_s(0.5)) == ("estop", 1, 2, 0.04)
     assert (bulk.total_bytes, bulk.expired, bulk.peer_lost, bulk.latency_s(0.5)) == (500, 1, 1, None)
     assert "<td>estop</td><td>1</td><td>0.00</td><td>2</td><td>0</td><td>0</td><td>40.0</td>" in page([recording], "")

@@ -10,7 +10,7 @@ from udp_mesh.core.events import MessageDelivered, MessageExpired, MessagePeerLo
 from udp_mesh.core.settings import Settings, Topic
 from udp_mesh.sim.command import find
 from udp_mesh.sim.medium import Channel
-from udp_mesh.sim.run import Played, play
+from udp_mesh.sim.run import RunResult, play
 from udp_mesh.sim.scenario import load
 from udp_mesh.sim.team import Team
 
@@ -22,15 +22,15 @@ def team(names: str, loss: float = 0.1, **channel: float) -> Team:
     return Team(settings, channel=Channel(**channel), loss=lambda a, b, now: loss, seed=1)  # type: ignore[arg-type]
 
 
-def accounted(played: Played) -> None:
+def accounted(played: RunResult) -> None:
     assert played.ledger.ended_twice == [], f"seed {played.scenario.seed}"
 
 
 def test_every_reliable_message_ends_once_and_is_delivered_where_the_link_stays() -> None:
     made = team("ab")
-    made.agenda.run_until(5.0)
+    made.event_queue.run_until(5.0)
     sent = [made.send("a", "map", bytes([number]) * 20_000, "b") for number in range(20)]
-    made.agenda.run_until(60.0)
+    made.event_queue.run_until(60.0)
     assert not any(isinstance(one, Rejected) for one in sent)
     assert made.ledger.total(MessageDelivered) == 20
     assert made.ledger.ended_twice == []
@@ -46,11 +46,11 @@ def test_an_urgent_message_overtakes_a_map_under_way() -> None:
             arrivals.append(topic)
 
     made = Team(settings, channel=Channel(rate=2e6), loss=lambda a, b, now: 0.0, seed=1, on_event=note)
-    made.agenda.run_until(5.0)
+    made.event_queue.run_until(5.0)
     made.send("a", "map", bytes(2_000_000), "b")
-    made.agenda.run_until(7.0)
+    made.event_queue.run_until(7.0)
     made.send("a", "estop", b"stop", "b")
-    made.agenda.run_until(30.0)
+    made.event_queue.run_until(30.0)
     assert arrivals == ["estop", "map"]
 
 
@@ -66,34 +66,34 @@ def test_a_repaired_broadcast_reaches_everybody_exactly_once() -> None:
         {name: Settings(name, unkeyed=True, topics=topics) for name in "abcd"},
         channel=Channel(), loss=lambda a, b, now: 0.3, seed=3, on_event=note,
     )  # fmt: skip
-    made.agenda.run_until(5.0)
+    made.event_queue.run_until(5.0)
     for number in range(20):
         made.send("a", "estop", bytes([number]))
-        made.agenda.run_until(5.0 * (number + 2))
-    made.agenda.run_until(130.0)
+        made.event_queue.run_until(5.0 * (number + 2))
+    made.event_queue.run_until(130.0)
     assert sorted(arrivals) == sorted((robot, bytes([number])) for robot in "bcd" for number in range(20))
 
 
 def test_a_crash_in_the_middle_of_a_transfer_is_survived() -> None:
     made = team("ab", rate=2e6)
-    made.agenda.run_until(5.0)
+    made.event_queue.run_until(5.0)
     made.send("a", "map", bytes(1_000_000), "b")
-    made.agenda.run_until(6.0)
+    made.event_queue.run_until(6.0)
     made.crash("b")
-    made.agenda.run_until(8.0)
+    made.event_queue.run_until(8.0)
     made.restart("b", Settings("b", unkeyed=True, topics=TOPICS))
-    made.agenda.run_until(40.0)
+    made.event_queue.run_until(40.0)
     assert made.ledger.total(MessageDelivered) == 1
     assert made.ledger.ended_twice == []
 
 
 def test_a_changed_address_is_found_without_losing_what_was_accepted() -> None:
     made = team("ab", rate=2e6)
-    made.agenda.run_until(5.0)
+    made.event_queue.run_until(5.0)
     made.send("a", "map", bytes(500_000), "b")
-    made.agenda.run_until(5.5)
+    made.event_queue.run_until(5.5)
     made.change_address("b", "10.0.77.7")
-    made.agenda.run_until(40.0)
+    made.event_queue.run_until(40.0)
     assert made.ledger.total(MessageDelivered) == 1
 
 

@@ -1,8 +1,8 @@
-"""The ROS 1 bridge: the daemon's connection and the ROS graph, joined by the relay.
+"""The ROS 1 bridge: the daemon and the ROS graph, joined by the relay.
 
-Three kinds of threads meet here: rospy's (one per connection), the port's, and `main`'s, which every TICK_S looks after
-what changed: topics, peers, the master. Of these only `main`'s waits for the master, so that what flows goes on flowing
-while there is none.
+Three kinds of threads run here: rospy's (one per connection), the daemon client's, and the main thread, which runs the
+relay's timers every TICK_S and refreshes topics, peers and the connection to the master every REFRESH_S. Only the main
+thread waits for the master, so that existing traffic continues while the master is down.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Callable
 import rosgraph
 import rospy
 
-from udp_mesh.bridges.daemon_client import CONDITIONS_TOPIC, MeshPort
+from udp_mesh.bridges.daemon_client import CONDITIONS_TOPIC, DaemonClient
 from udp_mesh.bridges.names import (
     Route,
     outbound_name,
@@ -28,84 +28,84 @@ from udp_mesh.bridges.names import (
 )
 from udp_mesh.bridges.relay import Relay, ToRos
 from udp_mesh.bridges.ros1.graph import MASTER_ERRORS, Graph, Parameters, log_to_ros, parameters
-from udp_mesh.bridges.runtime import Joint
+from udp_mesh.bridges.runtime import BridgeRuntime
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 
 log = logging.getLogger(__name__)
 
-EXCHANGE_TOPIC = "bridge/ros1"
+PROTOCOL_TOPIC = "bridge/ros1"
 ANY = "any"
-"""The fielded system's topic for messages of any type, at priority 1."""
+"""The legacy system's topic for messages of any type, at priority 1."""
 TICK_S = 0.1
-LOOK_S = 1.0
-"""Between two looks at the daemon's topics, its peers and the master."""
+REFRESH_S = 1.0
+"""Interval between refreshes of the daemon's topics and peers and of the master."""
 
 
 class Bridge:
     """The running bridge."""
 
-    def __init__(self, port: MeshPort, own: str, given: Parameters) -> None:
-        self._port = port
+    def __init__(self, daemon: DaemonClient, own: str, given: Parameters) -> None:
+        self._daemon = daemon
         self._own = own
-        self._look_soon = threading.Event()
+        self._refresh_requested = threading.Event()
         self._hosts = {str(host) for host in given.host_list}
         listed, problems = parse_topic_list(given.topic_list)
         for problem in problems:
             log.error("parameter-refused %s", problem)
         wanted = {topic.topic: {"priority": topic.priority} for topic in listed}
         wanted.setdefault(ANY, {"priority": 1})
-        relay = Relay(own, EXCHANGE_TOPIC, ros_version=1, nonce=os.urandom(16))
-        self._joint = Joint(port, relay, self._to_ros, wanted)
+        relay = Relay(own, PROTOCOL_TOPIC, ros_version=1, nonce=os.urandom(16))
+        self._runtime = BridgeRuntime(daemon, relay, self._to_ros, wanted)
         self._master_gone = False
-        self._graph = Graph(self._joint.from_ros, "/{}/".format(ros_word(own)), self._set_window)
+        self._graph = Graph(self._runtime.from_ros, "/{}/".format(ros_word(own)), self._set_window)
 
     def start(self, stop: threading.Event) -> None:
-        """Begins to publish; until `stop`."""
+        """Starts publishing, until `stop` is set."""
         self._graph.start(stop)
 
     def _to_ros(self, message: ToRos) -> None:
         self._graph.publish(message)
 
-    # What happens
+    # Callbacks
 
-    def daemon_up(self) -> None:
-        """The port calls this after each connect. Raises MeshError."""
-        self._joint.daemon_up()
-        self._look_soon.set()
+    def on_daemon_up(self) -> None:
+        """Called by the daemon client after each connect. Raises MeshError."""
+        self._runtime.on_daemon_up()
+        self._refresh_requested.set()
 
-    def from_daemon(self, frame: Frame) -> None:
-        """The port calls this for each frame."""
-        self._joint.from_daemon(frame)
+    def on_frame(self, frame: Frame) -> None:
+        """Called by the daemon client for each frame."""
+        self._runtime.on_frame(frame)
         header = frame[0]
         event = header.get("event")
         if event == "conditions":
             self._graph.publish_conditions(header["conditions"], json.dumps(header["conditions"], sort_keys=True))
         elif event == "peer-online":
-            self._look_soon.set()
+            self._refresh_requested.set()
 
     def _set_window(self, packets: int) -> None:
         try:
-            self._port.request("set-window", window=packets or "adaptive")
+            self._daemon.request("set-window", window=packets or "adaptive")
         except MeshError as error:
             log.warning("window-unchanged packets=%d %s", packets, error)
 
-    # What is looked after, by one thread
+    # The main thread
 
     def run(self, stop: threading.Event) -> None:
-        """Until `stop`: every TICK_S, and every LOOK_S or when something came, a look around."""
-        looked_at = 0.0
+        """Runs timers every TICK_S and refreshes every REFRESH_S or on request, until `stop` is set."""
+        refreshed_at = 0.0
         while not stop.wait(TICK_S):
             now = time.monotonic()
-            self._joint.tick(now)
-            if self._look_soon.is_set() or now - looked_at >= LOOK_S:
-                self._look_soon.clear()
-                looked_at = now
-                self._look()
+            self._runtime.tick(now)
+            if self._refresh_requested.is_set() or now - refreshed_at >= REFRESH_S:
+                self._refresh_requested.clear()
+                refreshed_at = now
+                self._refresh()
 
-    def _look(self) -> None:
-        """Topics may be added, peers may come, the master may go: listen on what is there now."""
+    def _refresh(self) -> None:
+        """Registers with a restarted master, and subscribes to the names of the current topics and peers."""
         try:
-            self._graph.renew()
+            self._graph.reregister()
             self._master_gone = False
         except MASTER_ERRORS as error:
             if not self._master_gone:
@@ -113,8 +113,8 @@ class Bridge:
             self._master_gone = True
             return
         try:
-            topics, undeclared = self._joint.learn(), self._port.takes_undeclared()
-            peers = {*self._port.peers(), *self._hosts}
+            topics, undeclared = self._runtime.refresh_topics(), self._daemon.accepts_undeclared()
+            peers = {*self._daemon.peers(), *self._hosts}
         except MeshError as error:
             log.debug("daemon-unreachable %s", error)
             return
@@ -137,7 +137,7 @@ class Bridge:
 
 
 def main() -> int:
-    """Runs until ROS or a signal ends it. Waits for a master and for the daemon."""
+    """Runs until ROS or a signal stops it. Waits for a master and for the daemon."""
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
     try:
         _wait_for(lambda: bool(rosgraph.is_master_online()), "master")
@@ -148,12 +148,12 @@ def main() -> int:
     stop = threading.Event()
     rospy.on_shutdown(stop.set)
     given = parameters(DEFAULT_SOCKET)
-    port = MeshPort(given.socket, ["*", CONDITIONS_TOPIC])
+    daemon = DaemonClient(given.socket, ["*", CONDITIONS_TOPIC])
     own: list[str] = []
 
     def named() -> bool:
         try:
-            own[:] = [port.own_name()]
+            own[:] = [daemon.node_name()]
         except MeshError:
             return bool(rospy.is_shutdown())
         return True
@@ -161,12 +161,12 @@ def main() -> int:
     _wait_for(named, "daemon")
     if not own:
         return 0
-    bridge = Bridge(port, given.hostname or own[0], given)
+    bridge = Bridge(daemon, given.hostname or own[0], given)
     bridge.start(stop)
 
     def serve() -> None:
         try:
-            port.run(stop, bridge.daemon_up, bridge.from_daemon)
+            daemon.run(stop, bridge.on_daemon_up, bridge.on_frame)
         finally:
             stop.set()
 
@@ -174,15 +174,15 @@ def main() -> int:
     thread.start()
     bridge.run(stop)
     thread.join(5.0)
-    # Where ROS did not end us, a thread of ours did by a mistake, and said which: roslaunch starts us anew.
+    # Not ROS but an unexpected exception, already logged, stopped the bridge: roslaunch restarts it.
     return 0 if rospy.is_shutdown() else 1
 
 
 def _wait_for(condition: Callable[[], bool], what: str) -> None:
-    """Asks once a second until it is so, and says once that it waits."""
-    told = False
+    """Polls once a second until the condition is true; logs once that it waits."""
+    logged = False
     while not condition():
-        if not told:
+        if not logged:
             log.info("waiting-for what=%s", what)
-            told = True
+            logged = True
         time.sleep(1.0)

@@ -1,10 +1,10 @@
-"""The ROS 1 graph as the bridge uses it: opaque subscribers and publishers that outlive the master. With `fielded`, all
-of rospy is here.
+"""The ROS 1 graph: opaque subscribers and publishers that survive restarts of the master. Together with `legacy`, the
+only user of rospy.
 
-A master that was restarted knows nobody, and rospy does not notice. So `renew` looks at the master's process number and
-at whether it knows this node, and registers everything again, leaving every connection as it is.
+A restarted master has lost all registrations, and rospy does not notice. `reregister` therefore compares the master's
+process id, checks whether it knows this node, and if not registers everything again without closing a connection.
 
-`publish` never waits for the master (`publications`); `listen` and `renew` do, and are called by one thread alone.
+`publish` never waits for the master (`publications`); `listen` and `reregister` do, and are called by one thread only.
 """
 
 from __future__ import annotations
@@ -30,43 +30,43 @@ from udp_mesh.bridges.types import TypeKey
 log = logging.getLogger(__name__)
 
 BUFFER_BYTES = 1 << 24
-"""rospy's receive buffer: with its own 64 kB large images lag ever further behind."""
+"""rospy's receive buffer: with its default of 64 kB the bridge falls behind on large images."""
 QUEUE_MESSAGES, QUEUE_BYTES = 10_000, 4 << 20
-"""What waits at most for one slow subscriber of a topic: bursts of small messages whole, of images the last few; at
-least one message."""
+"""Maximum queue for one slow subscriber of a topic: many small messages or the last few images, at least one
+message."""
 
 MASTER_ERRORS = (rosgraph.MasterException, OSError, xmlrpc.client.Error, http.client.HTTPException)
-"""What a call to a master that is gone, or going, raises."""
+"""Exceptions of calls to a master that is down or going down."""
 
 OnMessage = Callable[[Route, str, TypeKey, str, bool, bytes], None]
 
 
 class _Opaque:
-    """One topic we advertise: rospy's publisher of a class made for its type."""
+    """One advertised topic: rospy's publisher of a message class created for its type."""
 
     def __init__(self, message: Outgoing) -> None:
         fields = {"_type": message.key.name, "_md5sum": message.key.checksum, "_full_text": message.definition}
         self._class = type("Opaque", (rospy.AnyMsg,), fields)
-        self._depth = _depth(len(message.payload))
+        self._depth = _queue_depth(len(message.payload))
         self._publisher = rospy.Publisher(message.name, self._class, queue_size=self._depth, latch=message.latched)
 
     def connections(self) -> int:
         return int(self._publisher.get_num_connections())
 
     def publish(self, payload: bytes) -> None:
-        depth = _depth(len(payload))
+        depth = _queue_depth(len(payload))
         if depth < self._depth:
-            self._bound(depth)
+            self._shorten_queues(depth)
         opaque = self._class()
         opaque._buff = payload
         self._publisher.publish(opaque)
 
-    def _bound(self, depth: int) -> None:
-        """Messages have become larger: fewer may wait for a slow subscriber, those that are connected included."""
+    def _shorten_queues(self, depth: int) -> None:
+        """Shortens the queues, those of existing connections too, because messages have become larger."""
         self._depth = depth
         self._publisher.impl.set_queue_size(depth)
         for connection in self._publisher.impl.connections:
-            # rospy has no other way to shorten a queue; it drops from the front one by one, so cut it here.
+            # rospy cannot shorten a queue, and drops only one message at a time: truncate it here.
             with connection._lock:
                 connection._queue_size = depth
                 del connection._queue[:-depth]
@@ -75,12 +75,12 @@ class _Opaque:
         self._publisher.unregister()
 
 
-def _depth(payload_bytes: int) -> int:
+def _queue_depth(payload_bytes: int) -> int:
     return max(1, min(QUEUE_MESSAGES, QUEUE_BYTES // max(1, payload_bytes)))
 
 
 class Parameters(NamedTuple):
-    """Private parameters of the node, named like the fielded ones where those exist."""
+    """Private parameters of the node, with the legacy names where these exist."""
 
     socket: str
     hostname: str
@@ -89,7 +89,7 @@ class Parameters(NamedTuple):
 
 
 class Graph:
-    """Topics of this node, and the fielded status topics and service under `prefix`."""
+    """Topics of this node, and the legacy status topics and service under `prefix`."""
 
     def __init__(self, on_message: OnMessage, prefix: str, on_window: Callable[[int], None]) -> None:
         self._on_message = on_message
@@ -105,10 +105,10 @@ class Graph:
         self._settings = rospy.Subscriber(prefix + "mesh_settings", rospy.AnyMsg, self._settings_arrived, on_window)
 
     def start(self, stop: threading.Event) -> None:
-        """Begins to advertise; until `stop`."""
+        """Starts advertising, until `stop` is set."""
         threading.Thread(target=self._publications.run, args=(stop,), daemon=True).start()
 
-    # Subscribing
+    # Subscribe
 
     def listen(self, routes: dict[str, Route]) -> None:
         """Subscribes to exactly these names. Waits for the master."""
@@ -133,21 +133,21 @@ class Graph:
         )
 
     def _settings_arrived(self, message: Any, on_window: Callable[[int], None]) -> None:
-        """The fielded `MeshSettings`, one byte: the window in packets, 0 for adaptive."""
+        """The legacy `MeshSettings`, one byte: the window in packets, 0 for adaptive."""
         if len(message._buff) == 1:
             on_window(message._buff[0])
 
     def published(self) -> list[str]:
-        """Names somebody publishes, as the master knows them. Raises one of MASTER_ERRORS."""
+        """Names with publishers, according to the master. Raises one of MASTER_ERRORS."""
         return [name for name, _ in _master().getPublishedTopics("")]
 
-    # Publishing
+    # Publish
 
     def publish(self, message: ToRos) -> None:
-        """Publishes an opaque message, from any thread; a topic whose type or latching changed is advertised anew."""
+        """Publishes an opaque message, from any thread; a topic whose type or latching changed is advertised again."""
         key, definition = message.key, message.definition
         if not key.checksum:
-            # A fielded robot names only the type: checksum and definition are then those installed here.
+            # A legacy robot sends only the type's name: use the locally installed checksum and definition.
             found = roslib.message.get_message_class(key.name)
             if found is None:
                 if key not in self._unknown:
@@ -158,7 +158,7 @@ class Graph:
         self._publications.publish(Outgoing(message.name, key, definition or "", message.latched, message.payload))
 
     def publish_conditions(self, conditions: Mapping[str, Any], text: str) -> None:
-        """The network's conditions: to programs of the fielded system, and whole (`text`) for the autonomy."""
+        """Publishes the network conditions: as legacy messages, and as complete JSON (`text`)."""
         self._conditions = conditions
         self._stats.publish(legacy.network_stats(conditions))
         for entry in legacy.host_entries(conditions):
@@ -170,11 +170,11 @@ class Graph:
 
     # The master
 
-    def renew(self) -> bool:
-        """Registers everything again if the master was restarted; True if it did. Raises one of MASTER_ERRORS."""
+    def reregister(self) -> bool:
+        """Registers everything with a restarted master; returns whether it was needed. Raises one of MASTER_ERRORS."""
         master = _master()
         pid = master.getPid()
-        if pid == self._pid and _knows_us(master):
+        if pid == self._pid and _is_registered(master):
             return False
         uri = rospy.get_node_uri()
         ourselves = xmlrpc.client.ServerProxy(uri)
@@ -183,7 +183,7 @@ class Graph:
             master.registerPublisher(name, message_type, uri)
         for name in [*self._subscribers, self._settings.resolved_name]:
             publishers = master.registerSubscriber(name, rospy.AnyMsg._type, uri)
-            # The new master's answer reaches rospy as if the master had called.
+            # Pass the new master's answer to rospy as if the master had called.
             ourselves.publisherUpdate("/master", name, publishers)
         master.registerService(self._service.resolved_name, self._service.uri, uri)
         self._pid = pid
@@ -192,11 +192,11 @@ class Graph:
 
 
 def _master() -> Any:
-    """A connection to the master for the calling thread alone."""
+    """A master proxy for the calling thread only."""
     return rosgraph.Master(rospy.get_name())
 
 
-def _knows_us(master: Any) -> bool:
+def _is_registered(master: Any) -> bool:
     try:
         return bool(master.lookupNode(rospy.get_name()) == rospy.get_node_uri())
     except rosgraph.MasterException:
@@ -212,8 +212,8 @@ def _subscribers_of(name: str) -> int:
 
 
 def log_to_ros() -> None:
-    """What the bridge logs goes where rospy's own messages go: terminal and /rosout. Call it after `init_node`, which
-    takes all other handlers away."""
+    """Sends the bridge's log to rospy's handlers: terminal and /rosout. Call it after `init_node`, which removes all
+    other handlers."""
     ours = logging.getLogger("udp_mesh")
     ours.handlers = list(logging.getLogger("rosout").handlers)
     ours.setLevel(logging.INFO)
@@ -221,7 +221,7 @@ def log_to_ros() -> None:
 
 
 def parameters(default_socket: str) -> Parameters:
-    """The node's private parameters. One that should be a list and is none is reported, and taken for empty."""
+    """The node's private parameters. A parameter that should be a list and is not is logged and taken as empty."""
     return Parameters(
         str(rospy.get_param("~socket", default_socket)),
         str(rospy.get_param("~hostname", "")),

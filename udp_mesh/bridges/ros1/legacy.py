@@ -1,8 +1,8 @@
-"""The fielded system's own messages and its service, made here from their fields, so that no package need be installed.
+"""The legacy system's messages and service, generated here from their fields so that no package need be installed.
 
-`NetworkStats` (per peer what waits and when it was heard), `HostEntry` (one robot that is online), `GetHosts` (all of
-them). Their names, fields and checksums are what programs on existing robots use (docs/facts/legacy-wire.md). Fields
-that count what this transport does not have (`seqNum`, `staleInflightCount`, `incompleteCount`) are 0.
+`NetworkStats` (queue and last contact per peer), `HostEntry` (one online robot), `GetHosts` (all of them). Names,
+fields and checksums match those used by programs on existing robots (docs/facts/legacy-wire.md). Counters that this
+transport does not have (`seqNum`, `staleInflightCount`, `incompleteCount`) are 0.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ HostEntry: Any = _made("HostEntry", _HOST_ENTRY)["udp_mesh/HostEntry"]
 
 
 class GetHosts:
-    """The service, as rospy wants one: its checksum is that of the request's fields followed by the response's."""
+    """The service class rospy expects; its checksum is that of the request's fields followed by the response's."""
 
     _type = "udp_mesh/GetHosts"
     _md5sum = hashlib.md5(_HOSTS.encode()).hexdigest()
@@ -53,7 +53,7 @@ def network_stats(conditions: Mapping[str, Any]) -> Any:
 
 def _peer_stats(peer: Mapping[str, Any], now: Any) -> Any:
     ago = peer["heard_ago_s"]
-    # A simulated clock may have begun after the peer was last heard, and ROS has no time before 0.
+    # On a simulated clock the last contact may be before the start, and ROS has no negative time.
     heard = genpy.Time() if ago is None else genpy.Time.from_sec(max(0.0, now.to_sec() - ago))
     waiting = sum(queue["messages"] for queue in peer["queues"])
     round_trip = genpy.Duration.from_sec(peer["round_trip_s"] or 0.0)
@@ -61,13 +61,13 @@ def _peer_stats(peer: Mapping[str, Any], now: Any) -> Any:
 
 
 def host_entries(conditions: Mapping[str, Any]) -> list[Any]:
-    """One `HostEntry` per robot that is online; `mac` is its IP address, as in the fielded system."""
+    """One `HostEntry` per online robot; `mac` is its IP address, as in the legacy system."""
     stamp = rospy.Time.now()
     return [HostEntry(Header(stamp=stamp), host, address) for host, address in _online(conditions)]
 
 
 def hosts_response(conditions: Mapping[str, Any] | None) -> Any:
-    """The answer of `GetHosts`."""
+    """The response of `GetHosts`."""
     online = _online(conditions) if conditions is not None else []
     return GetHosts._response_class([host for host, _ in online], [address for _, address in online])
 

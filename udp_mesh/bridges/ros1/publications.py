@@ -1,10 +1,10 @@
-"""What goes out into a ROS graph, without ever waiting for its master.
+"""Publishes into a ROS graph without ever waiting for its master.
 
-rospy blocks whoever advertises a topic until the master answers, for as long as the master is away. So:
+rospy blocks a caller that advertises a topic until the master answers, as long as the master is down. So:
 
-1. `publish` hands a message to its topic's publisher where one of the right type is ready; else it waits, in order.
-2. `run`, on a thread of its own, advertises what messages wait for, withdrawing the topic's last type first.
-3. A new topic's first messages wait until the subscribers that were there before it have connected.
+1. `publish` passes a message to its topic's publisher if one of the right type is ready; otherwise the message waits.
+2. `run`, on a thread of its own, advertises the topics of waiting messages, first withdrawing the previous type.
+3. The first messages of a new topic wait until the subscribers that existed before it have connected.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from typing import Callable, Deque, NamedTuple, Protocol
 from udp_mesh.bridges.types import TypeKey
 
 FIRST_HOLD_S = 2.0
-"""How long the first messages of a new topic wait for subscribers who were there before it."""
-LOOK_S = 0.05
-"""Between two looks whether those subscribers have connected."""
+"""How long the first messages of a new topic wait for existing subscribers to connect."""
+POLL_S = 0.05
+"""Interval of polling for these connections."""
 MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 1000, 16 << 20
-"""Per topic, until it is advertised: seconds of telemetry, half a second of images; the oldest are dropped."""
+"""Per topic, until it is advertised: seconds of telemetry or half a second of images; the oldest are dropped."""
 
 
 class Outgoing(NamedTuple):
-    """A message to publish, with all that its topic must be advertised with."""
+    """A message, with everything needed to advertise its topic."""
 
     name: str
     key: TypeKey
@@ -34,7 +34,7 @@ class Outgoing(NamedTuple):
 
 
 class Advertised(Protocol):
-    """One advertised topic. `publish` returns at once."""
+    """One advertised topic. `publish` must not block."""
 
     def connections(self) -> int: ...
 
@@ -44,7 +44,7 @@ class Advertised(Protocol):
 
 
 class _Topic:
-    """One name: what it was last advertised as, and what waits."""
+    """State of one name: its current advertisement and its waiting messages."""
 
     def __init__(self) -> None:
         self.advertised: Advertised | None = None
@@ -54,7 +54,7 @@ class _Topic:
         self.waiting: Deque[Outgoing] = deque()
         self.waiting_bytes = 0
 
-    def fits(self, message: Outgoing) -> bool:
+    def matches(self, message: Outgoing) -> bool:
         return self.advertised is not None and self.kind == (message.key, message.latched)
 
 
@@ -73,10 +73,10 @@ class Publications:
         self._topics: dict[str, _Topic] = {}
         self._changed = threading.Condition()
         self.dropped = 0
-        """Messages that waited for the master in vain."""
+        """Messages dropped while they waited for the master."""
 
     def publish(self, message: Outgoing) -> None:
-        """Publishes now or as soon as the topic is advertised; never blocks."""
+        """Publishes now, or once the topic is advertised; never blocks."""
         with self._changed:
             topic = self._topics.setdefault(message.name, _Topic())
             topic.waiting.append(message)
@@ -89,28 +89,28 @@ class Publications:
                 self._changed.notify()
 
     def run(self, stop: threading.Event) -> None:
-        """Advertises what messages wait for, until `stop`."""
+        """Advertises the topics of waiting messages, until `stop` is set."""
         while not stop.is_set():
             with self._changed:
                 due = [topic for topic in self._topics.values() if topic.waiting]
                 if not due:
-                    # `stop` does not wake it: bounded, so that it is seen.
+                    # `stop` does not wake this wait, so it has a timeout.
                     self._changed.wait(1.0)
                     continue
             for topic in due:
                 self._serve(topic)
-            stop.wait(LOOK_S)
+            stop.wait(POLL_S)
 
     def _serve(self, topic: _Topic) -> None:
         with self._changed:
             self._flush(topic)
-            if not topic.waiting or topic.fits(topic.waiting[0]):
+            if not topic.waiting or topic.matches(topic.waiting[0]):
                 return
             first, last = topic.waiting[0], topic.advertised
             topic.advertised = None
-        # Outside of the lock: here the master may let us wait.
+        # Outside of the lock: the master may block these calls.
         if last is not None:
-            # rospy keeps the first type of a topic until its last publisher is gone.
+            # rospy keeps a topic's first type until its last publisher is gone.
             last.withdraw()
         subscribers = 0 if first.latched else self._subscribers_of(first.name)
         advertised = self._advertise(first)
@@ -120,20 +120,20 @@ class Publications:
             self._flush(topic)
 
     def _flush(self, topic: _Topic) -> None:
-        """Publishes what waits at the head, as far as it is of the advertised type."""
+        """Publishes the waiting messages at the front that have the advertised type."""
         advertised = topic.advertised
-        if advertised is None or not topic.waiting or not topic.fits(topic.waiting[0]):
+        if advertised is None or not topic.waiting or not topic.matches(topic.waiting[0]):
             return
         if topic.subscribers and advertised.connections() < topic.subscribers and self._clock() < topic.until:
             return
         topic.subscribers = 0
-        while topic.waiting and topic.fits(topic.waiting[0]):
+        while topic.waiting and topic.matches(topic.waiting[0]):
             payload = topic.waiting.popleft().payload
             topic.waiting_bytes -= len(payload)
             advertised.publish(payload)
 
     def advertised(self) -> list[tuple[str, str]]:
-        """Names and types that the master knows from us, or should."""
+        """Names and types registered with the master, or to be registered."""
         with self._changed:
             known = [(name, topic.kind) for name, topic in self._topics.items() if topic.advertised is not None]
         return [(name, kind[0].name) for name, kind in known if kind is not None]

@@ -1,9 +1,9 @@
-"""The ROS 2 bridge's edge: rclpy's raw subscriptions and publishers, joined to the daemon by the relay.
+"""The ROS 2 bridge: rclpy's raw subscriptions and publishers, joined to the daemon by the relay.
 
-All of rclpy is touched by the executor's thread alone: a timer looks every LOOK_S at the ROS graph (which types are
-published under our names?) and at the daemon (topics, peers); what the port's thread brings waits in a queue, and a
-guard condition wakes the executor for it. Types must be installed on both robots: rclpy makes publishers and
-subscriptions from their classes only.
+Only the executor's thread calls rclpy. Every REFRESH_S a timer reads the ROS graph (types published under our names)
+and the daemon (topics, peers). Messages from the daemon client's thread wait in a queue, and a guard condition wakes
+the executor for them. Types must be installed on both robots: rclpy needs their classes to create publishers and
+subscriptions.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import time
 from collections import deque
 from typing import Any, Deque, Sequence
 
-from udp_mesh.bridges.daemon_client import MeshPort
+from udp_mesh.bridges.daemon_client import DaemonClient
 from udp_mesh.bridges.names import Route, ros_word, routes
 from udp_mesh.bridges.relay import Relay, ToRos
-from udp_mesh.bridges.ros2.quality import Quality, parse_quality, quality_text, ros2_name, shared
-from udp_mesh.bridges.runtime import Joint
+from udp_mesh.bridges.ros2.quality import Quality, common, parse_quality, quality_text, ros2_name
+from udp_mesh.bridges.runtime import BridgeRuntime
 from udp_mesh.bridges.types import TypeKey
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 
@@ -37,16 +37,16 @@ except ModuleNotFoundError as error:
 
 log = logging.getLogger(__name__)
 
-EXCHANGE_TOPIC = "bridge/ros2"
-LOOK_S = 1.0
+PROTOCOL_TOPIC = "bridge/ros2"
+REFRESH_S = 1.0
 # https://docs.ros.org/en/rolling/Concepts/Basic/About-Interfaces.html: package and message names
 _TYPE_NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
 MAX_ARRIVED = 1000
-"""Messages of the mesh that wait for the executor: the oldest are dropped."""
+"""Messages from the mesh waiting for the executor; the oldest are dropped."""
 
 
 def profile(quality: Quality) -> Any:
-    """rclpy's profile of a quality."""
+    """A quality as rclpy's QoSProfile."""
     reliable, latched = quality.reliability == "reliable", quality.latched
     return QoSProfile(
         depth=quality.depth,
@@ -56,10 +56,10 @@ def profile(quality: Quality) -> Any:
 
 
 def quality_of(info: Any) -> Quality:
-    """The quality an endpoint of the graph offers; its depth is not told by the graph."""
+    """The quality offered by an endpoint; the graph does not report its depth."""
     reliable = info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
     latched = info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    # Since Iron; "INVALID" where the middleware does not tell it.
+    # Since Iron; "INVALID" if the middleware does not report it.
     type_hash = str(getattr(info, "topic_type_hash", ""))
     return Quality(
         "reliable" if reliable else "best_effort",
@@ -70,9 +70,9 @@ def quality_of(info: Any) -> Quality:
 
 
 def message_class(name: str) -> Any:
-    """`std_msgs/msg/String` -> its class. A peer chooses the name, so nothing but a package's messages is imported.
+    """`std_msgs/msg/String` -> its class. A peer chooses the name, so only messages of a package are imported.
 
-    rosidl_runtime_py has such a function, and is not part of every distribution of rclpy. Raises ValueError,
+    rosidl_runtime_py has such a function but is not part of every distribution of rclpy. Raises ValueError,
     ModuleNotFoundError or AttributeError.
     """
     found = _TYPE_NAME.fullmatch(name)
@@ -84,37 +84,37 @@ def message_class(name: str) -> Any:
 class Bridge:
     """The running bridge."""
 
-    def __init__(self, node: Any, port: MeshPort, own: str) -> None:
-        self._node, self._port, self._own = node, port, own
-        relay = Relay(own, EXCHANGE_TOPIC, ros_version=2, nonce=os.urandom(16))
-        self._joint = Joint(port, relay, self._to_ros)
+    def __init__(self, node: Any, daemon: DaemonClient, own: str) -> None:
+        self._node, self._daemon, self._own = node, daemon, own
+        relay = Relay(own, PROTOCOL_TOPIC, ros_version=2, nonce=os.urandom(16))
+        self._runtime = BridgeRuntime(daemon, relay, self._to_ros)
         self._arrived: Deque[ToRos] = deque(maxlen=MAX_ARRIVED)
         self._subscriptions: dict[str, tuple[TypeKey, Any]] = {}
         self._publishers: dict[str, tuple[TypeKey, Any]] = {}
-        self._told: set[str] = set()
+        self._warned: set[str] = set()
         self._wake = node.create_guard_condition(self.publish_arrived)
-        node.create_timer(LOOK_S, self.look)
+        node.create_timer(REFRESH_S, self.refresh)
 
     def _to_ros(self, message: ToRos) -> None:
         self._arrived.append(message)
         self._wake.trigger()
 
-    # The port's thread
+    # The daemon client's thread
 
-    def daemon_up(self) -> None:
-        """The port calls this after each connect. Raises MeshError."""
-        self._joint.daemon_up()
+    def on_daemon_up(self) -> None:
+        """Called by the daemon client after each connect. Raises MeshError."""
+        self._runtime.on_daemon_up()
 
-    def from_daemon(self, frame: Frame) -> None:
-        """The port calls this for each frame."""
-        self._joint.from_daemon(frame)
+    def on_frame(self, frame: Frame) -> None:
+        """Called by the daemon client for each frame."""
+        self._runtime.on_frame(frame)
 
     # The executor's thread
 
-    def look(self) -> None:
-        """Every LOOK_S: topics, peers, and what is published under our names."""
+    def refresh(self) -> None:
+        """Every REFRESH_S: updates topics, peers and subscriptions."""
         try:
-            topics, peers = self._joint.learn(), self._port.peers()
+            topics, peers = self._runtime.refresh_topics(), self._daemon.peers()
         except MeshError as error:
             log.debug("daemon-unreachable %s", error)
             return
@@ -123,14 +123,14 @@ class Bridge:
         for name in [name for name in self._subscriptions if name not in table]:
             self._node.destroy_subscription(self._subscriptions.pop(name)[1])
         for name, route in table.items():
-            self._look_at_publishers(name, route)
+            self._refresh_subscription(name, route)
 
-    def _look_at_publishers(self, name: str, route: Route) -> None:
+    def _refresh_subscription(self, name: str, route: Route) -> None:
         infos = self._node.get_publishers_info_by_topic(name)
         if not infos:
             return
         type_name = str(infos[0].topic_type)
-        quality = shared(quality_of(info) for info in infos if info.topic_type == type_name)
+        quality = common(quality_of(info) for info in infos if info.topic_type == type_name)
         key = TypeKey(type_name, quality_text(quality))
         known = self._subscriptions.get(name)
         if known is not None and known[0] == key:
@@ -142,9 +142,9 @@ class Bridge:
             self._node.destroy_subscription(known[1])
 
         def arrived(data: bytes) -> None:
-            self._joint.from_ros(route, name, key, "", quality.latched, bytes(data))
+            self._runtime.from_ros(route, name, key, "", quality.latched, bytes(data))
 
-        # The graph does not tell depths; ten messages bridge what the executor is busy with.
+        # The graph does not report depths; ten messages cover the time the executor is busy.
         wanted = profile(quality._replace(depth=10))
         self._subscriptions[name] = (
             key,
@@ -152,7 +152,7 @@ class Bridge:
         )
 
     def publish_arrived(self) -> None:
-        """What the mesh brought since the last call."""
+        """Publishes the messages that arrived from the mesh since the last call."""
         while self._arrived:
             self._publish(self._arrived.popleft())
 
@@ -167,12 +167,12 @@ class Bridge:
                 self._node.destroy_publisher(known[1])
             known = (message.key, self._node.create_publisher(message_class, name, profile(quality)))
             self._publishers[name] = known
-        if self._is_of_hash(name, quality.type_hash):
-            # rclpy takes bytes for a message that is serialized already.
+        if self._has_matching_hash(name, quality.type_hash):
+            # rclpy takes bytes as a serialized message.
             known[1].publish(message.payload)
 
-    def _is_of_hash(self, name: str, type_hash: str) -> bool:
-        """Whether our publisher's type is the source's, as far as ROS tells: CDR of another definition is garbage."""
+    def _has_matching_hash(self, name: str, type_hash: str) -> bool:
+        """Whether our publisher's type hash equals the source's, if both are known: CDR of another type is garbage."""
         hashes = {
             quality_of(info).type_hash
             for info in self._node.get_publishers_info_by_topic(name)
@@ -180,43 +180,43 @@ class Bridge:
         } - {""}
         if not type_hash or not hashes or type_hash in hashes:
             return True
-        self._tell_once(name, "{}: the type is defined otherwise on its source: not published".format(name))
+        self._warn_once(name, "{}: the source has another definition of the type: not published".format(name))
         return False
 
     def _class(self, name: str) -> Any:
         try:
             return message_class(name)
         except (AttributeError, ModuleNotFoundError, ValueError) as error:
-            self._tell_once(name, "type-unknown type={} {}".format(name, error))
+            self._warn_once(name, "type-unknown type={} {}".format(name, error))
             return None
 
-    def _tell_once(self, about: str, text: str) -> None:
-        if about not in self._told:
-            self._told.add(about)
+    def _warn_once(self, about: str, text: str) -> None:
+        if about not in self._warned:
+            self._warned.add(about)
             log.warning("%s", text)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs until ROS or a signal ends it. Waits for the daemon."""
-    parser = argparse.ArgumentParser(prog="udp_mesh.bridges.ros2", description="ROS 2 over the mesh")
-    parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket")
+    """Runs until ROS or a signal stops it. Waits for the daemon."""
+    parser = argparse.ArgumentParser(prog="udp_mesh.bridges.ros2", description="Carry ROS 2 topics over the mesh.")
+    parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket (default: %(default)s)")
     options, ros_arguments = parser.parse_known_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
-    port = MeshPort(options.socket, ["*"])
+    daemon = DaemonClient(options.socket, ["*"])
     stop = threading.Event()
     rclpy.init(args=ros_arguments)
     try:
-        own = _own_name(port)
+        own = _wait_for_node_name(daemon)
         if own is None:
             return 0
         node = Node("mesh_bridge", namespace=ros2_name("/" + ros_word(own)))
-        bridge = Bridge(node, port, own)
+        bridge = Bridge(node, daemon, own)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        thread = threading.Thread(target=port.run, args=(stop, bridge.daemon_up, bridge.from_daemon), daemon=True)
+        thread = threading.Thread(target=daemon.run, args=(stop, bridge.on_daemon_up, bridge.on_frame), daemon=True)
         thread.start()
         while rclpy.ok() and thread.is_alive():
-            executor.spin_once(timeout_sec=LOOK_S)
+            executor.spin_once(timeout_sec=REFRESH_S)
         failed = rclpy.ok()
         stop.set()
         thread.join(5.0)
@@ -227,21 +227,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     finally:
         stop.set()
         rclpy.try_shutdown()
-    # The port's thread ended by a mistake of ours, and said which: whoever started us starts us anew.
+    # The daemon client's thread failed and logged its exception; the supervisor restarts this process.
     return 1 if failed else 0
 
 
-def _own_name(port: MeshPort) -> str | None:
-    """The daemon's name, asked for until it answers; None where ROS ends before."""
-    told = False
+def _wait_for_node_name(daemon: DaemonClient) -> str | None:
+    """The daemon's node name, polled until the daemon answers; None if ROS shuts down first."""
+    logged = False
     while rclpy.ok():
         try:
-            return port.own_name()
+            return daemon.node_name()
         except MeshError as error:
-            if not told:
+            if not logged:
                 log.info("waiting-for what=daemon %s", error)
-                told = True
-        time.sleep(LOOK_S)
+                logged = True
+        time.sleep(REFRESH_S)
     return None
 
 

@@ -1,7 +1,7 @@
-"""ROS 2's quality of service and type hash as the checksum word of a type field (`types`), and back. Pure.
+"""ROS 2 quality of service and type hash <-> the checksum word of a type field (`types`). Pure.
 
-`reliable:transient_local:10:RIHS01_df66...`: reliability, durability, depth, and the type's hash where ROS tells it
-(since Iron). A receiver publishes with what the source offered, and only where its own type has that hash.
+`reliable:transient_local:10:RIHS01_df66...`: reliability, durability, depth, and the type's hash if ROS reports it
+(since Iron). A receiver publishes with the quality the source offered, and only if its own type has the same hash.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from typing import Iterable, NamedTuple
 RELIABILITIES = ("reliable", "best_effort")
 DURABILITIES = ("volatile", "transient_local")
 MAX_DEPTH = 10_000
-"""History kept per topic: bounds what a peer can make a publisher hold."""
+"""Maximum history depth per topic: bounds what a peer can make a publisher hold."""
 _TYPE_HASH = re.compile(r"(RIHS[0-9]{2}_[0-9a-f]{64})?")
 
 
 class Quality(NamedTuple):
-    """What a publisher offers. `type_hash`: "" where it is not known."""
+    """The quality a publisher offers. `type_hash` is "" if it is not known."""
 
     reliability: str = "reliable"
     durability: str = "volatile"
@@ -26,7 +26,7 @@ class Quality(NamedTuple):
 
     @property
     def latched(self) -> bool:
-        """Late subscribers get the last messages."""
+        """Whether late joiners get the last messages."""
         return self.durability == "transient_local"
 
 
@@ -35,7 +35,7 @@ def quality_text(quality: Quality) -> str:
 
 
 def parse_quality(text: str) -> Quality | None:
-    """The quality in a checksum word; None where it is none."""
+    """Parses a checksum word; None if it is not a quality."""
     parts = text.split(":")
     if len(parts) != 4 or parts[0] not in RELIABILITIES or parts[1] not in DURABILITIES:
         return None
@@ -44,9 +44,9 @@ def parse_quality(text: str) -> Quality | None:
     return Quality(parts[0], parts[1], int(parts[2]), parts[3]) if _TYPE_HASH.fullmatch(parts[3]) else None
 
 
-def shared(qualities: Iterable[Quality]) -> Quality:
-    """What all publishers of a topic offer: a subscription that asks for more than one of them offers does not hear it.
-    Expects at least one quality."""
+def common(qualities: Iterable[Quality]) -> Quality:
+    """The quality that all publishers of a topic offer: a subscription that requests more than a publisher offers does
+    not receive from it. Requires at least one quality."""
     found = list(qualities)
     return found[0]._replace(
         reliability=max((quality.reliability for quality in found), key=RELIABILITIES.index),
@@ -56,5 +56,5 @@ def shared(qualities: Iterable[Quality]) -> Quality:
 
 
 def ros2_name(name: str) -> str:
-    """A ROS name as ROS 2 allows it: underscores do not follow one another."""
+    """A ROS name as a valid ROS 2 name, which has no repeated underscores."""
     return re.sub("_{2,}", "_", name)
