@@ -16,10 +16,20 @@ from meshctl.apply.health_checks import Expectation
 from meshctl.apply.neighbor_query import look_around
 from meshctl.apply.prepare import base_macs
 from meshctl.apply.station_flush import NOT_ASKED, ask_the_rest
-from meshctl.cli.asking import must_agree
-from meshctl.cli.context import KeyFiles, Lab, Nodes, Session, chosen, exit_for, progress_for, session
+from meshctl.cli.context import (
+    AsJson,
+    InventoryPath,
+    KeyFiles,
+    Lab,
+    Nodes,
+    Session,
+    chosen,
+    exit_for,
+    must_agree,
+    progress_for,
+    session,
+)
 from meshctl.cli.journaled_run import Refused
-from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.plan import Yes
 from meshctl.device.observation import Observation
 from meshctl.errors import InputError

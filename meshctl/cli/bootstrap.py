@@ -23,9 +23,8 @@ from meshctl.apply.bootstrap import (
     restore_pins,
 )
 from meshctl.apply.replace import give_up, heir_of, identity_edits, succeed
-from meshctl.cli.context import KeyFiles, Lab, Session, exit_for, session
+from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Session, exit_for, session
 from meshctl.cli.journaled_run import SALT_BYTES, ask_and_carry_out, choices_of
-from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.output import complain, echo
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
 from meshctl.errors import ExitCode, InputError, MeshctlError

@@ -42,7 +42,7 @@ COMMANDS: dict[str, Entry] = {
     "backup": Entry("meshctl.cli.backup", "backup", "Fetch a node's whole state", _CHANGE),
     "restore": Entry("meshctl.cli.backup", "restore", "Put a node's saved state back", _CHANGE),
     "status": Entry("meshctl.cli.status", "status", "Show the whole fleet, and what is wrong with it", _WATCH),
-    "preflight": Entry("meshctl.cli.preflight", "preflight", "Go or no-go for the run, with reasons", _WATCH),
+    "preflight": Entry("meshctl.cli.status", "preflight", "Go or no-go for the run, with reasons", _WATCH),
     "topology": Entry("meshctl.cli.topology", "topology", "Draw the mesh as its nodes see it", _WATCH),
     "trust": Entry("meshctl.cli.ssh", "trust", "Pin the host keys of nodes", _WATCH),
     "run": Entry("meshctl.cli.ssh", "run", "Run a command on nodes", _WATCH),

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.options import InventoryPath
+from meshctl.cli.context import InventoryPath
 from meshctl.cli.output import echo
 from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state

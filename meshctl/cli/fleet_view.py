@@ -15,11 +15,9 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import KeyFiles, Lab, Session, session
-from meshctl.cli.options import InventoryPath
+from meshctl.cli.context import InventoryPath, KeyFiles, Lab, Options, Session, opening, session
 from meshctl.cli.output import is_plain
 from meshctl.cli.robots_context import AskSudo, sudo_password
-from meshctl.cli.shared import Options, opening
 from meshctl.device.connection import Deadlines
 from meshctl.model import Fleet, Node
 from meshctl.robots.connection import Reach

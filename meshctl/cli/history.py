@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from meshctl.cli.options import AsJson
+from meshctl.cli.context import AsJson
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import InputError
 from meshctl.fleet.journal import Journal, RunRecord, default_path

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.context import AsJson, InventoryPath
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state

@@ -11,11 +11,8 @@ import typer
 
 from meshctl.apply.executor import Setting, carry_out
 from meshctl.apply.prepare import Choices, Prepared, prepare
-from meshctl.cli.asking import must_agree
-from meshctl.cli.context import Session, chosen, exit_for, progress_for
-from meshctl.cli.options import line_width
-from meshctl.cli.output import complain, console, echo, echo_json
-from meshctl.cli.streams import unheard
+from meshctl.cli.context import Session, chosen, exit_for, line_width, must_agree, progress_for
+from meshctl.cli.output import complain, console, echo, echo_json, unheard
 from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Outcome, totals
 from meshctl.model import Fleet

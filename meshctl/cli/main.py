@@ -19,8 +19,7 @@ from typer.core import DEFAULT_MARKUP_MODE
 from meshctl import __version__
 from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.cli.extensions import load
-from meshctl.cli.output import echo, is_plain, prepare_streams
-from meshctl.cli.streams import unheard
+from meshctl.cli.output import echo, is_plain, prepare_streams, unheard
 from meshctl.errors import ExitCode, MeshctlError
 
 _EPILOG = """Start with `meshctl init DIR`, or `meshctl lab up` for a virtual fleet to practise on.

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import typer
@@ -57,3 +59,16 @@ def prepare_streams() -> None:
         reconfigure = getattr(stream, "reconfigure", None)
         if reconfigure is not None:
             reconfigure(errors="backslashreplace")
+
+
+@contextmanager
+def unheard() -> Iterator[None]:
+    """Within this block a write that fails (EPIPE, EIO) is the last that is tried."""
+    try:
+        yield
+        sys.stdout.flush()
+    except OSError:
+        # keeps the interpreter from trying, and complaining, once more at its exit
+        silence = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(silence, sys.stdout.fileno())
+        os.close(silence)

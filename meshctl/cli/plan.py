@@ -13,7 +13,7 @@ import typer
 
 from meshctl.apply.prepare import Choices
 from meshctl.apply.resume import settled
-from meshctl.cli.context import KeyFiles, Lab, Nodes, Session, session
+from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Nodes, Session, session
 from meshctl.cli.journaled_run import (
     ask_and_carry_out,
     carry_out_plan,
@@ -23,7 +23,6 @@ from meshctl.cli.journaled_run import (
     show,
     write_text,
 )
-from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet.journal import Journal, RunRecord
@@ -145,7 +144,7 @@ def resume(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         record, left = _to_resume(opened.journal, opened.fleet.name, run)
         if record.command.startswith("robots "):
-            from meshctl.cli.robots_work import take_up
+            from meshctl.cli.robots_context import take_up
 
             raise take_up(opened, inventory, record, as_json=as_json)
         if record.command == "restore":

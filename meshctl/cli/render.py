@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
+from meshctl.cli.context import AsJson, InventoryPath
 from meshctl.cli.git_revision import opened
-from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory import load_fleet

@@ -1,6 +1,6 @@
 """`meshctl robots`: udp_mesh on the robots' computers, deployed, watched and taken away.
 
-Each command gets a `Crew` (robots_context.py), works on all chosen robots at once (robots_work.py), and tells one
+Each command gets a `Crew` (robots_context.py), works on all chosen robots at once, and tells one
 outcome for each. Topics and keys, which change the inventory too, are in robots_topics.py.
 """
 
@@ -13,12 +13,10 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import exit_for
-from meshctl.cli.options import line_width
+from meshctl.cli.context import exit_for, line_width
 from meshctl.cli.output import echo, echo_json
-from meshctl.cli.robots_context import Crew, end, with_crew
+from meshctl.cli.robots_context import SERVICE_TIMEOUT_S, Crew, begin, end, with_crew
 from meshctl.cli.robots_topics import rotate_key_command, topic_app
-from meshctl.cli.robots_work import SERVICE_TIMEOUT_S, begin
 from meshctl.errors import ExitCode, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.robots.deploy import planned

@@ -2,7 +2,7 @@
 
 `with_crew` gives a command the options they all share, and the crew they make. `Crew.on_each` works on all robots at
 once; `Crew.change` does so for what changes them, shows it go on, and writes it into the journal, from which
-`meshctl resume` takes it up (robots_work.py has the work).
+`meshctl resume` takes it up.
 """
 
 from __future__ import annotations
@@ -22,19 +22,18 @@ from typing import Annotated, Any
 
 import typer
 
-from meshctl.cli.context import KeyFiles, Session, exit_for, progress_for, session
-from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Session, exit_for, opening, progress_for, session
 from meshctl.cli.output import complain, echo, echo_json
-from meshctl.cli.shared import opening
 from meshctl.device.connection import Connection
 from meshctl.errors import InputError, MeshctlError
-from meshctl.fleet import Event, EventKind, Observer, Outcome, Tee, outcome_of_error, run, silent, totals
+from meshctl.fleet import Event, EventKind, Observer, Outcome, Result, Tee, outcome_of_error, run, silent, totals
+from meshctl.fleet.journal import RunRecord
 from meshctl.inventory.secrets import SecretStore
 from meshctl.model import Fleet, Secret
 from meshctl.render.daemon import daemon_keys
 from meshctl.robots.bundle import configuration
 from meshctl.robots.connection import Reach, chosen_robots
-from meshctl.robots.deploy import Order, Wheelhouse
+from meshctl.robots.deploy import Order, Wheelhouse, claimed, deploy, roll_back
 from meshctl.robots.host import Host
 from meshctl.robots.wheels import stock_units
 
@@ -50,6 +49,11 @@ AskSudo = Annotated[
 Wait = Annotated[int, typer.Option("--wait", min=2, help="Seconds a daemon has to prove itself before it goes back.")]
 
 Work = Callable[[Host, str], Outcome]
+Told = Mapping[str, Any]
+
+# systemd stops and starts two services (TimeoutStopSec, TimeoutStartSec of the units).
+SERVICE_TIMEOUT_S = 240.0
+PREFIX = "robots "
 # How often somebody looks whether all connections shall be closed at once.
 _LEAVING_LOOK_S = 0.25
 
@@ -228,3 +232,66 @@ def end(crew: Crew, outcomes: dict[str, Outcome]) -> typer.Exit:
         if not counted.all_good:
             echo("`meshctl resume` takes up what is not done", err=True)
     return typer.Exit(exit_for(outcomes.values(), crew.opened.interrupt))
+
+
+def begin(crew: Crew, command: str, **told: Any) -> dict[str, Outcome]:
+    """Carry a command out on all robots of the crew; `told` is what it needs besides, and goes into the journal."""
+    told = {**told, "wait_s": crew.order.wait_s, "wheels": str(crew.wheels.resolve()) if crew.wheels else ""}
+    return crew.change(command, lambda opened: _work(command, opened, told), told)
+
+
+def _work(command: str, crew: Crew, told: Told) -> Work:
+    match command:
+        # topics and keys are changed in the inventory first; what is left for a robot is its deploy
+        case "deploy" | "topic" | "rotate-key":
+            return lambda host, robot: deploy(host, robot, crew.order)
+        case "rollback":
+            return lambda host, robot: roll_back(host, robot, crew.order)
+        case "restart" | "stop":
+            return lambda host, robot: _service(host, robot, command)
+        case "uninstall":
+            return lambda host, robot: _remove(host, robot, purge=bool(told.get("purge")))
+        case _:
+            raise InputError(f"a run of `robots {command}` cannot be taken up", hint="run the command again")
+
+
+def _service(host: Host, robot: str, verb: str) -> Outcome:
+    with claimed(host):
+        states = host.run("service", verb, timeout_s=SERVICE_TIMEOUT_S).splitlines()
+    told = [f"the {'ROS bridge' if 'ros' in unit else 'service'} is {state}" for unit, state in map(str.split, states)]
+    return Outcome(robot, Result.DONE, ", ".join(told))
+
+
+def _remove(host: Host, robot: str, *, purge: bool) -> Outcome:
+    with claimed(host):
+        host.run("remove", "purge" if purge else "keep", timeout_s=SERVICE_TIMEOUT_S)
+    return Outcome(robot, Result.DONE, "removed")
+
+
+def take_up(opened: Session, inventory: Path, record: RunRecord, *, as_json: bool) -> typer.Exit:
+    """Do an earlier run's command for the robots that it left; the exit to raise."""
+    command = record.command.removeprefix(PREFIX)
+    told = json.loads(record.plan).get("robots", {}) if record.plan else {}
+    able = {name for name, robot in opened.fleet.robots.items() if robot.computer is not None}
+    names = [name for name in opened.journal.unfinished(record.id) if name in able]
+    if not names:
+        echo(f"run {record.id} left nothing to do")
+        return typer.Exit()
+    if command == "rotate-key":
+        # its steps need all robots, and the inventory knows which is next
+        again = f"meshctl robots rotate-key {told.get('new_key', 'NEW_KEY')}"
+        raise InputError(f"run {record.id} changed keys in steps over all robots", hint=f"go on with `{again}`")
+    if not as_json:
+        echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")
+    wheels, wait_s = told.get("wheels", ""), int(told.get("wait_s", 30))
+    crew = crew_in(
+        opened,
+        inventory,
+        names,
+        sudo_password(False),
+        wheels=Path(wheels) if wheels else None,
+        wait_s=wait_s,
+        as_json=as_json,
+    )
+    crew = crew.at(opened.fleet, only_configuration=command == "topic")
+    return end(crew, begin(crew, command, **told))

@@ -16,8 +16,7 @@ import typer
 import yaml
 
 from meshctl.cli.output import echo
-from meshctl.cli.robots_context import Crew, end, with_crew
-from meshctl.cli.robots_work import begin
+from meshctl.cli.robots_context import Crew, begin, end, with_crew
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, totals
 from meshctl.inventory import load_fleet

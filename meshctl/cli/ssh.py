@@ -14,8 +14,7 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import KeyFiles, Lab, Nodes, Session, chosen, exit_for, session
-from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Nodes, Session, chosen, exit_for, session
 from meshctl.cli.output import complain, echo, echo_bytes, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result

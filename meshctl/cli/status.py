@@ -6,23 +6,27 @@ import json
 import os
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Annotated
 
 import typer
 
+from meshctl.cli.context import AsJson, line_width
 from meshctl.cli.fleet_view import Everybody, glance, paint_of, with_everybody
 from meshctl.cli.live_screen import live
-from meshctl.cli.options import AsJson, line_width
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode
-from meshctl.status import FleetStatus, assess
+from meshctl.status import Check, FleetStatus, assess
+from meshctl.status import preflight as checks_of
 from meshctl.status.assess import Look
 from meshctl.status.filters import ROLES, STATES, Filter
 from meshctl.status.json_output import as_json as status_json
+from meshctl.status.json_output import preflight_json
 from meshctl.status.last_known import facts_to_keep
-from meshctl.status.text import text
+from meshctl.status.robots import takes_part
+from meshctl.status.text import preflight_text, text
 
 Names = Annotated[
     list[str] | None, typer.Argument(metavar="[NAME]...", help="Radios and robots, or patterns: 'husky*'.")
@@ -137,3 +141,31 @@ def _watch(view: _View, period_s: float) -> None:
     if latest is not None:
         echo(view.text(view.status(latest, time.time())), styled=True)
     raise typer.Exit(ExitCode.INTERRUPTED)
+
+
+@with_everybody
+def preflight(everybody: Everybody, as_json: AsJson = False) -> None:
+    """Go or no-go for the run: one line per check, with the reason. Urgent messages are really sent between all robots.
+
+    Exit code: 0 go, 1 no-go, 2 could not look.
+
+    Example: meshctl preflight
+    """
+    found = assess(glance(everybody), everybody.nodes, time.time(), everybody.robots)
+    everybody.opened.journal.remember_all(everybody.fleet.name, facts_to_keep(found), time.time())
+    talking = [
+        robot.name
+        for robot in found.robots
+        if takes_part(robot.state) and robot.facts is not None and robot.facts.answers
+    ]
+    checks = checks_of(everybody.fleet, found, everybody.watcher.ping(talking))
+    show_preflight(checks, as_json=as_json)
+    raise typer.Exit(ExitCode.OK if all(check.is_go for check in checks) else ExitCode.FINDINGS)
+
+
+def show_preflight(checks: Sequence[Check], *, as_json: bool) -> None:
+    """Print the checks and the verdict."""
+    if as_json:
+        echo_json(json.dumps(preflight_json(checks), indent=2))
+    else:
+        echo(preflight_text(checks, line_width(), paint_of()), styled=True)

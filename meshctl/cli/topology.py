@@ -9,9 +9,8 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import KeyFiles, Lab
+from meshctl.cli.context import InventoryPath, KeyFiles, Lab
 from meshctl.cli.fleet_view import CONNECT_S, Timeout, glance, watcher
-from meshctl.cli.options import InventoryPath
 from meshctl.cli.output import echo
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.suggest import did_you_mean
