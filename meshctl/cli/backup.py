@@ -23,13 +23,13 @@ from meshctl.cli.context import (
     Lab,
     Nodes,
     Session,
-    chosen,
+    confirm,
     exit_for,
-    must_agree,
     progress_for,
+    selected_nodes,
     session,
 )
-from meshctl.cli.journaled_run import Refused
+from meshctl.cli.journaled_run import PlanRefused
 from meshctl.cli.plan import Yes
 from meshctl.device.observation import Observation
 from meshctl.errors import InputError
@@ -51,7 +51,7 @@ def backup(
     Example: meshctl backup 'husky*' --out backups
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        wanted = {node.name: node for node in chosen(opened.fleet, nodes)}
+        wanted = {node.name: node for node in selected_nodes(opened.fleet, nodes)}
         try:
             out.mkdir(parents=True, exist_ok=True, mode=0o700)
         except OSError as error:
@@ -108,10 +108,10 @@ def restore(
     except OSError as error:
         raise InputError(f"{file}: cannot be read: {error.strerror}") from error
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        (there,) = chosen(opened.fleet, [node])[:1]
+        (there,) = selected_nodes(opened.fleet, [node])[:1]
         if not yes:
             taken = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(saved.taken_s))
-            must_agree(f"Make {there.name} what it was on {taken}?")
+            confirm(f"Make {there.name} what it was on {taken}?")
         outcome = _restore(opened, there.name, saved, as_json=as_json)
     raise typer.Exit(exit_for([outcome], opened.interrupt))
 
@@ -147,10 +147,10 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Out
                     seen = observe_cleared(connection, (), opened.interrupt)
                     problem = objection_to(saved, name, seen)
                     if problem:
-                        raise Refused(problem)
+                        raise PlanRefused(problem)
                     shut_out = lockout_by(saved, node, opened.access.own_keys(node))
                     if shut_out is not None:
-                        raise Refused(shut_out.reason, hint=shut_out.hint)
+                        raise PlanRefused(shut_out.reason, hint=shut_out.hint)
                     around.update(
                         look_around(opened.access, opened.fleet, {name: seen}, known, interrupt=opened.interrupt)
                     )

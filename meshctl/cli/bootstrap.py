@@ -24,8 +24,8 @@ from meshctl.apply.bootstrap import (
 )
 from meshctl.apply.replace import give_up, heir_of, identity_edits, succeed
 from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Session, exit_for, session
-from meshctl.cli.journaled_run import SALT_BYTES, ask_and_carry_out, choices_of
-from meshctl.cli.output import complain, echo
+from meshctl.cli.journaled_run import SALT_BYTES, choices_of, confirm_and_execute
+from meshctl.cli.output import echo, echo_error
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
 from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Outcome, Result
@@ -38,7 +38,7 @@ Changes = tuple[Change, ...]
 
 # Stands for a device that is in no inventory yet.
 BENCH = "bench"
-SILENT_HINT = f"is it plugged in, on for a minute, and has this machine an address in {FACTORY_ADDRESS}'s network?"
+NO_ANSWER_HINT = f"is it plugged in, on for a minute, and has this machine an address in {FACTORY_ADDRESS}'s network?"
 
 At = Annotated[
     list[str] | None,
@@ -81,8 +81,8 @@ def bootstrap(
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        places = _places(opened, nodes or [], _spots(at or [], interface or []))
-        with opened.interrupt.on_signals(complain):
+        places = _expected_places(opened, nodes or [], _named_places(at or [], interface or []))
+        with opened.interrupt.on_signals(echo_error):
             arrivals = look_around(
                 opened.renderer,
                 opened.access,
@@ -93,7 +93,7 @@ def bootstrap(
                 interrupt=opened.interrupt,
             )
         for outcome in arrivals.outcomes:
-            _complain(outcome)
+            _print_failure(outcome)
         if not as_json:
             for name, item in arrivals.found.items():
                 echo(f"{name}: found at {item.place.endpoint.label}, host key {item.key.fingerprint}")
@@ -112,22 +112,24 @@ def bootstrap(
         refused = [plan.node for plan in prepared.plan.of(Verdict.REFUSED) if plan.node in arrivals.found]
         restore_pins(opened.trust, arrivals, refused)
         try:
-            ask_and_carry_out(opened, prepared, "bootstrap", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
+            confirm_and_execute(
+                opened, prepared, "bootstrap", choices, yes=yes, as_json=as_json, brief=brief, rate=rate
+            )
         except typer.Exit as ended:
             if arrivals.outcomes and ended.exit_code == ExitCode.OK:
                 raise typer.Exit(ExitCode.FINDINGS) from None
             raise
 
 
-def _complain(outcome: Outcome) -> None:
+def _print_failure(outcome: Outcome) -> None:
     echo(f"{outcome_text(outcome)}", err=True)
     is_silent = outcome.result is Result.UNREACHABLE and FACTORY_ADDRESS in outcome.node
-    hint = outcome.hint or (SILENT_HINT if is_silent else "")
+    hint = outcome.hint or (NO_ANSWER_HINT if is_silent else "")
     if hint:
         echo(f"  hint: {hint}", err=True)
 
 
-def _spots(at: list[str], interfaces: list[str]) -> list[BenchPlace]:
+def _named_places(at: list[str], interfaces: list[str]) -> list[BenchPlace]:
     """The places that were named, each by an address or by an interface."""
     if at and interfaces:
         raise InputError("expected --at or --interface, found both")
@@ -137,10 +139,10 @@ def _spots(at: list[str], interfaces: list[str]) -> list[BenchPlace]:
     for name in interfaces:
         if name not in known:
             raise InputError(f"--interface {name}: there is none here, found {', '.join(sorted(known))}")
-    return [_place(text) for text in at] + [BenchPlace(interface=name) for name in interfaces]
+    return [_parse_place(text) for text in at] + [BenchPlace(interface=name) for name in interfaces]
 
 
-def _places(opened: Session, words: list[str], at: list[BenchPlace]) -> list[BenchPlace]:
+def _expected_places(opened: Session, words: list[str], at: list[BenchPlace]) -> list[BenchPlace]:
     """Who is expected where."""
     if opened.lab is not None and not at:
         known = set(opened.lab.node_names)
@@ -162,7 +164,7 @@ def _places(opened: Session, words: list[str], at: list[BenchPlace]) -> list[Ben
     return [with_changes(place, node=name) for place, name in zip(at, names, strict=True)]
 
 
-def _place(text: str) -> BenchPlace:
+def _parse_place(text: str) -> BenchPlace:
     """`HOST`, `HOST:PORT` or `[v6]:PORT`; a bare IPv6 address holds colons of its own."""
     host, colon, port = text.rpartition(":")
     if not colon or (text.count(":") > 1 and not text.startswith("[")):
@@ -197,12 +199,12 @@ def replace(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         node = find_node(opened.fleet, old)
         spare = _spare(opened, node, new)
-        spots = _spots([at] if at else [], [interface] if interface else []) or [BenchPlace()][: spare is None]
+        spots = _named_places([at] if at else [], [interface] if interface else []) or [BenchPlace()][: spare is None]
         place = with_changes(spots[0], node=node.name) if spots else None
         fleet = heir_of(opened.fleet, node, spare)
         opened = with_changes(opened, fleet=fleet, renderer=with_changes(opened.renderer, fleet=fleet))
         node = fleet.nodes[node.name]
-        with opened.interrupt.on_signals(complain):
+        with opened.interrupt.on_signals(echo_error):
             successor = succeed(
                 opened.renderer,
                 opened.access,
@@ -213,7 +215,7 @@ def replace(
                 interrupt=opened.interrupt,
             )
         if not as_json:
-            echo(_who_becomes_whom(node, spare, new, successor.arrivals.found.get(node.name)))
+            echo(_replacement_text(node, spare, new, successor.arrivals.found.get(node.name)))
         status = int(ExitCode.FINDINGS)
         try:
             prepared = plan_arrivals(
@@ -226,19 +228,19 @@ def replace(
                 choices=choices,
                 interrupt=opened.interrupt,
             )
-            ask_and_carry_out(opened, prepared, "replace", choices, yes=yes, as_json=as_json, brief=True, rate=rate)
+            confirm_and_execute(opened, prepared, "replace", choices, yes=yes, as_json=as_json, brief=True, rate=rate)
         except typer.Exit as ended:
             status = ended.exit_code
         finally:
             if status != ExitCode.OK:
                 give_up(opened.trust, node, successor)
         if status == ExitCode.OK:
-            changes = _learn_identity(opened, inventory, node, spare, successor.arrivals.found[node.name])
+            changes = _record_identity(opened, inventory, node, spare, successor.arrivals.found[node.name])
             echo("".join(change.diff() for change in changes), nl=False, err=as_json)
         raise typer.Exit(status)
 
 
-def _who_becomes_whom(node: Node, spare: Node | None, new: str, found: Found | None) -> str:
+def _replacement_text(node: Node, spare: Node | None, new: str, found: Found | None) -> str:
     """`spare2, found at 192.168.1.1, becomes husky1-b03 (10.42.0.13): its name, address and role; ...`."""
     there = f", found at {found.place.endpoint.label}," if found is not None else ""
     who = spare.name if spare is not None else f"the device on the {new}"
@@ -259,7 +261,7 @@ def _spare(opened: Session, old: Node, new: str) -> Node | None:
     return spare
 
 
-def _learn_identity(opened: Session, inventory: Path, node: Node, spare: Node | None, found: Found) -> Changes:
+def _record_identity(opened: Session, inventory: Path, node: Node, spare: Node | None, found: Found) -> Changes:
     """Into the inventory and the pins. Raises InputError that says what to write there, when it cannot be written."""
     mine, theirs = identity_edits(node, spare, found.seen)
     if spare is not None:

@@ -135,7 +135,7 @@ def _lab(directory: Path | None) -> tuple[LabFleet | None, Locate]:
     return virtual, locate
 
 
-def chosen(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[Node, ...]:
+def selected_nodes(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[Node, ...]:
     """The managed nodes that a name or pattern selects, in the inventory's order; all when none is given.
 
     Raises InputError for a pattern that selects nothing.
@@ -157,13 +157,13 @@ def chosen(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[Node, ...]:
 
 def progress_for(count: int, *, as_json: bool) -> Progress:
     """Live lines on a terminal, JSON lines for programs, plain lines elsewhere."""
-    from meshctl.report.progress import Aside, JsonProgress, LiveProgress, PlainProgress
+    from meshctl.report.progress import JsonProgress, LiveProgress, PlainProgress, ThreadedProgress
 
     if as_json:
-        return Aside(JsonProgress(sys.stdout))
+        return ThreadedProgress(JsonProgress(sys.stdout))
     if sys.stdout.isatty():
-        return Aside(LiveProgress(console(), count))
-    return Aside(PlainProgress(sys.stdout))
+        return ThreadedProgress(LiveProgress(console(), count))
+    return ThreadedProgress(PlainProgress(sys.stdout))
 
 
 def exit_for(outcomes: Iterable[Outcome], interrupt: Interrupt) -> ExitCode:
@@ -176,7 +176,7 @@ def exit_for(outcomes: Iterable[Outcome], interrupt: Interrupt) -> ExitCode:
     return ExitCode.UNREACHABLE if counted.none_reached else ExitCode.FINDINGS
 
 
-def must_agree(question: str) -> None:
+def confirm(question: str) -> None:
     """Return when the answer is yes.
 
     Raises InputError where nobody can be asked, typer.Exit when the answer is no, typer.Abort at Ctrl-C or the end of
@@ -204,7 +204,7 @@ def line_width(*, wide: bool = False) -> int | None:
     return shutil.get_terminal_size().columns
 
 
-def opening(
+def with_options(
     parameter: str, opener: Callable[..., AbstractContextManager[Any]], options: Options
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A command that takes `parameter` and options of its own becomes one that has these `options` besides: `opener` is

@@ -1,7 +1,7 @@
 """What `status`, `preflight` and `topology` share: a `Watcher` over everything, who is asked, and how wide to write.
 
 `watcher` opens the fleet and finds a way to its radios and robots, for a command `with_everybody` by its options;
-`glance` takes one look, with its progress told on a terminal.
+`glance` takes one snapshot, with its progress told on a terminal.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import InventoryPath, KeyFiles, Lab, Options, Session, opening, session
+from meshctl.cli.context import InventoryPath, KeyFiles, Lab, Options, Session, session, with_options
 from meshctl.cli.output import is_plain
 from meshctl.cli.robots_context import AskSudo, sudo_password
 from meshctl.device.connection import Deadlines
 from meshctl.model import Fleet, Node
-from meshctl.robots.connection import Reach
-from meshctl.status.assess import Look
-from meshctl.status.collect import Progress, Watcher
+from meshctl.robots.connection import RobotConnector
+from meshctl.status.assess import Snapshot
+from meshctl.status.collect import Collector, Progress
 from meshctl.status.table import Paint, plain
 
 # A look wants to be quick: in this time TCP asks three times (RFC 6298: after 1 and 3 s), and a mesh that answers at
@@ -40,7 +40,7 @@ Timeout = Annotated[
 ]
 NoRobots = Annotated[bool, typer.Option("--no-robots", help="Ask the radios alone, not the robots' computers.")]
 
-# Of commands that look: the options by which `watcher` opens everybody.
+# Of commands that look: the options by which `watcher` opens fleet_view.
 _SHARED: Options = {
     "inventory": (InventoryPath, Path()),
     "no_robots": (NoRobots, False),
@@ -63,11 +63,11 @@ _COLOURS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Everybody:
+class FleetView:
     """A fleet opened for looking, and who is in it: its managed radios, its robots with a computer we can reach."""
 
     opened: Session
-    watcher: Watcher
+    watcher: Collector
     nodes: tuple[Node, ...]
     robots: tuple[str, ...]
 
@@ -77,7 +77,7 @@ class Everybody:
 
 
 @contextmanager
-def watcher(
+def open_fleet_view(
     inventory: Path,
     *,
     key: Iterable[Path] | None,
@@ -85,22 +85,22 @@ def watcher(
     timeout: float = CONNECT_S,
     ask_sudo: bool = False,
     no_robots: bool = False,
-) -> Iterator[Everybody]:
+) -> Iterator[FleetView]:
     """Open all of it, and close it in the end. Raises InvalidInput, InputError, MeshctlError."""
     password = None if no_robots else sudo_password(ask_sudo)
     with session(inventory, key_files=key or (), lab=lab) as opened:
         opened.access.deadlines = _deadlines(timeout)
-        robots, unasked = _robots(opened, not no_robots)
-        reach = Reach(opened.fleet, opened.access, lambda: password) if robots else None
-        with Watcher(
-            opened.fleet, opened.renderer, opened.access, opened.journal, opened.owner, reach, unasked
+        robots, skipped = _robots(opened, not no_robots)
+        connector = RobotConnector(opened.fleet, opened.access, lambda: password) if robots else None
+        with Collector(
+            opened.fleet, opened.renderer, opened.access, opened.journal, opened.owner, connector, skipped
         ) as watching:
-            yield Everybody(opened, watching, tuple(opened.fleet.managed()), robots)
+            yield FleetView(opened, watching, tuple(opened.fleet.managed()), robots)
 
 
-def with_everybody(command: Callable[..., None]) -> Callable[..., None]:
+def with_fleet_view(command: Callable[..., None]) -> Callable[..., None]:
     """A command that takes `everybody` and options of its own becomes one that has those of looking, and opens them."""
-    return opening("everybody", watcher, _SHARED)(command)
+    return with_options("fleet_view", open_fleet_view, _SHARED)(command)
 
 
 def _deadlines(connect_s: float) -> Deadlines:
@@ -122,24 +122,24 @@ def _robots(opened: Session, with_robots: bool) -> tuple[tuple[str, ...], str]:
     return (), "the robots' computers were not asked: with --lab only one of which the inventory gives ssh.host is"
 
 
-def glance(
-    everybody: Everybody,
+def collect(
+    fleet_view: FleetView,
     nodes: Iterable[Node] | None = None,
     robots: Iterable[str] | None = None,
     *,
-    is_told: bool = True,
-) -> Look:
-    """One look at these (default: everybody); `is_told` is how far it is, where the terminal is not a page's."""
-    return everybody.watcher.look(
-        everybody.nodes if nodes is None else nodes,
-        everybody.robots if robots is None else robots,
-        _progress(is_told=is_told),
+    show_progress: bool = True,
+) -> Snapshot:
+    """One look at these (default: fleet_view); `show_progress` is how far it is, where the terminal is not a page's."""
+    return fleet_view.watcher.collect(
+        fleet_view.nodes if nodes is None else nodes,
+        fleet_view.robots if robots is None else robots,
+        _progress(show_progress=show_progress),
     )
 
 
-def _progress(*, is_told: bool) -> Progress:
+def _progress(*, show_progress: bool) -> Progress:
     """A line that counts up on a terminal, and is gone in the end."""
-    if not (is_told and sys.stderr.isatty()):
+    if not (show_progress and sys.stderr.isatty()):
         return lambda done, count: None
 
     def tell(done: int, count: int) -> None:

@@ -24,12 +24,12 @@ _GIT_TIMEOUT_S = 120
 
 
 @dataclass(frozen=True, slots=True)
-class OpenedInventory:
+class InventoryCheckout:
     """`path` can be read while the context of `opened` lasts; messages say `shown` in place of `root`."""
 
     path: Path
     root: str = ""
-    shown: str = ""
+    label: str = ""
 
     def fleet(self) -> Fleet:
         """The fleet. Raises InvalidInput, whose places name the revision."""
@@ -39,17 +39,17 @@ class OpenedInventory:
             if not self.root:
                 raise
             raise InvalidInput(
-                replace(item, position=replace(item.position, file=item.position.file.replace(self.root, self.shown)))
+                replace(item, position=replace(item.position, file=item.position.file.replace(self.root, self.label)))
                 for item in error.diagnostics
             ) from error
 
 
 @contextmanager
-def opened(argument: str) -> Iterator[OpenedInventory]:
+def checkout(argument: str) -> Iterator[InventoryCheckout]:
     """The inventory that `argument` names: what exists as a path is one. Raises InputError when there is none."""
     revision, colon, path = argument.partition(":")
     if Path(argument).exists() or not colon:
-        yield OpenedInventory(Path(argument))
+        yield InventoryCheckout(Path(argument))
         return
     with tempfile.TemporaryDirectory(prefix="meshctl-diff-") as folder:
         tree = Path(folder) / "tree"
@@ -66,7 +66,7 @@ def opened(argument: str) -> Iterator[OpenedInventory]:
         inside = Path(os.path.normpath(tree / prefix / path))
         if not inside.exists() or not inside.is_relative_to(tree):
             raise InputError(f"{argument}: expected a file or directory of {revision}, found none")
-        yield OpenedInventory(inside, f"{tree}/", f"{revision}:")
+        yield InventoryCheckout(inside, f"{tree}/", f"{revision}:")
 
 
 def _git(*arguments: str, environ: dict[str, str]) -> str:

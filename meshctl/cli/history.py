@@ -33,26 +33,26 @@ def history(
     """
     with Journal(default_path(os.environ)) as journal:
         if run is None:
-            _list_runs(journal, _Wanted(node, fleet, lab), limit, as_json=as_json)
+            _list_runs(journal, _RunFilter(node, fleet, lab), limit, as_json=as_json)
         else:
             _show_run(journal, run, node, as_json=as_json)
 
 
 @dataclass(frozen=True, slots=True)
-class _Wanted:
+class _RunFilter:
     """Which runs are listed; None does not choose."""
 
     node: str | None
     fleet: str | None
     is_virtual: bool | None
 
-    def takes(self, record: RunRecord) -> bool:
+    def matches(self, record: RunRecord) -> bool:
         return self.fleet in (None, record.fleet) and self.is_virtual in (None, bool(record.lab))
 
 
-def _list_runs(journal: Journal, wanted: _Wanted, limit: int, *, as_json: bool) -> None:
+def _list_runs(journal: Journal, wanted: _RunFilter, limit: int, *, as_json: bool) -> None:
     found = journal.runs(node=wanted.node, limit=None)
-    records = tuple(islice((record for record in found if wanted.takes(record)), limit))
+    records = tuple(islice((record for record in found if wanted.matches(record)), limit))
     if as_json:
         echo_json(json.dumps([_run_object(record) for record in records], indent=1))
         return

@@ -77,7 +77,7 @@ def lint(
     Example: meshctl lint inventory/ --format sarif --out lint.sarif
     """
     if explain is not None:
-        echo(_explained(explain), nl=False)
+        echo(_rule_page(explain), nl=False)
         return
     if list_rules:
         for rule in RULES:
@@ -85,7 +85,7 @@ def lint(
         return
     if write_baseline and baseline is None:
         raise InputError("--write-baseline needs --baseline FILE, the file to write")
-    rules = chosen(select or (), ignore or ())
+    rules = selected_rules(select or (), ignore or ())
     database = load(regdb)
     if regdb is None and database.source == str(SHIPPED):
         echo(f"note: no regulatory database on this machine, using the shipped {shipped_version()}", err=True)
@@ -94,7 +94,7 @@ def lint(
     if files:
         targets = tuple(inventories_of(given))
     examined = [check_path(path, database, os.environ, rules) for path in targets]
-    findings = gathered(examined)
+    findings = merge_results(examined)
     if select:
         findings = _selected(findings, _prefixes(select, (*BY_CODE, *MEANINGS)))
     if write_baseline and baseline is not None:
@@ -128,7 +128,7 @@ def inventories_of(files: Iterable[Path]) -> Iterator[Path]:
     yield from found.values()
 
 
-def chosen(select: Iterable[str], ignore: Iterable[str]) -> tuple[Rule, ...]:
+def selected_rules(select: Iterable[str], ignore: Iterable[str]) -> tuple[Rule, ...]:
     """The rules whose code starts with a selected prefix (all without one) and with no ignored one.
 
     Prefixes may be joined by commas. Raises InputError for one that no rule has.
@@ -161,7 +161,7 @@ def _selected(findings: Findings, prefixes: tuple[str, ...]) -> Findings:
     return replace(findings, diagnostics=kept)
 
 
-def gathered(examined: Iterable[Examined]) -> Findings:
+def merge_results(examined: Iterable[Examined]) -> Findings:
     """What several inventories gave, as one; a file that two of them include is reported once."""
     parts = list(examined)
     sources = {file: text for part in parts for file, text in part.sources.items()}
@@ -184,7 +184,7 @@ def _write(path: Path, text: str) -> None:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def _explained(code: str) -> str:
+def _rule_page(code: str) -> str:
     wanted = code.strip().upper()
     if wanted in MEANINGS:
         return f"# {wanted}\n\n{MEANINGS[wanted]}\n"

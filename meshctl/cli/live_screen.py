@@ -32,12 +32,12 @@ _REDRAW_S = 1.0
 
 
 @dataclass(slots=True)
-class _Looks(Generic[T]):
+class _Refresher(Generic[T]):
     """The background's side: the latest value, or what went wrong; `bell` is written to when there is something new."""
 
-    take: Callable[[], T]
+    refresh: Callable[[], T]
     period_s: float
-    bell: int
+    wakeup_fd: int
     latest: T | None = None
     failure: BaseException | None = None
     _end: threading.Event = field(default_factory=threading.Event)
@@ -46,12 +46,12 @@ class _Looks(Generic[T]):
         while not self._end.is_set():
             began = time.monotonic()
             try:
-                self.latest = self.take()
+                self.latest = self.refresh()
             except BaseException as error:  # noqa: BLE001 - raised again in the main thread
                 self.failure = error
             if self._end.is_set():
                 return
-            _ring(self.bell)
+            _wake(self.wakeup_fd)
             if self.failure is not None:
                 return
             self._end.wait(max(0.0, self.period_s - (time.monotonic() - began)))
@@ -60,7 +60,7 @@ class _Looks(Generic[T]):
         self._end.set()
 
 
-def live(
+def live_screen(
     take: Callable[[], T],
     draw: Callable[[T | None, os.terminal_size], list[str]],
     period_s: float,
@@ -70,13 +70,13 @@ def live(
     """Draw what `take` gives every `period_s`, until Ctrl-C; returns the latest. `draw` gets it (None before the first)
     and the window's size, and gives lines. Raises what `take` raises."""
     reader, writer = os.pipe2(os.O_NONBLOCK)
-    looks = _Looks(take, period_s, writer)
+    looks = _Refresher(take, period_s, writer)
     thread = threading.Thread(target=looks.run, name="looks", daemon=True)
     try:
         with _screen(out, writer) as screen:
             thread.start()
             while looks.failure is None:
-                screen.give_and_take()
+                screen.handle_suspend()
                 _draw(draw, looks.latest, out, size())
                 ready, _, _ = select.select([reader], [], [], _REDRAW_S)
                 if ready:
@@ -92,7 +92,7 @@ def live(
     return looks.latest
 
 
-def _ring(bell: int) -> None:
+def _wake(bell: int) -> None:
     try:
         os.write(bell, b"!")
     except BlockingIOError:
@@ -122,7 +122,7 @@ class _Screen:
     """The terminal's other screen. `is_stopping`: Ctrl-Z was pressed; `is_resumed`: somebody else may have drawn."""
 
     out: TextIO
-    is_stopping: bool = False
+    is_suspend_requested: bool = False
     is_resumed: bool = False
 
     def enter(self) -> None:
@@ -132,10 +132,10 @@ class _Screen:
         self.out.write(_LEAVE)
         self.out.flush()
 
-    def give_and_take(self) -> None:
+    def handle_suspend(self) -> None:
         """Gives the terminal back for as long as the process is stopped, and takes it again."""
-        if self.is_stopping:
-            self.is_stopping = False
+        if self.is_suspend_requested:
+            self.is_suspend_requested = False
             self.leave()
             handler = signal.signal(signal.SIGTSTP, signal.SIG_DFL)
             # returns when somebody lets us go on; at once where nobody could, as in a session of our own (POSIX.1,
@@ -154,18 +154,18 @@ def _screen(out: TextIO, bell: int) -> Iterator[_Screen]:
     screen = _Screen(out)
 
     def resized(number: int, frame: FrameType | None) -> None:
-        _ring(bell)
+        _wake(bell)
 
     def ended(number: int, frame: FrameType | None) -> None:
         raise SystemExit(128 + number)
 
     def stopped(number: int, frame: FrameType | None) -> None:
-        screen.is_stopping = True
-        _ring(bell)
+        screen.is_suspend_requested = True
+        _wake(bell)
 
     def resumed(number: int, frame: FrameType | None) -> None:
         screen.is_resumed = True
-        _ring(bell)
+        _wake(bell)
 
     handlers = {
         signal.SIGWINCH: resized,

@@ -19,7 +19,7 @@ from typer.core import DEFAULT_MARKUP_MODE
 from meshctl import __version__
 from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.cli.extensions import load
-from meshctl.cli.output import echo, is_plain, prepare_streams, unheard
+from meshctl.cli.output import echo, ignore_broken_pipe, is_plain, prepare_streams
 from meshctl.errors import ExitCode, MeshctlError
 
 _EPILOG = """Start with `meshctl init DIR`, or `meshctl lab up` for a virtual fleet to practise on.
@@ -58,7 +58,7 @@ def build(meant: str) -> typer.Typer:
         if name == meant:
             _register(app, name, entry)
         else:
-            app.command(name, help=entry.summary, rich_help_panel=entry.panel)(_not_meant)
+            app.command(name, help=entry.summary, rich_help_panel=entry.panel)(_placeholder)
     return app
 
 
@@ -77,7 +77,7 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
-def _not_meant() -> None:
+def _placeholder() -> None:
     raise AssertionError("a command that was not named was called")
 
 
@@ -117,7 +117,7 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
             raise typer.Exit(int(ExitCode.INTERRUPTED)) from None
         except BrokenPipeError:
             # the reader (`| head`) has seen enough
-            with unheard():
+            with ignore_broken_pipe():
                 raise
             raise typer.Exit from None
 

@@ -31,7 +31,7 @@ def echo_json(text: str, *, err: bool = False, nl: bool = True) -> None:
     typer.echo(json_safe(text), err=err, nl=nl)
 
 
-def complain(text: str) -> None:
+def echo_error(text: str) -> None:
     """Print text on standard error."""
     echo(text, err=True)
 
@@ -62,7 +62,7 @@ def prepare_streams() -> None:
 
 
 @contextmanager
-def unheard() -> Iterator[None]:
+def ignore_broken_pipe() -> Iterator[None]:
     """Within this block a write that fails (EPIPE, EIO) is the last that is tried."""
     try:
         yield

@@ -15,11 +15,11 @@ from meshctl.apply.prepare import Choices
 from meshctl.apply.resume import settled
 from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Nodes, Session, session
 from meshctl.cli.journaled_run import (
-    ask_and_carry_out,
-    carry_out_plan,
-    checked,
     choices_of,
-    prepared_for,
+    confirm_and_execute,
+    execute_plan,
+    prepare_plan,
+    report_check,
     show,
     write_text,
 )
@@ -61,7 +61,7 @@ def plan(
     """
     choices = choices_of(no_firmware, leave_behind, accept_cut)
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        prepared = prepared_for(opened, nodes, choices)
+        prepared = prepare_plan(opened, nodes, choices)
         saved = SavedPlan(prepared.plan, prepared.salt, str(inventory), choices.with_firmware)
         if out is not None:
             write_text(out, dump(saved))
@@ -94,9 +94,9 @@ def apply(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         if saved.plan.fleet != opened.fleet.name:
             raise InputError(f"{plan_file}: a plan for fleet {saved.plan.fleet}, the inventory is {opened.fleet.name}")
-        fresh = prepared_for(opened, list(saved.plan.nodes), Choices(saved.with_firmware), saved.salt)
+        fresh = prepare_plan(opened, list(saved.plan.nodes), Choices(saved.with_firmware), saved.salt)
         agreed = replace(fresh, plan=as_agreed(saved.plan, fresh.plan))
-        carry_out_plan(opened, agreed, "apply", saved.with_firmware, as_json=as_json, rate=rate)
+        execute_plan(opened, agreed, "apply", saved.with_firmware, as_json=as_json, rate=rate)
 
 
 def provision(
@@ -119,10 +119,10 @@ def provision(
     """
     choices = choices_of(no_firmware, leave_behind, accept_cut)
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        prepared = prepared_for(opened, nodes, choices)
+        prepared = prepare_plan(opened, nodes, choices)
         if check:
-            raise typer.Exit(checked(prepared.plan, opened.fleet, as_json=as_json, brief=brief))
-        ask_and_carry_out(opened, prepared, "provision", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
+            raise typer.Exit(report_check(prepared.plan, opened.fleet, as_json=as_json, brief=brief))
+        confirm_and_execute(opened, prepared, "provision", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
 
 
 def resume(
@@ -144,9 +144,9 @@ def resume(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         record, left = _to_resume(opened.journal, opened.fleet.name, run)
         if record.command.startswith("robots "):
-            from meshctl.cli.robots_context import take_up
+            from meshctl.cli.robots_context import resume_run
 
-            raise take_up(opened, inventory, record, as_json=as_json)
+            raise resume_run(opened, inventory, record, as_json=as_json)
         if record.command == "restore":
             hint = f"`meshctl restore {' '.join(left)} FILE` again, or `meshctl provision` for what the inventory says"
             raise InputError(f"run {record.id} put a backup back, which the inventory does not know", hint=hint)
@@ -163,13 +163,13 @@ def resume(
             (*told.get("leave_behind", ()), *added.leave_behind),
             (*told.get("accept_cuts", ()), *added.accept_cuts),
         )
-        prepared = prepared_for(opened, names, choices)
+        prepared = prepare_plan(opened, names, choices)
         for line in bench_advice(record, prepared.plan):
             echo(line, err=True)
         for name, text in settled(record.id, opened.journal.outcomes(record.id), prepared).items():
             line = json.dumps({"event": "note", "node": name, "at_s": round(time.time(), 3), "text": text})
             echo(line if as_json else f"{name}: {text}")
-        ask_and_carry_out(opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
+        confirm_and_execute(opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
 
 
 def bench_advice(record: RunRecord, plan: Plan) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.cli.context import AsJson, InventoryPath
-from meshctl.cli.git_revision import opened
+from meshctl.cli.git_revision import checkout
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory import load_fleet
@@ -49,7 +49,7 @@ def render(
     """
     fleet = load_fleet(inventory, environ=os.environ)
     # all of them before anything is written: a fleet is rendered whole or not at all
-    rendered = render_nodes(fleet, _chosen(fleet, nodes or []), _secrets(fleet))
+    rendered = render_nodes(fleet, _selected_names(fleet, nodes or []), _secrets(fleet))
     folders = {item.node: write_node(item, out) for item in rendered} if out is not None else {}
     builds = (
         [(item, _write_build(item, imagebuilder)) for item in image_folders(fleet, rendered)] if imagebuilder else []
@@ -84,7 +84,7 @@ def _secrets(fleet: Fleet) -> Callable[[SecretRef], Secret]:
     return lambda ref: store.get(ref)
 
 
-def _chosen(fleet: Fleet, patterns: Iterable[str]) -> list[str]:
+def _selected_names(fleet: Fleet, patterns: Iterable[str]) -> list[str]:
     """The nodes that any pattern names, in the inventory's order. Raises InputError for one that names none."""
     wanted = list(patterns)
     if not wanted:
@@ -147,7 +147,7 @@ def diff(
 
     Example: meshctl diff HEAD~1:inventory/subt-final inventory/subt-final
     """
-    with opened(before) as old, opened(str(inventory) if after is None else after) as new:
+    with checkout(before) as old, checkout(str(inventory) if after is None else after) as new:
         differences = list(compare_fleets(old.fleet(), new.fleet()))
     if as_json:
         echo_json(json.dumps({"nodes": [_as_json(item) for item in differences]}, indent=2, ensure_ascii=False))

@@ -16,14 +16,14 @@ import typer
 import yaml
 
 from meshctl.cli.output import echo
-from meshctl.cli.robots_context import Crew, begin, end, with_crew
+from meshctl.cli.robots_context import RobotsContext, print_totals, run_command, with_robots_context
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, totals
 from meshctl.inventory import load_fleet
 from meshctl.inventory.edit import Change, Editor, add_topic, remove_topic, save, set_topic
 from meshctl.inventory.yaml_text import Value
 from meshctl.model import SecretRef
-from meshctl.robots.key_rotation import parse_ref, stages, written
+from meshctl.robots.key_rotation import inventory_value, parse_ref, rotation_stages
 
 topic_app = typer.Typer(help="Topics: in the inventory and on all robots at once.", no_args_is_help=True)
 
@@ -37,35 +37,35 @@ _SHARED = ("inventory", "wheels", "wait_s", "ask_sudo", "as_json", "key")
 
 
 @topic_app.command("add")
-@with_crew(*_SHARED)
-def topic_add(crew: Crew, topic: Topic, values: Assignments) -> None:
+@with_robots_context(*_SHARED)
+def topic_add(context: RobotsContext, topic: Topic, values: Assignments) -> None:
     """Add a topic to the inventory and to every running daemon, without a restart.
 
     Example: meshctl robots topic add video priority=9 reliable=false destinations=[base-station]
     """
     fields = _fields(values)
-    _change_topics(crew, topic, lambda editor: add_topic(editor, topic, fields))
+    _change_topics(context, topic, lambda editor: add_topic(editor, topic, fields))
 
 
 @topic_app.command("set")
-@with_crew(*_SHARED)
-def topic_set(crew: Crew, topic: Topic, values: Assignments) -> None:
+@with_robots_context(*_SHARED)
+def topic_set(context: RobotsContext, topic: Topic, values: Assignments) -> None:
     """Change a topic in the inventory and in every running daemon, without a restart.
 
     Example: meshctl robots topic set video priority=12
     """
     fields = _fields(values)
-    _change_topics(crew, topic, lambda editor: set_topic(editor, topic, fields))
+    _change_topics(context, topic, lambda editor: set_topic(editor, topic, fields))
 
 
 @topic_app.command("rm")
-@with_crew(*_SHARED)
-def topic_rm(crew: Crew, topic: Topic) -> None:
+@with_robots_context(*_SHARED)
+def topic_rm(context: RobotsContext, topic: Topic) -> None:
     """Take a topic out of the inventory and out of every running daemon, without a restart.
 
     Example: meshctl robots topic rm video
     """
-    _change_topics(crew, topic, lambda editor: remove_topic(editor, topic))
+    _change_topics(context, topic, lambda editor: remove_topic(editor, topic))
 
 
 def _fields(assignments: list[str]) -> dict[str, Value]:
@@ -88,26 +88,26 @@ def _fields(assignments: list[str]) -> dict[str, Value]:
     return fields
 
 
-def _change_topics(crew: Crew, topic: str, edit: Callable[[Editor], None]) -> None:
-    changed, changes = _edited(crew, edit)
-    if not crew.as_json:
+def _change_topics(context: RobotsContext, topic: str, edit: Callable[[Editor], None]) -> None:
+    changed, changes = _edited(context, edit)
+    if not context.as_json:
         for change in changes:
             echo(change.diff(), nl=False)
-    outcomes = begin(changed, "topic", topic=topic)
+    outcomes = run_command(changed, "topic", topic=topic)
     if not any(outcome.result.is_good for outcome in outcomes.values()):
         _undo(changes)
         echo("no robot took the change, so the inventory is as it was", err=True)
-    raise end(changed, outcomes)
+    raise print_totals(changed, outcomes)
 
 
-def _edited(crew: Crew, edit: Callable[[Editor], None]) -> tuple[Crew, tuple[Change, ...]]:
-    """The inventory edited, checked and saved, and the crew under it."""
-    editor = Editor.open(crew.inventory, environ=os.environ)
+def _edited(context: RobotsContext, edit: Callable[[Editor], None]) -> tuple[RobotsContext, tuple[Change, ...]]:
+    """The inventory edited, checked and saved, and the context under it."""
+    editor = Editor.open(context.inventory, environ=os.environ)
     edit(editor)
     changes = editor.changes()
     save(changes)
     try:
-        return crew.at(load_fleet(crew.inventory, environ=os.environ), only_configuration=True), changes
+        return context.with_fleet(load_fleet(context.inventory, environ=os.environ), only_configuration=True), changes
     except InputError:
         # what loads, but no daemon would take
         _undo(changes)
@@ -118,9 +118,9 @@ def _undo(changes: tuple[Change, ...]) -> None:
     save(tuple(Change(change.file, change.after, change.before) for change in changes))
 
 
-@with_crew(*_SHARED)
+@with_robots_context(*_SHARED)
 def rotate_key_command(
-    crew: Crew,
+    context: RobotsContext,
     new_key: Annotated[
         str,
         typer.Argument(
@@ -136,20 +136,20 @@ def rotate_key_command(
 
     Example: meshctl robots rotate-key file:secrets.yaml#udp_mesh_2027
     """
-    todo = stages(crew.fleet.udp_mesh.keys, parse_ref(new_key))
+    todo = rotation_stages(context.fleet.udp_mesh.keys, parse_ref(new_key))
     outcomes: dict[str, Outcome] = {}
     for number, stage in enumerate(todo, start=1):
-        if not crew.as_json:
+        if not context.as_json:
             echo(f"step {number} of {len(todo)}: {stage.title}")
-        crew, _ = _edited(crew, partial(_set_keys, keys=stage.keys))
-        outcomes = begin(crew, "rotate-key", new_key=new_key)
+        context, _ = _edited(context, partial(_set_keys, keys=stage.keys))
+        outcomes = run_command(context, "rotate-key", new_key=new_key)
         if not totals(outcomes.values()).all_good:
             late = ", ".join(name for name, outcome in outcomes.items() if not outcome.result.is_good)
             echo(f"stopped before the next step, nothing is cut off: {late} did not take this one", err=True)
             echo("run the same command again once they can be reached", err=True)
             break
-    raise end(crew, outcomes)
+    raise print_totals(context, outcomes)
 
 
 def _set_keys(editor: Editor, keys: tuple[SecretRef, ...]) -> None:
-    editor.set(("udp_mesh", "keys"), [written(key) for key in keys])
+    editor.set(("udp_mesh", "keys"), [inventory_value(key) for key in keys])

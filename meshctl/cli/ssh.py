@@ -14,8 +14,8 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Nodes, Session, chosen, exit_for, session
-from meshctl.cli.output import complain, echo, echo_bytes, echo_json
+from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Nodes, Session, exit_for, selected_nodes, session
+from meshctl.cli.output import echo, echo_bytes, echo_error, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet import run as run_on_all
@@ -42,13 +42,13 @@ def trust(
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
         shown = shown_keys(
-            opened.access, opened.trust, chosen(opened.fleet, nodes), parallel=opened.fleet.apply.parallel
+            opened.access, opened.trust, selected_nodes(opened.fleet, nodes), parallel=opened.fleet.apply.parallel
         )
         if as_json:
             echo_json(json.dumps([_key_object(item) for item in shown], indent=1))
         left = 0
         for item in shown:
-            left += not _decide(opened, item, may_replace=change, yes=yes, quiet=as_json)
+            left += not _pin_key(opened, item, may_replace=change, yes=yes, quiet=as_json)
         if left:
             silent = all(item.key is None for item in shown)
             raise typer.Exit(ExitCode.UNREACHABLE if silent else ExitCode.FINDINGS)
@@ -63,7 +63,7 @@ def _key_object(item: Shown) -> dict[str, str]:
     }
 
 
-def _decide(opened: Session, item: Shown, *, may_replace: bool, yes: bool, quiet: bool) -> bool:
+def _pin_key(opened: Session, item: Shown, *, may_replace: bool, yes: bool, quiet: bool) -> bool:
     """Tell, ask, pin; whether the node's key is pinned in the end."""
 
     def say(text: str) -> None:
@@ -127,7 +127,7 @@ def run(
         raise InputError("expected --raw or --json, found both")
     patterns, command = _split(words)
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        wanted = {node.name: node for node in chosen(opened.fleet, patterns)}
+        wanted = {node.name: node for node in selected_nodes(opened.fleet, patterns)}
         out = threading.Lock()
 
         def work(name: str) -> Outcome:
@@ -145,7 +145,7 @@ def run(
                 name, result, "" if done.exit_status == 0 else f"exit status {done.exit_status}", facts=facts
             )
 
-        with opened.interrupt.on_signals(complain):
+        with opened.interrupt.on_signals(echo_error):
             ended = run_on_all(wanted, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt)
         for outcome in ended.values():
             if not outcome.result.is_good and "exit_status" not in outcome.facts:
@@ -207,7 +207,7 @@ def ssh(
     if program is None:
         raise InputError("there is no ssh on this machine", hint="install openssh-client")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        (there,) = chosen(opened.fleet, [node])[:1]
+        (there,) = selected_nodes(opened.fleet, [node])[:1]
         arguments = ssh_arguments(opened, there)
     os.execv(program, [*arguments, *([shell_words(command)] if command else [])])
 

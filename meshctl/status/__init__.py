@@ -6,7 +6,7 @@
 
 from meshctl.status.assess import assess
 from meshctl.status.preflight import Check, preflight
-from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbour, NodeStatus, RobotStatus
+from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbor, NodeStatus, RobotStatus
 
 __all__ = [
     "Alarm",
@@ -14,7 +14,7 @@ __all__ = [
     "FleetStatus",
     "Health",
     "Level",
-    "Neighbour",
+    "Neighbor",
     "NodeStatus",
     "RobotStatus",
     "assess",

@@ -20,9 +20,9 @@ _NUMBERS = frozenset({"uptime_s", "load", "memory_free", "quality", "clock_offse
 _LISTS = frozenset({"macs", "neighbours", "heard", "channels", "lan_ports", "online", "relays"})
 
 
-def facts_to_keep(status: FleetStatus) -> dict[str, dict[str, str]]:
+def facts_to_record(status: FleetStatus) -> dict[str, dict[str, str]]:
     """By the journal's name: what everybody who answered told."""
-    kept = {f"{NODE_PREFIX}{node.name}": node_facts(node) for node in status.nodes if not node.silent_because}
+    kept = {f"{NODE_PREFIX}{node.name}": node_facts(node) for node in status.nodes if not node.no_answer_reason}
     kept |= {f"{ROBOT_PREFIX}{robot.name}": robot_facts(robot) for robot in status.robots if robot.facts is not None}
     return kept
 
@@ -43,7 +43,7 @@ def node_facts(node: NodeStatus) -> dict[str, str]:
         "quality": _number(node.quality),
         "via": node.via,
         "relays": " ".join(node.relays),
-        "heard": " ".join(neighbour.name for neighbour in node.neighbours[:_NEIGHBOURS_KEPT]),
+        "heard": " ".join(neighbour.name for neighbour in node.neighbors[:_NEIGHBOURS_KEPT]),
     }
     return {name: value for name, value in facts.items() if value}
 
@@ -73,7 +73,7 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:d}" if isinstance(value, int) else f"{value:.4g}"
 
 
-def remembered(known: Mapping[str, LastKnown]) -> dict[str, LastKnown]:
+def merge_by_device(known: Mapping[str, LastKnown]) -> dict[str, LastKnown]:
     """By node, and by `robot.NAME`: everything kept of it, with the time of the latest sighting."""
     found: dict[str, LastKnown] = {}
     for key, last in known.items():

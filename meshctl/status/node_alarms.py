@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from meshctl.device.observation import Observation
 from meshctl.model import Fleet, Node, NodeState, Role
 from meshctl.plan import NodePlan, Verdict
-from meshctl.status.values import Alarm, Level, Neighbour
+from meshctl.status.values import Alarm, Level, Neighbor
 from meshctl.topology import Path
 
 # below this the path loses more than it carries: move a beacon
@@ -29,18 +29,18 @@ CLOCK_TOLERANCE_S = 3600.0
 
 # how iw names the modes that a mesh runs in
 MESH_MODES = ("ibss", "mesh point")
-NAMES_IN_A_SENTENCE = 6
+MAX_NAMES = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class NodeAlarmInput:
     """Everything known about one node that answers."""
 
     fleet: Fleet
     node: Node
     observation: Observation
     plan: NodePlan | None
-    neighbours: tuple[Neighbour, ...]
+    neighbors: tuple[Neighbor, ...]
     path: Path | None
     is_path_known: bool
     """Whether enough was asked to tell its path."""
@@ -58,13 +58,13 @@ class Seen:
         return self.node.state is NodeState.DEPLOYED and any(n.state is NodeState.DEPLOYED for n in others)
 
 
-def alarms(seen: Seen) -> tuple[Alarm, ...]:
+def alarms(seen: NodeAlarmInput) -> tuple[Alarm, ...]:
     """All alarms of a node, the worst first."""
     found = [alarm for concern in _CONCERNS for alarm in concern(seen)]
     return tuple(sorted(found, key=lambda alarm: -alarm.level))
 
 
-def _identity(seen: Seen) -> Iterator[Alarm]:
+def _identity(seen: NodeAlarmInput) -> Iterator[Alarm]:
     board = seen.observation.board
     if board is not None and board.board_name and board.board_name != seen.node.hardware.board:
         told = f"is a {board.board_name}, the inventory says {seen.node.hardware.board}"
@@ -72,7 +72,7 @@ def _identity(seen: Seen) -> Iterator[Alarm]:
         yield Alarm(Level.ERROR, "board", told, hint)
 
 
-def _drift(seen: Seen) -> Iterator[Alarm]:
+def _drift(seen: NodeAlarmInput) -> Iterator[Alarm]:
     plan, name = seen.plan, seen.node.name
     if plan is None:
         return
@@ -90,7 +90,7 @@ def _drift(seen: Seen) -> Iterator[Alarm]:
         yield Alarm(Level.WARNING, "drift", f"configuration differs: {names}", hint)
 
 
-def _radios(seen: Seen) -> Iterator[Alarm]:
+def _radios(seen: NodeAlarmInput) -> Iterator[Alarm]:
     wanted = {radio.name for radio in seen.node.radios if radio.mesh is not None}
     for radio in seen.observation.radios or ():
         if radio.name in wanted and (not radio.up or radio.setup_failed):
@@ -110,8 +110,8 @@ def _radios(seen: Seen) -> Iterator[Alarm]:
             yield Alarm(Level.ERROR, "channel", told, f"meshctl plan {seen.node.name}")
 
 
-def _mesh(seen: Seen) -> Iterator[Alarm]:
-    if seen.must_mesh and not seen.neighbours:
+def _mesh(seen: NodeAlarmInput) -> Iterator[Alarm]:
+    if seen.must_mesh and not seen.neighbors:
         yield Alarm(Level.ERROR, "alone", "hears no other node", "antennas, distance, and whether its channel is free")
     elif seen.must_mesh and seen.path is None and seen.is_path_known:
         told = "no path through the mesh leads from it to the base"
@@ -121,17 +121,17 @@ def _mesh(seen: Seen) -> Iterator[Alarm]:
         told = f"path to the base carries {seen.path.quality:.0%} over {hops}"
         yield Alarm(Level.WARNING, "weak", told, f"drop a beacon between {seen.node.name} and {seen.path.via}")
     if seen.cuts_off and seen.node.state is NodeState.DEPLOYED:
-        yield Alarm(Level.NOTE, "cut-vertex", f"without it {some(seen.cuts_off)} would be cut off")
+        yield Alarm(Level.NOTE, "cut-vertex", f"without it {join_limited(seen.cuts_off)} would be cut off")
 
 
-def _dropped(seen: Seen) -> Iterator[Alarm]:
+def _dropped(seen: NodeAlarmInput) -> Iterator[Alarm]:
     """A beacon that the inventory has in a rack, and that others need where it is."""
     if seen.node.state is NodeState.CARRIED and seen.node.role is Role.BEACON and seen.relays:
-        text = f"carried by the inventory, and the way from {some(seen.relays)} to the base leads through it"
+        text = f"carried by the inventory, and the way from {join_limited(seen.relays)} to the base leads through it"
         yield Alarm(Level.NOTE, "dropped", text, f"if it has been dropped: meshctl deployed {seen.node.name}")
 
 
-def _bridge(seen: Seen) -> Iterator[Alarm]:
+def _bridge(seen: NodeAlarmInput) -> Iterator[Alarm]:
     """A radio whose bridge lacks a LAN port, or the mesh, carries nothing for the computer beside it."""
     bridges = seen.observation.bridges
     if bridges is None or not seen.node.meshes:
@@ -144,7 +144,7 @@ def _bridge(seen: Seen) -> Iterator[Alarm]:
         yield Alarm(level, "bridge", told, f"meshctl plan {seen.node.name}")
 
 
-def _resources(seen: Seen) -> Iterator[Alarm]:
+def _resources(seen: NodeAlarmInput) -> Iterator[Alarm]:
     memory, flash, load = seen.observation.memory, seen.observation.overlay, seen.observation.load
     if memory is not None and memory.total and memory.available / memory.total < LOW_MEMORY_SHARE:
         told = f"{memory.available / 2**20:.1f} MiB of memory left"
@@ -157,7 +157,7 @@ def _resources(seen: Seen) -> Iterator[Alarm]:
         yield Alarm(Level.NOTE, "load", told, f"meshctl run {seen.node.name} -- top -b -n 1")
 
 
-def _changes(seen: Seen) -> Iterator[Alarm]:
+def _changes(seen: NodeAlarmInput) -> Iterator[Alarm]:
     change = seen.observation.change
     if change is not None and change.state not in ("idle", "", "unknown", "absent"):
         left = "" if change.left_s is None else f", {change.left_s:.0f} s left"
@@ -172,7 +172,7 @@ def _changes(seen: Seen) -> Iterator[Alarm]:
         yield Alarm(Level.WARNING, "foreign", told, hint)
 
 
-def _time(seen: Seen) -> Iterator[Alarm]:
+def _time(seen: NodeAlarmInput) -> Iterator[Alarm]:
     offset_s, uptime_s = seen.observation.clock_offset_s, seen.observation.uptime_s
     if offset_s is not None and abs(offset_s) > CLOCK_TOLERANCE_S:
         yield Alarm(Level.NOTE, "clock", f"its clock is off by {duration(abs(offset_s))}")
@@ -181,14 +181,14 @@ def _time(seen: Seen) -> Iterator[Alarm]:
         yield Alarm(Level.NOTE, "rebooted", f"rebooted {duration(uptime_s)} ago")
 
 
-def some(names: tuple[str, ...]) -> str:
+def join_limited(names: tuple[str, ...]) -> str:
     """The first names and how many more: a sentence stays a sentence in a fleet of hundreds."""
-    if len(names) <= NAMES_IN_A_SENTENCE:
+    if len(names) <= MAX_NAMES:
         return ", ".join(names)
-    return f"{', '.join(names[:NAMES_IN_A_SENTENCE])} and {len(names) - NAMES_IN_A_SENTENCE} more"
+    return f"{', '.join(names[:MAX_NAMES])} and {len(names) - MAX_NAMES} more"
 
 
-_CONCERNS: tuple[Callable[[Seen], Iterator[Alarm]], ...] = (
+_CONCERNS: tuple[Callable[[NodeAlarmInput], Iterator[Alarm]], ...] = (
     _identity,
     _drift,
     _radios,

@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from meshctl.model import Fleet, NodeState, Role
-from meshctl.status.node_alarms import some
+from meshctl.status.node_alarms import join_limited
 from meshctl.status.pings import Pings
-from meshctl.status.robots import takes_part
+from meshctl.status.robots import is_active
 from meshctl.status.topics import is_urgent
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus
 
 # More reasons than this make a line that nobody reads; `meshctl status` has them all.
-REASONS_SHOWN = 4
+MAX_REASONS = 4
 # the check that stands for all of the robots' computers where they were not asked
 ROBOTS = "robots"
 
@@ -38,11 +38,11 @@ class Check:
 def preflight(fleet: Fleet, status: FleetStatus, pings: Pings | None = None) -> tuple[Check, ...]:
     """Every check. `pings` None means that no robot was asked to send any."""
     checks = [check(fleet, status) for check in _CHECKS]
-    if any(robot.computer is not None for robot in fleet.robots.values()) and not _unasked(status):
+    if any(robot.computer is not None for robot in fleet.robots.values()) and not _skipped_reason(status):
         checks += [check(fleet, status) for check in _ROBOT_CHECKS]
         checks.append(_delivery(fleet, status, pings or Pings()))
-    elif _unasked(status):
-        checks.append(Check(ROBOTS, True, _unasked(status), is_checked=False))
+    elif _skipped_reason(status):
+        checks.append(Check(ROBOTS, True, _skipped_reason(status), is_checked=False))
     return tuple(checks)
 
 
@@ -57,7 +57,7 @@ def verdict(checks: Iterable[Check]) -> str:
     return f"GO (not checked: {', '.join(left_out)})" if left_out else "GO"
 
 
-def _unasked(status: FleetStatus) -> str:
+def _skipped_reason(status: FleetStatus) -> str:
     return next((alarm.text for alarm in status.alarms if alarm.code == "robots-unasked"), "")
 
 
@@ -70,19 +70,19 @@ def _check(name: str, bad: Iterable[str], good: str, asked: tuple[int, int] | No
         if not answered:
             return Check(name, False, "nobody answers who could tell")
         good += f" ({answered} of {count} tell)" if answered < count else ""
-    more = f"; and {len(told) - REASONS_SHOWN} more" if len(told) > REASONS_SHOWN else ""
-    return Check(name, not told, "; ".join(told[:REASONS_SHOWN]) + more if told else good)
+    more = f"; and {len(told) - MAX_REASONS} more" if len(told) > MAX_REASONS else ""
+    return Check(name, not told, "; ".join(told[:MAX_REASONS]) + more if told else good)
 
 
-def _asked(devices: Sequence[NodeStatus | RobotStatus]) -> tuple[int, int]:
+def _answered(devices: Sequence[NodeStatus | RobotStatus]) -> tuple[int, int]:
     """How many answered, of those who are on or should be."""
     expected = [one for one in devices if one.health is not Health.OFF]
-    return sum(not one.silent_because for one in expected), len(expected)
+    return sum(not one.no_answer_reason for one in expected), len(expected)
 
 
-def _asked_daemons(status: FleetStatus) -> tuple[int, int]:
+def _answered_daemons(status: FleetStatus) -> tuple[int, int]:
     """How many daemons answered, of those that take part."""
-    crew = _crew(status)
+    crew = _active_robots(status)
     return sum(robot.facts is not None and robot.facts.answers for robot in crew), len(crew)
 
 
@@ -97,15 +97,15 @@ def _alarm_check(
 
     def check(fleet: Fleet, status: FleetStatus) -> Check:
         devices: Sequence[NodeStatus | RobotStatus] = status.robots if robots or daemons else status.nodes
-        asked = _asked_daemons(status) if daemons else _asked(devices)
-        bad = [_told(one.name, one.alarms, codes) for one in devices]
+        asked = _answered_daemons(status) if daemons else _answered(devices)
+        bad = [_alarm_text(one.name, one.alarms, codes) for one in devices]
         everywhere = [alarm.text for alarm in status.alarms if is_fleetwide and alarm.code in codes]
         return _check(name, [*everywhere, *(text for text in bad if text)], good, asked)
 
     return check
 
 
-def _told(name: str, alarms: Iterable[Alarm], codes: Iterable[str]) -> str:
+def _alarm_text(name: str, alarms: Iterable[Alarm], codes: Iterable[str]) -> str:
     """What a note says stops nobody."""
     found = ", ".join(alarm.text for alarm in alarms if alarm.code in codes and alarm.level > Level.NOTE)
     return f"{name}: {found}" if found else ""
@@ -116,8 +116,8 @@ def _base_answers(fleet: Fleet, status: FleetStatus) -> Check:
     if base is None:
         return Check("base", False, "the inventory has no base")
     found = next((node for node in status.nodes if node.name == base.name), None)
-    is_there = found is not None and not found.silent_because
-    why = f": {found.silent_because}" if found is not None and found.silent_because else ""
+    is_there = found is not None and not found.no_answer_reason
+    why = f": {found.no_answer_reason}" if found is not None and found.no_answer_reason else ""
     return Check("base", is_there, f"{base.name} answers" if is_there else f"{base.name} does not answer{why}")
 
 
@@ -127,41 +127,43 @@ def _robot_radios(fleet: Fleet, status: FleetStatus) -> Check:
     deployed = [node for node in radios if node.node.state is NodeState.DEPLOYED]
     shelved = [f"{node.name} ({node.node.state.value})" for node in radios if node.node.state is not NodeState.DEPLOYED]
     good = f"{_plural(len(deployed), 'robot radio')} answer{'s' if len(deployed) == 1 else ''}" if radios else "none"
-    good += f"; not taking part: {some(tuple(shelved))}" if shelved else ""
-    return _check("robot radios", [_silence(node) for node in deployed if node.silent_because], good)
+    good += f"; not taking part: {join_limited(tuple(shelved))}" if shelved else ""
+    return _check("robot radios", [_no_answer_text(node) for node in deployed if node.no_answer_reason], good)
 
 
 def _beacons(fleet: Fleet, status: FleetStatus) -> Check:
     """Those in a rack must have been seen once, those deployed must answer now."""
     states = (NodeState.CARRIED, NodeState.DEPLOYED)
     beacons = [node for node in status.nodes if node.node.role is Role.BEACON and node.node.state in states]
-    unknown = [node for node in beacons if node.age_s is None and node.silent_because]
+    unknown = [node for node in beacons if node.age_s is None and node.no_answer_reason]
     missed = [node for node in beacons if node.health is Health.UNREACHABLE and node not in unknown]
     told = (
-        [f"{some(tuple(n.name for n in unknown))}: never seen; switch on once before it is packed"] if unknown else []
+        [f"{join_limited(tuple(n.name for n in unknown))}: never seen; switch on once before it is packed"]
+        if unknown
+        else []
     )
-    on = sum(not node.silent_because for node in beacons)
+    on = sum(not node.no_answer_reason for node in beacons)
     good = f"{_plural(len(beacons), 'beacon')} known, {on} on" if beacons else "none"
-    return _check("beacons", [*told, *(_silence(node) for node in missed)], good)
+    return _check("beacons", [*told, *(_no_answer_text(node) for node in missed)], good)
 
 
-def _silence(one: NodeStatus | RobotStatus) -> str:
-    return f"{one.name}: {one.silent_because}"
+def _no_answer_text(one: NodeStatus | RobotStatus) -> str:
+    return f"{one.name}: {one.no_answer_reason}"
 
 
 def _quality(fleet: Fleet, status: FleetStatus) -> Check:
     deployed = [node for node in status.nodes if node.hops and node.quality is not None]
-    weak = [text for node in status.nodes if (text := _told(node.name, node.alarms, ("no-path", "weak")))]
+    weak = [text for node in status.nodes if (text := _alarm_text(node.name, node.alarms, ("no-path", "weak")))]
     worst = min((node.quality for node in deployed if node.quality is not None), default=None)
     good = "no path to measure" if worst is None else f"every path carries, the weakest {worst:.0%}"
-    found = _check("links", weak, good, _asked(status.nodes))
+    found = _check("links", weak, good, _answered(status.nodes))
     has_paths = any(node.node.role is not Role.BASE for node in status.nodes if node.health is not Health.OFF)
     return replace(found, is_checked=False) if found.is_go and worst is None and has_paths else found
 
 
 def _strangers(fleet: Fleet, status: FleetStatus) -> Check:
-    found = [f"{some(status.strangers)} in the mesh"] if status.strangers else []
-    return _check("strangers", found, "nobody else heard", _asked(status.nodes))
+    found = [f"{join_limited(status.strangers)} in the mesh"] if status.strangers else []
+    return _check("strangers", found, "nobody else heard", _answered(status.nodes))
 
 
 _CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
@@ -183,37 +185,40 @@ _CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
 )
 
 
-def _crew(status: FleetStatus) -> tuple[RobotStatus, ...]:
+def _active_robots(status: FleetStatus) -> tuple[RobotStatus, ...]:
     """The robots that take part."""
-    return tuple(robot for robot in status.robots if takes_part(robot.state))
+    return tuple(robot for robot in status.robots if is_active(robot.state))
 
 
 def _daemons(fleet: Fleet, status: FleetStatus) -> Check:
     """A daemon up on every robot that takes part."""
     codes = ("not-installed", "daemon", "unproven")
-    bad = [_silence(r) if r.silent_because else _told(r.name, r.alarms, codes) for r in _crew(status)]
+    bad = [
+        _no_answer_text(r) if r.no_answer_reason else _alarm_text(r.name, r.alarms, codes)
+        for r in _active_robots(status)
+    ]
     without = [
         f"{name} {'has no computer' if robot.fielded is None else 'still runs the fielded program'}"
         for name, robot in fleet.robots.items()
         if robot.computer is None
     ]
-    shelved = [robot.name for robot in status.robots if not takes_part(robot.state)]
-    good = f"{_plural(len(_crew(status)), 'daemon')} up"
-    good += f"; not taking part: {some(tuple(shelved))}" if shelved else ""
+    shelved = [robot.name for robot in status.robots if not is_active(robot.state)]
+    good = f"{_plural(len(_active_robots(status)), 'daemon')} up"
+    good += f"; not taking part: {join_limited(tuple(shelved))}" if shelved else ""
     good += f"; {', '.join(without)}" if without else ""
     return _check("daemons", [text for text in bad if text], good)
 
 
 def _peers(fleet: Fleet, status: FleetStatus) -> Check:
     """Every robot's daemon hears every other's."""
-    crew = [robot for robot in _crew(status) if robot.facts is not None and robot.facts.answers]
-    names = [robot.name for robot in _crew(status)]
+    crew = [robot for robot in _active_robots(status) if robot.facts is not None and robot.facts.answers]
+    names = [robot.name for robot in _active_robots(status)]
     bad = []
     for robot in crew:
         online = robot.facts.online if robot.facts is not None else ()
         missing = tuple(name for name in names if name not in online and name != robot.name)
         if missing:
-            bad.append(f"{robot.name} does not hear {some(missing)}")
+            bad.append(f"{robot.name} does not hear {join_limited(missing)}")
     if not crew:
         bad.append("no daemon answers")
     return _check("peers", bad, f"every robot hears all {_plural(len(names) - 1, 'other')}")
@@ -225,17 +230,17 @@ def _urgent_topics(fleet: Fleet, status: FleetStatus) -> Check:
     if not urgent:
         return Check("urgent topics", False, "the inventory has no topic of class emergency_stop or command")
     bad = [
-        f"{robot.name}: {topic.name} {topic.trouble}"
-        for robot in _crew(status)
+        f"{robot.name}: {topic.name} {topic.problem}"
+        for robot in _active_robots(status)
         for topic in robot.topics
         if topic.name in urgent and topic.code == "undeclared"
     ]
-    return _check("urgent topics", bad, f"{some(tuple(urgent))} declared everywhere", _asked_daemons(status))
+    return _check("urgent topics", bad, f"{join_limited(tuple(urgent))} declared everywhere", _answered_daemons(status))
 
 
 def _delivery(fleet: Fleet, status: FleetStatus, pings: Pings) -> Check:
     """A message through both daemons and back, from each robot to each other."""
-    names = [robot.name for robot in _crew(status) if robot.facts is not None and robot.facts.answers]
+    names = [robot.name for robot in _active_robots(status) if robot.facts is not None and robot.facts.answers]
     pairs = [(a, b) for a in names for b in names if a != b]
     bad = [
         f"{a} to {b}: {pings.failed.get((a, b), 'not tried')}" for a, b in pairs if (a, b) not in pings.round_trips_s

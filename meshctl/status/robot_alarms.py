@@ -33,14 +33,14 @@ DRIFT_LINES_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
-class RobotSeen:
+class RobotAlarmInput:
     """Everything known about one robot that answers. `told` are the facts of every robot that answers, by name; `last`
     is what was known before this look; `topics` are judged already."""
 
     fleet: Fleet
     robot: Robot
     facts: RobotFacts
-    told: Mapping[str, RobotFacts]
+    robots: Mapping[str, RobotFacts]
     topics: tuple[TopicStatus, ...]
     last: LastKnown | None
     urgent_bytes: int
@@ -48,7 +48,7 @@ class RobotSeen:
     @property
     def daemons(self) -> dict[str, RobotFacts]:
         """The robots whose daemon answers, this one left out."""
-        return {name: one for name, one in self.told.items() if one.answers and name != self.robot.name}
+        return {name: one for name, one in self.robots.items() if one.answers and name != self.robot.name}
 
 
 def urgent_bytes(fleet: Fleet, facts: RobotFacts) -> int:
@@ -57,13 +57,13 @@ def urgent_bytes(fleet: Fleet, facts: RobotFacts) -> int:
     return sum(queue.bytes for queue in facts.queues if queue.priority in urgent)
 
 
-def robot_alarms(seen: RobotSeen) -> tuple[Alarm, ...]:
+def robot_alarms(seen: RobotAlarmInput) -> tuple[Alarm, ...]:
     """All alarms of a robot, the worst first."""
     found = [alarm for concern in _CONCERNS for alarm in concern(seen)]
     return tuple(sorted(found, key=lambda alarm: -alarm.level))
 
 
-def _daemon(seen: RobotSeen) -> Iterator[Alarm]:
+def _daemon(seen: RobotAlarmInput) -> Iterator[Alarm]:
     facts, name = seen.facts, seen.robot.name
     if not facts.release and not facts.service.enabled:
         yield Alarm(Level.ERROR, "not-installed", "udp_mesh is not installed", f"meshctl robots deploy {name}")
@@ -83,7 +83,7 @@ def _daemon(seen: RobotSeen) -> Iterator[Alarm]:
         yield Alarm(Level.ERROR, "ros-bridge", told, "is roscore up? The bridge waits for it; then look at its journal")
 
 
-def _restarts(seen: RobotSeen) -> Iterator[Alarm]:
+def _restarts(seen: RobotAlarmInput) -> Iterator[Alarm]:
     before = seen.last.facts.get("restarts", "") if seen.last else ""
     again = seen.facts.service.restarts - int(before) if before.isdecimal() else 0
     if again > 0:
@@ -95,7 +95,7 @@ def _restarts(seen: RobotSeen) -> Iterator[Alarm]:
         yield Alarm(Level.NOTE, "rebooted", f"rebooted {duration(uptime_s)} ago")
 
 
-def _drift(seen: RobotSeen) -> Iterator[Alarm]:
+def _drift(seen: RobotAlarmInput) -> Iterator[Alarm]:
     facts, name = seen.facts, seen.robot.name
     if facts.drift and facts.release:
         more = len(facts.drift) - DRIFT_LINES_SHOWN
@@ -110,7 +110,7 @@ def _drift(seen: RobotSeen) -> Iterator[Alarm]:
             yield Alarm(Level.WARNING, "version", told, "meshctl robots deploy")
 
 
-def _keys(seen: RobotSeen) -> Iterator[Alarm]:
+def _keys(seen: RobotAlarmInput) -> Iterator[Alarm]:
     facts = seen.facts
     if facts.unkeyed:
         level = Level.ERROR if seen.fleet.udp_mesh.keys else Level.NOTE
@@ -123,7 +123,7 @@ def _keys(seen: RobotSeen) -> Iterator[Alarm]:
             yield Alarm(Level.ERROR, "key", told, "meshctl robots deploy, or go on with meshctl robots rotate-key")
 
 
-def _peers(seen: RobotSeen) -> Iterator[Alarm]:
+def _peers(seen: RobotAlarmInput) -> Iterator[Alarm]:
     if not seen.facts.answers:
         return
     missing = [name for name in seen.daemons if name not in seen.facts.online and name in seen.fleet.robots]
@@ -133,7 +133,7 @@ def _peers(seen: RobotSeen) -> Iterator[Alarm]:
         yield Alarm(Level.ERROR, "peers", told, "look at the radios between them: meshctl topology")
 
 
-def _queues(seen: RobotSeen) -> Iterator[Alarm]:
+def _queues(seen: RobotAlarmInput) -> Iterator[Alarm]:
     urgent = urgent_priorities(seen.fleet)
     late = [queue for queue in seen.facts.queues if queue.priority in urgent and queue.oldest_s > URGENT_WAIT_S]
     if not late:
@@ -149,7 +149,7 @@ def _queues(seen: RobotSeen) -> Iterator[Alarm]:
     yield Alarm(level, "urgent-queue", told, f"whom it cannot reach: meshctl robots status {seen.robot.name}")
 
 
-def _topics(seen: RobotSeen) -> Iterator[Alarm]:
+def _topics(seen: RobotAlarmInput) -> Iterator[Alarm]:
     if not seen.facts.answers:
         return
     urgent = {topic.name for topic in seen.fleet.topics if is_urgent(topic)}
@@ -162,11 +162,11 @@ def _topics(seen: RobotSeen) -> Iterator[Alarm]:
         bad = [topic for topic in seen.topics if topic.code == code]
         if bad:
             is_worse = code != "silent" and any(topic.name in urgent for topic in bad)
-            told = "; ".join(f"{topic.name}: {topic.trouble}" for topic in bad)
+            told = "; ".join(f"{topic.name}: {topic.problem}" for topic in bad)
             yield Alarm(Level.ERROR if is_worse else Level.WARNING, f"topic-{code}", told, hint)
 
 
-def _computer(seen: RobotSeen) -> Iterator[Alarm]:
+def _computer(seen: RobotAlarmInput) -> Iterator[Alarm]:
     computer, name = seen.facts.computer, seen.robot.name
     if computer.disk_kib:
         free = f"{size(computer.disk_free_kib)} of {size(computer.disk_kib)} of disk left"
@@ -194,7 +194,7 @@ def size(kib: float) -> str:
     return f"{kib / (1 << 30):.0f} TiB"
 
 
-_CONCERNS: tuple[Callable[[RobotSeen], Iterator[Alarm]], ...] = (
+_CONCERNS: tuple[Callable[[RobotAlarmInput], Iterator[Alarm]], ...] = (
     _daemon,
     _restarts,
     _drift,

@@ -24,7 +24,7 @@ class Cell:
     short: str = ""
 
     @property
-    def least(self) -> str:
+    def shortest(self) -> str:
         return self.short or self.text
 
 
@@ -73,7 +73,7 @@ def _node_row(node: NodeStatus) -> dict[str, Cell]:
         "health": Cell(node.health.value),
         "age": Cell(_age(node.age_s)),
     }
-    if node.silent_because:
+    if node.no_answer_reason:
         return cells | _bracketed(_known_node(node.last_known or {}))
     return cells | {
         "up": Cell(_up(node.uptime_s)),
@@ -92,10 +92,10 @@ def _node_row(node: NodeStatus) -> dict[str, Cell]:
 
 def _hears(node: NodeStatus) -> Cell:
     """How many nodes it hears, and the best of them: `3: b01 -70 dBm 62%`."""
-    count = str(len(node.neighbours))
-    if not node.neighbours:
+    count = str(len(node.neighbors))
+    if not node.neighbors:
         return Cell(count)
-    best = node.neighbours[0]
+    best = node.neighbors[0]
     signal = "" if best.signal_dbm is None else f" {best.signal_dbm} dBm"
     quality = "" if best.quality is None else f" {best.quality:.0%}"
     return Cell(f"{count}: {best.name}{signal}{quality}", count)
@@ -151,7 +151,7 @@ def _robot_row(robot: RobotStatus) -> dict[str, Cell]:
     waiting = [queue for queue in facts.queues if queue.messages]
     by_priority = " ".join(f"{queue.priority}:{queue.messages}" for queue in waiting)
     messages = sum(queue.messages for queue in waiting)
-    bad = sum(bool(topic.trouble) for topic in robot.topics)
+    bad = sum(bool(topic.problem) for topic in robot.topics)
     peers = f"{len(facts.online)} of {len(facts.peers)}"
     return cells | {
         "hears": Cell(f"{peers} daemons", peers),

@@ -62,7 +62,7 @@ def _left(columns: Sequence[Column], dropped: set[str]) -> tuple[Column, ...]:
 
 def _cell(row: Mapping[str, Cell], column: Column, is_short: bool) -> str:
     cell = row.get(column.key, Cell())
-    return one_line(cell.least if is_short else cell.text) or "-"
+    return one_line(cell.shortest if is_short else cell.text) or "-"
 
 
 def _widths(rows: Sequence[Mapping[str, Cell]], columns: Sequence[Column], is_short: bool) -> list[int]:

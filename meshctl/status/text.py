@@ -11,18 +11,18 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from meshctl.errors import ExitCode
 from meshctl.report.terminal_escapes import one_line
-from meshctl.status.node_alarms import duration, some
+from meshctl.status.node_alarms import duration, join_limited
 from meshctl.status.preflight import Check, verdict
 from meshctl.status.rows import COMPUTER, row
 from meshctl.status.table import Paint, plain, table_lines
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus
 
 # More devices than this with the same alarm are told together.
-SINGLE_ALARMS = 3
+MAX_SINGLE_ALARMS = 3
 # After a table longer than this its verdict is told once more, for the first one has left the screen.
-ROWS_ON_A_SCREEN = 20
+MAX_SCREEN_ROWS = 20
 # A text beside a lead is not squeezed into less.
-_LEAST_ROOM = 20
+_MIN_WIDTH = 20
 _VERDICTS = {
     ExitCode.OK: ("all well", "ok"),
     ExitCode.FINDINGS: ("DEGRADED", "degraded"),
@@ -45,7 +45,7 @@ def text(
     lines += table_lines([row(one) for one in devices], width, paint) or ["nobody to show"]
     if topics:
         lines += ["", *topic_lines(status, width)]
-    if len(devices) > ROWS_ON_A_SCREEN:
+    if len(devices) > MAX_SCREEN_ROWS:
         lines += ["", verdict_line(status, paint)]
     return "\n".join(lines)
 
@@ -87,7 +87,7 @@ def _all_alarms(status: FleetStatus) -> list[tuple[str, Alarm]]:
     found = [("", alarm) for alarm in status.alarms]
     if status.strangers:
         count = len(status.strangers)
-        told = f"{some(status.strangers)} {'are' if count > 1 else 'is'} in the mesh and in no inventory"
+        told = f"{join_limited(status.strangers)} {'are' if count > 1 else 'is'} in the mesh and in no inventory"
         found.append(("", Alarm(Level.WARNING, "stranger", told, "whose is it? Write it down as `mac:` of its radio")))
     for one in status:
         name = one.name if isinstance(one, NodeStatus) else f"{one.name} {COMPUTER}"
@@ -103,8 +103,8 @@ def _alarm_lines(status: FleetStatus, width: int | None, paint: Paint, brief: bo
         if brief and level is Level.NOTE:
             continue
         lead = level.text.upper().ljust(7)
-        if len(members) > SINGLE_ALARMS:
-            names = some(tuple(name for name, _ in members))
+        if len(members) > MAX_SINGLE_ALARMS:
+            names = join_limited(tuple(name for name, _ in members))
             told = f"{code} at {len(members)}: {names} (each: --alarm {code})"
             yield from _wrapped(lead, told, width, paint, level.text)
             continue
@@ -124,7 +124,7 @@ def _wrapped(lead: str, told: str, width: int | None, paint: Paint, style: str) 
 def _beside(lead: str, told: str, width: int | None, indent: str = "") -> list[str]:
     """The text beside `lead`, in as many lines as it takes, later ones `indent`ed further."""
     lead, told = one_line(lead), one_line(told)
-    room = None if width is None else max(width - len(lead), _LEAST_ROOM)
+    room = None if width is None else max(width - len(lead), _MIN_WIDTH)
     parts = [told] if room is None else textwrap.wrap(told, room, subsequent_indent=indent, break_on_hyphens=False)
     first, *others = parts or [""]
     return [f"{lead}{first}", *(f"{' ' * len(lead)}{part}" for part in others)]
@@ -142,7 +142,7 @@ def topic_lines(status: FleetStatus, width: int | None = None) -> list[str]:
                     robot.name,
                     _ago(topic.sent_ago_s),
                     _ago(topic.received_ago_s),
-                    topic.trouble,
+                    topic.problem,
                 )
             )
     rows = [rows[0], *sorted(rows[1:], key=lambda cells: (cells[1] == "-", cells[1].rjust(3), cells[0]))]

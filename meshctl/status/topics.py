@@ -17,7 +17,7 @@ from meshctl.status.values import TopicStatus
 # A topic misses this many of its periods before it counts as silent: one lost message is no alarm.
 SILENT_PERIODS = 5
 # Robots are asked one after the other, and each daemon is some seconds older than the other when we compare them.
-LEAST_LIMIT_S = 10.0
+MIN_LIMIT_S = 10.0
 
 
 def is_urgent(topic: Topic) -> bool:
@@ -34,7 +34,7 @@ def limit_s(topic: Topic) -> float | None:
     """The longest silence that its rate and deadline allow; None for a topic that comes when it comes."""
     if topic.rate_hz <= 0:
         return None
-    return max(SILENT_PERIODS / topic.rate_hz, topic.deadline_s or 0.0, LEAST_LIMIT_S)
+    return max(SILENT_PERIODS / topic.rate_hz, topic.deadline_s or 0.0, MIN_LIMIT_S)
 
 
 def topic_statuses(fleet: Fleet, told: Mapping[str, RobotFacts], robot: str) -> tuple[TopicStatus, ...]:
@@ -57,12 +57,12 @@ def _status(topic: Topic, here: TopicFacts | None, told: Mapping[str, RobotFacts
     if here is None or here.priority is None:
         return TopicStatus(topic.name, topic.priority, None, None, limit, "is not declared", "undeclared")
     status = TopicStatus(topic.name, here.priority, here.sent_ago_s, here.received_ago_s, limit)
-    for code, trouble in _troubles(topic, here, told, facts, limit):
+    for code, trouble in _problems(topic, here, told, facts, limit):
         return TopicStatus(topic.name, here.priority, here.sent_ago_s, here.received_ago_s, limit, trouble, code)
     return status
 
 
-def _troubles(
+def _problems(
     topic: Topic, here: TopicFacts, told: Mapping[str, RobotFacts], facts: RobotFacts, limit: float | None
 ) -> Iterator[tuple[str, str]]:
     if here.priority != topic.priority:
@@ -70,11 +70,11 @@ def _troubles(
     if limit is None or (facts.daemon_uptime_s or 0.0) <= limit:
         return
     if _sends(topic, facts.robot):
-        silent = _silence(here.sent_ago_s, here.sent_messages, limit)
+        silent = _silence_text(here.sent_ago_s, here.sent_messages, limit)
         if silent:
             yield "silent", f"has sent nothing {silent}"
     live = [name for name in _live_sources(topic, told, facts, limit) if name != facts.robot]
-    silent = _silence(here.received_ago_s, here.received_messages, limit)
+    silent = _silence_text(here.received_ago_s, here.received_messages, limit)
     if live and silent and ("all" in topic.destinations or facts.robot in topic.destinations):
         yield "not-arriving", f"nothing has arrived {silent}, though {', '.join(live)} sends"
 
@@ -83,7 +83,7 @@ def _sends(topic: Topic, robot: str) -> bool:
     return not topic.sources or robot in topic.sources
 
 
-def _silence(ago_s: float | None, messages: int, limit: float) -> str:
+def _silence_text(ago_s: float | None, messages: int, limit: float) -> str:
     """How long nothing came, where that is too long; a daemon that counts and tells no ages is believed."""
     if ago_s is None:
         return "" if messages else "yet"

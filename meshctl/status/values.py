@@ -53,7 +53,7 @@ def health_of(alarms: Iterable[Alarm]) -> Health:
 
 
 @dataclass(frozen=True, slots=True)
-class Silence:
+class NoAnswer:
     """Why somebody gave no answer. `code`: `unreachable` for silence, else what kept us out of a device that is there
     (`host-key`, `untrusted`, `login`, `failed`)."""
 
@@ -63,7 +63,7 @@ class Silence:
 
 
 @dataclass(frozen=True, slots=True)
-class Neighbour:
+class Neighbor:
     """A node heard directly. `quality` 0..1, None where nothing measures it."""
 
     name: str
@@ -81,7 +81,7 @@ class NodeStatus:
     health: Health
     alarms: tuple[Alarm, ...]
     age_s: float | None
-    silent_because: str = ""
+    no_answer_reason: str = ""
     version: str = ""
     revision: str = ""
     drift: tuple[str, ...] | None = None
@@ -96,7 +96,7 @@ class NodeStatus:
     tx_power_dbm: float | None = None
     lan_ports: tuple[str, ...] | None = None
     """What its LAN bridge joins now."""
-    neighbours: tuple[Neighbour, ...] = ()
+    neighbors: tuple[Neighbor, ...] = ()
     is_path_known: bool = True
     """Whether enough was asked to tell its path; then no `hops` means that there is none."""
     hops: int | None = None
@@ -129,7 +129,7 @@ class TopicStatus:
     sent_ago_s: float | None
     received_ago_s: float | None
     limit_s: float | None = None
-    trouble: str = ""
+    problem: str = ""
     code: str = ""
 
 
@@ -146,7 +146,7 @@ class RobotStatus:
     health: Health
     alarms: tuple[Alarm, ...]
     age_s: float | None
-    silent_because: str = ""
+    no_answer_reason: str = ""
     facts: RobotFacts | None = None
     topics: tuple[TopicStatus, ...] = ()
     is_compared: bool = True

@@ -148,9 +148,7 @@ def test_robots_that_were_not_asked_are_told_and_not_judged(fleet: Fleet) -> Non
 def test_an_unmeasured_path_is_neither_go_nor_no_go(fleet: Fleet) -> None:
     unmeasured = {name: seen(name, {}) for name in HEALTHY}
     status = status_of(fleet, unmeasured, known=KNOWN)
-    status = replace(
-        status, nodes=tuple(replace(node, quality=None, alarms=(), neighbours=()) for node in status.nodes)
-    )
+    status = replace(status, nodes=tuple(replace(node, quality=None, alarms=(), neighbors=()) for node in status.nodes))
     found = {check.name: check for check in preflight(fleet, status, DELIVERED)}
     assert (found["links"].is_go, found["links"].is_checked) == (True, False)
     assert preflight_text(found.values()).splitlines()[-1] == "GO (not checked: links)"

@@ -12,13 +12,13 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
 from meshctl.robots.facts import ComputerFacts, RobotFacts, ServiceFacts, TopicFacts
 from meshctl.status import Health, Level
-from meshctl.status.last_known import facts_to_keep, remembered
+from meshctl.status.last_known import facts_to_record, merge_by_device
 from meshctl.status.text import text
 from meshctl.status.topics import limit_s
-from meshctl.status.values import Silence
+from meshctl.status.values import NoAnswer
 from tests.meshctl.status.fleets import CREW, NOW, alarms, peer, queue, robot_health, status_of, told
 
-DOWN = Silence("no answer to connect within 5 s")
+DOWN = NoAnswer("no answer to connect within 5 s")
 COMPUTER = CREW["rover"].computer
 
 
@@ -42,7 +42,7 @@ def test_a_silent_robot_whose_daemon_others_hear_is_told_so(fleet: Fleet) -> Non
 
 
 def test_an_unpinned_computer_is_told_with_the_command_that_pins_it(fleet: Fleet) -> None:
-    silent = {"rover": Silence("no key is pinned", "untrusted")}
+    silent = {"rover": NoAnswer("no key is pinned", "untrusted")}
     status = status_of(fleet, robots={"station": told("station")}, silent_robots=silent)
     assert "meshctl robots trust rover" in alarms(status, "rover", robot=True)["untrusted"].hint
 
@@ -104,7 +104,7 @@ def test_a_robot_that_is_off_is_not_missed_by_its_peers(fleet: Fleet) -> None:
 
 def test_an_urgent_queue_that_grows_since_the_last_look_is_an_error(fleet: Fleet) -> None:
     first = status_of(fleet, robots=with_rover(queues=(queue(0, 2, 7.0, 1000),)))
-    known = remembered({name: LastKnown(name, NOW - 5, facts) for name, facts in facts_to_keep(first).items()})
+    known = merge_by_device({name: LastKnown(name, NOW - 5, facts) for name, facts in facts_to_record(first).items()})
     second = status_of(fleet, robots=with_rover(queues=(queue(0, 4, 12.0, 2500),)), known=known)
     alarm = alarms(second, "rover", robot=True)["urgent-queue"]
     assert (alarm.level, "1000 to 2500 B" in alarm.text) == (Level.ERROR, True)
