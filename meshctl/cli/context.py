@@ -40,31 +40,31 @@ InventoryPath = Annotated[
         "--inventory",
         "-i",
         envvar="MESHCTL_INVENTORY",
-        help="The inventory: a YAML file, or a directory that holds fleet.yaml.",
+        help="Inventory: a YAML file, or a directory with fleet.yaml.",
     ),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 LabDirectory = Annotated[
     Path | None,
-    typer.Option("--dir", envvar="MESHCTL_LAB", help="Where the fleet lives; default: $XDG_STATE_HOME/meshctl/lab."),
+    typer.Option("--dir", envvar="MESHCTL_LAB", help="Directory of the lab; default: $XDG_STATE_HOME/meshctl/lab."),
 ]
 KeyFiles = Annotated[
     list[Path] | None,
-    typer.Option("--key", help="Private key file to log in with, before those of the inventory and the agent."),
+    typer.Option("--key", help="SSH private key to try before those of the inventory and the agent."),
 ]
 Lab = Annotated[
     Path | None,
-    typer.Option("--lab", envvar="MESHCTL_LAB", help="Reach the nodes of the virtual fleet that runs in DIR."),
+    typer.Option("--lab", envvar="MESHCTL_LAB", help="Connect to the virtual fleet that runs in DIR."),
 ]
-Nodes = Annotated[list[str] | None, typer.Argument(help="Nodes, or patterns such as 'husky*'; default: all.")]
+Nodes = Annotated[list[str] | None, typer.Argument(help="Nodes or patterns such as 'husky*'; default: all.")]
 
 Options = Mapping[str, tuple[Any, Any]]
-"""By the opener's name for it: an option's type and default, as typer reads them of a function, in the help's order."""
+"""Type and default of each option, by the opener's parameter name, in the order of the help."""
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """Everything open. `owner` names this process to the locks on the nodes; `lab` is set for a virtual fleet."""
+    """What a command works with. `owner` names this process in the nodes' locks; `lab` is set for a virtual fleet."""
 
     fleet: Fleet
     renderer: Renderer
@@ -79,7 +79,7 @@ class Session:
 
 @contextmanager
 def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None = None) -> Iterator[Session]:
-    """Open all of it, and close it in the end. Raises InvalidInput, InputError, MeshctlError."""
+    """Open a session and close it at the end. Raises InvalidInput, InputError, MeshctlError."""
     from meshctl.fleet.journal import Journal, default_path
     from meshctl.fleet.lab_directory import lab_of
     from meshctl.fleet.process import lock_owner
@@ -91,7 +91,7 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
     fleet = load_fleet(inventory, environ=os.environ)
     trust = trust_of(fleet)
     virtual, locate = _lab(lab)
-    # commands without --lab work on the copy, too
+    # a lab's copy of the inventory also works without --lab
     lab_directory = str(virtual.directory) if virtual is not None else lab_of(str(inventory.resolve()))
     with (
         Journal(default_path(os.environ), lab=lab_directory) as journal,
@@ -112,7 +112,7 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
 
 
 def trust_of(fleet: Fleet) -> TrustStore:
-    """The fleet's own file of host keys, beside the inventory."""
+    """The fleet's own known_hosts, beside the inventory."""
     from meshctl.device.trust import TrustStore
 
     path = Path(fleet.operators.known_hosts).expanduser()
@@ -136,9 +136,9 @@ def _lab(directory: Path | None) -> tuple[LabFleet | None, Locate]:
 
 
 def selected_nodes(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[Node, ...]:
-    """The managed nodes that a name or pattern selects, in the inventory's order; all when none is given.
+    """The managed nodes that match any name or pattern, in inventory order; all without patterns.
 
-    Raises InputError for a pattern that selects nothing.
+    Raises InputError for a pattern that matches nothing.
     """
     from meshctl.inventory.suggest import did_you_mean
 
@@ -149,14 +149,14 @@ def selected_nodes(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[Node, 
     for pattern in wanted:
         if not any(fnmatchcase(name, pattern) for name in managed):
             raise InputError(
-                f"no managed node of {fleet.name} is called {pattern!r}",
-                hint=did_you_mean(pattern, managed) or "`meshctl inventory list` shows all",
+                f"no managed node of {fleet.name} matches {pattern!r}",
+                hint=did_you_mean(pattern, managed) or "run `meshctl inventory list` to list all nodes",
             )
     return tuple(node for name, node in managed.items() if any(fnmatchcase(name, pattern) for pattern in wanted))
 
 
 def progress_for(count: int, *, as_json: bool) -> Progress:
-    """Live lines on a terminal, JSON lines for programs, plain lines elsewhere."""
+    """JSON lines with `as_json`, live lines on a terminal, plain lines elsewhere."""
     from meshctl.report.progress import JsonProgress, LiveProgress, PlainProgress, ThreadedProgress
 
     if as_json:
@@ -177,20 +177,19 @@ def exit_for(outcomes: Iterable[Outcome], interrupt: Interrupt) -> ExitCode:
 
 
 def confirm(question: str) -> None:
-    """Return when the answer is yes.
+    """Return if the user confirms.
 
-    Raises InputError where nobody can be asked, typer.Exit when the answer is no, typer.Abort at Ctrl-C or the end of
-    input.
+    Raises InputError without a terminal, typer.Exit when the answer is no, typer.Abort at Ctrl-C or the end of input.
     """
     if not sys.stdin.isatty():
-        raise InputError("nobody can be asked here", hint="look at what would be done, then run again with --yes")
+        raise InputError("not a terminal: cannot ask for confirmation", hint="review the plan, then pass --yes")
     if not typer.confirm(question):
-        echo("nothing was changed", err=True)
+        echo("cancelled; nothing was changed", err=True)
         raise typer.Exit(int(ExitCode.FINDINGS))
 
 
 def lab_directory(given: Path | None) -> Path:
-    """Where the fleet lives when `LabDirectory` gives no place."""
+    """The lab's directory, by default below $XDG_STATE_HOME."""
     if given is not None:
         return given
     home = os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()
@@ -198,7 +197,7 @@ def lab_directory(given: Path | None) -> Path:
 
 
 def line_width(*, wide: bool = False) -> int | None:
-    """The terminal's, or COLUMNS; None where nobody wants lines broken."""
+    """Width of the terminal, or COLUMNS; None for unwrapped lines (`wide`, pipes)."""
     if wide or not (sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdecimal()):
         return None
     return shutil.get_terminal_size().columns
@@ -207,8 +206,7 @@ def line_width(*, wide: bool = False) -> int | None:
 def with_options(
     parameter: str, opener: Callable[..., AbstractContextManager[Any]], options: Options
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """A command that takes `parameter` and options of its own becomes one that has these `options` besides: `opener` is
-    called with them, and what it opens stands for as long as the command runs."""
+    """Add `options` to a command. They are passed to `opener`; the command gets what it yields as `parameter`."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         hints = get_type_hints(command, include_extras=True)

@@ -1,4 +1,4 @@
-"""From a session to a plan on the screen, and from an agreed plan to outcomes and an exit code."""
+"""Prepare and show a plan; execute a confirmed plan, journal it, print the summary and exit."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from meshctl.fleet import Outcome, totals
 from meshctl.model import Fleet
 from meshctl.plan import Plan, Verdict
 
-# Bytes of salt for a plan's fingerprints; RFC 7914 asks for no more.
+# Bytes of salt for a plan's fingerprints, as in RFC 7914.
 SALT_BYTES = 16
 
 
 class PlanRefused(MeshctlError):
-    """A plan that meshctl will not carry out as it stands."""
+    """A plan that meshctl refuses to execute."""
 
     exit_code = ExitCode.FINDINGS
 
@@ -57,7 +57,7 @@ def write_text(path: Path, text: str) -> None:
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
 
 
 def show(plan: Plan, fleet: Fleet, *, brief: bool) -> None:
@@ -72,8 +72,8 @@ def show(plan: Plan, fleet: Fleet, *, brief: bool) -> None:
 
 def report_check(plan: Plan, fleet: Fleet, *, as_json: bool, brief: bool) -> ExitCode:
     if as_json:
-        told = {name: {"verdict": node.verdict.value, "reason": node.reason} for name, node in plan.nodes.items()}
-        echo_json(json.dumps({"fleet": plan.fleet, "nodes": told}, indent=1))
+        nodes = {name: {"verdict": node.verdict.value, "reason": node.reason} for name, node in plan.nodes.items()}
+        echo_json(json.dumps({"fleet": plan.fleet, "nodes": nodes}, indent=1))
     else:
         show(plan, fleet, brief=brief)
     if plan.of(Verdict.CHANGE) or plan.of(Verdict.REFUSED):
@@ -111,18 +111,18 @@ def execute_plan(
     rate: float | None,
     choices: Choices | None = None,
 ) -> None:
-    """Apply, journal, tell the totals, exit."""
+    """Execute the plan, journal it, print the totals, exit."""
     plan = prepared.plan
     if plan.refusal:
         raise PlanRefused(plan.refusal, hint=plan.refusal_hint)
-    told = choices or Choices(with_firmware)
+    choices = choices or Choices(with_firmware)
     run = opened.journal.begin(
         command,
         fleet=opened.fleet.name,
         inventory=opened.inventory,
         nodes=tuple(plan.nodes),
         plan=json.dumps(
-            {"choices": asdict(told), "stages": [[stage.kind.value, *stage.nodes] for stage in plan.stages]}
+            {"choices": asdict(choices), "stages": [[stage.kind.value, *stage.nodes] for stage in plan.stages]}
         ),
     )
     outcomes: dict[str, Outcome] = {}
@@ -147,8 +147,8 @@ def execute_plan(
     if run.trouble:
         with ignore_broken_pipe():
             echo(f"the journal is incomplete: {run.trouble}", err=True)
-            echo("hint: what it lacks counts as not done, so `meshctl resume` looks at those nodes again", err=True)
-    # a reader that is gone (`| head`, a closed terminal) changes nothing about how it ended
+            echo("hint: `meshctl resume` checks the missing nodes again", err=True)
+    # a closed pipe or terminal must not change the exit code
     with ignore_broken_pipe():
         _print_summary(outcomes, run.id, as_json=as_json)
     raise typer.Exit(exit_for(outcomes.values(), opened.interrupt))
@@ -159,9 +159,9 @@ def _print_summary(outcomes: dict[str, Outcome], run_id: int, *, as_json: bool) 
     if as_json:
         from meshctl.report.progress import outcome_object
 
-        told = [outcome_object(outcome) for outcome in outcomes.values()]
-        echo_json(json.dumps({"event": "ended", "run": run_id, "totals": str(counted), "outcomes": told}))
+        objects = [outcome_object(outcome) for outcome in outcomes.values()]
+        echo_json(json.dumps({"event": "ended", "run": run_id, "totals": str(counted), "outcomes": objects}))
         return
     echo(f"run {run_id}: {counted}")
     if not counted.all_good:
-        echo("`meshctl resume` takes up what is not done", err=True)
+        echo("run `meshctl resume` for the unfinished nodes", err=True)

@@ -1,7 +1,7 @@
-"""`meshctl robots`: udp_mesh on the robots' computers, deployed, watched and taken away.
+"""`meshctl robots`: deploy, inspect and remove udp_mesh on the robots' computers.
 
-Each command gets a `RobotsContext` (robots_context.py), works on all chosen robots at once, and tells one
-outcome for each. Topics and keys, which change the inventory too, are in robots_topics.py.
+Each command gets a `RobotsContext` (robots_context.py), works on all selected robots in parallel, and reports one
+outcome per robot. Topics and keys, which also change the inventory, are in robots_topics.py.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from meshctl.robots.facts import RobotFacts, collect_facts, expected_release, fa
 from meshctl.robots.host import Host
 from meshctl.robots.status_table import difference, table
 
-app = typer.Typer(help="udp_mesh on the robots' computers: deploy, watch, change.", no_args_is_help=True)
+app = typer.Typer(help="Deploy and manage udp_mesh on robots.", no_args_is_help=True)
 app.add_typer(topic_app, name="topic")
 app.command("rotate-key")(rotate_key_command)
 
@@ -32,7 +32,7 @@ app.command("rotate-key")(rotate_key_command)
 @app.command("deploy")
 @with_robots_context("robots", "inventory", "wheels", "wait_s", "ask_sudo", "as_json", "key")
 def deploy_command(context: RobotsContext) -> None:
-    """Install or upgrade udp_mesh with the inventory's configuration; a release that is not healthy goes back.
+    """Install or upgrade udp_mesh with the inventory's configuration; an unhealthy release is rolled back.
 
     Example: meshctl robots deploy 'husky*' --wheels wheels/
     """
@@ -43,7 +43,7 @@ def deploy_command(context: RobotsContext) -> None:
 @app.command("diff")
 @with_robots_context("robots", "inventory", "wheels", "ask_sudo", "as_json", "key")
 def diff_command(context: RobotsContext) -> None:
-    """Show what a deploy would change on each robot, and what was changed there by hand. Exit code 1 for a difference.
+    """Show what a deploy would change on each robot, including changes by hand. Exit with 1 if there are any.
 
     Example: meshctl robots diff
     """
@@ -58,13 +58,13 @@ def diff_command(context: RobotsContext) -> None:
 
     outcomes = context.run_on_each(work)
     if context.as_json:
-        told = {
+        objects = {
             name: {"result": one.result.value, "differences": one.reason.splitlines()} for name, one in outcomes.items()
         }
-        echo_json(json.dumps(told, indent=1))
+        echo_json(json.dumps(objects, indent=1))
     else:
         for name, one in outcomes.items():
-            for line in (one.reason or "as the inventory says").splitlines():
+            for line in (one.reason or "no changes").splitlines():
                 echo(f"{name}: {line}")
     if any(one.result in (Result.PENDING, Result.REFUSED) for one in outcomes.values()):
         raise typer.Exit(ExitCode.FINDINGS)
@@ -74,7 +74,7 @@ def diff_command(context: RobotsContext) -> None:
 @app.command("status")
 @with_robots_context("robots", "inventory", "ask_sudo", "as_json", "key")
 def status_command(context: RobotsContext) -> None:
-    """Show every daemon: does it run, since when, whom does it see, what waits. Exit code 0 only when all are well.
+    """Show each daemon: service state, uptime, peers and queues. Exit with 0 only if all are healthy.
 
     Example: meshctl robots status
     """
@@ -97,7 +97,7 @@ def status_command(context: RobotsContext) -> None:
 @app.command("restart")
 @with_robots_context("robots", "inventory", "ask_sudo", "as_json", "key")
 def restart_command(context: RobotsContext) -> None:
-    """Restart the daemons and bridges. What they hold in memory for others is lost; what is on disk stays.
+    """Restart the daemons and bridges. Messages queued in memory are lost; those on disk are kept.
 
     Example: meshctl robots restart husky1
     """
@@ -118,8 +118,8 @@ def stop_command(context: RobotsContext) -> None:
 @with_robots_context("robots", "inventory", "ask_sudo", "key")
 def logs_command(
     context: RobotsContext,
-    lines: Annotated[int, typer.Option("--lines", "-n", min=1, help="The last so many lines of each.")] = 50,
-    since: Annotated[str, typer.Option("--since", help="Only from then on: '10 min ago', 'today'.")] = "",
+    lines: Annotated[int, typer.Option("--lines", "-n", min=1, help="Number of lines per robot.")] = 50,
+    since: Annotated[str, typer.Option("--since", help="Only lines since this time: '10 min ago', 'today'.")] = "",
 ) -> None:
     """Print the logs of the daemons and bridges.
 
@@ -142,7 +142,7 @@ def logs_command(
 @app.command("rollback")
 @with_robots_context("robots", "inventory", "wait_s", "ask_sudo", "as_json", "key")
 def rollback_command(context: RobotsContext) -> None:
-    """Go back to the release before, with its configuration and keys.
+    """Roll back to the previous release, with its configuration and keys.
 
     Example: meshctl robots rollback husky1
     """
@@ -153,9 +153,9 @@ def rollback_command(context: RobotsContext) -> None:
 @with_robots_context("named", "inventory", "ask_sudo", "as_json", "key")
 def uninstall_command(
     context: RobotsContext,
-    purge: Annotated[bool, typer.Option("--purge", help="Also messages kept for absent robots, and the user.")] = False,
+    purge: Annotated[bool, typer.Option("--purge", help="Also remove stored messages and the system user.")] = False,
 ) -> None:
-    """Take udp_mesh off robots. Messages kept on disk wait for the next install unless --purge.
+    """Remove udp_mesh from robots. Messages on disk are kept for the next install unless --purge is given.
 
     Example: meshctl robots uninstall husky1
     """
@@ -166,10 +166,10 @@ def uninstall_command(
 @with_robots_context("robots", "inventory", "key")
 def trust_command(
     context: RobotsContext,
-    change: Annotated[bool, typer.Option("--replace", help="Also take keys that differ from the pinned ones.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Pin without asking; compare fingerprints first.")] = False,
+    change: Annotated[bool, typer.Option("--replace", help="Also accept changed keys.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Pin without confirmation.")] = False,
 ) -> None:
-    """Show the computers' host key fingerprints, ask, and pin them in the fleet's known_hosts.
+    """Show the robots' host key fingerprints and pin them in the fleet's known_hosts after confirmation.
 
     Example: meshctl robots trust husky1
     """
@@ -179,14 +179,14 @@ def trust_command(
 
 
 def _pin_key(context: RobotsContext, robot: str, *, change: bool, yes: bool) -> bool:
-    """Tell, ask, pin; whether the computer's key is pinned in the end."""
+    """Show, confirm and pin the key; whether it is pinned in the end."""
     name = context.connector.endpoint(robot).identity
     try:
         shown = context.connector.presented_key(robot)
     except NodeError as error:
         echo(f"{robot}: {error}" + (f"\n  hint: {error.hint}" if error.hint else ""))
         return False
-    assert shown is not None, "a completed handshake has shown a key"
+    assert shown is not None, "a completed handshake presents a key"
     pinned = context.opened.trust.pinned(name)
     line = f"{robot}: {shown.fingerprint} ({shown.key_type})"
     if shown in pinned:
@@ -194,9 +194,9 @@ def _pin_key(context: RobotsContext, robot: str, *, change: bool, yes: bool) -> 
         return True
     if pinned and not change:
         echo(f"{line}: DIFFERS from the pinned {', '.join(one.fingerprint for one in pinned)}")
-        echo("  hint: another computer, a new installation, or an attack; --replace once you know which")
+        echo("  hint: another computer, a new installation, or an attack: verify, then use --replace")
         return False
-    if yes or (sys.stdin.isatty() and typer.confirm(f"{line}\n  Is this what the computer itself shows?")):
+    if yes or (sys.stdin.isatty() and typer.confirm(f"{line}\n  Does this match the fingerprint on the computer?")):
         context.opened.trust.replace(name, shown)
         echo(f"{line}: pinned now")
         return True

@@ -36,16 +36,16 @@ from meshctl.robots.deploy import DeployOptions, Wheelhouse, claim, deploy, roll
 from meshctl.robots.host import Host
 from meshctl.robots.wheels import stock_units
 
-Robots = Annotated[list[str] | None, typer.Argument(help="Robots, or patterns such as 'husky*'; default: all.")]
-Named = Annotated[list[str], typer.Argument(metavar="ROBOTS", help="Robots, or patterns such as 'husky*'.")]
+Robots = Annotated[list[str] | None, typer.Argument(help="Robots or patterns such as 'husky*'; default: all.")]
+Named = Annotated[list[str], typer.Argument(metavar="ROBOTS", help="Robots or patterns such as 'husky*'.")]
 Wheels = Annotated[
     Path | None,
-    typer.Option("--wheels", help="Directory with the wheels the robots need; without it pip downloads them here."),
+    typer.Option("--wheels", help="Directory with the required wheels; default: download them with pip."),
 ]
 AskSudo = Annotated[
-    bool, typer.Option("--ask-sudo", help="Ask for the password that sudo wants (or set MESHCTL_SUDO_PASSWORD).")
+    bool, typer.Option("--ask-sudo", help="Prompt for the sudo password (or set MESHCTL_SUDO_PASSWORD).")
 ]
-Wait = Annotated[int, typer.Option("--wait", min=2, help="Seconds a daemon has to prove itself before it goes back.")]
+Wait = Annotated[int, typer.Option("--wait", min=2, help="Seconds a new release has to become healthy.")]
 
 RobotTask = Callable[[Host, str], Outcome]
 Parameters = Mapping[str, Any]
@@ -53,13 +53,13 @@ Parameters = Mapping[str, Any]
 # systemd stops and starts two services (TimeoutStopSec, TimeoutStartSec of the units).
 SERVICE_TIMEOUT_S = 240.0
 COMMAND_PREFIX = "robots "
-# How often somebody looks whether all connections shall be closed at once.
+# Poll interval for a second Ctrl-C, which closes all connections.
 _LEAVE_POLL_S = 0.25
 
-# The options that commands share, by the name `crew_of` knows them by, in the options of the help.
+# Shared options by the parameters of `open_robots_context`, in the order of the help.
 _SHARED: dict[str, tuple[Any, Any]] = {
     "robots": (Robots, None),
-    # the same, for commands that nobody means for all by leaving it out
+    # required: for commands that must not default to all robots
     "named": (Named, inspect.Parameter.empty),
     "inventory": (InventoryPath, Path()),
     "wheels": (Wheels, None),
@@ -72,7 +72,7 @@ _SHARED: dict[str, tuple[Any, Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class RobotsContext:
-    """Everything open for one command. `robots` are the chosen ones; `wheels` is the directory named for them."""
+    """Everything open for one command: the selected `robots`; `wheels` is the directory given for them."""
 
     opened: Session
     connector: RobotConnector
@@ -87,7 +87,7 @@ class RobotsContext:
         return self.options.fleet
 
     def with_fleet(self, fleet: Fleet, *, only_configuration: bool = False) -> RobotsContext:
-        """The same context under a (changed) inventory. Raises InvalidInput and InputError for what no robot takes."""
+        """The same context for a changed inventory. Raises InvalidInput and InputError if a daemon would reject it."""
         secrets = SecretStore(os.environ, Path(fleet.base)).get
         daemon_keys(fleet, secrets)
         for robot in self.robots:
@@ -98,7 +98,7 @@ class RobotsContext:
     def run_on_each(
         self, work: RobotTask, observer: Observer = silent, say: Callable[[str], None] = echo_error
     ) -> dict[str, Outcome]:
-        """Connect to every chosen robot and work there, several at once. A second Ctrl-C closes all connections."""
+        """Connect to the selected robots in parallel and run `work`. A second Ctrl-C closes all connections."""
         interrupt = self.opened.interrupt
         connections: list[Connection] = []
         ended = threading.Event()
@@ -168,7 +168,7 @@ def open_robots_context(
     wait_s: int = 30,
     as_json: bool = False,
 ) -> Iterator[RobotsContext]:
-    """Open all of it. Raises InvalidInput and InputError for an inventory or a choice that cannot be worked with."""
+    """Open a session and its context. Raises InvalidInput and InputError for a bad inventory or selection."""
     password = sudo_password(ask_sudo)
     with session(inventory, key_files=key or ()) as opened:
         yield robots_context(opened, inventory, robots, password, wheels=wheels, wait_s=wait_s, as_json=as_json)
@@ -184,7 +184,7 @@ def robots_context(
     wait_s: int = 30,
     as_json: bool = False,
 ) -> RobotsContext:
-    """A context in a session that stands."""
+    """A context in an open session."""
     fleet = opened.fleet
     secrets = SecretStore(os.environ, Path(fleet.base)).get
     options = DeployOptions(fleet, secrets, Wheelhouse(wheels, _cache()).wheels, time.time, wait_s)
@@ -202,24 +202,24 @@ def with_robots_context(*shared: str) -> Callable[[Callable[..., None]], Callabl
 
 
 def sudo_password(ask: bool) -> Secret | None:
-    """What sudo on the robots gets where it wants one: asked for, or of MESHCTL_SUDO_PASSWORD, or none."""
+    """The sudo password: prompted for with `ask`, else from MESHCTL_SUDO_PASSWORD, else None."""
     given = os.environ.get("MESHCTL_SUDO_PASSWORD", "")
     if ask:
         if not sys.stdin.isatty():
-            raise InputError("nobody can be asked for a password here", hint="set MESHCTL_SUDO_PASSWORD")
+            raise InputError("not a terminal: cannot prompt for a password", hint="set MESHCTL_SUDO_PASSWORD")
         given = getpass.getpass("sudo password on the robots: ")
     return Secret(given) if given else None
 
 
 def _cache() -> Path:
-    """XDG Base Directory 0.8: what can be fetched again."""
+    """Directory of downloaded wheels (XDG Base Directory 0.8)."""
     named = os.environ.get("XDG_CACHE_HOME", "")
     root = Path(named) if named.startswith("/") else Path(os.environ.get("HOME", "~")).expanduser() / ".cache"
     return root / "meshctl" / "wheels"
 
 
 def print_totals(context: RobotsContext, outcomes: dict[str, Outcome]) -> typer.Exit:
-    """Tell the totals; the exit to raise."""
+    """Print the totals; returns the exit to raise."""
     counted = totals(outcomes.values())
     if context.as_json:
         from meshctl.report.progress import outcome_object
@@ -229,7 +229,7 @@ def print_totals(context: RobotsContext, outcomes: dict[str, Outcome]) -> typer.
     else:
         echo(str(counted))
         if not counted.all_good:
-            echo("`meshctl resume` takes up what is not done", err=True)
+            echo("run `meshctl resume` for the unfinished robots", err=True)
     return typer.Exit(exit_for(outcomes.values(), context.opened.interrupt))
 
 
@@ -245,7 +245,7 @@ def run_command(context: RobotsContext, command: str, **parameters: Any) -> dict
 
 def _task_for(command: str, context: RobotsContext, parameters: Parameters) -> RobotTask:
     match command:
-        # topics and keys are changed in the inventory first; what is left for a robot is its deploy
+        # topic and key changes are in the inventory already; a robot only needs a deploy
         case "deploy" | "topic" | "rotate-key":
             return lambda host, robot: deploy(host, robot, context.options)
         case "rollback":
@@ -255,7 +255,7 @@ def _task_for(command: str, context: RobotsContext, parameters: Parameters) -> R
         case "uninstall":
             return lambda host, robot: _remove(host, robot, purge=bool(parameters.get("purge")))
         case _:
-            raise InputError(f"a run of `robots {command}` cannot be taken up", hint="run the command again")
+            raise InputError(f"a run of `robots {command}` cannot be resumed", hint="run the command again")
 
 
 def _service(host: Host, robot: str, verb: str) -> Outcome:
@@ -274,18 +274,18 @@ def _remove(host: Host, robot: str, *, purge: bool) -> Outcome:
 
 
 def resume_run(opened: Session, inventory: Path, record: RunRecord, *, as_json: bool) -> typer.Exit:
-    """Do an earlier run's command for the robots that it left; the exit to raise."""
+    """Run the command of an earlier run for its unfinished robots; returns the exit to raise."""
     command = record.command.removeprefix(COMMAND_PREFIX)
     parameters = json.loads(record.plan).get("robots", {}) if record.plan else {}
     able = {name for name, robot in opened.fleet.robots.items() if robot.computer is not None}
     names = [name for name in opened.journal.unfinished(record.id) if name in able]
     if not names:
-        echo(f"run {record.id} left nothing to do")
+        echo(f"run {record.id} is finished: nothing to resume")
         return typer.Exit()
     if command == "rotate-key":
-        # its steps need all robots, and the inventory knows which is next
+        # each step needs all robots, and the inventory records the next one
         again = f"meshctl robots rotate-key {parameters.get('new_key', 'NEW_KEY')}"
-        raise InputError(f"run {record.id} changed keys in steps over all robots", hint=f"go on with `{again}`")
+        raise InputError(f"run {record.id} is a key rotation, which takes all robots", hint=f"continue with `{again}`")
     if not as_json:
         echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")
     wheels, wait_s = parameters.get("wheels", ""), int(parameters.get("wait_s", 30))

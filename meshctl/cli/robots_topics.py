@@ -1,8 +1,7 @@
-"""`meshctl robots topic` and `rotate-key`: the inventory and the running daemons changed together.
+"""`meshctl robots topic` and `rotate-key`: change the inventory and the running daemons together.
 
-The edit is checked as a whole first (it must load, and every daemon must take it), then written, then brought to the
-robots, whose daemons read their files again without dropping a message. Where no robot took it, the inventory goes
-back.
+The edit is validated first (the inventory must load, every daemon must accept it), then saved, then deployed to the
+robots, whose daemons reload without dropping a message. If no robot accepts it, the inventory edit is reverted.
 """
 
 from __future__ import annotations
@@ -25,11 +24,12 @@ from meshctl.inventory.yaml_text import Value
 from meshctl.model import SecretRef
 from meshctl.robots.key_rotation import inventory_value, parse_ref, rotation_stages
 
-topic_app = typer.Typer(help="Topics: in the inventory and on all robots at once.", no_args_is_help=True)
+topic_app = typer.Typer(help="Change topics in the inventory and on all robots.", no_args_is_help=True)
 
-Topic = Annotated[str, typer.Argument(help="The topic's name.")]
+Topic = Annotated[str, typer.Argument(help="Topic name.")]
 Assignments = Annotated[
-    list[str], typer.Argument(metavar="KEY=VALUE...", help="As in the inventory: priority=9 destinations=[base]")
+    list[str],
+    typer.Argument(metavar="KEY=VALUE...", help="Topic settings: priority=9 destinations=[base]"),
 ]
 
 
@@ -61,7 +61,7 @@ def topic_set(context: RobotsContext, topic: Topic, values: Assignments) -> None
 @topic_app.command("rm")
 @with_robots_context(*_SHARED)
 def topic_rm(context: RobotsContext, topic: Topic) -> None:
-    """Take a topic out of the inventory and out of every running daemon, without a restart.
+    """Remove a topic from the inventory and from every running daemon, without a restart.
 
     Example: meshctl robots topic rm video
     """
@@ -69,7 +69,7 @@ def topic_rm(context: RobotsContext, topic: Topic) -> None:
 
 
 def _fields(assignments: list[str]) -> dict[str, Value]:
-    """`priority=9 destinations=[base]` as values of the inventory. Raises InputError."""
+    """Parse `priority=9 destinations=[base]`. Raises InputError."""
     fields: dict[str, Value] = {}
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
@@ -78,13 +78,13 @@ def _fields(assignments: list[str]) -> dict[str, Value]:
         try:
             value = yaml.safe_load(text)
         except yaml.YAMLError:
-            raise InputError(f"{name}: expected a value as in the inventory, found {text!r}") from None
+            raise InputError(f"{name}: expected a YAML value, found {text!r}") from None
         if isinstance(value, list) and all(isinstance(item, str) for item in value):
             fields[name] = tuple(value)
         elif isinstance(value, str | int | float | bool):
             fields[name] = value
         else:
-            raise InputError(f"{name}: expected a number, a text, true, false or [a, list], found {text!r}")
+            raise InputError(f"{name}: expected a number, string, boolean or [list], found {text!r}")
     return fields
 
 
@@ -96,12 +96,12 @@ def _change_topics(context: RobotsContext, topic: str, edit: Callable[[Editor], 
     outcomes = run_command(changed, "topic", topic=topic)
     if not any(outcome.result.is_good for outcome in outcomes.values()):
         _undo(changes)
-        echo("no robot took the change, so the inventory is as it was", err=True)
+        echo("no robot accepted the change; the inventory edit was reverted", err=True)
     raise print_totals(changed, outcomes)
 
 
 def _edited(context: RobotsContext, edit: Callable[[Editor], None]) -> tuple[RobotsContext, tuple[Change, ...]]:
-    """The inventory edited, checked and saved, and the context under it."""
+    """Edit, validate and save the inventory; returns the context for it and the changes."""
     editor = Editor.open(context.inventory, environ=os.environ)
     edit(editor)
     changes = editor.changes()
@@ -109,7 +109,7 @@ def _edited(context: RobotsContext, edit: Callable[[Editor], None]) -> tuple[Rob
     try:
         return context.with_fleet(load_fleet(context.inventory, environ=os.environ), only_configuration=True), changes
     except InputError:
-        # what loads, but no daemon would take
+        # it loads, but the daemons would reject it
         _undo(changes)
         raise
 
@@ -125,14 +125,14 @@ def rotate_key_command(
         str,
         typer.Argument(
             metavar="NEW_KEY",
-            help="Where the new key is: env:NAME, file:PATH or file:PATH#ENTRY (relative to the inventory).",
+            help="Reference to the new key: env:NAME, file:PATH or file:PATH#ENTRY, relative to the inventory.",
         ),
     ],
 ) -> None:
-    """Give the fleet a new key without an interruption: accepted everywhere, then used, then the old one dropped.
+    """Rotate the fleet key without an interruption: accept the new key everywhere, use it, then drop the old one.
 
-    Each step must reach every robot before the next begins. Interrupted, or with a robot away, run the same command
-    again: it goes on where it was.
+    Each step must reach every robot before the next starts. After an interruption, or with a robot unreachable, run the
+    same command again to continue.
 
     Example: meshctl robots rotate-key file:secrets.yaml#udp_mesh_2027
     """
@@ -145,8 +145,8 @@ def rotate_key_command(
         outcomes = run_command(context, "rotate-key", new_key=new_key)
         if not totals(outcomes.values()).all_good:
             late = ", ".join(name for name, outcome in outcomes.items() if not outcome.result.is_good)
-            echo(f"stopped before the next step, nothing is cut off: {late} did not take this one", err=True)
-            echo("run the same command again once they can be reached", err=True)
+            echo(f"stopped before the next step: {late} did not complete this one; no robot is cut off", err=True)
+            echo("hint: run the same command again once they are reachable", err=True)
             break
     raise print_totals(context, outcomes)
 

@@ -1,4 +1,4 @@
-"""`meshctl status`: one look at all radios and robots, as a table, as JSON, once or until Ctrl-C."""
+"""`meshctl status` and `meshctl preflight`: a snapshot of all radios and robots; the go/no-go checks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from meshctl.status.robots import is_active
 from meshctl.status.text import preflight_text, text
 
 Names = Annotated[
-    list[str] | None, typer.Argument(metavar="[NAME]...", help="Radios and robots, or patterns: 'husky*'.")
+    list[str] | None, typer.Argument(metavar="[NAME]...", help="Radios and robots, or patterns such as 'husky*'.")
 ]
 
 
@@ -39,28 +39,29 @@ def status(
     names: Names = None,
     watch: Annotated[
         float | None,
-        typer.Option("--watch", "-w", min=1.0, metavar="S", help="Look again every S seconds; Ctrl-C ends."),
+        typer.Option("--watch", "-w", min=1.0, metavar="S", help="Refresh every S seconds until Ctrl-C."),
     ] = None,
     group: Annotated[list[str] | None, typer.Option("--group", help="Only members of this group.")] = None,
     robot: Annotated[list[str] | None, typer.Option("--robot", help="Only this robot's radios and computer.")] = None,
-    role: Annotated[list[str] | None, typer.Option("--role", help=f"Only {', '.join(ROLES)}.")] = None,
-    state: Annotated[list[str] | None, typer.Option("--state", help=f"Only {', '.join(STATES)}.")] = None,
+    role: Annotated[list[str] | None, typer.Option("--role", help=f"Only this role: {', '.join(ROLES)}.")] = None,
+    state: Annotated[list[str] | None, typer.Option("--state", help=f"Only this state: {', '.join(STATES)}.")] = None,
     alarm: Annotated[
         list[str] | None,
         typer.Option("--alarm", help="Only with this alarm: a code, error, warning, note, or any (error or warning)."),
     ] = None,
     only: Annotated[
-        bool, typer.Option("--only", help="Ask only those shown: quicker, without hops and who hears the silent.")
+        bool,
+        typer.Option("--only", help="Query only the selected devices: faster, without hop counts and 'heard by'."),
     ] = False,
-    topics: Annotated[bool, typer.Option("--topics", help="Add when each topic was last sent and received.")] = False,
-    wide: Annotated[bool, typer.Option("--wide", help="All columns, however wide the terminal.")] = False,
+    topics: Annotated[bool, typer.Option("--topics", help="Also show the age of each topic's messages.")] = False,
+    wide: Annotated[bool, typer.Option("--wide", help="Show all columns regardless of the terminal width.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show every radio and every robot: does it answer, is it as the inventory says, whom does it hear, what is wrong.
+    """Show the state of every radio and robot: reachability, drift from the inventory, neighbors and alarms.
 
-    Names and filters choose what is shown; everybody is asked. Nothing is changed anywhere.
+    Names and filters select what is shown; all devices are queried (see --only). Changes nothing.
 
-    Exit code: 0 all well, 1 something degraded, 3 somebody who must answer does not (of those shown), 2 could not look.
+    Exit code (of the devices shown): 0 healthy, 1 degraded, 3 a required device is unreachable, 2 could not run.
 
     Example: meshctl status --watch 5
     Example: meshctl status --role beacon --state deployed
@@ -82,7 +83,7 @@ def status(
 
 
 class _StatusQuery:
-    """Which part of the fleet is looked at, and how it is shown."""
+    """Which part of the fleet is queried, and how it is shown."""
 
     def __init__(self, fleet_view: FleetView, chosen: Filter, only: bool, topics: bool, wide: bool) -> None:
         self._fleet_view = fleet_view
@@ -95,7 +96,7 @@ class _StatusQuery:
         self._robots = tuple(name for name in fleet_view.robots if not only or chosen.matches_robot(fleet, name))
 
     def collect(self, *, show_progress: bool = True) -> Snapshot:
-        """Ask, and remember what was told; `show_progress`: count the answers on the terminal."""
+        """Take a snapshot and record it in the journal; `show_progress` counts answers on a terminal."""
         snapshot = collect(self._fleet_view, self._nodes, self._robots, show_progress=show_progress)
         snapshot = replace(snapshot, is_partial=self._is_partial)
         whole = assess(snapshot, self._nodes, time.time(), self._robots)
@@ -103,7 +104,7 @@ class _StatusQuery:
         return snapshot
 
     def status(self, snapshot: Snapshot, now: float) -> FleetStatus:
-        """Of those that are shown, with ages as of `now`."""
+        """The status of the selected devices, with ages as of `now`."""
         return self._chosen.apply(self._fleet_view.fleet, assess(snapshot, self._nodes, now, self._robots))
 
     def text(self, status: FleetStatus, width: int | None = None, *, brief: bool = False) -> str:
@@ -112,7 +113,7 @@ class _StatusQuery:
 
 
 def _follow(query: _StatusQuery, period_s: float, as_json: bool) -> None:
-    """One look after the other, for pipes and logs: JSON lines, or the text with a blank line behind."""
+    """Repeated snapshots for pipes and logs: JSON lines, or text blocks separated by blank lines."""
     while True:
         began = time.monotonic()
         found = query.status(query.collect(), time.time())
@@ -124,16 +125,16 @@ def _follow(query: _StatusQuery, period_s: float, as_json: bool) -> None:
 
 
 def _watch(query: _StatusQuery, period_s: float) -> None:
-    """The page until Ctrl-C; then what was seen last, where it stays."""
+    """The live screen until Ctrl-C, then the last snapshot as plain output."""
 
     def draw(snapshot: Snapshot | None, size: os.terminal_size) -> list[str]:
         if snapshot is None:
-            return ["looking at everybody for the first time ... (Ctrl-C ends)"]
+            return ["querying all devices ... (Ctrl-C to quit)"]
         status = query.status(snapshot, time.time())
-        footer = ["", f"a look every {period_s:g} s; Ctrl-C ends"]
+        footer = ["", f"refreshed every {period_s:g} s; Ctrl-C to quit"]
         lines = [*query.text(status, size.columns).splitlines(), *footer]
         if len(lines) > size.lines:
-            # in a small window the table comes before notes and advice
+            # in a small window, drop notes and hints to keep the table
             lines = [*query.text(status, size.columns, brief=True).splitlines(), *footer]
         return lines
 
@@ -145,20 +146,20 @@ def _watch(query: _StatusQuery, period_s: float) -> None:
 
 @with_fleet_view
 def preflight(fleet_view: FleetView, as_json: AsJson = False) -> None:
-    """Go or no-go for the run: one line per check, with the reason. Urgent messages are really sent between all robots.
+    """Run the go/no-go checks before a mission, including urgent test messages between all robots.
 
-    Exit code: 0 go, 1 no-go, 2 could not look.
+    Exit code: 0 go, 1 no-go, 2 could not run.
 
     Example: meshctl preflight
     """
     found = assess(collect(fleet_view), fleet_view.nodes, time.time(), fleet_view.robots)
     fleet_view.opened.journal.remember_all(fleet_view.fleet.name, facts_to_record(found), time.time())
-    talking = [
+    answering = [
         robot.name
         for robot in found.robots
         if is_active(robot.state) and robot.facts is not None and robot.facts.answers
     ]
-    checks = checks_of(fleet_view.fleet, found, fleet_view.watcher.ping(talking))
+    checks = checks_of(fleet_view.fleet, found, fleet_view.collector.ping(answering))
     show_preflight(checks, as_json=as_json)
     raise typer.Exit(ExitCode.OK if all(check.is_go for check in checks) else ExitCode.FINDINGS)
 

@@ -1,4 +1,4 @@
-"""`meshctl topology`: the mesh as its nodes see it, drawn."""
+"""`meshctl topology`: the mesh topology as its nodes report it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from meshctl.topology.cells import link_cells, mesh_reports
 
 
 class Format(str, Enum):  # noqa: UP042 - typer shows the values of a str enum
-    """How `meshctl topology` draws."""
+    """Output format of `meshctl topology`."""
 
     TABLE = "table"
     TREE = "tree"
@@ -32,25 +32,25 @@ class Format(str, Enum):  # noqa: UP042 - typer shows the values of a str enum
 
 
 def topology(
-    mesh: Annotated[str, typer.Option("--mesh", help="Which mesh, where the fleet has several.")] = "",
-    form: Annotated[Format, typer.Option("--format", "-f", help="How to draw it.")] = Format.TREE,
+    mesh: Annotated[str, typer.Option("--mesh", help="Mesh to show if the fleet has several.")] = "",
+    form: Annotated[Format, typer.Option("--format", "-f", help="Output format.")] = Format.TREE,
     inventory: InventoryPath = Path(),
     timeout: Timeout = CONNECT_S,
-    as_json: Annotated[bool, typer.Option("--json", help="The same as --format json.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Same as --format json.")] = False,
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Draw the mesh as its nodes see it: links with quality both ways, hops to the base, cut vertices marked.
+    """Show the mesh topology: links with quality in both directions, hops to the base, and cut vertices.
 
-    Exit code: 0 drawn, 3 nobody answered, 2 could not look.
+    Exit code: 0 success, 3 no node answered, 2 could not run.
 
     Example: meshctl topology --format dot | dot -Tsvg > mesh.svg
     """
     with open_fleet_view(inventory, key=key, lab=lab, timeout=timeout, no_robots=True) as fleet_view:
         fleet = fleet_view.fleet
         if mesh and mesh not in fleet.meshes:
-            hint = did_you_mean(mesh, fleet.meshes) or f"it has {', '.join(fleet.meshes)}"
-            raise InputError(f"no mesh of {fleet.name} is called {mesh!r}", hint=hint)
+            hint = did_you_mean(mesh, fleet.meshes) or f"its meshes are {', '.join(fleet.meshes)}"
+            raise InputError(f"{fleet.name} has no mesh {mesh!r}", hint=hint)
         names = {node.name for node in fleet.members(mesh)} if mesh else set(fleet.nodes)
         nodes = tuple(node for node in fleet_view.nodes if node.name in names)
         snapshot = collect(fleet_view, nodes)
@@ -79,9 +79,11 @@ def topology(
     if not snapshot.observations:
         is_new = bool(nodes) and all(node.age_s is None for node in found.nodes)
         why = (
-            "no node was ever seen: meshctl bootstrap takes factory devices in" if is_new else "meshctl status says why"
+            "no node was ever seen; run `meshctl bootstrap` to set up factory-default devices"
+            if is_new
+            else "run `meshctl status` for the reason"
         )
-        echo(f"nobody answered: {why}", err=True)
+        echo(f"no node answered: {why}", err=True)
     elif apart := [node.name for node in nodes if node.name not in graph]:
-        echo(f"nobody tells of {', '.join(apart)}: meshctl status says why", err=True)
+        echo(f"no node reports {', '.join(apart)}; run `meshctl status` for the reason", err=True)
     raise typer.Exit(ExitCode.OK if snapshot.observations or not nodes else ExitCode.UNREACHABLE)
