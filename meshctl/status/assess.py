@@ -1,6 +1,6 @@
-"""From one snapshot of the fleet to its status. Pure: what was seen and told, what was known before, and the time in.
+"""Assess a snapshot: observations, last known facts and the time -> `FleetStatus`. Pure.
 
-`assess` makes the radios' part here; the robots' part is made in `robots`.
+This module assesses the radios; `robots` assesses the robots.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from meshctl.topology import Graph, Report, Sighting, neighbours_of, report_of, 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """One look at the fleet.
+    """The answers of all queried devices at one time.
 
-    `known` is what the journal knew before it, by node and by `robot.NAME`; `macs` maps MACs to nodes; `silent` and
-    `silent_robots` tell why somebody gave no answer; `unrendered` why a node or a `robot.NAME` could not be compared
-    with the inventory; `own_lock` is who we are to the nodes' locks; `robots_unasked` why no robot was asked at all.
-    `is_partial` says that only some were asked, so that paths and cut vertices cannot be told.
+    `known` are the facts in the journal before it, by node and by `robot.NAME`; `macs` maps MACs to nodes; `no_answer`
+    and `no_answer_robots` hold the reasons for missing answers; `unrendered` why a node or `robot.NAME` could not be
+    compared with the inventory; `own_lock` is our name in the nodes' locks; `robots_skipped` why no robot was queried.
+    `is_partial`: only some nodes were queried, so paths and cut vertices are unknown.
     """
 
     fleet: Fleet
@@ -69,7 +69,7 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
             node=node,
             observation=seen,
             plan=snapshot.plans.get(node.name),
-            neighbors=_neighbours(reports[node.name], snapshot.macs),
+            neighbors=_neighbors(reports[node.name], snapshot.macs),
             path=paths.get(node.name),
             is_path_known=snapshot.entry in paths,
             cuts_off=cuts.get(node.name, ()),
@@ -100,15 +100,15 @@ def _fleet_alarms(snapshot: Snapshot) -> Iterable[Alarm]:
     for name, why in snapshot.unrendered.items():
         reasons.setdefault(why, []).append(name)
     for why, names in reasons.items():
-        told = f"{join_limited(tuple(names))} not compared with the inventory: {why}"
-        hint = "give the secret it names, or mend the inventory: meshctl lint"
-        yield Alarm(Level.WARNING, "not-compared", told, hint)
+        text = f"{join_limited(tuple(names))} not compared with the inventory: {why}"
+        hint = "provide the missing secret, or fix the inventory (meshctl lint)"
+        yield Alarm(Level.WARNING, "not-compared", text, hint)
     if snapshot.robots_skipped:
         yield Alarm(Level.NOTE, "robots-unasked", snapshot.robots_skipped)
 
 
-def _neighbours(report: Report, macs: Mapping[str, str]) -> tuple[Neighbor, ...]:
-    """The neighbours of one node that were heard lately, the best first."""
+def _neighbors(report: Report, macs: Mapping[str, str]) -> tuple[Neighbor, ...]:
+    """The neighbors that a node heard recently, best first."""
     found = [
         Neighbor(name, heard.last_seen_ms, heard.quality, heard.signal_dbm)
         for name, heard in neighbours_of(report, macs).items()
@@ -119,21 +119,21 @@ def _neighbours(report: Report, macs: Mapping[str, str]) -> tuple[Neighbor, ...]
 def _unreachable_status(snapshot: Snapshot, node: Node, heard_by: tuple[Sighting, ...], now: float) -> NodeStatus:
     last = snapshot.known.get(node.name)
     why = snapshot.no_answer.get(node.name, NOT_ASKED)
-    is_missed = node.state is NodeState.DEPLOYED
+    is_required = node.state is NodeState.DEPLOYED
     alarm = no_answer_alarm(
         why,
         last,
         heard_by,
         now,
-        is_required=is_missed,
+        is_required=is_required,
         trust=f"meshctl trust {node.name}",
-        first_contact_hint=f"not taken in yet? meshctl bootstrap {node.name}",
+        first_contact_hint=f"if it is not set up yet: meshctl bootstrap {node.name}",
     )
     lost_relay = lost_relay_alarm(node, why, last, now)
     found = tuple(one for one in (lost_relay, alarm) if one is not None)
     return NodeStatus(
         node=node,
-        health=Health.UNREACHABLE if is_missed else Health.DEGRADED if found else Health.OFF,
+        health=Health.UNREACHABLE if is_required else Health.DEGRADED if found else Health.OFF,
         alarms=found,
         age_s=None if last is None else now - last.seen_s,
         no_answer_reason=why.reason,
@@ -143,23 +143,24 @@ def _unreachable_status(snapshot: Snapshot, node: Node, heard_by: tuple[Sighting
 
 
 def _reachable_status(seen: NodeAlarmInput, now: float) -> NodeStatus:
-    told, plan = seen.observation, seen.plan
+    observed, plan = seen.observation, seen.plan
+    memory = observed.memory
     found = alarms(seen)
-    lan = next((bridge.ports for bridge in told.bridges or () if bridge.name == "br-lan"), None)
-    mesh_links = [link for link in told.links or () if link.mode.lower() in MESH_MODES]
+    lan = next((bridge.ports for bridge in observed.bridges or () if bridge.name == "br-lan"), None)
+    mesh_links = [link for link in observed.links or () if link.mode.lower() in MESH_MODES]
     return NodeStatus(
         node=seen.node,
         health=health_of(found),
         alarms=found,
-        age_s=max(0.0, now - told.answered_at_s),
-        version=told.release.version if told.release else "",
-        revision=told.release.revision if told.release else "",
+        age_s=max(0.0, now - observed.answered_at_s),
+        version=observed.release.version if observed.release else "",
+        revision=observed.release.revision if observed.release else "",
         drift=None if plan is None else tuple(change.path for change in plan.files),
-        uptime_s=told.uptime_s,
-        load=None if told.load is None else told.load.minute / told.load.processors,
-        memory_free=told.memory.available / told.memory.total if told.memory and told.memory.total else None,
-        flash_free_bytes=told.overlay.free if told.overlay else None,
-        clock_offset_s=told.clock_offset_s,
+        uptime_s=observed.uptime_s,
+        load=None if observed.load is None else observed.load.minute / observed.load.processors,
+        memory_free=memory.available / memory.total if memory and memory.total else None,
+        flash_free_bytes=observed.overlay.free if observed.overlay else None,
+        clock_offset_s=observed.clock_offset_s,
         channels=tuple(dict.fromkeys(link.channel for link in mesh_links if link.channel is not None)),
         tx_power_dbm=next((link.tx_power_dbm for link in mesh_links if link.tx_power_dbm is not None), None),
         lan_ports=lan,

@@ -1,7 +1,7 @@
-"""Which radios and robots of a status are shown: names, groups, robots, roles, states, alarms.
+"""Select the radios and robots of a status to show: by name, group, robot, role, state or alarm.
 
-Values of one kind are alternatives, kinds narrow each other down. Everybody may have been asked all the same: hops, and
-who hears a silent node, come from the others.
+Values of one kind are alternatives; different kinds must all match. Devices that are not shown are usually still
+queried, since hop counts and "heard by" come from them.
 """
 
 from __future__ import annotations
@@ -21,13 +21,12 @@ from meshctl.status.values import Alarm, FleetStatus, Level
 ROLES = (*(role.value for role in Role), COMPUTER)
 STATES = tuple(state.value for state in NodeState if state.is_managed)
 ANY_ALARM = "any"
-# a hint that fills the screen is none
 MAX_HINT_NAMES = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """Empty means all. `names` match radios and robots; `alarms` are codes, levels, or `any` (warnings and errors)."""
+    """Empty matches all. `names` match radios and robots; `alarms` are codes, levels or `any` (error, warning)."""
 
     names: tuple[str, ...] = ()
     groups: tuple[str, ...] = ()
@@ -41,7 +40,7 @@ class Filter:
         return self == Filter()
 
     def check(self, fleet: Fleet) -> None:
-        """Raises InputError for a value that selects nothing in this fleet, whatever its state."""
+        """Raises InputError for a value that can match nothing in this fleet."""
         names = [*(node.name for node in fleet.managed()), *fleet.robots]
         _require_match("node or robot", self.names, names, fleet.name)
         _require_match(
@@ -62,7 +61,7 @@ class Filter:
         )
 
     def matches_robot(self, fleet: Fleet, name: str) -> bool:
-        """A robot belongs to the groups of its radios, and has their state."""
+        """A robot has the groups and the state of its radios."""
         robot = fleet.robots[name]
         groups = {group for node in robot.nodes if node in fleet.nodes for group in fleet.nodes[node].groups}
         state = robot_state(fleet, robot)
@@ -75,7 +74,7 @@ class Filter:
         )
 
     def apply(self, fleet: Fleet, status: FleetStatus) -> FleetStatus:
-        """The same status of those that are shown; what concerns the whole fleet goes when anything is filtered."""
+        """The status of the matching devices; a filter drops the alarms of the whole fleet."""
         if self.is_empty:
             return status
         return replace(
@@ -106,5 +105,5 @@ def _require_match(what: str, patterns: tuple[str, ...], names: Iterable[str], w
     listed = list(names)
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in listed):
-            hint = did_you_mean(pattern, listed) or f"there are: {', '.join(listed[:MAX_HINT_NAMES])}"
-            raise InputError(f"no {what} of {where} is called {pattern!r}", hint=hint)
+            hint = did_you_mean(pattern, listed) or f"expected one of {', '.join(listed[:MAX_HINT_NAMES])}"
+            raise InputError(f"no {what} of {where} matches {pattern!r}", hint=hint)

@@ -1,6 +1,6 @@
-"""The status for scripts, as JSON values. docs/status.md describes the shape; VERSION changes when a field does.
+"""The status as JSON. docs/status.md describes the schema; VERSION changes with it.
 
-Times are seconds, shares 0 to 1; a fact that is not known is null, never 0.
+Times are in seconds, shares 0 to 1; an unknown value is null, never 0.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ VERSION = 1
 
 
 def as_json(status: FleetStatus) -> dict[str, Any]:
-    """Everything that the table tells, and what has no room there."""
+    """All facts, including those the table has no room for."""
     everywhere = [*status.alarms, *(alarm for one in status for alarm in one.alarms)]
     return {
         "version": VERSION,
@@ -165,7 +165,7 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
 
 
 def preflight_json(checks: Iterable[Check]) -> dict[str, Any]:
-    """`go` for the whole, then each check."""
+    """The overall `go` and each check."""
     listed = tuple(checks)
     return {
         "version": VERSION,

@@ -1,7 +1,4 @@
-"""From what the robots' computers told to their status: state, whom each hears and who hears it, topics, alarms.
-
-`RobotAnswers` is all that was told; `robot_status` makes one robot's status of it.
-"""
+"""Assess the robots: `RobotAnswers` (all facts) -> `robot_status` -> state, peers, topics and alarms of one robot."""
 
 from __future__ import annotations
 
@@ -21,8 +18,8 @@ from meshctl.topology import Sighting
 
 @dataclass(frozen=True, slots=True)
 class RobotAnswers:
-    """`told` are the facts of every robot that answered, `silent` says why others did not; `known` is what was known
-    before, by `robot.NAME`; `not_compared` are the `robot.NAME` whose configuration could not be rendered."""
+    """`facts` of the robots that answered, `no_answer` the reasons of the others; `known` are earlier facts by
+    `robot.NAME`; `not_compared` are the `robot.NAME` whose configuration could not be rendered."""
 
     fleet: Fleet
     facts: Mapping[str, RobotFacts]
@@ -33,7 +30,7 @@ class RobotAnswers:
 
     @property
     def base(self) -> str:
-        """The operator's own peer, empty where the inventory has none."""
+        """The operator's own peer; empty if the inventory has none."""
         return next((robot.name for robot in self.fleet.robots.values() if robot.is_base), "")
 
 
@@ -46,7 +43,7 @@ def robot_state(fleet: Fleet, robot: Robot) -> NodeState | None:
 
 
 def is_active(state: NodeState | None) -> bool:
-    """Whether a robot must answer: one on the shelf need not; one without radios here is on some other network."""
+    """Whether a robot must answer: deployed, or without radios in this inventory (on another network)."""
     return state in (None, NodeState.DEPLOYED)
 
 
@@ -82,13 +79,15 @@ def _unreachable_status(
     why = answers.no_answer.get(robot.name, NOT_ASKED)
     is_required = is_active(state)
     trust = f"meshctl robots trust {robot.name}"
-    hint = f"is its address right? Then {trust}, and meshctl robots deploy {robot.name}"
+    hint = f"check its address, then run {trust} and meshctl robots deploy {robot.name}"
     alarm = no_answer_alarm(
         why, last, heard_by, answers.now, is_required=is_required, trust=trust, first_contact_hint=hint
     )
     if alarm is not None and heard_by and alarm.code == "unreachable":
-        told = f"{alarm.text}: its daemon is heard, its SSH is not"
-        alarm = Alarm(Level.ERROR, "unreachable", told, "the run may go on without SSH; look at its sshd and its load")
+        text = f"{alarm.text}: its daemon is heard, but SSH does not answer"
+        alarm = Alarm(
+            Level.ERROR, "unreachable", text, "check its sshd and its load; the mission can continue without SSH"
+        )
     return RobotStatus(
         robot=robot,
         state=state,
@@ -102,7 +101,7 @@ def _unreachable_status(
 
 
 def _heard_by(answers: RobotAnswers, robot: str) -> tuple[Sighting, ...]:
-    """The robots whose daemons call this one online, the latest first."""
+    """The robots whose daemons report this one online, latest first."""
     seen = [
         Sighting(name, round(peer.heard_ago_s * 1000))
         for name, facts in answers.facts.items()

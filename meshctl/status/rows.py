@@ -1,7 +1,7 @@
 """The cells of the status table: one row per radio and per robot's computer, under the same columns.
 
-`row` gives the cells by column; what a device that is silent told last stands in brackets. A cell has a short form for
-narrow terminals where it says more than it must.
+`row` gives the cells by column; last known facts of unreachable devices are in parentheses. Cells may have a short form
+for narrow terminals.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ COMPUTER = "computer"
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """`short` is what stands there when the whole text has no room."""
+    """`short` replaces `text` on narrow terminals."""
 
     text: str = ""
     short: str = ""
@@ -30,14 +30,14 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """`rank` orders columns by how soon they give way on a narrow terminal, the highest first; 0 never does."""
+    """Columns with a higher `rank` are dropped first on a narrow terminal; 0 is never dropped."""
 
     key: str
     heading: str
     rank: int
 
 
-# In the order they stand in; docs/status.md explains each.
+# In display order; docs/status.md explains each.
 COLUMNS = (
     Column("name", "name", 0),
     Column("what", "what", 0),
@@ -61,7 +61,7 @@ COLUMNS = (
 
 
 def row(one: NodeStatus | RobotStatus) -> dict[str, Cell]:
-    """Its cells by column key."""
+    """The cells of a device by column key."""
     return _node_row(one) if isinstance(one, NodeStatus) else _robot_row(one)
 
 
@@ -91,7 +91,7 @@ def _node_row(node: NodeStatus) -> dict[str, Cell]:
 
 
 def _hears(node: NodeStatus) -> Cell:
-    """How many nodes it hears, and the best of them: `3: b01 -70 dBm 62%`."""
+    """The number of nodes heard and the best one: `3: b01 -70 dBm 62%`."""
     count = str(len(node.neighbors))
     if not node.neighbors:
         return Cell(count)
@@ -171,7 +171,7 @@ def _known_robot(facts: Mapping[str, str]) -> dict[str, Cell]:
 
 
 def _bracketed(cells: Mapping[str, Cell]) -> dict[str, Cell]:
-    """Known from before."""
+    """Cells of last known facts, in parentheses."""
     return {
         key: Cell(f"({cell.text})", f"({cell.short})" if cell.short else "") for key, cell in cells.items() if cell.text
     }

@@ -1,6 +1,6 @@
-"""The mesh as its nodes see it, for people and for other programs: table, tree, JSON, NetJSON NetworkGraph, DOT.
+"""The mesh topology as table, tree, JSON, NetJSON NetworkGraph or DOT.
 
-Every link carries its quality both ways and how old the reports are; cut vertices are marked.
+Links have the quality in both directions and the age of the reports; cut vertices are marked.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from meshctl.topology.cells import LinkCell
 
 @dataclass(frozen=True, slots=True)
 class Direction:
-    """What one end tells of a link; None everywhere when that end did not answer."""
+    """What one end reports of a link; all None if it did not answer."""
 
     quality: float | None = None
     signal_dbm: int | None = None
@@ -26,8 +26,8 @@ class Direction:
 
 @dataclass(frozen=True, slots=True)
 class TopologyView:
-    """`directions[a, b]` is what `a` tells of hearing `b`, `cells[a, b]` in which cells. `age_s` is how old a node's
-    report is."""
+    """`directions[a, b]` is what `a` reports of hearing `b`, `cells[a, b]` in which cells; `ages_s` are the ages of the
+    nodes' reports."""
 
     mesh: str
     entry: str
@@ -39,11 +39,11 @@ class TopologyView:
     cells: Mapping[tuple[str, str], tuple[LinkCell, ...]] = field(default_factory=dict)
 
     def age_s(self, name: str) -> float | None:
-        """For programs: to the millisecond."""
+        """The age of a node's report, rounded to milliseconds."""
         return round(self.ages_s[name], 3) if name in self.ages_s else None
 
     def cells_of(self, a: str, b: str) -> tuple[LinkCell, ...]:
-        """The cells of a link, by what either end tells."""
+        """The cells of a link, as reported by either end."""
         return tuple(dict.fromkeys((*self.cells.get((a, b), ()), *self.cells.get((b, a), ()))))
 
     def has_several_cells(self) -> bool:
@@ -54,7 +54,7 @@ class TopologyView:
 
 
 def directions(reports: Mapping[str, Report], macs: Mapping[str, str]) -> dict[tuple[str, str], Direction]:
-    """What every reporting node tells of each neighbour heard lately."""
+    """What each reporting node reports of the neighbors it heard recently."""
     return {
         (name, other): Direction(heard.quality, heard.signal_dbm, heard.last_seen_ms)
         for name, report in reports.items()
@@ -67,7 +67,7 @@ def _share(value: float | None) -> str:
 
 
 def table(view: TopologyView) -> str:
-    """One line per link, the weakest first."""
+    """One line per link, weakest first."""
     lines = [("link", "there", "back", "signal", "heard", "cell")]
     for link in sorted(view.graph.links, key=lambda link: (link.quality, link.a, link.b)):
         there, back = view.direction(link.a, link.b), view.direction(link.b, link.a)
@@ -81,12 +81,12 @@ def table(view: TopologyView) -> str:
     widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
     links = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in lines]
     cuts = view.graph.cut_off_by(view.entry)
-    told = [f"cut vertex: {name} (holds {', '.join(lost)})" for name, lost in cuts.items()]
-    return "\n".join([*links, *told])
+    notes = [f"cut vertex: {name} (connects {', '.join(lost)})" for name, lost in cuts.items()]
+    return "\n".join([*links, *notes])
 
 
 def tree(view: TopologyView) -> str:
-    """Every node below the next one on its best path to the entry; cut vertices carry a star."""
+    """Each node below its next hop to the entry; cut vertices are marked with a star."""
     paths = view.graph.paths(view.entry)
     children: dict[str, list[str]] = {}
     for name, path in sorted(paths.items()):
@@ -98,11 +98,11 @@ def tree(view: TopologyView) -> str:
     def label(name: str) -> str:
         star = " *" if name in cuts else ""
         path = paths[name]
-        told = "" if name == view.entry else f"  {path.hops} hop{'s' if path.hops > 1 else ''}, {path.quality:.0%}"
+        text = "" if name == view.entry else f"  {path.hops} hop{'s' if path.hops > 1 else ''}, {path.quality:.0%}"
         age = f", {duration(view.ages_s[name])} old" if name in view.ages_s else ", does not answer"
         if name != view.entry and view.has_several_cells():
-            told += "".join(f", {cell}" for cell in view.cells_of(name, path.via))
-        return f"{name}{star}{told}{age if name != view.entry else ''}"
+            text += "".join(f", {cell}" for cell in view.cells_of(name, path.via))
+        return f"{name}{star}{text}{age if name != view.entry else ''}"
 
     waiting = [(view.entry, "", "")] if view.entry in paths else []
     while waiting:
@@ -114,12 +114,12 @@ def tree(view: TopologyView) -> str:
             waiting.append((inner[index], below + ("`- " if last else "|- "), below + ("   " if last else "|  ")))
     apart = [name for name in view.graph.nodes if name not in paths]
     lines += [f"no path to {view.entry or 'the base'}: {', '.join(apart)}"] if apart else []
-    lines += ["* without it others would be cut off"] if cuts else []
+    lines += ["* cut vertex: others reach the base only through it"] if cuts else []
     return "\n".join(lines)
 
 
 def as_json(view: TopologyView) -> str:
-    """Nodes and links with both directions."""
+    """Nodes, and links with both directions."""
     paths = view.graph.paths(view.entry)
     cuts = view.graph.cut_off_by(view.entry)
     nodes: list[dict[str, Any]] = [
@@ -153,7 +153,7 @@ def _direction_json(direction: Direction) -> dict[str, Any]:
 
 
 def netjson(view: TopologyView) -> str:
-    """NetJSON NetworkGraph (netjson.org, draft 00): `cost` is 1 / quality, as expected transmissions are."""
+    """NetJSON NetworkGraph (netjson.org, draft 00): `cost` is 1 / quality, the expected transmissions."""
     return json.dumps(
         {
             "type": "NetworkGraph",

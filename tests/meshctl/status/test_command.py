@@ -219,10 +219,10 @@ def test_whoever_leaves_a_look_need_not_wait_for_the_silent(bench: Bench) -> Non
 def test_watch_draws_what_fits_follows_the_window_and_leaves_the_screen_as_it_was(bench: Bench) -> None:
     watch = bench.command("status", "--watch", "1", "--timeout", "60")
     with Terminal(watch, bench.environ, lines=60, columns=160) as terminal:
-        shown = terminal.shows("looked-at: .*all well.*Ctrl-C ends", "a page")
+        shown = terminal.shows("looked-at: .*all well.*Ctrl-C to quit", "a page")
         assert "disk free" in shown
         # a count of answers would stand in the page
-        assert "answered or given up" not in shown
+        assert "queried" not in shown
         terminal.forget()
         terminal.resize(8, 72)
         terminal.shows(r"\.\.\. \d+ more lines", "a page for the smaller window")

@@ -54,7 +54,7 @@ def broken(fleet: Fleet) -> FleetStatus:
 def test_no_line_is_wider_than_the_terminal(fleet: Fleet, width: int) -> None:
     status = broken(fleet)
     silent = [
-        replace(topic, problem="has sent nothing for 12 min, of all the topics there are")
+        replace(topic, problem="nothing sent for 12 min, of all the topics there are")
         for topic in status.robots[0].topics
     ]
     status = replace(status, robots=(replace(status.robots[0], topics=tuple(silent)), *status.robots[1:]))
@@ -71,12 +71,12 @@ def test_a_preflight_ends_with_its_verdict_and_what_stands_against_it(fleet: Fle
 
 def test_what_has_no_room_is_named(fleet: Fleet) -> None:
     told = " ".join(text(broken(fleet), 80).split())
-    left_out = re.search(r"no room for (.*?): --wide", told)
+    left_out = re.search(r"columns not shown: (.*?) \(use --wide", told)
     assert left_out is not None
     headings = text(broken(fleet), 80)
     for heading in left_out[1].split(", "):
         assert f"  {heading}  " not in headings.partition("name  ")[2].partition("\n")[0]
-    assert "no room for" not in text(broken(fleet))
+    assert "columns not shown" not in text(broken(fleet))
 
 
 @given(
@@ -117,7 +117,7 @@ def test_one_alarm_at_many_is_one_line(fleet: Fleet) -> None:
     status = status_of(fleet, {}, {}, silent={name: NoAnswer("no answer") for name in fleet.nodes})
     many = replace(status, robots=(), nodes=tuple(node for node in status.nodes if node.alarms) * 3)
     lines = summary_lines(many)
-    assert sum("unreachable at 9" in line for line in lines) == 1
+    assert sum("unreachable on 9" in line for line in lines) == 1
     assert any("--alarm unreachable" in line for line in lines)
 
 

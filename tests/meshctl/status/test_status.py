@@ -59,7 +59,7 @@ def test_a_deployed_node_that_is_silent_is_missed_and_told_by_whom_it_is_heard(f
 def test_who_is_gone_for_good_is_told_with_the_place_it_was_at(fleet: Fleet) -> None:
     known = {"rover": LastKnown("rover", NOW - 600, {"hops": "2", "via": "b01"})}
     status = status_of(fleet, {"base": seen("base", {})}, known=known)
-    assert alarms(status, "rover")["unreachable"].hint.startswith("it was 2 hops out, behind b01")
+    assert alarms(status, "rover")["unreachable"].hint.startswith("it was 2 hops away, behind b01")
     assert "meshctl bootstrap b01" in alarms(status, "b01")["unreachable"].hint
 
 
@@ -154,7 +154,7 @@ def test_drift_names_the_files_and_the_commands_that_mend_it(fleet: Fleet) -> No
     plan = NodePlan("rover", Verdict.CHANGE, files=(FileChange("etc/config/wireless", "changed", ""),))
     told = text(status_of(fleet, plans={"rover": plan}))
     assert "rover: configuration differs: wireless" in told
-    assert "meshctl provision rover puts it right" in told
+    assert "meshctl provision rover fixes them" in told
 
 
 def test_a_stranger_in_the_mesh_is_reported(fleet: Fleet) -> None:
@@ -201,7 +201,7 @@ _DROPPED = {
 def test_a_carried_beacon_that_others_need_is_said_to_be_dropped(fleet: Fleet) -> None:
     status = status_of(fleet, _DROPPED)
     alarm = alarms(status, "b02")["dropped"]
-    assert alarm.text == "carried by the inventory, and the way from rover to the base leads through it"
+    assert alarm.text == "marked as carried, but relays to the base for rover"
     assert alarm.hint == "if it has been dropped: meshctl deployed b02"
     assert "dropped" not in alarms(status, "b01")
     assert status.exit_code is ExitCode.OK
