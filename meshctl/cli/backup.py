@@ -1,4 +1,4 @@
-"""`meshctl backup` and `meshctl restore`: a node's whole state, kept and put back."""
+"""`meshctl backup` and `meshctl restore`: save a node's whole state and restore it."""
 
 from __future__ import annotations
 
@@ -16,10 +16,20 @@ from meshctl.apply.health_checks import Expectation
 from meshctl.apply.neighbor_query import look_around
 from meshctl.apply.prepare import base_macs
 from meshctl.apply.station_flush import NOT_ASKED, ask_the_rest
-from meshctl.cli.asking import must_agree
-from meshctl.cli.context import KeyFiles, Lab, Nodes, Session, chosen, exit_for, progress_for, session
-from meshctl.cli.journaled_run import Refused
-from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.context import (
+    AsJson,
+    InventoryPath,
+    KeyFiles,
+    Lab,
+    Nodes,
+    Session,
+    confirm,
+    exit_for,
+    progress_for,
+    selected_nodes,
+    session,
+)
+from meshctl.cli.journaled_run import PlanRefused
 from meshctl.cli.plan import Yes
 from meshctl.device.observation import Observation
 from meshctl.errors import InputError
@@ -30,22 +40,22 @@ from meshctl.plan import Cut, Effect, NodePlan, Verdict
 
 def backup(
     nodes: Nodes = None,
-    out: Annotated[Path, typer.Option("--out", help="Directory to write NODE-TIME.tgz to.")] = Path("backups"),
+    out: Annotated[Path, typer.Option("--out", help="Directory for the NODE-TIME.tgz files.")] = Path("backups"),
     inventory: InventoryPath = Path(),
     as_json: AsJson = False,
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Fetch the whole state of nodes: configuration, keys, accounts. The files hold secrets, and get mode 0600.
+    """Back up nodes: configuration, keys and accounts. Backups hold secrets and are written with mode 0600.
 
     Example: meshctl backup 'husky*' --out backups
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        wanted = {node.name: node for node in chosen(opened.fleet, nodes)}
+        wanted = {node.name: node for node in selected_nodes(opened.fleet, nodes)}
         try:
             out.mkdir(parents=True, exist_ok=True, mode=0o700)
         except OSError as error:
-            raise InputError(f"{out}: cannot be made: {error.strerror}") from error
+            raise InputError(f"cannot create {out}: {error.strerror}") from error
 
         def work(name: str) -> Outcome:
             with opened.access.lease(wanted[name]) as connection:
@@ -67,7 +77,7 @@ def backup(
 
 
 def _write_private(path: Path, data: bytes) -> None:
-    # half a backup must not look like one
+    # an incomplete file must not look like a backup
     part = path.with_name(f".{path.name}.part")
     try:
         with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
@@ -77,31 +87,31 @@ def _write_private(path: Path, data: bytes) -> None:
         part.replace(path)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
 
 
 def restore(
-    node: Annotated[str, typer.Argument(help="Name of the node.")],
-    file: Annotated[Path, typer.Argument(help="A file that `meshctl backup` wrote.")],
+    node: Annotated[str, typer.Argument(help="Node to restore.")],
+    file: Annotated[Path, typer.Argument(help="Backup written by `meshctl backup`.")],
     inventory: InventoryPath = Path(),
     yes: Yes = False,
     as_json: AsJson = False,
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Put a node's saved state back. Like every change it undoes itself unless the node can be reached with it.
+    """Restore a node from a backup. The node rolls back unless it stays reachable, as for every change.
 
     Example: meshctl restore b03 backups/b03-20260701T090000Z.tgz
     """
     try:
         saved = read_backup(file.read_bytes(), str(file))
     except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror}") from error
+        raise InputError(f"cannot read {file}: {error.strerror}") from error
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        (there,) = chosen(opened.fleet, [node])[:1]
+        (there,) = selected_nodes(opened.fleet, [node])[:1]
         if not yes:
             taken = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(saved.taken_s))
-            must_agree(f"Make {there.name} what it was on {taken}?")
+            confirm(f"Restore {there.name} to its state of {taken}?")
         outcome = _restore(opened, there.name, saved, as_json=as_json)
     raise typer.Exit(exit_for([outcome], opened.interrupt))
 
@@ -137,17 +147,17 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Out
                     seen = observe_cleared(connection, (), opened.interrupt)
                     problem = objection_to(saved, name, seen)
                     if problem:
-                        raise Refused(problem)
-                    shut_out = lockout_by(saved, node, opened.access.own_keys(node))
-                    if shut_out is not None:
-                        raise Refused(shut_out.reason, hint=shut_out.hint)
+                        raise PlanRefused(problem)
+                    lockout = lockout_by(saved, node, opened.access.own_keys(node))
+                    if lockout is not None:
+                        raise PlanRefused(lockout.reason, hint=lockout.hint)
                     around.update(
                         look_around(opened.access, opened.fleet, {name: seen}, known, interrupt=opened.interrupt)
                     )
                     for package in lacking_packages(saved, seen):
-                        work.note(f"package {package} was installed then and is not now", name)
+                        work.note(f"package {package} is in the backup but no longer installed", name)
                     if saved.disabled:
-                        work.note(f"disabled then, and left as they are: {', '.join(saved.disabled)}", name)
+                        work.note(f"services disabled in the backup, left unchanged: {', '.join(saved.disabled)}", name)
                     plan = NodePlan(name, Verdict.CHANGE, effects=(Effect("everything", Cut.MESH, "restored"),))
                     job = Job(work, node, plan, opened.renderer.wanted(node, seen), seen, Expectation())
                 except BaseException:

@@ -1,4 +1,4 @@
-"""`meshctl bootstrap` and `meshctl replace`: devices on the bench."""
+"""`meshctl bootstrap` and `meshctl replace`: set up devices on the bench."""
 
 from __future__ import annotations
 
@@ -23,10 +23,9 @@ from meshctl.apply.bootstrap import (
     restore_pins,
 )
 from meshctl.apply.replace import give_up, heir_of, identity_edits, succeed
-from meshctl.cli.context import KeyFiles, Lab, Session, exit_for, session
-from meshctl.cli.journaled_run import SALT_BYTES, ask_and_carry_out, choices_of
-from meshctl.cli.options import AsJson, InventoryPath
-from meshctl.cli.output import complain, echo
+from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Session, exit_for, session
+from meshctl.cli.journaled_run import SALT_BYTES, choices_of, confirm_and_execute
+from meshctl.cli.output import echo, echo_error
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
 from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Outcome, Result
@@ -37,14 +36,14 @@ from meshctl.report.progress import outcome_text
 
 Changes = tuple[FileEdit, ...]
 
-# Stands for a device that is in no inventory yet.
+# Argument for a device that is not in the inventory.
 BENCH = "bench"
-SILENT_HINT = f"is it plugged in, on for a minute, and has this machine an address in {FACTORY_ADDRESS}'s network?"
+NO_ANSWER_HINT = f"check that it has booted and that this machine has an address in the network of {FACTORY_ADDRESS}"
 
 At = Annotated[
     list[str] | None,
     typer.Option(
-        "--at", help="Where a device answers, HOST or HOST:PORT, e.g. fe80::1%eth2; one for each NODE, in their order."
+        "--at", help="Address of a device, HOST or HOST:PORT, e.g. fe80::1%eth2; one per NODE, in the same order."
     ),
 ]
 
@@ -52,7 +51,7 @@ Interfaces = Annotated[
     list[str] | None,
     typer.Option(
         "--interface",
-        help="An interface that one factory device is plugged into, e.g. eth1; one for each NODE, in their order.",
+        help="Interface with one factory-default device, e.g. eth1; one per NODE, in the same order.",
     ),
 ]
 
@@ -60,14 +59,12 @@ Interfaces = Annotated[
 def bootstrap(
     nodes: Annotated[
         list[str] | None,
-        typer.Argument(help="Whom to expect: name, label, serial number or MAC; default: whoever answers, by its MAC."),
+        typer.Argument(help="Expected nodes by name, label, serial number or MAC; default: identify by MAC."),
     ] = None,
     at: At = None,
     interface: Interfaces = None,
     inventory: InventoryPath = Path(),
-    replace_key: Annotated[
-        bool, typer.Option("--replace-key", "--replace", help="Take a device whose host key is new.")
-    ] = False,
+    replace_key: Annotated[bool, typer.Option("--replace-key", "--replace", help="Accept a changed host key.")] = False,
     yes: Yes = False,
     no_firmware: NoFirmware = False,
     rate: Rate = None,
@@ -76,14 +73,14 @@ def bootstrap(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Take factory devices (root without a password at 192.168.1.1) into the fleet: identify, set keys, provision.
+    """Set up factory-default devices (192.168.1.1, root without password): identify, install keys, provision.
 
     Example: meshctl bootstrap b03 b04 --interface eth1 --interface eth2
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        places = _places(opened, nodes or [], _spots(at or [], interface or []))
-        with opened.interrupt.on_signals(complain):
+        places = _expected_places(opened, nodes or [], _named_places(at or [], interface or []))
+        with opened.interrupt.on_signals(echo_error):
             arrivals = look_around(
                 opened.renderer,
                 opened.access,
@@ -94,7 +91,7 @@ def bootstrap(
                 interrupt=opened.interrupt,
             )
         for outcome in arrivals.outcomes:
-            _complain(outcome)
+            _print_failure(outcome)
         if not as_json:
             for name, item in arrivals.found.items():
                 echo(f"{name}: found at {item.place.endpoint.label}, host key {item.key.fingerprint}")
@@ -113,36 +110,38 @@ def bootstrap(
         refused = [plan.node for plan in prepared.plan.of(Verdict.REFUSED) if plan.node in arrivals.found]
         restore_pins(opened.trust, arrivals, refused)
         try:
-            ask_and_carry_out(opened, prepared, "bootstrap", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
+            confirm_and_execute(
+                opened, prepared, "bootstrap", choices, yes=yes, as_json=as_json, brief=brief, rate=rate
+            )
         except typer.Exit as ended:
             if arrivals.outcomes and ended.exit_code == ExitCode.OK:
                 raise typer.Exit(ExitCode.FINDINGS) from None
             raise
 
 
-def _complain(outcome: Outcome) -> None:
+def _print_failure(outcome: Outcome) -> None:
     echo(f"{outcome_text(outcome)}", err=True)
     is_silent = outcome.result is Result.UNREACHABLE and FACTORY_ADDRESS in outcome.node
-    hint = outcome.hint or (SILENT_HINT if is_silent else "")
+    hint = outcome.hint or (NO_ANSWER_HINT if is_silent else "")
     if hint:
         echo(f"  hint: {hint}", err=True)
 
 
-def _spots(at: list[str], interfaces: list[str]) -> list[BenchPlace]:
-    """The places that were named, each by an address or by an interface."""
+def _named_places(at: list[str], interfaces: list[str]) -> list[BenchPlace]:
+    """The bench places given by --at or --interface."""
     if at and interfaces:
         raise InputError("expected --at or --interface, found both")
     if doubles := sorted({name for name in interfaces if interfaces.count(name) > 1}):
-        raise InputError(f"--interface {doubles[0]} was given twice: one device answers on each")
+        raise InputError(f"--interface {doubles[0]} is given twice: expected one device per interface")
     known = {name for _, name in socket.if_nameindex()}
     for name in interfaces:
         if name not in known:
-            raise InputError(f"--interface {name}: there is none here, found {', '.join(sorted(known))}")
-    return [_place(text) for text in at] + [BenchPlace(interface=name) for name in interfaces]
+            raise InputError(f"--interface {name}: no such interface, found {', '.join(sorted(known))}")
+    return [_parse_place(text) for text in at] + [BenchPlace(interface=name) for name in interfaces]
 
 
-def _places(opened: Session, words: list[str], at: list[BenchPlace]) -> list[BenchPlace]:
-    """Who is expected where."""
+def _expected_places(opened: Session, words: list[str], at: list[BenchPlace]) -> list[BenchPlace]:
+    """Which node is expected at which place."""
     if opened.lab is not None and not at:
         known = set(opened.lab.node_names)
         names = [find_node(opened.fleet, word).name for word in words]
@@ -153,18 +152,18 @@ def _places(opened: Session, words: list[str], at: list[BenchPlace]) -> list[Ben
     if not at:
         if len(expected) > 1:
             raise InputError(
-                f"{len(expected)} nodes cannot all answer at one address",
-                hint="one at a time, or say where each is plugged in: --interface eth1 --interface eth2",
+                f"{len(expected)} nodes cannot share one address",
+                hint="bootstrap one at a time, or give each interface: --interface eth1 --interface eth2",
             )
         return [BenchPlace(node=expected[0] if expected else "")]
     if expected and len(expected) != len(at):
-        raise InputError(f"{len(expected)} nodes and {len(at)} places: expected as many places as nodes")
+        raise InputError(f"expected one --at or --interface per node, found {len(at)} for {len(expected)} nodes")
     names = expected or [""] * len(at)
     return [with_changes(place, node=name) for place, name in zip(at, names, strict=True)]
 
 
-def _place(text: str) -> BenchPlace:
-    """`HOST`, `HOST:PORT` or `[v6]:PORT`; a bare IPv6 address holds colons of its own."""
+def _parse_place(text: str) -> BenchPlace:
+    """Parse `HOST`, `HOST:PORT` or `[IPv6]:PORT`; a bare IPv6 address has no port."""
     host, colon, port = text.rpartition(":")
     if not colon or (text.count(":") > 1 and not text.startswith("[")):
         return BenchPlace(text)
@@ -174,13 +173,11 @@ def _place(text: str) -> BenchPlace:
 
 
 def replace(
-    old: Annotated[str, typer.Argument(help="The node whose device is dead or gone.")],
-    new: Annotated[str, typer.Argument(help="A spare of the inventory; `bench` for a device that is in none.")],
-    at: Annotated[
-        str, typer.Option("--at", help="Where the new device answers, if not at its own address: HOST or HOST:PORT.")
-    ] = "",
+    old: Annotated[str, typer.Argument(help="Node whose device failed or is lost.")],
+    new: Annotated[str, typer.Argument(help="Spare node, or `bench` for a device that is not in the inventory.")],
+    at: Annotated[str, typer.Option("--at", help="Address of the new device if not its own: HOST or HOST:PORT.")] = "",
     interface: Annotated[
-        str, typer.Option("--interface", help="The interface that a factory device is plugged into, e.g. eth1.")
+        str, typer.Option("--interface", help="Interface with the factory-default device, e.g. eth1.")
     ] = "",
     inventory: InventoryPath = Path(),
     yes: Yes = False,
@@ -190,7 +187,7 @@ def replace(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Give a dead node's identity to a spare: same name, address and role; the inventory learns its MAC and label.
+    """Replace a failed node: the new device gets its name, address and role, the inventory the new MAC and label.
 
     Example: meshctl replace husky1-b03 spare2
     """
@@ -198,12 +195,12 @@ def replace(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         node = find_node(opened.fleet, old)
         spare = _spare(opened, node, new)
-        spots = _spots([at] if at else [], [interface] if interface else []) or [BenchPlace()][: spare is None]
+        spots = _named_places([at] if at else [], [interface] if interface else []) or [BenchPlace()][: spare is None]
         place = with_changes(spots[0], node=node.name) if spots else None
         fleet = heir_of(opened.fleet, node, spare)
         opened = with_changes(opened, fleet=fleet, renderer=with_changes(opened.renderer, fleet=fleet))
         node = fleet.nodes[node.name]
-        with opened.interrupt.on_signals(complain):
+        with opened.interrupt.on_signals(echo_error):
             successor = succeed(
                 opened.renderer,
                 opened.access,
@@ -214,7 +211,7 @@ def replace(
                 interrupt=opened.interrupt,
             )
         if not as_json:
-            echo(_who_becomes_whom(node, spare, new, successor.arrivals.found.get(node.name)))
+            echo(_replacement_text(node, spare, new, successor.arrivals.found.get(node.name)))
         status = int(ExitCode.FINDINGS)
         try:
             prepared = plan_arrivals(
@@ -227,41 +224,41 @@ def replace(
                 choices=choices,
                 interrupt=opened.interrupt,
             )
-            ask_and_carry_out(opened, prepared, "replace", choices, yes=yes, as_json=as_json, brief=True, rate=rate)
+            confirm_and_execute(opened, prepared, "replace", choices, yes=yes, as_json=as_json, brief=True, rate=rate)
         except typer.Exit as ended:
             status = ended.exit_code
         finally:
             if status != ExitCode.OK:
                 give_up(opened.trust, node, successor)
         if status == ExitCode.OK:
-            changes = _learn_identity(opened, inventory, node, spare, successor.arrivals.found[node.name])
+            changes = _record_identity(opened, inventory, node, spare, successor.arrivals.found[node.name])
             echo("".join(change.diff() for change in changes), nl=False, err=as_json)
         raise typer.Exit(status)
 
 
-def _who_becomes_whom(node: Node, spare: Node | None, new: str, found: Found | None) -> str:
+def _replacement_text(node: Node, spare: Node | None, new: str, found: Found | None) -> str:
     """`spare2, found at 192.168.1.1, becomes husky1-b03 (10.42.0.13): its name, address and role; ...`."""
     there = f", found at {found.place.endpoint.label}," if found is not None else ""
     who = spare.name if spare is not None else f"the device on the {new}"
-    left = f"; the entry {spare.name} is retired" if spare is not None else ""
+    left = f"; {spare.name} is retired" if spare is not None else ""
     return f"{who}{there} becomes {node.name} ({node.address.ip}): its name, address and role{left}"
 
 
 def _spare(opened: Session, old: Node, new: str) -> Node | None:
-    """None for a device that is in no inventory."""
+    """The spare node; None for a device that is not in the inventory."""
     if new == BENCH:
         return None
     spare = find_node(opened.fleet, new)
     if spare.name == old.name:
-        raise InputError(f"{spare.name} cannot take over from itself")
+        raise InputError(f"{spare.name} cannot replace itself")
     if spare.state is not NodeState.SPARE:
-        hint = f"`meshctl inventory state {spare.name} spare`, if it is one"
+        hint = f"if it is a spare, run `meshctl inventory state {spare.name} spare`"
         raise InputError(f"{spare.name} is {spare.state.value}: expected a spare", hint=hint)
     return spare
 
 
-def _learn_identity(opened: Session, inventory: Path, node: Node, spare: Node | None, found: Found) -> Changes:
-    """Into the inventory and the pins. Raises InputError that says what to write there, when it cannot be written."""
+def _record_identity(opened: Session, inventory: Path, node: Node, spare: Node | None, found: Found) -> Changes:
+    """Write the new identity to the inventory. Raises InputError with the edits to make by hand if that fails."""
     mine, theirs = identity_edits(node, spare, found.seen)
     if spare is not None:
         opened.trust.forget(spare.name)
@@ -271,8 +268,8 @@ def _learn_identity(opened: Session, inventory: Path, node: Node, spare: Node | 
         both = {node.name: dict(mine), **({spare.name: dict(theirs)} if spare is not None else {})}
         edits = {name: edit for name, edit in both.items() if edit}
         raise InputError(
-            f"{node.name} runs on its new device, but the inventory could not learn of it: {error}",
-            hint=f"mend it, then write under `nodes`: {json.dumps(edits)}",
+            f"{node.name} runs on its new device, but the inventory could not be updated: {error}",
+            hint=f"fix the inventory, then add under `nodes`: {json.dumps(edits)}",
         ) from error
 
 
@@ -280,7 +277,7 @@ def _write_identity(
     inventory: Path, node: Node, spare: Node | None, found: Found, mine: Mapping[str, Any], theirs: Mapping[str, Any]
 ) -> Changes:
     editor = Editor.open(inventory, environ=os.environ)
-    # the spare's entry first: two nodes with one MAC would be refused
+    # the spare's entry first: two nodes must not share a MAC
     if spare is not None:
         set_node(editor, spare.name, dict(theirs))
         for word in ("mac", "serial", "label"):

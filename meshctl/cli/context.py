@@ -1,54 +1,70 @@
-"""What every command that talks to nodes opens first: the fleet, its secrets, its host keys, its journal.
+"""What every command that talks to nodes opens first, and the options that commands share.
 
-`session` opens them, `chosen` picks nodes by name or pattern, `progress_for` picks how a run is shown, `exit_for` turns
-outcomes into an exit code.
+`session` opens the fleet, its secrets, host keys and journal; `chosen` selects nodes by name or pattern; `progress_for`
+selects how a run is shown; `exit_for` turns outcomes into an exit code.
+
+Commands that open no session import this module for its options, so what only a session needs is imported in it.
 """
 
 from __future__ import annotations
 
+import inspect
 import os
+import shutil
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
 from meshctl.cli.extensions import LabFleet, attach_lab
-from meshctl.cli.output import console
-from meshctl.device.trust import TrustStore
+from meshctl.cli.output import console, echo
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Interrupt, Outcome, totals
-from meshctl.fleet.journal import Journal, default_path
-from meshctl.fleet.lab_directory import lab_of
-from meshctl.fleet.process import lock_owner
-from meshctl.inventory import load_fleet
-from meshctl.inventory.secrets import SecretStore
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Node
-from meshctl.nodes.connections import Access, Locate, as_written
-from meshctl.nodes.desired import Renderer
 
 if TYPE_CHECKING:
+    from meshctl.device.trust import TrustStore
+    from meshctl.fleet.journal import Journal
+    from meshctl.nodes.connections import Access, Locate
+    from meshctl.nodes.desired import Renderer
     from meshctl.report.progress import Progress
 
+InventoryPath = Annotated[
+    Path,
+    typer.Option(
+        "--inventory",
+        "-i",
+        envvar="MESHCTL_INVENTORY",
+        help="Inventory: a YAML file, or a directory with fleet.yaml.",
+    ),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+LabDirectory = Annotated[
+    Path | None,
+    typer.Option("--dir", envvar="MESHCTL_LAB", help="Directory of the lab; default: $XDG_STATE_HOME/meshctl/lab."),
+]
 KeyFiles = Annotated[
     list[Path] | None,
-    typer.Option("--key", help="Private key file to log in with, before those of the inventory and the agent."),
+    typer.Option("--key", help="SSH private key to try before those of the inventory and the agent."),
 ]
 Lab = Annotated[
     Path | None,
-    typer.Option("--lab", envvar="MESHCTL_LAB", help="Reach the nodes of the virtual fleet that runs in DIR."),
+    typer.Option("--lab", envvar="MESHCTL_LAB", help="Connect to the virtual fleet that runs in DIR."),
 ]
-Nodes = Annotated[list[str] | None, typer.Argument(help="Nodes, or patterns such as 'husky*'; default: all.")]
+Nodes = Annotated[list[str] | None, typer.Argument(help="Nodes or patterns such as 'husky*'; default: all.")]
+
+Options = Mapping[str, tuple[Any, Any]]
+"""Type and default of each option, by the opener's parameter name, in the order of the help."""
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """Everything open. `owner` names this process to the locks on the nodes; `lab` is set for a virtual fleet."""
+    """What a command works with. `owner` names this process in the nodes' locks; `lab` is set for a virtual fleet."""
 
     fleet: Fleet
     renderer: Renderer
@@ -63,11 +79,19 @@ class Session:
 
 @contextmanager
 def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None = None) -> Iterator[Session]:
-    """Open all of it, and close it in the end. Raises InvalidInput, InputError, MeshctlError."""
+    """Open a session and close it at the end. Raises InvalidInput, InputError, MeshctlError."""
+    from meshctl.fleet.journal import Journal, default_path
+    from meshctl.fleet.lab_directory import lab_of
+    from meshctl.fleet.process import lock_owner
+    from meshctl.inventory import load_fleet
+    from meshctl.inventory.secrets import SecretStore
+    from meshctl.nodes.connections import Access
+    from meshctl.nodes.desired import Renderer
+
     fleet = load_fleet(inventory, environ=os.environ)
     trust = trust_of(fleet)
     virtual, locate = _lab(lab)
-    # commands without --lab work on the copy, too
+    # a lab's copy of the inventory also works without --lab
     lab_directory = str(virtual.directory) if virtual is not None else lab_of(str(inventory.resolve()))
     with (
         Journal(default_path(os.environ), lab=lab_directory) as journal,
@@ -88,13 +112,17 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
 
 
 def trust_of(fleet: Fleet) -> TrustStore:
-    """The fleet's own file of host keys, beside the inventory."""
+    """The fleet's own known_hosts, beside the inventory."""
+    from meshctl.device.trust import TrustStore
+
     path = Path(fleet.operators.known_hosts).expanduser()
     pinned = {node.name: node.host_keys for node in fleet.nodes.values() if node.host_keys}
     return TrustStore(path if path.is_absolute() else Path(fleet.base) / path, inventory=pinned)
 
 
 def _lab(directory: Path | None) -> tuple[LabFleet | None, Locate]:
+    from meshctl.nodes.connections import as_written
+
     if directory is None:
         return None, as_written
 
@@ -107,11 +135,13 @@ def _lab(directory: Path | None) -> tuple[LabFleet | None, Locate]:
     return virtual, locate
 
 
-def chosen(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[Node, ...]:
-    """The managed nodes that a name or pattern selects, in the inventory's order; all when none is given.
+def selected_nodes(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[Node, ...]:
+    """The managed nodes that match any name or pattern, in inventory order; all without patterns.
 
-    Raises InputError for a pattern that selects nothing.
+    Raises InputError for a pattern that matches nothing.
     """
+    from meshctl.inventory.suggest import did_you_mean
+
     wanted = list(patterns or ())
     managed = {node.name: node for node in fleet.managed()}
     if not wanted:
@@ -119,21 +149,21 @@ def chosen(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[Node, ...]:
     for pattern in wanted:
         if not any(fnmatchcase(name, pattern) for name in managed):
             raise InputError(
-                f"no managed node of {fleet.name} is called {pattern!r}",
-                hint=did_you_mean(pattern, managed) or "`meshctl inventory list` shows all",
+                f"no managed node of {fleet.name} matches {pattern!r}",
+                hint=did_you_mean(pattern, managed) or "run `meshctl inventory list` to list all nodes",
             )
     return tuple(node for name, node in managed.items() if any(fnmatchcase(name, pattern) for pattern in wanted))
 
 
 def progress_for(count: int, *, as_json: bool) -> Progress:
-    """Live lines on a terminal, JSON lines for programs, plain lines elsewhere."""
-    from meshctl.report.progress import Aside, JsonProgress, LiveProgress, PlainProgress
+    """JSON lines with `as_json`, live lines on a terminal, plain lines elsewhere."""
+    from meshctl.report.progress import JsonProgress, LiveProgress, PlainProgress, ThreadedProgress
 
     if as_json:
-        return Aside(JsonProgress(sys.stdout))
+        return ThreadedProgress(JsonProgress(sys.stdout))
     if sys.stdout.isatty():
-        return Aside(LiveProgress(console(), count))
-    return Aside(PlainProgress(sys.stdout))
+        return ThreadedProgress(LiveProgress(console(), count))
+    return ThreadedProgress(PlainProgress(sys.stdout))
 
 
 def exit_for(outcomes: Iterable[Outcome], interrupt: Interrupt) -> ExitCode:
@@ -144,3 +174,62 @@ def exit_for(outcomes: Iterable[Outcome], interrupt: Interrupt) -> ExitCode:
     if counted.all_good:
         return ExitCode.OK
     return ExitCode.UNREACHABLE if counted.none_reached else ExitCode.FINDINGS
+
+
+def confirm(question: str) -> None:
+    """Return if the user confirms.
+
+    Raises InputError without a terminal, typer.Exit when the answer is no, typer.Abort at Ctrl-C or the end of input.
+    """
+    if not sys.stdin.isatty():
+        raise InputError("not a terminal: cannot ask for confirmation", hint="review the plan, then pass --yes")
+    if not typer.confirm(question):
+        echo("cancelled; nothing was changed", err=True)
+        raise typer.Exit(int(ExitCode.FINDINGS))
+
+
+def lab_directory(given: Path | None) -> Path:
+    """The lab's directory, by default below $XDG_STATE_HOME."""
+    if given is not None:
+        return given
+    home = os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()
+    return Path(home) / "meshctl" / "lab"
+
+
+def line_width(*, wide: bool = False) -> int | None:
+    """Width of the terminal, or COLUMNS; None for unwrapped lines (`wide`, pipes)."""
+    if wide or not (sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdecimal()):
+        return None
+    return shutil.get_terminal_size().columns
+
+
+def with_options(
+    parameter: str, opener: Callable[..., AbstractContextManager[Any]], options: Options
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Add `options` to a command. They are passed to `opener`; the command gets what it yields as `parameter`."""
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        hints = get_type_hints(command, include_extras=True)
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        own = [
+            each.replace(annotation=hints[each.name], kind=keyword)
+            for each in inspect.signature(command).parameters.values()
+            if each.name != parameter
+        ]
+        shared = [
+            inspect.Parameter(name, keyword, default=default, annotation=kind)
+            for name, (kind, default) in options.items()
+        ]
+
+        def run_command(**given: Any) -> None:
+            with opener(**{name: given.pop(name) for name in options}) as opened:
+                command(opened, **given)
+
+        parameters = [*own, *shared]
+        run_command.__name__, run_command.__doc__ = command.__name__, command.__doc__
+        # what typer reads of a function
+        run_command.__annotations__ = {each.name: each.annotation for each in parameters}
+        vars(run_command)["__signature__"] = inspect.Signature(parameters)
+        return run_command
+
+    return decorate

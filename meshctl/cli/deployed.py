@@ -1,7 +1,6 @@
-"""`meshctl deployed`: beacons that were dropped, from `carried` to `deployed` in the inventory, by name or label.
+"""`meshctl deployed`: change beacons from `carried` to `deployed` in the inventory, by name or label.
 
-Labels are what a person with gloves on reads off the box. The edit is that of `meshctl inventory state`: one value for
-each beacon, comments and layout stay.
+The edit is that of `meshctl inventory state`: one value per beacon; comments and layout stay.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.options import InventoryPath
+from meshctl.cli.context import InventoryPath
 from meshctl.cli.output import echo
 from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state
@@ -24,14 +23,12 @@ from meshctl.model import Fleet, Node, NodeState, Role
 
 
 def deployed(
-    beacons: Annotated[list[str], typer.Argument(help="Beacons by name, by label, or by a pattern such as 'h1-b0*'.")],
+    beacons: Annotated[list[str], typer.Argument(help="Beacons by name, label, or pattern such as 'h1-b0*'.")],
     inventory: InventoryPath = Path(),
-    back: Annotated[
-        bool, typer.Option("--back", help="The way back: picked up again, from deployed to carried.")
-    ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show the edit, write nothing.")] = False,
+    back: Annotated[bool, typer.Option("--back", help="Mark as carried again, after pick-up.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the change without writing it.")] = False,
 ) -> None:
-    """Mark beacons that were dropped as deployed: from then on status expects them to answer.
+    """Mark dropped beacons as deployed; `meshctl status` then expects them to answer.
 
     Example: meshctl deployed husky1-b03 B4
     """
@@ -42,8 +39,8 @@ def deployed(
     if wrong:
         states = ", ".join(f"{node.name} is {node.state.value}" for node in wrong)
         raise InputError(
-            f"expected beacons that are {before.value}: {states}",
-            hint=f"meshctl inventory state {wrong[0].name} {after.value} sets any state",
+            f"expected {before.value} beacons, found: {states}",
+            hint=f"to set any state, run `meshctl inventory state {wrong[0].name} {after.value}`",
         )
     editor = Editor.open(inventory, environ=os.environ)
     for node in chosen:
@@ -54,30 +51,30 @@ def deployed(
         echo(change.diff(), nl=False)
     for node in chosen:
         if node.state is after:
-            echo(f"{node.name}: {after.value} already")
+            echo(f"{node.name}: already {after.value}")
     if not dry_run:
         save(changes)
 
 
 def chosen_beacons(fleet: Fleet, words: Iterable[str]) -> list[Node]:
-    """The beacons that the words mean, each once. Raises InputError for a word that means none, or another radio."""
+    """The beacons that the words select, each once. Raises InputError for no match, or for another radio."""
     chosen: dict[str, Node] = {}
     for word in words:
-        named = [fleet.nodes[word]] if word in fleet.nodes else _labelled(fleet, word) or _matching(fleet, word)
+        named = [fleet.nodes[word]] if word in fleet.nodes else _labeled(fleet, word) or _matching(fleet, word)
         if not named:
             names = (*fleet.nodes, *(node.label for node in fleet.nodes.values() if node.label))
             raise InputError(f"no beacon has the name or label '{word}'", hint=did_you_mean(word, names))
         if named[0].role is not Role.BEACON:
-            raise InputError(f"{named[0].name} is no beacon: its role is {named[0].role.value}")
+            raise InputError(f"{named[0].name} is not a beacon: its role is {named[0].role.value}")
         chosen |= {node.name: node for node in named}
     return list(chosen.values())
 
 
-def _labelled(fleet: Fleet, word: str) -> list[Node]:
-    """Labels of managed nodes differ (lint, MC116); capitals make no difference."""
+def _labeled(fleet: Fleet, word: str) -> list[Node]:
+    """Case-insensitive; labels of managed nodes are unique (MC116)."""
     found = [node for node in fleet.managed() if node.label and node.label.lower() == word.lower()]
     if len(found) > 1:
-        raise InputError(f"several nodes have the label '{word}': {', '.join(node.name for node in found)}")
+        raise InputError(f"label '{word}' is ambiguous: {', '.join(node.name for node in found)}")
     return found
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.options import InventoryPath
+from meshctl.cli.context import InventoryPath
 from meshctl.cli.output import echo
 from meshctl.errors import InputError
 from meshctl.inventory.load import load_fleet

@@ -1,4 +1,4 @@
-"""What other distributions or packages add to meshctl, found by entry points of the group `meshctl.extensions`.
+"""Extensions of meshctl from other packages, found by entry points of the group `meshctl.extensions`.
 
 `lab` is a Typer app, the commands of `meshctl lab`; `lab-fleet` attaches to a running virtual fleet (`--lab`).
 """
@@ -17,7 +17,7 @@ _GROUP = "meshctl.extensions"
 
 
 class LabFleet(Protocol):
-    """A running virtual fleet, as far as the commands use it."""
+    """The part of a running virtual fleet that the commands use."""
 
     @property
     def directory(self) -> Path: ...
@@ -26,20 +26,20 @@ class LabFleet(Protocol):
     def node_names(self) -> tuple[str, ...]: ...
 
     def endpoint(self, address: str) -> Endpoint:
-        """Where on this machine the node with `address` is reached."""
+        """The local endpoint of the node with `address`."""
 
     def bench_endpoint(self, name: str) -> Endpoint:
-        """Where the node called `name` is reached at its factory address."""
+        """The local endpoint of the factory address of node `name`."""
 
 
 def attach_lab(directory: Path) -> LabFleet:
-    """The virtual fleet that runs in `directory`. Raises MeshctlError when none does."""
+    """The virtual fleet that runs in `directory`. Raises MeshctlError if there is none."""
     attach = cast("Callable[[Path], LabFleet]", load("lab-fleet"))
     return attach(directory)
 
 
 def load(name: str) -> Any:
-    """The object that the extension `name` declares. Raises InputError when none is installed."""
+    """The object of the extension `name`. Raises InputError if it is not installed."""
     for entry in entry_points(group=_GROUP, name=name):
         return entry.load()
-    raise InputError(f"the extension {name!r} of meshctl is not installed", hint="install meshctl from its wheel")
+    raise InputError(f"meshctl extension {name!r} is not installed", hint="install meshctl from its wheel")

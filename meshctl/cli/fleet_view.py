@@ -1,7 +1,7 @@
-"""What `status`, `preflight` and `topology` share: a `Watcher` over everything, who is asked, and how wide to write.
+"""What `status`, `preflight` and `topology` share: the fleet opened for reading, its radios and its robots.
 
-`watcher` opens the fleet and finds a way to its radios and robots, for a command `with_everybody` by its options;
-`glance` takes one look, with its progress told on a terminal.
+`with_fleet_view` adds the shared options to a command; `open_fleet_view` opens the connections; `collect` takes one
+snapshot, with progress on a terminal.
 """
 
 from __future__ import annotations
@@ -15,20 +15,18 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import KeyFiles, Lab, Session, session
-from meshctl.cli.options import InventoryPath
+from meshctl.cli.context import InventoryPath, KeyFiles, Lab, Options, Session, session, with_options
 from meshctl.cli.output import is_plain
 from meshctl.cli.robots_context import AskSudo, sudo_password
-from meshctl.cli.shared import Options, opening
 from meshctl.device.connection import Deadlines
 from meshctl.model import Fleet, Node
-from meshctl.robots.connection import Reach
-from meshctl.status.assess import Look
-from meshctl.status.collect import Progress, Watcher
+from meshctl.robots.connection import RobotConnector
+from meshctl.status.assess import Snapshot
+from meshctl.status.collect import Collector, Progress
 from meshctl.status.table import Paint, plain
 
-# A look wants to be quick: in this time TCP asks three times (RFC 6298: after 1 and 3 s), and a mesh that answers at
-# all answers one of them. Provisioning, which must not give up early, waits longer.
+# Short, since a status should be quick: TCP sends three SYNs in this time (RFC 6298: after 1 and 3 s). Provisioning,
+# which must not give up early, waits longer.
 CONNECT_S = 5.0
 
 Timeout = Annotated[
@@ -37,12 +35,12 @@ Timeout = Annotated[
         "--timeout",
         min=0.5,
         metavar="S",
-        help="Seconds a device has to take a connection; twice that for each step after it.",
+        help="Connection timeout in seconds; each later step gets twice as long.",
     ),
 ]
-NoRobots = Annotated[bool, typer.Option("--no-robots", help="Ask the radios alone, not the robots' computers.")]
+NoRobots = Annotated[bool, typer.Option("--no-robots", help="Query only the radios, not the robots' computers.")]
 
-# Of commands that look: the options by which `watcher` opens everybody.
+# Options of read-only commands, by the parameters of `open_fleet_view`.
 _SHARED: Options = {
     "inventory": (InventoryPath, Path()),
     "no_robots": (NoRobots, False),
@@ -51,7 +49,7 @@ _SHARED: Options = {
     "key": (KeyFiles, None),
     "lab": (Lab, None),
 }
-_COLOURS = {
+_COLORS = {
     "ok": {"fg": "green"},
     "degraded": {"fg": "yellow", "bold": True},
     "unreachable": {"fg": "red", "bold": True},
@@ -65,11 +63,11 @@ _COLOURS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Everybody:
-    """A fleet opened for looking, and who is in it: its managed radios, its robots with a computer we can reach."""
+class FleetView:
+    """A fleet opened for reading: its managed radios, and its robots whose computer can be queried."""
 
     opened: Session
-    watcher: Watcher
+    collector: Collector
     nodes: tuple[Node, ...]
     robots: tuple[str, ...]
 
@@ -79,7 +77,7 @@ class Everybody:
 
 
 @contextmanager
-def watcher(
+def open_fleet_view(
     inventory: Path,
     *,
     key: Iterable[Path] | None,
@@ -87,77 +85,77 @@ def watcher(
     timeout: float = CONNECT_S,
     ask_sudo: bool = False,
     no_robots: bool = False,
-) -> Iterator[Everybody]:
-    """Open all of it, and close it in the end. Raises InvalidInput, InputError, MeshctlError."""
+) -> Iterator[FleetView]:
+    """Open the fleet and close it at the end. Raises InvalidInput, InputError, MeshctlError."""
     password = None if no_robots else sudo_password(ask_sudo)
     with session(inventory, key_files=key or (), lab=lab) as opened:
         opened.access.deadlines = _deadlines(timeout)
-        robots, unasked = _robots(opened, not no_robots)
-        reach = Reach(opened.fleet, opened.access, lambda: password) if robots else None
-        with Watcher(
-            opened.fleet, opened.renderer, opened.access, opened.journal, opened.owner, reach, unasked
-        ) as watching:
-            yield Everybody(opened, watching, tuple(opened.fleet.managed()), robots)
+        robots, skipped = _robots(opened, not no_robots)
+        connector = RobotConnector(opened.fleet, opened.access, lambda: password) if robots else None
+        with Collector(
+            opened.fleet, opened.renderer, opened.access, opened.journal, opened.owner, connector, skipped
+        ) as collector:
+            yield FleetView(opened, collector, tuple(opened.fleet.managed()), robots)
 
 
-def with_everybody(command: Callable[..., None]) -> Callable[..., None]:
-    """A command that takes `everybody` and options of its own becomes one that has those of looking, and opens them."""
-    return opening("everybody", watcher, _SHARED)(command)
+def with_fleet_view(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the shared options to a command that takes `fleet_view`, and open the view for it."""
+    return with_options("fleet_view", open_fleet_view, _SHARED)(command)
 
 
 def _deadlines(connect_s: float) -> Deadlines:
-    """Each further step has twice that: it computes, on a small processor, besides travelling."""
+    """Later steps get twice as long: they also take computation on a slow processor."""
     return Deadlines(connect_s, handshake_s=2 * connect_s, auth_s=2 * connect_s, channel_s=2 * connect_s)
 
 
 def _robots(opened: Session, with_robots: bool) -> tuple[tuple[str, ...], str]:
-    """The robots to ask; where there are some and none is asked, why."""
+    """The robots to query, and the reason if none is although there are some."""
     able = {name: robot.computer for name, robot in opened.fleet.robots.items() if robot.computer is not None}
     if not with_robots:
-        return (), "the robots' computers were not asked (--no-robots)" if able else ""
+        return (), "robots were not queried (--no-robots)" if able else ""
     if opened.lab is None:
         return tuple(able), ""
-    # what the inventory calls 10.42.0.21 may be somebody's real machine; a virtual fleet is reached on loopback alone
+    # 10.42.0.21 may be a real machine on this network; a virtual fleet is reached on loopback only
     named = tuple(name for name, computer in able.items() if computer.ssh.host)
     if named or not able:
         return named, ""
-    return (), "the robots' computers were not asked: with --lab only one of which the inventory gives ssh.host is"
+    return (), "robots were not queried: --lab queries only computers with ssh.host in the inventory"
 
 
-def glance(
-    everybody: Everybody,
+def collect(
+    fleet_view: FleetView,
     nodes: Iterable[Node] | None = None,
     robots: Iterable[str] | None = None,
     *,
-    is_told: bool = True,
-) -> Look:
-    """One look at these (default: everybody); `is_told` is how far it is, where the terminal is not a page's."""
-    return everybody.watcher.look(
-        everybody.nodes if nodes is None else nodes,
-        everybody.robots if robots is None else robots,
-        _progress(is_told=is_told),
+    show_progress: bool = True,
+) -> Snapshot:
+    """One snapshot of these nodes and robots (default: all); `show_progress` counts answers on a terminal."""
+    return fleet_view.collector.collect(
+        fleet_view.nodes if nodes is None else nodes,
+        fleet_view.robots if robots is None else robots,
+        _progress(show_progress=show_progress),
     )
 
 
-def _progress(*, is_told: bool) -> Progress:
-    """A line that counts up on a terminal, and is gone in the end."""
-    if not (is_told and sys.stderr.isatty()):
+def _progress(*, show_progress: bool) -> Progress:
+    """A counter on the terminal that is erased at the end."""
+    if not (show_progress and sys.stderr.isatty()):
         return lambda done, count: None
 
-    def tell(done: int, count: int) -> None:
-        text = "" if done == count else f"{done} of {count} have answered or given up"
+    def show(done: int, count: int) -> None:
+        text = "" if done == count else f"queried {done} of {count}"
         sys.stderr.write(f"\r\x1b[K{text}")
         sys.stderr.flush()
 
-    return tell
+    return show
 
 
 def paint_of() -> Paint:
-    """Colours on a terminal, unless NO_COLOR (no-color.org) is set."""
+    """Colors on a terminal, unless NO_COLOR is set (no-color.org)."""
     return paint if sys.stdout.isatty() and not is_plain() else plain
 
 
 def paint(text: str, style: str) -> str:
-    """Terminal colours."""
-    given = _COLOURS.get(style)
+    """Apply a style as terminal colors."""
+    given = _COLORS.get(style)
     return typer.style(text, **given) if given else text  # type: ignore[arg-type]

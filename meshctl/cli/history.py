@@ -1,4 +1,4 @@
-"""`meshctl history`: earlier runs from the journal; it needs neither an inventory nor a node."""
+"""`meshctl history`: past runs from the journal; needs neither an inventory nor a node."""
 
 from __future__ import annotations
 
@@ -11,52 +11,52 @@ from typing import Annotated, Any
 
 import typer
 
-from meshctl.cli.options import AsJson
+from meshctl.cli.context import AsJson
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import InputError
 from meshctl.fleet.journal import Journal, RunRecord, default_path
 
 
 def history(
-    run: Annotated[int | None, typer.Argument(help="Number of a run, to see its nodes and steps.")] = None,
-    node: Annotated[str | None, typer.Option("--node", help="Only this node: its runs, or its steps in a run.")] = None,
-    fleet: Annotated[str | None, typer.Option("--fleet", help="Only runs of the fleet with this name.")] = None,
+    run: Annotated[int | None, typer.Argument(help="Run number; shows its nodes and steps.")] = None,
+    node: Annotated[str | None, typer.Option("--node", help="Only runs or steps of this node.")] = None,
+    fleet: Annotated[str | None, typer.Option("--fleet", help="Only runs of this fleet.")] = None,
     lab: Annotated[
-        bool | None, typer.Option("--virtual/--real", help="Only runs in labs, or only of real nodes.")
+        bool | None, typer.Option("--virtual/--real", help="Only runs in a lab, or only on real nodes.")
     ] = None,
-    limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="How many runs to list.")] = 20,
+    limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="Maximum number of runs.")] = 20,
     as_json: AsJson = False,
 ) -> None:
-    """Show earlier runs; with a run's number its nodes, steps, outcomes and durations.
+    """Show past runs; with a run number, its nodes, steps, outcomes and durations.
 
     Example: meshctl history 12 --node b03
     """
     with Journal(default_path(os.environ)) as journal:
         if run is None:
-            _list_runs(journal, _Wanted(node, fleet, lab), limit, as_json=as_json)
+            _list_runs(journal, _RunFilter(node, fleet, lab), limit, as_json=as_json)
         else:
             _show_run(journal, run, node, as_json=as_json)
 
 
 @dataclass(frozen=True, slots=True)
-class _Wanted:
-    """Which runs are listed; None does not choose."""
+class _RunFilter:
+    """Which runs are listed; None matches all."""
 
     node: str | None
     fleet: str | None
     is_virtual: bool | None
 
-    def takes(self, record: RunRecord) -> bool:
+    def matches(self, record: RunRecord) -> bool:
         return self.fleet in (None, record.fleet) and self.is_virtual in (None, bool(record.lab))
 
 
-def _list_runs(journal: Journal, wanted: _Wanted, limit: int, *, as_json: bool) -> None:
+def _list_runs(journal: Journal, wanted: _RunFilter, limit: int, *, as_json: bool) -> None:
     found = journal.runs(node=wanted.node, limit=None)
-    records = tuple(islice((record for record in found if wanted.takes(record)), limit))
+    records = tuple(islice((record for record in found if wanted.matches(record)), limit))
     if as_json:
         echo_json(json.dumps([_run_object(record) for record in records], indent=1))
         return
-    # nodes of several fleets share a name: runs of one fleet stand together
+    # several fleets may have a node of this name: group its runs by fleet
     by_fleet: dict[tuple[str, str], list[RunRecord]] = {}
     for record in records:
         by_fleet.setdefault((record.fleet, record.lab) if wanted.node is not None else ("", ""), []).append(record)
@@ -89,13 +89,13 @@ def _fleet_text(fleet: str, lab: str) -> str:
 def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool) -> None:
     record = journal.run(run_id)
     if record is None:
-        raise InputError(f"there is no run {run_id}", hint="`meshctl history` lists the runs")
+        raise InputError(f"run {run_id} does not exist", hint="run `meshctl history` to list all runs")
     outcomes = [outcome for outcome in journal.outcomes(run_id) if node in (None, outcome.node)]
     if not outcomes and node is not None:
-        raise InputError(f"{node} had no part in run {run_id}", hint=f"`meshctl history {run_id}` shows who had")
+        raise InputError(f"{node} was not part of run {run_id}", hint=f"`meshctl history {run_id}` lists its nodes")
     steps = journal.steps(run_id, node)
     if as_json:
-        told = {
+        document = {
             **_run_object(record),
             "outcomes": [{"node": o.node, "result": o.result.value, "reason": o.reason} for o in outcomes],
             "steps": [
@@ -103,7 +103,7 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool)
                 for s in steps
             ],
         }
-        echo_json(json.dumps(told, indent=1))
+        echo_json(json.dumps(document, indent=1))
         return
     fleet = _fleet_text(record.fleet, record.lab)
     echo(f"run {record.id}: {record.command} of {fleet} by {record.owner}, {_moment(record.began_s)}")
@@ -113,7 +113,7 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool)
         echo(f"{outcome}" + (f" ({outcome.duration_s:.1f} s)" if outcome.duration_s else ""))
         for step in steps:
             if step.node == outcome.node:
-                took = "cut short" if step.duration_s is None else f"{step.duration_s:.2f} s"
+                took = "interrupted" if step.duration_s is None else f"{step.duration_s:.2f} s"
                 result = "" if step.result == "done" else step.result
                 echo(f"  {step.step:<{width}} {took:>10}  {result}".rstrip())
 

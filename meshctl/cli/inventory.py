@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
+from meshctl.cli.context import AsJson, InventoryPath
 from meshctl.cli.export import export
-from meshctl.cli.options import AsJson, InventoryPath
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state
@@ -22,21 +22,21 @@ from meshctl.inventory.starter import write_starter
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Node, NodeState, Role
 
-app = typer.Typer(help="Show what the inventory says and why.", no_args_is_help=True)
+app = typer.Typer(help="Show and edit the inventory.", no_args_is_help=True)
 app.command("export")(export)
 
-# Where ssh-keygen puts public keys, the kind that every release but 19.07 knows first.
+# ssh-keygen's default files; ed25519 first, which every release but 19.07 supports.
 _PUBLIC_KEYS = ("id_ed25519.pub", "id_ecdsa.pub", "id_rsa.pub")
 
 
 def init(
-    directory: Annotated[Path, typer.Argument(help="Where to write it; made if it does not exist.")],
+    directory: Annotated[Path, typer.Argument(help="Directory to write to; created if missing.")],
     ssh_key: Annotated[
         Path | None,
-        typer.Option("--ssh-key", help="Your public key; without it the first one in ~/.ssh."),
+        typer.Option("--ssh-key", help="Your SSH public key; default: the first one in ~/.ssh."),
     ] = None,
 ) -> None:
-    """Write a commented starter inventory. Nothing is overwritten.
+    """Create a commented starter inventory. Existing files are never overwritten.
 
     Example: meshctl init my-fleet && meshctl lint my-fleet
     """
@@ -45,14 +45,14 @@ def init(
     for file in files:
         echo(f"wrote {file}")
     if not key:
-        echo("no public key was found in ~/.ssh: enter yours as operators.ssh_keys, or nobody may log in", err=True)
-    echo(f"next: edit it, then `meshctl lint {directory}`")
+        echo("no public key in ~/.ssh: add yours to operators.ssh_keys, or you cannot log in to the nodes", err=True)
+    echo(f"next: edit it, then run `meshctl lint {directory}`")
 
 
 def schema(
-    out: Annotated[Path | None, typer.Option("--out", help="Write it to this file.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Write to this file.")] = None,
 ) -> None:
-    """Print the inventory's JSON Schema, for editors that complete and check.
+    """Print the JSON Schema of the inventory, for completion and validation in editors.
 
     Example: meshctl schema --out inventory.schema.json
     """
@@ -63,15 +63,15 @@ def schema(
     try:
         out.write_text(text, encoding="utf-8")
     except OSError as reason:
-        raise InputError(f"{out} cannot be written: {reason.strerror}") from reason
+        raise InputError(f"cannot write {out}: {reason.strerror}") from reason
 
 
 @app.command("list")
 def list_nodes(
     inventory: InventoryPath = Path(),
-    role: Annotated[Role | None, typer.Option("--role", help="Only nodes of this role.")] = None,
+    role: Annotated[Role | None, typer.Option("--role", help="Only nodes with this role.")] = None,
     state: Annotated[NodeState | None, typer.Option("--state", help="Only nodes in this state.")] = None,
-    robot: Annotated[str, typer.Option("--robot", help="Only nodes that this robot carries.")] = "",
+    robot: Annotated[str, typer.Option("--robot", help="Only nodes on this robot.")] = "",
     as_json: AsJson = False,
 ) -> None:
     """List nodes with role, state, address, mesh and robot.
@@ -95,10 +95,10 @@ def list_nodes(
 def show(
     node: Annotated[str, typer.Argument(help="Name of the node.")],
     inventory: InventoryPath = Path(),
-    why: Annotated[bool, typer.Option("--why", help="Tell the layer, file and line of each value.")] = False,
+    why: Annotated[bool, typer.Option("--why", help="Show the layer, file and line of each value.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show everything that holds for one node, and with --why where each value was written.
+    """Show all values of one node; with --why, where each is defined.
 
     Example: meshctl inventory show husky1-b03 --why
     """
@@ -115,11 +115,11 @@ def show(
 @app.command("state")
 def change_state(
     node: Annotated[str, typer.Argument(help="Name of the node.")],
-    new: Annotated[NodeState, typer.Argument(help="Its new state.")],
+    new: Annotated[NodeState, typer.Argument(help="New state.")],
     inventory: InventoryPath = Path(),
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the change and write nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the change without writing it.")] = False,
 ) -> None:
-    """Write a node's state into the inventory, keeping comments and layout.
+    """Set a node's state in the inventory, keeping comments and layout.
 
     Example: meshctl inventory state husky1-b03 deployed
     """
@@ -135,7 +135,7 @@ def change_state(
 
 
 def _public_key(path: Path | None) -> str:
-    """The text of a public key: the named file's, or the first usual one's; empty when there is none."""
+    """The text of `path`, or of the first default public key; empty if there is none."""
     candidates = [path] if path is not None else [Path("~/.ssh", name).expanduser() for name in _PUBLIC_KEYS]
     for candidate in candidates:
         if path is None and not candidate.is_file():
@@ -143,9 +143,9 @@ def _public_key(path: Path | None) -> str:
         try:
             text = candidate.read_text(encoding="utf-8").strip()
         except (OSError, UnicodeDecodeError) as reason:
-            raise InputError(f"{candidate} cannot be read as a public key: {reason}") from reason
+            raise InputError(f"cannot read public key {candidate}: {reason}") from reason
         if "PRIVATE KEY" in text or len(text.splitlines()) != 1 or not text.startswith(("ssh-", "ecdsa-", "sk-")):
-            raise InputError(f"{candidate} is no SSH public key", hint="name the file that ends in .pub")
+            raise InputError(f"{candidate} is not an SSH public key", hint="give the file that ends in .pub")
         return text
     return ""
 
@@ -196,7 +196,7 @@ def _row(value: ExplainedValue, why: bool) -> list[str]:
 
 
 def _table(rows: Sequence[Sequence[str]], indent: str = "") -> None:
-    """Columns as wide as their widest cell."""
+    """Print rows with aligned columns."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]

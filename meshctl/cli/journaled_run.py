@@ -1,4 +1,4 @@
-"""From a session to a plan on the screen, and from an agreed plan to outcomes and an exit code."""
+"""Prepare and show a plan; execute a confirmed plan, journal it, print the summary and exit."""
 
 from __future__ import annotations
 
@@ -11,22 +11,19 @@ import typer
 
 from meshctl.apply.executor import Setting, carry_out
 from meshctl.apply.prepare import Choices, Prepared, prepare
-from meshctl.cli.asking import must_agree
-from meshctl.cli.context import Session, chosen, exit_for, progress_for
-from meshctl.cli.options import line_width
-from meshctl.cli.output import complain, console, echo, echo_json
-from meshctl.cli.streams import unheard
+from meshctl.cli.context import Session, confirm, exit_for, line_width, progress_for, selected_nodes
+from meshctl.cli.output import console, echo, echo_error, echo_json, ignore_broken_pipe
 from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Outcome, totals
 from meshctl.model import Fleet
 from meshctl.plan import Plan, Verdict
 
-# Bytes of salt for a plan's fingerprints; RFC 7914 asks for no more.
+# Bytes of salt for a plan's fingerprints, as in RFC 7914.
 SALT_BYTES = 16
 
 
-class Refused(MeshctlError):
-    """A plan that meshctl will not carry out as it stands."""
+class PlanRefused(MeshctlError):
+    """A plan that meshctl refuses to execute."""
 
     exit_code = ExitCode.FINDINGS
 
@@ -39,12 +36,12 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def prepared_for(opened: Session, nodes: list[str] | None, choices: Choices, salt: bytes | None = None) -> Prepared:
-    with opened.interrupt.on_signals(complain):
+def prepare_plan(opened: Session, nodes: list[str] | None, choices: Choices, salt: bytes | None = None) -> Prepared:
+    with opened.interrupt.on_signals(echo_error):
         prepared = prepare(
             opened.renderer,
             opened.access,
-            chosen(opened.fleet, nodes),
+            selected_nodes(opened.fleet, nodes),
             opened.journal,
             salt=salt or secrets.token_bytes(SALT_BYTES),
             owner=opened.owner,
@@ -60,7 +57,7 @@ def write_text(path: Path, text: str) -> None:
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
 
 
 def show(plan: Plan, fleet: Fleet, *, brief: bool) -> None:
@@ -73,10 +70,10 @@ def show(plan: Plan, fleet: Fleet, *, brief: bool) -> None:
         out.print(Text(line.text, line.style), soft_wrap=True)
 
 
-def checked(plan: Plan, fleet: Fleet, *, as_json: bool, brief: bool) -> ExitCode:
+def report_check(plan: Plan, fleet: Fleet, *, as_json: bool, brief: bool) -> ExitCode:
     if as_json:
-        told = {name: {"verdict": node.verdict.value, "reason": node.reason} for name, node in plan.nodes.items()}
-        echo_json(json.dumps({"fleet": plan.fleet, "nodes": told}, indent=1))
+        nodes = {name: {"verdict": node.verdict.value, "reason": node.reason} for name, node in plan.nodes.items()}
+        echo_json(json.dumps({"fleet": plan.fleet, "nodes": nodes}, indent=1))
     else:
         show(plan, fleet, brief=brief)
     if plan.of(Verdict.CHANGE) or plan.of(Verdict.REFUSED):
@@ -84,7 +81,7 @@ def checked(plan: Plan, fleet: Fleet, *, as_json: bool, brief: bool) -> ExitCode
     return ExitCode.UNREACHABLE if plan.of(Verdict.AWAY) else ExitCode.OK
 
 
-def ask_and_carry_out(
+def confirm_and_execute(
     opened: Session,
     prepared: Prepared,
     command: str,
@@ -100,11 +97,11 @@ def ask_and_carry_out(
     if not as_json:
         show(prepared.plan, opened.fleet, brief=brief)
     if not prepared.plan.is_empty and not prepared.plan.refusal and not yes:
-        must_agree(question(prepared.plan))
-    carry_out_plan(opened, prepared, command, choices.with_firmware, as_json=as_json, rate=rate, choices=choices)
+        confirm(question(prepared.plan))
+    execute_plan(opened, prepared, command, choices.with_firmware, as_json=as_json, rate=rate, choices=choices)
 
 
-def carry_out_plan(
+def execute_plan(
     opened: Session,
     prepared: Prepared,
     command: str,
@@ -114,18 +111,18 @@ def carry_out_plan(
     rate: float | None,
     choices: Choices | None = None,
 ) -> None:
-    """Apply, journal, tell the totals, exit."""
+    """Execute the plan, journal it, print the totals, exit."""
     plan = prepared.plan
     if plan.refusal:
-        raise Refused(plan.refusal, hint=plan.refusal_hint)
-    told = choices or Choices(with_firmware)
+        raise PlanRefused(plan.refusal, hint=plan.refusal_hint)
+    choices = choices or Choices(with_firmware)
     run = opened.journal.begin(
         command,
         fleet=opened.fleet.name,
         inventory=opened.inventory,
         nodes=tuple(plan.nodes),
         plan=json.dumps(
-            {"choices": asdict(told), "stages": [[stage.kind.value, *stage.nodes] for stage in plan.stages]}
+            {"choices": asdict(choices), "stages": [[stage.kind.value, *stage.nodes] for stage in plan.stages]}
         ),
     )
     outcomes: dict[str, Outcome] = {}
@@ -148,23 +145,23 @@ def carry_out_plan(
     finally:
         run.end(str(totals(outcomes.values())) if outcomes else "could not run")
     if run.trouble:
-        with unheard():
+        with ignore_broken_pipe():
             echo(f"the journal is incomplete: {run.trouble}", err=True)
-            echo("hint: what it lacks counts as not done, so `meshctl resume` looks at those nodes again", err=True)
-    # a reader that is gone (`| head`, a closed terminal) changes nothing about how it ended
-    with unheard():
-        _sum_up(outcomes, run.id, as_json=as_json)
+            echo("hint: `meshctl resume` checks the missing nodes again", err=True)
+    # a closed pipe or terminal must not change the exit code
+    with ignore_broken_pipe():
+        _print_summary(outcomes, run.id, as_json=as_json)
     raise typer.Exit(exit_for(outcomes.values(), opened.interrupt))
 
 
-def _sum_up(outcomes: dict[str, Outcome], run_id: int, *, as_json: bool) -> None:
+def _print_summary(outcomes: dict[str, Outcome], run_id: int, *, as_json: bool) -> None:
     counted = totals(outcomes.values())
     if as_json:
         from meshctl.report.progress import outcome_object
 
-        told = [outcome_object(outcome) for outcome in outcomes.values()]
-        echo_json(json.dumps({"event": "ended", "run": run_id, "totals": str(counted), "outcomes": told}))
+        objects = [outcome_object(outcome) for outcome in outcomes.values()]
+        echo_json(json.dumps({"event": "ended", "run": run_id, "totals": str(counted), "outcomes": objects}))
         return
     echo(f"run {run_id}: {counted}")
     if not counted.all_good:
-        echo("`meshctl resume` takes up what is not done", err=True)
+        echo("run `meshctl resume` for the unfinished nodes", err=True)

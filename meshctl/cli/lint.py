@@ -1,4 +1,4 @@
-"""`meshctl lint`: check inventories, report in the wanted format, exit 0 (clean), 1 (findings) or 2 (could not run)."""
+"""`meshctl lint`: check inventories and report findings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from meshctl.report.findings import FORMATS, Findings
 
 
 class Format(StrEnum):
-    """How findings are written."""
+    """Output format of findings."""
 
     TEXT = "text"
     JSON = "json"
@@ -33,7 +33,7 @@ class Format(StrEnum):
 
 
 class Threshold(StrEnum):
-    """The least severity that makes the exit code 1."""
+    """The lowest severity that makes the exit code 1."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -43,63 +43,61 @@ class Threshold(StrEnum):
 def lint(
     paths: Annotated[
         list[Path] | None,
-        typer.Argument(help="Inventories: YAML files or directories. Default: $MESHCTL_INVENTORY or here."),
+        typer.Argument(help="Inventories: YAML files or directories; default: $MESHCTL_INVENTORY or '.'."),
     ] = None,
-    inventory: Annotated[
-        list[Path] | None, typer.Option("--inventory", "-i", help="The same as an argument, as other commands take it.")
-    ] = None,
+    inventory: Annotated[list[Path] | None, typer.Option("--inventory", "-i", help="Same as an argument.")] = None,
     files: Annotated[
         bool,
-        typer.Option("--files", help="Paths are files: check each inventory one is part of, pass over the others."),
+        typer.Option("--files", help="Check the inventories that contain the given files; skip other files."),
     ] = False,
-    format: Annotated[Format, typer.Option("--format", "-f", help="How to write the findings.")] = Format.TEXT,
+    format: Annotated[Format, typer.Option("--format", "-f", help="Output format.")] = Format.TEXT,
     output: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write to this file.")] = None,
     select: Annotated[
-        list[str] | None, typer.Option(help="Only findings whose code starts so: MC3, INV020, or MC342,MC343.")
+        list[str] | None, typer.Option(help="Code prefixes to report: MC3, INV020, or MC342,MC343.")
     ] = None,
-    ignore: Annotated[list[str] | None, typer.Option(help="Leave out rules whose code starts so.")] = None,
-    fail_on: Annotated[Threshold, typer.Option(help="Exit with 1 from this severity on.")] = Threshold.WARNING,
-    baseline: Annotated[Path | None, typer.Option(help="Findings listed in this file do not count.")] = None,
+    ignore: Annotated[list[str] | None, typer.Option(help="Code prefixes to ignore.")] = None,
+    fail_on: Annotated[Threshold, typer.Option(help="Lowest severity that makes the exit code 1.")] = Threshold.WARNING,
+    baseline: Annotated[Path | None, typer.Option(help="Ignore the findings in this file.")] = None,
     write_baseline: Annotated[
-        bool, typer.Option("--write-baseline", help="Write what is found now to the baseline file.")
+        bool, typer.Option("--write-baseline", help="Write the current findings to the baseline file.")
     ] = False,
     regdb: Annotated[
-        Path | None, typer.Option(help="Regulatory database. Default: this machine's, else the one shipped.")
+        Path | None, typer.Option(help="Regulatory database; default: the system's, else the bundled one.")
     ] = None,
-    explain: Annotated[str | None, typer.Option(help="Print the page of one rule.", metavar="CODE")] = None,
+    explain: Annotated[str | None, typer.Option(help="Explain a rule.", metavar="CODE")] = None,
     list_rules: Annotated[bool, typer.Option("--list", help="List all rules.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="The same as --format json.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Same as --format json.")] = False,
 ) -> None:
-    """Check inventories across all layers.
+    """Check inventories for errors and risks, from the radio up to the application.
 
-    Exit code: 0 clean, 1 findings, 2 could not run. Notes alone do not count, unless --fail-on note.
+    Exit code: 0 no findings, 1 findings, 2 could not run. Notes count only with --fail-on note.
 
     Example: meshctl lint inventory/ --format sarif --out lint.sarif
     """
     if explain is not None:
-        echo(_explained(explain), nl=False)
+        echo(_rule_page(explain), nl=False)
         return
     if list_rules:
         for rule in RULES:
             echo(f"{rule.code}  {rule.severity.value:<7}  {rule.title}")
         return
     if write_baseline and baseline is None:
-        raise InputError("--write-baseline needs --baseline FILE, the file to write")
-    rules = chosen(select or (), ignore or ())
+        raise InputError("--write-baseline requires --baseline FILE")
+    rules = selected_rules(select or (), ignore or ())
     database = load(regdb)
     if regdb is None and database.source == str(SHIPPED):
-        echo(f"note: no regulatory database on this machine, using the shipped {shipped_version()}", err=True)
+        echo(f"note: no regulatory database on this machine; using the bundled {shipped_version()}", err=True)
     given = (*(paths or ()), *(inventory or ()))
     targets = given or (Path(os.environ.get("MESHCTL_INVENTORY") or "."),)
     if files:
         targets = tuple(inventories_of(given))
     examined = [check_path(path, database, os.environ, rules) for path in targets]
-    findings = gathered(examined)
+    findings = merge_results(examined)
     if select:
         findings = _selected(findings, _prefixes(select, (*BY_CODE, *MEANINGS)))
     if write_baseline and baseline is not None:
         _write(baseline, baselines.dump(item for item in findings.diagnostics if item.code in BY_CODE))
-        echo(f"{len(findings.diagnostics)} findings written to {baseline}", err=True)
+        echo(f"wrote {len(findings.diagnostics)} findings to {baseline}", err=True)
         return
     if baseline is not None:
         findings = _without_known(findings, baseline, rules)
@@ -107,7 +105,7 @@ def lint(
     if output is not None:
         _write(output, report)
     else:
-        # JSON and SARIF stay the same document, in the others a stand-in is shown
+        # JSON and SARIF are escaped, which keeps their values; other formats are sanitized
         is_json = json or format in (Format.JSON, Format.SARIF)
         (echo_json if is_json else echo)(report, nl=False)
     if not all(item.is_readable for item in examined):
@@ -118,7 +116,7 @@ def lint(
 
 
 def inventories_of(files: Iterable[Path]) -> Iterator[Path]:
-    """The inventory that each file is part of, once: the nearest directory above it, up to here, with a fleet.yaml."""
+    """The inventories that contain the files, each once: the nearest parent directory with a fleet.yaml."""
     found: dict[Path, Path] = {}
     for file in files:
         above = (file, *file.parents) if file.is_dir() else tuple(file.parents)
@@ -128,10 +126,10 @@ def inventories_of(files: Iterable[Path]) -> Iterator[Path]:
     yield from found.values()
 
 
-def chosen(select: Iterable[str], ignore: Iterable[str]) -> tuple[Rule, ...]:
-    """The rules whose code starts with a selected prefix (all without one) and with no ignored one.
+def selected_rules(select: Iterable[str], ignore: Iterable[str]) -> tuple[Rule, ...]:
+    """The rules with a selected prefix (default: all) and no ignored one.
 
-    Prefixes may be joined by commas. Raises InputError for one that no rule has.
+    Prefixes may be joined by commas. Raises InputError for an unknown prefix.
     """
     wanted, unwanted = _prefixes(select, (*BY_CODE, *MEANINGS)), _prefixes(ignore, BY_CODE)
     return tuple(
@@ -147,22 +145,22 @@ def _prefixes(given: Iterable[str], codes: Iterable[str]) -> tuple[str, ...]:
     for prefix in prefixes:
         if not any(code.startswith(prefix) for code in known):
             if any(code.startswith(prefix) for code in MEANINGS):
-                raise InputError(f"{prefix} cannot be left out: an inventory with such errors does not load")
-            raise InputError(f"expected the start of a rule's code, found {prefix}", hint="`meshctl lint --list`")
+                raise InputError(f"{prefix} cannot be ignored: an inventory with such an error does not load")
+            raise InputError(f"no rule code starts with {prefix}", hint="run `meshctl lint --list` to list all rules")
     return prefixes
 
 
 def _selected(findings: Findings, prefixes: tuple[str, ...]) -> Findings:
-    """Where the loader's codes alone are selected, without its other findings; they stay where rules are selected too,
-    since what does not load was not looked at."""
+    """Drop other findings of the loader if only loader codes are selected. With rules selected they stay: what does not
+    load was not checked."""
     if any(code.startswith(prefixes) for code in BY_CODE):
         return findings
     kept = tuple(item for item in findings.diagnostics if item.code.startswith(prefixes))
     return replace(findings, diagnostics=kept)
 
 
-def gathered(examined: Iterable[CheckResult]) -> Findings:
-    """What several inventories gave, as one; a file that two of them include is reported once."""
+def merge_results(examined: Iterable[CheckResult]) -> Findings:
+    """Merge the findings of several inventories; a file included by two of them is reported once."""
     parts = list(examined)
     sources = {file: text for part in parts for file, text in part.sources.items()}
     diagnostics = dict.fromkeys(item for part in parts for item in part.diagnostics)
@@ -181,14 +179,17 @@ def _write(path: Path, text: str) -> None:
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
 
 
-def _explained(code: str) -> str:
+def _rule_page(code: str) -> str:
     wanted = code.strip().upper()
     if wanted in MEANINGS:
         return f"# {wanted}\n\n{MEANINGS[wanted]}\n"
     rule = BY_CODE.get(wanted)
     if rule is None:
-        raise InputError(f"expected a rule's code such as MC342, found {code}", hint="`meshctl lint --list` shows all")
+        raise InputError(
+            f"unknown rule code {code}: expected a code such as MC342",
+            hint="run `meshctl lint --list` to list all rules",
+        )
     return page(rule)

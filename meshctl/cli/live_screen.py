@@ -1,10 +1,9 @@
-"""A page on the terminal that is drawn anew while looks go on in the background, until Ctrl-C.
+"""A full-screen view that is refreshed in the background, until Ctrl-C.
 
-`live` looks in a daemon thread and draws in the main one: at every answer, at every change of the window's size, and
-once a second, since ages grow. The page has the terminal's other screen, so what stood there before comes back.
+`live_screen` refreshes in a daemon thread and draws in the main thread: on new data, on a window resize, and once a
+second, since ages grow. It uses the terminal's alternate screen, so the previous contents come back.
 
-Signals do nothing themselves but ring the bell that the drawing waits for: a handler that wrote to the terminal could
-come in the middle of what is being written.
+Signal handlers only wake the drawing loop through a pipe: writing to the terminal in a handler could interrupt a write.
 """
 
 from __future__ import annotations
@@ -25,19 +24,19 @@ from meshctl.report.terminal_escapes import clean_styled
 
 T = TypeVar("T")
 
-# xterm's control sequences: other screen, hidden cursor, no wrapping of long lines
+# xterm control sequences: alternate screen, hidden cursor, no line wrapping
 _ENTER, _LEAVE = "\x1b[?1049h\x1b[?25l\x1b[?7l", "\x1b[?7h\x1b[?25h\x1b[?1049l"
 _HOME, _END_OF_LINE, _END_OF_PAGE = "\x1b[H", "\x1b[K", "\x1b[J"
 _REDRAW_S = 1.0
 
 
 @dataclass(slots=True)
-class _Looks(Generic[T]):
-    """The background's side: the latest value, or what went wrong; `bell` is written to when there is something new."""
+class _Refresher(Generic[T]):
+    """The background thread: keeps the latest value or the failure, and writes to `wakeup_fd` after each."""
 
-    take: Callable[[], T]
+    refresh: Callable[[], T]
     period_s: float
-    bell: int
+    wakeup_fd: int
     latest: T | None = None
     failure: BaseException | None = None
     _end: threading.Event = field(default_factory=threading.Event)
@@ -46,12 +45,12 @@ class _Looks(Generic[T]):
         while not self._end.is_set():
             began = time.monotonic()
             try:
-                self.latest = self.take()
+                self.latest = self.refresh()
             except BaseException as error:  # noqa: BLE001 - raised again in the main thread
                 self.failure = error
             if self._end.is_set():
                 return
-            _ring(self.bell)
+            _wake(self.wakeup_fd)
             if self.failure is not None:
                 return
             self._end.wait(max(0.0, self.period_s - (time.monotonic() - began)))
@@ -60,43 +59,45 @@ class _Looks(Generic[T]):
         self._end.set()
 
 
-def live(
-    take: Callable[[], T],
+def live_screen(
+    refresh: Callable[[], T],
     draw: Callable[[T | None, os.terminal_size], list[str]],
     period_s: float,
     out: TextIO,
     size: Callable[[], os.terminal_size] = shutil.get_terminal_size,
 ) -> T | None:
-    """Draw what `take` gives every `period_s`, until Ctrl-C; returns the latest. `draw` gets it (None before the first)
-    and the window's size, and gives lines. Raises what `take` raises."""
+    """Draw the value of `refresh` every `period_s` until Ctrl-C; returns the latest value.
+
+    `draw` gets the value (None before the first) and the window size, and returns lines. Raises what `refresh` raises.
+    """
     reader, writer = os.pipe2(os.O_NONBLOCK)
-    looks = _Looks(take, period_s, writer)
-    thread = threading.Thread(target=looks.run, name="looks", daemon=True)
+    refresher = _Refresher(refresh, period_s, writer)
+    thread = threading.Thread(target=refresher.run, name="refresh", daemon=True)
     try:
         with _screen(out, writer) as screen:
             thread.start()
-            while looks.failure is None:
-                screen.give_and_take()
-                _draw(draw, looks.latest, out, size())
+            while refresher.failure is None:
+                screen.handle_suspend()
+                _draw(draw, refresher.latest, out, size())
                 ready, _, _ = select.select([reader], [], [], _REDRAW_S)
                 if ready:
                     os.read(reader, 4096)
     except KeyboardInterrupt:
-        # the way to leave; what was seen last stays
+        # the way to quit
         pass
     finally:
-        looks.stop()
-        # the pipe stays open: a look that is still under way may ring, and a closed number may soon be another's
-    if looks.failure is not None:
-        raise looks.failure
-    return looks.latest
+        refresher.stop()
+        # the pipe stays open: a refresh in progress may still write, and a closed descriptor may be reused
+    if refresher.failure is not None:
+        raise refresher.failure
+    return refresher.latest
 
 
-def _ring(bell: int) -> None:
+def _wake(wakeup_fd: int) -> None:
     try:
-        os.write(bell, b"!")
+        os.write(wakeup_fd, b"!")
     except BlockingIOError:
-        # it has rung often enough to be heard
+        # the pipe is full, so the reader wakes up anyway
         return
 
 
@@ -108,21 +109,21 @@ def _draw(
 
 
 def page(lines: list[str], height: int) -> str:
-    """The lines as one page of that height, each clearing what stood there before."""
+    """The lines as one page of `height`, each clearing the rest of its line."""
     room = max(1, height)
     if len(lines) > room:
         hidden = len(lines) - room + 1
-        lines = [*lines[: room - 1], f"... {hidden} more lines: enlarge the window, or show less (--alarm any)"]
+        lines = [*lines[: room - 1], f"... {hidden} more lines: enlarge the window or filter (--alarm any)"]
     lines = [clean_styled(line) for line in lines]
     return _HOME + f"{_END_OF_LINE}\r\n".join(lines) + _END_OF_LINE + _END_OF_PAGE
 
 
 @dataclass(slots=True)
 class _Screen:
-    """The terminal's other screen. `is_stopping`: Ctrl-Z was pressed; `is_resumed`: somebody else may have drawn."""
+    """The alternate screen. `is_suspend_requested`: Ctrl-Z was pressed; `is_resumed`: it must be entered again."""
 
     out: TextIO
-    is_stopping: bool = False
+    is_suspend_requested: bool = False
     is_resumed: bool = False
 
     def enter(self) -> None:
@@ -132,14 +133,13 @@ class _Screen:
         self.out.write(_LEAVE)
         self.out.flush()
 
-    def give_and_take(self) -> None:
-        """Gives the terminal back for as long as the process is stopped, and takes it again."""
-        if self.is_stopping:
-            self.is_stopping = False
+    def handle_suspend(self) -> None:
+        """Release the terminal while the process is stopped, then enter the alternate screen again."""
+        if self.is_suspend_requested:
+            self.is_suspend_requested = False
             self.leave()
             handler = signal.signal(signal.SIGTSTP, signal.SIG_DFL)
-            # returns when somebody lets us go on; at once where nobody could, as in a session of our own (POSIX.1,
-            # orphaned process group)
+            # returns on SIGCONT, or at once in an orphaned process group (POSIX.1)
             os.kill(os.getpid(), signal.SIGTSTP)
             signal.signal(signal.SIGTSTP, handler)
             self.is_resumed = True
@@ -149,23 +149,23 @@ class _Screen:
 
 
 @contextmanager
-def _screen(out: TextIO, bell: int) -> Iterator[_Screen]:
-    """The other screen, for as long as the block runs. Window changes ring the bell; SIGTERM ends the process."""
+def _screen(out: TextIO, wakeup_fd: int) -> Iterator[_Screen]:
+    """The alternate screen within the block. Signals wake the drawing loop; SIGTERM ends the process."""
     screen = _Screen(out)
 
     def resized(number: int, frame: FrameType | None) -> None:
-        _ring(bell)
+        _wake(wakeup_fd)
 
     def ended(number: int, frame: FrameType | None) -> None:
         raise SystemExit(128 + number)
 
     def stopped(number: int, frame: FrameType | None) -> None:
-        screen.is_stopping = True
-        _ring(bell)
+        screen.is_suspend_requested = True
+        _wake(wakeup_fd)
 
     def resumed(number: int, frame: FrameType | None) -> None:
         screen.is_resumed = True
-        _ring(bell)
+        _wake(wakeup_fd)
 
     handlers = {
         signal.SIGWINCH: resized,

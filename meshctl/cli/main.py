@@ -1,7 +1,7 @@
-"""The root command: find the command that is meant, import it alone, run it, turn errors into exit codes.
+"""The root command: import the requested command alone, run it, turn errors into exit codes.
 
-`main` reads the words on the command line (or those being completed), registers the meant command for real and every
-other one by its summary only, and hands over to typer.
+`main` reads the command line (or the words being completed), registers the requested command in full and every other
+one by its summary only, and hands over to typer.
 """
 
 from __future__ import annotations
@@ -19,47 +19,46 @@ from typer.core import DEFAULT_MARKUP_MODE
 from meshctl import __version__
 from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.cli.extensions import load
-from meshctl.cli.output import echo, is_plain, prepare_streams
-from meshctl.cli.streams import unheard
+from meshctl.cli.output import echo, ignore_broken_pipe, is_plain, prepare_streams
 from meshctl.errors import ExitCode, MeshctlError
 
-_EPILOG = """Start with `meshctl init DIR`, or `meshctl lab up` for a virtual fleet to practise on.
+_EPILOG = """Start with `meshctl init DIR`, or with `meshctl lab up` for a virtual fleet.
 
-Exit codes: 0 well, 1 something to act on, 2 could not run, 3 needed nodes do not answer, 130 interrupted."""
+Exit codes: 0 success, 1 findings, 2 could not run, 3 required nodes unreachable, 130 interrupted."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run meshctl with `arguments` (default: the process's own); always ends in SystemExit."""
+    """Run meshctl with `arguments` (default: sys.argv); always raises SystemExit."""
     prepare_streams()
     words = list(sys.argv[1:] if arguments is None else arguments)
     completing = os.environ.get("COMP_WORDS", "").split()[1:] if "_MESHCTL_COMPLETE" in os.environ else []
-    meant = next((word for word in completing or words if not word.startswith("-")), "")
+    requested = next((word for word in completing or words if not word.startswith("-")), "")
     try:
-        build(meant)(args=words, prog_name="meshctl")
+        build(requested)(args=words, prog_name="meshctl")
     except KeyboardInterrupt:
-        # while the command was being imported, which takes seconds on a busy machine
+        # during the import of the command, which takes seconds on a busy machine
         echo("interrupted", err=True)
         sys.exit(int(ExitCode.INTERRUPTED))
 
 
-def build(meant: str) -> typer.Typer:
-    """The application, with only the command `meant` imported."""
+def build(requested: str) -> typer.Typer:
+    """The application, with only the `requested` command imported."""
     app = typer.Typer(
         name="meshctl",
-        help="Own a fleet of mesh radios from one inventory: lint, render, provision, watch.",
+        help="Manage a fleet of OpenWrt mesh radios from one inventory.",
         epilog=_EPILOG,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
-        # without it help and usage errors are plain text
+        # None: plain help and usage errors
         rich_markup_mode=None if is_plain() else DEFAULT_MARKUP_MODE,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     app.callback()(_root)
     for name, entry in COMMANDS.items():
-        if name == meant:
+        if name == requested:
             _register(app, name, entry)
         else:
-            app.command(name, help=entry.summary, rich_help_panel=entry.panel)(_not_meant)
+            app.command(name, help=entry.summary, rich_help_panel=entry.panel)(_placeholder)
     return app
 
 
@@ -69,7 +68,7 @@ def _root(
         typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=lambda v: _version(v)),
     ] = False,
 ) -> None:
-    """Own a fleet of mesh radios from one inventory: lint, render, provision, watch."""
+    """Manage a fleet of OpenWrt mesh radios from one inventory."""
 
 
 def _version(wanted: bool) -> None:
@@ -78,8 +77,8 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
-def _not_meant() -> None:
-    raise AssertionError("a command that was not named was called")
+def _placeholder() -> None:
+    raise AssertionError("a command other than the requested one was called")
 
 
 def _register(app: typer.Typer, name: str, entry: Entry) -> None:
@@ -88,7 +87,7 @@ def _register(app: typer.Typer, name: str, entry: Entry) -> None:
         _guard_group(target)
         app.add_typer(target, name=name, help=entry.summary, rich_help_panel=entry.panel, no_args_is_help=True)
     else:
-        # what follows `--` in `meshctl run NODE -- CMD -x` belongs to the command on the node
+        # words after `--` in `meshctl run NODE -- CMD -x` belong to the command on the node
         app.command(name, rich_help_panel=entry.panel)(_guarded(target))
 
 
@@ -102,7 +101,7 @@ def _guard_group(group: typer.Typer) -> None:
 
 
 def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The command with meshctl's errors and Ctrl-C turned into a message and an exit code."""
+    """Turn meshctl's errors and Ctrl-C into a message and an exit code."""
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> Any:
@@ -117,8 +116,8 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
             echo("interrupted", err=True)
             raise typer.Exit(int(ExitCode.INTERRUPTED)) from None
         except BrokenPipeError:
-            # the reader (`| head`) has seen enough
-            with unheard():
+            # the reader (`| head`) is gone
+            with ignore_broken_pipe():
                 raise
             raise typer.Exit from None
 

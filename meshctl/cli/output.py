@@ -1,13 +1,15 @@
-"""Everything that a command prints goes through here, and is safe for a terminal whatever a device put into it.
+"""All output of commands, made safe for a terminal whatever a device sent.
 
-`echo` prints text, `echo_json` JSON, `echo_bytes` what `--raw` asks for. Live lines (`report.progress`) and pages
-(`live`) clean what they draw themselves.
+`echo` prints text, `echo_json` JSON, `echo_bytes` the raw bytes of `--raw`. Live lines (`report.progress`) and the live
+screen (`live_screen`) sanitize what they draw themselves.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import typer
@@ -19,41 +21,54 @@ if TYPE_CHECKING:
 
 
 def echo(text: object = "", *, err: bool = False, nl: bool = True, styled: bool = False) -> None:
-    """Print text. `styled`: its colours are meshctl's own, and pass."""
+    """Print text. `styled`: keep color escapes, which are meshctl's own."""
     shown = clean_styled(str(text)) if styled else clean(str(text))
     typer.echo(shown, err=err, nl=nl)
 
 
 def echo_json(text: str, *, err: bool = False, nl: bool = True) -> None:
-    """Print JSON text; it stays the same value."""
+    """Print JSON text, escaped without changing its value."""
     typer.echo(json_safe(text), err=err, nl=nl)
 
 
-def complain(text: str) -> None:
+def echo_error(text: str) -> None:
     """Print text on standard error."""
     echo(text, err=True)
 
 
 def echo_bytes(raw: bytes, *, err: bool = False) -> None:
-    """Pass bytes through as they are."""
+    """Print bytes unchanged."""
     typer.echo(raw, err=err, nl=False)
 
 
 def is_plain() -> bool:
-    """Whether nothing is to be coloured or set in bold (no-color.org)."""
+    """Whether NO_COLOR is set (no-color.org)."""
     return bool(os.environ.get("NO_COLOR"))
 
 
 def console() -> Console:
-    """Standard output for rich, without colours and bold where those are unwanted."""
+    """Standard output for rich, without styles when NO_COLOR is set."""
     from rich.console import Console
 
     return Console(color_system=None if is_plain() else "auto", highlight=False, markup=False)
 
 
 def prepare_streams() -> None:
-    """Characters that a terminal's encoding lacks are shown by their numbers, instead of an error."""
+    """Escape characters that the terminal's encoding lacks instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         reconfigure = getattr(stream, "reconfigure", None)
         if reconfigure is not None:
             reconfigure(errors="backslashreplace")
+
+
+@contextmanager
+def ignore_broken_pipe() -> Iterator[None]:
+    """Stop writing to standard output once its reader is gone (EPIPE, EIO), without an error."""
+    try:
+        yield
+        sys.stdout.flush()
+    except OSError:
+        # or the interpreter flushes, and complains, once more at exit
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)

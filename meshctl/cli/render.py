@@ -1,4 +1,4 @@
-"""`meshctl render` and `meshctl diff`: what each node gets, and what changes between two inventories."""
+"""`meshctl render` and `meshctl diff`: the files of each node, and the changes between two inventories."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
-from meshctl.cli.git_revision import opened
-from meshctl.cli.options import AsJson, InventoryPath
+from meshctl.cli.context import AsJson, InventoryPath
+from meshctl.cli.git_revision import checkout
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory import load_fleet
@@ -33,23 +33,22 @@ from meshctl.render import (
 
 
 def render(
-    nodes: Annotated[
-        list[str] | None, typer.Argument(help="Nodes, or patterns such as 'husky*'; default: all.")
-    ] = None,
+    nodes: Annotated[list[str] | None, typer.Argument(help="Nodes or patterns such as 'husky*'; default: all.")] = None,
     inventory: InventoryPath = Path(),
     out: Annotated[Path | None, typer.Option("--out", help="Write each node's files to DIR/NODE/.")] = None,
     imagebuilder: Annotated[
-        Path | None, typer.Option("--imagebuilder", help="Write overlays, package lists and build scripts to DIR.")
+        Path | None,
+        typer.Option("--imagebuilder", help="Write ImageBuilder overlays and build scripts to DIR."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write the files each node gets; without --out or --imagebuilder print them, secrets masked.
+    """Render each node's configuration files; without --out or --imagebuilder, print them with secrets masked.
 
     Example: meshctl render 'husky1-*' --out build/
     """
     fleet = load_fleet(inventory, environ=os.environ)
-    # all of them before anything is written: a fleet is rendered whole or not at all
-    rendered = render_nodes(fleet, _chosen(fleet, nodes or []), _secrets(fleet))
+    # render all before writing any: a fleet is written completely or not at all
+    rendered = render_nodes(fleet, _selected_names(fleet, nodes or []), _secrets(fleet))
     folders = {item.node: write_node(item, out) for item in rendered} if out is not None else {}
     builds = (
         [(item, _write_build(item, imagebuilder)) for item in image_folders(fleet, rendered)] if imagebuilder else []
@@ -68,13 +67,13 @@ def render(
 
 
 def _warn_of_dead_ports(fleet: Fleet, rendered: Iterable[Rendered]) -> None:
-    """An image brings its own /etc/config/network, so its first boot writes no layout of the switch there."""
+    """An image has its own /etc/config/network, so its first boot does not write the switch layout."""
     dead = {item.node: fleet.nodes[item.node].unswitched_ports for item in rendered}
     for node, ports in dead.items():
         if ports:
             echo(
-                f"{node}: with this image {', '.join(ports)} may have no port behind it: "
-                "the inventory knows no switch_vlans of its hardware (MC530)",
+                f"warning: {node}: {', '.join(ports)} may have no port in this image: "
+                "its hardware has no switch_vlans in the inventory (MC530)",
                 err=True,
             )
 
@@ -84,8 +83,8 @@ def _secrets(fleet: Fleet) -> Callable[[SecretRef], Secret]:
     return lambda ref: store.get(ref)
 
 
-def _chosen(fleet: Fleet, patterns: Iterable[str]) -> list[str]:
-    """The nodes that any pattern names, in the inventory's order. Raises InputError for one that names none."""
+def _selected_names(fleet: Fleet, patterns: Iterable[str]) -> list[str]:
+    """The nodes that match any pattern, in inventory order. Raises InputError for a pattern without a match."""
     wanted = list(patterns)
     if not wanted:
         return [node.name for node in fleet.managed()]
@@ -93,9 +92,9 @@ def _chosen(fleet: Fleet, patterns: Iterable[str]) -> list[str]:
     for pattern in wanted:
         matches = [name for name in names if fnmatchcase(name, pattern)]
         if not matches:
-            raise InputError(f"no node is named {pattern!r}", hint="`meshctl inventory show` lists the nodes")
+            raise InputError(f"no node matches {pattern!r}", hint="run `meshctl inventory list` to list all nodes")
     chosen = [name for name in names if any(fnmatchcase(name, pattern) for pattern in wanted)]
-    # a pattern passes over what has no configuration any more; a name that is spelled out gets its reason
+    # patterns skip unmanaged nodes; an exact name reports why it cannot be rendered
     return [name for name in chosen if name in wanted or fleet.nodes[name].state.is_managed]
 
 
@@ -143,11 +142,11 @@ def diff(
     inventory: InventoryPath = Path(),
     as_json: AsJson = False,
 ) -> None:
-    """Show what changes on which node between two inventories; exit 1 when anything does. Needs no secrets.
+    """Show per-node changes between two inventories; exit with 1 if there are any. Needs no secrets.
 
     Example: meshctl diff HEAD~1:inventory/subt-final inventory/subt-final
     """
-    with opened(before) as old, opened(str(inventory) if after is None else after) as new:
+    with checkout(before) as old, checkout(str(inventory) if after is None else after) as new:
         differences = list(compare_fleets(old.fleet(), new.fleet()))
     if as_json:
         echo_json(json.dumps({"nodes": [_as_json(item) for item in differences]}, indent=2, ensure_ascii=False))

@@ -1,8 +1,7 @@
-"""What every `meshctl robots` command opens first: a `Crew` of chosen robots, the way to them, what they shall be.
+"""What every `meshctl robots` command opens first: a `RobotsContext` with the selected robots, connections and options.
 
-`with_crew` gives a command the options they all share, and the crew they make. `Crew.on_each` works on all robots at
-once; `Crew.change` does so for what changes them, shows it go on, and writes it into the journal, from which
-`meshctl resume` takes it up (robots_work.py has the work).
+`with_robots_context` adds the shared options to a command and opens the context. `run_on_each` works on all robots in
+parallel; `run_journaled` also shows progress and writes the journal that `meshctl resume` reads.
 """
 
 from __future__ import annotations
@@ -22,41 +21,45 @@ from typing import Annotated, Any
 
 import typer
 
-from meshctl.cli.context import KeyFiles, Session, exit_for, progress_for, session
-from meshctl.cli.options import AsJson, InventoryPath
-from meshctl.cli.output import complain, echo, echo_json
-from meshctl.cli.shared import opening
+from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Session, exit_for, progress_for, session, with_options
+from meshctl.cli.output import echo, echo_error, echo_json
 from meshctl.device.connection import Connection
 from meshctl.errors import InputError, MeshctlError
-from meshctl.fleet import Event, EventKind, Observer, Outcome, Tee, outcome_of_error, run, silent, totals
+from meshctl.fleet import Event, EventKind, Observer, Outcome, Result, Tee, outcome_of_error, run, silent, totals
+from meshctl.fleet.journal import RunRecord
 from meshctl.inventory.secrets import SecretStore
 from meshctl.model import Fleet, Secret
 from meshctl.render.daemon import daemon_keys
 from meshctl.robots.bundle import configuration
-from meshctl.robots.connection import Reach, chosen_robots
-from meshctl.robots.deploy import Order, Wheelhouse
+from meshctl.robots.connection import RobotConnector, selected_robots
+from meshctl.robots.deploy import DeployOptions, Wheelhouse, claim, deploy, roll_back
 from meshctl.robots.host import Host
 from meshctl.robots.wheels import stock_units
 
-Robots = Annotated[list[str] | None, typer.Argument(help="Robots, or patterns such as 'husky*'; default: all.")]
-Named = Annotated[list[str], typer.Argument(metavar="ROBOTS", help="Robots, or patterns such as 'husky*'.")]
+Robots = Annotated[list[str] | None, typer.Argument(help="Robots or patterns such as 'husky*'; default: all.")]
+Named = Annotated[list[str], typer.Argument(metavar="ROBOTS", help="Robots or patterns such as 'husky*'.")]
 Wheels = Annotated[
     Path | None,
-    typer.Option("--wheels", help="Directory with the wheels the robots need; without it pip downloads them here."),
+    typer.Option("--wheels", help="Directory with the required wheels; default: download them with pip."),
 ]
 AskSudo = Annotated[
-    bool, typer.Option("--ask-sudo", help="Ask for the password that sudo wants (or set MESHCTL_SUDO_PASSWORD).")
+    bool, typer.Option("--ask-sudo", help="Prompt for the sudo password (or set MESHCTL_SUDO_PASSWORD).")
 ]
-Wait = Annotated[int, typer.Option("--wait", min=2, help="Seconds a daemon has to prove itself before it goes back.")]
+Wait = Annotated[int, typer.Option("--wait", min=2, help="Seconds a new release has to become healthy.")]
 
-Work = Callable[[Host, str], Outcome]
-# How often somebody looks whether all connections shall be closed at once.
-_LEAVING_LOOK_S = 0.25
+RobotTask = Callable[[Host, str], Outcome]
+Parameters = Mapping[str, Any]
 
-# The options that commands share, by the name `crew_of` knows them by, in the order of the help.
+# systemd stops and starts two services (TimeoutStopSec, TimeoutStartSec of the units).
+SERVICE_TIMEOUT_S = 240.0
+COMMAND_PREFIX = "robots "
+# Poll interval for a second Ctrl-C, which closes all connections.
+_LEAVE_POLL_S = 0.25
+
+# Shared options by the parameters of `open_robots_context`, in the order of the help.
 _SHARED: dict[str, tuple[Any, Any]] = {
     "robots": (Robots, None),
-    # the same, for commands that nobody means for all by leaving it out
+    # required: for commands that must not default to all robots
     "named": (Named, inspect.Parameter.empty),
     "inventory": (InventoryPath, Path()),
     "wheels": (Wheels, None),
@@ -68,70 +71,70 @@ _SHARED: dict[str, tuple[Any, Any]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Crew:
-    """Everything open for one command. `robots` are the chosen ones; `wheels` is the directory named for them."""
+class RobotsContext:
+    """Everything open for one command: the selected `robots`; `wheels` is the directory given for them."""
 
     opened: Session
-    reach: Reach
+    connector: RobotConnector
     robots: tuple[str, ...]
-    order: Order
+    options: DeployOptions
     inventory: Path
     wheels: Path | None
     as_json: bool
 
     @property
     def fleet(self) -> Fleet:
-        return self.order.fleet
+        return self.options.fleet
 
-    def at(self, fleet: Fleet, *, only_configuration: bool = False) -> Crew:
-        """The same crew under a (changed) inventory. Raises InvalidInput and InputError for what no robot takes."""
+    def with_fleet(self, fleet: Fleet, *, only_configuration: bool = False) -> RobotsContext:
+        """The same context for a changed inventory. Raises InvalidInput and InputError if a daemon would reject it."""
         secrets = SecretStore(os.environ, Path(fleet.base)).get
         daemon_keys(fleet, secrets)
         for robot in self.robots:
             configuration(fleet, robot, secrets, stock_units())
-        order = replace(self.order, fleet=fleet, secrets=secrets, only_configuration=only_configuration)
-        return replace(self, order=order, reach=replace(self.reach, fleet=fleet))
+        options = replace(self.options, fleet=fleet, secrets=secrets, only_configuration=only_configuration)
+        return replace(self, options=options, connector=replace(self.connector, fleet=fleet))
 
-    def on_each(
-        self, work: Work, observer: Observer = silent, say: Callable[[str], None] = complain
+    def run_on_each(
+        self, work: RobotTask, observer: Observer = silent, say: Callable[[str], None] = echo_error
     ) -> dict[str, Outcome]:
-        """Connect to every chosen robot and work there, several at once. A second Ctrl-C closes all connections."""
+        """Connect to the selected robots in parallel and run `work`. A second Ctrl-C closes all connections."""
         interrupt = self.opened.interrupt
-        standing: list[Connection] = []
+        connections: list[Connection] = []
         ended = threading.Event()
 
         def one(robot: str) -> Outcome:
             try:
-                with self.reach.host(robot, opened=standing.append) as host:
+                with self.connector.host(robot, opened=connections.append) as host:
                     return work(host, robot)
             except MeshctlError as error:
                 return outcome_of_error(robot, error)
 
         def leave() -> None:
-            while not ended.wait(_LEAVING_LOOK_S):
+            while not ended.wait(_LEAVE_POLL_S):
                 if interrupt.leaving:
-                    for connection in tuple(standing):
+                    for connection in tuple(connections):
                         connection.close()
 
-        watching = threading.Thread(target=leave, name="leave", daemon=True)
-        watching.start()
+        watchdog = threading.Thread(target=leave, name="leave", daemon=True)
+        watchdog.start()
         try:
             with interrupt.on_signals(say):
                 return run(self.robots, one, parallel=self.fleet.apply.parallel, interrupt=interrupt, observer=observer)
         finally:
             ended.set()
-            watching.join()
+            watchdog.join()
 
-    def change(
-        self, command: str, work: Callable[[Crew], Work], told: Mapping[str, object] | None = None
+    def run_journaled(
+        self, command: str, work: Callable[[RobotsContext], RobotTask], parameters: Mapping[str, object] | None = None
     ) -> dict[str, Outcome]:
-        """`on_each` for what changes robots: shown, and in the journal as `robots COMMAND` with `told` to resume by."""
+        """`run_on_each` with progress and a journal entry `robots COMMAND`; `parameters` serve `meshctl resume`."""
         journal_run = self.opened.journal.begin(
             f"robots {command}",
             fleet=self.fleet.name,
             inventory=self.opened.inventory,
             nodes=self.robots,
-            plan=json.dumps({"robots": dict(told or {})}),
+            plan=json.dumps({"robots": dict(parameters or {})}),
         )
         outcomes: dict[str, Outcome] = {}
         try:
@@ -147,15 +150,15 @@ class Crew:
                     with journal_run.step(robot, name):
                         yield
 
-                crew = replace(self, order=replace(self.order, step=step))
-                outcomes = crew.on_each(work(crew), Tee((progress, keep)), progress.stopping)
+                context = replace(self, options=replace(self.options, step=step))
+                outcomes = context.run_on_each(work(context), Tee((progress, keep)), progress.stopping)
         finally:
             journal_run.end(str(totals(outcomes.values())) if outcomes else "could not run")
         return outcomes
 
 
 @contextmanager
-def crew_of(
+def open_robots_context(
     inventory: Path,
     robots: list[str] | None = None,
     *,
@@ -164,14 +167,14 @@ def crew_of(
     wheels: Path | None = None,
     wait_s: int = 30,
     as_json: bool = False,
-) -> Iterator[Crew]:
-    """Open all of it. Raises InvalidInput and InputError for an inventory or a choice that cannot be worked with."""
+) -> Iterator[RobotsContext]:
+    """Open a session and its context. Raises InvalidInput and InputError for a bad inventory or selection."""
     password = sudo_password(ask_sudo)
     with session(inventory, key_files=key or ()) as opened:
-        yield crew_in(opened, inventory, robots, password, wheels=wheels, wait_s=wait_s, as_json=as_json)
+        yield robots_context(opened, inventory, robots, password, wheels=wheels, wait_s=wait_s, as_json=as_json)
 
 
-def crew_in(
+def robots_context(
     opened: Session,
     inventory: Path,
     robots: list[str] | None,
@@ -180,51 +183,120 @@ def crew_in(
     wheels: Path | None = None,
     wait_s: int = 30,
     as_json: bool = False,
-) -> Crew:
-    """A crew in a session that stands."""
+) -> RobotsContext:
+    """A context in an open session."""
     fleet = opened.fleet
     secrets = SecretStore(os.environ, Path(fleet.base)).get
-    order = Order(fleet, secrets, Wheelhouse(wheels, _cache()).wheels, time.time, wait_s)
-    reach = Reach(fleet, opened.access, lambda: password, opened.owner)
-    return Crew(opened, reach, chosen_robots(fleet, robots), order, inventory, wheels, as_json)
+    options = DeployOptions(fleet, secrets, Wheelhouse(wheels, _cache()).wheels, time.time, wait_s)
+    reach = RobotConnector(fleet, opened.access, lambda: password, opened.owner)
+    return RobotsContext(opened, reach, selected_robots(fleet, robots), options, inventory, wheels, as_json)
 
 
-def with_crew(*shared: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """A command of a crew and options of its own becomes one that also has these shared options, and opens the crew."""
+def with_robots_context(*shared: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Add these shared options to a command that takes a `context`, and open the context for it."""
 
-    def opened(**given: Any) -> AbstractContextManager[Crew]:
-        return crew_of(**{"robots" if name == "named" else name: value for name, value in given.items()})
+    def opened(**given: Any) -> AbstractContextManager[RobotsContext]:
+        return open_robots_context(**{"robots" if name == "named" else name: value for name, value in given.items()})
 
-    return opening("crew", opened, {name: option for name, option in _SHARED.items() if name in shared})
+    return with_options("context", opened, {name: option for name, option in _SHARED.items() if name in shared})
 
 
 def sudo_password(ask: bool) -> Secret | None:
-    """What sudo on the robots gets where it wants one: asked for, or of MESHCTL_SUDO_PASSWORD, or none."""
+    """The sudo password: prompted for with `ask`, else from MESHCTL_SUDO_PASSWORD, else None."""
     given = os.environ.get("MESHCTL_SUDO_PASSWORD", "")
     if ask:
         if not sys.stdin.isatty():
-            raise InputError("nobody can be asked for a password here", hint="set MESHCTL_SUDO_PASSWORD")
+            raise InputError("not a terminal: cannot prompt for a password", hint="set MESHCTL_SUDO_PASSWORD")
         given = getpass.getpass("sudo password on the robots: ")
     return Secret(given) if given else None
 
 
 def _cache() -> Path:
-    """XDG Base Directory 0.8: what can be fetched again."""
+    """Directory of downloaded wheels (XDG Base Directory 0.8)."""
     named = os.environ.get("XDG_CACHE_HOME", "")
     root = Path(named) if named.startswith("/") else Path(os.environ.get("HOME", "~")).expanduser() / ".cache"
     return root / "meshctl" / "wheels"
 
 
-def end(crew: Crew, outcomes: dict[str, Outcome]) -> typer.Exit:
-    """Tell the totals; the exit to raise."""
+def print_totals(context: RobotsContext, outcomes: dict[str, Outcome]) -> typer.Exit:
+    """Print the totals; returns the exit to raise."""
     counted = totals(outcomes.values())
-    if crew.as_json:
+    if context.as_json:
         from meshctl.report.progress import outcome_object
 
-        told = [outcome_object(outcome) for outcome in outcomes.values()]
-        echo_json(json.dumps({"event": "ended", "totals": str(counted), "outcomes": told}))
+        objects = [outcome_object(outcome) for outcome in outcomes.values()]
+        echo_json(json.dumps({"event": "ended", "totals": str(counted), "outcomes": objects}))
     else:
         echo(str(counted))
         if not counted.all_good:
-            echo("`meshctl resume` takes up what is not done", err=True)
-    return typer.Exit(exit_for(outcomes.values(), crew.opened.interrupt))
+            echo("run `meshctl resume` for the unfinished robots", err=True)
+    return typer.Exit(exit_for(outcomes.values(), context.opened.interrupt))
+
+
+def run_command(context: RobotsContext, command: str, **parameters: Any) -> dict[str, Outcome]:
+    """Run a command on all robots of the context; `parameters` are journaled with it."""
+    parameters = {
+        **parameters,
+        "wait_s": context.options.wait_s,
+        "wheels": str(context.wheels.resolve()) if context.wheels else "",
+    }
+    return context.run_journaled(command, lambda opened: _task_for(command, opened, parameters), parameters)
+
+
+def _task_for(command: str, context: RobotsContext, parameters: Parameters) -> RobotTask:
+    match command:
+        # topic and key changes are in the inventory already; a robot only needs a deploy
+        case "deploy" | "topic" | "rotate-key":
+            return lambda host, robot: deploy(host, robot, context.options)
+        case "rollback":
+            return lambda host, robot: roll_back(host, robot, context.options)
+        case "restart" | "stop":
+            return lambda host, robot: _service(host, robot, command)
+        case "uninstall":
+            return lambda host, robot: _remove(host, robot, purge=bool(parameters.get("purge")))
+        case _:
+            raise InputError(f"a run of `robots {command}` cannot be resumed", hint="run the command again")
+
+
+def _service(host: Host, robot: str, verb: str) -> Outcome:
+    with claim(host):
+        states = host.run("service", verb, timeout_s=SERVICE_TIMEOUT_S).splitlines()
+    parameters = [
+        f"the {'ROS bridge' if 'ros' in unit else 'service'} is {state}" for unit, state in map(str.split, states)
+    ]
+    return Outcome(robot, Result.DONE, ", ".join(parameters))
+
+
+def _remove(host: Host, robot: str, *, purge: bool) -> Outcome:
+    with claim(host):
+        host.run("remove", "purge" if purge else "keep", timeout_s=SERVICE_TIMEOUT_S)
+    return Outcome(robot, Result.DONE, "removed")
+
+
+def resume_run(opened: Session, inventory: Path, record: RunRecord, *, as_json: bool) -> typer.Exit:
+    """Run the command of an earlier run for its unfinished robots; returns the exit to raise."""
+    command = record.command.removeprefix(COMMAND_PREFIX)
+    parameters = json.loads(record.plan).get("robots", {}) if record.plan else {}
+    able = {name for name, robot in opened.fleet.robots.items() if robot.computer is not None}
+    names = [name for name in opened.journal.unfinished(record.id) if name in able]
+    if not names:
+        echo(f"run {record.id} is finished: nothing to resume")
+        return typer.Exit()
+    if command == "rotate-key":
+        # each step needs all robots, and the inventory records the next one
+        again = f"meshctl robots rotate-key {parameters.get('new_key', 'NEW_KEY')}"
+        raise InputError(f"run {record.id} is a key rotation, which takes all robots", hint=f"continue with `{again}`")
+    if not as_json:
+        echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")
+    wheels, wait_s = parameters.get("wheels", ""), int(parameters.get("wait_s", 30))
+    context = robots_context(
+        opened,
+        inventory,
+        names,
+        sudo_password(False),
+        wheels=Path(wheels) if wheels else None,
+        wait_s=wait_s,
+        as_json=as_json,
+    )
+    context = context.with_fleet(opened.fleet, only_configuration=command == "topic")
+    return print_totals(context, run_command(context, command, **parameters))

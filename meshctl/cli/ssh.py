@@ -1,4 +1,4 @@
-"""`meshctl trust`, `run`, `ssh`: reach nodes with the fleet's own keys and pins."""
+"""`meshctl trust`, `run`, `ssh`: connect to nodes with the fleet's keys and pinned host keys."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import KeyFiles, Lab, Nodes, Session, chosen, exit_for, session
-from meshctl.cli.options import AsJson, InventoryPath
-from meshctl.cli.output import complain, echo, echo_bytes, echo_json
+from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Nodes, Session, exit_for, selected_nodes, session
+from meshctl.cli.output import echo, echo_bytes, echo_error, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet import run as run_on_all
@@ -27,29 +26,25 @@ from meshctl.nodes.host_keys import Shown, shown_keys
 def trust(
     nodes: Nodes = None,
     inventory: InventoryPath = Path(),
-    change: Annotated[
-        bool, typer.Option("--replace", "--replace-key", help="Also take keys that differ from the pinned ones.")
-    ] = False,
-    yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Pin without asking; compare the fingerprints first.")
-    ] = False,
+    change: Annotated[bool, typer.Option("--replace", "--replace-key", help="Also accept changed keys.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Pin without confirmation.")] = False,
     as_json: AsJson = False,
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Show the nodes' host key fingerprints, ask, and pin them in the fleet's known_hosts.
+    """Show the nodes' host key fingerprints and pin them in the fleet's known_hosts after confirmation.
 
     Example: meshctl trust b03
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
         shown = shown_keys(
-            opened.access, opened.trust, chosen(opened.fleet, nodes), parallel=opened.fleet.apply.parallel
+            opened.access, opened.trust, selected_nodes(opened.fleet, nodes), parallel=opened.fleet.apply.parallel
         )
         if as_json:
             echo_json(json.dumps([_key_object(item) for item in shown], indent=1))
         left = 0
         for item in shown:
-            left += not _decide(opened, item, may_replace=change, yes=yes, quiet=as_json)
+            left += not _pin_key(opened, item, may_replace=change, yes=yes, quiet=as_json)
         if left:
             silent = all(item.key is None for item in shown)
             raise typer.Exit(ExitCode.UNREACHABLE if silent else ExitCode.FINDINGS)
@@ -64,8 +59,8 @@ def _key_object(item: Shown) -> dict[str, str]:
     }
 
 
-def _decide(opened: Session, item: Shown, *, may_replace: bool, yes: bool, quiet: bool) -> bool:
-    """Tell, ask, pin; whether the node's key is pinned in the end."""
+def _pin_key(opened: Session, item: Shown, *, may_replace: bool, yes: bool, quiet: bool) -> bool:
+    """Show, confirm and pin the key; whether it is pinned in the end."""
 
     def say(text: str) -> None:
         if not quiet:
@@ -82,14 +77,14 @@ def _decide(opened: Session, item: Shown, *, may_replace: bool, yes: bool, quiet
     if item.is_changed:
         say(f"{line}: DIFFERS from the pinned {', '.join(item.pinned)}")
         if not may_replace:
-            say("  hint: another device, a flash meshctl did not do, or an attack; --replace once you know which")
+            say("  hint: another device, a reflash outside meshctl, or an attack: verify, then use --replace")
             return False
     else:
-        say(f"{line}: not pinned yet")
+        say(f"{line}: not pinned")
     if not yes:
         if quiet or not sys.stdin.isatty():
             return False
-        if not typer.confirm("  Is this what the node itself shows?"):
+        if not typer.confirm("  Does this match the fingerprint on the node?"):
             return False
     opened.trust.replace(name, item.key)
     say(f"{line}: pinned now")
@@ -101,13 +96,13 @@ def run(
         list[str],
         typer.Argument(
             metavar="NODES -- COMMAND",
-            help="Nodes or patterns, then -- and the command; without nodes: on all.",
+            help="Nodes or patterns (default: all), then -- and the command.",
         ),
     ],
     inventory: InventoryPath = Path(),
-    timeout: Annotated[float, typer.Option("--timeout", help="Seconds that a node may take.")] = 60.0,
+    timeout: Annotated[float, typer.Option("--timeout", help="Timeout per node in seconds.")] = 60.0,
     raw: Annotated[
-        bool, typer.Option("--raw", help="Pass the output through as it is: no names, control characters included.")
+        bool, typer.Option("--raw", help="Print output unchanged: without node names, with control characters.")
     ] = False,
     as_json: AsJson = False,
     key: KeyFiles = None,
@@ -115,10 +110,10 @@ def run(
 ) -> None:
     """Run a shell command on nodes, in parallel.
 
-    One word after -- goes to the node's shell as it stands: quote it once for your own shell, and pipes and variables
-    are the node's. Several words arrive there as these words, without expansion.
+    A single word after -- is passed to the node's shell as is: pipes and variables are evaluated on the node. Several
+    words are passed as literal arguments.
 
-    Exit code: 0 when it ends with 0 on every node, else 1; 3 when no node answers.
+    Exit code: 0 if the command succeeds on every node, 1 if not, 3 if no node answers.
 
     Example: meshctl run 'husky*' -- uptime
 
@@ -128,7 +123,7 @@ def run(
         raise InputError("expected --raw or --json, found both")
     patterns, command = _split(words)
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        wanted = {node.name: node for node in chosen(opened.fleet, patterns)}
+        wanted = {node.name: node for node in selected_nodes(opened.fleet, patterns)}
         out = threading.Lock()
 
         def work(name: str) -> Outcome:
@@ -146,7 +141,7 @@ def run(
                 name, result, "" if done.exit_status == 0 else f"exit status {done.exit_status}", facts=facts
             )
 
-        with opened.interrupt.on_signals(complain):
+        with opened.interrupt.on_signals(echo_error):
             ended = run_on_all(wanted, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt)
         for outcome in ended.values():
             if not outcome.result.is_good and "exit_status" not in outcome.facts:
@@ -160,7 +155,7 @@ def run(
 
 
 def _split(words: list[str]) -> tuple[list[str], str]:
-    """`b01 b02 -- CMD` or `-- CMD`. What click leaves of `--` is looked up in the process's own arguments."""
+    """Split `b01 b02 -- CMD`. click drops the `--`, so it is looked up in sys.argv."""
     given = sys.argv[1:]
     if "--" not in given:
         raise InputError("expected `--` before the command", hint="meshctl run b01 -- uptime")
@@ -171,7 +166,7 @@ def _split(words: list[str]) -> tuple[list[str], str]:
 
 
 def shell_words(command: list[str]) -> str:
-    """What the node's shell gets: one word as it stands, several so that each arrives as one."""
+    """The command line for the node's shell: one word unchanged, several words quoted."""
     return command[0] if len(command) == 1 else shlex.join(command)
 
 
@@ -189,14 +184,12 @@ def _print(name: str, stdout: str, stderr: str, *, as_json: bool, status: int) -
 
 def ssh(
     node: Annotated[str, typer.Argument(help="Name of the node.")],
-    command: Annotated[
-        list[str] | None, typer.Argument(help="After --: a command to run there instead of a shell.")
-    ] = None,
+    command: Annotated[list[str] | None, typer.Argument(help="After --: command to run instead of a shell.")] = None,
     inventory: InventoryPath = Path(),
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Log in to a node with the system's ssh, trusting what the fleet trusts. A command is quoted as for `run`.
+    """Log in to a node with the system's ssh and the fleet's pinned host keys. Commands are quoted as for `run`.
 
     Exit code: that of ssh.
 
@@ -206,15 +199,15 @@ def ssh(
     """
     program = shutil.which("ssh")
     if program is None:
-        raise InputError("there is no ssh on this machine", hint="install openssh-client")
+        raise InputError("ssh is not installed", hint="install openssh-client")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        (there,) = chosen(opened.fleet, [node])[:1]
+        (there,) = selected_nodes(opened.fleet, [node])[:1]
         arguments = ssh_arguments(opened, there)
     os.execv(program, [*arguments, *([shell_words(command)] if command else [])])
 
 
 def ssh_arguments(opened: Session, node: Node) -> list[str]:
-    """The command line of OpenSSH for a node: the fleet's pins under the node's name, its keys, its jump."""
+    """The OpenSSH command line for a node, with the fleet's pinned host keys, its keys and its jump host."""
     access = opened.access
     end = access.endpoint(node)
     arguments = ["ssh", "-p", str(end.port), "-o", f"UserKnownHostsFile={opened.trust.path}"]

@@ -1,4 +1,4 @@
-"""`meshctl status`: one look at all radios and robots, as a table, as JSON, once or until Ctrl-C."""
+"""`meshctl status` and `meshctl preflight`: a snapshot of all radios and robots; the go/no-go checks."""
 
 from __future__ import annotations
 
@@ -6,134 +6,167 @@ import json
 import os
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Annotated
 
 import typer
 
-from meshctl.cli.fleet_view import Everybody, glance, paint_of, with_everybody
-from meshctl.cli.live_screen import live
-from meshctl.cli.options import AsJson, line_width
+from meshctl.cli.context import AsJson, line_width
+from meshctl.cli.fleet_view import FleetView, collect, paint_of, with_fleet_view
+from meshctl.cli.live_screen import live_screen
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode
-from meshctl.status import FleetStatus, assess
-from meshctl.status.assess import Look
+from meshctl.status import Check, FleetStatus, assess
+from meshctl.status import preflight as checks_of
+from meshctl.status.assess import Snapshot
 from meshctl.status.filters import ROLES, STATES, Filter
 from meshctl.status.json_output import as_json as status_json
-from meshctl.status.last_known import facts_to_keep
-from meshctl.status.text import text
+from meshctl.status.json_output import preflight_json
+from meshctl.status.last_known import facts_to_record
+from meshctl.status.robots import is_active
+from meshctl.status.text import preflight_text, text
 
 Names = Annotated[
-    list[str] | None, typer.Argument(metavar="[NAME]...", help="Radios and robots, or patterns: 'husky*'.")
+    list[str] | None, typer.Argument(metavar="[NAME]...", help="Radios and robots, or patterns such as 'husky*'.")
 ]
 
 
-@with_everybody
+@with_fleet_view
 def status(
-    everybody: Everybody,
+    fleet_view: FleetView,
     names: Names = None,
     watch: Annotated[
         float | None,
-        typer.Option("--watch", "-w", min=1.0, metavar="S", help="Look again every S seconds; Ctrl-C ends."),
+        typer.Option("--watch", "-w", min=1.0, metavar="S", help="Refresh every S seconds until Ctrl-C."),
     ] = None,
     group: Annotated[list[str] | None, typer.Option("--group", help="Only members of this group.")] = None,
     robot: Annotated[list[str] | None, typer.Option("--robot", help="Only this robot's radios and computer.")] = None,
-    role: Annotated[list[str] | None, typer.Option("--role", help=f"Only {', '.join(ROLES)}.")] = None,
-    state: Annotated[list[str] | None, typer.Option("--state", help=f"Only {', '.join(STATES)}.")] = None,
+    role: Annotated[list[str] | None, typer.Option("--role", help=f"Only this role: {', '.join(ROLES)}.")] = None,
+    state: Annotated[list[str] | None, typer.Option("--state", help=f"Only this state: {', '.join(STATES)}.")] = None,
     alarm: Annotated[
         list[str] | None,
         typer.Option("--alarm", help="Only with this alarm: a code, error, warning, note, or any (error or warning)."),
     ] = None,
     only: Annotated[
-        bool, typer.Option("--only", help="Ask only those shown: quicker, without hops and who hears the silent.")
+        bool,
+        typer.Option("--only", help="Query only the selected devices: faster, without hop counts and 'heard by'."),
     ] = False,
-    topics: Annotated[bool, typer.Option("--topics", help="Add when each topic was last sent and received.")] = False,
-    wide: Annotated[bool, typer.Option("--wide", help="All columns, however wide the terminal.")] = False,
+    topics: Annotated[bool, typer.Option("--topics", help="Also show the age of each topic's messages.")] = False,
+    wide: Annotated[bool, typer.Option("--wide", help="Show all columns regardless of the terminal width.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show every radio and every robot: does it answer, is it as the inventory says, whom does it hear, what is wrong.
+    """Show the state of every radio and robot: reachability, drift from the inventory, neighbors and alarms.
 
-    Names and filters choose what is shown; everybody is asked. Nothing is changed anywhere.
+    Names and filters select what is shown; all devices are queried (see --only). Changes nothing.
 
-    Exit code: 0 all well, 1 something degraded, 3 somebody who must answer does not (of those shown), 2 could not look.
+    Exit code (of the devices shown): 0 healthy, 1 degraded, 3 a required device is unreachable, 2 could not run.
 
     Example: meshctl status --watch 5
     Example: meshctl status --role beacon --state deployed
     Example: meshctl status --alarm any
     """
     chosen = Filter(*(tuple(values or ()) for values in (names, group, robot, role, state, alarm)))
-    chosen.check(everybody.fleet)
-    view = _View(everybody, chosen, only, topics, wide)
+    chosen.check(fleet_view.fleet)
+    query = _StatusQuery(fleet_view, chosen, only, topics, wide)
     if watch is None:
-        found = view.status(view.look(), time.time())
+        found = query.status(query.collect(), time.time())
         if as_json:
             echo_json(json.dumps(status_json(found), indent=2))
         else:
-            echo(view.text(found), styled=True)
+            echo(query.text(found), styled=True)
         raise typer.Exit(found.exit_code)
     if as_json or not sys.stdout.isatty():
-        _follow(view, watch, as_json)
-    _watch(view, watch)
+        _follow(query, watch, as_json)
+    _watch(query, watch)
 
 
-class _View:
-    """Which part of the fleet is looked at, and how it is shown."""
+class _StatusQuery:
+    """Which part of the fleet is queried, and how it is shown."""
 
-    def __init__(self, everybody: Everybody, chosen: Filter, only: bool, topics: bool, wide: bool) -> None:
-        self._everybody = everybody
+    def __init__(self, fleet_view: FleetView, chosen: Filter, only: bool, topics: bool, wide: bool) -> None:
+        self._fleet_view = fleet_view
         self._chosen = chosen
         self._topics = topics
         self._wide = wide
-        fleet = everybody.fleet
+        fleet = fleet_view.fleet
         self._is_partial = only and not chosen.is_empty
-        self._nodes = tuple(n for n in everybody.nodes if not only or chosen.takes_node(n))
-        self._robots = tuple(name for name in everybody.robots if not only or chosen.takes_robot(fleet, name))
+        self._nodes = tuple(n for n in fleet_view.nodes if not only or chosen.matches_node(n))
+        self._robots = tuple(name for name in fleet_view.robots if not only or chosen.matches_robot(fleet, name))
 
-    def look(self, *, is_told: bool = True) -> Look:
-        """Ask, and remember what was told; `is_told`: count the answers on the terminal."""
-        look = glance(self._everybody, self._nodes, self._robots, is_told=is_told)
-        look = replace(look, is_partial=self._is_partial)
-        whole = assess(look, self._nodes, time.time(), self._robots)
-        self._everybody.opened.journal.remember_all(self._everybody.fleet.name, facts_to_keep(whole), time.time())
-        return look
+    def collect(self, *, show_progress: bool = True) -> Snapshot:
+        """Take a snapshot and record it in the journal; `show_progress` counts answers on a terminal."""
+        snapshot = collect(self._fleet_view, self._nodes, self._robots, show_progress=show_progress)
+        snapshot = replace(snapshot, is_partial=self._is_partial)
+        whole = assess(snapshot, self._nodes, time.time(), self._robots)
+        self._fleet_view.opened.journal.remember_all(self._fleet_view.fleet.name, facts_to_record(whole), time.time())
+        return snapshot
 
-    def status(self, look: Look, now: float) -> FleetStatus:
-        """Of those that are shown, with ages as of `now`."""
-        return self._chosen.apply(self._everybody.fleet, assess(look, self._nodes, now, self._robots))
+    def status(self, snapshot: Snapshot, now: float) -> FleetStatus:
+        """The status of the selected devices, with ages as of `now`."""
+        return self._chosen.apply(self._fleet_view.fleet, assess(snapshot, self._nodes, now, self._robots))
 
     def text(self, status: FleetStatus, width: int | None = None, *, brief: bool = False) -> str:
         room = width if width is not None and not self._wide else line_width(wide=self._wide)
         return text(status, room, paint_of(), topics=self._topics, brief=brief)
 
 
-def _follow(view: _View, period_s: float, as_json: bool) -> None:
-    """One look after the other, for pipes and logs: JSON lines, or the text with a blank line behind."""
+def _follow(query: _StatusQuery, period_s: float, as_json: bool) -> None:
+    """Repeated snapshots for pipes and logs: JSON lines, or text blocks separated by blank lines."""
     while True:
         began = time.monotonic()
-        found = view.status(view.look(), time.time())
+        found = query.status(query.collect(), time.time())
         if as_json:
             echo_json(json.dumps(status_json(found)))
         else:
-            echo(view.text(found) + "\n", styled=True)
+            echo(query.text(found) + "\n", styled=True)
         time.sleep(max(0.0, period_s - (time.monotonic() - began)))
 
 
-def _watch(view: _View, period_s: float) -> None:
-    """The page until Ctrl-C; then what was seen last, where it stays."""
+def _watch(query: _StatusQuery, period_s: float) -> None:
+    """The live screen until Ctrl-C, then the last snapshot as plain output."""
 
-    def draw(look: Look | None, size: os.terminal_size) -> list[str]:
-        if look is None:
-            return ["looking at everybody for the first time ... (Ctrl-C ends)"]
-        status = view.status(look, time.time())
-        footer = ["", f"a look every {period_s:g} s; Ctrl-C ends"]
-        lines = [*view.text(status, size.columns).splitlines(), *footer]
+    def draw(snapshot: Snapshot | None, size: os.terminal_size) -> list[str]:
+        if snapshot is None:
+            return ["querying all devices ... (Ctrl-C to quit)"]
+        status = query.status(snapshot, time.time())
+        footer = ["", f"refreshed every {period_s:g} s; Ctrl-C to quit"]
+        lines = [*query.text(status, size.columns).splitlines(), *footer]
         if len(lines) > size.lines:
-            # in a small window the table comes before notes and advice
-            lines = [*view.text(status, size.columns, brief=True).splitlines(), *footer]
+            # in a small window, drop notes and hints to keep the table
+            lines = [*query.text(status, size.columns, brief=True).splitlines(), *footer]
         return lines
 
-    latest = live(partial(view.look, is_told=False), draw, period_s, sys.stdout)
+    latest = live_screen(partial(query.collect, show_progress=False), draw, period_s, sys.stdout)
     if latest is not None:
-        echo(view.text(view.status(latest, time.time())), styled=True)
+        echo(query.text(query.status(latest, time.time())), styled=True)
     raise typer.Exit(ExitCode.INTERRUPTED)
+
+
+@with_fleet_view
+def preflight(fleet_view: FleetView, as_json: AsJson = False) -> None:
+    """Run the go/no-go checks before a mission, including urgent test messages between all robots.
+
+    Exit code: 0 go, 1 no-go, 2 could not run.
+
+    Example: meshctl preflight
+    """
+    found = assess(collect(fleet_view), fleet_view.nodes, time.time(), fleet_view.robots)
+    fleet_view.opened.journal.remember_all(fleet_view.fleet.name, facts_to_record(found), time.time())
+    answering = [
+        robot.name
+        for robot in found.robots
+        if is_active(robot.state) and robot.facts is not None and robot.facts.answers
+    ]
+    checks = checks_of(fleet_view.fleet, found, fleet_view.collector.ping(answering))
+    show_preflight(checks, as_json=as_json)
+    raise typer.Exit(ExitCode.OK if all(check.is_go for check in checks) else ExitCode.FINDINGS)
+
+
+def show_preflight(checks: Sequence[Check], *, as_json: bool) -> None:
+    """Print the checks and the verdict."""
+    if as_json:
+        echo_json(json.dumps(preflight_json(checks), indent=2))
+    else:
+        echo(preflight_text(checks, line_width(), paint_of()), styled=True)

@@ -1,4 +1,4 @@
-"""`meshctl topology`: the mesh as its nodes see it, drawn."""
+"""`meshctl topology`: the mesh topology as its nodes report it."""
 
 from __future__ import annotations
 
@@ -9,21 +9,20 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import KeyFiles, Lab
-from meshctl.cli.fleet_view import CONNECT_S, Timeout, glance, watcher
-from meshctl.cli.options import InventoryPath
+from meshctl.cli.context import InventoryPath, KeyFiles, Lab
+from meshctl.cli.fleet_view import CONNECT_S, Timeout, collect, open_fleet_view
 from meshctl.cli.output import echo
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Backend
 from meshctl.status import assess
-from meshctl.status.topology_formats import FORMATS, Picture, directions
+from meshctl.status.topology_formats import FORMATS, TopologyView, directions
 from meshctl.topology import observed_graph, report_of
 from meshctl.topology.cells import link_cells, mesh_reports
 
 
 class Format(str, Enum):  # noqa: UP042 - typer shows the values of a str enum
-    """How `meshctl topology` draws."""
+    """Output format of `meshctl topology`."""
 
     TABLE = "table"
     TREE = "tree"
@@ -33,56 +32,58 @@ class Format(str, Enum):  # noqa: UP042 - typer shows the values of a str enum
 
 
 def topology(
-    mesh: Annotated[str, typer.Option("--mesh", help="Which mesh, where the fleet has several.")] = "",
-    form: Annotated[Format, typer.Option("--format", "-f", help="How to draw it.")] = Format.TREE,
+    mesh: Annotated[str, typer.Option("--mesh", help="Mesh to show if the fleet has several.")] = "",
+    form: Annotated[Format, typer.Option("--format", "-f", help="Output format.")] = Format.TREE,
     inventory: InventoryPath = Path(),
     timeout: Timeout = CONNECT_S,
-    as_json: Annotated[bool, typer.Option("--json", help="The same as --format json.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Same as --format json.")] = False,
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Draw the mesh as its nodes see it: links with quality both ways, hops to the base, cut vertices marked.
+    """Show the mesh topology: links with quality in both directions, hops to the base, and cut vertices.
 
-    Exit code: 0 drawn, 3 nobody answered, 2 could not look.
+    Exit code: 0 success, 3 no node answered, 2 could not run.
 
     Example: meshctl topology --format dot | dot -Tsvg > mesh.svg
     """
-    with watcher(inventory, key=key, lab=lab, timeout=timeout, no_robots=True) as everybody:
-        fleet = everybody.fleet
+    with open_fleet_view(inventory, key=key, lab=lab, timeout=timeout, no_robots=True) as fleet_view:
+        fleet = fleet_view.fleet
         if mesh and mesh not in fleet.meshes:
-            hint = did_you_mean(mesh, fleet.meshes) or f"it has {', '.join(fleet.meshes)}"
-            raise InputError(f"no mesh of {fleet.name} is called {mesh!r}", hint=hint)
+            hint = did_you_mean(mesh, fleet.meshes) or f"its meshes are {', '.join(fleet.meshes)}"
+            raise InputError(f"{fleet.name} has no mesh {mesh!r}", hint=hint)
         names = {node.name for node in fleet.members(mesh)} if mesh else set(fleet.nodes)
-        nodes = tuple(node for node in everybody.nodes if node.name in names)
-        look = glance(everybody, nodes)
-        found = assess(look, nodes, time.time())
+        nodes = tuple(node for node in fleet_view.nodes if node.name in names)
+        snapshot = collect(fleet_view, nodes)
+        found = assess(snapshot, nodes, time.time())
     if mesh:
-        reports = mesh_reports(fleet, look.observations, mesh)
-        wires = [(link.a, link.b) for link in look.graph.links if link.wired]
-        graph = observed_graph(reports.values(), known_macs=look.macs, wires=wires)
+        reports = mesh_reports(fleet, snapshot.observations, mesh)
+        wires = [(link.a, link.b) for link in snapshot.graph.links if link.wired]
+        graph = observed_graph(reports.values(), known_macs=snapshot.macs, wires=wires)
     else:
-        reports = {name: report_of(name, one) for name, one in look.observations.items()}
-        graph = look.graph
+        reports = {name: report_of(name, one) for name, one in snapshot.observations.items()}
+        graph = snapshot.graph
     routing = next((m.backend for m in fleet.meshes.values() if m.name == mesh or not mesh), Backend.BATMAN)
-    picture = Picture(
+    view = TopologyView(
         mesh=mesh or fleet.name,
         entry=found.entry,
         graph=graph,
-        directions=directions(reports, look.macs),
-        ages_s={node.name: node.age_s for node in found.nodes if node.age_s is not None and not node.silent_because},
+        directions=directions(reports, snapshot.macs),
+        ages_s={node.name: node.age_s for node in found.nodes if node.age_s is not None and not node.no_answer_reason},
         addresses={node.name: str(node.address.ip) for node in fleet.nodes.values()},
         routing=routing.value,
-        cells=link_cells(fleet, look.observations, look.macs, (mesh,) if mesh else fleet.meshes),
+        cells=link_cells(fleet, snapshot.observations, snapshot.macs, (mesh,) if mesh else fleet.meshes),
     )
-    drawn = FORMATS["json" if as_json else form.value](picture)
+    drawn = FORMATS["json" if as_json else form.value](view)
     if drawn:
         echo(drawn)
-    if not look.observations:
+    if not snapshot.observations:
         is_new = bool(nodes) and all(node.age_s is None for node in found.nodes)
         why = (
-            "no node was ever seen: meshctl bootstrap takes factory devices in" if is_new else "meshctl status says why"
+            "no node was ever seen; run `meshctl bootstrap` to set up factory-default devices"
+            if is_new
+            else "run `meshctl status` for the reason"
         )
-        echo(f"nobody answered: {why}", err=True)
+        echo(f"no node answered: {why}", err=True)
     elif apart := [node.name for node in nodes if node.name not in graph]:
-        echo(f"nobody tells of {', '.join(apart)}: meshctl status says why", err=True)
-    raise typer.Exit(ExitCode.OK if look.observations or not nodes else ExitCode.UNREACHABLE)
+        echo(f"no node reports {', '.join(apart)}; run `meshctl status` for the reason", err=True)
+    raise typer.Exit(ExitCode.OK if snapshot.observations or not nodes else ExitCode.UNREACHABLE)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from meshctl.plan import FileChange
 
 # more settings of a file than these are counted
-SETTINGS_SHOWN = 8
+MAX_SETTINGS = 8
 
 _SECTION = re.compile(r"config\s+(\S+)(?:\s+'(.*)')?")
 _OPTION = re.compile(r"(?:option|list)\s+(\S+)\s+'(.*)'")
@@ -72,7 +72,7 @@ def _change(old: list[str], new: list[str]) -> str:
 def summary(change: FileChange) -> str:
     """The settings as one line; empty for a file that comes or goes as a whole."""
     found = settings(change)
-    if len(found) > SETTINGS_SHOWN:
+    if len(found) > MAX_SETTINGS:
         return f"{len(found)} settings"
     parts: dict[str, list[str]] = {}
     for text in found:

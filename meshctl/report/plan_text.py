@@ -15,7 +15,7 @@ from meshctl.report.changed_options import changed_lines, summary
 from meshctl.report.terminal_escapes import clean
 
 # narrower than this, words are no longer kept whole
-_LEAST_WIDTH = 20
+_MIN_WIDTH = 20
 
 
 class Line(NamedTuple):
@@ -40,7 +40,7 @@ def plan_lines(
             yield line._replace(text=text)
             continue
         indent = " " * (len(text) - len(text.lstrip()) + 2)
-        for part in textwrap.wrap(text, max(width, _LEAST_WIDTH), subsequent_indent=indent, break_on_hyphens=False):
+        for part in textwrap.wrap(text, max(width, _MIN_WIDTH), subsequent_indent=indent, break_on_hyphens=False):
             yield line._replace(text=part)
 
 
@@ -56,10 +56,10 @@ def _plan_lines(plan: Plan, *, with_diffs: bool, order: Iterable[str]) -> Iterat
         yield Line(f"note: {note}", "yellow")
     places = {name: place for place, name in enumerate(order)}
     nodes = sorted(plan.nodes.values(), key=lambda node: places.get(node.node, len(places)))
-    for group in _alike(nodes, with_diffs=with_diffs):
+    for group in _grouped(nodes, with_diffs=with_diffs):
         yield from _node(group, with_diffs=with_diffs)
     if len(nodes) > 1:
-        yield from _once_more(plan, nodes)
+        yield from _closing_summary(plan, nodes)
     if plan.refusal:
         yield Line("")
         yield Line(f"refused: {plan.refusal}", "bold red")
@@ -80,7 +80,7 @@ def _totals(plan: Plan) -> str:
     return ", ".join(f"{count} {word}" for count, word in counts if count) or "no node"
 
 
-def _once_more(plan: Plan, nodes: Iterable[NodePlan]) -> Iterator[Line]:
+def _closing_summary(plan: Plan, nodes: Iterable[NodePlan]) -> Iterator[Line]:
     """The totals, and who is left out and why: the first lines have left the screen."""
     yield Line("")
     yield Line(_totals(plan), "bold")
@@ -107,15 +107,15 @@ def _stages(plan: Plan) -> Iterator[Line]:
                 yield Line(f"  {'':>{width}}          {', '.join(members)}: {why}", "dim")
 
 
-def _alike(nodes: Iterable[NodePlan], *, with_diffs: bool) -> Iterator[tuple[NodePlan, ...]]:
+def _grouped(nodes: Iterable[NodePlan], *, with_diffs: bool) -> Iterator[tuple[NodePlan, ...]]:
     """The nodes in their order, each with the later ones to which the same happens."""
     groups: dict[object, list[NodePlan]] = {}
     for node in nodes:
-        groups.setdefault(_what_happens(node, with_diffs=with_diffs), []).append(node)
+        groups.setdefault(_effect_key(node, with_diffs=with_diffs), []).append(node)
     return (tuple(group) for group in groups.values())
 
 
-def _what_happens(node: NodePlan, *, with_diffs: bool) -> object:
+def _effect_key(node: NodePlan, *, with_diffs: bool) -> object:
     if node.verdict is not Verdict.CHANGE:
         return node.node
     return (

@@ -36,7 +36,7 @@ _STYLES = {
 REFRESH_PER_SECOND = 4
 # the totals, the state of stopping (which may take two lines), and the cursor's own
 _LINES_BELOW = 5
-_NAMES_SHOWN = 4
+_MAX_NAMES = 4
 
 
 class Progress(AbstractContextManager["Progress"], Protocol):
@@ -54,7 +54,7 @@ def outcome_text(outcome: Outcome) -> str:
     return f"{outcome}{took}"
 
 
-def _complain(text: str) -> None:
+def _write_error(text: str) -> None:
     # the terminal may be closed, and the work still has to be finished
     with suppress(OSError):
         sys.stderr.write(f"{clean(text)}\n")
@@ -65,7 +65,7 @@ class PlainProgress(Progress):
     """One line per step and outcome, for logs and pipes."""
 
     def stopping(self, text: str) -> None:
-        _complain(text)
+        _write_error(text)
 
     def __init__(self, out: TextIO) -> None:
         self._out = out
@@ -108,7 +108,7 @@ class JsonProgress(Progress):
     """One JSON object per event: `{"event", "node", "at_s", ...}`."""
 
     def stopping(self, text: str) -> None:
-        _complain(text)
+        _write_error(text)
 
     def __init__(self, out: TextIO) -> None:
         self._out = out
@@ -150,7 +150,7 @@ class LiveProgress(Progress):
     def __init__(self, console: Console, total: int) -> None:
         self._total = total
         self._lock = threading.Lock()
-        self._in_work: dict[str, tuple[str, float | None]] = {}
+        self._active: dict[str, tuple[str, float | None]] = {}
         self._counts: Counter[Result] = Counter()
         self._stopping = ""
         self._live = Live(console=console, refresh_per_second=REFRESH_PER_SECOND, transient=True)
@@ -168,33 +168,33 @@ class LiveProgress(Progress):
         with self._lock:
             match event.kind:
                 case EventKind.STARTED:
-                    self._in_work[event.node] = ("", None)
+                    self._active[event.node] = ("", None)
                 case EventKind.STEP:
-                    self._in_work[event.node] = (event.text, None)
+                    self._active[event.node] = (event.text, None)
                 case EventKind.PROGRESS:
-                    text, _ = self._in_work.get(event.node, ("", None))
-                    self._in_work[event.node] = (text, event.fraction)
+                    text, _ = self._active.get(event.node, ("", None))
+                    self._active[event.node] = (text, event.fraction)
                 case EventKind.NOTE:
                     self._live.console.print(Text(_line(event), "yellow"))
                 case EventKind.FINISHED:
-                    self._in_work.pop(event.node, None)
+                    self._active.pop(event.node, None)
                     if event.outcome is not None:
                         self._counts[event.outcome.result] += 1
                         self._live.console.print(Text(_line(event), _STYLES[event.outcome.result]))
-            self._live.update(self._picture())
+            self._live.update(self._render())
 
     def stopping(self, text: str) -> None:
         with self._lock:
             # stays on the screen, also when the live lines are gone
             self._live.console.print(Text(clean(text), "bold yellow"))
             self._stopping = text.partition(":")[0]
-            self._live.update(self._picture(), refresh=True)
+            self._live.update(self._render(), refresh=True)
 
-    def _picture(self) -> Group:
-        width = max((len(name) for name in self._in_work), default=0)
+    def _render(self) -> Group:
+        width = max((len(name) for name in self._active), default=0)
         lines = [
             Text(f"{name:<{width}}  {one_line(text)}" + (f" {fraction:.0%}" if fraction is not None else ""))
-            for name, (text, fraction) in self._in_work.items()
+            for name, (text, fraction) in self._active.items()
         ]
         # what does not fit is cut off at the bottom, where the totals and the state of stopping stand
         room = max(1, self._live.console.height - _LINES_BELOW)
@@ -205,12 +205,12 @@ class LiveProgress(Progress):
         totals = Text(f"{ended}/{self._total} nodes" + (f": {counts}" if counts else ""), "bold")
         if not self._stopping:
             return Group(*lines, totals)
-        names = ", ".join(list(self._in_work)[:_NAMES_SHOWN]) + (" ..." if len(self._in_work) > _NAMES_SHOWN else "")
+        names = ", ".join(list(self._active)[:_MAX_NAMES]) + (" ..." if len(self._active) > _MAX_NAMES else "")
         doing = f"finishing {names}" if names else "nothing is in work any more"
         return Group(*lines, totals, Text(f"{self._stopping.upper()}: {doing}; no other node is begun", "bold yellow"))
 
 
-class Aside(Progress):
+class ThreadedProgress(Progress):
     """Shows events from a thread of its own, so that no node's work waits for a screen.
 
     A reader that stands still (a pager, Ctrl-S) holds up nothing but the lines; one that is gone (a closed terminal,
@@ -222,7 +222,7 @@ class Aside(Progress):
         self._events: queue.SimpleQueue[Event | str | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._show, name="progress", daemon=True)
 
-    def __enter__(self) -> Aside:
+    def __enter__(self) -> ThreadedProgress:
         self._shown.__enter__()
         self._thread.start()
         return self
@@ -232,7 +232,7 @@ class Aside(Progress):
     ) -> None:
         self._events.put(None)
         self._thread.join()
-        with suppress(*_UNREAD):
+        with suppress(*_READER_GONE):
             self._shown.__exit__(kind, error, trace)
 
     def __call__(self, event: Event) -> None:
@@ -242,7 +242,7 @@ class Aside(Progress):
         self._events.put(text)
 
     def _show(self) -> None:
-        with suppress(*_UNREAD):
+        with suppress(*_READER_GONE):
             while (event := self._events.get()) is not None:
                 if isinstance(event, str):
                     self._shown.stopping(event)
@@ -251,4 +251,4 @@ class Aside(Progress):
 
 
 # EPIPE and EIO; rich makes SystemExit of the former
-_UNREAD = (OSError, SystemExit)
+_READER_GONE = (OSError, SystemExit)

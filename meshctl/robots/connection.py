@@ -30,7 +30,7 @@ def _no_password() -> Secret | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Reach:
+class RobotConnector:
     """How to get at the computers of a fleet. `access` holds its pins, keys and the way through radios; `password` is
     what sudo gets where it wants one; `owner` names us to the robots' locks. Safe for many threads."""
 
@@ -42,7 +42,7 @@ class Reach:
     def endpoint(self, robot: str) -> Endpoint:
         computer = computer_of(self.fleet, robot)
         host = computer.ssh.host or str(computer.address.ip)
-        user = computer.ssh.user or operators_name(robot)
+        user = computer.ssh.user or local_user(robot)
         return Endpoint(host, computer.ssh.port, user, identity=f"robot.{robot}")
 
     @contextmanager
@@ -76,7 +76,7 @@ class Reach:
                 )
             except NodeError as error:
                 is_user_written = bool(computer_of(self.fleet, robot).ssh.user)
-                error.hint = _remedy(error, robot, endpoint, is_user_written=is_user_written) or error.hint
+                error.hint = _hint_for(error, robot, endpoint, is_user_written=is_user_written) or error.hint
                 raise
             yield stack.enter_context(connection)
 
@@ -91,7 +91,7 @@ class Reach:
             raise InputError(f"{place}: there is no node {name!r}", hint=did_you_mean(name, self.fleet.nodes))
         return self.access.open(radio)
 
-    def shown_key(self, robot: str) -> HostKey | None:
+    def presented_key(self, robot: str) -> HostKey | None:
         """The host key that the computer shows, believed by nobody. Raises what `ssh.connect` raises."""
         recorder = Recorder()
         try:
@@ -109,7 +109,7 @@ class Reach:
         return path if path.is_absolute() else Path(self.fleet.base) / path
 
 
-def operators_name(robot: str) -> str:
+def local_user(robot: str) -> str:
     """Who logs in where the inventory names nobody: the operator, as OpenSSH has it. Raises InputError for a process
     without a name, as in a container."""
     try:
@@ -121,7 +121,7 @@ def operators_name(robot: str) -> str:
         ) from None
 
 
-def _remedy(error: NodeError, robot: str, endpoint: Endpoint, *, is_user_written: bool) -> str:
+def _hint_for(error: NodeError, robot: str, endpoint: Endpoint, *, is_user_written: bool) -> str:
     """What helps with a computer, where the device layer knows radios; empty for what is the same."""
     place = f"robots.{robot}.computer.ssh"
     match error:
@@ -143,7 +143,7 @@ def _remedy(error: NodeError, robot: str, endpoint: Endpoint, *, is_user_written
             return ""
 
 
-def chosen_robots(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[str, ...]:
+def selected_robots(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[str, ...]:
     """The robots with a computer that a name or pattern selects, in the inventory's order; all when none is given.
 
     Raises InputError for a pattern that selects nothing, and for a robot named that has no computer.

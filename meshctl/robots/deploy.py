@@ -19,18 +19,18 @@ from meshctl.fleet.process import is_dead
 from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.model.computers import ROS_1
 from meshctl.robots.bundle import Bundle, bundle, has_bridge
-from meshctl.robots.host import Host, Refused
+from meshctl.robots.host import Host, ScriptRefused
 from meshctl.robots.preconditions import (
-    Facts,
+    HostFacts,
     changed_files,
-    clock_remark,
+    clock_warning,
     computer_of,
-    objections,
     parse_facts,
-    room_objection,
+    unmet_disk_space,
+    unmet_preconditions,
 )
 from meshctl.robots.wheel_tags import Target
-from meshctl.robots.wheels import Wheel, choose, fetch, has_all, keep, stock_units
+from meshctl.robots.wheels import Wheel, cache_wheels, download_wheels, has_all, select_wheels, stock_units
 
 _WHEEL_DIRECTORY = "/opt/udp-mesh/wheels"
 PROBE_TIMEOUT_S = 120.0
@@ -60,17 +60,17 @@ class Wheelhouse:
         version = ".".join(map(str, (*target.python, target.libc, *target.libc_version)))
         kept = self.cache / f"{target.arch}-{version}"
         if self.named is not None:
-            chosen = choose(target, self.named)
-            keep(chosen, kept)
+            chosen = select_wheels(target, self.named)
+            cache_wheels(chosen, kept)
             return chosen
         # kept from before: the same robots get the same wheels, with or without internet
         if not has_all(target, kept):
-            fetch(target, kept)
-        return choose(target, kept)
+            download_wheels(target, kept)
+        return select_wheels(target, kept)
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class DeployOptions:
     """What all robots of one deploy share.
 
     `now_s` reads the operator's clock (Unix time); `wait_s` is how long a daemon may take to prove itself; with
@@ -87,28 +87,28 @@ class Order:
     step: Callable[[str, str, str], AbstractContextManager[None]] = lambda robot, name, text: nullcontext()
 
 
-def probe(host: Host, fleet: Fleet, robot: str) -> Facts:
+def probe(host: Host, fleet: Fleet, robot: str) -> HostFacts:
     """What the computer is and has. Changes nothing."""
     ros = ROS_1 if has_bridge(fleet, robot) else ""
     return parse_facts(host.run("probe", computer_of(fleet, robot).python, ros, timeout_s=PROBE_TIMEOUT_S))
 
 
-def wanted(order: Order, robot: str, facts: Facts) -> Bundle:
+def desired_bundle(options: DeployOptions, robot: str, facts: HostFacts) -> Bundle:
     """The bundle for a probed computer. Raises InputError where a wheel or a key is missing."""
     assert facts.target is not None, "objections come first"
-    wheels = order.wheels(facts.target)
-    return bundle(order.fleet, robot, order.secrets, wheels, executable=facts.executable, units=stock_units())
+    wheels = options.wheels(facts.target)
+    return bundle(options.fleet, robot, options.secrets, wheels, executable=facts.executable, units=stock_units())
 
 
-def planned(host: Host, robot: str, order: Order) -> tuple[Facts, Bundle] | Outcome:
+def plan_deploy(host: Host, robot: str, options: DeployOptions) -> tuple[HostFacts, Bundle] | Outcome:
     """The probed computer and what it shall have; an outcome for one that cannot have it. Changes nothing."""
-    facts = probe(host, order.fleet, robot)
-    computer = computer_of(order.fleet, robot)
-    reasons = list(objections(facts, robot=robot, arch=computer.arch, python=computer.python))
+    facts = probe(host, options.fleet, robot)
+    computer = computer_of(options.fleet, robot)
+    reasons = list(unmet_preconditions(facts, robot=robot, arch=computer.arch, python=computer.python))
     if reasons:
         return _refused(robot, reasons)
     try:
-        return facts, wanted(order, robot, facts)
+        return facts, desired_bundle(options, robot, facts)
     except InputError as error:
         return Outcome(robot, Result.REFUSED, str(error), hint=error.hint)
 
@@ -122,48 +122,50 @@ def _refused(robot: str, reasons: list[tuple[str, str]]) -> Outcome:
     )
 
 
-def deploy(host: Host, robot: str, order: Order) -> Outcome:
+def deploy(host: Host, robot: str, options: DeployOptions) -> Outcome:
     """Bring one robot to its bundle. Raises NodeError where it fails before anything that runs was touched."""
-    with order.step(robot, "look", ""):
-        plan = planned(host, robot, order)
+    with options.step(robot, "look", ""):
+        plan = plan_deploy(host, robot, options)
     if isinstance(plan, Outcome):
         return plan
     facts, release = plan
     if facts.current == release.id and facts.is_sound:
         same = Outcome(robot, Result.UNCHANGED, f"already runs {release.id}", facts={"release": release.id})
-        return _with_clock(same, facts, order)
-    if order.only_configuration and not _only_configuration(facts, release):
+        return _with_clock_warning(same, facts, options)
+    if options.only_configuration and not _only_configuration(facts, release):
         return _refused(robot, [_more_than_configuration(facts, release)])
     is_new = release.id not in facts.releases or bool(facts.damaged)
     needed = release.unpacked_bytes if is_new and (release.tree not in facts.trees or facts.damaged) else 0
-    full = list(room_objection(facts, needed)) if is_new else []
+    full = list(unmet_disk_space(facts, needed)) if is_new else []
     if full:
         return _refused(robot, full)
-    with claimed(host, current=facts.current):
-        sent = _bring(host, robot, order, release, is_new=is_new, with_wheels=needed > 0)
+    with claim(host, current=facts.current):
+        sent = _transfer(host, robot, options, release, is_new=is_new, with_wheels=needed > 0)
         how = "reload" if _only_configuration(facts, release) else "restart"
-        with order.step(robot, "switch", f"to {release.id} ({how})"):
-            outcome = switch(host, robot, release.id, how, order.wait_s)
+        with options.step(robot, "switch", f"to {release.id} ({how})"):
+            outcome = switch(host, robot, release.id, how, options.wait_s)
     told = {**outcome.facts, "release": release.id, "how": how, "sent_bytes": str(sent)}
-    return _with_clock(replace(outcome, facts=told), facts, order)
+    return _with_clock_warning(replace(outcome, facts=told), facts, options)
 
 
-def _bring(host: Host, robot: str, order: Order, release: Bundle, *, is_new: bool, with_wheels: bool) -> int:
+def _transfer(
+    host: Host, robot: str, options: DeployOptions, release: Bundle, *, is_new: bool, with_wheels: bool
+) -> int:
     """Put the release beside what runs; the bytes of packages that had to travel."""
     sent = 0
     if with_wheels:
         size_kib = sum(len(wheel.content) for wheel in release.wheels) >> 10
-        with order.step(robot, "send", f"{size_kib} KiB of packages"):
+        with options.step(robot, "send", f"{size_kib} KiB of packages"):
             for wheel in release.wheels:
                 sent += host.put(wheel.content, f"{_WHEEL_DIRECTORY}/{wheel.stored}")
     if is_new:
-        with order.step(robot, "install", release.id):
+        with options.step(robot, "install", release.id):
             host.run("install", release.id, release.tree, stdin=release.archive(), timeout_s=INSTALL_TIMEOUT_S)
     return sent
 
 
-def _with_clock(outcome: Outcome, facts: Facts, order: Order) -> Outcome:
-    remark, hint = clock_remark(facts, order.now_s())
+def _with_clock_warning(outcome: Outcome, facts: HostFacts, options: DeployOptions) -> Outcome:
+    remark, hint = clock_warning(facts, options.now_s())
     if not remark:
         return outcome
     return replace(
@@ -171,17 +173,17 @@ def _with_clock(outcome: Outcome, facts: Facts, order: Order) -> Outcome:
     )
 
 
-def _only_configuration(facts: Facts, release: Bundle) -> bool:
+def _only_configuration(facts: HostFacts, release: Bundle) -> bool:
     """Whether the running daemon can take the new release by reading its files again, losing nothing it holds."""
     return facts.is_sound and not _other_files(facts, release)
 
 
-def _other_files(facts: Facts, release: Bundle) -> list[str]:
+def _other_files(facts: HostFacts, release: Bundle) -> list[str]:
     changed = changed_files(facts, release.hashes)
     return [path for path in changed if not path.startswith("etc/") and path != "topics"]
 
 
-def _more_than_configuration(facts: Facts, release: Bundle) -> tuple[str, str]:
+def _more_than_configuration(facts: HostFacts, release: Bundle) -> tuple[str, str]:
     if not facts.current:
         return "udp_mesh is not installed there", "`meshctl robots deploy` first"
     if not facts.is_sound:
@@ -191,7 +193,7 @@ def _more_than_configuration(facts: Facts, release: Bundle) -> tuple[str, str]:
 
 
 @contextmanager
-def claimed(host: Host, *, current: str = "-") -> Iterator[None]:
+def claim(host: Host, *, current: str = "-") -> Iterator[None]:
     """Hold a robot against other operators and processes, from one script to the next.
 
     With `current` it must still run that release. Raises Refused for one that another process holds or has changed. A
@@ -203,7 +205,7 @@ def claimed(host: Host, *, current: str = "-") -> Iterator[None]:
     if told[:1] != ["claimed"]:
         _, holder, seconds = (*told, "", "", "")[:3]
         hint = "wait until it is done; a claim that nobody gives back ends by itself after 15 minutes"
-        raise Refused(f"{host.label}: {holder} changes this robot, for {seconds} s now", code="busy", hint=hint)
+        raise ScriptRefused(f"{host.label}: {holder} changes this robot, for {seconds} s now", code="busy", hint=hint)
     try:
         yield
     finally:
@@ -219,10 +221,10 @@ def switch(host: Host, robot: str, release: str, how: str, wait_s: int) -> Outco
     except (Timeout, ConnectionLost) as error:
         hint = "the robot finishes or undoes the switch by itself; deploy again to see which"
         return Outcome(robot, Result.UNCERTAIN, f"{error}", hint=hint)
-    return switched(robot, release, told)
+    return parse_switch(robot, release, told)
 
 
-def switched(robot: str, release: str, told: str) -> Outcome:
+def parse_switch(robot: str, release: str, told: str) -> Outcome:
     """The outcome in what `scripts/switch.sh` prints."""
     lines = [line.partition("=") for line in told.splitlines()]
     one = {name: value for name, _, value in lines}
@@ -246,16 +248,16 @@ def switched(robot: str, release: str, told: str) -> Outcome:
             return Outcome(robot, Result.FAILED, f"{reason or 'the switch said nothing'}; nothing to go back to", hint)
 
 
-def roll_back(host: Host, robot: str, order: Order) -> Outcome:
+def roll_back(host: Host, robot: str, options: DeployOptions) -> Outcome:
     """Go back to the release before, which stays installed for this."""
-    facts = probe(host, order.fleet, robot)
+    facts = probe(host, options.fleet, robot)
     hint = "`meshctl robots deploy` brings what the inventory says"
     if facts.previous and facts.previous not in facts.releases:
         told = f"{host.label}: the release before, {facts.previous}, is damaged there, or gone"
-        raise Refused(told, code="no-release", hint=hint)
+        raise ScriptRefused(told, code="no-release", hint=hint)
     if not facts.previous:
-        raise Refused(
+        raise ScriptRefused(
             f"{host.label}: there is no release before {facts.current or 'this'}", code="no-release", hint=hint
         )
-    with claimed(host, current=facts.current), order.step(robot, "switch", f"back to {facts.previous}"):
-        return switch(host, robot, facts.previous, "restart", order.wait_s)
+    with claim(host, current=facts.current), options.step(robot, "switch", f"back to {facts.previous}"):
+        return switch(host, robot, facts.previous, "restart", options.wait_s)

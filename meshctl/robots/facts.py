@@ -24,7 +24,7 @@ FACTS_TIMEOUT_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Expectation:
+class ExpectedRelease:
     """What the inventory wants of one robot: `files` are hashes by path in the release, `wheel` is the hash of our own
     packages; `bridge` says whether a ROS 1 bridge belongs there."""
 
@@ -141,7 +141,7 @@ class RobotFacts:
         return tuple(peer.name for peer in self.peers if peer.online)
 
     @property
-    def is_well(self) -> bool:
+    def is_healthy(self) -> bool:
         """Whether everything that belongs there runs and has proved itself; drift does not make it ill."""
         bridge_is_well = self.bridge is None or self.bridge.is_up
         return not self.trouble and self.service.is_up and self.is_proven and self.answers and bridge_is_well
@@ -166,21 +166,21 @@ class RobotFacts:
         return "; ".join(told)
 
 
-def expectation(fleet: Fleet, robot: str, secrets: Callable[[SecretRef], Secret]) -> Expectation:
+def expected_release(fleet: Fleet, robot: str, secrets: Callable[[SecretRef], Secret]) -> ExpectedRelease:
     """What the inventory wants of one robot, without the wheels that only a deploy needs.
 
     Raises InvalidInput for what the daemon would refuse, and for keys that cannot be had.
     """
     files = {file.path: file.sha256 for file in configuration(fleet, robot, secrets, stock_units())}
-    return Expectation(files, own_wheel().sha256, bridge=BRIDGE_UNIT_NAME in files)
+    return ExpectedRelease(files, own_wheel().sha256, bridge=BRIDGE_UNIT_NAME in files)
 
 
-def gather(host: Host, robot: str, wanted: Expectation, *, now_s: float) -> RobotFacts:
+def collect_facts(host: Host, robot: str, wanted: ExpectedRelease, *, now_s: float) -> RobotFacts:
     """Ask one robot, in one round trip; `now_s` is our clock (Unix time). Raises what `Host.run` raises."""
     return parse_robot_facts(robot, host.run("facts", timeout_s=FACTS_TIMEOUT_S), wanted, now_s=now_s)
 
 
-def parse_robot_facts(robot: str, text: str, wanted: Expectation, *, now_s: float) -> RobotFacts:
+def parse_robot_facts(robot: str, text: str, wanted: ExpectedRelease, *, now_s: float) -> RobotFacts:
     """The sections of `scripts/facts.sh`; a section that is missing or no JSON counts as no answer."""
     sections = _sections(text)
     services = _services(sections.get("services", ()))
@@ -210,7 +210,7 @@ def parse_robot_facts(robot: str, text: str, wanted: Expectation, *, now_s: floa
 
 
 def drift(
-    release: Mapping[str, list[str]], wanted: Expectation, services: Mapping[str, ServiceFacts]
+    release: Mapping[str, list[str]], wanted: ExpectedRelease, services: Mapping[str, ServiceFacts]
 ) -> tuple[str, ...]:
     """One line for each way in which what is deployed is not what the inventory says, or not what was deployed."""
     if not _last(release, "current"):
@@ -235,7 +235,7 @@ def facts_object(facts: RobotFacts) -> dict[str, Any]:
     told = dataclasses.asdict(facts)
     return {
         **told,
-        "well": facts.is_well,
+        "well": facts.is_healthy,
         "answers": facts.answers,
         "online": list(facts.online),
         "remark": facts.remark,

@@ -19,7 +19,7 @@ from meshctl.model import Secret
 from meshctl.robots.scripts import script
 
 
-class Refused(NodeError):
+class ScriptRefused(NodeError):
     """A script on the robot would not go on; `code` is its reason's word (`no-space`, `busy`, `check`, ...)."""
 
     def __init__(self, message: str, *, code: str, hint: str = "") -> None:
@@ -77,7 +77,7 @@ class SshHost(Host):
         last = (done.stderr.strip().splitlines() or [""])[-1]
         if last.startswith("refused "):
             _, code, reason = f"{last} ".split(" ", 2)
-            raise Refused(f"{self.label}: {reason.strip() or code}", code=code, hint=_HINTS.get(code, ""))
+            raise ScriptRefused(f"{self.label}: {reason.strip() or code}", code=code, hint=_HINTS.get(code, ""))
         return done.check(f"{self.label}: {verb}").stdout
 
     def put(self, content: bytes, path: str, mode: int = 0o644) -> int:
@@ -85,10 +85,10 @@ class SshHost(Host):
 
 
 # No greeting says this. What a computer's shell start-up files, sudo's lecture or its resolver say comes before it.
-_BEGINS = "== meshctl begins"
+_OUTPUT_MARKER = "== meshctl begins"
 
 
-class PastGreeting(Connection):
+class BannerFilter(Connection):
     """A connection whose scripts' output begins where they do: robots greet whoever logs in (~/.bashrc, sudo)."""
 
     def __init__(self, inner: Connection) -> None:
@@ -99,23 +99,23 @@ class PastGreeting(Connection):
         return self._inner.endpoint
 
     def run(self, script: str, *, stdin: bytes | Iterable[bytes] = b"", timeout_s: float | None = None) -> Completed:
-        said = quoted("echo", _BEGINS)
+        said = quoted("echo", _OUTPUT_MARKER)
         done = self._inner.run(f"{said}; {said} >&2\n{script}", stdin=stdin, timeout_s=timeout_s)
         return replace(
-            done, stdout_bytes=_past_greeting(done.stdout_bytes), stderr_bytes=_past_greeting(done.stderr_bytes)
+            done, stdout_bytes=_without_banner(done.stdout_bytes), stderr_bytes=_without_banner(done.stderr_bytes)
         )
 
     def close(self) -> None:
         self._inner.close()
 
 
-def _past_greeting(said: bytes) -> bytes:
+def _without_banner(said: bytes) -> bytes:
     """What comes after the line _BEGINS; all of it where the script never began, for then it tells why."""
-    before, line, after = said.partition(f"{_BEGINS}\n".encode())
+    before, line, after = said.partition(f"{_OUTPUT_MARKER}\n".encode())
     return after if line else before
 
 
-class AsRoot(Connection):
+class SudoConnection(Connection):
     """A connection whose scripts run as root through sudo; `password` None where sudo asks for none."""
 
     def __init__(self, inner: Connection, password: Secret | None) -> None:
@@ -146,7 +146,7 @@ def _chained(first: bytes, rest: Iterable[bytes]) -> Iterable[bytes]:
 
 # Tells how the login becomes root: `root`, `free` (sudo asks nothing), `password`, `no-sudo`, or `tty` (sudoers has
 # requiretty).
-_HOW = """\
+_ROOT_PROBE = """\
 if [ "$(id -u)" = 0 ]; then echo root
 elif ! command -v sudo >/dev/null 2>&1; then echo no-sudo
 elif why=$(LC_ALL=C sudo -k -n true 2>&1); then echo free
@@ -161,21 +161,21 @@ def become_root(connection: Connection, password: Callable[[], Secret | None]) -
     there is no way to become root.
     """
     label, user = connection.endpoint.label, connection.endpoint.user
-    itself = PastGreeting(connection)
+    itself = BannerFilter(connection)
     if user == "root":
         return itself
-    how = itself.run(_HOW).check(f"{label}: become root").stdout.strip()
+    how = itself.run(_ROOT_PROBE).check(f"{label}: become root").stdout.strip()
     match how:
         case "root":
             return itself
         case "free":
-            return PastGreeting(AsRoot(connection, None))
+            return BannerFilter(SudoConnection(connection, None))
         case "password":
             given = password()
             if given is None:
                 hint = "give it with --ask-sudo or MESHCTL_SUDO_PASSWORD, or let sudo ask for none"
                 raise CommandFailed(f"{label}: sudo wants a password for {user}", exit_status=1, hint=hint)
-            elevated = PastGreeting(AsRoot(connection, given))
+            elevated = BannerFilter(SudoConnection(connection, given))
             if elevated.run("id -u").stdout.strip() != "0":
                 hint = "check the password, and that the user may use sudo"
                 raise CommandFailed(f"{label}: sudo does not let {user} become root", exit_status=1, hint=hint)

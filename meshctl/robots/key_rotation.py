@@ -15,14 +15,14 @@ from meshctl.model import SecretKind, SecretRef
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class RotationStage:
     """`keys` are the live keys of this stage, the sealing one first."""
 
     title: str
     keys: tuple[SecretRef, ...]
 
 
-def stages(keys: tuple[SecretRef, ...], new: SecretRef) -> tuple[Stage, ...]:
+def rotation_stages(keys: tuple[SecretRef, ...], new: SecretRef) -> tuple[RotationStage, ...]:
     """The stages from what the inventory has to `new` alone; the first is the one that may be half done.
 
     Raises InputError for an unkeyed fleet and for one in the middle of another rotation.
@@ -33,14 +33,14 @@ def stages(keys: tuple[SecretRef, ...], new: SecretRef) -> tuple[Stage, ...]:
     if len(others) > 1:
         names = ", ".join(map(str, others))
         raise InputError(f"two other keys are live: {names}", hint="finish that rotation first, with the second as new")
-    done = Stage("the old key is dropped", (new,))
+    done = RotationStage("the old key is dropped", (new,))
     if not others:
         return (done,)
     (old,) = others
-    sealing = Stage("the new key seals", (new, old))
+    sealing = RotationStage("the new key seals", (new, old))
     if _same(keys[0]) == _same(new):
         return sealing, done
-    return Stage("the new key is accepted", (old, new)), sealing, done
+    return RotationStage("the new key is accepted", (old, new)), sealing, done
 
 
 def _same(ref: SecretRef) -> tuple[SecretKind, str, str]:
@@ -59,7 +59,7 @@ def parse_ref(text: str) -> SecretRef:
         raise InputError(f"expected env:NAME, file:PATH, file:PATH#KEY or age:PATH#KEY, found {text!r}") from None
 
 
-def written(ref: SecretRef) -> Value:
+def inventory_value(ref: SecretRef) -> Value:
     """The reference as an inventory writes it."""
     value: dict[str, Value] = {ref.kind.value: ref.where}
     if ref.key:

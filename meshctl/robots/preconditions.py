@@ -14,15 +14,15 @@ from meshctl.model import Computer, Fleet
 from meshctl.robots.wheel_tags import Target
 
 # udp_mesh uses asyncio.timeout and tomllib.
-LEAST_PYTHON = (3, 11)
+MIN_PYTHON = (3, 11)
 # A clock this far off has lost its battery.
 MAX_CLOCK_SKEW_S = 24 * 3600.0
 # What other programs on the computer need while a release is unpacked.
-SPARE_KIB = 32 << 10
+HEADROOM_KIB = 32 << 10
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
+class HostFacts:
     """`files` are hash by path of the current release as its manifest lists them; `damaged` are paths that are no
     longer so. `releases` and `trees` are those that are whole. `python` is None where there is none that runs."""
 
@@ -80,7 +80,7 @@ class Facts:
         return self.is_proven and not self.damaged and self.runs
 
 
-def parse_facts(text: str) -> Facts:
+def parse_facts(text: str) -> HostFacts:
     """The lines of `scripts/probe.sh`; lines it does not know are passed over."""
     one: dict[str, str] = {}
     many: dict[str, list[str]] = {}
@@ -90,7 +90,7 @@ def parse_facts(text: str) -> Facts:
             one[name] = value
             many.setdefault(name, []).append(value)
     libc, libc_version = _libc(one.get("libc", ""))
-    return Facts(
+    return HostFacts(
         arch=one.get("arch", ""),
         now_s=float(_number(one.get("now", ""))),
         uid=_number(one.get("uid", "-1"), -1),
@@ -154,7 +154,7 @@ def computer_of(fleet: Fleet, robot: str) -> Computer:
     return computer
 
 
-def clock_remark(facts: Facts, now_s: float) -> tuple[str, str]:
+def clock_warning(facts: HostFacts, now_s: float) -> tuple[str, str]:
     """(what is wrong with its clock, how to mend it), empty where nothing is.
 
     A wrong clock keeps nothing from working, since no step here and nothing in the daemon believes it; but its logs
@@ -167,7 +167,7 @@ def clock_remark(facts: Facts, now_s: float) -> tuple[str, str]:
     return f"its clock is {_days(abs(skew_s))} {side} ours", "its logs lie until it is set: `date -s`, or NTP"
 
 
-def objections(facts: Facts, *, robot: str, arch: str, python: str) -> Iterator[tuple[str, str]]:
+def unmet_preconditions(facts: HostFacts, *, robot: str, arch: str, python: str) -> Iterator[tuple[str, str]]:
     """Why the computer cannot run udp_mesh as the inventory (`arch`, `python`) has it: (reason, how to mend it)."""
     if facts.uid != 0:
         yield "the scripts did not run as root", "log in as root, or as a user who may use sudo"
@@ -181,7 +181,7 @@ def objections(facts: Facts, *, robot: str, arch: str, python: str) -> Iterator[
     if facts.arch != arch:
         hint = f"write `arch: {facts.arch}` at robots.{robot}.computer, if it is the right computer"
         yield f"wrong CPU: the inventory says {arch}, it is {facts.arch}", hint
-    yield from _python_objections(facts, robot, python)
+    yield from _unmet_python(facts, robot, python)
     if not facts.is_writable:
         yield "its disk is read-only", "remount it, or look at its log for disk errors"
     if not facts.runs_programs:
@@ -191,14 +191,14 @@ def objections(facts: Facts, *, robot: str, arch: str, python: str) -> Iterator[
         yield f"somebody has masked {' and '.join(facts.masked)} there", hint
 
 
-def _python_objections(facts: Facts, robot: str, python: str) -> Iterator[tuple[str, str]]:
-    least = ".".join(map(str, LEAST_PYTHON))
+def _unmet_python(facts: HostFacts, robot: str, python: str) -> Iterator[tuple[str, str]]:
+    least = ".".join(map(str, MIN_PYTHON))
     name_it = f"install Python {least} or newer beside it and name it as robots.{robot}.computer.python"
     if facts.python is None:
         yield f"no {python} runs there", name_it
         return
     found = ".".join(map(str, facts.python))
-    if facts.python[:2] < LEAST_PYTHON:
+    if facts.python[:2] < MIN_PYTHON:
         yield f"wrong Python: {python} is {found}, udp_mesh needs {least} or newer", name_it
     if facts.implementation != "CPython":
         yield f"wrong Python: {python} is {facts.implementation}, the wheels are for CPython", name_it
@@ -210,9 +210,9 @@ def _python_objections(facts: Facts, robot: str, python: str) -> Iterator[tuple[
         )
 
 
-def room_objection(facts: Facts, needed_bytes: int) -> Iterator[tuple[str, str]]:
+def unmet_disk_space(facts: HostFacts, needed_bytes: int) -> Iterator[tuple[str, str]]:
     """Whether a release of that many bytes, unpacked, fits beside what is there."""
-    needed_kib = needed_bytes // 1024 + SPARE_KIB
+    needed_kib = needed_bytes // 1024 + HEADROOM_KIB
     if facts.free_kib < needed_kib:
         found = f"{facts.free_kib >> 10} MiB are free"
         yield f"full disk: {(needed_kib >> 10) + 1} MiB are needed at /opt, {found}", "make room there"
@@ -223,7 +223,7 @@ def _days(seconds: float) -> str:
     return f"{days / 365.25:.1f} years" if days > 365 else f"{days:.1f} days"
 
 
-def changed_files(facts: Facts, wanted: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+def changed_files(facts: HostFacts, wanted: Iterable[tuple[str, str]]) -> tuple[str, ...]:
     """Paths whose hash differs between the current release and a wanted manifest, in the wanted order."""
     here = dict(facts.files)
     wanted = tuple(wanted)

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 from meshctl.robots.bundle import UNIT_NAME, Bundle
 from meshctl.robots.facts import RobotFacts
-from meshctl.robots.preconditions import Facts, changed_files
+from meshctl.robots.preconditions import HostFacts, changed_files
 
 _HEADINGS = ("robot", "service", "release", "version", "up", "peers", "queued", "last message", "load", "keys")
 # On a narrow terminal these go first, in this order: `--json` has them all.
@@ -87,7 +87,7 @@ def _duration(seconds: float | None) -> str:
     return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
-def difference(facts: Facts, release: Bundle) -> tuple[str, ...]:
+def difference(facts: HostFacts, release: Bundle) -> tuple[str, ...]:
     """One line for each way in which a robot is not as the inventory says; none when a deploy would do nothing.
 
     Files are named, not shown: what is on the robot is known by its hash.

@@ -55,7 +55,7 @@ def parse_wheel(file: str) -> WheelName | None:
     return WheelName(file, project, found["version"], *tags)
 
 
-def takes(target: Target, wheel: WheelName) -> bool:
+def is_compatible(target: Target, wheel: WheelName) -> bool:
     """Whether pip on that computer would accept the wheel."""
     return any(_python(target, python, abi) for python in wheel.pythons for abi in wheel.abis) and any(
         _platform(target, platform) for platform in wheel.platforms

@@ -20,7 +20,7 @@ from functools import cache
 from pathlib import Path
 
 from meshctl.errors import InputError
-from meshctl.robots.wheel_tags import Target, WheelName, parse_wheel, pip_options, takes
+from meshctl.robots.wheel_tags import Target, WheelName, is_compatible, parse_wheel, pip_options
 
 # What udp_mesh imports besides the standard library, and what that needs in turn.
 REQUIREMENTS = ("cryptography", "cffi", "pycparser")
@@ -104,7 +104,7 @@ def _urlsafe(content: bytes) -> str:
     return base64.urlsafe_b64encode(hashlib.sha256(content).digest()).decode().rstrip("=")
 
 
-def fetch(target: Target, directory: Path) -> None:
+def download_wheels(target: Target, directory: Path) -> None:
     """Let pip download the requirements for a target into `directory`, on the operator's machine. Raises InputError."""
     directory.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
@@ -119,7 +119,7 @@ def fetch(target: Target, directory: Path) -> None:
         raise InputError(f"pip could not fetch wheels for {target}: {last}", hint=hint)
 
 
-def choose(target: Target, directory: Path) -> tuple[Wheel, ...]:
+def select_wheels(target: Target, directory: Path) -> tuple[Wheel, ...]:
     """Our own wheel and one for each requirement. Raises InputError naming what is missing and what is there."""
     try:
         names = [parse_wheel(path.name) for path in sorted(directory.iterdir()) if path.suffix == ".whl"]
@@ -130,7 +130,7 @@ def choose(target: Target, directory: Path) -> tuple[Wheel, ...]:
     missing = []
     for project in REQUIREMENTS:
         of_project = [wheel for wheel in wheels if wheel.project == project]
-        fitting = [wheel for wheel in of_project if takes(target, wheel)]
+        fitting = [wheel for wheel in of_project if is_compatible(target, wheel)]
         if not fitting:
             there = ", ".join(wheel.file for wheel in of_project) or "none at all"
             missing.append(f"{directory}: expected a wheel of {project} for {target}, found {there}")
@@ -150,14 +150,16 @@ def choose(target: Target, directory: Path) -> tuple[Wheel, ...]:
 
 
 def has_all(target: Target, directory: Path) -> bool:
-    """Whether `choose` would find everything there."""
+    """Whether `select_wheels` would find everything there."""
     if not directory.is_dir():
         return False
     there = [wheel for wheel in map(parse_wheel, (path.name for path in directory.iterdir())) if wheel is not None]
-    return all(any(wheel.project == project and takes(target, wheel) for wheel in there) for project in REQUIREMENTS)
+    return all(
+        any(wheel.project == project and is_compatible(target, wheel) for wheel in there) for project in REQUIREMENTS
+    )
 
 
-def keep(wheels: Iterable[Wheel], directory: Path) -> None:
+def cache_wheels(wheels: Iterable[Wheel], directory: Path) -> None:
     """Make these the wheels that a later command finds in `directory` without being told. Raises InputError."""
     wanted = {wheel.file: wheel for wheel in wheels if parse_wheel(wheel.file) != parse_wheel(own_wheel().file)}
     try:

@@ -1,12 +1,12 @@
-"""The fleet as it is: what everybody tells, how old that is, what is wrong, and whether the run may begin.
+"""The state of the fleet: observations, their age, alarms, and the go/no-go checks before a mission.
 
-`look` asks radios and robots -> `assess` (radios) with `robots` (robots) -> `FleetStatus` with its alarms -> `text` (by
-`rows` and `table`), `document` (JSON) or `preflight`; `memory` keeps what was told, `filters` chooses what is shown.
+`collect` queries radios and robots -> `Snapshot` -> `assess` (radios) and `robots` -> `FleetStatus` with alarms ->
+`filters` -> `text` (by `rows` and `table`), `json_output` or `preflight`. `last_known` records facts in the journal.
 """
 
 from meshctl.status.assess import assess
 from meshctl.status.preflight import Check, preflight
-from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbour, NodeStatus, RobotStatus
+from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbor, NodeStatus, RobotStatus
 
 __all__ = [
     "Alarm",
@@ -14,7 +14,7 @@ __all__ = [
     "FleetStatus",
     "Health",
     "Level",
-    "Neighbour",
+    "Neighbor",
     "NodeStatus",
     "RobotStatus",
     "assess",

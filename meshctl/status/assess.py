@@ -1,6 +1,6 @@
-"""From one look at the fleet to its status. Pure: what was seen and told, what was known before, and the time in.
+"""Assess a snapshot: observations, last known facts and the time -> `FleetStatus`. Pure.
 
-`assess` makes the radios' part here; the robots' part is made in `robots`.
+This module assesses the radios; `robots` assesses the robots.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Node, NodeState
 from meshctl.plan import NodePlan
 from meshctl.robots.facts import RobotFacts
-from meshctl.status.node_alarms import MESH_MODES, Seen, alarms, some
-from meshctl.status.robots import Crew, robot_status
-from meshctl.status.unreachable import NOT_ASKED, lost_relay_alarm, silent_alarm
-from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbour, NodeStatus, Silence, health_of
+from meshctl.status.node_alarms import MESH_MODES, NodeAlarmInput, alarms, join_limited
+from meshctl.status.robots import RobotAnswers, robot_status
+from meshctl.status.unreachable import NOT_ASKED, lost_relay_alarm, no_answer_alarm
+from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbor, NoAnswer, NodeStatus, health_of
 from meshctl.topology import Graph, Report, Sighting, neighbours_of, report_of, seen_by
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """One look at the fleet.
+class Snapshot:
+    """The answers of all queried devices at one time.
 
-    `known` is what the journal knew before it, by node and by `robot.NAME`; `macs` maps MACs to nodes; `silent` and
-    `silent_robots` tell why somebody gave no answer; `unrendered` why a node or a `robot.NAME` could not be compared
-    with the inventory; `own_lock` is who we are to the nodes' locks; `robots_unasked` why no robot was asked at all.
-    `is_partial` says that only some were asked, so that paths and cut vertices cannot be told.
+    `known` are the facts in the journal before it, by node and by `robot.NAME`; `macs` maps MACs to nodes; `no_answer`
+    and `no_answer_robots` hold the reasons for missing answers; `unrendered` why a node or `robot.NAME` could not be
+    compared with the inventory; `own_lock` is our name in the nodes' locks; `robots_skipped` why no robot was queried.
+    `is_partial`: only some nodes were queried, so paths and cut vertices are unknown.
     """
 
     fleet: Fleet
     observations: Mapping[str, Observation]
-    silent: Mapping[str, Silence]
+    no_answer: Mapping[str, NoAnswer]
     plans: Mapping[str, NodePlan]
     graph: Graph
     known: Mapping[str, LastKnown]
@@ -41,127 +41,130 @@ class Look:
     own_lock: str = ""
     unrendered: Mapping[str, str] = field(default_factory=dict)
     robots: Mapping[str, RobotFacts] = field(default_factory=dict)
-    silent_robots: Mapping[str, Silence] = field(default_factory=dict)
-    robots_unasked: str = ""
+    no_answer_robots: Mapping[str, NoAnswer] = field(default_factory=dict)
+    robots_skipped: str = ""
     is_partial: bool = False
     took_s: float = 0.0
 
 
-def assess(look: Look, nodes: Iterable[Node], now: float, robots: Iterable[str] = ()) -> FleetStatus:
+def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterable[str] = ()) -> FleetStatus:
     """The status of these radios and robots at `now` (Unix time)."""
-    reports = {name: report_of(name, seen) for name, seen in look.observations.items()}
-    sightings = seen_by(reports.values(), look.macs)
-    paths = {} if look.is_partial else look.graph.paths(look.entry)
-    cuts = {} if look.is_partial else look.graph.cut_off_by(look.entry)
+    reports = {name: report_of(name, seen) for name, seen in snapshot.observations.items()}
+    sightings = seen_by(reports.values(), snapshot.macs)
+    paths = {} if snapshot.is_partial else snapshot.graph.paths(snapshot.entry)
+    cuts = {} if snapshot.is_partial else snapshot.graph.cut_off_by(snapshot.entry)
     relays: dict[str, list[str]] = {}
     for name, path in paths.items():
-        if path.hops and path.via != look.entry:
+        if path.hops and path.via != snapshot.entry:
             relays.setdefault(path.via, []).append(name)
     statuses = []
     for node in nodes:
-        seen = look.observations.get(node.name)
+        seen = snapshot.observations.get(node.name)
         if seen is None:
-            statuses.append(_silent(look, node, sightings.get(node.name, ()), now))
+            statuses.append(_unreachable_status(snapshot, node, sightings.get(node.name, ()), now))
             continue
-        last = look.known.get(node.name)
-        everything = Seen(
-            fleet=look.fleet,
+        last = snapshot.known.get(node.name)
+        everything = NodeAlarmInput(
+            fleet=snapshot.fleet,
             node=node,
             observation=seen,
-            plan=look.plans.get(node.name),
-            neighbours=_neighbours(reports[node.name], look.macs),
+            plan=snapshot.plans.get(node.name),
+            neighbors=_neighbors(reports[node.name], snapshot.macs),
             path=paths.get(node.name),
-            is_path_known=look.entry in paths,
+            is_path_known=snapshot.entry in paths,
             cuts_off=cuts.get(node.name, ()),
             relays=tuple(name for name in relays.get(node.name, ()) if name != node.name),
             seconds_since_last_known=None if last is None else max(0.0, seen.answered_at_s - last.seen_s),
-            own_lock=look.own_lock,
+            own_lock=snapshot.own_lock,
         )
-        statuses.append(_answering(everything, now))
-    names = set(look.macs.values()) | set(look.observations) | set(look.fleet.nodes)
-    strangers = tuple(name for name in look.graph.nodes if name not in names)
-    crew = Crew(look.fleet, look.robots, look.silent_robots, look.known, now, frozenset(look.unrendered))
+        statuses.append(_reachable_status(everything, now))
+    names = set(snapshot.macs.values()) | set(snapshot.observations) | set(snapshot.fleet.nodes)
+    strangers = tuple(name for name in snapshot.graph.nodes if name not in names)
+    robot_answers = RobotAnswers(
+        snapshot.fleet, snapshot.robots, snapshot.no_answer_robots, snapshot.known, now, frozenset(snapshot.unrendered)
+    )
     return FleetStatus(
-        look.fleet.name,
+        snapshot.fleet.name,
         now,
-        look.entry,
+        snapshot.entry,
         tuple(statuses),
-        tuple(robot_status(crew, look.fleet.robots[name]) for name in robots),
+        tuple(robot_status(robot_answers, snapshot.fleet.robots[name]) for name in robots),
         strangers,
-        tuple(_fleet_alarms(look)),
-        look.took_s,
+        tuple(_fleet_alarms(snapshot)),
+        snapshot.took_s,
     )
 
 
-def _fleet_alarms(look: Look) -> Iterable[Alarm]:
+def _fleet_alarms(snapshot: Snapshot) -> Iterable[Alarm]:
     reasons: dict[str, list[str]] = {}
-    for name, why in look.unrendered.items():
+    for name, why in snapshot.unrendered.items():
         reasons.setdefault(why, []).append(name)
     for why, names in reasons.items():
-        told = f"{some(tuple(names))} not compared with the inventory: {why}"
-        hint = "give the secret it names, or mend the inventory: meshctl lint"
-        yield Alarm(Level.WARNING, "not-compared", told, hint)
-    if look.robots_unasked:
-        yield Alarm(Level.NOTE, "robots-unasked", look.robots_unasked)
+        text = f"{join_limited(tuple(names))} not compared with the inventory: {why}"
+        hint = "provide the missing secret, or fix the inventory (meshctl lint)"
+        yield Alarm(Level.WARNING, "not-compared", text, hint)
+    if snapshot.robots_skipped:
+        yield Alarm(Level.NOTE, "robots-unasked", snapshot.robots_skipped)
 
 
-def _neighbours(report: Report, macs: Mapping[str, str]) -> tuple[Neighbour, ...]:
-    """The neighbours of one node that were heard lately, the best first."""
+def _neighbors(report: Report, macs: Mapping[str, str]) -> tuple[Neighbor, ...]:
+    """The neighbors that a node heard recently, best first."""
     found = [
-        Neighbour(name, heard.last_seen_ms, heard.quality, heard.signal_dbm)
+        Neighbor(name, heard.last_seen_ms, heard.quality, heard.signal_dbm)
         for name, heard in neighbours_of(report, macs).items()
     ]
     return tuple(sorted(found, key=lambda one: (-(one.quality or 0.0), -(one.signal_dbm or -200), one.name)))
 
 
-def _silent(look: Look, node: Node, heard_by: tuple[Sighting, ...], now: float) -> NodeStatus:
-    last = look.known.get(node.name)
-    why = look.silent.get(node.name, NOT_ASKED)
-    is_missed = node.state is NodeState.DEPLOYED
-    alarm = silent_alarm(
+def _unreachable_status(snapshot: Snapshot, node: Node, heard_by: tuple[Sighting, ...], now: float) -> NodeStatus:
+    last = snapshot.known.get(node.name)
+    why = snapshot.no_answer.get(node.name, NOT_ASKED)
+    is_required = node.state is NodeState.DEPLOYED
+    alarm = no_answer_alarm(
         why,
         last,
         heard_by,
         now,
-        is_missed=is_missed,
+        is_required=is_required,
         trust=f"meshctl trust {node.name}",
-        take_in=f"not taken in yet? meshctl bootstrap {node.name}",
+        first_contact_hint=f"if it is not set up yet: meshctl bootstrap {node.name}",
     )
     lost_relay = lost_relay_alarm(node, why, last, now)
     found = tuple(one for one in (lost_relay, alarm) if one is not None)
     return NodeStatus(
         node=node,
-        health=Health.UNREACHABLE if is_missed else Health.DEGRADED if found else Health.OFF,
+        health=Health.UNREACHABLE if is_required else Health.DEGRADED if found else Health.OFF,
         alarms=found,
         age_s=None if last is None else now - last.seen_s,
-        silent_because=why.reason,
+        no_answer_reason=why.reason,
         heard_by=heard_by,
         last_known=last.facts if last else None,
     )
 
 
-def _answering(seen: Seen, now: float) -> NodeStatus:
-    told, plan = seen.observation, seen.plan
+def _reachable_status(seen: NodeAlarmInput, now: float) -> NodeStatus:
+    observed, plan = seen.observation, seen.plan
+    memory = observed.memory
     found = alarms(seen)
-    lan = next((bridge.ports for bridge in told.bridges or () if bridge.name == "br-lan"), None)
-    mesh_links = [link for link in told.links or () if link.mode.lower() in MESH_MODES]
+    lan = next((bridge.ports for bridge in observed.bridges or () if bridge.name == "br-lan"), None)
+    mesh_links = [link for link in observed.links or () if link.mode.lower() in MESH_MODES]
     return NodeStatus(
         node=seen.node,
         health=health_of(found),
         alarms=found,
-        age_s=max(0.0, now - told.answered_at_s),
-        version=told.release.version if told.release else "",
-        revision=told.release.revision if told.release else "",
+        age_s=max(0.0, now - observed.answered_at_s),
+        version=observed.release.version if observed.release else "",
+        revision=observed.release.revision if observed.release else "",
         drift=None if plan is None else tuple(change.path for change in plan.files),
-        uptime_s=told.uptime_s,
-        load=None if told.load is None else told.load.minute / told.load.processors,
-        memory_free=told.memory.available / told.memory.total if told.memory and told.memory.total else None,
-        flash_free_bytes=told.overlay.free if told.overlay else None,
-        clock_offset_s=told.clock_offset_s,
+        uptime_s=observed.uptime_s,
+        load=None if observed.load is None else observed.load.minute / observed.load.processors,
+        memory_free=memory.available / memory.total if memory and memory.total else None,
+        flash_free_bytes=observed.overlay.free if observed.overlay else None,
+        clock_offset_s=observed.clock_offset_s,
         channels=tuple(dict.fromkeys(link.channel for link in mesh_links if link.channel is not None)),
         tx_power_dbm=next((link.tx_power_dbm for link in mesh_links if link.tx_power_dbm is not None), None),
         lan_ports=lan,
-        neighbours=seen.neighbours,
+        neighbors=seen.neighbors,
         is_path_known=seen.is_path_known,
         hops=seen.path.hops if seen.path else None,
         quality=seen.path.quality if seen.path else None,

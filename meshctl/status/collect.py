@@ -1,8 +1,7 @@
-"""One look at radios and robots, all at once: fleet -> connections -> what everybody told -> `Look`, and the journal.
+"""Query all radios and robots in parallel: fleet -> connections -> answers -> `Snapshot`, and facts to the journal.
 
-`Watcher` is all that a look needs, and keeps connections between looks; `Watcher.look` takes one. Nothing is changed on
-any device. Everybody is asked side by side in daemon threads: a look holds nothing that would have to be put back, so
-whoever leaves it (Ctrl-C) need not wait for the silent.
+`Collector.collect` takes a snapshot; the collector keeps connections between snapshots. Queries change nothing on a
+device, so they run in daemon threads: Ctrl-C need not wait for devices that do not answer.
 """
 
 from __future__ import annotations
@@ -28,68 +27,71 @@ from meshctl.nodes.connections import Access
 from meshctl.nodes.desired import Renderer
 from meshctl.plan import NodePlan, Wanted, node_plan
 from meshctl.plan.masking import Fingerprints
-from meshctl.robots.connection import Reach
-from meshctl.robots.facts import Expectation, RobotFacts, expectation, gather
+from meshctl.robots.connection import RobotConnector
+from meshctl.robots.facts import ExpectedRelease, RobotFacts, collect_facts, expected_release
 from meshctl.robots.host import Host
-from meshctl.status.assess import Look
-from meshctl.status.last_known import ROBOT_PREFIX, remembered
+from meshctl.status.assess import Snapshot
+from meshctl.status.last_known import ROBOT_PREFIX, merge_by_device
 from meshctl.status.pings import Pings, ping, pings_of
-from meshctl.status.unreachable import silence_of
-from meshctl.status.values import Silence
+from meshctl.status.unreachable import no_answer_of
+from meshctl.status.values import NoAnswer
 
 T = TypeVar("T")
 
-# So many are asked at once while answers come in: more would only make each other's handshakes late.
-SIDE_BY_SIDE = 32
-# When none came for so long, those asked are silent, and so many more are asked beside them: all the silent of a fleet
-# cost one deadline together.
-NOBODY_ANSWERS_S = 0.3
+# Parallel queries while answers come in; more would only delay each other's handshakes.
+MAX_PARALLEL = 32
+# Without an answer for this long, the running queries are taken for timeouts and as many more are started: all
+# unreachable devices together cost one timeout.
+STALL_TIMEOUT_S = 0.3
 # A busy radio with a 560 MHz processor takes about ten seconds for all its answers (device/observe.py).
 OBSERVE_S = 30.0
 _SALT_BYTES = 16
 Progress = Callable[[int, int], None]
 
 
-def _quiet(done: int, count: int) -> None:
-    """Tells nobody how far a look is."""
+def _no_progress(done: int, count: int) -> None:
+    """Ignore progress."""
 
 
 @dataclass(slots=True)
-class Watcher:
-    """Everything a look needs. `reach` is None where no robot can be asked, and `robots_unasked` says why; `owner` is
-    who we are to the nodes' locks. Not for several threads at once."""
+class Collector:
+    """Collects snapshots and keeps connections between them. Not thread-safe.
+
+    `connector` is None when no robot can be queried, for the reason in `robots_skipped`; `owner` is this process's name
+    in the nodes' locks.
+    """
 
     fleet: Fleet
     renderer: Renderer
     access: Access
     journal: Journal
     owner: str
-    reach: Reach | None = None
-    robots_unasked: str = ""
+    connector: RobotConnector | None = None
+    robots_skipped: str = ""
     clock: Callable[[], float] = time.time
-    _wanted: dict[str, Wanted | str] = field(default_factory=dict, repr=False)
-    _expected: dict[str, Expectation | str] = field(default_factory=dict, repr=False)
+    _desired_states: dict[str, Wanted | str] = field(default_factory=dict, repr=False)
+    _expected_releases: dict[str, ExpectedRelease | str] = field(default_factory=dict, repr=False)
     _computers: dict[str, tuple[ExitStack, Host]] = field(default_factory=dict, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
-    def look(self, nodes: Iterable[Node], robots: Iterable[str] = (), progress: Progress = _quiet) -> Look:
-        """Ask these radios and robots. Raises MeshctlError for what concerns all of them (a key file, the journal)."""
+    def collect(self, nodes: Iterable[Node], robots: Iterable[str] = (), progress: Progress = _no_progress) -> Snapshot:
+        """Query these radios and robots. Raises MeshctlError for a common failure (key file, journal)."""
         began = self.clock()
         known = self.journal.last_known(self.fleet.name)
         asked = {node.name: node for node in nodes}
-        crew = tuple(robots) if self.reach is not None else ()
+        targets = tuple(robots) if self.connector is not None else ()
         jobs: dict[tuple[str, str], Callable[[], object]] = {}
         for node in asked.values():
             jobs["node", node.name] = partial(self._observe, node)
-        for robot in crew:
-            jobs["robot", robot] = partial(self._ask, robot)
-        answers = side_by_side(jobs, SIDE_BY_SIDE, progress)
+        for robot in targets:
+            jobs["robot", robot] = partial(self._collect_robot, robot)
+        answers = run_parallel(jobs, MAX_PARALLEL, progress)
         observations = {key[1]: seen for key, seen in answers.items() if isinstance(seen, Observation)}
-        facts = {key[1]: told for key, told in answers.items() if isinstance(told, RobotFacts)}
-        silent: dict[str, dict[str, Silence]] = {"node": {}, "robot": {}}
+        facts = {key[1]: one for key, one in answers.items() if isinstance(one, RobotFacts)}
+        no_answer: dict[str, dict[str, NoAnswer]] = {"node": {}, "robot": {}}
         for (kind, name), answer in answers.items():
             if isinstance(answer, NodeError):
-                silent[kind][name] = silence_of(answer)
+                no_answer[kind][name] = no_answer_of(answer)
         seen = Seen(observations, {})
         self.journal.remember_all(
             self.fleet.name, {name: facts_of(one) for name, one in observations.items()}, self.clock()
@@ -98,79 +100,78 @@ class Watcher:
         for report in seen.reports:
             macs.update(dict.fromkeys(report.macs, report.node))
         plans, unrendered = self._plans(asked.values(), observations)
-        for robot in crew:
-            if isinstance(expected := self._expect(robot), str):
+        for robot in targets:
+            if isinstance(expected := self._expected_release(robot), str):
                 unrendered[f"{ROBOT_PREFIX}{robot}"] = expected
         base = self.fleet.base_node
-        return Look(
+        return Snapshot(
             fleet=self.fleet,
             observations=observations,
-            silent=silent["node"],
+            no_answer=no_answer["node"],
             plans=plans,
             graph=seen.graph(self.fleet, known),
-            known=remembered(known),
+            known=merge_by_device(known),
             macs=macs,
             entry=base.name if base is not None else "",
             own_lock=self.owner,
             unrendered=unrendered,
             robots=facts,
-            silent_robots=silent["robot"],
-            robots_unasked=self.robots_unasked,
+            no_answer_robots=no_answer["robot"],
+            robots_skipped=self.robots_skipped,
             took_s=self.clock() - began,
         )
 
     def ping(self, robots: Iterable[str]) -> Pings:
-        """Have each of these robots' daemons send an urgent message to each other's and back."""
+        """Have each of these robots' daemons send an urgent message to each other and back."""
         names = tuple(robots)
         jobs: dict[str, Callable[[], object]] = {
             name: partial(self._ping, name, [peer for peer in names if peer != name]) for name in names
         }
-        answers = side_by_side(jobs, SIDE_BY_SIDE)
-        return pings_of({name: told for name, told in answers.items() if isinstance(told, dict)})
+        answers = run_parallel(jobs, MAX_PARALLEL)
+        return pings_of({name: answer for name, answer in answers.items() if isinstance(answer, dict)})
 
     def _ping(self, robot: str, peers: Iterable[str]) -> dict[str, float | str]:
-        with self.computer(robot) as host:
+        with self.robot_host(robot) as host:
             return ping(host, peers)
 
     def close(self) -> None:
-        """Close the connections to computers, side by side. Those to radios are `access`'s to close."""
+        """Close the connections to computers in parallel; `access` closes those to radios."""
         with self._lock:
             jobs: dict[str, Callable[[], object]] = {name: stack.close for name, (stack, _) in self._computers.items()}
             self._computers.clear()
-        side_by_side(jobs, SIDE_BY_SIDE)
+        run_parallel(jobs, MAX_PARALLEL)
 
-    def __enter__(self) -> Watcher:
+    def __enter__(self) -> Collector:
         return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()
 
     def _observe(self, node: Node) -> Observation:
-        wanted = self._want(node)
+        wanted = self._desired_state(node)
         paths = () if isinstance(wanted, str) else other_paths(wanted)
         with self.access.lease(node) as connection:
             return observe(connection, extra_paths=paths, timeout_s=OBSERVE_S)
 
-    def _want(self, node: Node) -> Wanted | str:
-        """What the inventory wants of a node, or why that cannot be told: a fleet shows its state without its secrets,
-        too."""
+    def _desired_state(self, node: Node) -> Wanted | str:
+        """The desired state of a node, or why it cannot be rendered: status also works without the secrets."""
         with self._lock:
-            if node.name not in self._wanted:
+            if node.name not in self._desired_states:
                 try:
-                    self._wanted[node.name] = self.renderer.wanted(node)
+                    self._desired_states[node.name] = self.renderer.wanted(node)
                 except MeshctlError as error:
-                    self._wanted[node.name] = first_line(error)
-            return self._wanted[node.name]
+                    self._desired_states[node.name] = first_line(error)
+            return self._desired_states[node.name]
 
     def _plans(
         self, nodes: Iterable[Node], observations: Mapping[str, Observation]
     ) -> tuple[dict[str, NodePlan], dict[str, str]]:
-        """How each node that answered differs from the inventory, and why others could not be compared."""
+        """The drift of each node that answered, and why others could not be compared."""
         fingerprints = Fingerprints(secrets.token_bytes(_SALT_BYTES))
         plans: dict[str, NodePlan] = {}
         unrendered: dict[str, str] = {}
         for node in nodes:
-            seen, wanted = observations.get(node.name), self._want(node)
+            seen, wanted = observations.get(node.name), self._desired_state(node)
             if isinstance(wanted, str):
                 unrendered[node.name] = wanted
             elif seen is not None:
@@ -178,31 +179,31 @@ class Watcher:
                 plans[node.name] = node_plan(exact, seen, fingerprints, owner=self.owner)
         return plans, unrendered
 
-    def _ask(self, robot: str) -> RobotFacts:
-        expected = self._expect(robot)
-        with self.computer(robot) as host:
+    def _collect_robot(self, robot: str) -> RobotFacts:
+        expected = self._expected_release(robot)
+        with self.robot_host(robot) as host:
             if isinstance(expected, str):
-                return replace(gather(host, robot, Expectation(), now_s=self.clock()), drift=())
-            return gather(host, robot, expected, now_s=self.clock())
+                return replace(collect_facts(host, robot, ExpectedRelease(), now_s=self.clock()), drift=())
+            return collect_facts(host, robot, expected, now_s=self.clock())
 
-    def _expect(self, robot: str) -> Expectation | str:
+    def _expected_release(self, robot: str) -> ExpectedRelease | str:
         with self._lock:
-            if robot not in self._expected:
+            if robot not in self._expected_releases:
                 try:
-                    self._expected[robot] = expectation(self.fleet, robot, self.renderer.secrets)
+                    self._expected_releases[robot] = expected_release(self.fleet, robot, self.renderer.secrets)
                 except MeshctlError as error:
-                    self._expected[robot] = first_line(error)
-            return self._expected[robot]
+                    self._expected_releases[robot] = first_line(error)
+            return self._expected_releases[robot]
 
     @contextmanager
-    def computer(self, robot: str) -> Iterator[Host]:
-        """The robot's computer, over the connection of the last look where it still stands. Raises NodeError."""
-        assert self.reach is not None, "robots are asked only where there is a way to them"
+    def robot_host(self, robot: str) -> Iterator[Host]:
+        """The robot's computer, over the connection of the last snapshot if still open. Raises NodeError."""
+        assert self.connector is not None, "robots are queried only with a connector"
         with self._lock:
             kept = self._computers.pop(robot, None)
         if kept is None:
             stack = ExitStack()
-            kept = (stack, stack.enter_context(self.reach.host(robot)))
+            kept = (stack, stack.enter_context(self.connector.host(robot)))
         try:
             yield kept[1]
         except BaseException:
@@ -219,17 +220,17 @@ def first_line(error: Exception) -> str:
 K = TypeVar("K")
 
 
-def side_by_side(
+def run_parallel(
     jobs: Mapping[K, Callable[[], object]],
     parallel: int,
-    progress: Progress = _quiet,
+    progress: Progress = _no_progress,
     *,
-    patience_s: float = NOBODY_ANSWERS_S,
+    stall_timeout_s: float = STALL_TIMEOUT_S,
 ) -> dict[K, object]:
-    """What each job returned, or the NodeError it raised, in the jobs' order.
+    """What each job returned, or the NodeError it raised, in the jobs' order. Raises any other exception.
 
-    `parallel` run at once, and `parallel` more whenever none has ended for `patience_s`. Any other exception is raised
-    here. The threads are daemons: nobody who leaves early waits for them.
+    `parallel` jobs run at once, and `parallel` more whenever none has ended for `stall_timeout_s`. Threads are daemons,
+    so an interrupt need not wait for them.
     """
     waiting: queue.SimpleQueue[K] = queue.SimpleQueue()
     finished: queue.SimpleQueue[tuple[K, object, BaseException | None]] = queue.SimpleQueue()
@@ -246,20 +247,20 @@ def side_by_side(
                 finished.put((key, jobs[key](), None))
             except NodeError as error:
                 finished.put((key, error, None))
-            except BaseException as error:  # noqa: BLE001 - handed over to the caller's thread, which raises it
+            except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
                 finished.put((key, None, error))
 
-    def ask_more() -> None:
+    def start_more() -> None:
         for _ in range(min(parallel, waiting.qsize())):
-            threading.Thread(target=work, name="look", daemon=True).start()
+            threading.Thread(target=work, name="collect", daemon=True).start()
 
-    ask_more()
+    start_more()
     found: dict[K, object] = {}
     while len(found) < len(jobs):
         try:
-            key, answer, bug = finished.get(timeout=patience_s)
+            key, answer, bug = finished.get(timeout=stall_timeout_s)
         except queue.Empty:
-            ask_more()
+            start_more()
             continue
         if bug is not None:
             raise bug

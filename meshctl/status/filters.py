@@ -1,7 +1,7 @@
-"""Which radios and robots of a status are shown: names, groups, robots, roles, states, alarms.
+"""Select the radios and robots of a status to show: by name, group, robot, role, state or alarm.
 
-Values of one kind are alternatives, kinds narrow each other down. Everybody may have been asked all the same: hops, and
-who hears a silent node, come from the others.
+Values of one kind are alternatives; different kinds must all match. Devices that are not shown are usually still
+queried, since hop counts and "heard by" come from them.
 """
 
 from __future__ import annotations
@@ -21,13 +21,12 @@ from meshctl.status.values import Alarm, FleetStatus, Level
 ROLES = (*(role.value for role in Role), COMPUTER)
 STATES = tuple(state.value for state in NodeState if state.is_managed)
 ANY_ALARM = "any"
-# a hint that fills the screen is none
-NAMES_IN_A_HINT = 12
+MAX_HINT_NAMES = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """Empty means all. `names` match radios and robots; `alarms` are codes, levels, or `any` (warnings and errors)."""
+    """Empty matches all. `names` match radios and robots; `alarms` are codes, levels or `any` (error, warning)."""
 
     names: tuple[str, ...] = ()
     groups: tuple[str, ...] = ()
@@ -41,16 +40,18 @@ class Filter:
         return self == Filter()
 
     def check(self, fleet: Fleet) -> None:
-        """Raises InputError for a value that selects nothing in this fleet, whatever its state."""
+        """Raises InputError for a value that can match nothing in this fleet."""
         names = [*(node.name for node in fleet.managed()), *fleet.robots]
-        _known("node or robot", self.names, names, fleet.name)
-        _known("group", self.groups, {group for node in fleet.nodes.values() for group in node.groups}, fleet.name)
-        _known("robot", self.robots, fleet.robots, fleet.name)
-        _known("role", self.roles, ROLES, "a status")
-        _known("state", self.states, STATES, "a status")
-        _known("alarm", self.alarms, (*CODES, *(level.text for level in Level), ANY_ALARM), "a status")
+        _require_match("node or robot", self.names, names, fleet.name)
+        _require_match(
+            "group", self.groups, {group for node in fleet.nodes.values() for group in node.groups}, fleet.name
+        )
+        _require_match("robot", self.robots, fleet.robots, fleet.name)
+        _require_match("role", self.roles, ROLES, "a status")
+        _require_match("state", self.states, STATES, "a status")
+        _require_match("alarm", self.alarms, (*CODES, *(level.text for level in Level), ANY_ALARM), "a status")
 
-    def takes_node(self, node: Node) -> bool:
+    def matches_node(self, node: Node) -> bool:
         return (
             _matches(node.name, self.names)
             and (not self.groups or any(_matches(group, self.groups) for group in node.groups))
@@ -59,8 +60,8 @@ class Filter:
             and (not self.states or node.state.value in self.states)
         )
 
-    def takes_robot(self, fleet: Fleet, name: str) -> bool:
-        """A robot belongs to the groups of its radios, and has their state."""
+    def matches_robot(self, fleet: Fleet, name: str) -> bool:
+        """A robot has the groups and the state of its radios."""
         robot = fleet.robots[name]
         groups = {group for node in robot.nodes if node in fleet.nodes for group in fleet.nodes[node].groups}
         state = robot_state(fleet, robot)
@@ -73,20 +74,20 @@ class Filter:
         )
 
     def apply(self, fleet: Fleet, status: FleetStatus) -> FleetStatus:
-        """The same status of those that are shown; what concerns the whole fleet goes when anything is filtered."""
+        """The status of the matching devices; a filter drops the alarms of the whole fleet."""
         if self.is_empty:
             return status
         return replace(
             status,
-            nodes=tuple(one for one in status.nodes if self.takes_node(one.node) and self._alarmed(one.alarms)),
+            nodes=tuple(one for one in status.nodes if self.matches_node(one.node) and self._has_alarm(one.alarms)),
             robots=tuple(
-                one for one in status.robots if self.takes_robot(fleet, one.name) and self._alarmed(one.alarms)
+                one for one in status.robots if self.matches_robot(fleet, one.name) and self._has_alarm(one.alarms)
             ),
             alarms=(),
             strangers=(),
         )
 
-    def _alarmed(self, alarms: Iterable[Alarm]) -> bool:
+    def _has_alarm(self, alarms: Iterable[Alarm]) -> bool:
         if not self.alarms:
             return True
         wanted = set(self.alarms)
@@ -100,9 +101,9 @@ def _matches(name: str, patterns: tuple[str, ...]) -> bool:
     return not patterns or any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def _known(what: str, patterns: tuple[str, ...], names: Iterable[str], where: str) -> None:
+def _require_match(what: str, patterns: tuple[str, ...], names: Iterable[str], where: str) -> None:
     listed = list(names)
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in listed):
-            hint = did_you_mean(pattern, listed) or f"there are: {', '.join(listed[:NAMES_IN_A_HINT])}"
-            raise InputError(f"no {what} of {where} is called {pattern!r}", hint=hint)
+            hint = did_you_mean(pattern, listed) or f"expected one of {', '.join(listed[:MAX_HINT_NAMES])}"
+            raise InputError(f"no {what} of {where} matches {pattern!r}", hint=hint)

@@ -1,6 +1,6 @@
-"""The status for scripts, as JSON values. docs/status.md describes the shape; VERSION changes when a field does.
+"""The status as JSON. docs/status.md describes the schema; VERSION changes with it.
 
-Times are seconds, shares 0 to 1; a fact that is not known is null, never 0.
+Times are in seconds, shares 0 to 1; an unknown value is null, never 0.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ VERSION = 1
 
 
 def as_json(status: FleetStatus) -> dict[str, Any]:
-    """Everything that the table tells, and what has no room there."""
+    """All facts, including those the table has no room for."""
     everywhere = [*status.alarms, *(alarm for one in status for alarm in one.alarms)]
     return {
         "version": VERSION,
@@ -51,7 +51,7 @@ def _rounded(value: float | None, digits: int = 3) -> float | None:
 
 
 def _node(node: NodeStatus) -> dict[str, Any]:
-    answers = not node.silent_because
+    answers = not node.no_answer_reason
     return {
         "name": node.name,
         "role": node.node.role.value,
@@ -60,7 +60,7 @@ def _node(node: NodeStatus) -> dict[str, Any]:
         "address": str(node.node.address.ip),
         "health": node.health.value,
         "answers": answers,
-        "silent_because": node.silent_because or None,
+        "silent_because": node.no_answer_reason or None,
         "age_s": _rounded(node.age_s),
         "alarms": _alarms(node.alarms),
         "version": node.version or None,
@@ -76,7 +76,7 @@ def _node(node: NodeStatus) -> dict[str, Any]:
         "bridge_ports": None if node.lan_ports is None else list(node.lan_ports),
         "neighbours": [
             {"name": n.name, "age_s": n.age_ms / 1000, "quality": _rounded(n.quality), "signal_dbm": n.signal_dbm}
-            for n in node.neighbours
+            for n in node.neighbors
         ]
         if answers
         else None,
@@ -98,7 +98,7 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
         "address": None if robot.robot.computer is None else str(robot.robot.computer.address.ip),
         "health": robot.health.value,
         "answers": robot.facts is not None,
-        "silent_because": robot.silent_because or None,
+        "silent_because": robot.no_answer_reason or None,
         "age_s": _rounded(robot.age_s),
         "alarms": _alarms(robot.alarms),
         "heard_by": _sightings(robot.heard_by),
@@ -157,7 +157,7 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
                 "sent_ago_s": _rounded(topic.sent_ago_s),
                 "received_ago_s": _rounded(topic.received_ago_s),
                 "limit_s": _rounded(topic.limit_s),
-                "trouble": topic.trouble or None,
+                "trouble": topic.problem or None,
             }
             for topic in robot.topics
         ],
@@ -165,7 +165,7 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
 
 
 def preflight_json(checks: Iterable[Check]) -> dict[str, Any]:
-    """`go` for the whole, then each check."""
+    """The overall `go` and each check."""
     listed = tuple(checks)
     return {
         "version": VERSION,

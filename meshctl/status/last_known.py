@@ -1,7 +1,7 @@
-"""What is kept of a status for the day when a device is silent: status -> facts -> journal -> what was last known.
+"""Last known facts of devices, to show when they are unreachable: status -> facts -> journal -> last known.
 
-The journal keeps one text per fact and device. Radios are kept as `status.NAME`, beside what every command keeps of
-them under NAME; robots as `robot.NAME`. `remembered` joins both, the newer winning.
+The journal stores one text per fact and device: radios as `status.NAME`, beside the facts that every command stores as
+NAME, robots as `robot.NAME`. `merge_by_device` merges them; newer values win.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from meshctl.status.values import FleetStatus, NodeStatus, RobotStatus
 
 NODE_PREFIX = "status."
 ROBOT_PREFIX = "robot."
-# As many neighbours as help to find a node again.
-_NEIGHBOURS_KEPT = 4
+# Enough neighbors to find a node again.
+_MAX_NEIGHBORS = 4
 _INTEGERS = frozenset({"hops", "flash_free_bytes", "restarts", "urgent_bytes", "disk_free_kib"})
 _NUMBERS = frozenset({"uptime_s", "load", "memory_free", "quality", "clock_offset_s"})
 _LISTS = frozenset({"macs", "neighbours", "heard", "channels", "lan_ports", "online", "relays"})
 
 
-def facts_to_keep(status: FleetStatus) -> dict[str, dict[str, str]]:
-    """By the journal's name: what everybody who answered told."""
-    kept = {f"{NODE_PREFIX}{node.name}": node_facts(node) for node in status.nodes if not node.silent_because}
+def facts_to_record(status: FleetStatus) -> dict[str, dict[str, str]]:
+    """Facts of all devices that answered, by journal key."""
+    kept = {f"{NODE_PREFIX}{node.name}": node_facts(node) for node in status.nodes if not node.no_answer_reason}
     kept |= {f"{ROBOT_PREFIX}{robot.name}": robot_facts(robot) for robot in status.robots if robot.facts is not None}
     return kept
 
 
 def node_facts(node: NodeStatus) -> dict[str, str]:
-    """What is worth knowing of a radio that is gone."""
+    """The facts to record of a radio."""
     facts = {
         "version": node.version,
         "revision": node.revision,
@@ -43,27 +43,27 @@ def node_facts(node: NodeStatus) -> dict[str, str]:
         "quality": _number(node.quality),
         "via": node.via,
         "relays": " ".join(node.relays),
-        "heard": " ".join(neighbour.name for neighbour in node.neighbours[:_NEIGHBOURS_KEPT]),
+        "heard": " ".join(neighbor.name for neighbor in node.neighbors[:_MAX_NEIGHBORS]),
     }
     return {name: value for name, value in facts.items() if value}
 
 
 def robot_facts(robot: RobotStatus) -> dict[str, str]:
-    """What is worth knowing of a robot that is gone, and what the next look compares with."""
-    told = robot.facts
-    if told is None:
+    """The facts to record of a robot; the next snapshot compares with some of them."""
+    observed = robot.facts
+    if observed is None:
         return {}
-    computer = told.computer
+    computer = observed.computer
     facts = {
-        "version": told.version,
-        "release": told.release,
-        "config": "differs" if told.drift else "same",
-        "service": told.service.active,
+        "version": observed.version,
+        "release": observed.release,
+        "config": "differs" if observed.drift else "same",
+        "service": observed.service.active,
         "uptime_s": _number(computer.uptime_s),
         "memory_free": _number(computer.memory_free_kib / computer.memory_kib if computer.memory_kib else None),
         "disk_free_kib": _number(computer.disk_free_kib if computer.disk_kib else None),
-        "online": " ".join(told.online),
-        "restarts": _number(told.service.restarts),
+        "online": " ".join(observed.online),
+        "restarts": _number(observed.service.restarts),
         "urgent_bytes": _number(robot.urgent_bytes),
     }
     return {name: value for name, value in facts.items() if value}
@@ -73,8 +73,8 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:d}" if isinstance(value, int) else f"{value:.4g}"
 
 
-def remembered(known: Mapping[str, LastKnown]) -> dict[str, LastKnown]:
-    """By node, and by `robot.NAME`: everything kept of it, with the time of the latest sighting."""
+def merge_by_device(known: Mapping[str, LastKnown]) -> dict[str, LastKnown]:
+    """All facts by node and by `robot.NAME`, with the time of the latest."""
     found: dict[str, LastKnown] = {}
     for key, last in known.items():
         name = key.removeprefix(NODE_PREFIX)
@@ -88,20 +88,20 @@ def remembered(known: Mapping[str, LastKnown]) -> dict[str, LastKnown]:
 
 
 def typed(facts: Mapping[str, str]) -> dict[str, object]:
-    """The facts for programs: numbers as numbers, lists as lists."""
-    told: dict[str, object] = {}
+    """The facts as JSON values: numbers as numbers, lists as lists."""
+    values: dict[str, object] = {}
     for name, text in facts.items():
         if name in _LISTS:
-            told[name] = text.split()
+            values[name] = text.split()
         elif name in _INTEGERS | _NUMBERS:
-            told[name] = _parsed(text, whole=name in _INTEGERS)
+            values[name] = _parsed(text, whole=name in _INTEGERS)
         else:
-            told[name] = text
-    return told
+            values[name] = text
+    return values
 
 
 def _parsed(text: str, *, whole: bool) -> float | None:
-    """None for what an older or newer meshctl wrote in another form."""
+    """None for a value in the format of another meshctl version."""
     try:
         return int(text) if whole else float(text)
     except ValueError:

@@ -1,7 +1,7 @@
 """The cells of the status table: one row per radio and per robot's computer, under the same columns.
 
-`row` gives the cells by column; what a device that is silent told last stands in brackets. A cell has a short form for
-narrow terminals where it says more than it must.
+`row` gives the cells by column; last known facts of unreachable devices are in parentheses. Cells may have a short form
+for narrow terminals.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ COMPUTER = "computer"
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """`short` is what stands there when the whole text has no room."""
+    """`short` replaces `text` on narrow terminals."""
 
     text: str = ""
     short: str = ""
 
     @property
-    def least(self) -> str:
+    def shortest(self) -> str:
         return self.short or self.text
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """`rank` orders columns by how soon they give way on a narrow terminal, the highest first; 0 never does."""
+    """Columns with a higher `rank` are dropped first on a narrow terminal; 0 is never dropped."""
 
     key: str
     heading: str
     rank: int
 
 
-# In the order they stand in; docs/status.md explains each.
+# In display order; docs/status.md explains each.
 COLUMNS = (
     Column("name", "name", 0),
     Column("what", "what", 0),
@@ -61,7 +61,7 @@ COLUMNS = (
 
 
 def row(one: NodeStatus | RobotStatus) -> dict[str, Cell]:
-    """Its cells by column key."""
+    """The cells of a device by column key."""
     return _node_row(one) if isinstance(one, NodeStatus) else _robot_row(one)
 
 
@@ -73,7 +73,7 @@ def _node_row(node: NodeStatus) -> dict[str, Cell]:
         "health": Cell(node.health.value),
         "age": Cell(_age(node.age_s)),
     }
-    if node.silent_because:
+    if node.no_answer_reason:
         return cells | _bracketed(_known_node(node.last_known or {}))
     return cells | {
         "up": Cell(_up(node.uptime_s)),
@@ -91,11 +91,11 @@ def _node_row(node: NodeStatus) -> dict[str, Cell]:
 
 
 def _hears(node: NodeStatus) -> Cell:
-    """How many nodes it hears, and the best of them: `3: b01 -70 dBm 62%`."""
-    count = str(len(node.neighbours))
-    if not node.neighbours:
+    """The number of nodes heard and the best one: `3: b01 -70 dBm 62%`."""
+    count = str(len(node.neighbors))
+    if not node.neighbors:
         return Cell(count)
-    best = node.neighbours[0]
+    best = node.neighbors[0]
     signal = "" if best.signal_dbm is None else f" {best.signal_dbm} dBm"
     quality = "" if best.quality is None else f" {best.quality:.0%}"
     return Cell(f"{count}: {best.name}{signal}{quality}", count)
@@ -151,7 +151,7 @@ def _robot_row(robot: RobotStatus) -> dict[str, Cell]:
     waiting = [queue for queue in facts.queues if queue.messages]
     by_priority = " ".join(f"{queue.priority}:{queue.messages}" for queue in waiting)
     messages = sum(queue.messages for queue in waiting)
-    bad = sum(bool(topic.trouble) for topic in robot.topics)
+    bad = sum(bool(topic.problem) for topic in robot.topics)
     peers = f"{len(facts.online)} of {len(facts.peers)}"
     return cells | {
         "hears": Cell(f"{peers} daemons", peers),
@@ -171,7 +171,7 @@ def _known_robot(facts: Mapping[str, str]) -> dict[str, Cell]:
 
 
 def _bracketed(cells: Mapping[str, Cell]) -> dict[str, Cell]:
-    """Known from before."""
+    """Cells of last known facts, in parentheses."""
     return {
         key: Cell(f"({cell.text})", f"({cell.short})" if cell.short else "") for key, cell in cells.items() if cell.text
     }

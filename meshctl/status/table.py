@@ -1,7 +1,6 @@
-"""Rows of cells -> lines that fit a width: what has no room is said shorter, then left out and named.
+"""Rows of cells -> lines that fit a width: cells are shortened, then columns are dropped and listed.
 
-First whole cells with every column, then columns give way by rank, the cells' short forms in between; a column in which
-nobody has anything is left out without a word.
+Columns are dropped by rank, with the cells' short forms in between; empty columns are left out.
 """
 
 from __future__ import annotations
@@ -14,20 +13,20 @@ from meshctl.report.terminal_escapes import one_line
 from meshctl.status.rows import COLUMNS, Cell, Column
 
 _GAP = "  "
-# Between the columns that matter least and those that matter more, cells take their short form.
+# Columns of this rank or more are dropped before cells are shortened.
 _SHORTEN_BELOW_RANK = 5
 Paint = Callable[[str, str], str]
 """(text, style) -> text; styles: ok, degraded, unreachable, off, heading, known, error, warning, note, hint."""
 
 
 def plain(text: str, style: str) -> str:
-    """No colour at all."""
+    """No style."""
     return text
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Which columns are shown, and whether their cells are short; `dropped` are the headings of those left out."""
+    """The columns to show, and whether cells are short; `dropped` are the headings of the others."""
 
     columns: tuple[Column, ...]
     is_short: bool
@@ -35,34 +34,34 @@ class Layout:
 
 
 def layout(rows: Sequence[Mapping[str, Cell]], width: int | None) -> Layout:
-    """What fits into `width` characters (None: everything)."""
+    """The layout that fits into `width` characters (None: unlimited)."""
     columns = [column for column in COLUMNS if any(row.get(column.key, Cell()).text for row in rows)]
     leaving = sorted((column for column in columns if column.rank), key=lambda column: -column.rank)
     dropped: set[str] = set()
     is_short = False
-    while width is not None and _width(rows, _left(columns, dropped), is_short) > width:
+    while width is not None and _width(rows, _remaining(columns, dropped), is_short) > width:
         if not is_short and (not leaving or leaving[0].rank < _SHORTEN_BELOW_RANK):
             is_short = True
         elif leaving:
             dropped.add(leaving.pop(0).key)
         else:
             break
-    # short cells may have made room for what went before they were
+    # short cells may have made room for columns dropped earlier
     for column in sorted((column for column in columns if column.key in dropped), key=lambda column: column.rank):
-        if _width(rows, _left(columns, dropped - {column.key}), is_short) <= (width or 0):
+        if _width(rows, _remaining(columns, dropped - {column.key}), is_short) <= (width or 0):
             dropped.discard(column.key)
     return Layout(
-        _left(columns, dropped), is_short, tuple(column.heading for column in columns if column.key in dropped)
+        _remaining(columns, dropped), is_short, tuple(column.heading for column in columns if column.key in dropped)
     )
 
 
-def _left(columns: Sequence[Column], dropped: set[str]) -> tuple[Column, ...]:
+def _remaining(columns: Sequence[Column], dropped: set[str]) -> tuple[Column, ...]:
     return tuple(column for column in columns if column.key not in dropped)
 
 
 def _cell(row: Mapping[str, Cell], column: Column, is_short: bool) -> str:
     cell = row.get(column.key, Cell())
-    return one_line(cell.least if is_short else cell.text) or "-"
+    return one_line(cell.shortest if is_short else cell.text) or "-"
 
 
 def _widths(rows: Sequence[Mapping[str, Cell]], columns: Sequence[Column], is_short: bool) -> list[int]:
@@ -74,7 +73,7 @@ def _width(rows: Sequence[Mapping[str, Cell]], columns: Sequence[Column], is_sho
 
 
 def table_lines(rows: Sequence[Mapping[str, Cell]], width: int | None = None, paint: Paint = plain) -> list[str]:
-    """The heading, a line for each row, and which columns had no room."""
+    """The heading, one line per row, and a note on dropped columns."""
     if not rows:
         return []
     shown = layout(rows, width)
@@ -91,6 +90,6 @@ def table_lines(rows: Sequence[Mapping[str, Cell]], width: int | None = None, pa
             cells.append(paint(text, style) + " " * (room - len(text)))
         lines.append(_GAP.join(cells).rstrip())
     if shown.dropped:
-        told = f"no room for {', '.join(shown.dropped)}: --wide and --json have them"
-        lines += [paint(line, "note") for line in textwrap.wrap(told, width or len(told))]
+        note = f"columns not shown: {', '.join(shown.dropped)} (use --wide or --json)"
+        lines += [paint(line, "note") for line in textwrap.wrap(note, width or len(note))]
     return lines

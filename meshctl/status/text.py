@@ -1,6 +1,6 @@
-"""The status for people: totals, then what is wrong and what to do, worst first, then one table of all. Plain text.
+"""The status as text: totals, alarms with hints (most severe first), and one table of all devices.
 
-The same alarm at many devices is one line. The caller gives the width of the terminal and its colours.
+The same alarm on many devices is one line. The caller gives the terminal's width and colors.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from meshctl.errors import ExitCode
 from meshctl.report.terminal_escapes import one_line
-from meshctl.status.node_alarms import duration, some
+from meshctl.status.node_alarms import duration, join_limited
 from meshctl.status.preflight import Check, verdict
 from meshctl.status.rows import COMPUTER, row
 from meshctl.status.table import Paint, plain, table_lines
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus
 
-# More devices than this with the same alarm are told together.
-SINGLE_ALARMS = 3
-# After a table longer than this its verdict is told once more, for the first one has left the screen.
-ROWS_ON_A_SCREEN = 20
-# A text beside a lead is not squeezed into less.
-_LEAST_ROOM = 20
+# More devices than this with the same alarm share one line.
+MAX_SINGLE_ALARMS = 3
+# After a longer table the verdict is repeated, since the first one has scrolled off the screen.
+MAX_SCREEN_ROWS = 20
+# Minimum width of the text beside a label.
+_MIN_WIDTH = 20
 _VERDICTS = {
     ExitCode.OK: ("all well", "ok"),
     ExitCode.FINDINGS: ("DEGRADED", "degraded"),
@@ -38,14 +38,14 @@ def text(
     topics: bool = False,
     brief: bool = False,
 ) -> str:
-    """Everything, as lines no longer than `width` (None: as long as they are). `topics` adds one line per topic and
-    robot; `brief` leaves out notes and what to do."""
+    """All of it, wrapped at `width` (None: not wrapped). `topics` adds one line per topic and robot; `brief` leaves out
+    notes and hints."""
     devices = list(status)
     lines = [*summary_lines(status, width, paint, brief=brief), ""]
-    lines += table_lines([row(one) for one in devices], width, paint) or ["nobody to show"]
+    lines += table_lines([row(one) for one in devices], width, paint) or ["no device matches"]
     if topics:
         lines += ["", *topic_lines(status, width)]
-    if len(devices) > ROWS_ON_A_SCREEN:
+    if len(devices) > MAX_SCREEN_ROWS:
         lines += ["", verdict_line(status, paint)]
     return "\n".join(lines)
 
@@ -61,13 +61,13 @@ def summary_lines(
 
 
 def verdict_line(status: FleetStatus, paint: Paint = plain) -> str:
-    """`lab: DEGRADED: 1 error, 2 warnings (23:45:12 UTC, looked for 1.2 s)`."""
+    """`lab: DEGRADED: 1 error, 2 warnings (23:45:12 UTC, took 1.2 s)`."""
     word, style = _VERDICTS[status.exit_code]
     counts = {level: sum(alarm.level is level for _, alarm in _all_alarms(status)) for level in reversed(Level)}
-    told = [f"{count} {level.text}{'s' if count > 1 else ''}" for level, count in counts.items() if count]
+    parts = [f"{count} {level.text}{'s' if count > 1 else ''}" for level, count in counts.items() if count]
     when = time.strftime("%H:%M:%S UTC", time.gmtime(status.taken_s))
-    took = f", looked for {status.took_s:.1f} s" if status.took_s else ""
-    return f"{status.fleet}: {paint(word, style)}{': ' if told else ''}{', '.join(told)} ({when}{took})"
+    took = f", took {status.took_s:.1f} s" if status.took_s else ""
+    return f"{status.fleet}: {paint(word, style)}{': ' if parts else ''}{', '.join(parts)} ({when}{took})"
 
 
 def _totals(status: FleetStatus) -> Iterator[str]:
@@ -78,17 +78,17 @@ def _totals(status: FleetStatus) -> Iterator[str]:
     for what, devices in groups:
         if devices:
             counts = [(health, sum(one.health is health for one in devices)) for health in Health]
-            told = ", ".join(f"{count} {health.value}" for health, count in counts if count)
-            yield f"{len(devices)} {what}{'s' if len(devices) > 1 else ''}: {told}"
+            text = ", ".join(f"{count} {health.value}" for health, count in counts if count)
+            yield f"{len(devices)} {what}{'s' if len(devices) > 1 else ''}: {text}"
 
 
 def _all_alarms(status: FleetStatus) -> list[tuple[str, Alarm]]:
-    """(whose, alarm), the worst first; an empty name for the fleet itself."""
+    """(device, alarm), most severe first; the device is empty for alarms of the fleet."""
     found = [("", alarm) for alarm in status.alarms]
     if status.strangers:
         count = len(status.strangers)
-        told = f"{some(status.strangers)} {'are' if count > 1 else 'is'} in the mesh and in no inventory"
-        found.append(("", Alarm(Level.WARNING, "stranger", told, "whose is it? Write it down as `mac:` of its radio")))
+        text = f"{join_limited(status.strangers)} {'are' if count > 1 else 'is'} in the mesh but not in the inventory"
+        found.append(("", Alarm(Level.WARNING, "stranger", text, "if it is yours, add its `mac:` to the inventory")))
     for one in status:
         name = one.name if isinstance(one, NodeStatus) else f"{one.name} {COMPUTER}"
         found += [(name, alarm) for alarm in one.alarms]
@@ -103,10 +103,10 @@ def _alarm_lines(status: FleetStatus, width: int | None, paint: Paint, brief: bo
         if brief and level is Level.NOTE:
             continue
         lead = level.text.upper().ljust(7)
-        if len(members) > SINGLE_ALARMS:
-            names = some(tuple(name for name, _ in members))
-            told = f"{code} at {len(members)}: {names} (each: --alarm {code})"
-            yield from _wrapped(lead, told, width, paint, level.text)
+        if len(members) > MAX_SINGLE_ALARMS:
+            names = join_limited(tuple(name for name, _ in members))
+            text = f"{code} on {len(members)}: {names} (details: --alarm {code})"
+            yield from _wrapped(lead, text, width, paint, level.text)
             continue
         for name, alarm in members:
             yield from _wrapped(lead, f"{name}: {alarm.text}" if name else alarm.text, width, paint, level.text)
@@ -114,24 +114,24 @@ def _alarm_lines(status: FleetStatus, width: int | None, paint: Paint, brief: bo
                 yield from _wrapped("       ", f"-> {alarm.hint}", width, paint, "")
 
 
-def _wrapped(lead: str, told: str, width: int | None, paint: Paint, style: str) -> Iterator[str]:
-    """`lead` painted, then the text beside it, broken where the terminal ends."""
-    first, *others = _beside(f"{lead} ", told, width, "   " if told.startswith("-> ") else "")
+def _wrapped(lead: str, text: str, width: int | None, paint: Paint, style: str) -> Iterator[str]:
+    """`lead` in its style, then the text, wrapped."""
+    first, *others = _beside(f"{lead} ", text, width, "   " if text.startswith("-> ") else "")
     yield f"{paint(lead, style)}{first[len(lead) :]}"
     yield from others
 
 
-def _beside(lead: str, told: str, width: int | None, indent: str = "") -> list[str]:
-    """The text beside `lead`, in as many lines as it takes, later ones `indent`ed further."""
-    lead, told = one_line(lead), one_line(told)
-    room = None if width is None else max(width - len(lead), _LEAST_ROOM)
-    parts = [told] if room is None else textwrap.wrap(told, room, subsequent_indent=indent, break_on_hyphens=False)
+def _beside(lead: str, text: str, width: int | None, indent: str = "") -> list[str]:
+    """The text wrapped beside `lead`, with later lines `indent`ed further."""
+    lead, text = one_line(lead), one_line(text)
+    room = None if width is None else max(width - len(lead), _MIN_WIDTH)
+    parts = [text] if room is None else textwrap.wrap(text, room, subsequent_indent=indent, break_on_hyphens=False)
     first, *others = parts or [""]
     return [f"{lead}{first}", *(f"{' ' * len(lead)}{part}" for part in others)]
 
 
 def topic_lines(status: FleetStatus, width: int | None = None) -> list[str]:
-    """Per topic and robot: when it last sent and received, and what is wrong, which may take several lines."""
+    """One row per topic and robot: when it was last sent and received, and what is wrong."""
     rows = [("topic", "priority", COMPUTER, "sent", "received", "")]
     for robot in status.robots:
         for topic in robot.topics:
@@ -142,7 +142,7 @@ def topic_lines(status: FleetStatus, width: int | None = None) -> list[str]:
                     robot.name,
                     _ago(topic.sent_ago_s),
                     _ago(topic.received_ago_s),
-                    topic.trouble,
+                    topic.problem,
                 )
             )
     rows = [rows[0], *sorted(rows[1:], key=lambda cells: (cells[1] == "-", cells[1].rjust(3), cells[0]))]
@@ -159,7 +159,7 @@ def _ago(age_s: float | None) -> str:
 
 
 def preflight_text(checks: Iterable[Check], width: int | None = None, paint: Paint = plain) -> str:
-    """One line per check (`go`, `NO-GO`, `?` for what was not checked), and in the end the verdict."""
+    """One line per check (`go`, `NO-GO`, `?` for not checked), then the verdict."""
     listed: Sequence[Check] = tuple(checks)
     room = max((len(check.name) for check in listed), default=0)
     lines = []
@@ -177,7 +177,7 @@ def preflight_text(checks: Iterable[Check], width: int | None = None, paint: Pai
 
 
 def _mark(check: Check) -> tuple[str, str]:
-    """The word before a check, and its style."""
+    """The label of a check, and its style."""
     if not check.is_go:
         return "NO-GO", "error"
     return ("go   ", "ok") if check.is_checked else ("?    ", "warning")

@@ -1,8 +1,8 @@
-"""Each topic at each robot: the inventory's rate and deadline, and when its daemon last sent and received.
+"""Assess each topic at each robot: the inventory's rate and deadline against the last message sent and received.
 
-A topic is expected where the inventory gives it a rate. It is silent at a source that sends nothing for longer than
-that allows, and does not arrive where a source that is heard sends and nothing comes. Nothing is said of receivers
-while nobody sends: their silence follows from the sources'.
+Only topics with a rate are assessed. A topic is silent at a source that sends nothing for longer than its limit, and
+not arriving at a receiver that hears a sending source but gets nothing. Receivers are not assessed while no source
+sends.
 """
 
 from __future__ import annotations
@@ -14,35 +14,35 @@ from meshctl.robots.facts import RobotFacts, TopicFacts
 from meshctl.status.node_alarms import duration
 from meshctl.status.values import TopicStatus
 
-# A topic misses this many of its periods before it counts as silent: one lost message is no alarm.
+# Missed periods before a topic counts as silent: a single lost message is no alarm.
 SILENT_PERIODS = 5
-# Robots are asked one after the other, and each daemon is some seconds older than the other when we compare them.
-LEAST_LIMIT_S = 10.0
+# Robots answer some seconds apart.
+MIN_LIMIT_S = 10.0
 
 
 def is_urgent(topic: Topic) -> bool:
-    """What must get through before everything else."""
+    """Whether the topic is an emergency stop or a command."""
     return topic.topic_class in (TopicClass.EMERGENCY_STOP, TopicClass.COMMAND)
 
 
 def urgent_priorities(fleet: Fleet) -> frozenset[int]:
-    """The levels of emergency stops and commands; level 0 where the inventory names neither."""
+    """The priorities of emergency stops and commands; 0 if the inventory has neither."""
     return frozenset(topic.priority for topic in fleet.topics if is_urgent(topic)) or frozenset((0,))
 
 
 def limit_s(topic: Topic) -> float | None:
-    """The longest silence that its rate and deadline allow; None for a topic that comes when it comes."""
+    """The longest gap that its rate and deadline allow; None for a topic without a rate."""
     if topic.rate_hz <= 0:
         return None
-    return max(SILENT_PERIODS / topic.rate_hz, topic.deadline_s or 0.0, LEAST_LIMIT_S)
+    return max(SILENT_PERIODS / topic.rate_hz, topic.deadline_s or 0.0, MIN_LIMIT_S)
 
 
-def topic_statuses(fleet: Fleet, told: Mapping[str, RobotFacts], robot: str) -> tuple[TopicStatus, ...]:
-    """The inventory's topics at this robot, most urgent first, then those that only its daemon knows."""
-    facts = told[robot]
+def topic_statuses(fleet: Fleet, robots: Mapping[str, RobotFacts], robot: str) -> tuple[TopicStatus, ...]:
+    """The inventory's topics at this robot by priority, then those that only its daemon knows."""
+    facts = robots[robot]
     here = {topic.name: topic for topic in facts.topics}
     wanted = sorted(fleet.topics, key=lambda topic: (topic.priority, topic.name))
-    known = [_status(topic, here.get(topic.name), told, facts) for topic in wanted]
+    known = [_status(topic, here.get(topic.name), robots, facts) for topic in wanted]
     names = {topic.name for topic in wanted}
     others = [
         TopicStatus(one.name, one.priority, one.sent_ago_s, one.received_ago_s)
@@ -52,48 +52,48 @@ def topic_statuses(fleet: Fleet, told: Mapping[str, RobotFacts], robot: str) -> 
     return (*known, *others)
 
 
-def _status(topic: Topic, here: TopicFacts | None, told: Mapping[str, RobotFacts], facts: RobotFacts) -> TopicStatus:
+def _status(topic: Topic, here: TopicFacts | None, robots: Mapping[str, RobotFacts], facts: RobotFacts) -> TopicStatus:
     limit = limit_s(topic)
     if here is None or here.priority is None:
         return TopicStatus(topic.name, topic.priority, None, None, limit, "is not declared", "undeclared")
     status = TopicStatus(topic.name, here.priority, here.sent_ago_s, here.received_ago_s, limit)
-    for code, trouble in _troubles(topic, here, told, facts, limit):
+    for code, trouble in _problems(topic, here, robots, facts, limit):
         return TopicStatus(topic.name, here.priority, here.sent_ago_s, here.received_ago_s, limit, trouble, code)
     return status
 
 
-def _troubles(
-    topic: Topic, here: TopicFacts, told: Mapping[str, RobotFacts], facts: RobotFacts, limit: float | None
+def _problems(
+    topic: Topic, here: TopicFacts, robots: Mapping[str, RobotFacts], facts: RobotFacts, limit: float | None
 ) -> Iterator[tuple[str, str]]:
     if here.priority != topic.priority:
-        yield "undeclared", f"has priority {here.priority}, the inventory says {topic.priority}"
+        yield "undeclared", f"expected priority {topic.priority}, found {here.priority}"
     if limit is None or (facts.daemon_uptime_s or 0.0) <= limit:
         return
     if _sends(topic, facts.robot):
-        silent = _silence(here.sent_ago_s, here.sent_messages, limit)
+        silent = _silence_text(here.sent_ago_s, here.sent_messages, limit)
         if silent:
-            yield "silent", f"has sent nothing {silent}"
-    live = [name for name in _live_sources(topic, told, facts, limit) if name != facts.robot]
-    silent = _silence(here.received_ago_s, here.received_messages, limit)
+            yield "silent", f"nothing sent {silent}"
+    live = [name for name in _live_sources(topic, robots, facts, limit) if name != facts.robot]
+    silent = _silence_text(here.received_ago_s, here.received_messages, limit)
     if live and silent and ("all" in topic.destinations or facts.robot in topic.destinations):
-        yield "not-arriving", f"nothing has arrived {silent}, though {', '.join(live)} sends"
+        yield "not-arriving", f"nothing received {silent}, although {', '.join(live)} sends"
 
 
 def _sends(topic: Topic, robot: str) -> bool:
     return not topic.sources or robot in topic.sources
 
 
-def _silence(ago_s: float | None, messages: int, limit: float) -> str:
-    """How long nothing came, where that is too long; a daemon that counts and tells no ages is believed."""
+def _silence_text(ago_s: float | None, messages: int, limit: float) -> str:
+    """How long there was no message, if too long; empty for a daemon that reports counts but no ages."""
     if ago_s is None:
         return "" if messages else "yet"
     return f"for {duration(ago_s)}" if ago_s > limit else ""
 
 
-def _live_sources(topic: Topic, told: Mapping[str, RobotFacts], facts: RobotFacts, limit: float) -> Iterable[str]:
-    """The robots that this one hears and that send the topic now."""
+def _live_sources(topic: Topic, robots: Mapping[str, RobotFacts], facts: RobotFacts, limit: float) -> Iterable[str]:
+    """The robots heard by this one that currently send the topic."""
     for name in facts.online:
-        other = told.get(name)
+        other = robots.get(name)
         if other is None or not _sends(topic, name):
             continue
         ages = [one.sent_ago_s for one in other.topics if one.name == topic.name and one.sent_ago_s is not None]

@@ -1,6 +1,6 @@
-"""The mesh as its nodes see it, for people and for other programs: table, tree, JSON, NetJSON NetworkGraph, DOT.
+"""The mesh topology as table, tree, JSON, NetJSON NetworkGraph or DOT.
 
-Every link carries its quality both ways and how old the reports are; cut vertices are marked.
+Links have the quality in both directions and the age of the reports; cut vertices are marked.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from meshctl.topology.cells import LinkCell
 
 @dataclass(frozen=True, slots=True)
 class Direction:
-    """What one end tells of a link; None everywhere when that end did not answer."""
+    """What one end reports of a link; all None if it did not answer."""
 
     quality: float | None = None
     signal_dbm: int | None = None
@@ -25,9 +25,9 @@ class Direction:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """`directions[a, b]` is what `a` tells of hearing `b`, `cells[a, b]` in which cells. `age_s` is how old a node's
-    report is."""
+class TopologyView:
+    """`directions[a, b]` is what `a` reports of hearing `b`, `cells[a, b]` in which cells; `ages_s` are the ages of the
+    nodes' reports."""
 
     mesh: str
     entry: str
@@ -39,11 +39,11 @@ class Picture:
     cells: Mapping[tuple[str, str], tuple[LinkCell, ...]] = field(default_factory=dict)
 
     def age_s(self, name: str) -> float | None:
-        """For programs: to the millisecond."""
+        """The age of a node's report, rounded to milliseconds."""
         return round(self.ages_s[name], 3) if name in self.ages_s else None
 
     def cells_of(self, a: str, b: str) -> tuple[LinkCell, ...]:
-        """The cells of a link, by what either end tells."""
+        """The cells of a link, as reported by either end."""
         return tuple(dict.fromkeys((*self.cells.get((a, b), ()), *self.cells.get((b, a), ()))))
 
     def has_several_cells(self) -> bool:
@@ -54,7 +54,7 @@ class Picture:
 
 
 def directions(reports: Mapping[str, Report], macs: Mapping[str, str]) -> dict[tuple[str, str], Direction]:
-    """What every reporting node tells of each neighbour heard lately."""
+    """What each reporting node reports of the neighbors it heard recently."""
     return {
         (name, other): Direction(heard.quality, heard.signal_dbm, heard.last_seen_ms)
         for name, report in reports.items()
@@ -66,45 +66,45 @@ def _share(value: float | None) -> str:
     return "-" if value is None else f"{value:.0%}"
 
 
-def table(picture: Picture) -> str:
-    """One line per link, the weakest first."""
+def table(view: TopologyView) -> str:
+    """One line per link, weakest first."""
     lines = [("link", "there", "back", "signal", "heard", "cell")]
-    for link in sorted(picture.graph.links, key=lambda link: (link.quality, link.a, link.b)):
-        there, back = picture.direction(link.a, link.b), picture.direction(link.b, link.a)
+    for link in sorted(view.graph.links, key=lambda link: (link.quality, link.a, link.b)):
+        there, back = view.direction(link.a, link.b), view.direction(link.b, link.a)
         signals = "/".join("-" if d.signal_dbm is None else str(d.signal_dbm) for d in (there, back))
         ages = [d.age_ms for d in (there, back) if d.age_ms is not None]
         lines.append(
             (f"{link.a} -- {link.b}", _share(there.quality), _share(back.quality), signals,
              f"{max(ages)} ms ago" if ages else "-",
-             "wired" if link.wired else ", ".join(map(str, picture.cells_of(link.a, link.b))))
+             "wired" if link.wired else ", ".join(map(str, view.cells_of(link.a, link.b))))
         )  # fmt: skip
     widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
     links = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in lines]
-    cuts = picture.graph.cut_off_by(picture.entry)
-    told = [f"cut vertex: {name} (holds {', '.join(lost)})" for name, lost in cuts.items()]
-    return "\n".join([*links, *told])
+    cuts = view.graph.cut_off_by(view.entry)
+    notes = [f"cut vertex: {name} (connects {', '.join(lost)})" for name, lost in cuts.items()]
+    return "\n".join([*links, *notes])
 
 
-def tree(picture: Picture) -> str:
-    """Every node below the next one on its best path to the entry; cut vertices carry a star."""
-    paths = picture.graph.paths(picture.entry)
+def tree(view: TopologyView) -> str:
+    """Each node below its next hop to the entry; cut vertices are marked with a star."""
+    paths = view.graph.paths(view.entry)
     children: dict[str, list[str]] = {}
     for name, path in sorted(paths.items()):
-        if name != picture.entry:
+        if name != view.entry:
             children.setdefault(path.via, []).append(name)
-    cuts = picture.graph.cut_vertices(picture.entry)
+    cuts = view.graph.cut_vertices(view.entry)
     lines: list[str] = []
 
     def label(name: str) -> str:
         star = " *" if name in cuts else ""
         path = paths[name]
-        told = "" if name == picture.entry else f"  {path.hops} hop{'s' if path.hops > 1 else ''}, {path.quality:.0%}"
-        age = f", {duration(picture.ages_s[name])} old" if name in picture.ages_s else ", does not answer"
-        if name != picture.entry and picture.has_several_cells():
-            told += "".join(f", {cell}" for cell in picture.cells_of(name, path.via))
-        return f"{name}{star}{told}{age if name != picture.entry else ''}"
+        text = "" if name == view.entry else f"  {path.hops} hop{'s' if path.hops > 1 else ''}, {path.quality:.0%}"
+        age = f", {duration(view.ages_s[name])} old" if name in view.ages_s else ", does not answer"
+        if name != view.entry and view.has_several_cells():
+            text += "".join(f", {cell}" for cell in view.cells_of(name, path.via))
+        return f"{name}{star}{text}{age if name != view.entry else ''}"
 
-    waiting = [(picture.entry, "", "")] if picture.entry in paths else []
+    waiting = [(view.entry, "", "")] if view.entry in paths else []
     while waiting:
         name, lead, below = waiting.pop()
         lines.append(f"{lead}{label(name)}")
@@ -112,39 +112,39 @@ def tree(picture: Picture) -> str:
         for index in range(len(inner) - 1, -1, -1):
             last = index == len(inner) - 1
             waiting.append((inner[index], below + ("`- " if last else "|- "), below + ("   " if last else "|  ")))
-    apart = [name for name in picture.graph.nodes if name not in paths]
-    lines += [f"no path to {picture.entry or 'the base'}: {', '.join(apart)}"] if apart else []
-    lines += ["* without it others would be cut off"] if cuts else []
+    apart = [name for name in view.graph.nodes if name not in paths]
+    lines += [f"no path to {view.entry or 'the base'}: {', '.join(apart)}"] if apart else []
+    lines += ["* cut vertex: others reach the base only through it"] if cuts else []
     return "\n".join(lines)
 
 
-def as_json(picture: Picture) -> str:
-    """Nodes and links with both directions."""
-    paths = picture.graph.paths(picture.entry)
-    cuts = picture.graph.cut_off_by(picture.entry)
+def as_json(view: TopologyView) -> str:
+    """Nodes, and links with both directions."""
+    paths = view.graph.paths(view.entry)
+    cuts = view.graph.cut_off_by(view.entry)
     nodes: list[dict[str, Any]] = [
         {
-            "name": name, "address": picture.addresses.get(name), "age_s": picture.age_s(name),
+            "name": name, "address": view.addresses.get(name), "age_s": view.age_s(name),
             "hops": paths[name].hops if name in paths else None,
             "quality": round(paths[name].quality, 4) if name in paths else None,
-            "via": paths[name].via if name in paths and name != picture.entry else None,
+            "via": paths[name].via if name in paths and name != view.entry else None,
             "cuts_off": list(cuts.get(name, ())),
         }
-        for name in picture.graph.nodes
+        for name in view.graph.nodes
     ]  # fmt: skip
     links = [
         {
             "a": link.a, "b": link.b, "quality": round(link.quality, 4), "wired": link.wired,
             "cells": [
                 {"mesh": cell.mesh, "band": cell.band.value, "channel": cell.channel}
-                for cell in picture.cells_of(link.a, link.b)
+                for cell in view.cells_of(link.a, link.b)
             ],
-            "a_hears_b": _direction_json(picture.direction(link.a, link.b)),
-            "b_hears_a": _direction_json(picture.direction(link.b, link.a)),
+            "a_hears_b": _direction_json(view.direction(link.a, link.b)),
+            "b_hears_a": _direction_json(view.direction(link.b, link.a)),
         }
-        for link in picture.graph.links
+        for link in view.graph.links
     ]  # fmt: skip
-    return json.dumps({"mesh": picture.mesh, "entry": picture.entry, "nodes": nodes, "links": links}, indent=2)
+    return json.dumps({"mesh": view.mesh, "entry": view.entry, "nodes": nodes, "links": links}, indent=2)
 
 
 def _direction_json(direction: Direction) -> dict[str, Any]:
@@ -152,45 +152,45 @@ def _direction_json(direction: Direction) -> dict[str, Any]:
     return {"quality": quality, "signal_dbm": direction.signal_dbm, "age_ms": direction.age_ms}
 
 
-def netjson(picture: Picture) -> str:
-    """NetJSON NetworkGraph (netjson.org, draft 00): `cost` is 1 / quality, as expected transmissions are."""
+def netjson(view: TopologyView) -> str:
+    """NetJSON NetworkGraph (netjson.org, draft 00): `cost` is 1 / quality, the expected transmissions."""
     return json.dumps(
         {
             "type": "NetworkGraph",
-            "protocol": picture.routing,
+            "protocol": view.routing,
             "version": None,
             "metric": "ETX",
-            "label": picture.mesh,
+            "label": view.mesh,
             "nodes": [
                 {
-                    "id": picture.addresses.get(name, name),
+                    "id": view.addresses.get(name, name),
                     "label": name,
-                    "properties": {"age_s": picture.age_s(name)},
+                    "properties": {"age_s": view.age_s(name)},
                 }
-                for name in picture.graph.nodes
+                for name in view.graph.nodes
             ],
             "links": [
                 {
-                    "source": picture.addresses.get(link.a, link.a),
-                    "target": picture.addresses.get(link.b, link.b),
+                    "source": view.addresses.get(link.a, link.a),
+                    "target": view.addresses.get(link.b, link.b),
                     "cost": round(1.0 / max(link.quality, 1e-3), 4),
                     "properties": {"wired": link.wired},
                 }
-                for link in picture.graph.links
+                for link in view.graph.links
             ],
         },
         indent=2,
     )
 
 
-def dot(picture: Picture) -> str:
+def dot(view: TopologyView) -> str:
     """Graphviz: cut vertices as boxes, quality as label and thickness."""
-    cuts = picture.graph.cut_vertices(picture.entry)
-    lines = [f"graph {json.dumps(picture.mesh)} {{"]
-    for name in picture.graph.nodes:
-        shape = "doublecircle" if name == picture.entry else "box" if name in cuts else "ellipse"
+    cuts = view.graph.cut_vertices(view.entry)
+    lines = [f"graph {json.dumps(view.mesh)} {{"]
+    for name in view.graph.nodes:
+        shape = "doublecircle" if name == view.entry else "box" if name in cuts else "ellipse"
         lines.append(f"  {json.dumps(name)} [shape={shape}];")
-    for link in picture.graph.links:
+    for link in view.graph.links:
         style = (
             ' style="dashed"' if link.wired else f' label="{link.quality:.0%}" penwidth="{1 + 3 * link.quality:.1f}"'
         )
@@ -198,7 +198,7 @@ def dot(picture: Picture) -> str:
     return "\n".join([*lines, "}"])
 
 
-FORMATS: dict[str, Callable[[Picture], str]] = {
+FORMATS: dict[str, Callable[[TopologyView], str]] = {
     "table": table,
     "tree": tree,
     "json": as_json,

@@ -1,4 +1,4 @@
-"""What is known of each radio, of each robot and of the fleet: values for tables, scripts and the go/no-go."""
+"""The status of radios, robots and the fleet: values for tables, JSON and the go/no-go checks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from meshctl.topology import Sighting
 
 
 class Level(IntEnum):
-    """How much an alarm matters: NOTE informs, WARNING degrades what it is about, ERROR makes it unfit for the run."""
+    """Severity of an alarm: NOTE informs, WARNING degrades the device, ERROR makes it unfit for the mission."""
 
     NOTE = 0
     WARNING = 1
@@ -25,7 +25,7 @@ class Level(IntEnum):
 
 
 class Health(Enum):
-    """One word per device. OFF: silent, and expected to be (carried, spare). UNREACHABLE: silent, and missed."""
+    """State of a device. OFF: no answer and none required (carried, spare). UNREACHABLE: required, but no answer."""
 
     OK = "ok"
     DEGRADED = "degraded"
@@ -39,7 +39,7 @@ class Health(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """`code` is stable, for filters; `text` one sentence for a person, `hint` what to do about it."""
+    """`code` is stable, for filters; `text` says what is wrong, `hint` what to do."""
 
     level: Level
     code: str
@@ -48,14 +48,14 @@ class Alarm:
 
 
 def health_of(alarms: Iterable[Alarm]) -> Health:
-    """Of somebody who answers."""
+    """The health of a device that answers."""
     return Health.DEGRADED if any(alarm.level > Level.NOTE for alarm in alarms) else Health.OK
 
 
 @dataclass(frozen=True, slots=True)
-class Silence:
-    """Why somebody gave no answer. `code`: `unreachable` for silence, else what kept us out of a device that is there
-    (`host-key`, `untrusted`, `login`, `failed`)."""
+class NoAnswer:
+    """Why a device gave no answer. `code` is `unreachable`, or why a device that is on could not be queried:
+    `host-key`, `untrusted`, `login` or `failed`."""
 
     reason: str
     code: str = "unreachable"
@@ -63,8 +63,8 @@ class Silence:
 
 
 @dataclass(frozen=True, slots=True)
-class Neighbour:
-    """A node heard directly. `quality` 0..1, None where nothing measures it."""
+class Neighbor:
+    """A node heard directly. `quality` 0..1, None if not measured."""
 
     name: str
     age_ms: int
@@ -74,38 +74,38 @@ class Neighbour:
 
 @dataclass(frozen=True, slots=True)
 class NodeStatus:
-    """What is known of one radio. Facts are None where the node did not tell; `age_s` is how old they are, for a node
-    that does not answer the age of what was last known (None: nothing ever was)."""
+    """The status of one radio. Unknown facts are None; `age_s` is the age of the facts, or of the last known facts if
+    the node does not answer (None: never seen)."""
 
     node: Node
     health: Health
     alarms: tuple[Alarm, ...]
     age_s: float | None
-    silent_because: str = ""
+    no_answer_reason: str = ""
     version: str = ""
     revision: str = ""
     drift: tuple[str, ...] | None = None
     uptime_s: float | None = None
     load: float | None = None
-    """Processes that want to run, per processor, over the last minute."""
+    """Load average over one minute, per processor."""
     memory_free: float | None = None
-    """Share of memory available, 0..1."""
+    """Share of available memory, 0..1."""
     flash_free_bytes: int | None = None
     clock_offset_s: float | None = None
     channels: tuple[int, ...] = ()
     tx_power_dbm: float | None = None
     lan_ports: tuple[str, ...] | None = None
-    """What its LAN bridge joins now."""
-    neighbours: tuple[Neighbour, ...] = ()
+    """Ports of its LAN bridge."""
+    neighbors: tuple[Neighbor, ...] = ()
     is_path_known: bool = True
-    """Whether enough was asked to tell its path; then no `hops` means that there is none."""
+    """Whether enough nodes were queried to know its path; then `hops` None means that there is none."""
     hops: int | None = None
     quality: float | None = None
-    """Of the whole path to the base, 0..1."""
+    """Quality of the whole path to the base, 0..1."""
     via: str = ""
     is_cut_vertex: bool = False
     relays: tuple[str, ...] = ()
-    """Nodes whose path to the base leads through it."""
+    """Nodes whose path to the base uses it."""
     heard_by: tuple[Sighting, ...] = ()
     last_known: Mapping[str, str] | None = None
 
@@ -120,7 +120,7 @@ class NodeStatus:
 
 @dataclass(frozen=True, slots=True)
 class TopicStatus:
-    """One topic at one robot. `limit_s` is the silence that its rate and deadline allow (None: none is too long);
+    """One topic at one robot. `limit_s` is the longest gap that its rate and deadline allow (None: unlimited);
     `trouble` says what is wrong, `code` in one word (`undeclared`, `silent`, `not-arriving`), both empty when nothing
     is."""
 
@@ -129,13 +129,13 @@ class TopicStatus:
     sent_ago_s: float | None
     received_ago_s: float | None
     limit_s: float | None = None
-    trouble: str = ""
+    problem: str = ""
     code: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """What is known of one robot's computer and its udp_mesh daemon; `facts` None where it gave no answer.
+    """The status of one robot's computer and its udp_mesh daemon; `facts` is None if it did not answer.
 
     `state` is that of its radios: DEPLOYED when one of them is, None for a robot without any. `heard_by` are the robots
     whose daemons hear this one's. `base_round_trip_s` is its daemon's to the base's.
@@ -146,13 +146,13 @@ class RobotStatus:
     health: Health
     alarms: tuple[Alarm, ...]
     age_s: float | None
-    silent_because: str = ""
+    no_answer_reason: str = ""
     facts: RobotFacts | None = None
     topics: tuple[TopicStatus, ...] = ()
     is_compared: bool = True
-    """Whether its configuration could be held against the inventory."""
+    """Whether its configuration could be compared with the inventory."""
     urgent_bytes: int = 0
-    """What waits on the priorities of emergency stops and commands."""
+    """Queued bytes at the priorities of emergency stops and commands."""
     base_round_trip_s: float | None = None
     heard_by: tuple[Sighting, ...] = ()
     last_known: Mapping[str, str] | None = None
@@ -164,7 +164,7 @@ class RobotStatus:
 
 @dataclass(frozen=True, slots=True)
 class FleetStatus:
-    """Every managed radio and every robot with a computer, at `taken_s` (Unix time), from a look of `took_s`.
+    """Every managed radio and every robot with a computer, at `taken_s` (Unix time), collected in `took_s` seconds.
 
     `strangers` are MACs heard in the mesh that belong to no node of the inventory; `alarms` concern the whole fleet.
     """
@@ -190,12 +190,12 @@ class FleetStatus:
         yield from by_name.values()
 
     def count(self, health: Health) -> int:
-        """Of radios and robots together."""
+        """The number of radios and robots with this health."""
         return sum(one.health is health for one in self)
 
     @property
     def exit_code(self) -> ExitCode:
-        """All well 0, something degraded 1, somebody who must answer does not 3."""
+        """0 healthy, 1 degraded, 3 a required device is unreachable."""
         if self.count(Health.UNREACHABLE):
             return ExitCode.UNREACHABLE
         is_fleet_degraded = any(alarm.level > Level.NOTE for alarm in self.alarms)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from meshctl.cli.options import AsJson, LabDirectory, lab_directory
+from meshctl.cli.context import AsJson, LabDirectory, lab_directory
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshlab import placement, propagation_file, scenario_file

@@ -2,7 +2,7 @@
 
     facts                     prints the daemon's status and topics, as sections that a line `== NAME` begins
     online                    prints the peers that are online
-    before                    prints, as one line of JSON, what has to be so again after a switch: `Before`
+    before                    prints, as one line of JSON, what must hold again after a switch: `Baseline`
     prove WAIT_S BEFORE UNIT... prints nothing as soon as all is well, or after WAIT_S what is not
 
 The scripts beside this file call it; `look` and `ask` are all its I/O, `flowing` and `ill` decide.
@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 
 SOCKET = "/run/udp-mesh/udp-mesh.sock"
 CURRENT = Path("/opt/udp-mesh/current")
-ASK_TIMEOUT_S = 10.0
-LOOK_EVERY_S = 0.25
+QUERY_TIMEOUT_S = 10.0
+POLL_INTERVAL_S = 0.25
 # A daemon that dies at start is back within RestartSec=1 for another try: a process must have lived for longer.
 STEADY_S = 2.0
 # The bridge reads all of ROS before it can fail; a topic that it asks the daemon for shows sooner that it got through.
@@ -30,12 +30,12 @@ BRIDGE_STEADY_S = 8.0
 BRIDGE_TOPIC = "bridge/ros1"
 # Topics are called flowing when so many messages came within so long, so that a single message is no promise of more.
 FLOW_WATCH_S = 1.0
-FLOW_MESSAGES = 2
+MIN_FLOW_MESSAGES = 2
 
 Json = dict[str, Any]
 
 
-class Before(NamedTuple):
+class Baseline(NamedTuple):
     """What was so while the release before ran: peers that were online, messages received by topic that flowed, and
     which process it was (a reload keeps it, and its counts go on)."""
 
@@ -44,7 +44,7 @@ class Before(NamedTuple):
     boot: str
 
 
-class Unit(NamedTuple):
+class ServiceState(NamedTuple):
     """A service as `systemctl show` tells it; `started_s` is on the monotonic clock."""
 
     name: str
@@ -60,13 +60,13 @@ class Unit(NamedTuple):
         return f"{self.active or 'not there'} ({self.sub}{result}{again})"
 
 
-class Look(NamedTuple):
+class HealthSnapshot(NamedTuple):
     """One look: the units, and what the daemon answered, or why it did not."""
 
-    units: list[Unit]
+    units: list[ServiceState]
     status: Json
     topics: list[Json]
-    silent_because: str = ""
+    no_answer_reason: str = ""
 
     @property
     def online(self) -> list[str]:
@@ -78,51 +78,51 @@ def flowing(first: list[Json], then: list[Json]) -> dict[str, int]:
     """Topics that received at least FLOW_MESSAGES between two looks, with their counts at the second."""
     counts = {topic["name"]: int(topic["received_messages"]) for topic in first}
     later = {topic["name"]: int(topic["received_messages"]) for topic in then}
-    return {name: count for name, count in later.items() if count - counts.get(name, 0) >= FLOW_MESSAGES}
+    return {name: count for name, count in later.items() if count - counts.get(name, 0) >= MIN_FLOW_MESSAGES}
 
 
-def ill(look: Look, wanted: list[str], before: Before, now_s: float) -> str:
+def problems(snapshot: HealthSnapshot, wanted: list[str], baseline: Baseline, now_s: float) -> str:
     """Why the robot is not well yet, in one line; empty when it is. `wanted` are the topics it shall have."""
-    for unit in look.units:
+    for unit in snapshot.units:
         if unit.active != "active":
             return f"{_called(unit)} does not run: systemd says {unit}"
-    if look.silent_because:
-        return f"the daemon does not answer: {look.silent_because}"
-    here = {topic["name"]: topic for topic in look.topics}
+    if snapshot.no_answer_reason:
+        return f"the daemon does not answer: {snapshot.no_answer_reason}"
+    here = {topic["name"]: topic for topic in snapshot.topics}
     lacking = [name for name in wanted if not here.get(name, {}).get("configured")]
     if lacking:
         return f"topics are not there: {', '.join(lacking)}"
-    away = [peer for peer in before.online if peer not in look.online]
+    away = [peer for peer in baseline.online if peer not in snapshot.online]
     if away:
         return f"peers were online before and are not seen: {', '.join(away)}"
-    same = look.status.get("boot") == before.boot
+    same = snapshot.status.get("boot") == baseline.boot
     dry = [
         name
-        for name, count in before.flowing.items()
+        for name, count in baseline.flowing.items()
         if name in here and int(here[name]["received_messages"]) <= (count if same else 0)
     ]
     if dry:
         return f"topics flowed before and receive nothing: {', '.join(dry)}"
     young = [
         unit
-        for unit in look.units
+        for unit in snapshot.units
         if now_s - unit.started_s < (BRIDGE_STEADY_S if _is_bridge(unit) and BRIDGE_TOPIC not in here else STEADY_S)
     ]
     return f"{_called(young[0])} has only just started" if young else ""
 
 
-def _is_bridge(unit: Unit) -> bool:
+def _is_bridge(unit: ServiceState) -> bool:
     return "ros" in unit.name
 
 
-def _called(unit: Unit) -> str:
+def _called(unit: ServiceState) -> str:
     return "the ROS bridge" if _is_bridge(unit) else "the daemon"
 
 
-def ask(*operations: str) -> list[Json]:
+def query(*operations: str) -> list[Json]:
     """The daemon's replies. Raises OSError, and ValueError for what is no reply (docs/local-api.md)."""
     with socket.socket(socket.AF_UNIX) as server:
-        server.settimeout(ASK_TIMEOUT_S)
+        server.settimeout(QUERY_TIMEOUT_S)
         server.connect(SOCKET)
         with server.makefile("rwb") as stream:
             replies = []
@@ -142,59 +142,59 @@ def ask(*operations: str) -> list[Json]:
             return replies
 
 
-def look(units: list[str]) -> Look:
+def take_snapshot(units: list[str]) -> HealthSnapshot:
     seen = [_unit(unit) for unit in units]
     try:
-        status, topics = ask("status", "topics")
+        status, topics = query("status", "topics")
     except (OSError, ValueError) as error:
-        return Look(seen, {}, [], str(error) or type(error).__name__)
-    return Look(seen, status, list(topics.get("topics", ())))
+        return HealthSnapshot(seen, {}, [], str(error) or type(error).__name__)
+    return HealthSnapshot(seen, status, list(topics.get("topics", ())))
 
 
-def _unit(name: str) -> Unit:
+def _unit(name: str) -> ServiceState:
     asked = "ActiveState,SubState,Result,NRestarts,ExecMainStartTimestampMonotonic"
     shown = subprocess.run(["systemctl", "show", "-p", asked, name], capture_output=True, text=True, check=False)
     told = dict(line.partition("=")[::2] for line in shown.stdout.splitlines())
     active, sub, result, restarts, started_us = (told.get(key, "") for key in asked.split(","))
     started_s = int(started_us) / 1e6 if started_us.isdecimal() else 0.0
-    return Unit(name, active, sub, result, restarts, started_s)
+    return ServiceState(name, active, sub, result, restarts, started_s)
 
 
-def before() -> Before:
+def baseline() -> Baseline:
     """Waits for FLOW_WATCH_S, but only where something may be flowing."""
-    first = look([])
+    first = take_snapshot([])
     recent = [
         topic for topic in first.topics if (age := topic.get("received_ago_s")) is not None and age < FLOW_WATCH_S
     ]
     flows: dict[str, int] = {}
     if recent:
         time.sleep(FLOW_WATCH_S)
-        flows = flowing(first.topics, look([]).topics)
-    return Before(first.online, flows, str(first.status.get("boot", "")))
+        flows = flowing(first.topics, take_snapshot([]).topics)
+    return Baseline(first.online, flows, str(first.status.get("boot", "")))
 
 
-def prove(wait_s: float, was: Before, units: list[str]) -> str:
+def wait_healthy(wait_s: float, was: Baseline, units: list[str]) -> str:
     """Looks until all is well; after `wait_s` tells what is not."""
     wanted = (CURRENT / "topics").read_text(encoding="utf-8").splitlines()
     deadline = time.monotonic() + wait_s
     while True:
-        reason = ill(look(units), wanted, was, time.monotonic())
+        reason = problems(take_snapshot(units), wanted, was, time.monotonic())
         if not reason or time.monotonic() >= deadline:
             return reason
-        time.sleep(LOOK_EVERY_S)
+        time.sleep(POLL_INTERVAL_S)
 
 
 def main(words: list[str]) -> None:
     if words[0] == "facts":
-        seen = look([])
+        seen = take_snapshot([])
         sys.stdout.write(f"== status\n{json.dumps(seen.status)}\n== topics\n{json.dumps({'topics': seen.topics})}\n")
     elif words[0] == "online":
-        sys.stdout.write(" ".join(look([]).online))
+        sys.stdout.write(" ".join(take_snapshot([]).online))
     elif words[0] == "before":
-        sys.stdout.write(f"{json.dumps(before())}\n")
+        sys.stdout.write(f"{json.dumps(baseline())}\n")
     else:
         _, wait_s, was, *units = words
-        sys.stdout.write(prove(float(wait_s), Before(*json.loads(was)), units))
+        sys.stdout.write(wait_healthy(float(wait_s), Baseline(*json.loads(was)), units))
 
 
 if __name__ == "__main__":

@@ -62,7 +62,7 @@ def test_what_is_marked_already_is_said_and_left(inventory: Path) -> None:
     _run(inventory, "husky1-b1")
     text = (inventory / "fleet.yaml").read_text()
     result = _run(inventory, "husky1-b1")
-    assert (result.exit_code, result.output) == (0, "husky1-b1: deployed already\n")
+    assert (result.exit_code, result.output) == (0, "husky1-b1: already deployed\n")
     assert (inventory / "fleet.yaml").read_text() == text
 
 
@@ -83,7 +83,7 @@ def test_a_dry_run_shows_the_edit_and_writes_nothing(inventory: Path) -> None:
     ("words", "message"),
     [
         (("husky1-b9",), "no beacon has the name or label 'husky1-b9'"),
-        (("base",), "base is no beacon: its role is base"),
+        (("base",), "base is not a beacon: its role is base"),
         (("x*",), "no beacon has the name or label 'x*'"),
     ],
 )
@@ -102,5 +102,5 @@ def test_a_lost_beacon_is_not_brought_back_by_the_way(inventory: Path) -> None:
     file.write_text(file.read_text().replace("{label: B2}", "{label: B2, state: lost}"))
     result = _run(inventory, "husky1-b2")
     assert result.exit_code == 2
-    assert "expected beacons that are carried: husky1-b2 is lost" in result.stderr
+    assert "expected carried beacons, found: husky1-b2 is lost" in result.stderr
     assert "meshctl inventory state husky1-b2 deployed" in result.stderr

@@ -67,8 +67,8 @@ def test_a_resumed_bootstrap_says_that_silent_nodes_belong_on_the_bench() -> Non
     nodes = {"b01": NodePlan("b01", Verdict.AWAY, reason="no answer"), "b02": NodePlan("b02", Verdict.SAME)}
     plan = Plan("f", 0.0, "base", nodes)
     assert bench_advice(run_of("bootstrap"), plan) == (
-        "run 7 was a bootstrap: b01 may still be factory fresh",
-        "hint: plug in such a device on the bench and run `meshctl bootstrap` again",
+        "run 7 was a bootstrap: b01 may still have factory defaults",
+        "hint: connect such a device on the bench and run `meshctl bootstrap` again",
     )
     assert bench_advice(run_of("provision"), plan) == ()
     assert bench_advice(run_of("bootstrap"), Plan("f", 0.0, "base", {"b02": nodes["b02"]})) == ()

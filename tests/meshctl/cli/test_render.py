@@ -123,7 +123,7 @@ def test_an_image_whose_ports_may_be_dead_is_told_of(run: Run, inventory: Path, 
     (inventory / "fleet.yaml").write_text(text)
     told = run("render", "b01", "--imagebuilder", tmp_path / "ib")
     assert (told.code, told.err.count("\n")) == (0, 1)
-    assert told.err.startswith("b01: with this image eth0.1 may have no port behind it")
+    assert told.err.startswith("warning: b01: eth0.1 may have no port in this image")
     assert run("render", "b01", "--out", tmp_path / "out").err == ""
     (inventory / "fleet.yaml").write_text(text.replace("[eth0.1]", "[eth0.1]\n    switch_vlans: {1: 3 0t}"))
     assert run("render", "b01", "--imagebuilder", tmp_path / "ib").err == ""
@@ -144,7 +144,7 @@ def test_a_layout_that_no_switch_can_have_is_told(run: Run, inventory: Path, vla
 def test_a_node_that_is_not_there_is_told(run: Run) -> None:
     ran = run("render", "b9*")
     assert ran.code == 2
-    assert ran.err.startswith("error: no node is named 'b9*'")
+    assert ran.err.startswith("error: no node matches 'b9*'")
 
 
 def test_a_missing_key_is_told_with_its_place(run: Run, inventory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,8 +231,8 @@ class TestRevisions:
         ("argument", "words"),
         [
             ("nothing:fleet.yaml", "git rev-parse"),
-            ("HEAD:gone.yaml", "expected a file or directory of HEAD, found none"),
-            ("HEAD:../../etc/passwd", "expected a file or directory of HEAD, found none"),
+            ("HEAD:gone.yaml", "no such file or directory in HEAD"),
+            ("HEAD:../../etc/passwd", "no such file or directory in HEAD"),
         ],
     )
     def test_what_is_not_there_is_told(self, run: Run, argument: str, words: str) -> None:

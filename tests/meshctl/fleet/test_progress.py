@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from meshctl.fleet import Event, EventKind, Outcome, Result
-from meshctl.report.progress import Aside, JsonProgress, LiveProgress, PlainProgress
+from meshctl.report.progress import JsonProgress, LiveProgress, PlainProgress, ThreadedProgress
 
 GONE = Outcome("b01", Result.ROLLED_BACK, "no neighbour came back", hint="look at its antenna", duration_s=12.34)
 EVENTS = [
@@ -66,7 +66,7 @@ def test_a_reader_that_stands_still_holds_up_no_work() -> None:
             return super().write(text)
 
     out = Slow()
-    with Aside(PlainProgress(out)) as progress:
+    with ThreadedProgress(PlainProgress(out)) as progress:
         for event in EVENTS:
             progress(event)
         assert out.getvalue() == ""
@@ -81,7 +81,7 @@ def test_a_reader_that_is_gone_ends_the_lines_and_no_work() -> None:
 
     for make in (PlainProgress, JsonProgress):
         out = Closed()
-        with Aside(make(out)) as progress:
+        with ThreadedProgress(make(out)) as progress:
             for event in EVENTS:
                 progress(event)
         assert out.getvalue() == ""
@@ -93,7 +93,7 @@ STOPPING = "stopping: finishing the nodes in work, taking up no more (again to l
 def test_the_state_of_stopping_stands_in_the_live_lines_with_what_is_finished() -> None:
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=100, height=30)
-    with Aside(LiveProgress(console, 3)) as progress:
+    with ThreadedProgress(LiveProgress(console, 3)) as progress:
         progress(EVENTS[0])
         progress(Event(EventKind.STARTED, "b02", 1.0))
         progress.stopping(STOPPING)

@@ -49,7 +49,7 @@ def test_init_takes_no_private_key_and_nothing_else_that_is_no_public_key(conten
     (tmp_path / "key").write_text(content)
     result = _meshctl("init", tmp_path / "new", "--ssh-key", tmp_path / "key")
     assert result.exit_code == 2
-    assert "is no SSH public key" in result.stderr
+    assert "is not an SSH public key" in result.stderr
     assert not (tmp_path / "new").exists()
 
 

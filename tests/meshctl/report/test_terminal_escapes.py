@@ -18,7 +18,7 @@ from rich.console import Console
 
 from meshctl.cli.fleet_view import paint
 from meshctl.cli.live_screen import page
-from meshctl.cli.preflight import show as show_preflight
+from meshctl.cli.status import show_preflight
 from meshctl.fleet import Event, EventKind, Outcome, Result
 from meshctl.fleet.journal import Journal
 from meshctl.model import Fleet
@@ -141,7 +141,7 @@ def test_colours_of_status_and_preflight_are_colours(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     checks = (Check("base", True, "answers"), Check("links", False, HOSTILE), Check("robots", True, "", False))
-    monkeypatch.setattr("meshctl.cli.preflight.paint_of", lambda: paint)
+    monkeypatch.setattr("meshctl.cli.status.paint_of", lambda: paint)
     # as on a terminal, where colours are not taken out
     monkeypatch.setattr("typer.echo", lambda text, **_: sys.stdout.write(text))
     show_preflight(checks, as_json=False)

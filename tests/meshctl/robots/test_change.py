@@ -56,7 +56,7 @@ def test_a_key_is_rotated_without_an_interruption_and_waits_for_robots_that_are_
     boots = _pair(fleet)
     fleet.machines["husky2"].stop()
     told = fleet.meshctl("rotate-key", "file:keys.yaml#new", exit_code=3)
-    assert "husky2 did not take this one" in told
+    assert "husky2 did not complete this one" in told
     assert [key.key for key in load_fleet(fleet.file).udp_mesh.keys] == ["old", "new"]
 
     fleet.machines["husky2"].start()

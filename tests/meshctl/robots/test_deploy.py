@@ -28,7 +28,7 @@ def test_a_first_deploy_installs_and_starts_and_a_second_changes_nothing(fleet: 
     assert "husky1: unchanged: already runs " in fleet.deploy()
     assert fleet.shell("husky1", _EVERYTHING) == before
     # the wheels given once are kept for later commands
-    assert "husky1: as the inventory says" in fleet.meshctl("diff")
+    assert "husky1: no changes" in fleet.meshctl("diff")
     found = fleet.status()["husky1"]
     assert found["well"]
     assert {topic["name"] for topic in found["topics"]} == {"estop", "status"}
@@ -95,7 +95,7 @@ def test_what_was_changed_by_hand_or_cut_short_is_seen_and_mended(fleet: RobotFl
     assert "changed on the robot: etc/udp-mesh.toml" in told
     assert "changed on the robot: lib/./udp_mesh/daemon/api.py" in told
     assert f"husky1: done: runs {release}" in fleet.deploy()
-    assert "as the inventory says" in fleet.meshctl("diff")
+    assert "no changes" in fleet.meshctl("diff")
 
     fleet.shell("husky1", "rm /opt/udp-mesh/current/manifest")
     assert "changed on the robot: manifest" in fleet.meshctl("diff", exit_code=1)

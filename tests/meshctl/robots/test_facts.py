@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 
-from meshctl.robots.facts import Expectation, RobotFacts, facts_object, parse_robot_facts
+from meshctl.robots.facts import ExpectedRelease, RobotFacts, facts_object, parse_robot_facts
 from meshctl.robots.status_table import table
 
 NOW_S = 1_800_000_000.0
-WANTED = Expectation({"etc/udp-mesh.toml": "1111", "udp-mesh.service": "2222"}, wheel="9999")
+WANTED = ExpectedRelease({"etc/udp-mesh.toml": "1111", "udp-mesh.service": "2222"}, wheel="9999")
 
 _SERVICES = """\
 == services
@@ -77,13 +77,13 @@ _TOPICS = json.dumps(
 ANSWER = f"{_SERVICES}== status\n{_STATUS}\n== topics\n{_TOPICS}\n"
 
 
-def _facts(text: str = ANSWER, wanted: Expectation = WANTED) -> RobotFacts:
+def _facts(text: str = ANSWER, wanted: ExpectedRelease = WANTED) -> RobotFacts:
     return parse_robot_facts("husky1", text, wanted, now_s=NOW_S)
 
 
 def test_one_answer_tells_service_release_daemon_and_computer() -> None:
     facts = _facts()
-    assert facts.is_well
+    assert facts.is_healthy
     assert (facts.service.active, facts.service.enabled, facts.service.restarts) == ("active", "enabled", 2)
     assert facts.bridge is None, "none is wanted and none is installed"
     assert (facts.release, facts.previous, facts.version, facts.drift) == ("aaaa", "bbbb", "0.1.0", ())
@@ -110,30 +110,30 @@ def test_drift_names_what_differs_from_the_inventory_and_what_was_changed_by_han
         "another version of udp-mesh than ours",
         "udp-mesh.service will not start at boot",
     )
-    assert facts.is_well, "what runs is well, only not as the inventory says"
+    assert facts.is_healthy, "what runs is well, only not as the inventory says"
     assert "4 differ" in facts.remark
 
 
 def test_a_bridge_that_is_wanted_and_does_not_run_makes_the_robot_ill() -> None:
-    wanted = Expectation(WANTED.files, WANTED.wheel, bridge=True)
+    wanted = ExpectedRelease(WANTED.files, WANTED.wheel, bridge=True)
     facts = _facts(wanted=wanted)
     assert facts.bridge is not None
-    assert not facts.is_well
+    assert not facts.is_healthy
     assert "the ROS bridge is absent" in facts.remark
     bridge = _SERVICES.index("Id=udp-mesh-ros1")
     up = ANSWER[:bridge] + ANSWER[bridge:].replace("not-found", "loaded", 1).replace("inactive", "active", 1)
     up = up.replace("UnitFileState=\n", "UnitFileState=enabled\n")
-    assert _facts(up, wanted).is_well
+    assert _facts(up, wanted).is_healthy
     assert _facts(up).bridge is not None, "one that is there is told even where the inventory wants none"
 
 
 def test_a_daemon_that_does_not_answer_is_not_well_and_says_so() -> None:
     silent = _facts(f"{_SERVICES}== status\n== topics\n")
-    assert not silent.is_well
+    assert not silent.is_healthy
     assert silent.remark == "the daemon does not answer"
     assert "the daemon does not answer" in table([silent, _facts()])
     nothing = _facts("")
-    assert not nothing.is_well
+    assert not nothing.is_healthy
     assert nothing.drift == ("nothing is installed",)
     assert "not installed" in nothing.remark
     away = RobotFacts("husky9", trouble="husky9 (10.42.0.19): no answer")

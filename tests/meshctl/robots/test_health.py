@@ -4,31 +4,40 @@ from __future__ import annotations
 
 import pytest
 
-from meshctl.robots.scripts.health import BRIDGE_STEADY_S, BRIDGE_TOPIC, STEADY_S, Before, Look, Unit, flowing, ill
+from meshctl.robots.scripts.health import (
+    BRIDGE_STEADY_S,
+    BRIDGE_TOPIC,
+    STEADY_S,
+    Baseline,
+    HealthSnapshot,
+    ServiceState,
+    flowing,
+    problems,
+)
 
 NOW_S = 1000.0
-DAEMON = Unit("udp-mesh.service", "active", "running", "success", "0", NOW_S - 60)
+DAEMON = ServiceState("udp-mesh.service", "active", "running", "success", "0", NOW_S - 60)
 BRIDGE = DAEMON._replace(name="udp-mesh-ros1.service")
-NOTHING = Before([], {}, "")
+NOTHING = Baseline([], {}, "")
 
 
 def _topic(name: str, received: int = 0, *, configured: bool = True) -> dict[str, object]:
     return {"name": name, "configured": configured, "received_messages": received}
 
 
-def _look(*units: Unit, online: tuple[str, ...] = (), boot: str = "b", received: int = 0) -> Look:
+def _look(*units: ServiceState, online: tuple[str, ...] = (), boot: str = "b", received: int = 0) -> HealthSnapshot:
     peers = [{"name": name, "online": True} for name in online] + [{"name": "off", "online": False}]
     topics = [_topic("estop"), _topic("video", received)]
-    return Look(list(units or (DAEMON,)), {"boot": boot, "conditions": {"peers": peers}}, topics)
+    return HealthSnapshot(list(units or (DAEMON,)), {"boot": boot, "conditions": {"peers": peers}}, topics)
 
 
-def _ill(look: Look, before: Before = NOTHING, wanted: tuple[str, ...] = ("estop", "video")) -> str:
-    return ill(look, list(wanted), before, NOW_S)
+def _ill(look: HealthSnapshot, before: Baseline = NOTHING, wanted: tuple[str, ...] = ("estop", "video")) -> str:
+    return problems(look, list(wanted), before, NOW_S)
 
 
 def test_all_that_ran_and_was_seen_before_makes_it_well() -> None:
     assert _ill(_look()) == ""
-    before = Before(["base"], {"video": 700}, "a")
+    before = Baseline(["base"], {"video": 700}, "a")
     assert _ill(_look(DAEMON, BRIDGE, online=("base", "husky2"), received=1), before) == ""
 
 
@@ -41,14 +50,14 @@ def test_all_that_ran_and_was_seen_before_makes_it_well() -> None:
             "the daemon does not run: systemd says activating (auto-restart, exit-code, started again 3 times)",
         ),
         (_look(DAEMON, BRIDGE._replace(active="failed", sub="failed")), NOTHING, "the ROS bridge does not run"),
-        (Look([DAEMON], {}, [], "timed out"), NOTHING, "the daemon does not answer: timed out"),
-        (_look(online=("base",)), Before(["base", "husky2"], {}, "b"), "are not seen: husky2"),
-        (_look(), Before([], {"video": 5}, "a"), "topics flowed before and receive nothing: video"),
+        (HealthSnapshot([DAEMON], {}, [], "timed out"), NOTHING, "the daemon does not answer: timed out"),
+        (_look(online=("base",)), Baseline(["base", "husky2"], {}, "b"), "are not seen: husky2"),
+        (_look(), Baseline([], {"video": 5}, "a"), "topics flowed before and receive nothing: video"),
         (_look(DAEMON._replace(started_s=NOW_S - STEADY_S / 2)), NOTHING, "the daemon has only just started"),
         (_look(DAEMON, BRIDGE._replace(started_s=NOW_S - STEADY_S)), NOTHING, "the ROS bridge has only just started"),
     ],
 )
-def test_what_is_not_well_is_said_in_one_line(look: Look, before: Before, reason: str) -> None:
+def test_what_is_not_well_is_said_in_one_line(look: HealthSnapshot, before: Baseline, reason: str) -> None:
     assert reason in _ill(look, before)
 
 
@@ -67,13 +76,13 @@ def test_a_topic_that_is_lacking_or_only_arrives_is_not_there() -> None:
 
 
 def test_after_a_reload_the_same_process_must_count_on() -> None:
-    before = Before([], {"video": 5}, "b")
+    before = Baseline([], {"video": 5}, "b")
     assert "receive nothing" in _ill(_look(boot="b", received=5), before)
     assert _ill(_look(boot="b", received=6), before) == ""
 
 
 def test_a_topic_that_was_taken_out_needs_not_flow_any_more() -> None:
-    assert _ill(_look(), Before([], {"gone": 5}, "a")) == ""
+    assert _ill(_look(), Baseline([], {"gone": 5}, "a")) == ""
 
 
 def test_a_single_message_is_no_flow() -> None:

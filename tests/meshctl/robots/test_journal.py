@@ -70,7 +70,7 @@ def test_an_interrupted_deploy_is_in_the_history_and_resume_takes_up_what_is_lef
     told = fleet.root_command("resume")
     assert "resuming run 1 (robots deploy): husky2" in told
     assert "husky2: done: runs " in told
-    assert "run 2 left nothing to do" in fleet.root_command("resume")
+    assert "run 2 is finished: nothing to resume" in fleet.root_command("resume")
 
 
 @pytest.mark.proof

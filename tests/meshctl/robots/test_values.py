@@ -12,11 +12,18 @@ from meshctl.errors import InputError
 from meshctl.fleet import Result
 from meshctl.model import Computer, Robot, SecretKind, SecretRef
 from meshctl.robots.bundle import UNIT_NAME, Bundle, File, service_unit
-from meshctl.robots.connection import chosen_robots
-from meshctl.robots.deploy import switched
-from meshctl.robots.key_rotation import parse_ref, stages, written
-from meshctl.robots.preconditions import Facts, changed_files, clock_remark, objections, parse_facts, room_objection
-from meshctl.robots.wheel_tags import Target, parse_wheel, pip_options, takes
+from meshctl.robots.connection import selected_robots
+from meshctl.robots.deploy import parse_switch
+from meshctl.robots.key_rotation import inventory_value, parse_ref, rotation_stages
+from meshctl.robots.preconditions import (
+    HostFacts,
+    changed_files,
+    clock_warning,
+    parse_facts,
+    unmet_disk_space,
+    unmet_preconditions,
+)
+from meshctl.robots.wheel_tags import Target, is_compatible, parse_wheel, pip_options
 from meshctl.robots.wheels import own_wheel, stock_units
 from tests.meshctl.render import fleets
 
@@ -41,7 +48,7 @@ ALPINE = Target((3, 12), "x86_64", "musl", (1, 2))
 def test_a_wheel_is_taken_by_the_computers_that_pip_would_install_it_on(file: str, takers: set[Target]) -> None:
     wheel = parse_wheel(file)
     assert wheel is not None
-    assert {target for target in (BOOKWORM, PI, ALPINE) if takes(target, wheel)} == takers
+    assert {target for target in (BOOKWORM, PI, ALPINE) if is_compatible(target, wheel)} == takers
 
 
 def test_pip_is_asked_for_the_targets_python_and_platforms_and_nothing_newer() -> None:
@@ -98,8 +105,8 @@ unit=udp-mesh-ros1.service inactive
 """
 
 
-def _reasons(facts: Facts) -> list[str]:
-    return [reason for reason, _ in objections(facts, robot="r", arch="x86_64", python="python3")]
+def _reasons(facts: HostFacts) -> list[str]:
+    return [reason for reason, _ in unmet_preconditions(facts, robot="r", arch="x86_64", python="python3")]
 
 
 def test_a_fitting_computer_meets_no_objection_and_every_misfit_is_told_at_once() -> None:
@@ -124,16 +131,16 @@ def test_a_fitting_computer_meets_no_objection_and_every_misfit_is_told_at_once(
 
 def test_a_clock_that_is_years_off_is_told_and_is_no_objection() -> None:
     facts = parse_facts(PROBED)
-    assert clock_remark(facts, 1e9) == ("", "")
-    assert clock_remark(facts, 1.2e9)[0] == "its clock is 6.3 years behind ours"
-    assert clock_remark(facts, 1e9 - 7 * 86_400)[0] == "its clock is 7.0 days ahead of ours"
+    assert clock_warning(facts, 1e9) == ("", "")
+    assert clock_warning(facts, 1.2e9)[0] == "its clock is 6.3 years behind ours"
+    assert clock_warning(facts, 1e9 - 7 * 86_400)[0] == "its clock is 7.0 days ahead of ours"
     assert _reasons(facts) == []
 
 
 def test_room_is_asked_for_what_is_unpacked_and_something_to_spare() -> None:
     facts = parse_facts(PROBED)
-    assert not list(room_objection(facts, 100 << 20))
-    ((reason, _),) = room_objection(facts, 1 << 30)
+    assert not list(unmet_disk_space(facts, 100 << 20))
+    ((reason, _),) = unmet_disk_space(facts, 1 << 30)
     assert reason.startswith("full disk: 1057 MiB are needed at /opt")
 
 
@@ -145,11 +152,11 @@ def test_changed_files_are_those_whose_hash_differs_or_that_one_side_lacks() -> 
 
 
 def test_what_a_switch_says_becomes_one_outcome() -> None:
-    assert switched("r", "id", "result=switched\nonline=base husky2\n").reason == "runs id, 2 peers online"
-    back = switched("r", "id", "result=rolled-back\nreason=the daemon does not run\nlog=a=b\nlog=c\n")
+    assert parse_switch("r", "id", "result=switched\nonline=base husky2\n").reason == "runs id, 2 peers online"
+    back = parse_switch("r", "id", "result=rolled-back\nreason=the daemon does not run\nlog=a=b\nlog=c\n")
     assert back.result is Result.ROLLED_BACK
     assert back.hint == "its last words:\na=b\nc"
-    assert switched("r", "id", "").result is Result.FAILED
+    assert parse_switch("r", "id", "").result is Result.FAILED
 
 
 OLD, NEW, OTHER = (SecretRef(SecretKind.ENV, name) for name in ("OLD", "NEW", "OTHER"))
@@ -157,20 +164,20 @@ OLD, NEW, OTHER = (SecretRef(SecretKind.ENV, name) for name in ("OLD", "NEW", "O
 
 def test_a_rotation_goes_on_from_wherever_the_inventory_says_it_is() -> None:
     every = [(OLD, NEW), (NEW, OLD), (NEW,)]
-    assert [stage.keys for stage in stages((OLD,), NEW)] == every
-    assert [stage.keys for stage in stages((OLD, NEW), NEW)] == every
-    assert [stage.keys for stage in stages((NEW, OLD), NEW)] == every[1:]
-    assert [stage.keys for stage in stages((NEW,), NEW)] == every[2:]
+    assert [stage.keys for stage in rotation_stages((OLD,), NEW)] == every
+    assert [stage.keys for stage in rotation_stages((OLD, NEW), NEW)] == every
+    assert [stage.keys for stage in rotation_stages((NEW, OLD), NEW)] == every[1:]
+    assert [stage.keys for stage in rotation_stages((NEW,), NEW)] == every[2:]
     with pytest.raises(InputError, match="two other keys"):
-        stages((OLD, OTHER), NEW)
+        rotation_stages((OLD, OTHER), NEW)
     with pytest.raises(InputError, match="no key yet"):
-        stages((), NEW)
+        rotation_stages((), NEW)
 
 
 @pytest.mark.parametrize("text", ["env:NAME", "file:a/b.yaml#new", "age:keys.age#x"])
 def test_a_reference_reads_back_as_it_is_printed(text: str) -> None:
     assert str(parse_ref(text)) == text
-    assert parse_ref(text).kind.value in dict(written(parse_ref(text)))  # type: ignore[arg-type]
+    assert parse_ref(text).kind.value in dict(inventory_value(parse_ref(text)))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("text", ["NAME", "env:", "vault:x", ""])
@@ -188,10 +195,10 @@ def test_a_robot_that_has_not_moved_over_is_passed_by_and_named_with_the_way_to_
             "cart": Robot("cart", ()),
         }
     )
-    assert chosen_robots(fleet, None) == ("husky1",)
+    assert selected_robots(fleet, None) == ("husky1",)
     with pytest.raises(InputError) as caught:
-        chosen_robots(fleet, ["husky2"])
+        selected_robots(fleet, ["husky2"])
     assert caught.value.hint == "write robots.husky2.computer in place of `fielded`, and stop the fielded program there"
     with pytest.raises(InputError) as caught:
-        chosen_robots(fleet, ["cart"])
+        selected_robots(fleet, ["cart"])
     assert caught.value.hint == "write robots.cart.computer"

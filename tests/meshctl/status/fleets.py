@@ -28,8 +28,8 @@ from meshctl.model import Fleet
 from meshctl.plan import NodePlan
 from meshctl.robots.facts import ComputerFacts, PeerFacts, QueueFacts, RobotFacts, ServiceFacts, TopicFacts
 from meshctl.status import Alarm, FleetStatus, Health, assess
-from meshctl.status.assess import Look
-from meshctl.status.values import Silence
+from meshctl.status.assess import Snapshot
+from meshctl.status.values import NoAnswer
 from meshctl.topology import observed_graph, report_of
 
 INVENTORY = """\
@@ -158,22 +158,22 @@ def look_of(
     *,
     plans: Mapping[str, NodePlan] | None = None,
     known: Mapping[str, LastKnown] | None = None,
-    silent: Mapping[str, Silence] | None = None,
-    silent_robots: Mapping[str, Silence] | None = None,
+    silent: Mapping[str, NoAnswer] | None = None,
+    silent_robots: Mapping[str, NoAnswer] | None = None,
     **other: Any,
-) -> Look:
+) -> Snapshot:
     graph = observed_graph([report_of(name, one) for name, one in observations.items()], known_macs=NAMES)
-    look = Look(
+    look = Snapshot(
         fleet=fleet,
         observations=observations,
-        silent=silent or {},
+        no_answer=silent or {},
         plans=plans or {},
         graph=graph,
         known=known or {},
         macs=NAMES,
         entry="base",
         robots=robots,
-        silent_robots=silent_robots or {},
+        no_answer_robots=silent_robots or {},
     )
     return replace(look, **other)
 

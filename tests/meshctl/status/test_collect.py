@@ -8,7 +8,7 @@ import pytest
 
 from meshctl.cli.live_screen import page
 from meshctl.errors import NodeError, Unreachable
-from meshctl.status.collect import side_by_side
+from meshctl.status.collect import run_parallel
 
 
 def refuse() -> object:
@@ -22,7 +22,7 @@ def vanish() -> object:
 def test_answers_come_in_the_order_asked_and_errors_beside_them() -> None:
     told: list[tuple[int, int]] = []
     jobs = {"a": lambda: 1, "b": refuse, "c": vanish, "d": lambda: None}
-    found = side_by_side(jobs, 2, lambda done, count: told.append((done, count)))
+    found = run_parallel(jobs, 2, lambda done, count: told.append((done, count)))
     assert list(found) == ["a", "b", "c", "d"]
     assert (found["a"], found["d"]) == (1, None)
     assert isinstance(found["b"], NodeError)
@@ -32,17 +32,17 @@ def test_answers_come_in_the_order_asked_and_errors_beside_them() -> None:
 
 def test_a_bug_is_raised_to_the_caller() -> None:
     with pytest.raises(ZeroDivisionError):
-        side_by_side({"a": lambda: 1 // 0}, 1)
+        run_parallel({"a": lambda: 1 // 0}, 1)
 
 
 def test_nobody_to_ask_is_no_wait() -> None:
-    assert side_by_side({}, 8) == {}
+    assert run_parallel({}, 8) == {}
 
 
 def test_the_silent_do_not_keep_others_from_being_asked() -> None:
     """With one at a time, and everyone waiting for the last: only those asked beside the silent can let it end."""
     barrier = threading.Barrier(12)
-    found = side_by_side(dict.fromkeys(range(12), barrier.wait), 1, patience_s=0.001)
+    found = run_parallel(dict.fromkeys(range(12), barrier.wait), 1, stall_timeout_s=0.001)
     assert sorted(str(place) for place in found.values()) == sorted(str(place) for place in range(12))
 
 
@@ -57,7 +57,7 @@ def test_those_asked_at_once_are_no_more_than_allowed_while_answers_come() -> No
         with lock:
             running -= 1
 
-    side_by_side(dict.fromkeys(range(200), work), 4, patience_s=3600)
+    run_parallel(dict.fromkeys(range(200), work), 4, stall_timeout_s=3600)
     assert most <= 4
 
 

@@ -26,7 +26,7 @@ from meshctl.status.preflight import Check
 from meshctl.status.rows import COLUMNS, Cell
 from meshctl.status.table import layout, table_lines
 from meshctl.status.text import preflight_text, summary_lines, text, topic_lines
-from meshctl.status.values import Silence
+from meshctl.status.values import NoAnswer
 from tests.meshctl.status.fleets import CREW, HEALTHY, NOW, look_of, status_of
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -45,8 +45,8 @@ def broken(fleet: Fleet) -> FleetStatus:
         known={
             "rover": LastKnown("rover", NOW - 600, {"version": "23.05.5", "hops": "2", "via": "b01", "heard": "b01"})
         },
-        silent={"rover": Silence("no answer to connect within 5 s")},
-        silent_robots={"shelf": Silence("no answer to connect within 5 s")},
+        silent={"rover": NoAnswer("no answer to connect within 5 s")},
+        silent_robots={"shelf": NoAnswer("no answer to connect within 5 s")},
     )
 
 
@@ -54,7 +54,7 @@ def broken(fleet: Fleet) -> FleetStatus:
 def test_no_line_is_wider_than_the_terminal(fleet: Fleet, width: int) -> None:
     status = broken(fleet)
     silent = [
-        replace(topic, trouble="has sent nothing for 12 min, of all the topics there are")
+        replace(topic, problem="nothing sent for 12 min, of all the topics there are")
         for topic in status.robots[0].topics
     ]
     status = replace(status, robots=(replace(status.robots[0], topics=tuple(silent)), *status.robots[1:]))
@@ -71,12 +71,12 @@ def test_a_preflight_ends_with_its_verdict_and_what_stands_against_it(fleet: Fle
 
 def test_what_has_no_room_is_named(fleet: Fleet) -> None:
     told = " ".join(text(broken(fleet), 80).split())
-    left_out = re.search(r"no room for (.*?): --wide", told)
+    left_out = re.search(r"columns not shown: (.*?) \(use --wide", told)
     assert left_out is not None
     headings = text(broken(fleet), 80)
     for heading in left_out[1].split(", "):
         assert f"  {heading}  " not in headings.partition("name  ")[2].partition("\n")[0]
-    assert "no room for" not in text(broken(fleet))
+    assert "columns not shown" not in text(broken(fleet))
 
 
 @given(
@@ -114,10 +114,10 @@ def test_the_summary_comes_first_and_the_verdict_again_after_a_long_table(fleet:
 
 
 def test_one_alarm_at_many_is_one_line(fleet: Fleet) -> None:
-    status = status_of(fleet, {}, {}, silent={name: Silence("no answer") for name in fleet.nodes})
+    status = status_of(fleet, {}, {}, silent={name: NoAnswer("no answer") for name in fleet.nodes})
     many = replace(status, robots=(), nodes=tuple(node for node in status.nodes if node.alarms) * 3)
     lines = summary_lines(many)
-    assert sum("unreachable at 9" in line for line in lines) == 1
+    assert sum("unreachable on 9" in line for line in lines) == 1
     assert any("--alarm unreachable" in line for line in lines)
 
 
@@ -137,7 +137,7 @@ def test_every_alarm_has_a_code_that_is_listed_and_documented() -> None:
     used = set()
     for path in (ROOT / "meshctl/status").glob("*.py"):
         for call in ast.walk(ast.parse(path.read_text())):
-            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in ("Alarm", "Silence"):
+            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in ("Alarm", "NoAnswer"):
                 used |= {
                     arg.value for arg in call.args[1:2] if isinstance(arg, ast.Constant) and isinstance(arg.value, str)
                 }
@@ -171,7 +171,7 @@ def test_the_json_is_as_its_schema_says(fleet: Fleet) -> None:
     schema = json.loads((ROOT / "docs/status.schema.json").read_text())
     jsonschema.Draft202012Validator.check_schema(schema)
     is_valid = jsonschema.Draft202012Validator(schema).validate
-    unasked = status_of(fleet, robots={}, robots_unasked="--no-robots")
+    unasked = status_of(fleet, robots={}, robots_skipped="--no-robots")
     statuses = (status_of(fleet), broken(fleet), status_of(fleet, {}, {}), unasked)
     for status in statuses:
         is_valid(as_json(status))

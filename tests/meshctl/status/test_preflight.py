@@ -53,7 +53,7 @@ def test_a_robot_that_has_not_moved_over_is_named_and_stops_nobody(fleet: Fleet)
     asked = status_of(fleet, known=KNOWN)
     found = {check.name: check for check in preflight(replace(fleet, robots=robots), asked, DELIVERED)}
     assert stopped(found) == []
-    assert "husky still runs the fielded program, cart has no computer" in found["daemons"].reason
+    assert "husky still runs the legacy program, cart has no computer" in found["daemons"].reason
 
 
 def test_a_beacon_that_was_never_seen_is_a_no_go_before_it_is_packed(fleet: Fleet) -> None:
@@ -83,7 +83,7 @@ def test_a_radio_without_a_path_or_with_one_that_carries_nothing_is_a_no_go(flee
     }
     found = checks(fleet, observations=islands)
     assert "links" in stopped(found)
-    assert "rover: path to the base carries 0%" in found["links"].reason
+    assert "rover: path to the base has 0% quality" in found["links"].reason
     islands = {**HEALTHY, "b01": seen("b01", {"rover": 200})}
     islands["base"] = seen("base", {"b02": 200})
     assert "no path through the mesh" in checks(fleet, observations=islands)["links"].reason
@@ -115,13 +115,13 @@ def test_what_nobody_could_tell_is_no_go(fleet: Fleet) -> None:
     status = status_of(fleet, {}, {}, known=KNOWN)
     found = {check.name: check for check in preflight(fleet, status, Pings())}
     assert not any(check.is_go for check in found.values() if check.name != "beacons")
-    assert found["radios"].reason == "nobody answers who could tell"
+    assert found["radios"].reason == "cannot check: no device answers"
 
 
 def test_how_many_could_tell_is_said_where_some_could_not(fleet: Fleet) -> None:
     status = status_of(fleet, {name: HEALTHY[name] for name in ("base", "b01")}, known=KNOWN)
     found = {check.name: check for check in preflight(fleet, status, DELIVERED)}
-    assert found["identity"].reason == "every radio is the one it should be (2 of 3 tell)"
+    assert found["identity"].reason == "every radio is the expected device (2 of 3 answer)"
 
 
 def test_a_busy_computer_is_a_note_and_stops_nobody(fleet: Fleet) -> None:
@@ -148,9 +148,7 @@ def test_robots_that_were_not_asked_are_told_and_not_judged(fleet: Fleet) -> Non
 def test_an_unmeasured_path_is_neither_go_nor_no_go(fleet: Fleet) -> None:
     unmeasured = {name: seen(name, {}) for name in HEALTHY}
     status = status_of(fleet, unmeasured, known=KNOWN)
-    status = replace(
-        status, nodes=tuple(replace(node, quality=None, alarms=(), neighbours=()) for node in status.nodes)
-    )
+    status = replace(status, nodes=tuple(replace(node, quality=None, alarms=(), neighbors=()) for node in status.nodes))
     found = {check.name: check for check in preflight(fleet, status, DELIVERED)}
     assert (found["links"].is_go, found["links"].is_checked) == (True, False)
     assert preflight_text(found.values()).splitlines()[-1] == "GO (not checked: links)"
@@ -159,7 +157,7 @@ def test_an_unmeasured_path_is_neither_go_nor_no_go(fleet: Fleet) -> None:
 def test_pings_are_read_line_by_line_and_what_is_missing_has_no_answer() -> None:
     text = '{"peer": "a", "round_trip_s": 0.5}\nnoise\n{"peer": "b", "error": "no-answer"}\n[1]\n{"peer": "c"}\n'
     told = parse_pings(text, ("a", "b", "c", "d"))
-    assert told == {"a": 0.5, "b": "no-answer", "c": "no answer", "d": "the daemon did not try"}
+    assert told == {"a": 0.5, "b": "no-answer", "c": "no answer", "d": "not sent"}
     pings = pings_of({"x": told})
     assert pings.round_trips_s == {("x", "a"): 0.5}
     assert pings.failed["x", "b"] == "no-answer"

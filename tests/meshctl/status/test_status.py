@@ -24,10 +24,10 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
 from meshctl.plan import FileChange, NodePlan, Verdict
 from meshctl.status import Health
-from meshctl.status.last_known import facts_to_keep, remembered, typed
+from meshctl.status.last_known import facts_to_record, merge_by_device, typed
 from meshctl.status.text import text
-from meshctl.status.unreachable import silence_of
-from meshctl.status.values import Silence
+from meshctl.status.unreachable import no_answer_of
+from meshctl.status.values import NoAnswer
 from tests.meshctl.status.fleets import HEALTHY, MACS, NOW, alarms, health, seen, status_of
 
 WITHOUT_ROVER = {name: HEALTHY[name] for name in ("base", "b01")}
@@ -42,7 +42,7 @@ def test_what_is_carried_and_off_is_fine(fleet: Fleet) -> None:
 
 def test_a_carried_beacon_that_others_hear_and_that_does_not_answer_is_worth_a_look(fleet: Fleet) -> None:
     b01 = seen("b01", {"base": 250, "rover": 200, "b02": 240})
-    status = status_of(fleet, {**HEALTHY, "b01": b01}, silent={"b02": Silence("no answer to connect within 5 s")})
+    status = status_of(fleet, {**HEALTHY, "b01": b01}, silent={"b02": NoAnswer("no answer to connect within 5 s")})
     assert "b01 hears it" in alarms(status, "b02")["mute"].text
     assert status.exit_code is ExitCode.FINDINGS
 
@@ -59,7 +59,7 @@ def test_a_deployed_node_that_is_silent_is_missed_and_told_by_whom_it_is_heard(f
 def test_who_is_gone_for_good_is_told_with_the_place_it_was_at(fleet: Fleet) -> None:
     known = {"rover": LastKnown("rover", NOW - 600, {"hops": "2", "via": "b01"})}
     status = status_of(fleet, {"base": seen("base", {})}, known=known)
-    assert alarms(status, "rover")["unreachable"].hint.startswith("it was 2 hops out, behind b01")
+    assert alarms(status, "rover")["unreachable"].hint.startswith("it was 2 hops away, behind b01")
     assert "meshctl bootstrap b01" in alarms(status, "b01")["unreachable"].hint
 
 
@@ -74,7 +74,7 @@ def test_who_is_gone_for_good_is_told_with_the_place_it_was_at(fleet: Fleet) -> 
     ],
 )
 def test_why_a_node_gave_no_answer_has_a_code_of_its_own(fleet: Fleet, error: NodeError, code: str) -> None:
-    silence = silence_of(error)
+    silence = no_answer_of(error)
     assert not silence.reason.startswith("b01")
     status = status_of(fleet, WITHOUT_ROVER, silent={"rover": silence})
     (found,) = alarms(status, "rover").values()
@@ -82,7 +82,7 @@ def test_why_a_node_gave_no_answer_has_a_code_of_its_own(fleet: Fleet, error: No
 
 
 def test_a_carried_node_that_keeps_us_out_is_told_though_it_may_be_off(fleet: Fleet) -> None:
-    status = status_of(fleet, silent={"b02": Silence("the host key changed", "host-key")})
+    status = status_of(fleet, silent={"b02": NoAnswer("the host key changed", "host-key")})
     assert "meshctl trust b02 --replace" in alarms(status, "b02")["host-key"].hint
     assert health(status)["b02"] is Health.DEGRADED
 
@@ -154,7 +154,7 @@ def test_drift_names_the_files_and_the_commands_that_mend_it(fleet: Fleet) -> No
     plan = NodePlan("rover", Verdict.CHANGE, files=(FileChange("etc/config/wireless", "changed", ""),))
     told = text(status_of(fleet, plans={"rover": plan}))
     assert "rover: configuration differs: wireless" in told
-    assert "meshctl provision rover puts it right" in told
+    assert "meshctl provision rover fixes them" in told
 
 
 def test_a_stranger_in_the_mesh_is_reported(fleet: Fleet) -> None:
@@ -173,10 +173,10 @@ def test_what_could_not_be_compared_is_told_once_for_all(fleet: Fleet) -> None:
 
 
 def test_what_is_kept_of_a_node_comes_back_when_it_is_silent(fleet: Fleet) -> None:
-    kept = facts_to_keep(status_of(fleet))
+    kept = facts_to_record(status_of(fleet))
     known = {"rover": LastKnown("rover", NOW - 90, {"version": "23.05.4", "macs": MACS["rover"]})}
     known |= {name: LastKnown(name, NOW - 60, facts) for name, facts in kept.items()}
-    status = status_of(fleet, WITHOUT_ROVER, known=remembered(known))
+    status = status_of(fleet, WITHOUT_ROVER, known=merge_by_device(known))
     rover = next(node for node in status.nodes if node.name == "rover")
     assert rover.last_known is not None
     facts = typed(rover.last_known)
@@ -201,16 +201,16 @@ _DROPPED = {
 def test_a_carried_beacon_that_others_need_is_said_to_be_dropped(fleet: Fleet) -> None:
     status = status_of(fleet, _DROPPED)
     alarm = alarms(status, "b02")["dropped"]
-    assert alarm.text == "carried by the inventory, and the way from rover to the base leads through it"
+    assert alarm.text == "marked as carried, but relays to the base for rover"
     assert alarm.hint == "if it has been dropped: meshctl deployed b02"
     assert "dropped" not in alarms(status, "b01")
     assert status.exit_code is ExitCode.OK
 
 
 def test_a_dropped_beacon_that_dies_is_an_alarm_although_nobody_marked_it(fleet: Fleet) -> None:
-    kept = facts_to_keep(status_of(fleet, _DROPPED))
-    known = remembered({name: LastKnown(name, NOW - 600, facts) for name, facts in kept.items()})
-    status = status_of(fleet, known=known, silent={"b02": Silence("no answer to connect within 5 s")})
+    kept = facts_to_record(status_of(fleet, _DROPPED))
+    known = merge_by_device({name: LastKnown(name, NOW - 600, facts) for name, facts in kept.items()})
+    status = status_of(fleet, known=known, silent={"b02": NoAnswer("no answer to connect within 5 s")})
     alarm = alarms(status, "b02")["dropped"]
     assert alarm.text == "no answer to connect within 5 s; rover reached the base through it 10 min ago"
     assert health(status)["b02"] is Health.DEGRADED
@@ -219,17 +219,17 @@ def test_a_dropped_beacon_that_dies_is_an_alarm_although_nobody_marked_it(fleet:
 
 def test_a_carried_beacon_that_nobody_needed_may_be_switched_off(fleet: Fleet) -> None:
     on = {**HEALTHY, "b02": seen("b02", {"b01": 220})}
-    kept = facts_to_keep(status_of(fleet, on))
-    known = remembered({name: LastKnown(name, NOW - 600, facts) for name, facts in kept.items()})
-    status = status_of(fleet, known=known, silent={"b02": Silence("no answer to connect within 5 s")})
+    kept = facts_to_record(status_of(fleet, on))
+    known = merge_by_device({name: LastKnown(name, NOW - 600, facts) for name, facts in kept.items()})
+    status = status_of(fleet, known=known, silent={"b02": NoAnswer("no answer to connect within 5 s")})
     assert alarms(status, "b02") == {}
     assert status.exit_code is ExitCode.OK
 
 
 def test_a_beacon_that_was_picked_up_and_switched_on_once_is_no_longer_missed(fleet: Fleet) -> None:
-    first = facts_to_keep(status_of(fleet, _DROPPED))
-    again = facts_to_keep(status_of(fleet, {**HEALTHY, "b02": seen("b02", {"b01": 220})}))
+    first = facts_to_record(status_of(fleet, _DROPPED))
+    again = facts_to_record(status_of(fleet, {**HEALTHY, "b02": seen("b02", {"b01": 220})}))
     # the journal keeps the newest facts of each device
-    known = remembered({name: LastKnown(name, NOW - 60, facts) for name, facts in {**first, **again}.items()})
-    status = status_of(fleet, known=known, silent={"b02": Silence("no answer to connect within 5 s")})
+    known = merge_by_device({name: LastKnown(name, NOW - 60, facts) for name, facts in {**first, **again}.items()})
+    status = status_of(fleet, known=known, silent={"b02": NoAnswer("no answer to connect within 5 s")})
     assert alarms(status, "b02") == {}

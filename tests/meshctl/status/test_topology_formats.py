@@ -13,7 +13,7 @@ from meshctl.device.observation import MeshNeighbour, Observation, Originator, S
 from meshctl.inventory import load_fleet
 from meshctl.model import Fleet, Secret
 from meshctl.resolve import resolve
-from meshctl.status.topology_formats import FORMATS, Picture, directions
+from meshctl.status.topology_formats import FORMATS, TopologyView, directions
 from meshctl.topology import observed_graph, report_of
 from meshctl.topology.cells import link_cells, mesh_reports
 from tests.meshctl.status.fleets import HEALTHY, INVENTORY, MACS, NAMES, alarms, seen, status_of
@@ -22,7 +22,7 @@ from tests.meshctl.status.fleets import HEALTHY, INVENTORY, MACS, NAMES, alarms,
 @pytest.mark.parametrize("form", list(FORMATS))
 def test_each_picture_shows_every_node_and_marks_the_cut_vertex(form: str) -> None:
     reports = {name: report_of(name, one) for name, one in HEALTHY.items()}
-    picture = Picture(
+    picture = TopologyView(
         "main",
         "base",
         observed_graph(reports.values()),
@@ -108,7 +108,7 @@ def test_a_link_names_the_cells_that_it_runs_through(
 ) -> None:
     fleet, observations, names = relays
     reports = {name: report_of(name, one) for name, one in observations.items()}
-    picture = Picture(
+    picture = TopologyView(
         "trio",
         "base",
         observed_graph(reports.values(), known_macs=names),
