@@ -18,10 +18,10 @@ from dataclasses import dataclass, field
 from ipaddress import IPv4Address
 from types import MappingProxyType
 
-from meshctl.apply.change_in_progress import Attempt
+from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.change_set import new_change_id, new_nonce, reload_script
-from meshctl.apply.commit_confirm import carry
-from meshctl.apply.context import Job
+from meshctl.apply.commit_confirm import run_change
+from meshctl.apply.context import NodeContext
 from meshctl.device import openwrt
 from meshctl.device.connection import OwnKey
 from meshctl.device.deadman import Change, NewFile
@@ -31,7 +31,7 @@ from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.model import Node
 from meshctl.plan.lockout import lockout
-from meshctl.plan.preconditions import Objection
+from meshctl.plan.preconditions import FailedPrecondition
 from meshctl.plan.radios import NO_RADIOS, Radios, restarted
 from meshctl.plan.seen import WIRELESS, packages_seen, parsed
 from meshctl.render import MARKER_PATH
@@ -164,7 +164,7 @@ def _members(data: bytes, file: str) -> list[tuple[tarfile.TarInfo, bytes]]:
     return found
 
 
-def put_back(job: Job, connection: SshConnection, backup: Backup) -> Outcome:
+def restore_backup(job: NodeContext, connection: SshConnection, backup: Backup) -> Outcome:
     """Make the node what the backup has, under its dead-man's switch. Owns `connection`.
 
     Raises NodeError only when nothing was changed on the node.
@@ -174,20 +174,20 @@ def put_back(job: Job, connection: SshConnection, backup: Backup) -> Outcome:
     live = job.before.uci or {}
     files = {path: new for path, new in backup.files.items() if _differs(path, new, live)}
     if not files:
-        job.work.access.keep(job.name, connection)
+        job.run.connections.release(job.name, connection)
         return Outcome(job.name, Result.UNCHANGED)
     change = Change(new_change_id(), files, reload_script({path.lstrip("/") for path in files}, ()))
     address = _address(backup)
-    attempt = Attempt(
+    attempt = ChangeInProgress(
         job,
         change,
         new_nonce(),
         job.node.confirm_window_s,
         connection.endpoint,
-        job.work.access.places(job.node, address),
+        job.run.connections.candidates(job.node, address),
         radios=_radios(files, job.before),
     )
-    return carry(attempt, connection)
+    return run_change(attempt, connection)
 
 
 def _radios(files: Mapping[str, NewFile], before: Observation) -> Radios:
@@ -213,12 +213,12 @@ def _address(backup: Backup) -> IPv4Address | None:
     return IPv4Address(text) if text else None
 
 
-def lockout_by(backup: Backup, node: Node, own: Sequence[OwnKey]) -> Objection | None:
+def lockout_by(backup: Backup, node: Node, own: Sequence[OwnKey]) -> FailedPrecondition | None:
     """The objection against a backup after which none of our keys would be let in, or None."""
     return lockout(node, {path.lstrip("/"): new.content for path, new in backup.files.items()}, own)
 
 
-def objection_to(backup: Backup, node: str, seen: Observation) -> str:
+def incompatibility(backup: Backup, node: str, seen: Observation) -> str:
     """Why a backup must not go onto this device; empty when it may."""
     board = seen.board.board_name if seen.board else ""
     if backup.board and board != backup.board:
@@ -228,6 +228,6 @@ def objection_to(backup: Backup, node: str, seen: Observation) -> str:
     return ""
 
 
-def lacking_packages(backup: Backup, seen: Observation) -> tuple[str, ...]:
+def uninstalled_packages(backup: Backup, seen: Observation) -> tuple[str, ...]:
     """Packages that were installed when the backup was taken and are not now."""
     return tuple(name for name in backup.packages if name not in (seen.packages or {}))

@@ -11,18 +11,18 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from meshctl.apply.neighbor_query import look_around as look_at_neighbours
-from meshctl.apply.prepare import Choices, Prepared, assemble, other_paths
+from meshctl.apply.neighbor_query import observe_neighbors as look_at_neighbours
+from meshctl.apply.prepare import PlanOptions, Prepared, assemble, other_paths
 from meshctl.device.connection import Endpoint
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection, connect
-from meshctl.device.trust import HostKey, Recorder, TrustStore
+from meshctl.device.trust import AcceptAnyKey, HostKey, TrustStore
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Node
-from meshctl.nodes.collect import Seen, observe_cleared
-from meshctl.nodes.connections import Access
+from meshctl.nodes.collect import FleetObservation, observe_cleared
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
 from meshctl.topology import alternate_macs
 
@@ -30,7 +30,7 @@ FACTORY_ADDRESS = "192.168.1.1"
 
 
 @dataclass(frozen=True, slots=True)
-class BenchPlace:
+class BenchTarget:
     """Where one device answers; `node` is whom the operator says it is, empty when the device has to tell; `interface`
     the interface of this machine that it is plugged into, empty where only one device has the address."""
 
@@ -49,10 +49,10 @@ class BenchPlace:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FoundDevice:
     """A device on the bench: which node it is, what it told, its host key, and the keys that were pinned before."""
 
-    place: BenchPlace
+    place: BenchTarget
     node: Node
     seen: Observation
     key: HostKey
@@ -115,33 +115,33 @@ def _macs(node: Node) -> set[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class Arrivals:
+class Discovered:
     """`found`: node -> device. `outcomes`: what came of the places where nothing could be taken in."""
 
-    found: Mapping[str, Found]
+    found: Mapping[str, FoundDevice]
     outcomes: tuple[Outcome, ...]
 
 
-def look_around(
+def discover(
     renderer: Renderer,
-    access: Access,
+    access: ConnectionPool,
     trust: TrustStore,
-    places: Sequence[BenchPlace],
+    places: Sequence[BenchTarget],
     *,
     parallel: int,
     replace_keys: bool = False,
     interrupt: Interrupt | None = None,
     observer: Observer = silent,
-) -> Arrivals:
+) -> Discovered:
     """See who is where. Host keys are pinned, connections kept with `access` under the nodes' names."""
-    found: dict[str, Found] = {}
+    found: dict[str, FoundDevice] = {}
     lock = threading.Lock()
     signal = interrupt or Interrupt()
     by_name = {str(place): place for place in places}
 
     def meet(name: str) -> Outcome:
         place = by_name[name]
-        recorder = Recorder()
+        recorder = AcceptAnyKey()
         connection = _connect(access, renderer.fleet, place, recorder)
         try:
             with lock:
@@ -155,18 +155,18 @@ def look_around(
             connection.close()
             raise
         with lock:
-            found[node.name] = Found(place, node, seen, recorder.key, old_pins)
-            access.newcomers[node.name] = replace(connection.endpoint, identity=node.name)
+            found[node.name] = FoundDevice(place, node, seen, recorder.key, old_pins)
+            access.bench_endpoints[node.name] = replace(connection.endpoint, identity=node.name)
             if place.interface:
                 access.interfaces[node.name] = place.interface
-        access.keep(node.name, connection)
+        access.release(node.name, connection)
         return Outcome(name, Result.DONE)
 
     ended = run(by_name, meet, parallel=parallel, interrupt=signal, observer=observer)
-    return Arrivals(found, tuple(outcome for outcome in ended.values() if not outcome.result.is_good))
+    return Discovered(found, tuple(outcome for outcome in ended.values() if not outcome.result.is_good))
 
 
-def _connect(access: Access, fleet: Fleet, place: BenchPlace, recorder: Recorder) -> SshConnection:
+def _connect(access: ConnectionPool, fleet: Fleet, place: BenchTarget, recorder: AcceptAnyKey) -> SshConnection:
     """Log in with no password, or with the fleet's keys where an earlier attempt has come half way."""
     some = next(fleet.managed())
     credentials = replace(access.credentials(some), empty_password=True)
@@ -174,11 +174,11 @@ def _connect(access: Access, fleet: Fleet, place: BenchPlace, recorder: Recorder
     return connect(place.endpoint, credentials=credentials, trust=recorder, deadlines=access.deadlines, release=release)
 
 
-def _paths(renderer: Renderer, place: BenchPlace) -> tuple[str, ...]:
+def _paths(renderer: Renderer, place: BenchTarget) -> tuple[str, ...]:
     """The files to look at; which node it is may not be known yet, and the paths are much the same for all."""
     fleet = renderer.fleet
     node = find_node(fleet, place.node) if place.node else next(fleet.managed())
-    return other_paths(renderer.wanted(node))
+    return other_paths(renderer.desired(node))
 
 
 def _pin(trust: TrustStore, name: str, key: HostKey, *, replace_keys: bool) -> None:
@@ -193,28 +193,37 @@ def _pin(trust: TrustStore, name: str, key: HostKey, *, replace_keys: bool) -> N
     trust.replace(name, key)
 
 
-def restore_pins(trust: TrustStore, arrivals: Arrivals, names: Iterable[str]) -> None:
+def restore_pins(trust: TrustStore, arrivals: Discovered, names: Iterable[str]) -> None:
     """Trust the keys of before for these nodes: a device that was refused is not the node it was taken for."""
     for name in names:
         trust.replace(name, *arrivals.found[name].old_pins)
 
 
-def plan_arrivals(
+def plan_discovered(
     renderer: Renderer,
-    access: Access,
-    arrivals: Arrivals,
+    access: ConnectionPool,
+    arrivals: Discovered,
     known: Mapping[str, LastKnown],
     *,
     salt: bytes,
     owner: str,
-    choices: Choices | None = None,
+    choices: PlanOptions | None = None,
     interrupt: Interrupt | None = None,
 ) -> Prepared:
     """The plan that provisions the devices that were found. Whoever may know their radios is looked at, too: a spare
     may have been in the mesh, and a device that was reset was in it before."""
-    first = {name: renderer.wanted(item.node) for name, item in arrivals.found.items()}
+    first = {name: renderer.desired(item.node) for name, item in arrivals.found.items()}
     found = {name: item.seen for name, item in arrivals.found.items()}
     made = assemble(
-        renderer, access, first, Seen(found, {}), known, salt=salt, owner=owner, choices=choices or Choices()
+        renderer,
+        access,
+        first,
+        FleetObservation(found, {}),
+        known,
+        salt=salt,
+        owner=owner,
+        choices=choices or PlanOptions(),
     )
-    return replace(made, around=look_at_neighbours(access, renderer.fleet, found, known, interrupt=interrupt))
+    return replace(
+        made, neighbor_observations=look_at_neighbours(access, renderer.fleet, found, known, interrupt=interrupt)
+    )

@@ -10,7 +10,7 @@ from meshctl.device.framing import quoted
 from meshctl.device.observation import Observation
 from meshctl.device.scripts import script
 from meshctl.model import Backend, Fleet, Node, Secret
-from meshctl.plan import NodePlan, Wanted
+from meshctl.plan import DesiredState, NodePlan
 from meshctl.plan.seen import file_info, package_of, text_of
 
 # An id is part of a file's name on the node; a nonce has to be unguessable for a window of minutes.
@@ -25,7 +25,9 @@ def new_nonce() -> Secret:
     return Secret(secrets.token_hex(NONCE_BYTES))
 
 
-def change_of(change_id: str, plan: NodePlan, wanted: Wanted, before: Observation, services: tuple[str, ...]) -> Change:
+def change_of(
+    change_id: str, plan: NodePlan, wanted: DesiredState, before: Observation, services: tuple[str, ...]
+) -> Change:
     """The change that makes the files of `plan` what `wanted` has; the node refuses it if it is not as observed."""
     touched = {change.path for change in plan.files}
     files = {f"/{file.path}": NewFile(file.content, file.mode) for file in wanted.files if file.path in touched}

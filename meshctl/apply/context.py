@@ -14,16 +14,16 @@ from meshctl.device.upload import Progress
 from meshctl.fleet import Event, EventKind, Interrupt, Observer
 from meshctl.fleet.journal import Run
 from meshctl.model import Fleet, Node
-from meshctl.nodes.connections import Access
-from meshctl.plan import NodePlan, Wanted
+from meshctl.nodes.connections import ConnectionPool
+from meshctl.plan import DesiredState, NodePlan
 from meshctl.topology import mesh_macs
 
 if TYPE_CHECKING:
-    from meshctl.apply.station_flush import Forgetting
+    from meshctl.apply.station_flush import StationFlush
 
 
 @dataclass(frozen=True, slots=True)
-class Work:
+class RunContext:
     """What all nodes of a run share. `owner` names this process to the locks on the nodes; `remember` keeps what a
     node told, for later; `around` is what the nodes of their meshes told before anything was changed, `names` tells
     whose the MACs of mesh radios are, `bases` which are the base's; `later` collects what is to be asked in the end.
@@ -33,46 +33,46 @@ class Work:
     """
 
     fleet: Fleet
-    access: Access
-    run: Run
+    connections: ConnectionPool
+    journal_run: Run
     observer: Observer
     interrupt: Interrupt
     owner: str
     remember: Callable[[str, Observation], None] = lambda name, seen: None
     rate_bytes_per_s: float | None = None
-    around: Mapping[str, Observation] = field(default_factory=dict)
-    names: Mapping[str, str] = field(default_factory=dict)
-    bases: Sequence[str] = ()
-    later: list[Forgetting] = field(default_factory=list)
+    observations: Mapping[str, Observation] = field(default_factory=dict)
+    mac_owners: Mapping[str, str] = field(default_factory=dict)
+    base_macs: Sequence[str] = ()
+    unfinished_flushes: list[StationFlush] = field(default_factory=list)
     macs: dict[str, frozenset[str]] = field(default_factory=dict)
 
-    def saw(self, name: str, seen: Observation) -> None:
+    def record(self, name: str, seen: Observation) -> None:
         """Keep what a node reported, for the rest of the run and for later ones."""
         self.macs[name] = self.macs.get(name, frozenset()) | frozenset(mesh_macs(seen))
         self.remember(name, seen)
 
-    def current_names(self) -> dict[str, str]:
+    def current_mac_owners(self) -> dict[str, str]:
         """MAC -> node, with those that were learned during the run."""
-        return {**self.names, **{mac: name for name, macs in self.macs.items() for mac in macs}}
+        return {**self.mac_owners, **{mac: name for name, macs in self.macs.items() for mac in macs}}
 
-    def current_bases(self) -> frozenset[str]:
+    def current_base_macs(self) -> frozenset[str]:
         """The MACs of the base's mesh radios: those of before the run, and those seen since."""
         base = self.fleet.base_node
         seen = frozenset[str]() if base is None else self.macs.get(base.name, frozenset())
-        return frozenset(mac.lower() for mac in self.bases) | seen
+        return frozenset(mac.lower() for mac in self.base_macs) | seen
 
     def note(self, text: str, node: str = "") -> None:
         self.observer(Event(EventKind.NOTE, node, time.time(), text))
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class NodeContext:
     """One node: its plan, what it shall be, what it was before, what has to be there again afterwards."""
 
-    work: Work
+    run: RunContext
     node: Node
     plan: NodePlan
-    wanted: Wanted
+    desired: DesiredState
     before: Observation
     expected: Expectation
 
@@ -83,11 +83,11 @@ class Job:
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
         """Tell and journal a step."""
-        self.work.observer(Event(EventKind.STEP, self.name, time.time(), name))
-        with self.work.run.step(self.name, name):
+        self.run.observer(Event(EventKind.STEP, self.name, time.time(), name))
+        with self.run.journal_run.step(self.name, name):
             yield
 
     def progress(self, told: Progress) -> None:
         """For uploads: how much is on the node."""
         fraction = told.verified / told.total if told.total else 1.0
-        self.work.observer(Event(EventKind.PROGRESS, self.name, time.time(), fraction=fraction))
+        self.run.observer(Event(EventKind.PROGRESS, self.name, time.time(), fraction=fraction))

@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from meshctl.apply.commit_confirm import configure
-from meshctl.apply.context import Job, Work
+from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.health_checks import expectation
-from meshctl.apply.mesh_commit import switch
-from meshctl.apply.neighbor_query import look_around
+from meshctl.apply.mesh_commit import commit_mesh
+from meshctl.apply.neighbor_query import observe_neighbors
 from meshctl.apply.packages import install
 from meshctl.apply.prepare import Prepared, base_macs
-from meshctl.apply.stale_stations import booted_unforgotten_s
-from meshctl.apply.station_flush import NOT_ASKED, ask_the_rest, make_up_for
+from meshctl.apply.stale_stations import unflushed_boot_s
+from meshctl.apply.station_flush import UNFLUSHED, flush_later, retry_unanswered
 from meshctl.apply.sysupgrade import checked_image, flash
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
@@ -38,26 +38,26 @@ from meshctl.fleet import (
 from meshctl.fleet.journal import Journal, Run
 from meshctl.model import Fleet, NodeState
 from meshctl.nodes.collect import facts_of, known_macs
-from meshctl.nodes.connections import Access
-from meshctl.nodes.last_seen import ask_around
+from meshctl.nodes.connections import ConnectionPool
+from meshctl.nodes.last_seen import query_neighbors
 from meshctl.plan import NodePlan, Plan, Stage, StageKind, Verdict
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class RunSettings:
     """Where and for whom a plan is carried out."""
 
     fleet: Fleet
-    access: Access
+    connections: ConnectionPool
     journal: Journal
-    run: Run
+    journal_run: Run
     owner: str
     interrupt: Interrupt
     observer: Observer
     rate_bytes_per_s: float | None = None
 
 
-def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
+def execute(prepared: Prepared, setting: RunSettings) -> dict[str, Outcome]:
     """Apply the plan. Raises InputError and InvalidInput before anything is changed: an image or package file that is
     not what the inventory says."""
     plan, fleet = prepared.plan, setting.fleet
@@ -65,14 +65,14 @@ def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
         node.hardware.name: checked_image(node.hardware)
         for node in (fleet.nodes[name] for name, planned in plan.nodes.items() if planned.firmware is not None)
     }
-    unforgotten = _unforgotten(prepared, setting)
-    work = _work(prepared, setting, unforgotten)
-    outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _without_work(fleet, made))}
+    unforgotten = _unflushed(prepared, setting)
+    work = _run_context(prepared, setting, unforgotten)
+    outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _unchanged_outcome(fleet, made))}
     for outcome in outcomes.values():
-        _tell(setting, outcome)
-    jobs = _jobs(prepared, work)
+        _finish(setting, outcome)
+    jobs = _node_contexts(prepared, work)
     for name, since_s in unforgotten.items():
-        make_up_for(_job(prepared, work, name), max(0.0, time.time() - since_s))
+        flush_later(_node_context(prepared, work, name), max(0.0, time.time() - since_s))
     budget = FailureBudget(fleet.apply.stop_after_failures)
     stopped = ""
     for stage in plan.stages:
@@ -81,47 +81,47 @@ def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
         if reason:
             ended = {name: Outcome(name, Result.PENDING, reason) for name in stage.nodes}
             for outcome in ended.values():
-                _tell(setting, outcome)
+                _finish(setting, outcome)
         else:
-            ended = _stage(stage, jobs, plan, work, setting, budget, images)
+            ended = _run_stage(stage, jobs, plan, work, setting, budget, images)
         outcomes.update(ended)
         if stage.kind is StageKind.CANARY and any(outcome.result.is_failure for outcome in ended.values()):
             stopped = f"stopped: the canary {stage.nodes[0]} failed"
         elif budget.spent:
             stopped = budget.reason
-    outcomes.update(_searched(prepared, setting, jobs, outcomes))
-    outcomes.update(_with_those_not_asked(work, outcomes))
+    outcomes.update(_with_last_seen(prepared, setting, jobs, outcomes))
+    outcomes.update(_with_unflushed_neighbors(work, outcomes))
     return {name: outcomes[name] for name in plan.nodes}
 
 
-def _unforgotten(prepared: Prepared, setting: Setting) -> dict[str, float]:
+def _unflushed(prepared: Prepared, setting: RunSettings) -> dict[str, float]:
     """The nodes that answered whose radios may have started anew without their neighbours having been told, and since
     when (Unix time): of a change's beginning the end was not seen, or they have booted since they were last known."""
-    seen = prepared.seen.observations
+    seen = prepared.observed.observations
     lost = setting.journal.lost_sight_of(setting.fleet.name)
-    booted = {name: booted_unforgotten_s(name, seen) for name in prepared.plan.nodes}
+    booted = {name: unflushed_boot_s(name, seen) for name in prepared.plan.nodes}
     since = {name: at_s for name, at_s in booted.items() if at_s is not None} | lost
     return {name: at_s for name, at_s in since.items() if name in prepared.plan.nodes and name in seen}
 
 
-def _work(prepared: Prepared, setting: Setting, unforgotten: Iterable[str]) -> Work:
-    fleet, seen = setting.fleet, prepared.seen.observations
+def _run_context(prepared: Prepared, setting: RunSettings, unforgotten: Iterable[str]) -> RunContext:
+    fleet, seen = setting.fleet, prepared.observed.observations
     known = setting.journal.last_known(fleet.name)
-    around = {**seen, **prepared.around}
+    around = {**seen, **prepared.neighbor_observations}
     if again := {name: seen[name] for name in unforgotten}:
-        around = look_around(setting.access, fleet, again, known, told=around, interrupt=setting.interrupt)
-    return Work(
+        around = observe_neighbors(setting.connections, fleet, again, known, told=around, interrupt=setting.interrupt)
+    return RunContext(
         fleet,
-        setting.access,
-        setting.run,
+        setting.connections,
+        setting.journal_run,
         setting.observer,
         setting.interrupt,
         setting.owner,
-        remember=lambda name, told: setting.run.remember(fleet.name, name, facts_of(told), told.answered_at_s),
+        remember=lambda name, told: setting.journal_run.remember(fleet.name, name, facts_of(told), told.answered_at_s),
         rate_bytes_per_s=setting.rate_bytes_per_s,
-        around=around,
-        names=known_macs(fleet, known),
-        bases=base_macs(fleet, seen, known),
+        observations=around,
+        mac_owners=known_macs(fleet, known),
+        base_macs=base_macs(fleet, seen, known),
     )
 
 
@@ -129,8 +129,8 @@ def _work(prepared: Prepared, setting: Setting, unforgotten: Iterable[str]) -> W
 _LOST = (Result.UNCERTAIN, Result.UNREACHABLE)
 
 
-def _searched(
-    prepared: Prepared, setting: Setting, jobs: Mapping[str, Job], outcomes: Mapping[str, Outcome]
+def _with_last_seen(
+    prepared: Prepared, setting: RunSettings, jobs: Mapping[str, NodeContext], outcomes: Mapping[str, Outcome]
 ) -> dict[str, Outcome]:
     """The outcomes of nodes that did not return, with what was last seen of them, and by whom."""
     lost = [name for name in jobs if outcomes[name].result in _LOST]
@@ -138,32 +138,32 @@ def _searched(
         return {}
     fleet = setting.fleet
     known = setting.journal.last_known(fleet.name)
-    found = ask_around(setting.access, fleet, lost, prepared.seen, known, interrupt=setting.interrupt)
+    found = query_neighbors(setting.connections, fleet, lost, prepared.observed, known, interrupt=setting.interrupt)
     told = {}
     for name, place in found.items():
         text = place.text(time.time())
         outcome = outcomes[name]
         told[name] = replace(outcome, reason=f"{outcome.reason}; {text}", facts={**outcome.facts, **place.facts})
-        setting.run.finish_node(told[name])
+        setting.journal_run.finish_node(told[name])
         setting.observer(Event(EventKind.NOTE, name, time.time(), text))
     return told
 
 
-def _with_those_not_asked(work: Work, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
+def _with_unflushed_neighbors(work: RunContext, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
     """The outcomes of nodes that some neighbour may not hear for a while, with who that is."""
     told = {}
-    for name, silent in ask_the_rest(work).items():
-        told[name] = replace(outcomes[name], facts={**outcomes[name].facts, NOT_ASKED: " ".join(silent)})
-        work.run.finish_node(told[name])
+    for name, silent in retry_unanswered(work).items():
+        told[name] = replace(outcomes[name], facts={**outcomes[name].facts, UNFLUSHED: " ".join(silent)})
+        work.journal_run.finish_node(told[name])
     return told
 
 
-def _tell(setting: Setting, outcome: Outcome) -> None:
-    setting.run.finish_node(outcome)
+def _finish(setting: RunSettings, outcome: Outcome) -> None:
+    setting.journal_run.finish_node(outcome)
     setting.observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
 
 
-def _without_work(fleet: Fleet, plan: NodePlan) -> Outcome | None:
+def _unchanged_outcome(fleet: Fleet, plan: NodePlan) -> Outcome | None:
     """The outcome of a node that nothing is done to; None for one that is changed."""
     match plan.verdict:
         case Verdict.SAME:
@@ -177,27 +177,27 @@ def _without_work(fleet: Fleet, plan: NodePlan) -> Outcome | None:
             return None
 
 
-def _jobs(prepared: Prepared, work: Work) -> dict[str, Job]:
+def _node_contexts(prepared: Prepared, work: RunContext) -> dict[str, NodeContext]:
     changing = (name for name, plan in prepared.plan.nodes.items() if plan.verdict is Verdict.CHANGE)
-    return {name: _job(prepared, work, name) for name in changing}
+    return {name: _node_context(prepared, work, name) for name in changing}
 
 
-def _job(prepared: Prepared, work: Work, name: str) -> Job:
-    seen, wanted = prepared.seen.observations[name], prepared.wanted[name]
-    expected = expectation(wanted, seen, work.bases)
-    return Job(work, work.fleet.nodes[name], prepared.plan.nodes[name], wanted, seen, expected)
+def _node_context(prepared: Prepared, work: RunContext, name: str) -> NodeContext:
+    seen, wanted = prepared.observed.observations[name], prepared.desired[name]
+    expected = expectation(wanted, seen, work.base_macs)
+    return NodeContext(work, work.fleet.nodes[name], prepared.plan.nodes[name], wanted, seen, expected)
 
 
-def _stage(
+def _run_stage(
     stage: Stage,
-    jobs: Mapping[str, Job],
+    jobs: Mapping[str, NodeContext],
     plan: Plan,
-    work: Work,
-    setting: Setting,
+    work: RunContext,
+    setting: RunSettings,
     budget: FailureBudget,
     images: Mapping[str, Path],
 ) -> dict[str, Outcome]:
-    observer = Tee((_journaling(setting.run), setting.observer))
+    observer = Tee((_journaling(setting.journal_run), setting.observer))
     if stage.kind is StageKind.SWITCH:
         ended = _switch_stage(stage, jobs, plan, work, observer)
         for outcome in ended.values():
@@ -205,7 +205,7 @@ def _stage(
         return ended
     return run(
         stage.nodes,
-        lambda name: _one_node(jobs[name], images),
+        lambda name: _change_node(jobs[name], images),
         # a stage says who may be down together, the policy how many we can work on at once
         parallel=max(1, work.fleet.apply.parallel),
         budget=budget,
@@ -222,7 +222,7 @@ def _journaling(journal_run: Run) -> Observer:
     return write
 
 
-def _one_node(job: Job, images: Mapping[str, Path]) -> Outcome:
+def _change_node(job: NodeContext, images: Mapping[str, Path]) -> Outcome:
     """Firmware, or packages and then files. NodeError means that nothing was changed."""
     if job.plan.firmware is not None:
         return flash(job, _connection(job), images[job.node.hardware.name])
@@ -241,14 +241,14 @@ def _one_node(job: Job, images: Mapping[str, Path]) -> Outcome:
         return replace(failed, result=Result.FAILED, reason=f"its packages are installed, its files not: {error}")
 
 
-def _connection(job: Job) -> SshConnection:
+def _connection(job: NodeContext) -> SshConnection:
     """The kept connection, or a new one to where the node is now: on the bench, if it was met there."""
-    access = job.work.access
-    return access.take(job.name) or access.open(job.node, endpoint=access.newcomers.get(job.name))
+    access = job.run.connections
+    return access.acquire(job.name) or access.open(job.node, endpoint=access.bench_endpoints.get(job.name))
 
 
 def _switch_stage(
-    stage: Stage, jobs: Mapping[str, Job], plan: Plan, work: Work, observer: Observer
+    stage: Stage, jobs: Mapping[str, NodeContext], plan: Plan, work: RunContext, observer: Observer
 ) -> dict[str, Outcome]:
     """Packages first, which cut nothing; then everybody at one moment."""
     began = time.monotonic()
@@ -259,7 +259,7 @@ def _switch_stage(
         reason = f"the switch was called off: {', '.join(failed)} was not ready"
         ended = {name: failed.get(name) or Outcome(name, Result.PENDING, reason) for name in stage.nodes}
     else:
-        ended = switch(
+        ended = commit_mesh(
             work,
             [jobs[name] for name in stage.nodes],
             quorum=work.fleet.apply.quorum,
@@ -273,7 +273,7 @@ def _switch_stage(
     return told
 
 
-def _packages_first(stage: Stage, jobs: Mapping[str, Job]) -> dict[str, Outcome]:
+def _packages_first(stage: Stage, jobs: Mapping[str, NodeContext]) -> dict[str, Outcome]:
     failed: dict[str, Outcome] = {}
     for name in stage.nodes:
         step = jobs[name].plan.packages

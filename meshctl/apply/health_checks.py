@@ -11,13 +11,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from meshctl.device.observation import Observation
-from meshctl.plan import Wanted
+from meshctl.plan import DesiredState
 from meshctl.plan.packages import NO_NEEDS, Needs, missing_packages
 from meshctl.topology import NEIGHBOUR_FRESH_MS
 from meshctl.uci import Package, Section
 
 # Robots move: of the neighbours a node had, so many have to be heard again.
-NEIGHBOURS_BACK = 0.5
+MIN_NEIGHBOR_SHARE = 0.5
 RELOADING = "its services are still reloading"
 
 
@@ -28,33 +28,33 @@ class Expectation:
 
     wireless: Package | None = None
     network: Package | None = None
-    neighbours: frozenset[str] = frozenset()
-    bases: frozenset[str] = frozenset()
+    neighbors: frozenset[str] = frozenset()
+    base_macs: frozenset[str] = frozenset()
     needs: Needs = NO_NEEDS
 
-    def with_bases(self, current: frozenset[str]) -> Expectation:
+    def with_base_macs(self, current: frozenset[str]) -> Expectation:
         """The same, where the base may be reached by any of these MACs; a node that did not reach it need not now."""
-        return replace(self, bases=self.bases | current) if self.bases else self
+        return replace(self, base_macs=self.base_macs | current) if self.base_macs else self
 
 
-def expectation(wanted: Wanted, before: Observation, base_macs: Iterable[str] = ()) -> Expectation:
+def expectation(wanted: DesiredState, before: Observation, base_macs: Iterable[str] = ()) -> Expectation:
     """What this node had and must have again; the base counts only if it was reached through the mesh before."""
     trees = {file.package.name: file.package for file in wanted.files if file.package is not None}
     originators = {entry.mac.lower() for entry in before.originators or ()}
     return Expectation(
         trees.get("wireless"),
         trees.get("network"),
-        heard(before),
+        heard_neighbors(before),
         frozenset(mac.lower() for mac in base_macs) & originators,
     )
 
 
-def heard(seen: Observation, fresh_ms: float = NEIGHBOUR_FRESH_MS) -> frozenset[str]:
+def heard_neighbors(seen: Observation, fresh_ms: float = NEIGHBOUR_FRESH_MS) -> frozenset[str]:
     """The MACs of the mesh neighbours heard lately."""
     return frozenset(n.mac.lower() for n in seen.neighbours or () if n.last_seen_ms <= fresh_ms)
 
 
-def missing(expected: Expectation, after: Observation, *, since_s: float | None = None) -> tuple[str, ...]:
+def unmet(expected: Expectation, after: Observation, *, since_s: float | None = None) -> tuple[str, ...]:
     """What is not there yet, each as half a sentence; empty when the change has proven itself.
 
     `since_s` is how long the change has stood: what was heard before it does not count.
@@ -65,7 +65,7 @@ def missing(expected: Expectation, after: Observation, *, since_s: float | None 
         *_packages(expected, after),
         *_lan(expected, after),
         *_radios(expected, after),
-        *_neighbours(expected, after, fresh_ms),
+        *_neighbors(expected, after, fresh_ms),
         *_base(expected, after, fresh_ms),
     )
 
@@ -142,17 +142,17 @@ def _radio(iface: Section, channel: str, after: Observation) -> list[str]:
     return []
 
 
-def _neighbours(expected: Expectation, after: Observation, fresh_ms: float) -> tuple[str, ...]:
-    needed = math.ceil(len(expected.neighbours) * NEIGHBOURS_BACK)
+def _neighbors(expected: Expectation, after: Observation, fresh_ms: float) -> tuple[str, ...]:
+    needed = math.ceil(len(expected.neighbors) * MIN_NEIGHBOR_SHARE)
     # by number, not by name: a neighbour may have moved on, another come near
-    found = len(heard(after, fresh_ms))
+    found = len(heard_neighbors(after, fresh_ms))
     if found >= needed:
         return ()
-    return (f"it hears {found} mesh neighbour{'s' if found != 1 else ''} of the {len(expected.neighbours)} it had",)
+    return (f"it hears {found} mesh neighbour{'s' if found != 1 else ''} of the {len(expected.neighbors)} it had",)
 
 
 def _base(expected: Expectation, after: Observation, fresh_ms: float) -> tuple[str, ...]:
-    if not expected.bases:
+    if not expected.base_macs:
         return ()
     reached = {entry.mac.lower() for entry in after.originators or () if entry.last_seen_ms <= fresh_ms}
-    return () if expected.bases & reached else ("it has no way to the base",)
+    return () if expected.base_macs & reached else ("it has no way to the base",)

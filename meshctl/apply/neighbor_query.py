@@ -10,21 +10,21 @@ import time
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from meshctl.apply.stale_stations import MOST_ASKED, neighbours_now
+from meshctl.apply.stale_stations import MAX_QUERIED, current_neighbors
 from meshctl.device.observation import Observation
 from meshctl.fleet import Interrupt
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
-from meshctl.nodes.collect import gather, known_macs
-from meshctl.nodes.connections import Access
+from meshctl.nodes.collect import collect, known_macs
+from meshctl.nodes.connections import ConnectionPool
 
 # So long an 802.11s mesh remembers whom it does not hear (IEEE80211_MESH_PEER_INACTIVITY_LIMIT, net/mac80211/mesh.h);
 # an ad-hoc cell forgets within a minute.
 REMEMBERED_S = 1800.0
 
 
-def look_around(
-    access: Access,
+def observe_neighbors(
+    access: ConnectionPool,
     fleet: Fleet,
     seen: Mapping[str, Observation],
     known: Mapping[str, LastKnown],
@@ -36,13 +36,13 @@ def look_around(
 
     Connections stay with `access`.
     """
-    names = neighbours_of(fleet, seen, known, now_s=time.time())
+    names = known_neighbors(fleet, seen, known, now_s=time.time())
     nodes = [fleet.nodes[name] for name in names if name not in told]
-    around = gather(access, nodes, parallel=max(1, fleet.apply.parallel), interrupt=interrupt) if nodes else None
+    around = collect(access, nodes, parallel=max(1, fleet.apply.parallel), interrupt=interrupt) if nodes else None
     return {**told, **seen, **(around.observations if around is not None else {})}
 
 
-def neighbours_of(
+def known_neighbors(
     fleet: Fleet, seen: Mapping[str, Observation], known: Mapping[str, LastKnown], *, now_s: float
 ) -> tuple[str, ...]:
     """The nodes beside these that may know one of them. Pure."""
@@ -53,5 +53,5 @@ def neighbours_of(
         heard = () if last is None else last.facts.get("neighbours", "").split()
         is_recent = last is not None and now_s - last.seen_s < REMEMBERED_S
         former = [names[mac.lower()] for mac in heard if is_recent and mac.lower() in names]
-        near += [*neighbours_now(observation, names), *former][:MOST_ASKED]
+        near += [*current_neighbors(observation, names), *former][:MAX_QUERIED]
     return tuple(name for name in dict.fromkeys(near) if name not in seen and name in fleet.nodes)

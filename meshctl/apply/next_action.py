@@ -12,7 +12,7 @@ from enum import Enum
 from meshctl.device.observation import ChangeStatus
 
 
-class Move(Enum):
+class Action(Enum):
     """START: nothing of ours is armed, send it. BEGIN: it is armed and waits for the word. WAIT: it is on its way.
     CONFIRM: it has proven itself. ABORT: it never will. KEPT, WENT_BACK: it has ended. FOREIGN: somebody else's change
     is in the way."""
@@ -28,10 +28,10 @@ class Move(Enum):
 
 
 # Too little of the window left to prove anything more: take it back now instead of waiting for the timer.
-LAST_MOMENT_S = 3.0
+MIN_PROOF_S = 3.0
 
 
-def next_move(
+def next_action(
     change_id: str,
     status: ChangeStatus,
     missing: Sequence[str],
@@ -39,38 +39,38 @@ def next_move(
     is_at_new_address: bool,
     leaving: bool = False,
     is_given_up: bool = False,
-) -> Move:
+) -> Action:
     """The next move for change `change_id`. `missing` is what has not come back yet (only counts once applied);
     `is_at_new_address` whether the answer came from where the node shall be; `leaving` that nobody will wait;
     `is_given_up` that the change is not wanted any more, whatever it proves."""
-    start = Move.WENT_BACK if is_given_up else Move.START
+    start = Action.WENT_BACK if is_given_up else Action.START
     if not status.installed:
         return start
     if status.change_id == change_id:
         match status.state:
             case "staged":
-                return Move.ABORT if is_given_up else Move.START
+                return Action.ABORT if is_given_up else Action.START
             case "armed":
-                return Move.ABORT if is_given_up else Move.BEGIN
+                return Action.ABORT if is_given_up else Action.BEGIN
             case "applied":
                 if is_given_up:
-                    return Move.ABORT
+                    return Action.ABORT
                 return _applied(status, missing, is_at_new_address=is_at_new_address, leaving=leaving)
             case _:
-                return Move.ABORT if is_given_up and status.state == "waiting" else Move.WAIT
+                return Action.ABORT if is_given_up and status.state == "waiting" else Action.WAIT
     if status.last_id == change_id:
-        return Move.KEPT if status.last_outcome == "confirmed" else Move.WENT_BACK
+        return Action.KEPT if status.last_outcome == "confirmed" else Action.WENT_BACK
     if status.state in ("armed", "waiting", "applied", "restoring"):
-        return Move.FOREIGN
+        return Action.FOREIGN
     return start
 
 
-def _applied(status: ChangeStatus, missing: Sequence[str], *, is_at_new_address: bool, leaving: bool) -> Move:
+def _applied(status: ChangeStatus, missing: Sequence[str], *, is_at_new_address: bool, leaving: bool) -> Action:
     if not missing and is_at_new_address:
-        return Move.CONFIRM
+        return Action.CONFIRM
     failed = status.reload_status not in (None, 0)
-    late = status.left_s is not None and status.left_s < LAST_MOMENT_S
-    return Move.ABORT if failed or late or leaving else Move.WAIT
+    late = status.left_s is not None and status.left_s < MIN_PROOF_S
+    return Action.ABORT if failed or late or leaving else Action.WAIT
 
 
 def applied_age_s(status: ChangeStatus) -> float | None:
@@ -92,7 +92,7 @@ REASONS = {
 }
 
 
-def why_it_went_back(status: ChangeStatus, missing: Sequence[str], shut_out: str = "", unreached: str = "") -> str:
+def rollback_reason(status: ChangeStatus, missing: Sequence[str], shut_out: str = "", unreached: str = "") -> str:
     """One sentence for an outcome. `shut_out` is that it let nobody in while the change was in force: what was missing
     was then seen too late, after it went back. `unreached` is why it could not be reached at all."""
     word, _, rest = status.last_reason.partition("+")

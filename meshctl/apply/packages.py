@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from meshctl.apply.change_in_progress import Attempt, await_flash
+from meshctl.apply.change_in_progress import ChangeInProgress, await_flash
 from meshctl.apply.change_set import new_change_id, new_nonce
-from meshctl.apply.commit_confirm import carry
-from meshctl.apply.context import Job
+from meshctl.apply.commit_confirm import run_change
+from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import Expectation
 from meshctl.device import deadman
 from meshctl.device.deadman import Change
@@ -30,14 +30,14 @@ from meshctl.plan.seen import CONFIG
 
 DIRECTORY = "/tmp/meshctl/packages"
 # Unpacking packages into jffs2 takes a minute on the slowest boards, and as much again to keep what is removed.
-INSTALL_S = 300.0
+INSTALL_TIMEOUT_S = 300.0
 # What conflicts is the radios' supplicant: netifd sets each radio up with the one there is now.
-_WITH_THE_OTHER_SUPPLICANT = "[ ! -x /sbin/wifi ] || /sbin/wifi\n"
+_RESTART_RADIOS = "[ ! -x /sbin/wifi ] || /sbin/wifi\n"
 # A package's uci-defaults edit /etc/config and commit it (base-files, default_postinst): taken up, or put back.
-_TAKE_UP = "reload_config\n"
+_RELOAD = "reload_config\n"
 
 
-def install(job: Job, connection: SshConnection, step: PackageStep) -> Outcome:
+def install(job: NodeContext, connection: SshConnection, step: PackageStep) -> Outcome:
     """Install the step's packages. Owns `connection`, and keeps one to the node if all went well.
 
     Raises NodeError when nothing but its memory was changed on the node, InputError for a file that is not there.
@@ -50,14 +50,14 @@ def install(job: Job, connection: SshConnection, step: PackageStep) -> Outcome:
         with job.step("packages"):
             # first, because files in memory do not outlive a boot that is yet to come to its end
             await_flash(job, connection)
-            script = deadman.packages(tool, _bring(job, connection, files), step.remove)
+            script = deadman.packages(tool, _upload(job, connection, files), step.remove)
     except BaseException:
         connection.close()
         raise
-    return carry(_attempt(job, connection, script, has_other_supplicant=bool(step.remove)), connection)
+    return run_change(_new_change(job, connection, script, has_other_supplicant=bool(step.remove)), connection)
 
 
-def _bring(job: Job, connection: SshConnection, files: Sequence[Path]) -> list[str]:
+def _upload(job: NodeContext, connection: SshConnection, files: Sequence[Path]) -> list[str]:
     there = []
     # of an earlier attempt with other files, which would only fill the memory
     names = "|".join(f"{quoted(file.name)}|.{quoted(file.name)}.*.part" for file in files)
@@ -66,24 +66,26 @@ def _bring(job: Job, connection: SshConnection, files: Sequence[Path]) -> list[s
     )
     for file in files:
         path = f"{DIRECTORY}/{file.name}"
-        upload(connection, file, path, rate_bytes_per_s=job.work.rate_bytes_per_s, progress=job.progress)
+        upload(connection, file, path, rate_bytes_per_s=job.run.rate_bytes_per_s, progress=job.progress)
         there.append(path)
     return there
 
 
-def _attempt(job: Job, connection: SshConnection, script: str, *, has_other_supplicant: bool) -> Attempt:
+def _new_change(
+    job: NodeContext, connection: SshConnection, script: str, *, has_other_supplicant: bool
+) -> ChangeInProgress:
     """A change of packages alone: the node stays where it is, and has to hear whom it heard."""
     here = replace(connection.endpoint, identity=job.name)
-    expected = Expectation(neighbours=job.expected.neighbours, bases=job.expected.bases, needs=job.wanted.needs)
-    reload = _TAKE_UP + (_WITH_THE_OTHER_SUPPLICANT if has_other_supplicant else "exit 0\n")
-    return Attempt(
+    expected = Expectation(neighbors=job.expected.neighbors, base_macs=job.expected.base_macs, needs=job.desired.needs)
+    reload = _RELOAD + (_RESTART_RADIOS if has_other_supplicant else "exit 0\n")
+    return ChangeInProgress(
         replace(job, expected=expected),
         Change(new_change_id(), {}, reload, extra=script, covered=_configuration(job.before)),
         new_nonce(),
         job.node.confirm_window_s,
         here,
         (here,),
-        extra_s=INSTALL_S,
+        extra_s=INSTALL_TIMEOUT_S,
         radios=EVERY_RADIO if has_other_supplicant else NO_RADIOS,
     )
 
@@ -93,10 +95,10 @@ def _configuration(before: Observation) -> tuple[str, ...]:
     return tuple(f"/{CONFIG}{package}" for package in sorted(before.uci or {}))
 
 
-def _local(job: Job, file: str) -> Path:
+def _local(job: NodeContext, file: str) -> Path:
     """A package file's path here; relative ones stand beside the inventory."""
     path = Path(file).expanduser()
-    path = path if path.is_absolute() else Path(job.work.fleet.base) / path
+    path = path if path.is_absolute() else Path(job.run.fleet.base) / path
     if not path.is_file():
         raise InputError(f"{path}: package file not found", hint="correct package_files in the hardware profile")
     return path

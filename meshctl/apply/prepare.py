@@ -17,18 +17,18 @@ from meshctl.errors import InputError
 from meshctl.fleet import Interrupt, Observer, silent
 from meshctl.fleet.journal import Journal, LastKnown
 from meshctl.model import Fleet, Node, NodeState
-from meshctl.nodes.collect import Seen, facts_of, gather, known_macs
-from meshctl.nodes.connections import Access
+from meshctl.nodes.collect import FleetObservation, collect, facts_of, known_macs
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
-from meshctl.nodes.last_seen import WITNESSES, whereabouts
-from meshctl.plan import Cut, NodePlan, Plan, Verdict, Wanted, fleet_plan, node_plan
+from meshctl.nodes.last_seen import MAX_QUERIED, last_seen_of
+from meshctl.plan import Cut, DesiredState, NodePlan, Plan, Verdict, fleet_plan, node_plan
 from meshctl.plan.masking import Fingerprints
 from meshctl.plan.seen import package_of
 from meshctl.topology import mesh_macs
 
 
 @dataclass(frozen=True, slots=True)
-class Choices:
+class PlanOptions:
     """What a person decided about a plan."""
 
     with_firmware: bool = True
@@ -42,21 +42,21 @@ class Prepared:
     """A plan, and what was rendered and seen for it; `around` is what others told who may know these nodes' radios."""
 
     plan: Plan
-    wanted: Mapping[str, Wanted] = field(repr=False)
-    seen: Seen = field(repr=False)
+    desired: Mapping[str, DesiredState] = field(repr=False)
+    observed: FleetObservation = field(repr=False)
     salt: bytes = b""
-    around: Mapping[str, Observation] = field(default_factory=dict, repr=False)
+    neighbor_observations: Mapping[str, Observation] = field(default_factory=dict, repr=False)
 
 
 def prepare(
     renderer: Renderer,
-    access: Access,
+    access: ConnectionPool,
     nodes: Iterable[Node],
     journal: Journal,
     *,
     salt: bytes,
     owner: str,
-    choices: Choices | None = None,
+    choices: PlanOptions | None = None,
     interrupt: Interrupt | None = None,
     observer: Observer = silent,
 ) -> Prepared:
@@ -67,8 +67,8 @@ def prepare(
     """
     fleet = renderer.fleet
     chosen = tuple(nodes)
-    first = {node.name: renderer.wanted(node) for node in chosen}
-    seen = gather(
+    first = {node.name: renderer.desired(node) for node in chosen}
+    seen = collect(
         access,
         chosen,
         parallel=fleet.apply.parallel,
@@ -77,25 +77,25 @@ def prepare(
         observer=observer,
     )
     _remember(journal, fleet, seen)
-    decided = choices or Choices()
+    decided = choices or PlanOptions()
     single = _node_plans(renderer, access, first, seen, salt=salt, owner=owner, choices=decided)
-    rest = _rest_of_their_meshes(fleet, single.plans.values()) or _witnesses(
+    rest = _other_members(fleet, single.plans.values()) or _former_neighbors(
         fleet, single.plans.values(), journal.last_known(fleet.name)
     )
     if rest and not (interrupt is not None and interrupt.stopping):
-        around = gather(access, rest, parallel=fleet.apply.parallel, interrupt=interrupt, observer=observer)
+        around = collect(access, rest, parallel=fleet.apply.parallel, interrupt=interrupt, observer=observer)
         _remember(journal, fleet, around)
         seen = replace(seen, observations={**seen.observations, **around.observations})
-        single = replace(single, around=_plans_around(renderer, around, salt, owner))
-    return _in_order(fleet, single, seen, journal.last_known(fleet.name), salt=salt, choices=decided)
+        single = replace(single, unchanged=_unchanged_plans(renderer, around, salt, owner))
+    return _with_fleet_plan(fleet, single, seen, journal.last_known(fleet.name), salt=salt, choices=decided)
 
 
-def _remember(journal: Journal, fleet: Fleet, seen: Seen) -> None:
+def _remember(journal: Journal, fleet: Fleet, seen: FleetObservation) -> None:
     facts = {name: facts_of(observation) for name, observation in seen.observations.items()}
     journal.remember_all(fleet.name, facts, time.time())
 
 
-def _rest_of_their_meshes(fleet: Fleet, plans: Iterable[NodePlan]) -> tuple[Node, ...]:
+def _other_members(fleet: Fleet, plans: Iterable[NodePlan]) -> tuple[Node, ...]:
     """The deployed nodes beside these that share a mesh which one of these would cut, leave or come back to."""
     planned = {plan.node: plan for plan in plans}
     meshes = {
@@ -108,7 +108,7 @@ def _rest_of_their_meshes(fleet: Fleet, plans: Iterable[NodePlan]) -> tuple[Node
     return tuple(node for name, node in members.items() if name not in planned and node.state is NodeState.DEPLOYED)
 
 
-def _witnesses(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[str, LastKnown]) -> tuple[Node, ...]:
+def _former_neighbors(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[str, LastKnown]) -> tuple[Node, ...]:
     """Who may tell of those that do not answer: the neighbours they had when they were last seen, and the base."""
     chosen = {plan.node: plan for plan in plans}
     macs = known_macs(fleet, known)
@@ -122,66 +122,66 @@ def _witnesses(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[str, Last
     ]
     base = [fleet.base_node.name] if away and fleet.base_node is not None else []
     names = [name for name in dict.fromkeys((*near, *base)) if name not in chosen]
-    return tuple(fleet.nodes[name] for name in names[:WITNESSES])
+    return tuple(fleet.nodes[name] for name in names[:MAX_QUERIED])
 
 
-def _plans_around(renderer: Renderer, around: Seen, salt: bytes, owner: str) -> dict[str, NodePlan]:
+def _unchanged_plans(renderer: Renderer, around: FleetObservation, salt: bytes, owner: str) -> dict[str, NodePlan]:
     """What would be done to these, had they been chosen, as far as it tells which cell they run."""
     plans = {}
     for name, observation in around.observations.items():
         # a node that was not asked for may not be the reason why nothing can be done to the others
         with suppress(InvalidInput, InputError):
-            wanted = renderer.wanted(renderer.fleet.nodes[name], observation)
+            wanted = renderer.desired(renderer.fleet.nodes[name], observation)
             plans[name] = node_plan(wanted, observation, Fingerprints(salt), owner=owner, with_firmware=False)
     return plans
 
 
 def assemble(
     renderer: Renderer,
-    access: Access,
-    first: Mapping[str, Wanted],
-    seen: Seen,
+    access: ConnectionPool,
+    first: Mapping[str, DesiredState],
+    seen: FleetObservation,
     known: Mapping[str, LastKnown],
     *,
     salt: bytes,
     owner: str,
-    choices: Choices,
+    choices: PlanOptions,
 ) -> Prepared:
     """The plan for what was rendered without the devices' facts (`first`) and what was seen."""
     single = _node_plans(renderer, access, first, seen, salt=salt, owner=owner, choices=choices)
-    return _in_order(renderer.fleet, single, seen, known, salt=salt, choices=choices)
+    return _with_fleet_plan(renderer.fleet, single, seen, known, salt=salt, choices=choices)
 
 
 @dataclass(frozen=True, slots=True)
-class _Single:
+class _NodePlans:
     """Each node for itself; `around`: others of their meshes, to which nothing is done."""
 
     plans: Mapping[str, NodePlan]
-    wanted: Mapping[str, Wanted] = field(repr=False)
-    around: Mapping[str, NodePlan] = field(default_factory=dict)
+    desired: Mapping[str, DesiredState] = field(repr=False)
+    unchanged: Mapping[str, NodePlan] = field(default_factory=dict)
 
 
 def _node_plans(
     renderer: Renderer,
-    access: Access,
-    first: Mapping[str, Wanted],
-    seen: Seen,
+    access: ConnectionPool,
+    first: Mapping[str, DesiredState],
+    seen: FleetObservation,
     *,
     salt: bytes,
     owner: str,
-    choices: Choices,
-) -> _Single:
+    choices: PlanOptions,
+) -> _NodePlans:
     fingerprints = Fingerprints(salt)
-    wanted: dict[str, Wanted] = {}
+    wanted: dict[str, DesiredState] = {}
     plans: dict[str, NodePlan] = {}
     for name, want in first.items():
         observation = seen.observations.get(name)
-        wanted[name] = want if observation is None else renderer.wanted(want.node, observation)
+        wanted[name] = want if observation is None else renderer.desired(want.node, observation)
         made = node_plan(
             wanted[name],
             observation,
             fingerprints,
-            away=seen.away.get(name, ""),
+            away=seen.unreachable.get(name, ""),
             owner=owner,
             with_firmware=choices.with_firmware,
             own_keys=None if observation is None else access.own_keys(want.node),
@@ -190,37 +190,37 @@ def _node_plans(
         if error is not None:
             made = replace(made, verdict=Verdict.REFUSED, reason=str(error), hint=error.hint)
         plans[name] = made
-    return _Single(plans, wanted)
+    return _NodePlans(plans, wanted)
 
 
-def _in_order(
+def _with_fleet_plan(
     fleet: Fleet,
-    single: _Single,
-    seen: Seen,
+    single: _NodePlans,
+    seen: FleetObservation,
     known: Mapping[str, LastKnown],
     *,
     salt: bytes,
-    choices: Choices,
+    choices: PlanOptions,
 ) -> Prepared:
     plans = dict(single.plans)
     away = [name for name, made in plans.items() if made.verdict is Verdict.AWAY]
-    for name, place in whereabouts(fleet, away, seen.observations, known).items():
+    for name, place in last_seen_of(fleet, away, seen.observations, known).items():
         plans[name] = replace(plans[name], reason=f"{plans[name].reason}; {place.text(time.time())}")
     plan = fleet_plan(
         fleet,
         plans,
         seen.graph(fleet, known),
         now_s=time.time(),
-        around=single.around,
+        around=single.unchanged,
         entry=choices.entry,
         leave_behind=choices.leave_behind,
         accept_cuts=choices.accept_cuts,
         never_meshed=[name for name in single.plans if name in known and known[name].facts.get("cell") == "none"],
     )
-    return Prepared(plan, single.wanted, seen, salt)
+    return Prepared(plan, single.desired, seen, salt)
 
 
-def other_paths(wanted: Wanted) -> tuple[str, ...]:
+def other_paths(wanted: DesiredState) -> tuple[str, ...]:
     """The absolute paths of a node's files that are no UCI packages."""
     return tuple(f"/{file.path}" for file in wanted.files if package_of(file.path) is None)
 

@@ -11,44 +11,44 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from meshctl.apply.bootstrap import Arrivals, BenchPlace, Found
+from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice
 from meshctl.apply.prepare import other_paths
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import connect
-from meshctl.device.trust import HostKey, Recorder, TrustStore
+from meshctl.device.trust import AcceptAnyKey, HostKey, TrustStore
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Interrupt
 from meshctl.model import Fleet, Node, NodeState
 from meshctl.nodes.collect import observe_cleared
-from meshctl.nodes.connections import Access
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
 
 
 @dataclass(frozen=True, slots=True)
-class Successor:
+class Replacement:
     """The device that takes over: `spare` is its node in the inventory, None for a stranger on the bench."""
 
-    arrivals: Arrivals
+    discovered: Discovered
     spare: Node | None
     old_pins: tuple[HostKey, ...]
 
 
-def succeed(
+def adopt(
     renderer: Renderer,
-    access: Access,
+    access: ConnectionPool,
     trust: TrustStore,
     old: Node,
     *,
     spare: Node | None,
-    place: BenchPlace | None,
+    place: BenchTarget | None,
     interrupt: Interrupt,
-) -> Successor:
+) -> Replacement:
     """Meet the new device and pin its key under the old node's name.
 
     Raises NodeError when the old node still answers as itself, or the new device does not.
     """
-    _must_be_silent(access, old)
-    recorder = Recorder()
+    _require_unreachable(access, old)
+    recorder = AcceptAnyKey()
     if place is not None:
         credentials = replace(access.credentials(old), empty_password=True)
         connection = connect(
@@ -62,7 +62,7 @@ def succeed(
     else:
         raise InputError("expected a spare of the inventory, or a place on the bench")
     try:
-        seen = observe_cleared(connection, other_paths(renderer.wanted(old)), interrupt)
+        seen = observe_cleared(connection, other_paths(renderer.desired(old)), interrupt)
         if key is None:
             raise NodeError(f"{connection.endpoint.label}: showed no host key")
     except BaseException:
@@ -70,15 +70,15 @@ def succeed(
         raise
     pins = trust.pinned(old.name)
     trust.replace(old.name, key)
-    access.newcomers[old.name] = replace(connection.endpoint, identity=old.name)
+    access.bench_endpoints[old.name] = replace(connection.endpoint, identity=old.name)
     if connection.endpoint.interface:
         access.interfaces[old.name] = connection.endpoint.interface
-    access.keep(old.name, connection)
-    where = place or BenchPlace(connection.endpoint.host, connection.endpoint.port, old.name)
-    return Successor(Arrivals({old.name: Found(where, old, seen, key)}, ()), spare, pins)
+    access.release(old.name, connection)
+    where = place or BenchTarget(connection.endpoint.host, connection.endpoint.port, old.name)
+    return Replacement(Discovered({old.name: FoundDevice(where, old, seen, key)}, ()), spare, pins)
 
 
-def _must_be_silent(access: Access, old: Node) -> None:
+def _require_unreachable(access: ConnectionPool, old: Node) -> None:
     """Two devices with one address and one name would fight: the old one has to be off."""
     try:
         access.open(old).close()
@@ -90,12 +90,12 @@ def _must_be_silent(access: Access, old: Node) -> None:
     )
 
 
-def give_up(trust: TrustStore, old: Node, successor: Successor) -> None:
+def restore_old_pins(trust: TrustStore, old: Node, successor: Replacement) -> None:
     """The change failed: believe what was believed before."""
     trust.replace(old.name, *successor.old_pins)
 
 
-def heir_of(fleet: Fleet, old: Node, spare: Node | None) -> Fleet:
+def with_identity(fleet: Fleet, old: Node, spare: Node | None) -> Fleet:
     """The fleet in which the old node carries the spare's label and serial number, as far as they are rendered."""
     if spare is None:
         return fleet

@@ -12,14 +12,14 @@ from meshctl.fleet import Outcome, Result
 from meshctl.plan import Verdict
 
 
-def settled(run_id: int, earlier: Iterable[Outcome], now: Prepared) -> dict[str, str]:
+def resolutions(run_id: int, earlier: Iterable[Outcome], now: Prepared) -> dict[str, str]:
     """Node -> what became of it, for each that ended as UNCERTAIN. Pure."""
     told = {}
     for outcome in earlier:
         plan = now.plan.nodes.get(outcome.node)
         if outcome.result is not Result.UNCERTAIN or plan is None:
             continue
-        seen = now.seen.observations.get(outcome.node)
+        seen = now.observed.observations.get(outcome.node)
         match plan.verdict:
             case Verdict.SAME:
                 what = "it is as wanted"

@@ -31,9 +31,9 @@ from meshctl.topology import NEIGHBOUR_FRESH_MS, mesh_macs
 # they are asked again while the node is silent, after the first pause, then after twice as long each time. A minute is
 # the longest, because that long an ad-hoc cell of Linux remembers whom it does not hear
 # (IEEE80211_IBSS_INACTIVITY_LIMIT, net/mac80211/ibss.c).
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 5.0, 60.0
+FIRST_PAUSE_S, MAX_PAUSE_S = 5.0, 60.0
 # More neighbours than any radio here has; bounds what a hostile station table costs.
-MOST_ASKED = 16
+MAX_QUERIED = 16
 # What a holder says of an entry that was old enough: removed, cannot be removed, not stale, cannot find out.
 GONE, KEPT, ANSWERS, UNKNOWN = "gone", "kept", "answers", "unknown"
 # iw's list of its interfaces, for sh; a name of Linux's holds no blank
@@ -41,7 +41,7 @@ _EVERY_INTERFACE = "\"$(iw dev 2>/dev/null | sed -n 's/^[[:space:]]*Interface //
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class StationEntry:
     """A station entry: node `holder` knows the radio `mac` on its interface `ifname`, on whichever it is when empty."""
 
     holder: str
@@ -59,13 +59,13 @@ def radio_macs(seen: Observation, radios: Radios) -> tuple[str, ...]:
     return tuple(dict.fromkeys(mac for ifname, mac in macs.items() if ifname in radios and mac in known))
 
 
-def entries_of(node: str, around: Mapping[str, Observation], radios: Radios = EVERY_RADIO) -> tuple[Entry, ...]:
+def entries_of(node: str, around: Mapping[str, Observation], radios: Radios = EVERY_RADIO) -> tuple[StationEntry, ...]:
     """Who of those observed holds a station entry of these radios of `node`, in the order of `around`."""
     if node not in around:
         return ()
     macs = frozenset(radio_macs(around[node], radios))
     return tuple(
-        Entry(holder, station.ifname, station.mac)
+        StationEntry(holder, station.ifname, station.mac)
         for holder, seen in around.items()
         if holder != node
         for station in seen.stations or ()
@@ -73,13 +73,15 @@ def entries_of(node: str, around: Mapping[str, Observation], radios: Radios = EV
     )
 
 
-def own_entries(node: str, seen: Observation, radios: Radios = EVERY_RADIO) -> tuple[Entry, ...]:
+def own_entries(node: str, seen: Observation, radios: Radios = EVERY_RADIO) -> tuple[StationEntry, ...]:
     """The entries that the node itself holds, of whomever these radios of it know."""
-    own = (Entry(node, station.ifname, station.mac) for station in seen.stations or () if station.ifname in radios)
-    return tuple(own)[:MOST_ASKED]
+    own = (
+        StationEntry(node, station.ifname, station.mac) for station in seen.stations or () if station.ifname in radios
+    )
+    return tuple(own)[:MAX_QUERIED]
 
 
-def silent_holders(
+def possible_holders(
     node: str, around: Mapping[str, Observation], names: Mapping[str, str], fellows: Iterable[str]
 ) -> tuple[str, ...]:
     """Who may hold an entry of `node` and did not tell: those that it hears itself, by the MACs that `names` knows.
@@ -89,14 +91,14 @@ def silent_holders(
     if node not in around:
         return ()
     told = {name: seen for name, seen in around.items() if seen.stations is not None}
-    strangers = _heard_by(around[node]) - {mac for seen in told.values() for mac in mesh_macs(seen)}
+    strangers = _heard_macs(around[node]) - {mac for seen in told.values() for mac in mesh_macs(seen)}
     named = [names[mac] for mac in sorted(strangers) if mac in names]
     known = frozenset(names.values())
     nameless = [name for name in fellows if name not in known] if strangers - names.keys() else []
     return tuple(name for name in dict.fromkeys((*named, *nameless)) if name != node and name not in told)
 
 
-def booted_unforgotten_s(node: str, around: Mapping[str, Observation]) -> float | None:
+def unflushed_boot_s(node: str, around: Mapping[str, Observation]) -> float | None:
     """When `node` booted (Unix time), if somebody has known a radio of it from before that; None otherwise."""
     own = around.get(node)
     if own is None or own.uptime_s is None:
@@ -115,25 +117,25 @@ def booted_unforgotten_s(node: str, around: Mapping[str, Observation]) -> float 
     return booted_s if is_known_from_before else None
 
 
-def neighbours_now(seen: Observation, names: Mapping[str, str]) -> tuple[str, ...]:
+def current_neighbors(seen: Observation, names: Mapping[str, str]) -> tuple[str, ...]:
     """Whom a node hears, by name."""
-    return tuple(dict.fromkeys(names[mac] for mac in sorted(_heard_by(seen)) if mac in names))
+    return tuple(dict.fromkeys(names[mac] for mac in sorted(_heard_macs(seen)) if mac in names))
 
 
-def _heard_by(seen: Observation) -> frozenset[str]:
+def _heard_macs(seen: Observation) -> frozenset[str]:
     fresh = (one.mac.lower() for one in seen.neighbours or () if one.last_seen_ms <= NEIGHBOUR_FRESH_MS)
     return frozenset((*fresh, *(station.mac.lower() for station in seen.stations or ())))
 
 
-def by_holder(entries: Iterable[Entry]) -> dict[str, tuple[Entry, ...]]:
+def by_holder(entries: Iterable[StationEntry]) -> dict[str, tuple[StationEntry, ...]]:
     """The entries of each holder, of the first `MOST_ASKED` ones."""
-    grouped: dict[str, tuple[Entry, ...]] = {}
+    grouped: dict[str, tuple[StationEntry, ...]] = {}
     for entry in entries:
         grouped[entry.holder] = (*grouped.get(entry.holder, ()), entry)
-    return dict(list(grouped.items())[:MOST_ASKED])
+    return dict(list(grouped.items())[:MAX_QUERIED])
 
 
-def behind(node: str, around: Mapping[str, Observation], base_macs: Iterable[str]) -> frozenset[str]:
+def routed_through(node: str, around: Mapping[str, Observation], base_macs: Iterable[str]) -> frozenset[str]:
     """The nodes whose best way to the base leads through `node` first: while it is not heard, they are out of reach."""
     if node not in around:
         return frozenset()
@@ -146,7 +148,7 @@ def behind(node: str, around: Mapping[str, Observation], base_macs: Iterable[str
     )
 
 
-def flush_script(entries: Iterable[Entry], *, older_than_s: float, has_restarted: bool = False) -> str:
+def flush_script(entries: Iterable[StationEntry], *, older_than_s: float, has_restarted: bool = False) -> str:
     """POSIX sh that removes those of a holder's entries that are at least that old and stale, or, where the radios were
     seen to have restarted, all that are that old.
 
@@ -161,7 +163,7 @@ def flush_script(entries: Iterable[Entry], *, older_than_s: float, has_restarted
     return "".join((script("stale_station.sh"), *calls))
 
 
-def watch_script(node: str, entries: Iterable[Entry], *, for_s: float) -> str:
+def watch_script(node: str, entries: Iterable[StationEntry], *, for_s: float) -> str:
     """POSIX sh that starts a process of the holder's own, which for `for_s` removes those of its entries that become
     stale. It takes the place of one that watches for `node` already."""
     watched = [f"{entry.ifname}/{entry.mac}" for entry in entries]
@@ -173,9 +175,9 @@ def watch_script(node: str, entries: Iterable[Entry], *, for_s: float) -> str:
     )
 
 
-def next_ask_s(asked_s: Sequence[float]) -> float:
+def next_query_s(asked_s: Sequence[float]) -> float:
     """When those around a silent node are asked next, after they were at `asked_s` (seconds of one clock)."""
     if not asked_s:
         return float("-inf")
     pause_s: float = FIRST_PAUSE_S * 2 ** (len(asked_s) - 1)
-    return asked_s[-1] + min(pause_s, LONGEST_PAUSE_S)
+    return asked_s[-1] + min(pause_s, MAX_PAUSE_S)

@@ -16,8 +16,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from meshctl.apply.change_in_progress import LOCK_SLACK_S, install_switch
-from meshctl.apply.context import Job
-from meshctl.apply.station_flush import Forgetting
+from meshctl.apply.context import NodeContext
+from meshctl.apply.station_flush import StationFlush
 from meshctl.device import deadman, openwrt
 from meshctl.device.observation import Observation
 from meshctl.device.observe import observe
@@ -29,8 +29,8 @@ from meshctl.errors import InputError, NodeError
 from meshctl.firmware import check, image_path, is_revision
 from meshctl.fleet import Outcome, Result
 from meshctl.model import HardwareProfile
-from meshctl.nodes.backoff import Pace
-from meshctl.plan import Wanted
+from meshctl.nodes.backoff import Backoff
+from meshctl.plan import DesiredState
 
 IMAGE_PATH = "/tmp/meshctl/firmware.bin"
 ARCHIVE_PATH = "/tmp/meshctl/firmware.tgz"
@@ -39,9 +39,9 @@ HOST_KEYS = "/etc/dropbear/dropbear_*_host_key"
 # sysupgrade's own copy of busybox and what it runs in RAM; less and the kernel kills it half way.
 HEADROOM_BYTES = 4 << 20
 # Writing 16 MB of NOR takes up to 3 minutes, the first boot 2 more, and making keys or joining the mesh its own.
-RETURN_S = 900.0
+RETURN_TIMEOUT_S = 900.0
 # sysupgrade that has not taken the node down by then has given up.
-START_S = 120.0
+START_TIMEOUT_S = 120.0
 
 
 def checked_image(profile: HardwareProfile) -> Path:
@@ -55,14 +55,14 @@ def checked_image(profile: HardwareProfile) -> Path:
     return path
 
 
-def flash(job: Job, connection: SshConnection, image: Path) -> Outcome:
+def flash(job: NodeContext, connection: SshConnection, image: Path) -> Outcome:
     """Flash a node and prove it. Owns `connection`. Raises NodeError only while nothing on the node has stopped."""
-    forgetting = Forgetting(job)
+    forgetting = StationFlush(job)
     try:
-        marker = _send(job, connection, image, forgetting)
+        marker = _upload_and_start(job, connection, image, forgetting)
     except NodeError:
         with suppress(NodeError):
-            deadman.unlock(connection, job.work.owner)
+            deadman.unlock(connection, job.run.owner)
         raise
     finally:
         connection.close()
@@ -70,17 +70,17 @@ def flash(job: Job, connection: SshConnection, image: Path) -> Outcome:
         return _await_return(job, marker, forgetting)
 
 
-def _send(job: Job, connection: SshConnection, image: Path, forgetting: Forgetting) -> str:
+def _upload_and_start(job: NodeContext, connection: SshConnection, image: Path, forgetting: StationFlush) -> str:
     """Everything up to the moment sysupgrade starts; returns the marker that the new system will hold."""
     size = image.stat().st_size
     with job.step("check"):
         _check_memory(job.before, size)
         # for its lock: a device fresh from its box has none
         install_switch(job, connection)
-        deadman.lock(connection, job.work.owner, ttl_s=int(RETURN_S) + LOCK_SLACK_S)
+        deadman.lock(connection, job.run.owner, ttl_s=int(RETURN_TIMEOUT_S) + LOCK_SLACK_S)
     with job.step("upload"):
         upload(
-            connection, image, IMAGE_PATH, rate_bytes_per_s=job.work.rate_bytes_per_s, progress=job.progress, mode=0o600
+            connection, image, IMAGE_PATH, rate_bytes_per_s=job.run.rate_bytes_per_s, progress=job.progress, mode=0o600
         )
     with job.step("test"):
         tested = openwrt.check_firmware(connection, IMAGE_PATH)
@@ -96,11 +96,11 @@ def _send(job: Job, connection: SshConnection, image: Path, forgetting: Forgetti
         if not keys:
             raise NodeError(f"{job.name}: its host keys cannot be read, so they could not be kept")
         marker = secrets.token_hex(16)
-        upload(connection, archive(job.wanted, keys, marker), ARCHIVE_PATH, mode=0o600)
+        upload(connection, archive(job.desired, keys, marker), ARCHIVE_PATH, mode=0o600)
     recipe = job.node.hardware.recovery or "none is written down in its hardware profile"
-    job.work.note(f"if it does not come back: {recipe}", job.name)
-    forgetting.beforehand(for_s=RETURN_S)
-    forgetting.begins()
+    job.run.note(f"if it does not come back: {recipe}", job.name)
+    forgetting.watch(for_s=RETURN_TIMEOUT_S)
+    forgetting.started()
     openwrt.start_sysupgrade(connection, IMAGE_PATH, ARCHIVE_PATH)
     return marker
 
@@ -114,7 +114,7 @@ def _check_memory(before: Observation, size: int) -> None:
         )
 
 
-def archive(wanted: Wanted, host_keys: Mapping[str, FetchedFile], marker: str) -> bytes:
+def archive(wanted: DesiredState, host_keys: Mapping[str, FetchedFile], marker: str) -> bytes:
     """The tar.gz that the new system unpacks at its first boot: same in, same bytes out."""
     files = [(f"/{file.path}", file.content, file.mode) for file in wanted.files]
     files += [(path, file.content, file.mode) for path, file in host_keys.items()]
@@ -138,26 +138,26 @@ def _tar(files: Iterable[tuple[str, bytes, int]], links: Iterable[tuple[str, str
     return out.getvalue()
 
 
-def _await_return(job: Job, marker: str, forgetting: Forgetting) -> Outcome:
+def _await_return(job: NodeContext, marker: str, forgetting: StationFlush) -> Outcome:
     """Look for the node until it is back and proven, or it is clear that it will not be."""
-    pace = Pace(RETURN_S, job.work.interrupt)
+    pace = Backoff(RETURN_TIMEOUT_S, job.run.interrupt)
     trouble = ""
-    while not pace.is_over and not job.work.interrupt.leaving:
+    while not pace.is_over and not job.run.interrupt.leaving:
         try:
-            connection = job.work.access.open(job.node)
+            connection = job.run.connections.open(job.node)
             try:
                 seen = observe(connection, extra_paths=[MARKER_PATH])
             finally:
                 connection.close()
         except NodeError as error:
             trouble = str(error)
-            forgetting.while_silent()
+            forgetting.unreachable()
         else:
-            job.work.saw(job.name, seen)
+            job.run.record(job.name, seen)
             if seen.boot_id != job.before.boot_id:
-                forgetting.when_back(seen, rebooted=True)
+                forgetting.ended(seen, rebooted=True)
                 return _verdict(job, seen, marker)
-            if pace.elapsed_s > START_S:
+            if pace.elapsed_s > START_TIMEOUT_S:
                 return Outcome(
                     job.name, Result.FAILED, "sysupgrade did not take it down; it runs what it ran", hint="see its log"
                 )
@@ -170,7 +170,7 @@ def _await_return(job: Job, marker: str, forgetting: Forgetting) -> Outcome:
     )
 
 
-def _verdict(job: Job, seen: Observation, marker: str) -> Outcome:
+def _verdict(job: NodeContext, seen: Observation, marker: str) -> Outcome:
     """Whether the node that came back is the one that was meant to, piece by piece."""
     running = seen.release.revision if seen.release else "unknown"
     board = seen.board.board_name if seen.board else "unknown"

@@ -15,14 +15,14 @@ import typer
 
 from meshctl.apply.bootstrap import (
     FACTORY_ADDRESS,
-    BenchPlace,
-    Found,
+    BenchTarget,
+    FoundDevice,
+    discover,
     find_node,
-    look_around,
-    plan_arrivals,
+    plan_discovered,
     restore_pins,
 )
-from meshctl.apply.replace import give_up, heir_of, identity_edits, succeed
+from meshctl.apply.replace import adopt, identity_edits, restore_old_pins, with_identity
 from meshctl.cli.context import KeyFiles, Lab, Session, exit_for, session
 from meshctl.cli.journaled_run import SALT_BYTES, ask_and_carry_out, choices_of
 from meshctl.cli.options import AsJson, InventoryPath
@@ -84,7 +84,7 @@ def bootstrap(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         places = _places(opened, nodes or [], _spots(at or [], interface or []))
         with opened.interrupt.on_signals(complain):
-            arrivals = look_around(
+            arrivals = discover(
                 opened.renderer,
                 opened.access,
                 opened.trust,
@@ -100,7 +100,7 @@ def bootstrap(
                 echo(f"{name}: found at {item.place.endpoint.label}, host key {item.key.fingerprint}")
         if not arrivals.found:
             raise typer.Exit(exit_for(arrivals.outcomes, opened.interrupt))
-        prepared = plan_arrivals(
+        prepared = plan_discovered(
             opened.renderer,
             opened.access,
             arrivals,
@@ -128,7 +128,7 @@ def _complain(outcome: Outcome) -> None:
         echo(f"  hint: {hint}", err=True)
 
 
-def _spots(at: list[str], interfaces: list[str]) -> list[BenchPlace]:
+def _spots(at: list[str], interfaces: list[str]) -> list[BenchTarget]:
     """The places that were named, each by an address or by an interface."""
     if at and interfaces:
         raise InputError("expected --at or --interface, found both")
@@ -138,17 +138,17 @@ def _spots(at: list[str], interfaces: list[str]) -> list[BenchPlace]:
     for name in interfaces:
         if name not in known:
             raise InputError(f"--interface {name}: there is none here, found {', '.join(sorted(known))}")
-    return [_place(text) for text in at] + [BenchPlace(interface=name) for name in interfaces]
+    return [_place(text) for text in at] + [BenchTarget(interface=name) for name in interfaces]
 
 
-def _places(opened: Session, words: list[str], at: list[BenchPlace]) -> list[BenchPlace]:
+def _places(opened: Session, words: list[str], at: list[BenchTarget]) -> list[BenchTarget]:
     """Who is expected where."""
     if opened.lab is not None and not at:
         known = set(opened.lab.node_names)
         names = [find_node(opened.fleet, word).name for word in words]
         names = names or [node.name for node in opened.fleet.managed() if node.name in known]
         ends = {name: opened.lab.bench_endpoint(name) for name in names}
-        return [BenchPlace(end.host, end.port, name) for name, end in ends.items()]
+        return [BenchTarget(end.host, end.port, name) for name, end in ends.items()]
     expected = [find_node(opened.fleet, word).name for word in words]
     if not at:
         if len(expected) > 1:
@@ -156,21 +156,21 @@ def _places(opened: Session, words: list[str], at: list[BenchPlace]) -> list[Ben
                 f"{len(expected)} nodes cannot all answer at one address",
                 hint="one at a time, or say where each is plugged in: --interface eth1 --interface eth2",
             )
-        return [BenchPlace(node=expected[0] if expected else "")]
+        return [BenchTarget(node=expected[0] if expected else "")]
     if expected and len(expected) != len(at):
         raise InputError(f"{len(expected)} nodes and {len(at)} places: expected as many places as nodes")
     names = expected or [""] * len(at)
     return [with_changes(place, node=name) for place, name in zip(at, names, strict=True)]
 
 
-def _place(text: str) -> BenchPlace:
+def _place(text: str) -> BenchTarget:
     """`HOST`, `HOST:PORT` or `[v6]:PORT`; a bare IPv6 address holds colons of its own."""
     host, colon, port = text.rpartition(":")
     if not colon or (text.count(":") > 1 and not text.startswith("[")):
-        return BenchPlace(text)
+        return BenchTarget(text)
     if not port.isdecimal() or not 0 < int(port) < 65536:
         raise InputError(f"--at {text}: expected HOST or HOST:PORT")
-    return BenchPlace(host.strip("[]"), int(port))
+    return BenchTarget(host.strip("[]"), int(port))
 
 
 def replace(
@@ -198,13 +198,13 @@ def replace(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         node = find_node(opened.fleet, old)
         spare = _spare(opened, node, new)
-        spots = _spots([at] if at else [], [interface] if interface else []) or [BenchPlace()][: spare is None]
+        spots = _spots([at] if at else [], [interface] if interface else []) or [BenchTarget()][: spare is None]
         place = with_changes(spots[0], node=node.name) if spots else None
-        fleet = heir_of(opened.fleet, node, spare)
+        fleet = with_identity(opened.fleet, node, spare)
         opened = with_changes(opened, fleet=fleet, renderer=with_changes(opened.renderer, fleet=fleet))
         node = fleet.nodes[node.name]
         with opened.interrupt.on_signals(complain):
-            successor = succeed(
+            successor = adopt(
                 opened.renderer,
                 opened.access,
                 opened.trust,
@@ -214,13 +214,13 @@ def replace(
                 interrupt=opened.interrupt,
             )
         if not as_json:
-            echo(_who_becomes_whom(node, spare, new, successor.arrivals.found.get(node.name)))
+            echo(_who_becomes_whom(node, spare, new, successor.discovered.found.get(node.name)))
         status = int(ExitCode.FINDINGS)
         try:
-            prepared = plan_arrivals(
+            prepared = plan_discovered(
                 opened.renderer,
                 opened.access,
-                successor.arrivals,
+                successor.discovered,
                 opened.journal.last_known(opened.fleet.name),
                 salt=secrets.token_bytes(SALT_BYTES),
                 owner=opened.owner,
@@ -232,14 +232,14 @@ def replace(
             status = ended.exit_code
         finally:
             if status != ExitCode.OK:
-                give_up(opened.trust, node, successor)
+                restore_old_pins(opened.trust, node, successor)
         if status == ExitCode.OK:
-            changes = _learn_identity(opened, inventory, node, spare, successor.arrivals.found[node.name])
+            changes = _learn_identity(opened, inventory, node, spare, successor.discovered.found[node.name])
             echo("".join(change.diff() for change in changes), nl=False, err=as_json)
         raise typer.Exit(status)
 
 
-def _who_becomes_whom(node: Node, spare: Node | None, new: str, found: Found | None) -> str:
+def _who_becomes_whom(node: Node, spare: Node | None, new: str, found: FoundDevice | None) -> str:
     """`spare2, found at 192.168.1.1, becomes husky1-b03 (10.42.0.13): its name, address and role; ...`."""
     there = f", found at {found.place.endpoint.label}," if found is not None else ""
     who = spare.name if spare is not None else f"the device on the {new}"
@@ -260,7 +260,7 @@ def _spare(opened: Session, old: Node, new: str) -> Node | None:
     return spare
 
 
-def _learn_identity(opened: Session, inventory: Path, node: Node, spare: Node | None, found: Found) -> Changes:
+def _learn_identity(opened: Session, inventory: Path, node: Node, spare: Node | None, found: FoundDevice) -> Changes:
     """Into the inventory and the pins. Raises InputError that says what to write there, when it cannot be written."""
     mine, theirs = identity_edits(node, spare, found.seen)
     if spare is not None:
@@ -277,7 +277,12 @@ def _learn_identity(opened: Session, inventory: Path, node: Node, spare: Node | 
 
 
 def _write_identity(
-    inventory: Path, node: Node, spare: Node | None, found: Found, mine: Mapping[str, Any], theirs: Mapping[str, Any]
+    inventory: Path,
+    node: Node,
+    spare: Node | None,
+    found: FoundDevice,
+    mine: Mapping[str, Any],
+    theirs: Mapping[str, Any],
 ) -> Changes:
     editor = Editor.open(inventory, environ=os.environ)
     # the spare's entry first: two nodes with one MAC would be refused

@@ -29,7 +29,7 @@ from meshctl.inventory import load_fleet
 from meshctl.inventory.secrets import SecretStore
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Node
-from meshctl.nodes.connections import Access, Locate, as_written
+from meshctl.nodes.connections import ConnectionPool, Locate, as_written
 from meshctl.nodes.desired import Renderer
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class Session:
 
     fleet: Fleet
     renderer: Renderer
-    access: Access
+    access: ConnectionPool
     journal: Journal
     trust: TrustStore
     owner: str
@@ -71,7 +71,7 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
     lab_directory = str(virtual.directory) if virtual is not None else lab_of(str(inventory.resolve()))
     with (
         Journal(default_path(os.environ), lab=lab_directory) as journal,
-        Access(fleet, trust, key_files=tuple(key_files), locate=locate) as access,
+        ConnectionPool(fleet, trust, key_files=tuple(key_files), locate=locate) as access,
     ):
         journal.separate(fleet.name, lab_of)
         yield Session(

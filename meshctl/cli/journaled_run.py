@@ -9,8 +9,8 @@ from pathlib import Path
 
 import typer
 
-from meshctl.apply.executor import Setting, carry_out
-from meshctl.apply.prepare import Choices, Prepared, prepare
+from meshctl.apply.executor import RunSettings, execute
+from meshctl.apply.prepare import PlanOptions, Prepared, prepare
 from meshctl.cli.asking import must_agree
 from meshctl.cli.context import Session, chosen, exit_for, progress_for
 from meshctl.cli.options import line_width
@@ -31,15 +31,15 @@ class Refused(MeshctlError):
     exit_code = ExitCode.FINDINGS
 
 
-def choices_of(no_firmware: bool, leave_behind: str, accept_cut: str) -> Choices:
-    return Choices(not no_firmware, _names(leave_behind), _names(accept_cut))
+def choices_of(no_firmware: bool, leave_behind: str, accept_cut: str) -> PlanOptions:
+    return PlanOptions(not no_firmware, _names(leave_behind), _names(accept_cut))
 
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def prepared_for(opened: Session, nodes: list[str] | None, choices: Choices, salt: bytes | None = None) -> Prepared:
+def prepared_for(opened: Session, nodes: list[str] | None, choices: PlanOptions, salt: bytes | None = None) -> Prepared:
     with opened.interrupt.on_signals(complain):
         prepared = prepare(
             opened.renderer,
@@ -88,7 +88,7 @@ def ask_and_carry_out(
     opened: Session,
     prepared: Prepared,
     command: str,
-    choices: Choices,
+    choices: PlanOptions,
     *,
     yes: bool,
     as_json: bool,
@@ -112,13 +112,13 @@ def carry_out_plan(
     *,
     as_json: bool,
     rate: float | None,
-    choices: Choices | None = None,
+    choices: PlanOptions | None = None,
 ) -> None:
     """Apply, journal, tell the totals, exit."""
     plan = prepared.plan
     if plan.refusal:
         raise Refused(plan.refusal, hint=plan.refusal_hint)
-    told = choices or Choices(with_firmware)
+    told = choices or PlanOptions(with_firmware)
     run = opened.journal.begin(
         command,
         fleet=opened.fleet.name,
@@ -134,7 +134,7 @@ def carry_out_plan(
             progress_for(len(plan.nodes), as_json=as_json) as progress,
             opened.interrupt.on_signals(progress.stopping),
         ):
-            setting = Setting(
+            setting = RunSettings(
                 opened.fleet,
                 opened.access,
                 opened.journal,
@@ -144,7 +144,7 @@ def carry_out_plan(
                 progress,
                 None if rate is None else rate * 1000,
             )
-            outcomes = carry_out(prepared, setting)
+            outcomes = execute(prepared, setting)
     finally:
         run.end(str(totals(outcomes.values())) if outcomes else "could not run")
     if run.trouble:

@@ -11,8 +11,8 @@ from typing import Annotated
 
 import typer
 
-from meshctl.apply.prepare import Choices
-from meshctl.apply.resume import settled
+from meshctl.apply.prepare import PlanOptions
+from meshctl.apply.resume import resolutions
 from meshctl.cli.context import KeyFiles, Lab, Nodes, Session, session
 from meshctl.cli.journaled_run import (
     ask_and_carry_out,
@@ -95,7 +95,7 @@ def apply(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         if saved.plan.fleet != opened.fleet.name:
             raise InputError(f"{plan_file}: a plan for fleet {saved.plan.fleet}, the inventory is {opened.fleet.name}")
-        fresh = prepared_for(opened, list(saved.plan.nodes), Choices(saved.with_firmware), saved.salt)
+        fresh = prepared_for(opened, list(saved.plan.nodes), PlanOptions(saved.with_firmware), saved.salt)
         agreed = replace(fresh, plan=as_agreed(saved.plan, fresh.plan))
         carry_out_plan(opened, agreed, "apply", saved.with_firmware, as_json=as_json, rate=rate)
 
@@ -159,7 +159,7 @@ def resume(
             echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")
         told = json.loads(record.plan).get("choices", {}) if record.plan else {}
         added = choices_of(False, leave_behind, accept_cut)
-        choices = Choices(
+        choices = PlanOptions(
             bool(told.get("with_firmware", True)),
             (*told.get("leave_behind", ()), *added.leave_behind),
             (*told.get("accept_cuts", ()), *added.accept_cuts),
@@ -167,7 +167,7 @@ def resume(
         prepared = prepared_for(opened, names, choices)
         for line in bench_advice(record, prepared.plan):
             echo(line, err=True)
-        for name, text in settled(record.id, opened.journal.outcomes(record.id), prepared).items():
+        for name, text in resolutions(record.id, opened.journal.outcomes(record.id), prepared).items():
             line = json.dumps({"event": "note", "node": name, "at_s": round(time.time(), 3), "text": text})
             echo(line if as_json else f"{name}: {text}")
         ask_and_carry_out(opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)

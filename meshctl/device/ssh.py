@@ -16,7 +16,7 @@ from types import TracebackType
 
 import paramiko
 
-from meshctl.device.authentication import Attempt, attempts
+from meshctl.device.authentication import LoginAttempt, login_attempts
 from meshctl.device.connection import Completed, Connection, Credentials, Deadlines, Endpoint
 from meshctl.device.errors import (
     AuthenticationRefused,
@@ -30,7 +30,7 @@ from meshctl.device.errors import (
 )
 from meshctl.device.framing import framed
 from meshctl.device.legacy_rsa import SSH_RSA, LegacyTransport
-from meshctl.device.liveness import Heard, Watch, asking
+from meshctl.device.liveness import ActivityStream, Watchdog, keepalives
 from meshctl.device.sockets import open_socket
 from meshctl.device.trust import HostKey, HostKeyPolicy
 from meshctl.model import Release
@@ -68,7 +68,7 @@ def connect(
     """
     limits = deadlines or Deadlines()
     legacy = legacy_rsa_sha1
-    with attempts(credentials, legacy_rsa_sha1=legacy or release is Release.V19_07) as wanted:
+    with login_attempts(credentials, legacy_rsa_sha1=legacy or release is Release.V19_07) as wanted:
         left = list(wanted)
         tried: list[str] = []
         allowed: tuple[str, ...] = ()
@@ -115,37 +115,37 @@ def _translated(
     seconds: float,
     phase: str,
     *,
-    heard: Heard | None = None,
+    heard: ActivityStream | None = None,
     silence_s: float = 0.0,
 ) -> Iterator[None]:
     """Foreign exceptions become ours here; a wait that took too long is told as such whatever it made paramiko raise.
 
     With `heard`, a connection that is silent for `silence_s` meanwhile is lost.
     """
-    with Watch(transport, seconds, heard=heard, silence_s=silence_s) as watch:
+    with Watchdog(transport, seconds, heard=heard, silence_s=silence_s) as watch:
         try:
             yield
         except (paramiko.SSHException, OSError, EOFError) as error:
-            if watch.passed or watch.silent:
+            if watch.timed_out or watch.silent:
                 raise _waited(endpoint, watch, seconds, silence_s, phase) from error
             if transport.is_active():
                 raise ChannelClosed(f"{endpoint.label}: {phase} was refused or cut: {error}") from error
             raise ConnectionLost(f"{endpoint.label}: the connection broke during {phase}: {error}") from error
-    if watch.passed or watch.silent:
+    if watch.timed_out or watch.silent:
         raise _waited(endpoint, watch, seconds, silence_s, phase)
 
 
-def _waited(endpoint: Endpoint, watch: Watch, seconds: float, silence_s: float, phase: str) -> Unreachable:
-    if watch.passed:
+def _waited(endpoint: Endpoint, watch: Watchdog, seconds: float, silence_s: float, phase: str) -> Unreachable:
+    if watch.timed_out:
         return Timeout(f"{endpoint.label}: no answer to {phase} within {seconds:g} s", phase=phase)
     return ConnectionLost(f"{endpoint.label}: silent for {silence_s:g} s during {phase}")
 
 
 def _handshake(
     endpoint: Endpoint, limits: Deadlines, trust: HostKeyPolicy, via: SshConnection | None, *, legacy: bool
-) -> tuple[paramiko.Transport, Heard]:
+) -> tuple[paramiko.Transport, ActivityStream]:
     known = trust.known(endpoint)
-    heard = Heard(open_socket(endpoint, limits) if via is None else via.tunnel(endpoint))
+    heard = ActivityStream(open_socket(endpoint, limits) if via is None else via.tunnel(endpoint))
     transport = (LegacyTransport if legacy else paramiko.Transport)(heard)  # type: ignore[arg-type]
     transport.daemon = True
     transport.banner_timeout = transport.handshake_timeout = limits.handshake_s * 2  # ours comes first
@@ -186,7 +186,7 @@ def _prefer(transport: paramiko.Transport, known: tuple[HostKey, ...], *, legacy
 
 
 def _login(
-    endpoint: Endpoint, transport: paramiko.Transport, wanted: list[Attempt], limits: Deadlines
+    endpoint: Endpoint, transport: paramiko.Transport, wanted: list[LoginAttempt], limits: Deadlines
 ) -> tuple[bool, tuple[str, ...]]:
     """Whether one of `wanted` was accepted, and otherwise what the server said it would accept."""
     allowed: tuple[str, ...] = ()
@@ -212,7 +212,9 @@ def _login(
 class SshConnection(Connection):
     """See `Connection`. Also carries tunnels to nodes behind this one."""
 
-    def __init__(self, endpoint: Endpoint, transport: paramiko.Transport, limits: Deadlines, heard: Heard) -> None:
+    def __init__(
+        self, endpoint: Endpoint, transport: paramiko.Transport, limits: Deadlines, heard: ActivityStream
+    ) -> None:
         self._endpoint = endpoint
         self._transport = transport
         self._limits = limits
@@ -253,7 +255,7 @@ class SshConnection(Connection):
         sent = framed(script)
         seconds = self._limits.run_s if timeout_s is None else timeout_s
         pieces = (stdin,) if isinstance(stdin, bytes) else stdin
-        with asking(self._transport, self._limits.ask_s, self._limits.keepalive_s):
+        with keepalives(self._transport, self._limits.ask_s, self._limits.keepalive_s):
             with self._waiting(min(seconds, self._limits.channel_s), "opening a channel"):
                 channel = self._transport.open_session()
             try:

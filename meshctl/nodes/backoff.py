@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from meshctl.fleet import Interrupt
 
 # A virtual or near node answers within the first pause; a far one costs a few connections more.
-FIRST_PAUSE_S, LONGEST_PAUSE_S, GROWTH = 0.2, 2.0, 1.5
+FIRST_PAUSE_S, MAX_PAUSE_S, GROWTH = 0.2, 2.0, 1.5
 
 
 @dataclass(slots=True)
-class Pace:
+class Backoff:
     """`pause` sleeps; `is_over` once `limit_s` have passed since the pace was made."""
 
     limit_s: float
@@ -31,4 +31,4 @@ class Pace:
     def pause(self) -> None:
         """Sleep a while, less when somebody wants to leave."""
         self.interrupt.wait(min(self._pause_s, max(0.0, self.limit_s - self.elapsed_s)))
-        self._pause_s = min(self._pause_s * GROWTH, LONGEST_PAUSE_S)
+        self._pause_s = min(self._pause_s * GROWTH, MAX_PAUSE_S)

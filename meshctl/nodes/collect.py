@@ -21,8 +21,8 @@ from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.fleet.process import is_dead
 from meshctl.model import Fleet, Node
-from meshctl.nodes.backoff import Pace
-from meshctl.nodes.connections import Access
+from meshctl.nodes.backoff import Backoff
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.topology import Graph, Report, mesh_macs, observed_graph, report_of, with_alternates
 
 # How long a node may take to put back what a dead process had armed: its files, and a reload.
@@ -30,12 +30,12 @@ CLEARING_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class FleetObservation:
     """`observations` of the nodes that answered; `away` and `refused`: why others gave none (silence, or a host key or
     login that does not fit)."""
 
     observations: Mapping[str, Observation]
-    away: Mapping[str, str]
+    unreachable: Mapping[str, str]
     refused: Mapping[str, NodeError] = field(default_factory=dict)
 
     @property
@@ -68,15 +68,15 @@ def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
     return with_alternates(macs)
 
 
-def gather(
-    access: Access,
+def collect(
+    access: ConnectionPool,
     nodes: Iterable[Node],
     *,
     parallel: int,
     paths: Callable[[Node], Iterable[str]] = lambda node: (),
     interrupt: Interrupt | None = None,
     observer: Observer = silent,
-) -> Seen:
+) -> FleetObservation:
     """Observe these nodes; `paths` names the files beside UCI's to look at. Connections stay with `access`."""
     wanted = {node.name: node for node in nodes}
     found: dict[str, Observation] = {}
@@ -86,7 +86,7 @@ def gather(
 
     def look(name: str) -> Outcome:
         try:
-            with access.lease(wanted[name]) as connection:
+            with access.borrow(wanted[name]) as connection:
                 seen = observe_cleared(connection, tuple(paths(wanted[name])), signal)
         except NodeError as error:
             with lock:
@@ -103,7 +103,7 @@ def gather(
         if name not in found and (name not in errors or isinstance(errors[name], Unreachable))
     }
     refused = {name: error for name, error in errors.items() if not isinstance(error, Unreachable)}
-    return Seen({name: found[name] for name in wanted if name in found}, away, refused)
+    return FleetObservation({name: found[name] for name in wanted if name in found}, away, refused)
 
 
 def observe_cleared(connection: SshConnection, paths: tuple[str, ...], interrupt: Interrupt) -> Observation:
@@ -112,7 +112,7 @@ def observe_cleared(connection: SshConnection, paths: tuple[str, ...], interrupt
     change = seen.change
     if change is None or not (is_dead(change.lock_owner) or (is_dead(change.owner) and change.state != "idle")):
         return seen
-    pace = Pace(CLEARING_S, interrupt)
+    pace = Backoff(CLEARING_S, interrupt)
     while not pace.is_over and not interrupt.leaving:
         _clear(connection, change)
         seen = observe(connection, extra_paths=paths)

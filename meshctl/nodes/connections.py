@@ -23,7 +23,7 @@ from meshctl.errors import InputError, Unreachable
 from meshctl.model import Fleet, Node
 
 # Closing waits for the connection's thread, up to two seconds where the other side is gone: a fleet's wait together.
-CLOSED_AT_ONCE = 32
+MAX_PARALLEL_CLOSES = 32
 
 
 class Locate(Protocol):
@@ -38,7 +38,7 @@ def as_written(node: Node, address: IPv4Address) -> tuple[str, int]:
 
 
 @dataclass(slots=True)
-class Access:
+class ConnectionPool:
     """Everything needed to reach any node. Safe for many threads; each connection belongs to one at a time.
 
     `key_files` come before those the inventory names. `trust` is the file of pins; `policy` judges host keys and may
@@ -53,7 +53,7 @@ class Access:
     policy: HostKeyPolicy | None = None
     locate: Locate = as_written
     # devices on the bench, by node: they answer there, and let in whoever comes
-    newcomers: dict[str, Endpoint] = field(default_factory=dict)
+    bench_endpoints: dict[str, Endpoint] = field(default_factory=dict)
     # nodes met through one interface of this machine, by node: their new address is looked for there first
     interfaces: dict[str, str] = field(default_factory=dict)
     _kept: dict[str, SshConnection] = field(default_factory=dict, repr=False)
@@ -66,7 +66,7 @@ class Access:
         host, port = self.locate(node, address or node.address.ip)
         return Endpoint(host, port, node.ssh.user, identity=node.name, interface=self.interfaces.get(node.name, ""))
 
-    def places(self, node: Node, address: IPv4Address | None = None) -> tuple[Endpoint, ...]:
+    def candidates(self, node: Node, address: IPv4Address | None = None) -> tuple[Endpoint, ...]:
         """Where a node is looked for: through its own interface, if it has one, then wherever the routes lead."""
         first = self.endpoint(node, address)
         return (first, replace(first, interface="")) if first.interface else (first,)
@@ -75,7 +75,7 @@ class Access:
         """What we log in with: keys, and on the bench alone no password. At a node's own address only a key proves
         that the operators have not locked themselves out."""
         named = tuple(_key_path(text, self.fleet) for text in node.ssh.key_files)
-        is_new = endpoint is not None and endpoint == self.newcomers.get(node.name)
+        is_new = endpoint is not None and endpoint == self.bench_endpoints.get(node.name)
         return Credentials(key_files=(*self.key_files, *named), use_agent=self.use_agent, empty_password=is_new)
 
     def own_keys(self, node: Node) -> tuple[OwnKey, ...]:
@@ -96,7 +96,7 @@ class Access:
         deadlines: Deadlines | None = None,
     ) -> SshConnection:
         """A new connection, owned by the caller. Raises what `ssh.connect` raises."""
-        places = (endpoint,) if endpoint is not None else self.places(node)
+        places = (endpoint,) if endpoint is not None else self.candidates(node)
         while True:
             where, *places_left = places
             try:
@@ -127,20 +127,20 @@ class Access:
             return kept
 
     @contextmanager
-    def lease(self, node: Node) -> Iterator[SshConnection]:
+    def borrow(self, node: Node) -> Iterator[SshConnection]:
         """The kept connection to a node, or a new one, which is kept afterwards unless it broke."""
-        connection = self.take(node.name) or self.open(node)
+        connection = self.acquire(node.name) or self.open(node)
         try:
             yield connection
         except ConnectionLost:
             connection.close()
             raise
         except BaseException:
-            self.keep(node.name, connection)
+            self.release(node.name, connection)
             raise
-        self.keep(node.name, connection)
+        self.release(node.name, connection)
 
-    def take(self, name: str) -> SshConnection | None:
+    def acquire(self, name: str) -> SshConnection | None:
         """The kept connection, if it still stands; the caller owns it now."""
         with self._lock:
             kept = self._kept.pop(name, None)
@@ -149,7 +149,7 @@ class Access:
             return None
         return kept
 
-    def keep(self, name: str, connection: SshConnection) -> None:
+    def release(self, name: str, connection: SshConnection) -> None:
         """Give a connection back for later use."""
         if not connection.is_open:
             connection.close()
@@ -162,7 +162,7 @@ class Access:
 
     def drop(self, name: str) -> None:
         """Close the kept connection to a node."""
-        kept = self.take(name)
+        kept = self.acquire(name)
         if kept is not None:
             kept.close()
 
@@ -175,7 +175,7 @@ class Access:
         _close(kept)
         _close(jumps)
 
-    def __enter__(self) -> Access:
+    def __enter__(self) -> ConnectionPool:
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -183,7 +183,7 @@ class Access:
 
 
 def _close(connections: Iterable[SshConnection]) -> None:
-    with ThreadPoolExecutor(CLOSED_AT_ONCE, "close") as pool:
+    with ThreadPoolExecutor(MAX_PARALLEL_CLOSES, "close") as pool:
         for _ in pool.map(lambda connection: connection.close(), connections):
             pass
 

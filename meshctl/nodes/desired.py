@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from meshctl.device.observation import Observation
 from meshctl.model import Fleet, Node, Secret, SecretRef
-from meshctl.plan import Wanted
+from meshctl.plan import DesiredState
 from meshctl.plan.packages import Needs
 from meshctl.plan.seen import packages_seen
 from meshctl.render import DeviceFacts, Templates, render, with_switch
@@ -26,11 +26,11 @@ class Renderer:
     def of(cls, fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> Renderer:
         return cls(fleet, secrets, Templates.of(fleet))
 
-    def wanted(self, node: Node, seen: Observation | None = None) -> Wanted:
+    def desired(self, node: Node, seen: Observation | None = None) -> DesiredState:
         """One node's files and packages. Raises InvalidInput for values that cannot be written down."""
         intent = resolve(self.fleet, node, self.secrets)
         rendered = render(intent, self.templates, device_facts(node, seen))
-        return Wanted(
+        return DesiredState(
             node,
             rendered.files,
             tuple(secret.reveal() for secret in intent.secrets),

@@ -7,21 +7,21 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from meshctl.device.errors import AuthenticationRefused
-from meshctl.device.trust import HostKey, Recorder, TrustStore
+from meshctl.device.trust import AcceptAnyKey, HostKey, TrustStore
 from meshctl.errors import NodeError
 from meshctl.fleet import Outcome, Result, run
 from meshctl.model import Node
-from meshctl.nodes.connections import Access
+from meshctl.nodes.connections import ConnectionPool
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class HostKeyState:
     """A node's key as it shows it; None with `trouble` when it does not answer. `pinned` are fingerprints."""
 
     node: Node
     key: HostKey | None
     pinned: tuple[str, ...] = ()
-    trouble: str = ""
+    error: str = ""
 
     @property
     def is_pinned(self) -> bool:
@@ -38,15 +38,17 @@ class Shown:
         return "pinned" if self.is_pinned else "changed" if self.is_changed else "new"
 
 
-def shown_keys(access: Access, trust: TrustStore, nodes: Iterable[Node], *, parallel: int) -> tuple[Shown, ...]:
+def fetch_host_keys(
+    access: ConnectionPool, trust: TrustStore, nodes: Iterable[Node], *, parallel: int
+) -> tuple[HostKeyState, ...]:
     """Ask every node for its host key, believing nothing."""
     wanted = {node.name: node for node in nodes}
-    found: dict[str, Shown] = {}
+    found: dict[str, HostKeyState] = {}
     lock = threading.Lock()
 
     def look(name: str) -> Outcome:
         node = wanted[name]
-        recorder = Recorder()
+        recorder = AcceptAnyKey()
         trouble = ""
         try:
             access.open(node, policy=recorder).close()
@@ -57,7 +59,7 @@ def shown_keys(access: Access, trust: TrustStore, nodes: Iterable[Node], *, para
             trouble = str(error)
         pinned = tuple(key.fingerprint for key in trust.pinned(name))
         with lock:
-            found[name] = Shown(node, recorder.key, pinned, trouble)
+            found[name] = HostKeyState(node, recorder.key, pinned, trouble)
         return Outcome(name, Result.DONE)
 
     run(wanted, look, parallel=parallel)

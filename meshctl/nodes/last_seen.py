@@ -14,20 +14,20 @@ from meshctl.device.observation import Observation
 from meshctl.fleet import Interrupt
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
-from meshctl.nodes.collect import Seen, gather, known_macs
-from meshctl.nodes.connections import Access
+from meshctl.nodes.collect import FleetObservation, collect, known_macs
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.topology import Sighting, names_by_mac, report_of, seen_by
 
 # batman-adv forgets whom it has not heard for 200 s (PURGE_TIMEOUT, net/batman-adv/main.h).
 REMEMBERED_MS = 200_000
 # Neighbours come first; so many nodes tell enough, and looking at more would hold up a big fleet's end.
-WITNESSES = 12
+MAX_QUERIED = 12
 # How many of those that hear it are named.
-NAMED = 3
+MAX_NAMED = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Whereabouts:
+class LastSeen:
     """`heard` by direct neighbours, `routed` by nodes that had a way to it, both latest first; `asked` is how many
     nodes told."""
 
@@ -38,9 +38,9 @@ class Whereabouts:
 
     def text(self, now_s: float) -> str:
         """`last seen 40 s ago (12:03:05 UTC), up 2 h, r24106; heard by b02 0.4 s ago (-61 dBm)`."""
-        return "; ".join(part for part in (self._last(now_s), self._witnesses()) if part)
+        return "; ".join(part for part in (self._last_text(now_s), self._heard_text()) if part)
 
-    def _last(self, now_s: float) -> str:
+    def _last_text(self, now_s: float) -> str:
         if self.last is None:
             return "never seen before"
         moment = datetime.fromtimestamp(self.last.seen_s, UTC)
@@ -54,12 +54,12 @@ class Whereabouts:
         told += [text for key in ("version", "revision") if (text := self.last.facts.get(key))]
         return ", ".join(told)
 
-    def _witnesses(self) -> str:
+    def _heard_text(self) -> str:
         if self.heard:
-            return "heard by " + ", ".join(_sighting(one) for one in self.heard[:NAMED])
+            return "heard by " + ", ".join(_sighting(one) for one in self.heard[:MAX_NAMED])
         if self.routed:
             return "no neighbour that answers hears it; a way to it was known by " + ", ".join(
-                _sighting(one) for one in self.routed[:NAMED]
+                _sighting(one) for one in self.routed[:MAX_NAMED]
             )
         if not self.asked:
             return "no other node could be asked"
@@ -90,9 +90,9 @@ def _span(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
-def whereabouts(
+def last_seen_of(
     fleet: Fleet, names: Iterable[str], observations: Mapping[str, Observation], known: Mapping[str, LastKnown]
-) -> dict[str, Whereabouts]:
+) -> dict[str, LastSeen]:
     """What is known of each of `names` from what other nodes were seen to hear and from the journal."""
     lost = tuple(names)
     told = {name: seen for name, seen in observations.items() if name not in lost}
@@ -100,7 +100,7 @@ def whereabouts(
     macs = known_macs(fleet, known)
     heard = seen_by(reports, macs, fresh_ms=REMEMBERED_MS)
     routed = _routed(told, names_by_mac(reports, macs))
-    return {name: Whereabouts(known.get(name), heard.get(name, ()), routed.get(name, ()), len(told)) for name in lost}
+    return {name: LastSeen(known.get(name), heard.get(name, ()), routed.get(name, ()), len(told)) for name in lost}
 
 
 def _routed(observations: Mapping[str, Observation], names: Mapping[str, str]) -> dict[str, tuple[Sighting, ...]]:
@@ -118,15 +118,15 @@ def _routed(observations: Mapping[str, Observation], names: Mapping[str, str]) -
     }
 
 
-def ask_around(
-    access: Access,
+def query_neighbors(
+    access: ConnectionPool,
     fleet: Fleet,
     names: Iterable[str],
-    before: Seen,
+    before: FleetObservation,
     known: Mapping[str, LastKnown],
     *,
     interrupt: Interrupt,
-) -> dict[str, Whereabouts]:
+) -> dict[str, LastSeen]:
     """The same, from a new look at those who heard them before, at the base, and at some others that answered then."""
     lost = tuple(names)
     graph = before.graph(fleet, known)
@@ -135,10 +135,10 @@ def ask_around(
     witnesses = [
         name for name in dict.fromkeys((*near, *base, *before.observations)) if name in fleet.nodes and name not in lost
     ]
-    seen = gather(
+    seen = collect(
         access,
-        [fleet.nodes[name] for name in witnesses[:WITNESSES]],
+        [fleet.nodes[name] for name in witnesses[:MAX_QUERIED]],
         parallel=max(1, fleet.apply.parallel),
         interrupt=interrupt,
     )
-    return whereabouts(fleet, lost, seen.observations, known)
+    return last_seen_of(fleet, lost, seen.observations, known)

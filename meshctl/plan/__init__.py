@@ -5,7 +5,7 @@ the observed mesh, `saved` writes the plan to JSON and reads it back. Nothing he
 """
 
 from meshctl.plan.build import fleet_plan
-from meshctl.plan.node import Wanted, node_plan
+from meshctl.plan.node import DesiredState, node_plan
 from meshctl.plan.values import (
     Cut,
     Effect,
@@ -21,6 +21,7 @@ from meshctl.plan.values import (
 
 __all__ = [
     "Cut",
+    "DesiredState",
     "Effect",
     "FileChange",
     "FirmwareStep",
@@ -30,7 +31,6 @@ __all__ = [
     "Stage",
     "StageKind",
     "Verdict",
-    "Wanted",
     "fleet_plan",
     "node_plan",
 ]

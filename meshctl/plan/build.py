@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 from meshctl.model import Fleet
-from meshctl.plan.order import Surroundings, stages_of
-from meshctl.plan.switch import Switches, switches
+from meshctl.plan.order import MeshContext, stages_of
+from meshctl.plan.switch import MeshSwitches, switches
 from meshctl.plan.values import NodePlan, Plan, StageKind, Verdict
 from meshctl.topology import Graph
 
@@ -33,7 +33,7 @@ def fleet_plan(
     base = fleet.base_node
     stand_on = entry or (base.name if base is not None else "")
     found = switches(fleet, plans, around=around, acknowledged=leave_behind, never_meshed=never_meshed)
-    surroundings = Surroundings(
+    surroundings = MeshContext(
         graph, stand_on, fleet.apply, MappingProxyType({node.name: node.robot for node in fleet.nodes.values()})
     )
     todo = [plan for plan in plans.values() if plan.verdict is Verdict.CHANGE]
@@ -55,7 +55,7 @@ def fleet_plan(
 
 
 def _refusal(
-    found: Switches, plans: Mapping[str, NodePlan], graph: Graph, entry: str, accepted: frozenset[str]
+    found: MeshSwitches, plans: Mapping[str, NodePlan], graph: Graph, entry: str, accepted: frozenset[str]
 ) -> tuple[str, str]:
     for mesh, why in found.blocked.items():
         return (

@@ -80,7 +80,7 @@ def differences(before: Cell, after: Cell) -> tuple[str, ...]:
     return tuple(told)
 
 
-def split_differences(before: Mapping[str, Cell], after: Mapping[str, Cell]) -> dict[str, tuple[str, ...]]:
+def partitions(before: Mapping[str, Cell], after: Mapping[str, Cell]) -> dict[str, tuple[str, ...]]:
     """Radio -> what parts its present cell from the one to come; radios without a present cell part from nothing."""
     return {
         radio: told

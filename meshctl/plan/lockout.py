@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 
 from meshctl.device.connection import OwnKey, fingerprint_of
 from meshctl.model import Node
-from meshctl.plan.preconditions import Objection
+from meshctl.plan.preconditions import FailedPrecondition
 from meshctl.uci import Package
 
 # what libubox takes for false
@@ -20,7 +20,7 @@ _OFF = frozenset({"0", "off", "false", "no", "disabled"})
 AUTHORIZED_KEYS = "etc/dropbear/authorized_keys"
 
 
-def lockout(node: Node, files: Mapping[str, bytes], own: Sequence[OwnKey]) -> Objection | None:
+def lockout(node: Node, files: Mapping[str, bytes], own: Sequence[OwnKey]) -> FailedPrecondition | None:
     """The objection against a change to `files` (paths without a leading slash) after which none of `own` would be let
     in, or None."""
     content = files.get(AUTHORIZED_KEYS)
@@ -35,7 +35,7 @@ def lockout(node: Node, files: Mapping[str, bytes], own: Sequence[OwnKey]) -> Ob
         return None
     ours = ", ".join(f"{key.fingerprint} ({key.name})" for key in usable) or "none"
     release = "" if node.release.has_ed25519 else f" that OpenWrt {node.release} knows"
-    return Objection(
+    return FailedPrecondition(
         f"nobody here could log in to it afterwards: it gets the keys {', '.join(map(_shown, lines)) or 'none'}; "
         f"the keys we have{release}: {ours}",
         "name the private key of one of them (--key, ssh.key_files) or load it into your agent, "
@@ -43,7 +43,7 @@ def lockout(node: Node, files: Mapping[str, bytes], own: Sequence[OwnKey]) -> Ob
     )
 
 
-def server_lockout(packages: Mapping[str, Package]) -> Objection | None:
+def server_lockout(packages: Mapping[str, Package]) -> FailedPrecondition | None:
     """The objection against a configuration (package name -> tree) whose dropbear would not listen after a boot.
 
     On a running node `Interface` and `DirectInterface` of a network that is not there change nothing: dropbear listens
@@ -61,9 +61,11 @@ def server_lockout(packages: Mapping[str, Package]) -> Objection | None:
     if sections and len(bad) < len(sections):
         return None
     if not sections:
-        return Objection("nobody could log in to it afterwards: its dropbear is off", "remove `enable` from extra_uci")
+        return FailedPrecondition(
+            "nobody could log in to it afterwards: its dropbear is off", "remove `enable` from extra_uci"
+        )
     option, name = bad[0]
-    return Objection(
+    return FailedPrecondition(
         f"nobody could log in to it after its next boot: dropbear would wait for {option} {name}, "
         "which is no network of it with a static address",
         f"name one of {', '.join(sorted(str(one) for one in steady - {'loopback'})) or 'its networks'}, "

@@ -13,13 +13,13 @@ from dataclasses import dataclass, field, replace
 from meshctl.device.connection import OwnKey
 from meshctl.device.observation import Observation
 from meshctl.model import Node
-from meshctl.plan.cell import cells, split_differences
+from meshctl.plan.cell import cells, partitions
 from meshctl.plan.effects import effects
 from meshctl.plan.firmware import firmware_step
 from meshctl.plan.lockout import lockout, server_lockout
 from meshctl.plan.masking import Fingerprints, masked_text, secrets_of
 from meshctl.plan.packages import NO_NEEDS, Needs, package_step
-from meshctl.plan.preconditions import objection
+from meshctl.plan.preconditions import failed_precondition
 from meshctl.plan.seen import file_info, fingerprint_texts, is_meshed, packages_seen, parsed, text_of
 from meshctl.plan.values import Cut, Effect, FileChange, FirmwareStep, NodePlan, Verdict
 from meshctl.render import MARKER_PATH, RenderedFile
@@ -30,7 +30,7 @@ PUBLIC_FILES = (MARKER_PATH, "etc/dropbear/authorized_keys")
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class DesiredState:
     """What the inventory wants of one node: its rendered files, the secrets in them, its packages."""
 
     node: Node
@@ -44,7 +44,7 @@ class Wanted:
 
 
 def node_plan(
-    wanted: Wanted,
+    wanted: DesiredState,
     seen: Observation | None,
     fingerprints: Fingerprints,
     *,
@@ -67,12 +67,12 @@ def node_plan(
     live = cells(before.get("wireless"), before.get("network"))
     old_secrets = (secret for package in before.values() if package is not None for secret in secrets_of(package))
     live_after = cells(after.get("wireless"), after.get("network"))
-    split = split_differences(live, live_after)
+    split = partitions(live, live_after)
     basis = NodePlan(
         node.name,
         Verdict.SAME,
         splits=tuple(f"{radio}: {one}" for radio, all_of_it in split.items() for one in all_of_it),
-        parted_from=_parted_from(node, split),
+        parted_from=_partitioned_meshes(node, split),
         meshes=node.meshes,
         has_cell=bool(live),
         is_meshed=is_meshed(seen, live),
@@ -81,7 +81,7 @@ def node_plan(
     )
     firmware = firmware_step(node, seen) if with_firmware else None
     packages = package_step(wanted.needs, seen, node.hardware.package_files)
-    problem = objection(node, seen, before, owner=owner, is_flashed=firmware is not None, packages=packages)
+    problem = failed_precondition(node, seen, before, owner=owner, is_flashed=firmware is not None, packages=packages)
     if problem is not None:
         return replace(basis, verdict=Verdict.REFUSED, reason=problem.reason, hint=problem.hint)
     files = file_changes(wanted.files, seen)
@@ -109,7 +109,7 @@ def node_plan(
     )
 
 
-def _parted_from(node: Node, radios: Iterable[str]) -> tuple[str, ...]:
+def _partitioned_meshes(node: Node, radios: Iterable[str]) -> tuple[str, ...]:
     """The meshes of these radios, or all of the node's when one of the radios is not in the inventory."""
     mesh_of = {radio.name: radio.mesh for radio in node.radios}
     names = set(radios)

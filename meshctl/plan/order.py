@@ -17,7 +17,7 @@ from meshctl.topology import Graph, Path
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class MeshContext:
     """What the order depends on besides the plans: the observed mesh, the node we reach it through, the robots."""
 
     graph: Graph
@@ -27,7 +27,7 @@ class Surroundings:
 
 
 def stages_of(
-    plans: Iterable[NodePlan], around: Surroundings, switches: Mapping[str, Sequence[str]] | None = None
+    plans: Iterable[NodePlan], around: MeshContext, switches: Mapping[str, Sequence[str]] | None = None
 ) -> tuple[Stage, ...]:
     """The stages for all plans with something to do. `switches` maps meshes to the nodes that change cell together."""
     switched = {name for nodes in (switches or {}).values() for name in nodes}
@@ -55,7 +55,7 @@ def _together(plans: Sequence[NodePlan], policy: ApplyPolicy, reason: str) -> tu
     return (Stage(StageKind.FREE, tuple(names), reason),) if names else ()
 
 
-def _switch(mesh: str, nodes: Sequence[str], around: Surroundings) -> Stage:
+def _switch(mesh: str, nodes: Sequence[str], around: MeshContext) -> Stage:
     order = {name: position for position, name in enumerate(around.graph.farthest_first(around.entry))}
     last = [name for name in nodes if name == around.entry]
     names = sorted((name for name in nodes if name != around.entry), key=lambda name: (order.get(name, -1), name))
@@ -70,7 +70,7 @@ def _switch(mesh: str, nodes: Sequence[str], around: Surroundings) -> Stage:
     )
 
 
-def _rolling(plans: Sequence[NodePlan], around: Surroundings) -> tuple[Stage, ...]:
+def _rolling(plans: Sequence[NodePlan], around: MeshContext) -> tuple[Stage, ...]:
     """From the far end inward, at most `max_down` at once, cut vertices alone, the entry last."""
     paths = around.graph.paths(around.entry)
     cuts = around.graph.cut_off_by(around.entry)
@@ -99,7 +99,7 @@ def _rolling(plans: Sequence[NodePlan], around: Surroundings) -> tuple[Stage, ..
     return tuple(stages)
 
 
-def _batch(waiting: Sequence[str], around: Surroundings, cuts: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+def _batch(waiting: Sequence[str], around: MeshContext, cuts: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
     batch = [waiting[0]]
     if waiting[0] in cuts:
         return (waiting[0],)

@@ -142,7 +142,7 @@ def _texts(items: Any) -> tuple[str, ...]:
     return tuple(str(item) for item in items)
 
 
-def moved_on(agreed: NodePlan, now: NodePlan) -> str:
+def stale_reason(agreed: NodePlan, now: NodePlan) -> str:
     """Why a node can no longer be done as agreed; empty when it can. Both plans must share a salt."""
     if now.verdict is Verdict.AWAY:
         return ""
@@ -179,5 +179,5 @@ def _still(old: NodePlan, now: NodePlan) -> NodePlan:
         return replace(now, verdict=Verdict.REFUSED, reason="the plan that was agreed on does nothing to it")
     if now.verdict is Verdict.AWAY:
         return now
-    why = moved_on(old, now)
+    why = stale_reason(old, now)
     return replace(old, verdict=Verdict.REFUSED, reason=why, hint="make a new plan") if why else old

@@ -19,7 +19,7 @@ ALL = "all"
 
 
 @dataclass(frozen=True, slots=True)
-class Switches:
+class MeshSwitches:
     """`nodes`: mesh, or meshes (`main, far`) -> the nodes that change cell together. `left_behind`: mesh -> members
     that are off, not acknowledged. `blocked`: mesh -> members that answer and yet cannot take part, with the reason."""
 
@@ -35,7 +35,7 @@ def switches(
     around: Mapping[str, NodePlan] = MappingProxyType({}),
     acknowledged: Iterable[str] = (),
     never_meshed: Iterable[str] = (),
-) -> Switches:
+) -> MeshSwitches:
     """The switches among these plans. `around` are members that were seen and to which nothing is done; `never_meshed`
     names nodes known to be in no cell yet (fresh from their box)."""
     known, fresh = set(acknowledged), set(never_meshed)
@@ -65,7 +65,7 @@ def switches(
         )
         if behind and ALL not in known:
             left[mesh] = behind
-    return Switches(_joined(nodes), left, blocked)
+    return MeshSwitches(_joined(nodes), left, blocked)
 
 
 def _joined(switching: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:

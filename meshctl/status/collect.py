@@ -23,10 +23,10 @@ from meshctl.device.observe import observe
 from meshctl.errors import MeshctlError, NodeError
 from meshctl.fleet.journal import Journal
 from meshctl.model import Fleet, Node
-from meshctl.nodes.collect import Seen, facts_of, known_macs
-from meshctl.nodes.connections import Access
+from meshctl.nodes.collect import FleetObservation, facts_of, known_macs
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
-from meshctl.plan import NodePlan, Wanted, node_plan
+from meshctl.plan import DesiredState, NodePlan, node_plan
 from meshctl.plan.masking import Fingerprints
 from meshctl.robots.connection import Reach
 from meshctl.robots.facts import Expectation, RobotFacts, expectation, gather
@@ -61,13 +61,13 @@ class Watcher:
 
     fleet: Fleet
     renderer: Renderer
-    access: Access
+    access: ConnectionPool
     journal: Journal
     owner: str
     reach: Reach | None = None
     robots_unasked: str = ""
     clock: Callable[[], float] = time.time
-    _wanted: dict[str, Wanted | str] = field(default_factory=dict, repr=False)
+    _wanted: dict[str, DesiredState | str] = field(default_factory=dict, repr=False)
     _expected: dict[str, Expectation | str] = field(default_factory=dict, repr=False)
     _computers: dict[str, tuple[ExitStack, Host]] = field(default_factory=dict, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
@@ -90,7 +90,7 @@ class Watcher:
         for (kind, name), answer in answers.items():
             if isinstance(answer, NodeError):
                 silent[kind][name] = silence_of(answer)
-        seen = Seen(observations, {})
+        seen = FleetObservation(observations, {})
         self.journal.remember_all(
             self.fleet.name, {name: facts_of(one) for name, one in observations.items()}, self.clock()
         )
@@ -148,16 +148,16 @@ class Watcher:
     def _observe(self, node: Node) -> Observation:
         wanted = self._want(node)
         paths = () if isinstance(wanted, str) else other_paths(wanted)
-        with self.access.lease(node) as connection:
+        with self.access.borrow(node) as connection:
             return observe(connection, extra_paths=paths, timeout_s=OBSERVE_S)
 
-    def _want(self, node: Node) -> Wanted | str:
+    def _want(self, node: Node) -> DesiredState | str:
         """What the inventory wants of a node, or why that cannot be told: a fleet shows its state without its secrets,
         too."""
         with self._lock:
             if node.name not in self._wanted:
                 try:
-                    self._wanted[node.name] = self.renderer.wanted(node)
+                    self._wanted[node.name] = self.renderer.desired(node)
                 except MeshctlError as error:
                     self._wanted[node.name] = first_line(error)
             return self._wanted[node.name]
@@ -174,7 +174,7 @@ class Watcher:
             if isinstance(wanted, str):
                 unrendered[node.name] = wanted
             elif seen is not None:
-                exact = self.renderer.wanted(node, seen)
+                exact = self.renderer.desired(node, seen)
                 plans[node.name] = node_plan(exact, seen, fingerprints, owner=self.owner)
         return plans, unrendered
 

@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import pytest
 
-from meshctl.apply.bootstrap import Arrivals, BenchPlace, Found, find_node, identify, restore_pins
+from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice, find_node, identify, restore_pins
 from meshctl.apply.replace import identity_edits
 from meshctl.device.observation import BoardInfo, Observation
 from meshctl.device.trust import HostKey, TrustStore
@@ -80,8 +80,8 @@ def test_a_device_that_was_refused_leaves_the_pins_of_before(tmp_path: Path) -> 
     for name in ("b01", "b02"):
         trust.replace(name, new)
     found = {
-        name: Found(BenchPlace(node=name), fleet().nodes[name], device(), new, pins)
+        name: FoundDevice(BenchTarget(node=name), fleet().nodes[name], device(), new, pins)
         for name, pins in (("b01", (old,)), ("b02", ()))
     }
-    restore_pins(trust, Arrivals(found, ()), ["b01", "b02"])
+    restore_pins(trust, Discovered(found, ()), ["b01", "b02"])
     assert (trust.pinned("b01"), trust.pinned("b02")) == ((old,), ())

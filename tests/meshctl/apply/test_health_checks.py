@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from meshctl.apply.health_checks import expectation, missing
+from meshctl.apply.health_checks import expectation, unmet
 from meshctl.device.observation import (
     Bridge,
     ChangeStatus,
@@ -38,7 +38,7 @@ def good() -> Observation:
 
 
 def gaps(after: Observation, since_s: float | None = 20.0) -> tuple[str, ...]:
-    return missing(expectation(wanted(fleet(), "b01"), good(), [BASE]), after, since_s=since_s)
+    return unmet(expectation(wanted(fleet(), "b01"), good(), [BASE]), after, since_s=since_s)
 
 
 def test_a_node_with_all_it_had_has_proven_itself() -> None:
@@ -95,21 +95,21 @@ def test_what_was_heard_before_the_change_does_not_count() -> None:
 
 def test_a_node_alone_on_the_bench_need_hear_nobody() -> None:
     alone = replace(good(), neighbours=(), originators=())
-    assert missing(expectation(wanted(fleet(), "b01"), alone, [BASE]), alone) == ()
+    assert unmet(expectation(wanted(fleet(), "b01"), alone, [BASE]), alone) == ()
 
 
 def test_the_base_counts_only_if_it_was_reached_before() -> None:
     before = replace(good(), originators=())
-    assert expectation(wanted(fleet(), "b01"), before, [BASE]).bases == frozenset()
+    assert expectation(wanted(fleet(), "b01"), before, [BASE]).base_macs == frozenset()
 
 
 def test_the_base_may_be_reached_by_an_address_that_it_got_during_the_run() -> None:
     expected = expectation(wanted(fleet(), "b01"), good(), [BASE])
     moved = "42:00:00:00:00:01"
     after = replace(good(), originators=(Originator(moved, moved, "mesh0", 200, True, 250),))
-    assert missing(expected, after) == ("it has no way to the base",)
-    assert missing(expected.with_bases(frozenset({moved})), after) == ()
-    assert expectation(wanted(fleet(), "b01"), good()).with_bases(frozenset({moved})).bases == frozenset()
+    assert unmet(expected, after) == ("it has no way to the base",)
+    assert unmet(expected.with_base_macs(frozenset({moved})), after) == ()
+    assert expectation(wanted(fleet(), "b01"), good()).with_base_macs(frozenset({moved})).base_macs == frozenset()
 
 
 @pytest.mark.parametrize(
@@ -130,4 +130,4 @@ def test_an_encrypted_radio_that_joined_in_the_open_has_not_proven_itself(
     text = re.sub("option encryption '.*'", f"option encryption '{encryption}'", dump(expected.wireless))
     assert f"'{encryption}'" in text
     sealed = replace(expected, wireless=parse(text, "wireless"))
-    assert missing(sealed, replace(good(), supplicants=supplicants)) == gaps
+    assert unmet(sealed, replace(good(), supplicants=supplicants)) == gaps

@@ -7,7 +7,7 @@ from typing import Any
 
 from meshctl.device.observation import MeshNeighbour, Observation, Originator, Station
 from meshctl.fleet.journal import LastKnown
-from meshctl.nodes.last_seen import Whereabouts, whereabouts
+from meshctl.nodes.last_seen import LastSeen, last_seen_of
 from tests.meshctl.plan.support import fleet, running
 
 LOST = "02:00:00:00:01:03"
@@ -24,8 +24,8 @@ def hears(name: str, age_ms: int, **changes: Any) -> Observation:
     return replace(seen, neighbours=(MeshNeighbour(LOST.upper(), "mesh0", age_ms),), **changes)
 
 
-def of(**observations: Observation) -> Whereabouts:
-    return whereabouts(fleet(), ["b03"], observations, KNOWN)["b03"]
+def of(**observations: Observation) -> LastSeen:
+    return last_seen_of(fleet(), ["b03"], observations, KNOWN)["b03"]
 
 
 def test_the_last_sighting_and_those_who_hear_it_are_told_the_latest_first() -> None:
@@ -63,7 +63,7 @@ def test_what_batman_has_long_forgotten_does_not_count() -> None:
 
 
 def test_a_node_never_seen_is_told_as_such_and_an_old_sighting_with_its_day() -> None:
-    assert whereabouts(fleet(), ["b04"], {}, {})["b04"].text(NOW_S) == (
+    assert last_seen_of(fleet(), ["b04"], {}, {})["b04"].text(NOW_S) == (
         "never seen before; no other node could be asked"
     )
     assert "last seen 3 d ago (1970-01-01 02:46 UTC)" in of().text(10_000.0 + 3 * 86400)

@@ -11,7 +11,7 @@ import pytest
 from meshctl.errors import InputError
 from meshctl.model import Fleet, Node, NodeState
 from meshctl.plan import Plan, StageKind, Verdict, fleet_plan
-from meshctl.plan.saved import SavedPlan, dump, load, moved_on
+from meshctl.plan.saved import SavedPlan, dump, load, stale_reason
 from tests.meshctl.plan.support import PASS_PHRASE, SALT, factory, fleet, graph, planned, plans, running, two_meshes
 
 TEAM = ("base", "b01", "b02", "b03", "b04", "b05")
@@ -190,13 +190,13 @@ def test_what_is_no_json_is_refused() -> None:
 
 def test_a_node_that_moved_on_is_told_from_one_that_did_not() -> None:
     agreed = planned(fleet(channel=11), "b01", running(fleet(), "b01"))
-    assert moved_on(agreed, agreed) == ""
+    assert stale_reason(agreed, agreed) == ""
     edited = running(fleet(), "b01")
     assert edited.uci is not None
     edited = replace(edited, uci={**edited.uci, "dhcp": edited.uci["dhcp"] + "config dhcp 'wan'\n"})
-    assert "not as it was" in moved_on(agreed, planned(fleet(channel=11), "b01", edited))
-    assert "inventory wants something else" in moved_on(
+    assert "not as it was" in stale_reason(agreed, planned(fleet(channel=11), "b01", edited))
+    assert "inventory wants something else" in stale_reason(
         agreed, planned(fleet(channel=1), "b01", running(fleet(), "b01"))
     )
     rebooted = replace(running(fleet(), "b01"), boot_id="another", uptime_s=3.0)
-    assert moved_on(agreed, planned(fleet(channel=11), "b01", rebooted)) == ""
+    assert stale_reason(agreed, planned(fleet(channel=11), "b01", rebooted)) == ""

@@ -9,7 +9,7 @@ import pytest
 
 from meshctl.device.connection import OwnKey
 from meshctl.model import Release
-from meshctl.plan import Verdict, Wanted
+from meshctl.plan import DesiredState, Verdict
 from meshctl.plan.lockout import AUTHORIZED_KEYS, lockout, server_lockout
 from meshctl.uci import parse
 from tests.meshctl.plan.support import factory, fleet, planned, running, wanted
@@ -20,7 +20,7 @@ OURS = OwnKey("agent key alice", "ssh-ed25519", base64.b64decode(AUTHORIZED.spli
 OTHER = OwnKey("key /home/bob/.ssh/id_ed25519", "ssh-ed25519", b"\0\0\0\x0bssh-ed25519\0\0\0 " + bytes(32))
 
 
-def contents(want: Wanted) -> dict[str, bytes]:
+def contents(want: DesiredState) -> dict[str, bytes]:
     return {file.path: file.content for file in want.files}
 
 

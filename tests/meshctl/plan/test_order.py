@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from meshctl.model import ApplyPolicy
 from meshctl.plan import Cut, Effect, NodePlan, StageKind, Verdict
-from meshctl.plan.order import Surroundings, stages_of
+from meshctl.plan.order import MeshContext, stages_of
 from meshctl.topology import Graph, Link, graph_of
 from tests.meshctl.plan.support import graph
 
@@ -23,8 +23,8 @@ def changing(name: str, *, cut: Cut = Cut.MESH, is_meshed: bool = True) -> NodeP
     )
 
 
-def around(mesh: Graph, *, max_down: int = 1, canary: bool = False, **robots: str) -> Surroundings:
-    return Surroundings(mesh, "base", ApplyPolicy(max_down=max_down, canary=canary), MappingProxyType(robots))
+def around(mesh: Graph, *, max_down: int = 1, canary: bool = False, **robots: str) -> MeshContext:
+    return MeshContext(mesh, "base", ApplyPolicy(max_down=max_down, canary=canary), MappingProxyType(robots))
 
 
 @st.composite
