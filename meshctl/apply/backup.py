@@ -140,12 +140,12 @@ def read_backup(data: bytes, file: str) -> Backup:
 
 def _info(content: bytes, file: str) -> dict[str, object]:
     try:
-        told = json.loads(content)
+        document = json.loads(content)
     except ValueError as error:
         raise InputError(f"{file}: {INFO_NAME} is damaged: {error}") from error
-    if not isinstance(told, dict):
+    if not isinstance(document, dict):
         raise InputError(f"{file}: {INFO_NAME} is damaged: expected an object")
-    return told
+    return document
 
 
 def _members(data: bytes, file: str) -> list[tuple[tarfile.TarInfo, bytes]]:
@@ -164,30 +164,30 @@ def _members(data: bytes, file: str) -> list[tuple[tarfile.TarInfo, bytes]]:
     return found
 
 
-def restore_backup(job: NodeContext, connection: SshConnection, backup: Backup) -> Outcome:
+def restore_backup(ctx: NodeContext, connection: SshConnection, backup: Backup) -> Outcome:
     """Make the node what the backup has, under its dead-man's switch. Owns `connection`.
 
     Raises NodeError only when nothing was changed on the node.
 
     Files that the node has now and the backup has not stay: `sysupgrade -b` does not name what it left out.
     """
-    live = job.before.uci or {}
+    live = ctx.before.uci or {}
     files = {path: new for path, new in backup.files.items() if _differs(path, new, live)}
     if not files:
-        job.run.connections.release(job.name, connection)
-        return Outcome(job.name, Result.UNCHANGED)
-    change = Change(new_change_id(), files, reload_script({path.lstrip("/") for path in files}, ()))
+        ctx.run.connections.release(ctx.name, connection)
+        return Outcome(ctx.name, Result.UNCHANGED)
+    payload = Change(new_change_id(), files, reload_script({path.lstrip("/") for path in files}, ()))
     address = _address(backup)
-    attempt = ChangeInProgress(
-        job,
-        change,
+    change = ChangeInProgress(
+        ctx,
+        payload,
         new_nonce(),
-        job.node.confirm_window_s,
+        ctx.node.confirm_window_s,
         connection.endpoint,
-        job.run.connections.candidates(job.node, address),
-        radios=_radios(files, job.before),
+        ctx.run.connections.candidates(ctx.node, address),
+        radios=_radios(files, ctx.before),
     )
-    return run_change(attempt, connection)
+    return run_change(change, connection)
 
 
 def _radios(files: Mapping[str, NewFile], before: Observation) -> Radios:

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from meshctl.apply.neighbor_query import observe_neighbors as look_at_neighbours
+from meshctl.apply.neighbor_query import observe_neighbors
 from meshctl.apply.prepare import PlanOptions, Prepared, assemble, other_paths
 from meshctl.device.connection import Endpoint
 from meshctl.device.observation import Observation
@@ -52,7 +52,7 @@ class BenchTarget:
 class FoundDevice:
     """A device on the bench: which node it is, what it told, its host key, and the keys that were pinned before."""
 
-    place: BenchTarget
+    target: BenchTarget
     node: Node
     seen: Observation
     key: HostKey
@@ -77,7 +77,7 @@ def find_node(fleet: Fleet, word: str) -> Node:
     return found[0]
 
 
-def identify(fleet: Fleet, seen: Observation, said: str, taken: Iterable[str] = ()) -> Node:
+def identify(fleet: Fleet, seen: Observation, said: str, identified: Iterable[str] = ()) -> Node:
     """Which node this device is. Its MACs decide; where the inventory knows none, the operator's word does.
 
     Raises NodeError for a device that is not the one it is said to be, or that nothing identifies.
@@ -105,7 +105,7 @@ def identify(fleet: Fleet, seen: Observation, said: str, taken: Iterable[str] = 
             f"nothing tells which node it is: no node of the inventory has one of its MACs ({shown})",
             hint="say it (`meshctl bootstrap NODE`), or write its MAC into the inventory",
         )
-    if node.name in set(taken):
+    if node.name in set(identified):
         raise NodeError(f"{node.name} was found at another place already")
     return node
 
@@ -124,9 +124,9 @@ class Discovered:
 
 def discover(
     renderer: Renderer,
-    access: ConnectionPool,
+    connections: ConnectionPool,
     trust: TrustStore,
-    places: Sequence[BenchTarget],
+    targets: Sequence[BenchTarget],
     *,
     parallel: int,
     replace_keys: bool = False,
@@ -137,47 +137,55 @@ def discover(
     found: dict[str, FoundDevice] = {}
     lock = threading.Lock()
     signal = interrupt or Interrupt()
-    by_name = {str(place): place for place in places}
+    by_name = {str(target): target for target in targets}
 
-    def meet(name: str) -> Outcome:
-        place = by_name[name]
-        recorder = AcceptAnyKey()
-        connection = _connect(access, renderer.fleet, place, recorder)
+    def identify_one(name: str) -> Outcome:
+        target = by_name[name]
+        host_key_policy = AcceptAnyKey()
+        connection = _connect(connections, renderer.fleet, target, host_key_policy)
         try:
             with lock:
-                taken = tuple(found)
-            seen = observe_cleared(connection, _paths(renderer, place), signal)
-            node = identify(renderer.fleet, seen, place.node, taken)
-            assert recorder.key is not None
+                identified = tuple(found)
+            seen = observe_cleared(connection, _paths(renderer, target), signal)
+            node = identify(renderer.fleet, seen, target.node, identified)
+            assert host_key_policy.key is not None
             old_pins = trust.pinned(node.name)
-            _pin(trust, node.name, recorder.key, replace_keys=replace_keys)
+            _pin(trust, node.name, host_key_policy.key, replace_keys=replace_keys)
         except BaseException:
             connection.close()
             raise
         with lock:
-            found[node.name] = FoundDevice(place, node, seen, recorder.key, old_pins)
-            access.bench_endpoints[node.name] = replace(connection.endpoint, identity=node.name)
-            if place.interface:
-                access.interfaces[node.name] = place.interface
-        access.release(node.name, connection)
+            found[node.name] = FoundDevice(target, node, seen, host_key_policy.key, old_pins)
+            connections.bench_endpoints[node.name] = replace(connection.endpoint, identity=node.name)
+            if target.interface:
+                connections.interfaces[node.name] = target.interface
+        connections.release(node.name, connection)
         return Outcome(name, Result.DONE)
 
-    ended = run(by_name, meet, parallel=parallel, interrupt=signal, observer=observer)
+    ended = run(by_name, identify_one, parallel=parallel, interrupt=signal, observer=observer)
     return Discovered(found, tuple(outcome for outcome in ended.values() if not outcome.result.is_good))
 
 
-def _connect(access: ConnectionPool, fleet: Fleet, place: BenchTarget, recorder: AcceptAnyKey) -> SshConnection:
+def _connect(
+    connections: ConnectionPool, fleet: Fleet, target: BenchTarget, host_key_policy: AcceptAnyKey
+) -> SshConnection:
     """Log in with no password, or with the fleet's keys where an earlier attempt has come half way."""
     some = next(fleet.managed())
-    credentials = replace(access.credentials(some), empty_password=True)
-    release = find_node(fleet, place.node).release if place.node else None
-    return connect(place.endpoint, credentials=credentials, trust=recorder, deadlines=access.deadlines, release=release)
+    credentials = replace(connections.credentials(some), empty_password=True)
+    release = find_node(fleet, target.node).release if target.node else None
+    return connect(
+        target.endpoint,
+        credentials=credentials,
+        trust=host_key_policy,
+        deadlines=connections.deadlines,
+        release=release,
+    )
 
 
-def _paths(renderer: Renderer, place: BenchTarget) -> tuple[str, ...]:
+def _paths(renderer: Renderer, target: BenchTarget) -> tuple[str, ...]:
     """The files to look at; which node it is may not be known yet, and the paths are much the same for all."""
     fleet = renderer.fleet
-    node = find_node(fleet, place.node) if place.node else next(fleet.managed())
+    node = find_node(fleet, target.node) if target.node else next(fleet.managed())
     return other_paths(renderer.desired(node))
 
 
@@ -193,16 +201,16 @@ def _pin(trust: TrustStore, name: str, key: HostKey, *, replace_keys: bool) -> N
     trust.replace(name, key)
 
 
-def restore_pins(trust: TrustStore, arrivals: Discovered, names: Iterable[str]) -> None:
+def restore_pins(trust: TrustStore, discovered: Discovered, names: Iterable[str]) -> None:
     """Trust the keys of before for these nodes: a device that was refused is not the node it was taken for."""
     for name in names:
-        trust.replace(name, *arrivals.found[name].old_pins)
+        trust.replace(name, *discovered.found[name].old_pins)
 
 
 def plan_discovered(
     renderer: Renderer,
-    access: ConnectionPool,
-    arrivals: Discovered,
+    connections: ConnectionPool,
+    discovered: Discovered,
     known: Mapping[str, LastKnown],
     *,
     salt: bytes,
@@ -212,11 +220,11 @@ def plan_discovered(
 ) -> Prepared:
     """The plan that provisions the devices that were found. Whoever may know their radios is looked at, too: a spare
     may have been in the mesh, and a device that was reset was in it before."""
-    first = {name: renderer.desired(item.node) for name, item in arrivals.found.items()}
-    found = {name: item.seen for name, item in arrivals.found.items()}
+    first = {name: renderer.desired(item.node) for name, item in discovered.found.items()}
+    found = {name: item.seen for name, item in discovered.found.items()}
     made = assemble(
         renderer,
-        access,
+        connections,
         first,
         FleetObservation(found, {}),
         known,
@@ -225,5 +233,5 @@ def plan_discovered(
         choices=choices or PlanOptions(),
     )
     return replace(
-        made, neighbor_observations=look_at_neighbours(access, renderer.fleet, found, known, interrupt=interrupt)
+        made, neighbor_observations=observe_neighbors(connections, renderer.fleet, found, known, interrupt=interrupt)
     )

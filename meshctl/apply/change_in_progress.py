@@ -96,128 +96,129 @@ class ChangeInProgress:
         return SETTLE_S if self.ctx.plan.cut > Cut.LOGIN else 0.0
 
 
-def new_change(job: NodeContext, old: Endpoint, *, window_s: int | None = None) -> ChangeInProgress:
+def new_change(ctx: NodeContext, old: Endpoint, *, window_s: int | None = None) -> ChangeInProgress:
     """A new change for a node that is reached at `old` now."""
-    services = services_of(job.run.fleet, job.node)
+    services = services_of(ctx.run.fleet, ctx.node)
     return ChangeInProgress(
-        job,
-        change_of(new_change_id(), job.plan, job.desired, job.before, services),
+        ctx,
+        change_of(new_change_id(), ctx.plan, ctx.desired, ctx.before, services),
         new_nonce(),
-        window_s or job.node.confirm_window_s,
+        window_s or ctx.node.confirm_window_s,
         old,
-        job.run.connections.candidates(job.node),
-        radios=_radios_of(job),
+        ctx.run.connections.candidates(ctx.node),
+        radios=_radios_of(ctx),
     )
 
 
-def _radios_of(job: NodeContext) -> Radios:
+def _radios_of(ctx: NodeContext) -> Radios:
     """Which of the node's radios start anew with its plan's files."""
-    if not any(change.path == WIRELESS for change in job.plan.files):
+    if not any(change.path == WIRELESS for change in ctx.plan.files):
         return NO_RADIOS
-    before = packages_seen([WIRELESS], job.before)["wireless"]
-    return restarted(before, next((file.package for file in job.desired.files if file.path == WIRELESS), None))
+    before = packages_seen([WIRELESS], ctx.before)["wireless"]
+    return restarted(before, next((file.package for file in ctx.desired.files if file.path == WIRELESS), None))
 
 
-def arm(attempt: ChangeInProgress, connection: SshConnection) -> None:
+def arm(change: ChangeInProgress, connection: SshConnection) -> None:
     """Bring the change there and arm it; nothing it touches has changed yet. Raises NodeRefused, NodeError."""
-    job, owner = attempt.ctx, attempt.ctx.run.owner
-    attempt.starts += 1
-    await_flash(job, connection)
-    with job.step("stage"):
-        install_switch(job, connection)
-        deadman.lock(connection, owner, ttl_s=attempt.window_s + LOCK_SLACK_S)
+    ctx, owner = change.ctx, change.ctx.run.owner
+    change.starts += 1
+    await_flash(ctx, connection)
+    with ctx.step("stage"):
+        install_switch(ctx, connection)
+        deadman.lock(connection, owner, ttl_s=change.window_s + LOCK_SLACK_S)
         deadman.stage(
-            connection, owner, attempt.payload, rate_bytes_per_s=job.run.rate_bytes_per_s, progress=job.progress
+            connection, owner, change.payload, rate_bytes_per_s=ctx.run.rate_bytes_per_s, progress=ctx.progress
         )
-    with job.step("arm"):
-        deadman.arm(connection, owner, attempt.id, nonce=attempt.nonce, window_s=attempt.window_s)
+    with ctx.step("arm"):
+        deadman.arm(connection, owner, change.id, nonce=change.nonce, window_s=change.window_s)
 
 
-def await_flash(job: NodeContext, connection: SshConnection) -> None:
+def await_flash(ctx: NodeContext, connection: SshConnection) -> None:
     """Wait until / is in flash: at its first boot a node is in memory until its flash is formatted, and what is written
     until then may be lost. Raises NodeError when that does not come to pass."""
-    if not job.before.root_in_ram or not root_in_ram(connection):
+    if not ctx.before.root_in_ram or not root_in_ram(connection):
         return
-    job.run.note("its flash is not ready yet (first boot): waiting", job.name)
-    pace = Backoff(FLASH_READY_TIMEOUT_S, job.run.interrupt)
-    with job.step("flash ready"):
+    ctx.run.note("its flash is not ready yet (first boot): waiting", ctx.name)
+    backoff = Backoff(FLASH_READY_TIMEOUT_S, ctx.run.interrupt)
+    with ctx.step("flash ready"):
         while root_in_ram(connection):
-            if pace.is_over or job.run.interrupt.leaving:
+            if backoff.is_over or ctx.run.interrupt.leaving:
                 raise NodeError(
-                    f"{job.name}: its flash was not ready within {FLASH_READY_TIMEOUT_S / 60:.0f} minutes; nothing was changed",
+                    f"{ctx.name}: its flash was not ready within {FLASH_READY_TIMEOUT_S / 60:.0f} minutes; "
+                    "nothing was changed",
                     hint="switch it off and on, then run again",
                 )
-            pace.pause()
+            backoff.pause()
 
 
-def install_switch(job: NodeContext, connection: SshConnection) -> None:
+def install_switch(ctx: NodeContext, connection: SshConnection) -> None:
     """Put the switch there unless this very version already is."""
-    known = job.before.change
+    known = ctx.before.change
     own = re.search(rb"^VERSION=(\S+)", deadman.installed_files()[deadman.PROGRAM][1], re.MULTILINE)
     if known is None or not known.installed or own is None or known.version != own[1].decode():
         deadman.install(connection)
 
 
-def start(attempt: ChangeInProgress, connection: SshConnection, *, at_uptime_s: float | None = None) -> None:
+def start(change: ChangeInProgress, connection: SshConnection, *, at_uptime_s: float | None = None) -> None:
     """Have the node begin: in a moment, or when its own uptime reaches `at_uptime_s`.
 
     The change may cut this very connection, so an answer that does not come soon is not waited for: the window is
     running. Raises NodeRefused, Unreachable.
     """
-    attempt.flush.started()
-    patience = threading.Timer(min(APPLY_ANSWER_TIMEOUT_S, attempt.window_s / 4), connection.close)
+    change.flush.started()
+    patience = threading.Timer(min(APPLY_ANSWER_TIMEOUT_S, change.window_s / 4), connection.close)
     patience.daemon = True
     patience.start()
     in_s = None if at_uptime_s is not None else APPLY_DELAY_S
     try:
-        with attempt.ctx.step("apply"):
-            deadman.apply(connection, attempt.ctx.run.owner, attempt.id, in_s=in_s, at_uptime_s=at_uptime_s)
+        with change.ctx.step("apply"):
+            deadman.apply(connection, change.ctx.run.owner, change.id, in_s=in_s, at_uptime_s=at_uptime_s)
     finally:
         patience.cancel()
 
 
-def connect(attempt: ChangeInProgress) -> SshConnection | None:
+def connect(change: ChangeInProgress) -> SshConnection | None:
     """A new connection to where the node shall be, or else to where it was."""
-    job = attempt.ctx
-    for endpoint in dict.fromkeys((attempt.new, *attempt.candidates, attempt.old)):
+    ctx = change.ctx
+    for endpoint in dict.fromkeys((change.new, *change.candidates, change.old)):
         try:
-            connection = job.run.connections.open(job.node, endpoint=endpoint)
+            connection = ctx.run.connections.open(ctx.node, endpoint=endpoint)
         except NodeError as error:
-            attempt.last_error = attempt.connect_error = str(error)
+            change.last_error = change.connect_error = str(error)
             if isinstance(error, AuthenticationRefused):
-                attempt.login_refused = attempt.last_error
+                change.login_refused = change.last_error
             continue
-        if endpoint in attempt.candidates:
-            attempt.found_at = endpoint
+        if endpoint in change.candidates:
+            change.found_at = endpoint
         return connection
     return None
 
 
-def observe_and_decide(attempt: ChangeInProgress, connection: SshConnection) -> Action:
+def observe_and_decide(change: ChangeInProgress, connection: SshConnection) -> Action:
     """Observe the node once and say what is next. Raises Unreachable."""
-    job = attempt.ctx
-    busy = _while_it_reloads(attempt, connection)
+    ctx = change.ctx
+    busy = _while_it_reloads(change, connection)
     if busy is not None:
         return busy
-    attempt.last = observe(connection)
-    age_s = applied_age_s(attempt.status)
+    change.last = observe(connection)
+    age_s = applied_age_s(change.status)
     if age_s is not None:
-        attempt.login_refused = attempt.connect_error = ""
-        attempt.flush.observed()
-    attempt.unmet = unmet(job.expected.with_base_macs(job.run.current_base_macs()), attempt.last, since_s=age_s)
-    if age_s is not None and age_s < attempt.settle_s:
-        attempt.unmet = (*attempt.unmet, "it has not settled yet")
+        change.login_refused = change.connect_error = ""
+        change.flush.observed()
+    change.unmet = unmet(ctx.expected.with_base_macs(ctx.run.current_base_macs()), change.last, since_s=age_s)
+    if age_s is not None and age_s < change.settle_s:
+        change.unmet = (*change.unmet, "it has not settled yet")
     return next_action(
-        attempt.id,
-        attempt.status,
-        attempt.unmet,
-        is_at_new_address=connection.endpoint == attempt.new,
-        leaving=job.run.interrupt.leaving,
-        is_given_up=attempt.is_abandoned,
+        change.id,
+        change.status,
+        change.unmet,
+        is_at_new_address=connection.endpoint == change.new,
+        leaving=ctx.run.interrupt.leaving,
+        is_given_up=change.is_abandoned,
     )
 
 
-def _while_it_reloads(attempt: ChangeInProgress, connection: SshConnection) -> Action | None:
+def _while_it_reloads(change: ChangeInProgress, connection: SshConnection) -> Action | None:
     """What is next as long as the node's services take up the change; None when it is time to look at everything.
 
     That would hold them up on a small processor, and be cut short when they take the radio down. Raises Unreachable.
@@ -227,55 +228,55 @@ def _while_it_reloads(attempt: ChangeInProgress, connection: SshConnection) -> A
     except CommandFailed:
         # what is wrong there the observation tells
         return None
-    if status.change_id != attempt.id or status.state not in ("waiting", "applied"):
+    if status.change_id != change.id or status.state not in ("waiting", "applied"):
         return None
     if status.reload_status is not None:
-        if attempt.is_reloaded or status.state != "applied":
+        if change.is_reloaded or status.state != "applied":
             return None
         # this very connection may have been let in before the effects were in force
-        attempt.is_reloaded = True
+        change.is_reloaded = True
     if status.state == "applied":
-        attempt.login_refused = attempt.connect_error = ""
-        attempt.flush.observed()
-    attempt.unmet = (RELOADING,)
-    leaving = attempt.ctx.run.interrupt.leaving
+        change.login_refused = change.connect_error = ""
+        change.flush.observed()
+    change.unmet = (RELOADING,)
+    leaving = change.ctx.run.interrupt.leaving
     return next_action(
-        attempt.id,
+        change.id,
         status,
-        attempt.unmet,
+        change.unmet,
         is_at_new_address=False,
         leaving=leaving,
-        is_given_up=attempt.is_abandoned,
+        is_given_up=change.is_abandoned,
     )
 
 
-def confirm(attempt: ChangeInProgress) -> bool:
+def confirm(change: ChangeInProgress) -> bool:
     """Confirm over a connection opened only now: that it lets us in after the change is the proof.
 
     False when the window had run out on the way. Raises Unreachable.
     """
-    job = attempt.ctx
-    connection = job.run.connections.open(job.node, endpoint=attempt.new)
+    ctx = change.ctx
+    connection = ctx.run.connections.open(ctx.node, endpoint=change.new)
     try:
-        deadman.confirm(connection, attempt.id, nonce=attempt.nonce)
-        unlock(attempt, connection)
+        deadman.confirm(connection, change.id, nonce=change.nonce)
+        unlock(change, connection)
     except NodeRefused:
         connection.close()
         return False
     except BaseException:
         connection.close()
         raise
-    job.run.connections.release(job.name, connection)
+    ctx.run.connections.release(ctx.name, connection)
     return True
 
 
-def unlock(attempt: ChangeInProgress, connection: SshConnection) -> None:
+def unlock(change: ChangeInProgress, connection: SshConnection) -> None:
     """Give the lock back; that it cannot be (it runs out by itself) changes nothing about the outcome."""
     with suppress(NodeError):
-        deadman.unlock(connection, attempt.ctx.run.owner)
+        deadman.unlock(connection, change.ctx.run.owner)
 
 
-def abort(attempt: ChangeInProgress, connection: SshConnection) -> None:
+def abort(change: ChangeInProgress, connection: SshConnection) -> None:
     """Have the node undo the change now. What the node refuses it will tell in its next status."""
     with suppress(NodeRefused):
-        deadman.abort(connection, attempt.ctx.run.owner, attempt.id)
+        deadman.abort(connection, change.ctx.run.owner, change.id)

@@ -26,11 +26,11 @@ def new_nonce() -> Secret:
 
 
 def change_of(
-    change_id: str, plan: NodePlan, wanted: DesiredState, before: Observation, services: tuple[str, ...]
+    change_id: str, plan: NodePlan, desired: DesiredState, before: Observation, services: tuple[str, ...]
 ) -> Change:
     """The change that makes the files of `plan` what `wanted` has; the node refuses it if it is not as observed."""
     touched = {change.path for change in plan.files}
-    files = {f"/{file.path}": NewFile(file.content, file.mode) for file in wanted.files if file.path in touched}
+    files = {f"/{file.path}": NewFile(file.content, file.mode) for file in desired.files if file.path in touched}
     return Change(
         change_id=change_id,
         files=files,

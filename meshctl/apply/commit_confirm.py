@@ -36,133 +36,133 @@ GRACE_AFTER_WINDOW_S = 60.0
 MAX_STARTS = 3
 
 
-def configure(job: NodeContext, connection: SshConnection) -> Outcome:
+def configure(ctx: NodeContext, connection: SshConnection) -> Outcome:
     """Carry out the file changes of a node's plan. Owns `connection`, and keeps one to the node if all went well.
 
     Raises NodeError only when nothing was changed on the node.
     """
     # a device that was met on the bench is known by its name from now on
-    return run_change(new_change(job, replace(connection.endpoint, identity=job.name)), connection)
+    return run_change(new_change(ctx, replace(connection.endpoint, identity=ctx.name)), connection)
 
 
-def run_change(attempt: ChangeInProgress, connection: SshConnection) -> Outcome:
+def run_change(change: ChangeInProgress, connection: SshConnection) -> Outcome:
     """Carry a change to its end. Owns `connection`, and keeps one to the node if all went well.
 
     Raises NodeError only when nothing was changed on the node.
     """
-    job = attempt.ctx
+    ctx = change.ctx
     try:
-        arm(attempt, connection)
-        if attempt.radios:
-            attempt.flush.watch_own_entries(connection, for_s=_limit_s(attempt))
-            attempt.flush.watch(for_s=_limit_s(attempt))
-        start(attempt, connection)
+        arm(change, connection)
+        if change.radios:
+            change.flush.watch_own_entries(connection, for_s=_limit_s(change))
+            change.flush.watch(for_s=_limit_s(change))
+        start(change, connection)
     except Unreachable as error:
         # how far it came, the node itself will tell
-        attempt.last_error = str(error)
+        change.last_error = str(error)
     except NodeRefused as refusal:
-        unlock(attempt, connection)
-        return Outcome(job.name, Result.REFUSED, str(refusal), hint=refusal.hint)
+        unlock(change, connection)
+        return Outcome(ctx.name, Result.REFUSED, str(refusal), hint=refusal.hint)
     except NodeError:
-        unlock(attempt, connection)
+        unlock(change, connection)
         raise
     finally:
         connection.close()
-    with job.step("prove"):
-        return poll(attempt)
+    with ctx.step("prove"):
+        return poll(change)
 
 
-def poll(attempt: ChangeInProgress) -> Outcome:
+def poll(change: ChangeInProgress) -> Outcome:
     """Ask and do what is next until the change has ended one way or the other."""
-    work = attempt.ctx.run
-    pace = Backoff(_limit_s(attempt), work.interrupt)
-    work.interrupt.wait(attempt.settle_s)
-    while not pace.is_over:
-        with attempt.flush.flush_if_slow():
-            connection = connect(attempt)
+    run_context = change.ctx.run
+    backoff = Backoff(_limit_s(change), run_context.interrupt)
+    run_context.interrupt.wait(change.settle_s)
+    while not backoff.is_over:
+        with change.flush.flush_if_slow():
+            connection = connect(change)
         if connection is not None:
             try:
-                outcome = _act(attempt, connection)
+                outcome = _act(change, connection)
             except Unreachable as error:
-                attempt.last_error, outcome = str(error), None
+                change.last_error, outcome = str(error), None
             finally:
                 connection.close()
-            if attempt.last is not None:
-                work.record(attempt.ctx.name, attempt.last)
+            if change.last is not None:
+                run_context.record(change.ctx.name, change.last)
             if outcome is not None:
-                _flush_stations(attempt, outcome)
+                _flush_stations(change, outcome)
                 return outcome
         else:
-            attempt.flush.unreachable()
-        if work.interrupt.leaving:
+            change.flush.unreachable()
+        if run_context.interrupt.leaving:
             break
-        pace.pause()
-    return _uncertain(attempt)
+        backoff.pause()
+    return _uncertain(change)
 
 
-def _act(attempt: ChangeInProgress, connection: SshConnection) -> Outcome | None:
+def _act(change: ChangeInProgress, connection: SshConnection) -> Outcome | None:
     """Look at the node once and make the next move; an outcome when it was the last."""
-    name = attempt.ctx.name
-    match observe_and_decide(attempt, connection):
+    name = change.ctx.name
+    match observe_and_decide(change, connection):
         case Action.CONFIRM:
-            return Outcome(name, Result.DONE) if confirm(attempt) else None
+            return Outcome(name, Result.DONE) if confirm(change) else None
         case Action.ABORT:
-            abort(attempt, connection)
+            abort(change, connection)
         case Action.KEPT:
-            unlock(attempt, connection)
+            unlock(change, connection)
             return Outcome(name, Result.DONE)
         case Action.WENT_BACK:
-            unlock(attempt, connection)
-            why = rollback_reason(attempt.status, attempt.unmet, attempt.login_refused, attempt.connect_error)
+            unlock(change, connection)
+            why = rollback_reason(change.status, change.unmet, change.login_refused, change.connect_error)
             return Outcome(name, Result.ROLLED_BACK, why)
         case Action.FOREIGN:
-            status = attempt.status
+            status = change.status
             return Outcome(name, Result.REFUSED, f"a change of {status.owner} is {status.state} on it")
         case Action.START | Action.BEGIN as move:
-            return _resend(attempt, connection, move)
+            return _resend(change, connection, move)
         case Action.WAIT:
             pass
     return None
 
 
-def _resend(attempt: ChangeInProgress, connection: SshConnection, move: Action) -> Outcome | None:
+def _resend(change: ChangeInProgress, connection: SshConnection, move: Action) -> Outcome | None:
     """The node has nothing of ours that would begin by itself: send what is missing again, a few times."""
-    name = attempt.ctx.name
-    if attempt.starts >= MAX_STARTS:
+    name = change.ctx.name
+    if change.starts >= MAX_STARTS:
         with suppress(NodeError):
-            abort(attempt, connection)
-        unlock(attempt, connection)
-        return Outcome(name, Result.FAILED, f"its link breaks before the change is there: {attempt.last_error}")
+            abort(change, connection)
+        unlock(change, connection)
+        return Outcome(name, Result.FAILED, f"its link breaks before the change is there: {change.last_error}")
     try:
         if move is Action.START:
-            arm(attempt, connection)
+            arm(change, connection)
         else:
-            attempt.starts += 1
-        start(attempt, connection)
+            change.starts += 1
+        start(change, connection)
     except NodeRefused as refusal:
-        abort(attempt, connection)
-        unlock(attempt, connection)
+        abort(change, connection)
+        unlock(change, connection)
         return Outcome(name, Result.REFUSED, str(refusal), hint=refusal.hint)
     return None
 
 
-def _limit_s(attempt: ChangeInProgress) -> float:
+def _limit_s(change: ChangeInProgress) -> float:
     """Within this time the change has been confirmed or undone."""
-    return attempt.settle_s + attempt.extra_s + attempt.window_s + GRACE_AFTER_WINDOW_S
+    return change.settle_s + change.extra_s + change.window_s + GRACE_AFTER_WINDOW_S
 
 
-def _flush_stations(attempt: ChangeInProgress, outcome: Outcome) -> None:
+def _flush_stations(change: ChangeInProgress, outcome: Outcome) -> None:
     if outcome.result in (Result.DONE, Result.ROLLED_BACK):
-        attempt.flush.ended(
-            attempt.last,
+        change.flush.ended(
+            change.last,
             went_back=outcome.result is Result.ROLLED_BACK,
-            rebooted=attempt.last is not None and attempt.last.boot_id != attempt.ctx.before.boot_id,
+            rebooted=change.last is not None and change.last.boot_id != change.ctx.before.boot_id,
         )
 
 
-def _uncertain(attempt: ChangeInProgress) -> Outcome:
-    if attempt.ctx.run.interrupt.leaving:
-        why = f"left while its change was under way; it goes back by itself within {attempt.window_s} s"
+def _uncertain(change: ChangeInProgress) -> Outcome:
+    if change.ctx.run.interrupt.leaving:
+        why = f"left while its change was under way; it goes back by itself within {change.window_s} s"
     else:
-        why = f"not seen since its change began ({attempt.last_error}); by its own timer it has gone back"
-    return Outcome(attempt.ctx.name, Result.UNCERTAIN, why, hint="`meshctl resume` looks at it again")
+        why = f"not seen since its change began ({change.last_error}); by its own timer it has gone back"
+    return Outcome(change.ctx.name, Result.UNCERTAIN, why, hint="`meshctl resume` looks at it again")

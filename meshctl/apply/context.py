@@ -87,7 +87,7 @@ class NodeContext:
         with self.run.journal_run.step(self.name, name):
             yield
 
-    def progress(self, told: Progress) -> None:
+    def progress(self, uploaded: Progress) -> None:
         """For uploads: how much is on the node."""
-        fraction = told.verified / told.total if told.total else 1.0
+        fraction = uploaded.verified / uploaded.total if uploaded.total else 1.0
         self.run.observer(Event(EventKind.PROGRESS, self.name, time.time(), fraction=fraction))

@@ -57,69 +57,71 @@ class RunSettings:
     rate_bytes_per_s: float | None = None
 
 
-def execute(prepared: Prepared, setting: RunSettings) -> dict[str, Outcome]:
+def execute(prepared: Prepared, settings: RunSettings) -> dict[str, Outcome]:
     """Apply the plan. Raises InputError and InvalidInput before anything is changed: an image or package file that is
     not what the inventory says."""
-    plan, fleet = prepared.plan, setting.fleet
+    plan, fleet = prepared.plan, settings.fleet
     images = {
         node.hardware.name: checked_image(node.hardware)
         for node in (fleet.nodes[name] for name, planned in plan.nodes.items() if planned.firmware is not None)
     }
-    unforgotten = _unflushed(prepared, setting)
-    work = _run_context(prepared, setting, unforgotten)
+    unflushed = _unflushed(prepared, settings)
+    run_context = _run_context(prepared, settings, unflushed)
     outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _unchanged_outcome(fleet, made))}
     for outcome in outcomes.values():
-        _finish(setting, outcome)
-    jobs = _node_contexts(prepared, work)
-    for name, since_s in unforgotten.items():
-        flush_later(_node_context(prepared, work, name), max(0.0, time.time() - since_s))
+        _finish(settings, outcome)
+    jobs = _node_contexts(prepared, run_context)
+    for name, since_s in unflushed.items():
+        flush_later(_node_context(prepared, run_context, name), max(0.0, time.time() - since_s))
     budget = FailureBudget(fleet.apply.stop_after_failures)
     stopped = ""
     for stage in plan.stages:
         # a canary that was left in the middle is no canary that failed
-        reason = "interrupted before its turn" if setting.interrupt.stopping else stopped
+        reason = "interrupted before its turn" if settings.interrupt.stopping else stopped
         if reason:
             ended = {name: Outcome(name, Result.PENDING, reason) for name in stage.nodes}
             for outcome in ended.values():
-                _finish(setting, outcome)
+                _finish(settings, outcome)
         else:
-            ended = _run_stage(stage, jobs, plan, work, setting, budget, images)
+            ended = _run_stage(stage, jobs, plan, run_context, settings, budget, images)
         outcomes.update(ended)
         if stage.kind is StageKind.CANARY and any(outcome.result.is_failure for outcome in ended.values()):
             stopped = f"stopped: the canary {stage.nodes[0]} failed"
         elif budget.spent:
             stopped = budget.reason
-    outcomes.update(_with_last_seen(prepared, setting, jobs, outcomes))
-    outcomes.update(_with_unflushed_neighbors(work, outcomes))
+    outcomes.update(_with_last_seen(prepared, settings, jobs, outcomes))
+    outcomes.update(_with_unflushed_neighbors(run_context, outcomes))
     return {name: outcomes[name] for name in plan.nodes}
 
 
-def _unflushed(prepared: Prepared, setting: RunSettings) -> dict[str, float]:
+def _unflushed(prepared: Prepared, settings: RunSettings) -> dict[str, float]:
     """The nodes that answered whose radios may have started anew without their neighbours having been told, and since
     when (Unix time): of a change's beginning the end was not seen, or they have booted since they were last known."""
     seen = prepared.observed.observations
-    lost = setting.journal.lost_sight_of(setting.fleet.name)
+    lost = settings.journal.lost_sight_of(settings.fleet.name)
     booted = {name: unflushed_boot_s(name, seen) for name in prepared.plan.nodes}
-    since = {name: at_s for name, at_s in booted.items() if at_s is not None} | lost
-    return {name: at_s for name, at_s in since.items() if name in prepared.plan.nodes and name in seen}
+    since_s = {name: at_s for name, at_s in booted.items() if at_s is not None} | lost
+    return {name: at_s for name, at_s in since_s.items() if name in prepared.plan.nodes and name in seen}
 
 
-def _run_context(prepared: Prepared, setting: RunSettings, unforgotten: Iterable[str]) -> RunContext:
-    fleet, seen = setting.fleet, prepared.observed.observations
-    known = setting.journal.last_known(fleet.name)
-    around = {**seen, **prepared.neighbor_observations}
-    if again := {name: seen[name] for name in unforgotten}:
-        around = observe_neighbors(setting.connections, fleet, again, known, told=around, interrupt=setting.interrupt)
+def _run_context(prepared: Prepared, settings: RunSettings, unflushed: Iterable[str]) -> RunContext:
+    fleet, seen = settings.fleet, prepared.observed.observations
+    known = settings.journal.last_known(fleet.name)
+    observations = {**seen, **prepared.neighbor_observations}
+    if again := {name: seen[name] for name in unflushed}:
+        observations = observe_neighbors(
+            settings.connections, fleet, again, known, observations=observations, interrupt=settings.interrupt
+        )
     return RunContext(
         fleet,
-        setting.connections,
-        setting.journal_run,
-        setting.observer,
-        setting.interrupt,
-        setting.owner,
-        remember=lambda name, told: setting.journal_run.remember(fleet.name, name, facts_of(told), told.answered_at_s),
-        rate_bytes_per_s=setting.rate_bytes_per_s,
-        observations=around,
+        settings.connections,
+        settings.journal_run,
+        settings.observer,
+        settings.interrupt,
+        settings.owner,
+        remember=lambda name, seen: settings.journal_run.remember(fleet.name, name, facts_of(seen), seen.answered_at_s),
+        rate_bytes_per_s=settings.rate_bytes_per_s,
+        observations=observations,
         mac_owners=known_macs(fleet, known),
         base_macs=base_macs(fleet, seen, known),
     )
@@ -130,37 +132,37 @@ _LOST = (Result.UNCERTAIN, Result.UNREACHABLE)
 
 
 def _with_last_seen(
-    prepared: Prepared, setting: RunSettings, jobs: Mapping[str, NodeContext], outcomes: Mapping[str, Outcome]
+    prepared: Prepared, settings: RunSettings, jobs: Mapping[str, NodeContext], outcomes: Mapping[str, Outcome]
 ) -> dict[str, Outcome]:
     """The outcomes of nodes that did not return, with what was last seen of them, and by whom."""
     lost = [name for name in jobs if outcomes[name].result in _LOST]
-    if not lost or setting.interrupt.leaving:
+    if not lost or settings.interrupt.leaving:
         return {}
-    fleet = setting.fleet
-    known = setting.journal.last_known(fleet.name)
-    found = query_neighbors(setting.connections, fleet, lost, prepared.observed, known, interrupt=setting.interrupt)
-    told = {}
+    fleet = settings.fleet
+    known = settings.journal.last_known(fleet.name)
+    found = query_neighbors(settings.connections, fleet, lost, prepared.observed, known, interrupt=settings.interrupt)
+    updated = {}
     for name, place in found.items():
         text = place.text(time.time())
         outcome = outcomes[name]
-        told[name] = replace(outcome, reason=f"{outcome.reason}; {text}", facts={**outcome.facts, **place.facts})
-        setting.journal_run.finish_node(told[name])
-        setting.observer(Event(EventKind.NOTE, name, time.time(), text))
-    return told
+        updated[name] = replace(outcome, reason=f"{outcome.reason}; {text}", facts={**outcome.facts, **place.facts})
+        settings.journal_run.finish_node(updated[name])
+        settings.observer(Event(EventKind.NOTE, name, time.time(), text))
+    return updated
 
 
-def _with_unflushed_neighbors(work: RunContext, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
+def _with_unflushed_neighbors(run_context: RunContext, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
     """The outcomes of nodes that some neighbour may not hear for a while, with who that is."""
-    told = {}
-    for name, silent in retry_unanswered(work).items():
-        told[name] = replace(outcomes[name], facts={**outcomes[name].facts, UNFLUSHED: " ".join(silent)})
-        work.journal_run.finish_node(told[name])
-    return told
+    updated = {}
+    for name, silent in retry_unanswered(run_context).items():
+        updated[name] = replace(outcomes[name], facts={**outcomes[name].facts, UNFLUSHED: " ".join(silent)})
+        run_context.journal_run.finish_node(updated[name])
+    return updated
 
 
-def _finish(setting: RunSettings, outcome: Outcome) -> None:
-    setting.journal_run.finish_node(outcome)
-    setting.observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
+def _finish(settings: RunSettings, outcome: Outcome) -> None:
+    settings.journal_run.finish_node(outcome)
+    settings.observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
 
 
 def _unchanged_outcome(fleet: Fleet, plan: NodePlan) -> Outcome | None:
@@ -177,29 +179,29 @@ def _unchanged_outcome(fleet: Fleet, plan: NodePlan) -> Outcome | None:
             return None
 
 
-def _node_contexts(prepared: Prepared, work: RunContext) -> dict[str, NodeContext]:
+def _node_contexts(prepared: Prepared, run_context: RunContext) -> dict[str, NodeContext]:
     changing = (name for name, plan in prepared.plan.nodes.items() if plan.verdict is Verdict.CHANGE)
-    return {name: _node_context(prepared, work, name) for name in changing}
+    return {name: _node_context(prepared, run_context, name) for name in changing}
 
 
-def _node_context(prepared: Prepared, work: RunContext, name: str) -> NodeContext:
-    seen, wanted = prepared.observed.observations[name], prepared.desired[name]
-    expected = expectation(wanted, seen, work.base_macs)
-    return NodeContext(work, work.fleet.nodes[name], prepared.plan.nodes[name], wanted, seen, expected)
+def _node_context(prepared: Prepared, run_context: RunContext, name: str) -> NodeContext:
+    seen, desired = prepared.observed.observations[name], prepared.desired[name]
+    expected = expectation(desired, seen, run_context.base_macs)
+    return NodeContext(run_context, run_context.fleet.nodes[name], prepared.plan.nodes[name], desired, seen, expected)
 
 
 def _run_stage(
     stage: Stage,
     jobs: Mapping[str, NodeContext],
     plan: Plan,
-    work: RunContext,
-    setting: RunSettings,
+    run_context: RunContext,
+    settings: RunSettings,
     budget: FailureBudget,
     images: Mapping[str, Path],
 ) -> dict[str, Outcome]:
-    observer = Tee((_journaling(setting.journal_run), setting.observer))
+    observer = Tee((_journaling(settings.journal_run), settings.observer))
     if stage.kind is StageKind.SWITCH:
-        ended = _switch_stage(stage, jobs, plan, work, observer)
+        ended = _switch_stage(stage, jobs, plan, run_context, observer)
         for outcome in ended.values():
             budget.count(outcome)
         return ended
@@ -207,9 +209,9 @@ def _run_stage(
         stage.nodes,
         lambda name: _change_node(jobs[name], images),
         # a stage says who may be down together, the policy how many we can work on at once
-        parallel=max(1, work.fleet.apply.parallel),
+        parallel=max(1, run_context.fleet.apply.parallel),
         budget=budget,
-        interrupt=setting.interrupt,
+        interrupt=settings.interrupt,
         observer=observer,
     )
 
@@ -222,33 +224,35 @@ def _journaling(journal_run: Run) -> Observer:
     return write
 
 
-def _change_node(job: NodeContext, images: Mapping[str, Path]) -> Outcome:
+def _change_node(ctx: NodeContext, images: Mapping[str, Path]) -> Outcome:
     """Firmware, or packages and then files. NodeError means that nothing was changed."""
-    if job.plan.firmware is not None:
-        return flash(job, _connection(job), images[job.node.hardware.name])
-    outcome = Outcome(job.name, Result.DONE)
-    if job.plan.packages is not None:
-        outcome = install(job, _connection(job), job.plan.packages)
-    if not job.plan.files or not outcome.result.is_good:
+    if ctx.plan.firmware is not None:
+        return flash(ctx, _connection(ctx), images[ctx.node.hardware.name])
+    outcome = Outcome(ctx.name, Result.DONE)
+    if ctx.plan.packages is not None:
+        outcome = install(ctx, _connection(ctx), ctx.plan.packages)
+    if not ctx.plan.files or not outcome.result.is_good:
         return outcome
     try:
-        return configure(job, _connection(job))
+        return configure(ctx, _connection(ctx))
     except NodeError as error:
-        if job.plan.packages is None:
+        if ctx.plan.packages is None:
             raise
         # its packages are there to stay, and a resume has only the files left to do
-        failed = outcome_of_error(job.name, error)
+        failed = outcome_of_error(ctx.name, error)
         return replace(failed, result=Result.FAILED, reason=f"its packages are installed, its files not: {error}")
 
 
-def _connection(job: NodeContext) -> SshConnection:
+def _connection(ctx: NodeContext) -> SshConnection:
     """The kept connection, or a new one to where the node is now: on the bench, if it was met there."""
-    access = job.run.connections
-    return access.acquire(job.name) or access.open(job.node, endpoint=access.bench_endpoints.get(job.name))
+    connections = ctx.run.connections
+    return connections.acquire(ctx.name) or connections.open(
+        ctx.node, endpoint=connections.bench_endpoints.get(ctx.name)
+    )
 
 
 def _switch_stage(
-    stage: Stage, jobs: Mapping[str, NodeContext], plan: Plan, work: RunContext, observer: Observer
+    stage: Stage, jobs: Mapping[str, NodeContext], plan: Plan, run_context: RunContext, observer: Observer
 ) -> dict[str, Outcome]:
     """Packages first, which cut nothing; then everybody at one moment."""
     began = time.monotonic()
@@ -260,17 +264,17 @@ def _switch_stage(
         ended = {name: failed.get(name) or Outcome(name, Result.PENDING, reason) for name in stage.nodes}
     else:
         ended = commit_mesh(
-            work,
+            run_context,
             [jobs[name] for name in stage.nodes],
-            quorum=work.fleet.apply.quorum,
-            parallel=work.fleet.apply.parallel,
+            quorum=run_context.fleet.apply.quorum,
+            parallel=run_context.fleet.apply.parallel,
             entry=plan.entry,
         )
     took_s = round(time.monotonic() - began, 3)
-    told = {name: replace(outcome, duration_s=took_s) for name, outcome in ended.items()}
-    for outcome in told.values():
+    updated = {name: replace(outcome, duration_s=took_s) for name, outcome in ended.items()}
+    for outcome in updated.values():
         observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
-    return told
+    return updated
 
 
 def _packages_first(stage: Stage, jobs: Mapping[str, NodeContext]) -> dict[str, Outcome]:

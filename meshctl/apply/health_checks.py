@@ -37,9 +37,9 @@ class Expectation:
         return replace(self, base_macs=self.base_macs | current) if self.base_macs else self
 
 
-def expectation(wanted: DesiredState, before: Observation, base_macs: Iterable[str] = ()) -> Expectation:
+def expectation(desired: DesiredState, before: Observation, base_macs: Iterable[str] = ()) -> Expectation:
     """What this node had and must have again; the base counts only if it was reached through the mesh before."""
-    trees = {file.package.name: file.package for file in wanted.files if file.package is not None}
+    trees = {file.package.name: file.package for file in desired.files if file.package is not None}
     originators = {entry.mac.lower() for entry in before.originators or ()}
     return Expectation(
         trees.get("wireless"),
@@ -114,13 +114,13 @@ def _radios(expected: Expectation, after: Observation) -> tuple[str, ...]:
     if expected.wireless is None or after.links is None:
         return ()
     devices = {section.name: section for section in expected.wireless.of_type("wifi-device")}
-    told = []
+    problems = []
     for iface in expected.wireless.of_type("wifi-iface"):
         device = devices.get(iface.get("device"))
         if device is None or "1" in (device.get("disabled", "0"), iface.get("disabled", "0")):
             continue
-        told += _radio(iface, device.get("channel"), after)
-    return tuple(told)
+        problems += _radio(iface, device.get("channel"), after)
+    return tuple(problems)
 
 
 def _radio(iface: Section, channel: str, after: Observation) -> list[str]:

@@ -78,225 +78,244 @@ class _MeshCommit:
     entry: str
     pool: ThreadPoolExecutor = field(repr=False)
 
-    def each(self, members: Iterable[Participant], act: Callable[[Participant], None]) -> None:
+    def each(self, participants: Iterable[Participant], act: Callable[[Participant], None]) -> None:
         """Do it for all, `parallel` at a time, and wait; a bug is raised."""
-        for future in [self.pool.submit(act, member) for member in members]:
+        for future in [self.pool.submit(act, participant) for participant in participants]:
             future.result()
 
 
 def commit_mesh(
-    work: RunContext, jobs: Sequence[NodeContext], *, quorum: float, parallel: int, entry: str
+    run_context: RunContext, jobs: Sequence[NodeContext], *, quorum: float, parallel: int, entry: str
 ) -> dict[str, Outcome]:
     """Carry out the jobs' file changes at one moment. Returns each node's outcome; nothing is raised for a node."""
-    members = [Participant(job) for job in jobs]
-    window_s = max(job.node.confirm_window_s for job in jobs)
+    participants = [Participant(ctx) for ctx in jobs]
+    window_s = max(ctx.node.confirm_window_s for ctx in jobs)
     with ThreadPoolExecutor(max_workers=max(1, parallel), thread_name_prefix="switch") as pool:
-        run = _MeshCommit(work, members, window_s, max(1, parallel), entry, pool)
-        run.each(members, lambda member: _arm(run, member))
-        if any(member.failure for member in members) or work.interrupt.stopping:
-            return _cancel(run, "the switch was called off: not every node was ready")
-        _schedule(run)
-        if not all(member.is_scheduled for member in members):
-            return _cancel(run, "the switch was called off: not every node took the moment")
-        needed = quorum_of(members, quorum)
-        told = ", ".join(f"{count} of mesh {mesh}" if len(needed) > 1 else f"{count}" for mesh, count in needed.items())
-        work.note(f"{len(members)} nodes change at one moment; {told} of them have to meet again")
-        return _decide(run, needed)
+        commit = _MeshCommit(run_context, participants, window_s, max(1, parallel), entry, pool)
+        commit.each(participants, lambda participant: _arm(commit, participant))
+        if any(participant.failure for participant in participants) or run_context.interrupt.stopping:
+            return _cancel(commit, "the switch was called off: not every node was ready")
+        _schedule(commit)
+        if not all(participant.is_scheduled for participant in participants):
+            return _cancel(commit, "the switch was called off: not every node took the moment")
+        needed = quorum_of(participants, quorum)
+        quorum_text = ", ".join(
+            f"{count} of mesh {mesh}" if len(needed) > 1 else f"{count}" for mesh, count in needed.items()
+        )
+        run_context.note(f"{len(participants)} nodes change at one moment; {quorum_text} of them have to meet again")
+        return _decide(commit, needed)
 
 
-def quorum_of(members: Iterable[Participant], quorum: float) -> dict[str, int]:
+def quorum_of(participants: Iterable[Participant], quorum: float) -> dict[str, int]:
     """How many nodes of each changing mesh have to meet again."""
-    counts = Counter(mesh for member in members for mesh in member.meshes)
+    counts = Counter(mesh for participant in participants for mesh in participant.meshes)
     return {mesh: max(1, math.ceil(quorum * count)) for mesh, count in counts.items()}
 
 
 def short_of_quorum(proven: Iterable[Participant], needed: Mapping[str, int]) -> str:
     """Which meshes are short of nodes; empty when each has as many as it needs."""
-    there = Counter(mesh for member in proven for mesh in member.meshes)
+    there = Counter(mesh for participant in proven for mesh in participant.meshes)
     short = {mesh: count for mesh, count in needed.items() if there[mesh] < count}
     return "; ".join(f"{there[mesh]} of mesh {mesh} met again, {count} needed" for mesh, count in short.items())
 
 
-def _arm(run: _MeshCommit, member: Participant) -> None:
-    job = member.ctx
+def _arm(commit: _MeshCommit, participant: Participant) -> None:
+    ctx = participant.ctx
     try:
-        with run.run.connections.borrow(job.node) as connection:
-            member.change = new_change(job, connection.endpoint, window_s=run.window_s)
-            arm(member.change, connection)
-            member.clock = measure_uptime(connection)
+        with commit.run.connections.borrow(ctx.node) as connection:
+            participant.change = new_change(ctx, connection.endpoint, window_s=commit.window_s)
+            arm(participant.change, connection)
+            participant.clock = measure_uptime(connection)
     except NodeError as error:
-        member.failure = Outcome(job.name, Result.FAILED, str(error), hint=error.hint)
+        participant.failure = Outcome(ctx.name, Result.FAILED, str(error), hint=error.hint)
 
 
-def _schedule(run: _MeshCommit) -> None:
+def _schedule(commit: _MeshCommit) -> None:
     """Tell every node the moment, in its own uptime."""
-    slowest_s = max((2 * member.clock.error_s for member in run.participants if member.clock is not None), default=0.0)
-    turns = math.ceil(len(run.participants) / run.parallel)
+    slowest_s = max(
+        (2 * participant.clock.error_s for participant in commit.participants if participant.clock is not None),
+        default=0.0,
+    )
+    turns = math.ceil(len(commit.participants) / commit.parallel)
     moment = time.monotonic() + max(LEAD_S, LEAD_ROUND_TRIPS * slowest_s * turns)
 
-    def tell(member: Participant) -> None:
-        if member.change is None or member.clock is None:
+    def start_one(participant: Participant) -> None:
+        if participant.change is None or participant.clock is None:
             return
         try:
-            with run.run.connections.borrow(member.ctx.node) as connection:
-                start(member.change, connection, at_uptime_s=member.clock.uptime_at(moment))
-            member.is_scheduled = True
+            with commit.run.connections.borrow(participant.ctx.node) as connection:
+                start(participant.change, connection, at_uptime_s=participant.clock.uptime_at(moment))
+            participant.is_scheduled = True
         except NodeError as error:
-            member.failure = Outcome(member.name, Result.FAILED, str(error), hint=error.hint)
+            participant.failure = Outcome(participant.name, Result.FAILED, str(error), hint=error.hint)
 
-    run.each(run.participants, tell)
-    if all(member.is_scheduled for member in run.participants):
-        for member in run.participants:
-            run.run.connections.drop(member.name)
+    commit.each(commit.participants, start_one)
+    if all(participant.is_scheduled for participant in commit.participants):
+        for participant in commit.participants:
+            commit.run.connections.drop(participant.name)
         time.sleep(max(0.0, moment - time.monotonic()))
 
 
-def _cancel(run: _MeshCommit, reason: str) -> dict[str, Outcome]:
+def _cancel(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:
     """Nothing has changed yet, or is about to: drop it everywhere."""
 
-    def drop(member: Participant) -> None:
-        attempt = member.change
-        if attempt is None:
+    def cancel_one(participant: Participant) -> None:
+        change = participant.change
+        if change is None:
             return
-        attempt.is_abandoned = True
+        change.is_abandoned = True
         try:
-            with run.run.connections.borrow(member.ctx.node) as connection:
-                abort(attempt, connection)
-                unlock(attempt, connection)
+            with commit.run.connections.borrow(participant.ctx.node) as connection:
+                abort(change, connection)
+                unlock(change, connection)
         except NodeError as error:
-            attempt.last_error = str(error)
-        if member.is_scheduled or attempt.last_error:
+            change.last_error = str(error)
+        if participant.is_scheduled or change.last_error:
             # it may have begun before it could be dropped
-            outcome = poll(attempt)
+            outcome = poll(change)
             if not outcome.result.is_good:
-                member.failure = member.failure or outcome
+                participant.failure = participant.failure or outcome
 
-    run.each(run.participants, drop)
-    return {member.name: member.failure or Outcome(member.name, Result.PENDING, reason) for member in run.participants}
+    commit.each(commit.participants, cancel_one)
+    return {
+        participant.name: participant.failure or Outcome(participant.name, Result.PENDING, reason)
+        for participant in commit.participants
+    }
 
 
-def _decide(run: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome]:
+def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome]:
     """Look for everybody in the new cell until all are there or it is time to decide; then decide, once."""
-    pace = Backoff(run.window_s * (1 - CONFIRM_SHARE), run.run.interrupt)
-    run.run.interrupt.wait(max(member.change.settle_s for member in run.participants if member.change is not None))
+    backoff = Backoff(commit.window_s * (1 - CONFIRM_SHARE), commit.run.interrupt)
+    commit.run.interrupt.wait(
+        max(participant.change.settle_s for participant in commit.participants if participant.change is not None)
+    )
     while True:
-        run.each([member for member in run.participants if not member.is_proven], _prove)
-        proven = [member for member in run.participants if member.is_proven]
-        if len(proven) == len(run.participants) or pace.is_over or run.run.interrupt.leaving:
+        commit.each([participant for participant in commit.participants if not participant.is_proven], _prove)
+        proven = [participant for participant in commit.participants if participant.is_proven]
+        if len(proven) == len(commit.participants) or backoff.is_over or commit.run.interrupt.leaving:
             break
-        _flush_unreachable(run, proven)
-        pace.pause()
+        _flush_unreachable(commit, proven)
+        backoff.pause()
     has_entry = (
-        not run.entry or any(m.name == run.entry for m in proven) or all(m.name != run.entry for m in run.participants)
+        not commit.entry
+        or any(m.name == commit.entry for m in proven)
+        or all(m.name != commit.entry for m in commit.participants)
     )
     why = short_of_quorum(proven, needed) if has_entry else "the base did not come back"
     if not why:
-        return _confirm_all(run)
-    run.run.note(
-        f"{why}; rolling back: {'; '.join(gap_of(member) for member in run.participants if not member.is_proven)}"
-    )
-    return _roll_back(run, why)
+        return _confirm_all(commit)
+    unproven = [unmet_of(participant) for participant in commit.participants if not participant.is_proven]
+    commit.run.note(f"{why}; rolling back: {'; '.join(unproven)}")
+    return _roll_back(commit, why)
 
 
-def gap_of(member: Participant) -> str:
+def unmet_of(participant: Participant) -> str:
     """`b01: it has no way to the base`: what kept a member from proving itself when it was last looked for."""
-    attempt = member.change
-    if attempt is None or member.is_unreachable or not attempt.unmet:
-        last_error = "" if attempt is None else attempt.last_error
-        return f"{member.name}: it does not answer{f' ({last_error})' if last_error else ''}"
-    return f"{member.name}: {', '.join(attempt.unmet)}"
+    change = participant.change
+    if change is None or participant.is_unreachable or not change.unmet:
+        last_error = "" if change is None else change.last_error
+        return f"{participant.name}: it does not answer{f' ({last_error})' if last_error else ''}"
+    return f"{participant.name}: {', '.join(change.unmet)}"
 
 
-def _flush_unreachable(run: _MeshCommit, proven: Sequence[Participant]) -> None:
+def _flush_unreachable(commit: _MeshCommit, proven: Sequence[Participant]) -> None:
     """Where a cell keeps its channel and BSSID, a node that changed early still hears one that changes late, and may
     come to know its old radio."""
-    names = {member.name for member in proven}
+    names = {participant.name for participant in proven}
 
-    def ask(member: Participant) -> None:
-        if member.change is not None and member.is_unreachable:
-            member.change.flush.unreachable(names)
+    def flush_one(participant: Participant) -> None:
+        if participant.change is not None and participant.is_unreachable:
+            participant.change.flush.unreachable(names)
 
-    run.each(run.participants, ask)
+    commit.each(commit.participants, flush_one)
 
 
-def _prove(member: Participant) -> None:
-    attempt = member.change
-    connection = None if attempt is None else connect(attempt)
-    member.is_unreachable = connection is None
-    if attempt is None or connection is None:
+def _prove(participant: Participant) -> None:
+    change = participant.change
+    connection = None if change is None else connect(change)
+    participant.is_unreachable = connection is None
+    if change is None or connection is None:
         return
     try:
-        member.is_proven = observe_and_decide(attempt, connection) is Action.CONFIRM
-        if attempt.last is not None:
-            member.ctx.run.record(member.name, attempt.last)
+        participant.is_proven = observe_and_decide(change, connection) is Action.CONFIRM
+        if change.last is not None:
+            participant.ctx.run.record(participant.name, change.last)
     except NodeError as error:
-        attempt.last_error = str(error)
+        change.last_error = str(error)
     finally:
         connection.close()
 
 
-def _confirm_all(run: _MeshCommit) -> dict[str, Outcome]:
+def _confirm_all(commit: _MeshCommit) -> dict[str, Outcome]:
     """Confirm those that are there, and those that come late, again and again until the window's end; the others are
     left behind."""
 
-    def keep(member: Participant) -> None:
-        if not member.is_proven:
-            _prove(member)
-        if member.change is None or not member.is_proven:
+    def confirm_one(participant: Participant) -> None:
+        if not participant.is_proven:
+            _prove(participant)
+        if participant.change is None or not participant.is_proven:
             return
         try:
-            member.is_confirmed = confirm(member.change)
+            participant.is_confirmed = confirm(participant.change)
         except NodeError as error:
-            member.change.last_error = str(error)
+            participant.change.last_error = str(error)
 
-    pace = Backoff(run.window_s * CONFIRM_SHARE, run.run.interrupt)
-    while not pace.is_over:
-        run.each([member for member in run.participants if not member.is_confirmed], keep)
-        if all(member.is_confirmed for member in run.participants) or run.run.interrupt.leaving:
+    backoff = Backoff(commit.window_s * CONFIRM_SHARE, commit.run.interrupt)
+    while not backoff.is_over:
+        commit.each([participant for participant in commit.participants if not participant.is_confirmed], confirm_one)
+        if all(participant.is_confirmed for participant in commit.participants) or commit.run.interrupt.leaving:
             break
-        pace.pause()
-    return {member.name: _confirmed_outcome(member) for member in run.participants}
+        backoff.pause()
+    return {participant.name: _confirmed_outcome(participant) for participant in commit.participants}
 
 
-def _confirmed_outcome(member: Participant) -> Outcome:
-    if member.is_confirmed:
-        return Outcome(member.name, Result.DONE)
-    gaps = "; ".join(member.change.unmet) if member.change is not None and member.change.unmet else "it was not seen"
+def _confirmed_outcome(participant: Participant) -> Outcome:
+    if participant.is_confirmed:
+        return Outcome(participant.name, Result.DONE)
+    unmet = (
+        "; ".join(participant.change.unmet)
+        if participant.change is not None and participant.change.unmet
+        else "it was not seen"
+    )
     return Outcome(
-        member.name,
+        participant.name,
         Result.UNCERTAIN,
-        f"left behind: the others are in the new cell, it goes back to the old one ({gaps})",
+        f"left behind: the others are in the new cell, it goes back to the old one ({unmet})",
         hint="reach it by cable and `meshctl resume`, or take the mesh back to the old cell",
-        facts={LEFT_BEHIND: ", ".join(member.ctx.plan.splits)},
+        facts={LEFT_BEHIND: ", ".join(participant.ctx.plan.splits)},
     )
 
 
-def _roll_back(run: _MeshCommit, why: str) -> dict[str, Outcome]:
+def _roll_back(commit: _MeshCommit, why: str) -> dict[str, Outcome]:
     """Take back whoever can be reached, the farthest first, so that the way to the others lasts; then see them back."""
-    gaps = {member.name: gap_of(member) for member in run.participants if not member.is_proven}
-    for member in run.participants:
-        if member.change is None:
+    unmet = {
+        participant.name: unmet_of(participant) for participant in commit.participants if not participant.is_proven
+    }
+    for participant in commit.participants:
+        if participant.change is None:
             continue
-        member.change.is_abandoned = True
-        connection = connect(member.change)
+        participant.change.is_abandoned = True
+        connection = connect(participant.change)
         if connection is None:
             continue
         try:
-            abort(member.change, connection)
+            abort(participant.change, connection)
         except NodeError as error:
-            member.change.last_error = str(error)
+            participant.change.last_error = str(error)
         finally:
             connection.close()
     ended: dict[str, Outcome] = {}
 
-    def see(member: Participant) -> None:
-        if member.change is not None:
-            ended[member.name] = poll(member.change)
+    def poll_one(participant: Participant) -> None:
+        if participant.change is not None:
+            ended[participant.name] = poll(participant.change)
 
-    run.each(run.participants, see)
+    commit.each(commit.participants, poll_one)
     return {
-        member.name: _rolled_back_outcome(ended.get(member.name), member.name, why, gaps.get(member.name, ""))
-        for member in run.participants
+        participant.name: _rolled_back_outcome(
+            ended.get(participant.name), participant.name, why, unmet.get(participant.name, "")
+        )
+        for participant in commit.participants
     }
 
 

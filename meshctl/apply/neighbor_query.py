@@ -24,12 +24,12 @@ REMEMBERED_S = 1800.0
 
 
 def observe_neighbors(
-    access: ConnectionPool,
+    connections: ConnectionPool,
     fleet: Fleet,
     seen: Mapping[str, Observation],
     known: Mapping[str, LastKnown],
     *,
-    told: Mapping[str, Observation] = MappingProxyType({}),
+    observations: Mapping[str, Observation] = MappingProxyType({}),
     interrupt: Interrupt | None = None,
 ) -> dict[str, Observation]:
     """What these nodes told, and what those told who answer of their neighbours; `told` is what others told already.
@@ -37,9 +37,9 @@ def observe_neighbors(
     Connections stay with `access`.
     """
     names = known_neighbors(fleet, seen, known, now_s=time.time())
-    nodes = [fleet.nodes[name] for name in names if name not in told]
-    around = collect(access, nodes, parallel=max(1, fleet.apply.parallel), interrupt=interrupt) if nodes else None
-    return {**told, **seen, **(around.observations if around is not None else {})}
+    nodes = [fleet.nodes[name] for name in names if name not in observations]
+    around = collect(connections, nodes, parallel=max(1, fleet.apply.parallel), interrupt=interrupt) if nodes else None
+    return {**observations, **seen, **(around.observations if around is not None else {})}
 
 
 def known_neighbors(

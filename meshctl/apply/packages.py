@@ -37,27 +37,27 @@ _RESTART_RADIOS = "[ ! -x /sbin/wifi ] || /sbin/wifi\n"
 _RELOAD = "reload_config\n"
 
 
-def install(job: NodeContext, connection: SshConnection, step: PackageStep) -> Outcome:
+def install(ctx: NodeContext, connection: SshConnection, step: PackageStep) -> Outcome:
     """Install the step's packages. Owns `connection`, and keeps one to the node if all went well.
 
     Raises NodeError when nothing but its memory was changed on the node, InputError for a file that is not there.
     """
     try:
-        files = [_local(job, file) for file in step.files]
-        tool = job.before.package_tool
+        files = [_local(ctx, file) for file in step.files]
+        tool = ctx.before.package_tool
         if tool is None:
-            raise NodeError(f"{job.name}: it did not tell whether it has opkg or apk")
-        with job.step("packages"):
+            raise NodeError(f"{ctx.name}: it did not tell whether it has opkg or apk")
+        with ctx.step("packages"):
             # first, because files in memory do not outlive a boot that is yet to come to its end
-            await_flash(job, connection)
-            script = deadman.packages(tool, _upload(job, connection, files), step.remove)
+            await_flash(ctx, connection)
+            script = deadman.packages(tool, _upload(ctx, connection, files), step.remove)
     except BaseException:
         connection.close()
         raise
-    return run_change(_new_change(job, connection, script, has_other_supplicant=bool(step.remove)), connection)
+    return run_change(_new_change(ctx, connection, script, has_other_supplicant=bool(step.remove)), connection)
 
 
-def _upload(job: NodeContext, connection: SshConnection, files: Sequence[Path]) -> list[str]:
+def _upload(ctx: NodeContext, connection: SshConnection, files: Sequence[Path]) -> list[str]:
     there = []
     # of an earlier attempt with other files, which would only fill the memory
     names = "|".join(f"{quoted(file.name)}|.{quoted(file.name)}.*.part" for file in files)
@@ -66,23 +66,23 @@ def _upload(job: NodeContext, connection: SshConnection, files: Sequence[Path]) 
     )
     for file in files:
         path = f"{DIRECTORY}/{file.name}"
-        upload(connection, file, path, rate_bytes_per_s=job.run.rate_bytes_per_s, progress=job.progress)
+        upload(connection, file, path, rate_bytes_per_s=ctx.run.rate_bytes_per_s, progress=ctx.progress)
         there.append(path)
     return there
 
 
 def _new_change(
-    job: NodeContext, connection: SshConnection, script: str, *, has_other_supplicant: bool
+    ctx: NodeContext, connection: SshConnection, script: str, *, has_other_supplicant: bool
 ) -> ChangeInProgress:
     """A change of packages alone: the node stays where it is, and has to hear whom it heard."""
-    here = replace(connection.endpoint, identity=job.name)
-    expected = Expectation(neighbors=job.expected.neighbors, base_macs=job.expected.base_macs, needs=job.desired.needs)
+    here = replace(connection.endpoint, identity=ctx.name)
+    expected = Expectation(neighbors=ctx.expected.neighbors, base_macs=ctx.expected.base_macs, needs=ctx.desired.needs)
     reload = _RELOAD + (_RESTART_RADIOS if has_other_supplicant else "exit 0\n")
     return ChangeInProgress(
-        replace(job, expected=expected),
-        Change(new_change_id(), {}, reload, extra=script, covered=_configuration(job.before)),
+        replace(ctx, expected=expected),
+        Change(new_change_id(), {}, reload, extra=script, covered=_configuration(ctx.before)),
         new_nonce(),
-        job.node.confirm_window_s,
+        ctx.node.confirm_window_s,
         here,
         (here,),
         extra_s=INSTALL_TIMEOUT_S,
@@ -95,10 +95,10 @@ def _configuration(before: Observation) -> tuple[str, ...]:
     return tuple(f"/{CONFIG}{package}" for package in sorted(before.uci or {}))
 
 
-def _local(job: NodeContext, file: str) -> Path:
+def _local(ctx: NodeContext, file: str) -> Path:
     """A package file's path here; relative ones stand beside the inventory."""
     path = Path(file).expanduser()
-    path = path if path.is_absolute() else Path(job.run.fleet.base) / path
+    path = path if path.is_absolute() else Path(ctx.run.fleet.base) / path
     if not path.is_file():
         raise InputError(f"{path}: package file not found", hint="correct package_files in the hardware profile")
     return path

@@ -50,7 +50,7 @@ class Prepared:
 
 def prepare(
     renderer: Renderer,
-    access: ConnectionPool,
+    connections: ConnectionPool,
     nodes: Iterable[Node],
     journal: Journal,
     *,
@@ -69,7 +69,7 @@ def prepare(
     chosen = tuple(nodes)
     first = {node.name: renderer.desired(node) for node in chosen}
     seen = collect(
-        access,
+        connections,
         chosen,
         parallel=fleet.apply.parallel,
         paths=lambda node: other_paths(first[node.name]),
@@ -78,12 +78,12 @@ def prepare(
     )
     _remember(journal, fleet, seen)
     decided = choices or PlanOptions()
-    single = _node_plans(renderer, access, first, seen, salt=salt, owner=owner, choices=decided)
+    single = _node_plans(renderer, connections, first, seen, salt=salt, owner=owner, choices=decided)
     rest = _other_members(fleet, single.plans.values()) or _former_neighbors(
         fleet, single.plans.values(), journal.last_known(fleet.name)
     )
     if rest and not (interrupt is not None and interrupt.stopping):
-        around = collect(access, rest, parallel=fleet.apply.parallel, interrupt=interrupt, observer=observer)
+        around = collect(connections, rest, parallel=fleet.apply.parallel, interrupt=interrupt, observer=observer)
         _remember(journal, fleet, around)
         seen = replace(seen, observations={**seen.observations, **around.observations})
         single = replace(single, unchanged=_unchanged_plans(renderer, around, salt, owner))
@@ -131,14 +131,14 @@ def _unchanged_plans(renderer: Renderer, around: FleetObservation, salt: bytes, 
     for name, observation in around.observations.items():
         # a node that was not asked for may not be the reason why nothing can be done to the others
         with suppress(InvalidInput, InputError):
-            wanted = renderer.desired(renderer.fleet.nodes[name], observation)
-            plans[name] = node_plan(wanted, observation, Fingerprints(salt), owner=owner, with_firmware=False)
+            desired = renderer.desired(renderer.fleet.nodes[name], observation)
+            plans[name] = node_plan(desired, observation, Fingerprints(salt), owner=owner, with_firmware=False)
     return plans
 
 
 def assemble(
     renderer: Renderer,
-    access: ConnectionPool,
+    connections: ConnectionPool,
     first: Mapping[str, DesiredState],
     seen: FleetObservation,
     known: Mapping[str, LastKnown],
@@ -148,7 +148,7 @@ def assemble(
     choices: PlanOptions,
 ) -> Prepared:
     """The plan for what was rendered without the devices' facts (`first`) and what was seen."""
-    single = _node_plans(renderer, access, first, seen, salt=salt, owner=owner, choices=choices)
+    single = _node_plans(renderer, connections, first, seen, salt=salt, owner=owner, choices=choices)
     return _with_fleet_plan(renderer.fleet, single, seen, known, salt=salt, choices=choices)
 
 
@@ -163,7 +163,7 @@ class _NodePlans:
 
 def _node_plans(
     renderer: Renderer,
-    access: ConnectionPool,
+    connections: ConnectionPool,
     first: Mapping[str, DesiredState],
     seen: FleetObservation,
     *,
@@ -172,25 +172,25 @@ def _node_plans(
     choices: PlanOptions,
 ) -> _NodePlans:
     fingerprints = Fingerprints(salt)
-    wanted: dict[str, DesiredState] = {}
+    desired: dict[str, DesiredState] = {}
     plans: dict[str, NodePlan] = {}
     for name, want in first.items():
         observation = seen.observations.get(name)
-        wanted[name] = want if observation is None else renderer.desired(want.node, observation)
+        desired[name] = want if observation is None else renderer.desired(want.node, observation)
         made = node_plan(
-            wanted[name],
+            desired[name],
             observation,
             fingerprints,
             away=seen.unreachable.get(name, ""),
             owner=owner,
             with_firmware=choices.with_firmware,
-            own_keys=None if observation is None else access.own_keys(want.node),
+            own_keys=None if observation is None else connections.own_keys(want.node),
         )
         error = seen.refused.get(name)
         if error is not None:
             made = replace(made, verdict=Verdict.REFUSED, reason=str(error), hint=error.hint)
         plans[name] = made
-    return _NodePlans(plans, wanted)
+    return _NodePlans(plans, desired)
 
 
 def _with_fleet_plan(
@@ -220,9 +220,9 @@ def _with_fleet_plan(
     return Prepared(plan, single.desired, seen, salt)
 
 
-def other_paths(wanted: DesiredState) -> tuple[str, ...]:
+def other_paths(desired: DesiredState) -> tuple[str, ...]:
     """The absolute paths of a node's files that are no UCI packages."""
-    return tuple(f"/{file.path}" for file in wanted.files if package_of(file.path) is None)
+    return tuple(f"/{file.path}" for file in desired.files if package_of(file.path) is None)
 
 
 def base_macs(fleet: Fleet, seen: Mapping[str, Observation], known: Mapping[str, LastKnown]) -> tuple[str, ...]:

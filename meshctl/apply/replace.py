@@ -35,29 +35,33 @@ class Replacement:
 
 def adopt(
     renderer: Renderer,
-    access: ConnectionPool,
+    connections: ConnectionPool,
     trust: TrustStore,
     old: Node,
     *,
     spare: Node | None,
-    place: BenchTarget | None,
+    target: BenchTarget | None,
     interrupt: Interrupt,
 ) -> Replacement:
     """Meet the new device and pin its key under the old node's name.
 
     Raises NodeError when the old node still answers as itself, or the new device does not.
     """
-    _require_unreachable(access, old)
+    _require_unreachable(connections, old)
     recorder = AcceptAnyKey()
-    if place is not None:
-        credentials = replace(access.credentials(old), empty_password=True)
+    if target is not None:
+        credentials = replace(connections.credentials(old), empty_password=True)
         connection = connect(
-            place.endpoint, credentials=credentials, trust=recorder, deadlines=access.deadlines, release=old.release
+            target.endpoint,
+            credentials=credentials,
+            trust=recorder,
+            deadlines=connections.deadlines,
+            release=old.release,
         )
         key = recorder.key
     elif spare is not None:
         # known by name, so its own pin has to fit
-        connection = access.open(spare)
+        connection = connections.open(spare)
         key = connection.host_key
     else:
         raise InputError("expected a spare of the inventory, or a place on the bench")
@@ -70,37 +74,37 @@ def adopt(
         raise
     pins = trust.pinned(old.name)
     trust.replace(old.name, key)
-    access.bench_endpoints[old.name] = replace(connection.endpoint, identity=old.name)
+    connections.bench_endpoints[old.name] = replace(connection.endpoint, identity=old.name)
     if connection.endpoint.interface:
-        access.interfaces[old.name] = connection.endpoint.interface
-    access.release(old.name, connection)
-    where = place or BenchTarget(connection.endpoint.host, connection.endpoint.port, old.name)
+        connections.interfaces[old.name] = connection.endpoint.interface
+    connections.release(old.name, connection)
+    where = target or BenchTarget(connection.endpoint.host, connection.endpoint.port, old.name)
     return Replacement(Discovered({old.name: FoundDevice(where, old, seen, key)}, ()), spare, pins)
 
 
-def _require_unreachable(access: ConnectionPool, old: Node) -> None:
+def _require_unreachable(connections: ConnectionPool, old: Node) -> None:
     """Two devices with one address and one name would fight: the old one has to be off."""
     try:
-        access.open(old).close()
+        connections.open(old).close()
     except NodeError:
         return
     raise NodeError(
-        f"{old.name} still answers at {access.endpoint(old).address}: two nodes with one address would fight",
+        f"{old.name} still answers at {connections.endpoint(old).address}: two nodes with one address would fight",
         hint="switch the old one off first",
     )
 
 
-def restore_old_pins(trust: TrustStore, old: Node, successor: Replacement) -> None:
+def restore_old_pins(trust: TrustStore, old: Node, replacement: Replacement) -> None:
     """The change failed: believe what was believed before."""
-    trust.replace(old.name, *successor.old_pins)
+    trust.replace(old.name, *replacement.old_pins)
 
 
 def with_identity(fleet: Fleet, old: Node, spare: Node | None) -> Fleet:
     """The fleet in which the old node carries the spare's label and serial number, as far as they are rendered."""
     if spare is None:
         return fleet
-    heir = replace(old, label=spare.label or old.label, serial=spare.serial or old.serial)
-    return replace(fleet, nodes=MappingProxyType({**fleet.nodes, old.name: heir}))
+    adopted = replace(old, label=spare.label or old.label, serial=spare.serial or old.serial)
+    return replace(fleet, nodes=MappingProxyType({**fleet.nodes, old.name: adopted}))
 
 
 def identity_edits(old: Node, spare: Node | None, seen: Observation) -> tuple[Mapping[str, str], Mapping[str, str]]:

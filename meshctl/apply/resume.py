@@ -14,7 +14,7 @@ from meshctl.plan import Verdict
 
 def resolutions(run_id: int, earlier: Iterable[Outcome], now: Prepared) -> dict[str, str]:
     """Node -> what became of it, for each that ended as UNCERTAIN. Pure."""
-    told = {}
+    resolved = {}
     for outcome in earlier:
         plan = now.plan.nodes.get(outcome.node)
         if outcome.result is not Result.UNCERTAIN or plan is None:
@@ -29,8 +29,8 @@ def resolutions(run_id: int, earlier: Iterable[Outcome], now: Prepared) -> dict[
                 what = f"it answers, and is refused: {plan.reason}"
             case Verdict.AWAY:
                 what = "it is still not seen" + _left(outcome)
-        told[outcome.node] = f"uncertain after run {run_id}; now {what}"
-    return told
+        resolved[outcome.node] = f"uncertain after run {run_id}; now {what}"
+    return resolved
 
 
 def _why(change: ChangeStatus | None) -> str:

@@ -90,12 +90,12 @@ def possible_holders(
     """
     if node not in around:
         return ()
-    told = {name: seen for name, seen in around.items() if seen.stations is not None}
-    strangers = _heard_macs(around[node]) - {mac for seen in told.values() for mac in mesh_macs(seen)}
+    observed = {name: seen for name, seen in around.items() if seen.stations is not None}
+    strangers = _heard_macs(around[node]) - {mac for seen in observed.values() for mac in mesh_macs(seen)}
     named = [names[mac] for mac in sorted(strangers) if mac in names]
     known = frozenset(names.values())
     nameless = [name for name in fellows if name not in known] if strangers - names.keys() else []
-    return tuple(name for name in dict.fromkeys((*named, *nameless)) if name != node and name not in told)
+    return tuple(name for name in dict.fromkeys((*named, *nameless)) if name != node and name not in observed)
 
 
 def unflushed_boot_s(node: str, around: Mapping[str, Observation]) -> float | None:

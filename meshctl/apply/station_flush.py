@@ -100,8 +100,8 @@ class StationFlush:
 
     def watch(self, *, for_s: float) -> None:
         """Have those behind the node watch it; call it while the node still carries their frames."""
-        work = self.ctx.run
-        hidden = routed_through(self.node, work.observations, work.base_macs)
+        run_context = self.ctx.run
+        hidden = routed_through(self.node, run_context.observations, run_context.base_macs)
         names = [name for name in self._holders if name in hidden]
         answers = self._query(
             "neighbours watch it",
@@ -110,7 +110,9 @@ class StationFlush:
         self._watching = frozenset(name for name, answer in answers.items() if answer)
         unwatched = [name for name in names if name not in self._watching]
         if unwatched:
-            work.note(f"{_listed(unwatched)} did not answer, and cannot watch for its radio's restart", self.node)
+            run_context.note(
+                f"{_listed(unwatched)} did not answer, and cannot watch for its radio's restart", self.node
+            )
 
     def watch_own_entries(self, connection: SshConnection, *, for_s: float) -> None:
         """Have the node watch its own entries: should a neighbor remove its entry although the radio did not restart,
@@ -186,20 +188,24 @@ class StationFlush:
     def _possible_holders(self, now: Observation | None) -> dict[str, tuple[StationEntry, ...]]:
         """Who holds an entry as they told; then, on any of their interfaces, those who did not tell, and those who came
         to know it since."""
-        work, job = self.ctx.run, self.ctx
-        asked = by_holder(entries_of(self.node, work.observations, self.radios))
-        told = {mac: name for name, seen in work.observations.items() for mac in radio_macs(seen, EVERY_RADIO)}
-        names = {**work.current_mac_owners(), **told}
-        fellows = [node.name for mesh in job.node.meshes for node in work.fleet.members(mesh)]
+        run_context, ctx = self.ctx.run, self.ctx
+        asked = by_holder(entries_of(self.node, run_context.observations, self.radios))
+        observed_macs = {
+            mac: name for name, seen in run_context.observations.items() for mac in radio_macs(seen, EVERY_RADIO)
+        }
+        names = {**run_context.current_mac_owners(), **observed_macs}
+        fellows = [node.name for mesh in ctx.node.meshes for node in run_context.fleet.members(mesh)]
         others = (
-            *possible_holders(self.node, work.observations, names, fellows),
+            *possible_holders(self.node, run_context.observations, names, fellows),
             *(current_neighbors(now, names) if now else ()),
         )
         # the radio may have been another one's the last time, or another MAC: whatever is known of it
-        own = [radio_macs(seen, self.radios) for seen in (work.observations.get(self.node), now) if seen is not None]
+        own = [
+            radio_macs(seen, self.radios) for seen in (run_context.observations.get(self.node), now) if seen is not None
+        ]
         macs = tuple(dict.fromkeys(mac for some in own for mac in some))
         for name in others:
-            if name != self.node and name in work.fleet.nodes:
+            if name != self.node and name in run_context.fleet.nodes:
                 asked.setdefault(name, tuple(StationEntry(name, "", mac) for mac in macs))
         return {name: asked[name] for name in list(asked)[:MAX_QUERIED] if name not in self._watching and asked[name]}
 
@@ -245,37 +251,37 @@ class StationFlush:
             return _query_all(self.ctx.run, scripts)
 
 
-def retry_unanswered(work: RunContext) -> dict[str, tuple[str, ...]]:
+def retry_unanswered(run_context: RunContext) -> dict[str, tuple[str, ...]]:
     """Ask once more who did not answer when a node was back, each of them for all nodes at once.
 
     Returns node -> who still has not; the operator is told.
     """
-    waiting = [(forgetting, forgetting.retries()) for forgetting in work.unfinished_flushes]
-    if not waiting or work.interrupt.leaving:
+    unfinished = [(flush, flush.retries()) for flush in run_context.unfinished_flushes]
+    if not unfinished or run_context.interrupt.leaving:
         return {}
-    names = dict.fromkeys(name for _, scripts in waiting for name in scripts)
-    of_each = {name: [scripts[name] for _, scripts in waiting if name in scripts] for name in names}
-    answers = _query_all(work, {name: partial(_joined, scripts) for name, scripts in of_each.items()})
+    names = dict.fromkeys(name for _, scripts in unfinished for name in scripts)
+    of_each = {name: [scripts[name] for _, scripts in unfinished if name in scripts] for name in names}
+    answers = _query_all(run_context, {name: partial(_joined, scripts) for name, scripts in of_each.items()})
     rest: dict[str, tuple[str, ...]] = {}
-    for forgetting, scripts in waiting:
-        forgetting.report({name: forgetting.own_lines(answers[name]) for name in scripts if name in answers})
+    for flush, scripts in unfinished:
+        flush.report({name: flush.own_lines(answers[name]) for name in scripts if name in answers})
         silent = tuple(name for name in scripts if name not in answers)
         if silent:
-            rest[forgetting.node] = silent
-            work.note(
-                f"{_listed(silent)} did not answer and may hold a stale entry of its radio{MAY_LOSE}", forgetting.node
+            rest[flush.node] = silent
+            run_context.note(
+                f"{_listed(silent)} did not answer and may hold a stale entry of its radio{MAY_LOSE}", flush.node
             )
     return rest
 
 
-def flush_later(job: NodeContext, ago_s: float) -> None:
+def flush_later(ctx: NodeContext, ago_s: float) -> None:
     """A change was begun on the node that long ago and its end not seen, or it booted then: whichever of its radios
     have started since, their neighbours are asked to forget those that were there before."""
-    forgetting = StationFlush(job, started_within(job.before, ago_s))
-    if job.before.uptime_s is not None:
-        ago_s = min(ago_s, job.before.uptime_s + time.time() - job.before.asked_at_s)
-    forgetting.started_ago(ago_s)
-    forgetting.ended(job.before)
+    flush = StationFlush(ctx, started_within(ctx.before, ago_s))
+    if ctx.before.uptime_s is not None:
+        ago_s = min(ago_s, ctx.before.uptime_s + time.time() - ctx.before.asked_at_s)
+    flush.started_ago(ago_s)
+    flush.ended(ctx.before)
 
 
 def _flush_since(entries: Sequence[StationEntry], since_s: float, *, has_restarted: bool = False) -> str:
@@ -286,17 +292,17 @@ def _joined(scripts: Iterable[Script]) -> str:
     return "".join(script() for script in scripts)
 
 
-def _query_all(work: RunContext, scripts: Mapping[str, Script]) -> dict[str, str]:
+def _query_all(run_context: RunContext, scripts: Mapping[str, Script]) -> dict[str, str]:
     """What each printed that answered in time."""
     with ThreadPoolExecutor(max_workers=min(len(scripts), MAX_QUERIED), thread_name_prefix="forget") as pool:
-        answers = pool.map(lambda name: _query_one(work, name, scripts[name]), scripts)
+        answers = pool.map(lambda name: _query_one(run_context, name, scripts[name]), scripts)
         return {name: said for name, said in zip(scripts, answers, strict=True) if said is not None}
 
 
-def _query_one(work: RunContext, name: str, script: Script) -> str | None:
-    access = work.connections
+def _query_one(run_context: RunContext, name: str, script: Script) -> str | None:
+    connections = run_context.connections
     try:
-        connection = access.acquire(name) or access.open(work.fleet.nodes[name], deadlines=_DEADLINES)
+        connection = connections.acquire(name) or connections.open(run_context.fleet.nodes[name], deadlines=_DEADLINES)
     except NodeError:
         return None
     # a kept connection has longer deadlines of its own, and may lead through the very node that is silent
@@ -310,7 +316,7 @@ def _query_one(work: RunContext, name: str, script: Script) -> str | None:
         return None
     finally:
         patience.cancel()
-        access.release(name, connection)
+        connections.release(name, connection)
     return done.stdout.strip()
 
 

@@ -55,52 +55,52 @@ def checked_image(profile: HardwareProfile) -> Path:
     return path
 
 
-def flash(job: NodeContext, connection: SshConnection, image: Path) -> Outcome:
+def flash(ctx: NodeContext, connection: SshConnection, image: Path) -> Outcome:
     """Flash a node and prove it. Owns `connection`. Raises NodeError only while nothing on the node has stopped."""
-    forgetting = StationFlush(job)
+    flush = StationFlush(ctx)
     try:
-        marker = _upload_and_start(job, connection, image, forgetting)
+        marker = _upload_and_start(ctx, connection, image, flush)
     except NodeError:
         with suppress(NodeError):
-            deadman.unlock(connection, job.run.owner)
+            deadman.unlock(connection, ctx.run.owner)
         raise
     finally:
         connection.close()
-    with job.step("flash"):
-        return _await_return(job, marker, forgetting)
+    with ctx.step("flash"):
+        return _await_return(ctx, marker, flush)
 
 
-def _upload_and_start(job: NodeContext, connection: SshConnection, image: Path, forgetting: StationFlush) -> str:
+def _upload_and_start(ctx: NodeContext, connection: SshConnection, image: Path, flush: StationFlush) -> str:
     """Everything up to the moment sysupgrade starts; returns the marker that the new system will hold."""
     size = image.stat().st_size
-    with job.step("check"):
-        _check_memory(job.before, size)
+    with ctx.step("check"):
+        _check_memory(ctx.before, size)
         # for its lock: a device fresh from its box has none
-        install_switch(job, connection)
-        deadman.lock(connection, job.run.owner, ttl_s=int(RETURN_TIMEOUT_S) + LOCK_SLACK_S)
-    with job.step("upload"):
+        install_switch(ctx, connection)
+        deadman.lock(connection, ctx.run.owner, ttl_s=int(RETURN_TIMEOUT_S) + LOCK_SLACK_S)
+    with ctx.step("upload"):
         upload(
-            connection, image, IMAGE_PATH, rate_bytes_per_s=job.run.rate_bytes_per_s, progress=job.progress, mode=0o600
+            connection, image, IMAGE_PATH, rate_bytes_per_s=ctx.run.rate_bytes_per_s, progress=ctx.progress, mode=0o600
         )
-    with job.step("test"):
+    with ctx.step("test"):
         tested = openwrt.check_firmware(connection, IMAGE_PATH)
         if not tested.valid:
-            raise NodeError(f"{job.name}: its own sysupgrade refuses the image: {tested.reason}")
+            raise NodeError(f"{ctx.name}: its own sysupgrade refuses the image: {tested.reason}")
         if tested.available_bytes is not None and tested.available_bytes < HEADROOM_BYTES:
             raise NodeError(
-                f"{job.name}: {tested.available_bytes >> 20} MiB of memory left beside the image, "
+                f"{ctx.name}: {tested.available_bytes >> 20} MiB of memory left beside the image, "
                 f"{HEADROOM_BYTES >> 20} needed",
                 hint="stop services on it, or flash it by cable",
             )
         keys = openwrt.fetch_files(connection, [HOST_KEYS])
         if not keys:
-            raise NodeError(f"{job.name}: its host keys cannot be read, so they could not be kept")
+            raise NodeError(f"{ctx.name}: its host keys cannot be read, so they could not be kept")
         marker = secrets.token_hex(16)
-        upload(connection, archive(job.desired, keys, marker), ARCHIVE_PATH, mode=0o600)
-    recipe = job.node.hardware.recovery or "none is written down in its hardware profile"
-    job.run.note(f"if it does not come back: {recipe}", job.name)
-    forgetting.watch(for_s=RETURN_TIMEOUT_S)
-    forgetting.started()
+        upload(connection, archive(ctx.desired, keys, marker), ARCHIVE_PATH, mode=0o600)
+    recipe = ctx.node.hardware.recovery or "none is written down in its hardware profile"
+    ctx.run.note(f"if it does not come back: {recipe}", ctx.name)
+    flush.watch(for_s=RETURN_TIMEOUT_S)
+    flush.started()
     openwrt.start_sysupgrade(connection, IMAGE_PATH, ARCHIVE_PATH)
     return marker
 
@@ -114,9 +114,9 @@ def _check_memory(before: Observation, size: int) -> None:
         )
 
 
-def archive(wanted: DesiredState, host_keys: Mapping[str, FetchedFile], marker: str) -> bytes:
+def archive(desired: DesiredState, host_keys: Mapping[str, FetchedFile], marker: str) -> bytes:
     """The tar.gz that the new system unpacks at its first boot: same in, same bytes out."""
-    files = [(f"/{file.path}", file.content, file.mode) for file in wanted.files]
+    files = [(f"/{file.path}", file.content, file.mode) for file in desired.files]
     files += [(path, file.content, file.mode) for path, file in host_keys.items()]
     files += [(path, content, mode) for path, (mode, content) in deadman.installed_files().items()]
     files.append((MARKER_PATH, f"{marker}\n".encode(), 0o644))
@@ -138,50 +138,50 @@ def _tar(files: Iterable[tuple[str, bytes, int]], links: Iterable[tuple[str, str
     return out.getvalue()
 
 
-def _await_return(job: NodeContext, marker: str, forgetting: StationFlush) -> Outcome:
+def _await_return(ctx: NodeContext, marker: str, flush: StationFlush) -> Outcome:
     """Look for the node until it is back and proven, or it is clear that it will not be."""
-    pace = Backoff(RETURN_TIMEOUT_S, job.run.interrupt)
-    trouble = ""
-    while not pace.is_over and not job.run.interrupt.leaving:
+    backoff = Backoff(RETURN_TIMEOUT_S, ctx.run.interrupt)
+    last_error = ""
+    while not backoff.is_over and not ctx.run.interrupt.leaving:
         try:
-            connection = job.run.connections.open(job.node)
+            connection = ctx.run.connections.open(ctx.node)
             try:
                 seen = observe(connection, extra_paths=[MARKER_PATH])
             finally:
                 connection.close()
         except NodeError as error:
-            trouble = str(error)
-            forgetting.unreachable()
+            last_error = str(error)
+            flush.unreachable()
         else:
-            job.run.record(job.name, seen)
-            if seen.boot_id != job.before.boot_id:
-                forgetting.ended(seen, rebooted=True)
-                return _verdict(job, seen, marker)
-            if pace.elapsed_s > START_TIMEOUT_S:
+            ctx.run.record(ctx.name, seen)
+            if seen.boot_id != ctx.before.boot_id:
+                flush.ended(seen, rebooted=True)
+                return _verdict(ctx, seen, marker)
+            if backoff.elapsed_s > START_TIMEOUT_S:
                 return Outcome(
-                    job.name, Result.FAILED, "sysupgrade did not take it down; it runs what it ran", hint="see its log"
+                    ctx.name, Result.FAILED, "sysupgrade did not take it down; it runs what it ran", hint="see its log"
                 )
-        pace.pause()
+        backoff.pause()
     return Outcome(
-        job.name,
+        ctx.name,
         Result.UNCERTAIN,
-        f"not back after it was flashed ({trouble})",
-        hint=job.node.hardware.recovery or "`meshctl resume` looks at it again",
+        f"not back after it was flashed ({last_error})",
+        hint=ctx.node.hardware.recovery or "`meshctl resume` looks at it again",
     )
 
 
-def _verdict(job: NodeContext, seen: Observation, marker: str) -> Outcome:
+def _verdict(ctx: NodeContext, seen: Observation, marker: str) -> Outcome:
     """Whether the node that came back is the one that was meant to, piece by piece."""
     running = seen.release.revision if seen.release else "unknown"
     board = seen.board.board_name if seen.board else "unknown"
-    wanted = job.plan.firmware.to_revision if job.plan.firmware is not None else running
+    desired = ctx.plan.firmware.to_revision if ctx.plan.firmware is not None else running
     info = seen.files.get(MARKER_PATH)
     problems = [
-        "" if is_revision(running, wanted) else f"it runs {running}, not {wanted}",
-        "" if board == job.node.hardware.board else f"its board is {board}, not {job.node.hardware.board}",
+        "" if is_revision(running, desired) else f"it runs {running}, not {desired}",
+        "" if board == ctx.node.hardware.board else f"its board is {board}, not {ctx.node.hardware.board}",
         "" if info is not None and (info.text or "").strip() == marker else "its configuration is not the flashed one",
     ]
-    told = "; ".join(problem for problem in problems if problem)
-    if told:
-        return Outcome(job.name, Result.FAILED, f"it came back, but {told}")
-    return Outcome(job.name, Result.DONE, facts={"revision": running, "boot_id": seen.boot_id or ""})
+    problem_text = "; ".join(problem for problem in problems if problem)
+    if problem_text:
+        return Outcome(ctx.name, Result.FAILED, f"it came back, but {problem_text}")
+    return Outcome(ctx.name, Result.DONE, facts={"revision": running, "boot_id": seen.boot_id or ""})

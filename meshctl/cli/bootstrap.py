@@ -97,7 +97,7 @@ def bootstrap(
             _complain(outcome)
         if not as_json:
             for name, item in arrivals.found.items():
-                echo(f"{name}: found at {item.place.endpoint.label}, host key {item.key.fingerprint}")
+                echo(f"{name}: found at {item.target.endpoint.label}, host key {item.key.fingerprint}")
         if not arrivals.found:
             raise typer.Exit(exit_for(arrivals.outcomes, opened.interrupt))
         prepared = plan_discovered(
@@ -210,7 +210,7 @@ def replace(
                 opened.trust,
                 node,
                 spare=spare,
-                place=place,
+                target=place,
                 interrupt=opened.interrupt,
             )
         if not as_json:
@@ -241,7 +241,7 @@ def replace(
 
 def _who_becomes_whom(node: Node, spare: Node | None, new: str, found: FoundDevice | None) -> str:
     """`spare2, found at 192.168.1.1, becomes husky1-b03 (10.42.0.13): its name, address and role; ...`."""
-    there = f", found at {found.place.endpoint.label}," if found is not None else ""
+    there = f", found at {found.target.endpoint.label}," if found is not None else ""
     who = spare.name if spare is not None else f"the device on the {new}"
     left = f"; the entry {spare.name} is retired" if spare is not None else ""
     return f"{who}{there} becomes {node.name} ({node.address.ip}): its name, address and role{left}"

@@ -69,7 +69,7 @@ def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
 
 
 def collect(
-    access: ConnectionPool,
+    connections: ConnectionPool,
     nodes: Iterable[Node],
     *,
     parallel: int,
@@ -84,9 +84,9 @@ def collect(
     lock = threading.Lock()
     signal = interrupt or Interrupt()
 
-    def look(name: str) -> Outcome:
+    def observe_one(name: str) -> Outcome:
         try:
-            with access.borrow(wanted[name]) as connection:
+            with connections.borrow(wanted[name]) as connection:
                 seen = observe_cleared(connection, tuple(paths(wanted[name])), signal)
         except NodeError as error:
             with lock:
@@ -96,14 +96,14 @@ def collect(
             found[name] = seen
         return Outcome(name, Result.DONE)
 
-    outcomes = run(wanted, look, parallel=parallel, interrupt=signal, observer=observer)
-    away = {
+    outcomes = run(wanted, observe_one, parallel=parallel, interrupt=signal, observer=observer)
+    unreachable = {
         name: outcome.reason
         for name, outcome in outcomes.items()
         if name not in found and (name not in errors or isinstance(errors[name], Unreachable))
     }
     refused = {name: error for name, error in errors.items() if not isinstance(error, Unreachable)}
-    return FleetObservation({name: found[name] for name in wanted if name in found}, away, refused)
+    return FleetObservation({name: found[name] for name in wanted if name in found}, unreachable, refused)
 
 
 def observe_cleared(connection: SshConnection, paths: tuple[str, ...], interrupt: Interrupt) -> Observation:
@@ -112,14 +112,14 @@ def observe_cleared(connection: SshConnection, paths: tuple[str, ...], interrupt
     change = seen.change
     if change is None or not (is_dead(change.lock_owner) or (is_dead(change.owner) and change.state != "idle")):
         return seen
-    pace = Backoff(CLEARING_S, interrupt)
-    while not pace.is_over and not interrupt.leaving:
+    backoff = Backoff(CLEARING_S, interrupt)
+    while not backoff.is_over and not interrupt.leaving:
         _clear(connection, change)
         seen = observe(connection, extra_paths=paths)
         change = seen.change
         if change is None or not is_dead(change.owner) or change.state in ("idle", "staged"):
             break
-        pace.pause()
+        backoff.pause()
     return seen
 
 

@@ -39,28 +39,28 @@ class HostKeyState:
 
 
 def fetch_host_keys(
-    access: ConnectionPool, trust: TrustStore, nodes: Iterable[Node], *, parallel: int
+    connections: ConnectionPool, trust: TrustStore, nodes: Iterable[Node], *, parallel: int
 ) -> tuple[HostKeyState, ...]:
     """Ask every node for its host key, believing nothing."""
-    wanted = {node.name: node for node in nodes}
+    by_name = {node.name: node for node in nodes}
     found: dict[str, HostKeyState] = {}
     lock = threading.Lock()
 
-    def look(name: str) -> Outcome:
-        node = wanted[name]
-        recorder = AcceptAnyKey()
-        trouble = ""
+    def fetch_one(name: str) -> Outcome:
+        node = by_name[name]
+        host_key_policy = AcceptAnyKey()
+        last_error = ""
         try:
-            access.open(node, policy=recorder).close()
+            connections.open(node, policy=host_key_policy).close()
         except AuthenticationRefused:
             # the key was shown before the login was refused, and it is the key that was asked for
             pass
         except NodeError as error:
-            trouble = str(error)
+            last_error = str(error)
         pinned = tuple(key.fingerprint for key in trust.pinned(name))
         with lock:
-            found[name] = HostKeyState(node, recorder.key, pinned, trouble)
+            found[name] = HostKeyState(node, host_key_policy.key, pinned, last_error)
         return Outcome(name, Result.DONE)
 
-    run(wanted, look, parallel=parallel)
-    return tuple(found[name] for name in wanted)
+    run(by_name, fetch_one, parallel=parallel)
+    return tuple(found[name] for name in by_name)

@@ -94,13 +94,13 @@ def last_seen_of(
     fleet: Fleet, names: Iterable[str], observations: Mapping[str, Observation], known: Mapping[str, LastKnown]
 ) -> dict[str, LastSeen]:
     """What is known of each of `names` from what other nodes were seen to hear and from the journal."""
-    lost = tuple(names)
-    told = {name: seen for name, seen in observations.items() if name not in lost}
+    missing = tuple(names)
+    told = {name: seen for name, seen in observations.items() if name not in missing}
     reports = [report_of(name, seen) for name, seen in told.items()]
     macs = known_macs(fleet, known)
     heard = seen_by(reports, macs, fresh_ms=REMEMBERED_MS)
     routed = _routed(told, names_by_mac(reports, macs))
-    return {name: LastSeen(known.get(name), heard.get(name, ()), routed.get(name, ()), len(told)) for name in lost}
+    return {name: LastSeen(known.get(name), heard.get(name, ()), routed.get(name, ()), len(told)) for name in missing}
 
 
 def _routed(observations: Mapping[str, Observation], names: Mapping[str, str]) -> dict[str, tuple[Sighting, ...]]:
@@ -119,7 +119,7 @@ def _routed(observations: Mapping[str, Observation], names: Mapping[str, str]) -
 
 
 def query_neighbors(
-    access: ConnectionPool,
+    connections: ConnectionPool,
     fleet: Fleet,
     names: Iterable[str],
     before: FleetObservation,
@@ -128,17 +128,19 @@ def query_neighbors(
     interrupt: Interrupt,
 ) -> dict[str, LastSeen]:
     """The same, from a new look at those who heard them before, at the base, and at some others that answered then."""
-    lost = tuple(names)
+    missing = tuple(names)
     graph = before.graph(fleet, known)
-    near = [other for name in lost for other in graph.neighbours.get(name, ())]
+    neighbors = [other for name in missing for other in graph.neighbours.get(name, ())]
     base = [fleet.base_node.name] if fleet.base_node is not None else []
     witnesses = [
-        name for name in dict.fromkeys((*near, *base, *before.observations)) if name in fleet.nodes and name not in lost
+        name
+        for name in dict.fromkeys((*neighbors, *base, *before.observations))
+        if name in fleet.nodes and name not in missing
     ]
     seen = collect(
-        access,
+        connections,
         [fleet.nodes[name] for name in witnesses[:MAX_QUERIED]],
         parallel=max(1, fleet.apply.parallel),
         interrupt=interrupt,
     )
-    return last_seen_of(fleet, lost, seen.observations, known)
+    return last_seen_of(fleet, missing, seen.observations, known)

@@ -62,7 +62,7 @@ def test_the_wrong_device_is_refused_whatever_the_operator_says() -> None:
 
 def test_one_node_is_not_found_twice() -> None:
     with pytest.raises(NodeError, match="found at another place already"):
-        identify(labelled(), device(MAC), "", taken=["b01"])
+        identify(labelled(), device(MAC), "", identified=["b01"])
 
 
 def test_a_spare_hands_over_its_mac_label_and_serial_and_retires() -> None:
