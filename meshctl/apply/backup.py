@@ -32,7 +32,7 @@ from meshctl.fleet import Outcome, Result
 from meshctl.model import Node
 from meshctl.plan.lockout import lockout
 from meshctl.plan.preconditions import FailedPrecondition
-from meshctl.plan.radios import NO_RADIOS, Radios, restarted
+from meshctl.plan.radios import NO_RADIOS, Radios, restarting_radios
 from meshctl.plan.seen import WIRELESS, packages_seen, parsed
 from meshctl.render import MARKER_PATH
 
@@ -196,7 +196,7 @@ def _radios(files: Mapping[str, NewFile], before: Observation) -> Radios:
     if wireless is None:
         return NO_RADIOS
     after = parsed(wireless.content.decode("utf-8", "replace"), "wireless")
-    return restarted(packages_seen([WIRELESS], before)["wireless"], after)
+    return restarting_radios(packages_seen([WIRELESS], before)["wireless"], after)
 
 
 def _differs(path: str, new: NewFile, live: Mapping[str, str]) -> bool:

@@ -28,7 +28,7 @@ from meshctl.errors import NodeError
 from meshctl.model import Secret
 from meshctl.nodes.backoff import Backoff
 from meshctl.plan import Cut
-from meshctl.plan.radios import NO_RADIOS, Radios, restarted
+from meshctl.plan.radios import NO_RADIOS, Radios, restarting_radios
 from meshctl.plan.seen import WIRELESS, packages_seen
 
 # A lock outlives its change by this much, for the moves after it.
@@ -115,7 +115,7 @@ def _radios_of(ctx: NodeContext) -> Radios:
     if not any(change.path == WIRELESS for change in ctx.plan.files):
         return NO_RADIOS
     before = packages_seen([WIRELESS], ctx.before)["wireless"]
-    return restarted(before, next((file.package for file in ctx.desired.files if file.path == WIRELESS), None))
+    return restarting_radios(before, next((file.package for file in ctx.desired.files if file.path == WIRELESS), None))
 
 
 def arm(change: ChangeInProgress, connection: SshConnection) -> None:

@@ -55,7 +55,7 @@ def run_change(change: ChangeInProgress, connection: SshConnection) -> Outcome:
         arm(change, connection)
         if change.radios:
             change.flush.watch_own_entries(connection, for_s=_limit_s(change))
-            change.flush.watch(for_s=_limit_s(change))
+            change.flush.watch_neighbors(for_s=_limit_s(change))
         start(change, connection)
     except Unreachable as error:
         # how far it came, the node itself will tell

@@ -98,7 +98,7 @@ def _unflushed(prepared: Prepared, settings: RunSettings) -> dict[str, float]:
     """The nodes that answered whose radios may have started anew without their neighbours having been told, and since
     when (Unix time): of a change's beginning the end was not seen, or they have booted since they were last known."""
     seen = prepared.observed.observations
-    lost = settings.journal.lost_sight_of(settings.fleet.name)
+    lost = settings.journal.unfinished_changes(settings.fleet.name)
     booted = {name: unflushed_boot_s(name, seen) for name in prepared.plan.nodes}
     since_s = {name: at_s for name, at_s in booted.items() if at_s is not None} | lost
     return {name: at_s for name, at_s in since_s.items() if name in prepared.plan.nodes and name in seen}

@@ -29,7 +29,7 @@ from meshctl.apply.change_in_progress import (
 from meshctl.apply.commit_confirm import poll
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.next_action import Action
-from meshctl.device.openwrt import Clocked, measure_uptime
+from meshctl.device.openwrt import UptimeSample, measure_uptime
 from meshctl.errors import NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.nodes.backoff import Backoff
@@ -50,7 +50,7 @@ class Participant:
 
     ctx: NodeContext
     change: ChangeInProgress | None = None
-    clock: Clocked | None = None
+    clock: UptimeSample | None = None
     failure: Outcome | None = None
     is_scheduled: bool = False
     is_unreachable: bool = False

@@ -45,7 +45,7 @@ from meshctl.device.connection import Deadlines
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
-from meshctl.plan.radios import EVERY_RADIO, Radios, seen_to_restart, started_within
+from meshctl.plan.radios import EVERY_RADIO, Radios, observed_restarts, started_within
 
 # A neighbor's answer: it waits up to 3 s for an echo, once for each of a node's two radios.
 QUERY_TIMEOUT_S = 10.0
@@ -98,7 +98,7 @@ class StationFlush:
     def node(self) -> str:
         return self.ctx.name
 
-    def watch(self, *, for_s: float) -> None:
+    def watch_neighbors(self, *, for_s: float) -> None:
         """Have those behind the node watch it; call it while the node still carries their frames."""
         run_context = self.ctx.run
         hidden = routed_through(self.node, run_context.observations, run_context.base_macs)
@@ -178,7 +178,7 @@ class StationFlush:
     ) -> None:
         """Those that cannot find out whether their entry is stale remove it for the radios that the node was seen to
         have restarted."""
-        restarted = seen_to_restart(self.ctx.before, now, time.monotonic() - since_s)
+        restarted = observed_restarts(self.ctx.before, now, time.monotonic() - since_s)
         if not restarted:
             return
         macs = frozenset(radio_macs(self.ctx.before, restarted)) | frozenset(radio_macs(now, restarted))

@@ -99,7 +99,7 @@ def _upload_and_start(ctx: NodeContext, connection: SshConnection, image: Path, 
         upload(connection, archive(ctx.desired, keys, marker), ARCHIVE_PATH, mode=0o600)
     recipe = ctx.node.hardware.recovery or "none is written down in its hardware profile"
     ctx.run.note(f"if it does not come back: {recipe}", ctx.name)
-    flush.watch(for_s=RETURN_TIMEOUT_S)
+    flush.watch_neighbors(for_s=RETURN_TIMEOUT_S)
     flush.started()
     openwrt.start_sysupgrade(connection, IMAGE_PATH, ARCHIVE_PATH)
     return marker

@@ -73,7 +73,7 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
         Journal(default_path(os.environ), lab=lab_directory) as journal,
         ConnectionPool(fleet, trust, key_files=tuple(key_files), locate=locate) as access,
     ):
-        journal.separate(fleet.name, lab_of)
+        journal.move_lab_runs(fleet.name, lab_of)
         yield Session(
             fleet,
             Renderer.of(fleet, SecretStore(os.environ, Path(fleet.base)).get),

@@ -147,9 +147,9 @@ def carry_out_plan(
             outcomes = execute(prepared, setting)
     finally:
         run.end(str(totals(outcomes.values())) if outcomes else "could not run")
-    if run.trouble:
+    if run.error:
         with unheard():
-            echo(f"the journal is incomplete: {run.trouble}", err=True)
+            echo(f"the journal is incomplete: {run.error}", err=True)
             echo("hint: what it lacks counts as not done, so `meshctl resume` looks at those nodes again", err=True)
     # a reader that is gone (`| head`, a closed terminal) changes nothing about how it ended
     with unheard():

@@ -187,7 +187,7 @@ def bench_advice(record: RunRecord, plan: Plan) -> tuple[str, ...]:
 
 def _to_resume(journal: Journal, fleet: str, run_id: int | None) -> tuple[RunRecord, tuple[str, ...]]:
     """The run, and the nodes of it to take up."""
-    left = journal.left(fleet)
+    left = journal.unfinished_runs(fleet)
     number = run_id if run_id is not None else next(iter(left), None)
     if number is None:
         latest = next(iter(journal.runs(fleet=fleet, limit=1)), None)

@@ -38,11 +38,11 @@ from meshctl.model import Release
 __all__ = ["SshConnection", "connect"]
 
 # OpenWrt's dropbear closes after three refusals (MaxAuthTries in /etc/init.d/dropbear).
-TRIES_PER_CONNECTION = 3
+MAX_LOGINS_PER_CONNECTION = 3
 # What one command may say; more than any observation, less than what would hurt the host with 200 nodes at once.
 MAX_OUTPUT_BYTES = 16 << 20
 # Up to this much stdin fits the receive window of every dropbear (24 KiB) and needs no thread of its own.
-INLINE_STDIN_BYTES = 8 << 10
+MAX_INLINE_STDIN_BYTES = 8 << 10
 _READ_BYTES = 32 << 10
 _RSA_SHA2 = ("rsa-sha2-512", "rsa-sha2-256")
 
@@ -84,16 +84,16 @@ def connect(
                 legacy = True
                 continue
             try:
-                accepted, refused = _login(endpoint, transport, left[:TRIES_PER_CONNECTION], limits)
+                accepted, refused = _login(endpoint, transport, left[:MAX_LOGINS_PER_CONNECTION], limits)
             except BaseException:
                 transport.close()
                 raise
             if accepted:
                 return SshConnection(endpoint, transport, limits, heard)
             transport.close()
-            tried += [attempt.name for attempt in left[:TRIES_PER_CONNECTION]]
+            tried += [attempt.name for attempt in left[:MAX_LOGINS_PER_CONNECTION]]
             allowed = refused or allowed
-            left = left[TRIES_PER_CONNECTION:]
+            left = left[MAX_LOGINS_PER_CONNECTION:]
             if not left:
                 given = ", ".join(tried) or "no credentials at all"
                 raise AuthenticationRefused(
@@ -109,7 +109,7 @@ class _OnlySha1(Exception):
 
 
 @contextmanager
-def _translated(
+def _translating_errors(
     endpoint: Endpoint,
     transport: paramiko.Transport,
     seconds: float,
@@ -127,15 +127,15 @@ def _translated(
             yield
         except (paramiko.SSHException, OSError, EOFError) as error:
             if watch.timed_out or watch.silent:
-                raise _waited(endpoint, watch, seconds, silence_s, phase) from error
+                raise _timeout_error(endpoint, watch, seconds, silence_s, phase) from error
             if transport.is_active():
                 raise ChannelClosed(f"{endpoint.label}: {phase} was refused or cut: {error}") from error
             raise ConnectionLost(f"{endpoint.label}: the connection broke during {phase}: {error}") from error
     if watch.timed_out or watch.silent:
-        raise _waited(endpoint, watch, seconds, silence_s, phase)
+        raise _timeout_error(endpoint, watch, seconds, silence_s, phase)
 
 
-def _waited(endpoint: Endpoint, watch: Watchdog, seconds: float, silence_s: float, phase: str) -> Unreachable:
+def _timeout_error(endpoint: Endpoint, watch: Watchdog, seconds: float, silence_s: float, phase: str) -> Unreachable:
     if watch.timed_out:
         return Timeout(f"{endpoint.label}: no answer to {phase} within {seconds:g} s", phase=phase)
     return ConnectionLost(f"{endpoint.label}: silent for {silence_s:g} s during {phase}")
@@ -153,7 +153,7 @@ def _handshake(
     transport.clear_to_send_timeout = limits.run_s
     _prefer(transport, known, legacy=legacy)
     try:
-        with _translated(endpoint, transport, limits.handshake_s, "the SSH handshake"):
+        with _translating_errors(endpoint, transport, limits.handshake_s, "the SSH handshake"):
             try:
                 transport.start_client(timeout=limits.handshake_s * 2)
             except paramiko.ssh_exception.IncompatiblePeer as error:
@@ -191,7 +191,7 @@ def _login(
     """Whether one of `wanted` was accepted, and otherwise what the server said it would accept."""
     allowed: tuple[str, ...] = ()
     for attempt in wanted:
-        with _translated(endpoint, transport, limits.auth_s, "authentication"):
+        with _translating_errors(endpoint, transport, limits.auth_s, "authentication"):
             try:
                 attempt.run(transport, endpoint.user)
             except paramiko.BadAuthenticationType as error:
@@ -245,7 +245,9 @@ class SshConnection(Connection):
 
     def tunnel(self, target: Endpoint) -> paramiko.Channel:
         """A TCP stream from this node to `target` (direct-tcpip, RFC 4254 section 7.2)."""
-        with _translated(target, self._transport, self._limits.connect_s, f"a tunnel through {self._endpoint.label}"):
+        with _translating_errors(
+            target, self._transport, self._limits.connect_s, f"a tunnel through {self._endpoint.label}"
+        ):
             try:
                 return self._transport.open_channel("direct-tcpip", (target.host, target.port), ("127.0.0.1", 0))
             except paramiko.ChannelException as error:
@@ -261,7 +263,7 @@ class SshConnection(Connection):
             try:
                 with self._waiting(seconds, "a command"):
                     channel.exec_command(sent.command)
-                    with _fed(channel, sent.preamble, pieces, inline=isinstance(stdin, bytes)) as feeder:
+                    with _sending_stdin(channel, sent.preamble, pieces, inline=isinstance(stdin, bytes)) as feeder:
                         out, err = _collect(channel, self._endpoint.label)
                     status = channel.recv_exit_status()
                     if status < 0:
@@ -269,13 +271,15 @@ class SshConnection(Connection):
                 if feeder is not None and feeder.failure is not None:
                     raise feeder.failure
             finally:
-                with _quiet():
+                with _ignoring_closed():
                     channel.close()
         return Completed(out, err, status)
 
     def _waiting(self, seconds: float, phase: str) -> AbstractContextManager[None]:
         silence_s = self._limits.silence_s
-        return _translated(self._endpoint, self._transport, seconds, phase, heard=self._heard, silence_s=silence_s)
+        return _translating_errors(
+            self._endpoint, self._transport, seconds, phase, heard=self._heard, silence_s=silence_s
+        )
 
     def close(self) -> None:
         self._transport.close()
@@ -292,7 +296,7 @@ class SshConnection(Connection):
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _ignoring_closed() -> Iterator[None]:
     """Closing what is already gone is no error."""
     try:
         yield
@@ -325,19 +329,19 @@ class _Feeder(threading.Thread):
                 # The command ended without reading all of it, as its exit status says, or the link was cut, as the
                 # reader finds out.
                 return
-        with _quiet():
+        with _ignoring_closed():
             self._channel.shutdown_write()
 
 
 @contextmanager
-def _fed(
+def _sending_stdin(
     channel: paramiko.Channel, preamble: bytes, pieces: Iterable[bytes], *, inline: bool
 ) -> Iterator[_Feeder | None]:
     """Send `preamble` and `pieces` to the command: at once when they fit its window, else beside the reading."""
     if inline:
         text = preamble + b"".join(pieces)
-        if len(text) <= INLINE_STDIN_BYTES:
-            with _quiet():
+        if len(text) <= MAX_INLINE_STDIN_BYTES:
+            with _ignoring_closed():
                 channel.sendall(text)
                 channel.shutdown_write()
             yield None
@@ -349,7 +353,7 @@ def _fed(
     try:
         yield feeder
     finally:
-        with _quiet():
+        with _ignoring_closed():
             channel.shutdown_write()
         feeder.join(timeout=5.0)
 

@@ -18,7 +18,7 @@ def fleet_plan(
     graph: Graph,
     *,
     now_s: float,
-    around: Mapping[str, NodePlan] = MappingProxyType({}),
+    unchanged: Mapping[str, NodePlan] = MappingProxyType({}),
     entry: str = "",
     leave_behind: Iterable[str] = (),
     never_meshed: Iterable[str] = (),
@@ -32,7 +32,7 @@ def fleet_plan(
     """
     base = fleet.base_node
     stand_on = entry or (base.name if base is not None else "")
-    found = switches(fleet, plans, around=around, acknowledged=leave_behind, never_meshed=never_meshed)
+    found = switches(fleet, plans, unchanged=unchanged, acknowledged=leave_behind, never_meshed=never_meshed)
     surroundings = MeshContext(
         graph, stand_on, fleet.apply, MappingProxyType({node.name: node.robot for node in fleet.nodes.values()})
     )

@@ -14,7 +14,7 @@ from meshctl.plan.values import Cut, Effect
 from meshctl.uci import Package, Section
 
 # Package -> (service, what its reload cuts), where the content does not matter.
-_SIMPLE: Mapping[str, tuple[str, Cut]] = {
+_RELOADS: Mapping[str, tuple[str, Cut]] = {
     "system": ("system, log", Cut.NOTHING),
     "dhcp": ("dnsmasq, odhcpd", Cut.NOTHING),
     "firewall": ("firewall", Cut.LOGIN),
@@ -44,7 +44,7 @@ def _effects(
         return _network(before.get(package), after.get(package))
     if package == "wireless":
         return _wireless(before.get(package), after.get(package), release)
-    service, cut = _SIMPLE.get(package, (package, Cut.MESH))
+    service, cut = _RELOADS.get(package, (package, Cut.MESH))
     return [Effect(service, cut, f"{package} changes")]
 
 

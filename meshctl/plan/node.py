@@ -44,26 +44,26 @@ class DesiredState:
 
 
 def node_plan(
-    wanted: DesiredState,
+    desired: DesiredState,
     seen: Observation | None,
     fingerprints: Fingerprints,
     *,
-    away: str = "",
+    unreachable: str = "",
     owner: str = "",
     with_firmware: bool = True,
     own_keys: Sequence[OwnKey] | None = None,
 ) -> NodePlan:
     """The plan of one node. `seen` None means it did not answer, `away` says why; `owner` is who we are to its lock,
     `own_keys` what we log in with (None: not asked)."""
-    node = wanted.node
+    node = desired.node
     target = fingerprints.of(
-        {file.path: f"{file.mode:o} " + file.content.decode("utf-8", "surrogateescape") for file in wanted.files},
-        wanted.secrets,
+        {file.path: f"{file.mode:o} " + file.content.decode("utf-8", "surrogateescape") for file in desired.files},
+        desired.secrets,
     )
     if seen is None:
-        return NodePlan(node.name, Verdict.AWAY, away or "did not answer", meshes=node.meshes, wanted=target)
-    before = packages_seen(wanted.paths, seen)
-    after = {file.package.name: file.package for file in wanted.files if file.package is not None}
+        return NodePlan(node.name, Verdict.AWAY, unreachable or "did not answer", meshes=node.meshes, wanted=target)
+    before = packages_seen(desired.paths, seen)
+    after = {file.package.name: file.package for file in desired.files if file.package is not None}
     live = cells(before.get("wireless"), before.get("network"))
     old_secrets = (secret for package in before.values() if package is not None for secret in secrets_of(package))
     live_after = cells(after.get("wireless"), after.get("network"))
@@ -76,16 +76,16 @@ def node_plan(
         meshes=node.meshes,
         has_cell=bool(live),
         is_meshed=is_meshed(seen, live),
-        observed=fingerprints.of(fingerprint_texts(wanted.paths, seen), (*wanted.secrets, *old_secrets)),
+        observed=fingerprints.of(fingerprint_texts(desired.paths, seen), (*desired.secrets, *old_secrets)),
         wanted=target,
     )
     firmware = firmware_step(node, seen) if with_firmware else None
-    packages = package_step(wanted.needs, seen, node.hardware.package_files)
+    packages = package_step(desired.needs, seen, node.hardware.package_files)
     problem = failed_precondition(node, seen, before, owner=owner, is_flashed=firmware is not None, packages=packages)
     if problem is not None:
         return replace(basis, verdict=Verdict.REFUSED, reason=problem.reason, hint=problem.hint)
-    files = file_changes(wanted.files, seen)
-    contents = {file.path: file.content for file in wanted.files} if files or firmware else {}
+    files = file_changes(desired.files, seen)
+    contents = {file.path: file.content for file in desired.files} if files or firmware else {}
     shut_out = None if own_keys is None else lockout(node, contents, own_keys)
     if shut_out is None and contents:
         shut_out = server_lockout(after)
@@ -168,16 +168,16 @@ def _file_change(file: RenderedFile, seen: Observation) -> FileChange | None:
     return FileChange(file.path, "changed", _diff(file.path, old, file.masked))
 
 
-def _package_change(path: str, wanted: Package, live: str | None) -> FileChange | None:
+def _package_change(path: str, desired: Package, live: str | None) -> FileChange | None:
     if live is None:
-        return FileChange(path, "added", _diff(path, "", masked_text(wanted)))
-    current = parsed(live, wanted.name)
+        return FileChange(path, "added", _diff(path, "", masked_text(desired)))
+    current = parsed(live, desired.name)
     if current is None:
         return FileChange(path, "changed", f"--- a/{path}\n(no UCI reader accepts what is there)\n+++ b/{path}\n")
-    if current == wanted:
+    if current == desired:
         return None
-    old = masked_text(current, differing_from=wanted)
-    return FileChange(path, "changed", _diff(path, old, masked_text(wanted)))
+    old = masked_text(current, differing_from=desired)
+    return FileChange(path, "changed", _diff(path, old, masked_text(desired)))
 
 
 def _diff(path: str, old: str, new: str) -> str:

@@ -27,21 +27,21 @@ class MeshContext:
 
 
 def stages_of(
-    plans: Iterable[NodePlan], around: MeshContext, switches: Mapping[str, Sequence[str]] | None = None
+    plans: Iterable[NodePlan], context: MeshContext, switches: Mapping[str, Sequence[str]] | None = None
 ) -> tuple[Stage, ...]:
     """The stages for all plans with something to do. `switches` maps meshes to the nodes that change cell together."""
     switched = {name for nodes in (switches or {}).values() for name in nodes}
     todo = [plan for plan in plans if plan.node not in switched]
-    rank = {name: position for position, name in enumerate(around.graph.farthest_first(around.entry))}
+    rank = {name: position for position, name in enumerate(context.graph.farthest_first(context.entry))}
     todo.sort(key=lambda plan: (rank.get(plan.node, -1), plan.node))
     free = [plan for plan in todo if not plan.is_meshed]
     harmless = [plan for plan in todo if plan.is_meshed and plan.cut <= Cut.LOGIN]
     cutting = [plan for plan in todo if plan.is_meshed and plan.cut > Cut.LOGIN]
     return (
-        *_together(free, around.policy, "outside any running mesh: nothing in use is cut"),
-        *(_switch(mesh, nodes, around) for mesh, nodes in (switches or {}).items()),
-        *_together(harmless, around.policy, "nothing is cut by it"),
-        *_rolling(cutting, around),
+        *_together(free, context.policy, "outside any running mesh: nothing in use is cut"),
+        *(_switch(mesh, nodes, context) for mesh, nodes in (switches or {}).items()),
+        *_together(harmless, context.policy, "nothing is cut by it"),
+        *_rolling(cutting, context),
     )
 
 
@@ -55,35 +55,35 @@ def _together(plans: Sequence[NodePlan], policy: ApplyPolicy, reason: str) -> tu
     return (Stage(StageKind.FREE, tuple(names), reason),) if names else ()
 
 
-def _switch(mesh: str, nodes: Sequence[str], around: MeshContext) -> Stage:
-    order = {name: position for position, name in enumerate(around.graph.farthest_first(around.entry))}
-    last = [name for name in nodes if name == around.entry]
-    names = sorted((name for name in nodes if name != around.entry), key=lambda name: (order.get(name, -1), name))
+def _switch(mesh: str, nodes: Sequence[str], context: MeshContext) -> Stage:
+    order = {name: position for position, name in enumerate(context.graph.farthest_first(context.entry))}
+    last = [name for name in nodes if name == context.entry]
+    names = sorted((name for name in nodes if name != context.entry), key=lambda name: (order.get(name, -1), name))
     count = len(nodes)
     what = f"meshes {mesh} change their cells" if "," in mesh else f"mesh {mesh} changes its cell"
     return Stage(
         StageKind.SWITCH,
         (*names, *last),
         f"{what}: {count} node{'s' if count > 1 else ''} at one moment, undone everywhere unless "
-        f"{around.policy.quorum:.0%} of them meet again",
+        f"{context.policy.quorum:.0%} of them meet again",
         mesh=mesh,
     )
 
 
-def _rolling(plans: Sequence[NodePlan], around: MeshContext) -> tuple[Stage, ...]:
+def _rolling(plans: Sequence[NodePlan], context: MeshContext) -> tuple[Stage, ...]:
     """From the far end inward, at most `max_down` at once, cut vertices alone, the entry last."""
-    paths = around.graph.paths(around.entry)
-    cuts = around.graph.cut_off_by(around.entry)
-    waiting = [plan.node for plan in plans if plan.node != around.entry]
+    paths = context.graph.paths(context.entry)
+    cuts = context.graph.cut_off_by(context.entry)
+    waiting = [plan.node for plan in plans if plan.node != context.entry]
     stages: list[Stage] = []
-    if around.policy.canary and len(waiting) > 1:
+    if context.policy.canary and len(waiting) > 1:
         # the farthest node whose loss harms nobody else
         canary = next((name for name in waiting if name not in cuts), waiting[0])
         waiting.remove(canary)
         reason = f"first alone, to see it work: {_distance(canary, paths)}"
         stages.append(Stage(StageKind.CANARY, (canary,), reason, cuts.get(canary, ())))
     while waiting:
-        batch = _batch(waiting, around, cuts)
+        batch = _batch(waiting, context, cuts)
         waiting = [name for name in waiting if name not in batch]
         lost = cuts.get(batch[0], ())
         if lost:
@@ -93,24 +93,24 @@ def _rolling(plans: Sequence[NodePlan], around: MeshContext) -> tuple[Stage, ...
         else:
             reason = f"together, they cut nobody else off: {'; '.join(_distance(name, paths) for name in batch)}"
         stages.append(Stage(StageKind.ROLLING, batch, reason, lost))
-    if any(plan.node == around.entry for plan in plans):
-        rest = sorted(around.graph.reachable(around.entry) - {around.entry})
-        stages.append(Stage(StageKind.LAST, (around.entry,), "last: we reach the mesh through it", tuple(rest)))
+    if any(plan.node == context.entry for plan in plans):
+        rest = sorted(context.graph.reachable(context.entry) - {context.entry})
+        stages.append(Stage(StageKind.LAST, (context.entry,), "last: we reach the mesh through it", tuple(rest)))
     return tuple(stages)
 
 
-def _batch(waiting: Sequence[str], around: MeshContext, cuts: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+def _batch(waiting: Sequence[str], context: MeshContext, cuts: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
     batch = [waiting[0]]
     if waiting[0] in cuts:
         return (waiting[0],)
     for name in waiting[1:]:
-        if len(batch) >= max(1, around.policy.max_down):
+        if len(batch) >= max(1, context.policy.max_down):
             break
-        robots = {around.robot_of.get(other) for other in batch} - {None, ""}
+        robots = {context.robot_of.get(other) for other in batch} - {None, ""}
         # both radios of a robot down at once would cut the robot itself off
-        if name in cuts or around.robot_of.get(name) in robots:
+        if name in cuts or context.robot_of.get(name) in robots:
             continue
-        if not around.graph.cut_off_by_all(around.entry, [*batch, name]):
+        if not context.graph.cut_off_by_all(context.entry, [*batch, name]):
             batch.append(name)
     return tuple(batch)
 

@@ -20,7 +20,7 @@ class FailedPrecondition:
 
 
 @dataclass(frozen=True, slots=True)
-class _Case:
+class _Checked:
     node: Node
     seen: Observation
     uci: Mapping[str, Package | None]
@@ -39,18 +39,18 @@ def failed_precondition(
     packages: PackageStep | None,
 ) -> FailedPrecondition | None:
     """The first reason against touching this node, or None. `owner` is who we are to the node's lock."""
-    case = _Case(node, seen, uci, owner, is_flashed, packages)
+    case = _Checked(node, seen, uci, owner, is_flashed, packages)
     return next((found for check in _CHECKS if (found := check(case)) is not None), None)
 
 
-def _observed(case: _Case) -> FailedPrecondition | None:
+def _observed(case: _Checked) -> FailedPrecondition | None:
     if case.seen.uci is None or case.seen.board is None:
         missing = "its configuration" if case.seen.uci is None else "its board"
         return FailedPrecondition(f"it did not tell {missing}", "; ".join(case.seen.notes))
     return None
 
 
-def _board(case: _Case) -> FailedPrecondition | None:
+def _board(case: _Checked) -> FailedPrecondition | None:
     found = case.seen.board.board_name if case.seen.board else ""
     expected = case.node.hardware.board
     if found == expected:
@@ -61,7 +61,7 @@ def _board(case: _Case) -> FailedPrecondition | None:
     )
 
 
-def _release(case: _Case) -> FailedPrecondition | None:
+def _release(case: _Checked) -> FailedPrecondition | None:
     if case.is_flashed or runs_release(case.node, case.seen):
         return None
     found = case.seen.release.version if case.seen.release else "an unknown release"
@@ -71,7 +71,7 @@ def _release(case: _Case) -> FailedPrecondition | None:
     )
 
 
-def _radio_paths(case: _Case) -> FailedPrecondition | None:
+def _radio_paths(case: _Checked) -> FailedPrecondition | None:
     wireless = case.uci.get("wireless")
     for radio in case.node.radios:
         section = None if wireless is None else wireless.section(radio.name)
@@ -84,7 +84,7 @@ def _radio_paths(case: _Case) -> FailedPrecondition | None:
     return None
 
 
-def _lan_ports(case: _Case) -> FailedPrecondition | None:
+def _lan_ports(case: _Checked) -> FailedPrecondition | None:
     known = case.seen.macs
     if not known:
         return None
@@ -98,7 +98,7 @@ def _lan_ports(case: _Case) -> FailedPrecondition | None:
     return None
 
 
-def _packages(case: _Case) -> FailedPrecondition | None:
+def _packages(case: _Checked) -> FailedPrecondition | None:
     lacking = () if case.packages is None or case.is_flashed else unavailable(case.packages)
     if not lacking:
         return None
@@ -108,7 +108,7 @@ def _packages(case: _Case) -> FailedPrecondition | None:
     )
 
 
-def _foreign_changes(case: _Case) -> FailedPrecondition | None:
+def _foreign_changes(case: _Checked) -> FailedPrecondition | None:
     changes = case.seen.uci_changes
     if not changes:
         return None
@@ -118,7 +118,7 @@ def _foreign_changes(case: _Case) -> FailedPrecondition | None:
     )
 
 
-def _other_operator(case: _Case) -> FailedPrecondition | None:
+def _other_operator(case: _Checked) -> FailedPrecondition | None:
     change = case.seen.change
     if change is None:
         return None
@@ -132,7 +132,7 @@ def _other_operator(case: _Case) -> FailedPrecondition | None:
     return None
 
 
-_CHECKS: tuple[Callable[[_Case], FailedPrecondition | None], ...] = (
+_CHECKS: tuple[Callable[[_Checked], FailedPrecondition | None], ...] = (
     _observed,
     _board,
     _release,

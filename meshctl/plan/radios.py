@@ -35,7 +35,7 @@ NO_RADIOS = Radios()
 EVERY_RADIO = Radios(every=True)
 
 
-def restarted(before: Package | None, after: Package | None) -> Radios:
+def restarting_radios(before: Package | None, after: Package | None) -> Radios:
     """The radios that may restart when /etc/config/wireless becomes `after`: each whose own section or one of whose
     interfaces differs. A package that cannot be read may have held anything."""
     if before is None or after is None:
@@ -111,7 +111,7 @@ def _by_device(wireless: Package) -> dict[str, tuple[Section, ...]]:
     }
 
 
-def seen_to_restart(before: Observation, now: Observation, seconds: float) -> Radios:
+def observed_restarts(before: Observation, now: Observation, seconds: float) -> Radios:
     """The radios that were seen to restart between two observations, the change being `seconds` old at the second: the
     node booted, the interface has another index, or it knows no neighbor for longer than that."""
     if before.boot_id != now.boot_id:

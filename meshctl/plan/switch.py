@@ -32,7 +32,7 @@ def switches(
     fleet: Fleet,
     plans: Mapping[str, NodePlan],
     *,
-    around: Mapping[str, NodePlan] = MappingProxyType({}),
+    unchanged: Mapping[str, NodePlan] = MappingProxyType({}),
     acknowledged: Iterable[str] = (),
     never_meshed: Iterable[str] = (),
 ) -> MeshSwitches:
@@ -45,7 +45,9 @@ def switches(
     for mesh in fleet.meshes:
         members = [plans[node.name] for node in fleet.members(mesh) if node.name in plans]
         parting = [plan for plan in members if mesh in plan.parted_from and plan.verdict is Verdict.CHANGE]
-        beside = [around[node.name] for node in fleet.members(mesh) if node.name in around and node.name not in plans]
+        beside = [
+            unchanged[node.name] for node in fleet.members(mesh) if node.name in unchanged and node.name not in plans
+        ]
         staying = [plan for plan in (*members, *beside) if plan.has_cell and mesh not in plan.parted_from]
         # the mesh is where most of its members are; a few that differ from it come back to it
         if not parting or len(staying) >= len(parting):

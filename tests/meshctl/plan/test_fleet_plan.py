@@ -76,7 +76,7 @@ def test_one_that_stayed_in_the_old_cell_comes_back_alone_when_the_rest_is_seen_
     new = fleet(channel=11)
     stray = plans(new, {"b01": running(fleet(), "b01")})
     others = plans(new, {name: running(new, name) for name in TEAM if name != "b01"})
-    plan = fleet_plan(new, stray, STAR, now_s=0.0, around=others)
+    plan = fleet_plan(new, stray, STAR, now_s=0.0, unchanged=others)
     assert (plan.refusal, [stage.nodes for stage in plan.stages]) == ("", [("b01",)])
     assert plan.stages[0].kind is not StageKind.SWITCH
 
@@ -85,7 +85,7 @@ def test_others_that_still_run_the_old_cell_are_not_left_behind_by_a_part_of_the
     new = fleet(channel=11)
     some = plans(new, {name: running(fleet(), name) for name in TEAM[:3]})
     others = plans(new, {name: running(fleet(), name) for name in TEAM[3:]})
-    assert "would leave behind b03, b04, b05" in fleet_plan(new, some, STAR, now_s=0.0, around=others).refusal
+    assert "would leave behind b03, b04, b05" in fleet_plan(new, some, STAR, now_s=0.0, unchanged=others).refusal
 
 
 def test_members_that_are_refused_in_the_old_cell_block_a_switch_however_many_they_are() -> None:
