@@ -220,12 +220,12 @@ def plan_discovered(
 ) -> Prepared:
     """The plan that provisions the devices that were found. Whoever may know their radios is looked at, too: a spare
     may have been in the mesh, and a device that was reset was in it before."""
-    first = {name: renderer.desired(item.node) for name, item in discovered.found.items()}
+    rendered = {name: renderer.desired(item.node) for name, item in discovered.found.items()}
     found = {name: item.seen for name, item in discovered.found.items()}
     made = assemble(
         renderer,
         connections,
-        first,
+        rendered,
         FleetObservation(found, {}),
         known,
         salt=salt,

@@ -70,7 +70,7 @@ def execute(prepared: Prepared, settings: RunSettings) -> dict[str, Outcome]:
     outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _unchanged_outcome(fleet, made))}
     for outcome in outcomes.values():
         _finish(settings, outcome)
-    jobs = _node_contexts(prepared, run_context)
+    contexts = _node_contexts(prepared, run_context)
     for name, since_s in unflushed.items():
         flush_later(_node_context(prepared, run_context, name), max(0.0, time.time() - since_s))
     budget = FailureBudget(fleet.apply.stop_after_failures)
@@ -83,13 +83,13 @@ def execute(prepared: Prepared, settings: RunSettings) -> dict[str, Outcome]:
             for outcome in ended.values():
                 _finish(settings, outcome)
         else:
-            ended = _run_stage(stage, jobs, plan, run_context, settings, budget, images)
+            ended = _run_stage(stage, contexts, plan, run_context, settings, budget, images)
         outcomes.update(ended)
         if stage.kind is StageKind.CANARY and any(outcome.result.is_failure for outcome in ended.values()):
             stopped = f"stopped: the canary {stage.nodes[0]} failed"
         elif budget.spent:
             stopped = budget.reason
-    outcomes.update(_with_last_seen(prepared, settings, jobs, outcomes))
+    outcomes.update(_with_last_seen(prepared, settings, contexts, outcomes))
     outcomes.update(_with_unflushed_neighbors(run_context, outcomes))
     return {name: outcomes[name] for name in plan.nodes}
 
@@ -98,9 +98,9 @@ def _unflushed(prepared: Prepared, settings: RunSettings) -> dict[str, float]:
     """The nodes that answered whose radios may have started anew without their neighbours having been told, and since
     when (Unix time): of a change's beginning the end was not seen, or they have booted since they were last known."""
     seen = prepared.observed.observations
-    lost = settings.journal.unfinished_changes(settings.fleet.name)
+    missing = settings.journal.unfinished_changes(settings.fleet.name)
     booted = {name: unflushed_boot_s(name, seen) for name in prepared.plan.nodes}
-    since_s = {name: at_s for name, at_s in booted.items() if at_s is not None} | lost
+    since_s = {name: at_s for name, at_s in booted.items() if at_s is not None} | missing
     return {name: at_s for name, at_s in since_s.items() if name in prepared.plan.nodes and name in seen}
 
 
@@ -132,15 +132,17 @@ _LOST = (Result.UNCERTAIN, Result.UNREACHABLE)
 
 
 def _with_last_seen(
-    prepared: Prepared, settings: RunSettings, jobs: Mapping[str, NodeContext], outcomes: Mapping[str, Outcome]
+    prepared: Prepared, settings: RunSettings, contexts: Mapping[str, NodeContext], outcomes: Mapping[str, Outcome]
 ) -> dict[str, Outcome]:
     """The outcomes of nodes that did not return, with what was last seen of them, and by whom."""
-    lost = [name for name in jobs if outcomes[name].result in _LOST]
-    if not lost or settings.interrupt.leaving:
+    missing = [name for name in contexts if outcomes[name].result in _LOST]
+    if not missing or settings.interrupt.leaving:
         return {}
     fleet = settings.fleet
     known = settings.journal.last_known(fleet.name)
-    found = query_neighbors(settings.connections, fleet, lost, prepared.observed, known, interrupt=settings.interrupt)
+    found = query_neighbors(
+        settings.connections, fleet, missing, prepared.observed, known, interrupt=settings.interrupt
+    )
     updated = {}
     for name, place in found.items():
         text = place.text(time.time())
@@ -154,8 +156,8 @@ def _with_last_seen(
 def _with_unflushed_neighbors(run_context: RunContext, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
     """The outcomes of nodes that some neighbour may not hear for a while, with who that is."""
     updated = {}
-    for name, silent in retry_unanswered(run_context).items():
-        updated[name] = replace(outcomes[name], facts={**outcomes[name].facts, UNFLUSHED: " ".join(silent)})
+    for name, unflushed in retry_unanswered(run_context).items():
+        updated[name] = replace(outcomes[name], facts={**outcomes[name].facts, UNFLUSHED: " ".join(unflushed)})
         run_context.journal_run.finish_node(updated[name])
     return updated
 
@@ -192,7 +194,7 @@ def _node_context(prepared: Prepared, run_context: RunContext, name: str) -> Nod
 
 def _run_stage(
     stage: Stage,
-    jobs: Mapping[str, NodeContext],
+    contexts: Mapping[str, NodeContext],
     plan: Plan,
     run_context: RunContext,
     settings: RunSettings,
@@ -201,13 +203,13 @@ def _run_stage(
 ) -> dict[str, Outcome]:
     observer = Tee((_journaling(settings.journal_run), settings.observer))
     if stage.kind is StageKind.SWITCH:
-        ended = _switch_stage(stage, jobs, plan, run_context, observer)
+        ended = _switch_stage(stage, contexts, plan, run_context, observer)
         for outcome in ended.values():
             budget.count(outcome)
         return ended
     return run(
         stage.nodes,
-        lambda name: _change_node(jobs[name], images),
+        lambda name: _change_node(contexts[name], images),
         # a stage says who may be down together, the policy how many we can work on at once
         parallel=max(1, run_context.fleet.apply.parallel),
         budget=budget,
@@ -252,20 +254,20 @@ def _connection(ctx: NodeContext) -> SshConnection:
 
 
 def _switch_stage(
-    stage: Stage, jobs: Mapping[str, NodeContext], plan: Plan, run_context: RunContext, observer: Observer
+    stage: Stage, contexts: Mapping[str, NodeContext], plan: Plan, run_context: RunContext, observer: Observer
 ) -> dict[str, Outcome]:
     """Packages first, which cut nothing; then everybody at one moment."""
     began = time.monotonic()
     for name in stage.nodes:
         observer(Event(EventKind.STARTED, name, time.time()))
-    failed = _packages_first(stage, jobs)
+    failed = _packages_first(stage, contexts)
     if failed:
         reason = f"the switch was called off: {', '.join(failed)} was not ready"
         ended = {name: failed.get(name) or Outcome(name, Result.PENDING, reason) for name in stage.nodes}
     else:
         ended = commit_mesh(
             run_context,
-            [jobs[name] for name in stage.nodes],
+            [contexts[name] for name in stage.nodes],
             quorum=run_context.fleet.apply.quorum,
             parallel=run_context.fleet.apply.parallel,
             entry=plan.entry,
@@ -277,14 +279,14 @@ def _switch_stage(
     return updated
 
 
-def _packages_first(stage: Stage, jobs: Mapping[str, NodeContext]) -> dict[str, Outcome]:
+def _packages_first(stage: Stage, contexts: Mapping[str, NodeContext]) -> dict[str, Outcome]:
     failed: dict[str, Outcome] = {}
     for name in stage.nodes:
-        step = jobs[name].plan.packages
+        step = contexts[name].plan.packages
         if step is None:
             continue
         try:
-            outcome = install(jobs[name], _connection(jobs[name]), step)
+            outcome = install(contexts[name], _connection(contexts[name]), step)
         except NodeError as error:
             outcome = outcome_of_error(name, error)
         if not outcome.result.is_good:

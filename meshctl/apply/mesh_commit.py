@@ -85,11 +85,11 @@ class _MeshCommit:
 
 
 def commit_mesh(
-    run_context: RunContext, jobs: Sequence[NodeContext], *, quorum: float, parallel: int, entry: str
+    run_context: RunContext, contexts: Sequence[NodeContext], *, quorum: float, parallel: int, entry: str
 ) -> dict[str, Outcome]:
     """Carry out the jobs' file changes at one moment. Returns each node's outcome; nothing is raised for a node."""
-    participants = [Participant(ctx) for ctx in jobs]
-    window_s = max(ctx.node.confirm_window_s for ctx in jobs)
+    participants = [Participant(ctx) for ctx in contexts]
+    window_s = max(ctx.node.confirm_window_s for ctx in contexts)
     with ThreadPoolExecutor(max_workers=max(1, parallel), thread_name_prefix="switch") as pool:
         commit = _MeshCommit(run_context, participants, window_s, max(1, parallel), entry, pool)
         commit.each(participants, lambda participant: _arm(commit, participant))

@@ -38,8 +38,10 @@ def observe_neighbors(
     """
     names = known_neighbors(fleet, seen, known, now_s=time.time())
     nodes = [fleet.nodes[name] for name in names if name not in observations]
-    around = collect(connections, nodes, parallel=max(1, fleet.apply.parallel), interrupt=interrupt) if nodes else None
-    return {**observations, **seen, **(around.observations if around is not None else {})}
+    collected = (
+        collect(connections, nodes, parallel=max(1, fleet.apply.parallel), interrupt=interrupt) if nodes else None
+    )
+    return {**observations, **seen, **(collected.observations if collected is not None else {})}
 
 
 def known_neighbors(
@@ -47,11 +49,11 @@ def known_neighbors(
 ) -> tuple[str, ...]:
     """The nodes beside these that may know one of them. Pure."""
     names = known_macs(fleet, known)
-    near: list[str] = []
+    neighbors: list[str] = []
     for name, observation in seen.items():
         last = known.get(name)
         heard = () if last is None else last.facts.get("neighbours", "").split()
         is_recent = last is not None and now_s - last.seen_s < REMEMBERED_S
         former = [names[mac.lower()] for mac in heard if is_recent and mac.lower() in names]
-        near += [*current_neighbors(observation, names), *former][:MAX_QUERIED]
-    return tuple(name for name in dict.fromkeys(near) if name not in seen and name in fleet.nodes)
+        neighbors += [*current_neighbors(observation, names), *former][:MAX_QUERIED]
+    return tuple(name for name in dict.fromkeys(neighbors) if name not in seen and name in fleet.nodes)

@@ -67,26 +67,26 @@ def prepare(
     """
     fleet = renderer.fleet
     chosen = tuple(nodes)
-    first = {node.name: renderer.desired(node) for node in chosen}
+    rendered = {node.name: renderer.desired(node) for node in chosen}
     seen = collect(
         connections,
         chosen,
         parallel=fleet.apply.parallel,
-        paths=lambda node: other_paths(first[node.name]),
+        paths=lambda node: other_paths(rendered[node.name]),
         interrupt=interrupt,
         observer=observer,
     )
     _remember(journal, fleet, seen)
     decided = choices or PlanOptions()
-    single = _node_plans(renderer, connections, first, seen, salt=salt, owner=owner, choices=decided)
+    single = _node_plans(renderer, connections, rendered, seen, salt=salt, owner=owner, choices=decided)
     rest = _other_members(fleet, single.plans.values()) or _former_neighbors(
         fleet, single.plans.values(), journal.last_known(fleet.name)
     )
     if rest and not (interrupt is not None and interrupt.stopping):
-        around = collect(connections, rest, parallel=fleet.apply.parallel, interrupt=interrupt, observer=observer)
-        _remember(journal, fleet, around)
-        seen = replace(seen, observations={**seen.observations, **around.observations})
-        single = replace(single, unchanged=_unchanged_plans(renderer, around, salt, owner))
+        others = collect(connections, rest, parallel=fleet.apply.parallel, interrupt=interrupt, observer=observer)
+        _remember(journal, fleet, others)
+        seen = replace(seen, observations={**seen.observations, **others.observations})
+        single = replace(single, unchanged=_unchanged_plans(renderer, others, salt, owner))
     return _with_fleet_plan(fleet, single, seen, journal.last_known(fleet.name), salt=salt, choices=decided)
 
 
@@ -125,10 +125,10 @@ def _former_neighbors(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[st
     return tuple(fleet.nodes[name] for name in names[:MAX_QUERIED])
 
 
-def _unchanged_plans(renderer: Renderer, around: FleetObservation, salt: bytes, owner: str) -> dict[str, NodePlan]:
+def _unchanged_plans(renderer: Renderer, others: FleetObservation, salt: bytes, owner: str) -> dict[str, NodePlan]:
     """What would be done to these, had they been chosen, as far as it tells which cell they run."""
     plans = {}
-    for name, observation in around.observations.items():
+    for name, observation in others.observations.items():
         # a node that was not asked for may not be the reason why nothing can be done to the others
         with suppress(InvalidInput, InputError):
             desired = renderer.desired(renderer.fleet.nodes[name], observation)
@@ -139,7 +139,7 @@ def _unchanged_plans(renderer: Renderer, around: FleetObservation, salt: bytes, 
 def assemble(
     renderer: Renderer,
     connections: ConnectionPool,
-    first: Mapping[str, DesiredState],
+    rendered: Mapping[str, DesiredState],
     seen: FleetObservation,
     known: Mapping[str, LastKnown],
     *,
@@ -148,7 +148,7 @@ def assemble(
     choices: PlanOptions,
 ) -> Prepared:
     """The plan for what was rendered without the devices' facts (`first`) and what was seen."""
-    single = _node_plans(renderer, connections, first, seen, salt=salt, owner=owner, choices=choices)
+    single = _node_plans(renderer, connections, rendered, seen, salt=salt, owner=owner, choices=choices)
     return _with_fleet_plan(renderer.fleet, single, seen, known, salt=salt, choices=choices)
 
 
@@ -164,7 +164,7 @@ class _NodePlans:
 def _node_plans(
     renderer: Renderer,
     connections: ConnectionPool,
-    first: Mapping[str, DesiredState],
+    rendered: Mapping[str, DesiredState],
     seen: FleetObservation,
     *,
     salt: bytes,
@@ -174,7 +174,7 @@ def _node_plans(
     fingerprints = Fingerprints(salt)
     desired: dict[str, DesiredState] = {}
     plans: dict[str, NodePlan] = {}
-    for name, want in first.items():
+    for name, want in rendered.items():
         observation = seen.observations.get(name)
         desired[name] = want if observation is None else renderer.desired(want.node, observation)
         made = node_plan(

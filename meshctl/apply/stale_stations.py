@@ -59,14 +59,16 @@ def radio_macs(seen: Observation, radios: Radios) -> tuple[str, ...]:
     return tuple(dict.fromkeys(mac for ifname, mac in macs.items() if ifname in radios and mac in known))
 
 
-def entries_of(node: str, around: Mapping[str, Observation], radios: Radios = EVERY_RADIO) -> tuple[StationEntry, ...]:
+def entries_of(
+    node: str, observations: Mapping[str, Observation], radios: Radios = EVERY_RADIO
+) -> tuple[StationEntry, ...]:
     """Who of those observed holds a station entry of these radios of `node`, in the order of `around`."""
-    if node not in around:
+    if node not in observations:
         return ()
-    macs = frozenset(radio_macs(around[node], radios))
+    macs = frozenset(radio_macs(observations[node], radios))
     return tuple(
         StationEntry(holder, station.ifname, station.mac)
-        for holder, seen in around.items()
+        for holder, seen in observations.items()
         if holder != node
         for station in seen.stations or ()
         if station.mac.lower() in macs
@@ -82,25 +84,25 @@ def own_entries(node: str, seen: Observation, radios: Radios = EVERY_RADIO) -> t
 
 
 def possible_holders(
-    node: str, around: Mapping[str, Observation], names: Mapping[str, str], fellows: Iterable[str]
+    node: str, observations: Mapping[str, Observation], names: Mapping[str, str], mesh_nodes: Iterable[str]
 ) -> tuple[str, ...]:
     """Who may hold an entry of `node` and did not tell: those that it hears itself, by the MACs that `names` knows.
 
     When it hears somebody by no known name, that may be any of its `fellows` whose MACs nobody knows.
     """
-    if node not in around:
+    if node not in observations:
         return ()
-    observed = {name: seen for name, seen in around.items() if seen.stations is not None}
-    strangers = _heard_macs(around[node]) - {mac for seen in observed.values() for mac in mesh_macs(seen)}
-    named = [names[mac] for mac in sorted(strangers) if mac in names]
+    observed = {name: seen for name, seen in observations.items() if seen.stations is not None}
+    unknown_macs = _heard_macs(observations[node]) - {mac for seen in observed.values() for mac in mesh_macs(seen)}
+    named = [names[mac] for mac in sorted(unknown_macs) if mac in names]
     known = frozenset(names.values())
-    nameless = [name for name in fellows if name not in known] if strangers - names.keys() else []
-    return tuple(name for name in dict.fromkeys((*named, *nameless)) if name != node and name not in observed)
+    unnamed = [name for name in mesh_nodes if name not in known] if unknown_macs - names.keys() else []
+    return tuple(name for name in dict.fromkeys((*named, *unnamed)) if name != node and name not in observed)
 
 
-def unflushed_boot_s(node: str, around: Mapping[str, Observation]) -> float | None:
+def unflushed_boot_s(node: str, observations: Mapping[str, Observation]) -> float | None:
     """When `node` booted (Unix time), if somebody has known a radio of it from before that; None otherwise."""
-    own = around.get(node)
+    own = observations.get(node)
     if own is None or own.uptime_s is None:
         return None
     macs = frozenset(mesh_macs(own))
@@ -110,7 +112,7 @@ def unflushed_boot_s(node: str, around: Mapping[str, Observation]) -> float | No
         station.connected_s is not None
         and station.mac.lower() in macs
         and seen.answered_at_s - station.connected_s < booted_s - SLACK_S
-        for holder, seen in around.items()
+        for holder, seen in observations.items()
         for station in seen.stations or ()
         if holder != node
     )
@@ -135,14 +137,14 @@ def by_holder(entries: Iterable[StationEntry]) -> dict[str, tuple[StationEntry, 
     return dict(list(grouped.items())[:MAX_QUERIED])
 
 
-def routed_through(node: str, around: Mapping[str, Observation], base_macs: Iterable[str]) -> frozenset[str]:
+def routed_through(node: str, observations: Mapping[str, Observation], base_macs: Iterable[str]) -> frozenset[str]:
     """The nodes whose best way to the base leads through `node` first: while it is not heard, they are out of reach."""
-    if node not in around:
+    if node not in observations:
         return frozenset()
-    own, bases = frozenset(mesh_macs(around[node])), frozenset(mac.lower() for mac in base_macs)
+    own, bases = frozenset(mesh_macs(observations[node])), frozenset(mac.lower() for mac in base_macs)
     return frozenset(
         name
-        for name, seen in around.items()
+        for name, seen in observations.items()
         for entry in seen.originators or ()
         if name != node and entry.best and entry.mac.lower() in bases and entry.next_hop.lower() in own
     )

@@ -194,9 +194,9 @@ class StationFlush:
             mac: name for name, seen in run_context.observations.items() for mac in radio_macs(seen, EVERY_RADIO)
         }
         names = {**run_context.current_mac_owners(), **observed_macs}
-        fellows = [node.name for mesh in ctx.node.meshes for node in run_context.fleet.members(mesh)]
+        mesh_nodes = [node.name for mesh in ctx.node.meshes for node in run_context.fleet.members(mesh)]
         others = (
-            *possible_holders(self.node, run_context.observations, names, fellows),
+            *possible_holders(self.node, run_context.observations, names, mesh_nodes),
             *(current_neighbors(now, names) if now else ()),
         )
         # the radio may have been another one's the last time, or another MAC: whatever is known of it
@@ -262,16 +262,16 @@ def retry_unanswered(run_context: RunContext) -> dict[str, tuple[str, ...]]:
     names = dict.fromkeys(name for _, scripts in unfinished for name in scripts)
     of_each = {name: [scripts[name] for _, scripts in unfinished if name in scripts] for name in names}
     answers = _query_all(run_context, {name: partial(_joined, scripts) for name, scripts in of_each.items()})
-    rest: dict[str, tuple[str, ...]] = {}
+    unflushed: dict[str, tuple[str, ...]] = {}
     for flush, scripts in unfinished:
         flush.report({name: flush.own_lines(answers[name]) for name in scripts if name in answers})
-        silent = tuple(name for name in scripts if name not in answers)
-        if silent:
-            rest[flush.node] = silent
+        unanswered = tuple(name for name in scripts if name not in answers)
+        if unanswered:
+            unflushed[flush.node] = unanswered
             run_context.note(
-                f"{_listed(silent)} did not answer and may hold a stale entry of its radio{MAY_LOSE}", flush.node
+                f"{_listed(unanswered)} did not answer and may hold a stale entry of its radio{MAY_LOSE}", flush.node
             )
-    return rest
+    return unflushed
 
 
 def flush_later(ctx: NodeContext, ago_s: float) -> None:

@@ -64,8 +64,8 @@ def login_attempts(credentials: Credentials, *, legacy_rsa_sha1: bool) -> Iterat
 
 def own_keys(credentials: Credentials) -> tuple[OwnKey, ...]:
     """The public parts of all keys that would be tried. Raises InputError for a key file that cannot be used."""
-    with login_attempts(credentials, legacy_rsa_sha1=False) as tries:
-        return tuple(OwnKey(one.name, one.key.get_name(), one.key.asbytes()) for one in tries if one.key is not None)
+    with login_attempts(credentials, legacy_rsa_sha1=False) as found:
+        return tuple(OwnKey(one.name, one.key.get_name(), one.key.asbytes()) for one in found if one.key is not None)
 
 
 def load_key(path: Path, passphrase: Secret | None) -> PKey:

@@ -49,7 +49,7 @@ def keepalives(transport: paramiko.Transport, every_s: float, idle_s: float) -> 
     """Within this block the server is asked for a sign whenever nothing was read or written for `every_s`; afterwards
     it is sent a keepalive that wants no answer, every `idle_s`. The transport's own thread does it."""
 
-    def ask() -> None:
+    def send_request() -> None:
         request = Message()
         request.add_byte(cMSG_GLOBAL_REQUEST)
         request.add_string(_REQUEST)
@@ -57,7 +57,7 @@ def keepalives(transport: paramiko.Transport, every_s: float, idle_s: float) -> 
         # paramiko's own global_request waits for the answer in the thread that would have to read it
         transport._send_user_message(request)  # type: ignore[attr-defined]
 
-    transport.packetizer.set_keepalive(every_s, ask)
+    transport.packetizer.set_keepalive(every_s, send_request)
     try:
         yield
     finally:
@@ -75,13 +75,13 @@ class Watchdog:
         transport: paramiko.Transport,
         seconds: float,
         *,
-        heard: ActivityStream | None = None,
+        activity: ActivityStream | None = None,
         silence_s: float = 0.0,
     ) -> None:
         self.timed_out = self.silent = False
         self._transport = transport
         self._seconds = seconds
-        self._heard = heard
+        self._activity = activity
         self._silence_s = silence_s
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -94,9 +94,9 @@ class Watchdog:
             if left_s <= 0:
                 self.timed_out = True
                 break
-            if self._heard is not None:
+            if self._activity is not None:
                 # what was silent before we began to wait had nothing to say
-                patience_s = max(self._heard.last_received_s, began_s) + self._silence_s - now_s
+                patience_s = max(self._activity.last_received_s, began_s) + self._silence_s - now_s
                 if patience_s <= -MAX_OWN_PAUSE_S:
                     self.silent = True
                     break

@@ -144,18 +144,18 @@ def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
     done = connection.run(script, timeout_s=FIRMWARE_TEST_TIMEOUT_S)
     lines = done.check(f"{connection.endpoint.label}: test the firmware").stdout.splitlines()
     said = [_STAMP.sub("", line[5:]).strip() for line in lines if line.startswith("said ")]
-    told = mapping(parse_json(next((line[5:] for line in lines if line.startswith("json ")), "")))
+    validation = mapping(parse_json(next((line[5:] for line in lines if line.startswith("json ")), "")))
     memory = parse_meminfo(done.stdout)
     # procd refuses `-f` for such an image, only after `sysupgrade` has begun; -T does not look at it
-    bare = told.get("allow_backup") is False
-    passed = "status 0" in lines and (not told or truth(told.get("valid"))) and not bare
+    bare = validation.get("allow_backup") is False
+    passed = "status 0" in lines and (not validation or truth(validation.get("valid"))) and not bare
     reason = "; ".join(line for line in said if line and not line.startswith(_FORCE_ADVICE)) or "sysupgrade -T failed"
     if bare:
         reason = "it takes over no configuration from the running system"
     return FirmwareCheck(
         valid=passed,
         reason="" if passed else reason,
-        tests={name: truth(value) for name, value in mapping(told.get("tests")).items()},
+        tests={name: truth(value) for name, value in mapping(validation.get("tests")).items()},
         available_bytes=None if memory is None else memory.available,
     )
 

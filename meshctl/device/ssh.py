@@ -68,13 +68,13 @@ def connect(
     """
     limits = deadlines or Deadlines()
     legacy = legacy_rsa_sha1
-    with login_attempts(credentials, legacy_rsa_sha1=legacy or release is Release.V19_07) as wanted:
-        left = list(wanted)
+    with login_attempts(credentials, legacy_rsa_sha1=legacy or release is Release.V19_07) as attempts:
+        remaining = list(attempts)
         tried: list[str] = []
         allowed: tuple[str, ...] = ()
         while True:
             try:
-                transport, heard = _handshake(endpoint, limits, trust, via, legacy=legacy)
+                transport, activity = _handshake(endpoint, limits, trust, via, legacy=legacy)
             except _OnlySha1 as error:
                 if legacy or release is not Release.V19_07:
                     raise IncompatibleServer(
@@ -84,17 +84,17 @@ def connect(
                 legacy = True
                 continue
             try:
-                accepted, refused = _login(endpoint, transport, left[:MAX_LOGINS_PER_CONNECTION], limits)
+                accepted, refused = _login(endpoint, transport, remaining[:MAX_LOGINS_PER_CONNECTION], limits)
             except BaseException:
                 transport.close()
                 raise
             if accepted:
-                return SshConnection(endpoint, transport, limits, heard)
+                return SshConnection(endpoint, transport, limits, activity)
             transport.close()
-            tried += [attempt.name for attempt in left[:MAX_LOGINS_PER_CONNECTION]]
+            tried += [attempt.name for attempt in remaining[:MAX_LOGINS_PER_CONNECTION]]
             allowed = refused or allowed
-            left = left[MAX_LOGINS_PER_CONNECTION:]
-            if not left:
+            remaining = remaining[MAX_LOGINS_PER_CONNECTION:]
+            if not remaining:
                 given = ", ".join(tried) or "no credentials at all"
                 raise AuthenticationRefused(
                     f"{endpoint.label}: let {endpoint.user} in with none of: {given}",
@@ -115,28 +115,28 @@ def _translating_errors(
     seconds: float,
     phase: str,
     *,
-    heard: ActivityStream | None = None,
+    activity: ActivityStream | None = None,
     silence_s: float = 0.0,
 ) -> Iterator[None]:
     """Foreign exceptions become ours here; a wait that took too long is told as such whatever it made paramiko raise.
 
     With `heard`, a connection that is silent for `silence_s` meanwhile is lost.
     """
-    with Watchdog(transport, seconds, heard=heard, silence_s=silence_s) as watch:
+    with Watchdog(transport, seconds, activity=activity, silence_s=silence_s) as watchdog:
         try:
             yield
         except (paramiko.SSHException, OSError, EOFError) as error:
-            if watch.timed_out or watch.silent:
-                raise _timeout_error(endpoint, watch, seconds, silence_s, phase) from error
+            if watchdog.timed_out or watchdog.silent:
+                raise _timeout_error(endpoint, watchdog, seconds, silence_s, phase) from error
             if transport.is_active():
                 raise ChannelClosed(f"{endpoint.label}: {phase} was refused or cut: {error}") from error
             raise ConnectionLost(f"{endpoint.label}: the connection broke during {phase}: {error}") from error
-    if watch.timed_out or watch.silent:
-        raise _timeout_error(endpoint, watch, seconds, silence_s, phase)
+    if watchdog.timed_out or watchdog.silent:
+        raise _timeout_error(endpoint, watchdog, seconds, silence_s, phase)
 
 
-def _timeout_error(endpoint: Endpoint, watch: Watchdog, seconds: float, silence_s: float, phase: str) -> Unreachable:
-    if watch.timed_out:
+def _timeout_error(endpoint: Endpoint, watchdog: Watchdog, seconds: float, silence_s: float, phase: str) -> Unreachable:
+    if watchdog.timed_out:
         return Timeout(f"{endpoint.label}: no answer to {phase} within {seconds:g} s", phase=phase)
     return ConnectionLost(f"{endpoint.label}: silent for {silence_s:g} s during {phase}")
 
@@ -145,8 +145,8 @@ def _handshake(
     endpoint: Endpoint, limits: Deadlines, trust: HostKeyPolicy, via: SshConnection | None, *, legacy: bool
 ) -> tuple[paramiko.Transport, ActivityStream]:
     known = trust.known(endpoint)
-    heard = ActivityStream(open_socket(endpoint, limits) if via is None else via.tunnel(endpoint))
-    transport = (LegacyTransport if legacy else paramiko.Transport)(heard)  # type: ignore[arg-type]
+    activity = ActivityStream(open_socket(endpoint, limits) if via is None else via.tunnel(endpoint))
+    transport = (LegacyTransport if legacy else paramiko.Transport)(activity)  # type: ignore[arg-type]
     transport.daemon = True
     transport.banner_timeout = transport.handshake_timeout = limits.handshake_s * 2  # ours comes first
     transport.auth_timeout = limits.auth_s * 2
@@ -170,7 +170,7 @@ def _handshake(
         transport.close()
         raise
     transport.set_keepalive(limits.keepalive_s)
-    return transport, heard
+    return transport, activity
 
 
 def _prefer(transport: paramiko.Transport, known: tuple[HostKey, ...], *, legacy: bool) -> None:
@@ -186,11 +186,11 @@ def _prefer(transport: paramiko.Transport, known: tuple[HostKey, ...], *, legacy
 
 
 def _login(
-    endpoint: Endpoint, transport: paramiko.Transport, wanted: list[LoginAttempt], limits: Deadlines
+    endpoint: Endpoint, transport: paramiko.Transport, attempts: list[LoginAttempt], limits: Deadlines
 ) -> tuple[bool, tuple[str, ...]]:
     """Whether one of `wanted` was accepted, and otherwise what the server said it would accept."""
     allowed: tuple[str, ...] = ()
-    for attempt in wanted:
+    for attempt in attempts:
         with _translating_errors(endpoint, transport, limits.auth_s, "authentication"):
             try:
                 attempt.run(transport, endpoint.user)
@@ -201,7 +201,7 @@ def _login(
                     # it hung up on the refusal, as dropbear does after the last one it allows
                     return False, allowed
             except (paramiko.SSHException, EOFError):
-                if not transport.is_active() and attempt is wanted[-1]:
+                if not transport.is_active() and attempt is attempts[-1]:
                     return False, allowed
                 raise
             if transport.is_authenticated():
@@ -213,12 +213,12 @@ class SshConnection(Connection):
     """See `Connection`. Also carries tunnels to nodes behind this one."""
 
     def __init__(
-        self, endpoint: Endpoint, transport: paramiko.Transport, limits: Deadlines, heard: ActivityStream
+        self, endpoint: Endpoint, transport: paramiko.Transport, limits: Deadlines, activity: ActivityStream
     ) -> None:
         self._endpoint = endpoint
         self._transport = transport
         self._limits = limits
-        self._heard = heard
+        self._activity = activity
 
     @property
     def endpoint(self) -> Endpoint:
@@ -278,7 +278,7 @@ class SshConnection(Connection):
     def _waiting(self, seconds: float, phase: str) -> AbstractContextManager[None]:
         silence_s = self._limits.silence_s
         return _translating_errors(
-            self._endpoint, self._transport, seconds, phase, heard=self._heard, silence_s=silence_s
+            self._endpoint, self._transport, seconds, phase, activity=self._activity, silence_s=silence_s
         )
 
     def close(self) -> None:

@@ -95,17 +95,17 @@ def upload(
     """
     content = Content(source)
     partial = _partial(path, content)
-    tell = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     sent = 0
     kept_at_first: int | None = None
     for _ in range(MAX_SURVEYS):
         survey = _survey(connection, path, partial, content)
         if survey.done:
-            tell(Progress(content.size, content.size))
+            report(Progress(content.size, content.size))
             return Uploaded(path, content.sha256, content.size, sent, content.size - sent)
         good = survey.good_chunks
         kept_at_first = good * CHUNK_BYTES if kept_at_first is None else kept_at_first
-        tell(Progress(min(good * CHUNK_BYTES, content.size), content.size))
+        report(Progress(min(good * CHUNK_BYTES, content.size), content.size))
         while good < content.chunks:
             data = content.chunk(good)
             arrived = _send_chunk(connection, partial, good, data, rate_bytes_per_s, sleep)
@@ -113,7 +113,7 @@ def upload(
             if not arrived:
                 break
             good += 1
-            tell(Progress(min(good * CHUNK_BYTES, content.size), content.size))
+            report(Progress(min(good * CHUNK_BYTES, content.size), content.size))
         if good == content.chunks and _put_in_place(connection, partial, path, content, mode):
             return Uploaded(path, content.sha256, content.size, sent, min(kept_at_first, content.size))
     raise UploadFailed(f"{connection.endpoint.label}: {path}: the bytes that arrive are not those sent")

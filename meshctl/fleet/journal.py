@@ -257,11 +257,11 @@ class Journal:
             " ORDER BY run DESC, outcomes.rowid",
             (self._key(fleet),),
         )
-        left: dict[int, tuple[str, ...]] = {}
+        unfinished: dict[int, tuple[str, ...]] = {}
         for run_id, node, result in rows:
             if not Result(result).is_settled:
-                left[run_id] = (*left.get(run_id, ()), node)
-        return left
+                unfinished[run_id] = (*unfinished.get(run_id, ()), node)
+        return unfinished
 
     def unfinished_changes(self, fleet: str) -> dict[str, float]:
         """The nodes on which a change was begun that no run saw the end of, and when the first such was (Unix time)."""
@@ -283,7 +283,7 @@ class Journal:
     def remember_all(self, fleet: str, facts: Mapping[str, Mapping[str, str]], seen_s: float) -> None:
         with self._write() as database:
             database.executemany(
-                _REMEMBER, [_sighting(self._key(fleet), node, told, seen_s) for node, told in facts.items()]
+                _REMEMBER, [_sighting(self._key(fleet), node, known, seen_s) for node, known in facts.items()]
             )
 
     def last_known(self, fleet: str) -> dict[str, LastKnown]:
@@ -338,12 +338,12 @@ class Run:
     def _put(self, statement: str, *values: object, wait_s: float = STEP_TIMEOUT_S) -> None:
         with self._guard:
             # whoever could not write waits no second time before the end
-            patience_s = 0.0 if self._pending and wait_s <= STEP_TIMEOUT_S else wait_s
+            timeout_s = 0.0 if self._pending and wait_s <= STEP_TIMEOUT_S else wait_s
             self._pending.append((statement, values))
             try:
-                with self._journal._write(patience_s) as database:
-                    for owed in self._pending:
-                        database.execute(*owed)
+                with self._journal._write(timeout_s) as database:
+                    for pending in self._pending:
+                        database.execute(*pending)
             except MeshctlError as error:
                 self.error = str(error)
             else:

@@ -47,12 +47,12 @@ class LastSeen:
         age_s = max(0.0, now_s - self.last.seen_s)
         # the time of day alone misleads about another day
         shown = moment.strftime("%H:%M:%S UTC" if age_s < 12 * 3600 else "%Y-%m-%d %H:%M UTC")
-        told = [f"last seen {_span(age_s)} ago ({shown})"]
+        parts = [f"last seen {_span(age_s)} ago ({shown})"]
         uptime = self.last.facts.get("uptime_s", "")
         if uptime.isdigit():
-            told.append(f"up {_span(float(uptime))} then")
-        told += [text for key in ("version", "revision") if (text := self.last.facts.get(key))]
-        return ", ".join(told)
+            parts.append(f"up {_span(float(uptime))} then")
+        parts += [text for key in ("version", "revision") if (text := self.last.facts.get(key))]
+        return ", ".join(parts)
 
     def _heard_text(self) -> str:
         if self.heard:
@@ -68,13 +68,13 @@ class LastSeen:
     @property
     def facts(self) -> dict[str, str]:
         """For scripts, beside an outcome."""
-        told = {
+        facts = {
             "last_seen_s": "" if self.last is None else f"{self.last.seen_s:.0f}",
             "heard_by": " ".join(f"{one.by}:{one.age_ms}ms" for one in self.heard),
             "routed_by": " ".join(f"{one.by}:{one.age_ms}ms" for one in self.routed),
             "asked": str(self.asked),
         }
-        return {key: value for key, value in told.items() if value}
+        return {key: value for key, value in facts.items() if value}
 
 
 def _sighting(one: Sighting) -> str:
@@ -95,12 +95,12 @@ def last_seen_of(
 ) -> dict[str, LastSeen]:
     """What is known of each of `names` from what other nodes were seen to hear and from the journal."""
     missing = tuple(names)
-    told = {name: seen for name, seen in observations.items() if name not in missing}
-    reports = [report_of(name, seen) for name, seen in told.items()]
+    others = {name: seen for name, seen in observations.items() if name not in missing}
+    reports = [report_of(name, seen) for name, seen in others.items()]
     macs = known_macs(fleet, known)
     heard = seen_by(reports, macs, fresh_ms=REMEMBERED_MS)
-    routed = _routed(told, names_by_mac(reports, macs))
-    return {name: LastSeen(known.get(name), heard.get(name, ()), routed.get(name, ()), len(told)) for name in missing}
+    routed = _routed(others, names_by_mac(reports, macs))
+    return {name: LastSeen(known.get(name), heard.get(name, ()), routed.get(name, ()), len(others)) for name in missing}
 
 
 def _routed(observations: Mapping[str, Observation], names: Mapping[str, str]) -> dict[str, tuple[Sighting, ...]]:

@@ -72,18 +72,20 @@ def _routing_algo(network: Package | None, interface: str) -> str:
 
 def differences(before: Cell, after: Cell) -> tuple[str, ...]:
     """`channel 6 -> 11`, one for each field that differs; a key is only said to change."""
-    told = []
+    changed = []
     for item in fields(Cell):
         old, new = getattr(before, item.name), getattr(after, item.name)
         if old != new:
-            told.append(f"{item.name} changes" if item.name == "key" else f"{item.name} {old or '-'} -> {new or '-'}")
-    return tuple(told)
+            changed.append(
+                f"{item.name} changes" if item.name == "key" else f"{item.name} {old or '-'} -> {new or '-'}"
+            )
+    return tuple(changed)
 
 
 def partitions(before: Mapping[str, Cell], after: Mapping[str, Cell]) -> dict[str, tuple[str, ...]]:
     """Radio -> what parts its present cell from the one to come; radios without a present cell part from nothing."""
     return {
-        radio: told
+        radio: changed
         for radio, cell in before.items()
-        if (told := differences(cell, after[radio]) if radio in after else ("leaves the mesh",))
+        if (changed := differences(cell, after[radio]) if radio in after else ("leaves the mesh",))
     }

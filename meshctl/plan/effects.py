@@ -77,14 +77,14 @@ def _network(before: Package | None, after: Package | None) -> list[Effect]:
     old, new = _by_key(before), _by_key(after)
     differing = [key for key in {**old, **new} if old.get(key) != new.get(key)]
     was_there = [section for key in differing if (section := old.get(key)) is not None]
-    told = []
+    found = []
     if any(section.get("proto") in ("batadv", "batadv_hardif") for section in was_there):
         # any option of bat0 destroys and recreates it (openwrt-facts.md section 1)
-        told.append(Effect("network", Cut.MESH, "bat0 is made anew"))
+        found.append(Effect("network", Cut.MESH, "bat0 is made anew"))
     address = _address(old.get("lan")), _address(new.get("lan"))
     if address[0] != address[1]:
-        told.append(Effect("network", Cut.LAN, f"its address moves from {address[0] or '-'} to {address[1] or '-'}"))
-    return told or [Effect("network", Cut.LAN, "network changes")]
+        found.append(Effect("network", Cut.LAN, f"its address moves from {address[0] or '-'} to {address[1] or '-'}"))
+    return found or [Effect("network", Cut.LAN, "network changes")]
 
 
 def _by_key(package: Package) -> dict[str, Section]:

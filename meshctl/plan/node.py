@@ -67,12 +67,12 @@ def node_plan(
     live = cells(before.get("wireless"), before.get("network"))
     old_secrets = (secret for package in before.values() if package is not None for secret in secrets_of(package))
     live_after = cells(after.get("wireless"), after.get("network"))
-    split = partitions(live, live_after)
+    partition = partitions(live, live_after)
     basis = NodePlan(
         node.name,
         Verdict.SAME,
-        splits=tuple(f"{radio}: {one}" for radio, all_of_it in split.items() for one in all_of_it),
-        parted_from=_partitioned_meshes(node, split),
+        splits=tuple(f"{radio}: {one}" for radio, all_of_it in partition.items() for one in all_of_it),
+        parted_from=_partitioned_meshes(node, partition),
         meshes=node.meshes,
         has_cell=bool(live),
         is_meshed=is_meshed(seen, live),
@@ -86,21 +86,24 @@ def node_plan(
         return replace(basis, verdict=Verdict.REFUSED, reason=problem.reason, hint=problem.hint)
     files = file_changes(desired.files, seen)
     contents = {file.path: file.content for file in desired.files} if files or firmware else {}
-    shut_out = None if own_keys is None else lockout(node, contents, own_keys)
-    if shut_out is None and contents:
-        shut_out = server_lockout(after)
-    if shut_out is not None:
-        return replace(basis, verdict=Verdict.REFUSED, reason=shut_out.reason, hint=shut_out.hint)
-    told = effects((change.path for change in files), before, after, node.release)
+    locked_out = None if own_keys is None else lockout(node, contents, own_keys)
+    if locked_out is None and contents:
+        locked_out = server_lockout(after)
+    if locked_out is not None:
+        return replace(basis, verdict=Verdict.REFUSED, reason=locked_out.reason, hint=locked_out.hint)
+    node_effects = effects((change.path for change in files), before, after, node.release)
     if firmware is not None:
-        told = (Effect("firmware", Cut.NODE, f"{firmware.from_revision} -> {firmware.to_revision}"), *told)
+        node_effects = (
+            Effect("firmware", Cut.NODE, f"{firmware.from_revision} -> {firmware.to_revision}"),
+            *node_effects,
+        )
     return replace(
         basis,
         verdict=Verdict.CHANGE if files or firmware or packages else Verdict.SAME,
         firmware=firmware,
         packages=packages,
         files=files,
-        effects=told,
+        effects=node_effects,
         notes=(
             *seen.notes,
             *_tagged_ports(node, seen, after.get("network")),

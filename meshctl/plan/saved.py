@@ -93,9 +93,9 @@ def load(text: str, file: str) -> SavedPlan:
             str(document["refusal"]),
             str(document["refusal_hint"]),
         )
-        strangers = [name for stage in plan.stages for name in stage.nodes if name not in plan.nodes]
-        if strangers:
-            raise ValueError(f"stages name {', '.join(strangers)}, which is no node of the plan")
+        unknown = [name for stage in plan.stages for name in stage.nodes if name not in plan.nodes]
+        if unknown:
+            raise ValueError(f"stages name {', '.join(unknown)}, which is no node of the plan")
         return SavedPlan(
             plan, bytes.fromhex(document["salt"]), str(document["inventory"]), bool(document["with_firmware"])
         )

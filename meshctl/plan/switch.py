@@ -38,9 +38,9 @@ def switches(
 ) -> MeshSwitches:
     """The switches among these plans. `around` are members that were seen and to which nothing is done; `never_meshed`
     names nodes known to be in no cell yet (fresh from their box)."""
-    known, fresh = set(acknowledged), set(never_meshed)
+    known, new_nodes = set(acknowledged), set(never_meshed)
     nodes: dict[str, tuple[str, ...]] = {}
-    left: dict[str, tuple[str, ...]] = {}
+    left_behind: dict[str, tuple[str, ...]] = {}
     blocked: dict[str, tuple[str, ...]] = {}
     for mesh in fleet.meshes:
         members = [plans[node.name] for node in fleet.members(mesh) if node.name in plans]
@@ -57,17 +57,19 @@ def switches(
         flashed = [f"{plan.node}: its firmware changes too" for plan in parting if plan.firmware is not None]
         if refused or flashed:
             blocked[mesh] = (*refused, *flashed)
-        there = {plan.node for plan in staying}
-        unplanned = [node.name for node in fleet.members(mesh) if node.name not in plans and node.name not in there]
+        staying_names = {plan.node for plan in staying}
+        unplanned = [
+            node.name for node in fleet.members(mesh) if node.name not in plans and node.name not in staying_names
+        ]
         away = [plan.node for plan in members if plan.verdict is Verdict.AWAY]
         behind = tuple(
             name
             for name in (*away, *unplanned)
-            if name not in known and name not in fresh and fleet.nodes[name].state is not NodeState.SPARE
+            if name not in known and name not in new_nodes and fleet.nodes[name].state is not NodeState.SPARE
         )
         if behind and ALL not in known:
-            left[mesh] = behind
-    return MeshSwitches(_joined(nodes), left, blocked)
+            left_behind[mesh] = behind
+    return MeshSwitches(_joined(nodes), left_behind, blocked)
 
 
 def _joined(switching: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:

@@ -80,7 +80,7 @@ def test_what_no_reader_accepts_is_replaced_and_not_shown() -> None:
 
 
 def test_a_silent_node_is_away_with_its_reason() -> None:
-    plan = planned(fleet(), "b01", None, away="no answer at 10.42.0.101")
+    plan = planned(fleet(), "b01", None, unreachable="no answer at 10.42.0.101")
     assert (plan.verdict, plan.reason) == (Verdict.AWAY, "no answer at 10.42.0.101")
 
 
