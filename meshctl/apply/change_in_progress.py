@@ -1,7 +1,7 @@
-"""A change under way on one node: sending it, beginning it, finding the node again, looking, confirming.
+"""The steps of a change on one node; each may be repeated after its connection was cut.
 
-`prepare` (install the switch, lock, stage, arm) and `begin` go over the connection at hand; from then on each look is
-over a new connection (`reach`, `look`), and `confirm` opens one of its own. Each verb may be repeated after a cut.
+`arm` (install the dead-man's switch, lock, stage, arm) and `start` use the existing connection. After that every
+observation uses a new one (`connect`, `observe_and_decide`), and `confirm` or `abort` ends the change.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from meshctl.plan import Cut
 from meshctl.plan.radios import NO_RADIOS, Radios, restarting_radios
 from meshctl.plan.seen import WIRELESS, packages_seen
 
-# A lock outlives its change by this much, for the moves after it.
+# The lock outlives the confirm window by this much, for the actions after it.
 LOCK_SLACK_S = 60
-# reload_config returns before netifd has begun: procd gathers events for 1 s, then interfaces go down and come up.
+# reload_config returns before netifd starts: procd collects events for 1 s, then interfaces go down and come up.
 SETTLE_S = 3.0
-# The answer to `apply` has to be out before the change cuts the connection; one that is late is not waited for long.
+# The change starts after this delay, so that the answer to `apply` arrives before the connection may be cut.
 APPLY_DELAY_S, APPLY_ANSWER_TIMEOUT_S = 0.5, 15.0
 # Erasing 16 MB of NOR takes up to three minutes, more with other work beside it.
 FLASH_READY_TIMEOUT_S = 600.0
@@ -44,9 +44,9 @@ ABSENT = ChangeStatus("absent", installed=False)
 
 @dataclass(slots=True)
 class ChangeInProgress:
-    """One change. `old` is where the node answers before it, `new` where it shall answer after it: the first of
-    `places`, until it was `met` at another. `gaps` is what was still missing when the node was last seen (`last`),
-    `trouble` why it was not."""
+    """A change and its progress. The node answers at `old` before the change and at `new` after it: the first of
+    `candidates`, unless it was `found_at` another. `unmet` lists the health checks that failed in the latest
+    observation (`last`); `last_error` is why there was none."""
 
     ctx: NodeContext
     payload: Change
@@ -58,19 +58,19 @@ class ChangeInProgress:
     unmet: tuple[str, ...] = ()
     last: Observation | None = None
     last_error: str = ""
-    # that it let nobody in, since it was last seen with the change in force
+    # the refused login, since the change was last observed as applied
     login_refused: str = ""
-    # why it could not be reached, since it was last seen with the change in force
+    # why the node was unreachable, since the change was last observed as applied
     connect_error: str = ""
-    # decided against: from now on it is only ever taken back
+    # from now on the change is only ever aborted
     is_abandoned: bool = False
-    # what it does besides files may take so long before its window begins
+    # how long its `extra` script may take before the confirm window starts
     extra_s: float = 0.0
-    # those that start anew with it
+    # the radios that the change restarts
     radios: Radios = NO_RADIOS
-    # the one of `places` where it was met
+    # the one of `candidates` where the node answered
     found_at: Endpoint | None = None
-    # whether its services have taken up the change: only a connection opened after that proves anything
+    # whether its services have reloaded: only a connection opened after that proves the node reachable
     is_reloaded: bool = False
     flush: StationFlush = field(init=False, repr=False)
 
@@ -87,17 +87,17 @@ class ChangeInProgress:
 
     @property
     def status(self) -> ChangeStatus:
-        """What the node's switch said when it was last seen."""
+        """The state of the dead-man's switch in the latest observation."""
         return ABSENT if self.last is None else self.last.change or ABSENT
 
     @property
     def settle_s(self) -> float:
-        """How long the change has to stand before what is seen counts as its effect."""
+        """How long the change must be applied before an observation counts as its effect."""
         return SETTLE_S if self.ctx.plan.cut > Cut.LOGIN else 0.0
 
 
 def new_change(ctx: NodeContext, old: Endpoint, *, window_s: int | None = None) -> ChangeInProgress:
-    """A new change for a node that is reached at `old` now."""
+    """A new change for a node that answers at `old` now."""
     services = services_of(ctx.run.fleet, ctx.node)
     return ChangeInProgress(
         ctx,
@@ -111,7 +111,7 @@ def new_change(ctx: NodeContext, old: Endpoint, *, window_s: int | None = None) 
 
 
 def _radios_of(ctx: NodeContext) -> Radios:
-    """Which of the node's radios start anew with its plan's files."""
+    """The radios that restart with the plan's files."""
     if not any(change.path == WIRELESS for change in ctx.plan.files):
         return NO_RADIOS
     before = packages_seen([WIRELESS], ctx.before)["wireless"]
@@ -119,7 +119,7 @@ def _radios_of(ctx: NodeContext) -> Radios:
 
 
 def arm(change: ChangeInProgress, connection: SshConnection) -> None:
-    """Bring the change there and arm it; nothing it touches has changed yet. Raises NodeRefused, NodeError."""
+    """Upload the change and arm it; no file has changed yet. Raises NodeRefused, NodeError."""
     ctx, owner = change.ctx, change.ctx.run.owner
     change.starts += 1
     await_flash(ctx, connection)
@@ -134,11 +134,11 @@ def arm(change: ChangeInProgress, connection: SshConnection) -> None:
 
 
 def await_flash(ctx: NodeContext, connection: SshConnection) -> None:
-    """Wait until / is in flash: at its first boot a node is in memory until its flash is formatted, and what is written
-    until then may be lost. Raises NodeError when that does not come to pass."""
+    """Wait until / is in flash: at its first boot a node runs from memory until its flash is formatted, and may lose
+    what is written before. Raises NodeError on timeout."""
     if not ctx.before.root_in_ram or not root_in_ram(connection):
         return
-    ctx.run.note("its flash is not ready yet (first boot): waiting", ctx.name)
+    ctx.run.note("waiting for its flash to be formatted (first boot)", ctx.name)
     backoff = Backoff(FLASH_READY_TIMEOUT_S, ctx.run.interrupt)
     with ctx.step("flash ready"):
         while root_in_ram(connection):
@@ -146,13 +146,13 @@ def await_flash(ctx: NodeContext, connection: SshConnection) -> None:
                 raise NodeError(
                     f"{ctx.name}: its flash was not ready within {FLASH_READY_TIMEOUT_S / 60:.0f} minutes; "
                     "nothing was changed",
-                    hint="switch it off and on, then run again",
+                    hint="power-cycle it, then run again",
                 )
             backoff.pause()
 
 
 def install_switch(ctx: NodeContext, connection: SshConnection) -> None:
-    """Put the switch there unless this very version already is."""
+    """Install the dead-man's switch unless the node has this version."""
     known = ctx.before.change
     own = re.search(rb"^VERSION=(\S+)", deadman.installed_files()[deadman.PROGRAM][1], re.MULTILINE)
     if known is None or not known.installed or own is None or known.version != own[1].decode():
@@ -160,10 +160,10 @@ def install_switch(ctx: NodeContext, connection: SshConnection) -> None:
 
 
 def start(change: ChangeInProgress, connection: SshConnection, *, at_uptime_s: float | None = None) -> None:
-    """Have the node begin: in a moment, or when its own uptime reaches `at_uptime_s`.
+    """Start the change: in a moment, or when the node's uptime reaches `at_uptime_s`.
 
-    The change may cut this very connection, so an answer that does not come soon is not waited for: the window is
-    running. Raises NodeRefused, Unreachable.
+    The change may cut this connection while its confirm window runs, so the wait for the answer is short. Raises
+    NodeRefused, Unreachable.
     """
     change.flush.started()
     patience = threading.Timer(min(APPLY_ANSWER_TIMEOUT_S, change.window_s / 4), connection.close)
@@ -178,7 +178,7 @@ def start(change: ChangeInProgress, connection: SshConnection, *, at_uptime_s: f
 
 
 def connect(change: ChangeInProgress) -> SshConnection | None:
-    """A new connection to where the node shall be, or else to where it was."""
+    """A new connection to the node's new address, or else to its old one."""
     ctx = change.ctx
     for endpoint in dict.fromkeys((change.new, *change.candidates, change.old)):
         try:
@@ -195,7 +195,7 @@ def connect(change: ChangeInProgress) -> SshConnection | None:
 
 
 def observe_and_decide(change: ChangeInProgress, connection: SshConnection) -> Action:
-    """Observe the node once and say what is next. Raises Unreachable."""
+    """Observe the node once and return the next action. Raises Unreachable."""
     ctx = change.ctx
     busy = _while_it_reloads(change, connection)
     if busy is not None:
@@ -207,7 +207,7 @@ def observe_and_decide(change: ChangeInProgress, connection: SshConnection) -> A
         change.flush.observed()
     change.unmet = unmet(ctx.expected.with_base_macs(ctx.run.current_base_macs()), change.last, since_s=age_s)
     if age_s is not None and age_s < change.settle_s:
-        change.unmet = (*change.unmet, "it has not settled yet")
+        change.unmet = (*change.unmet, "its services may still be reloading")
     return next_action(
         change.id,
         change.status,
@@ -219,21 +219,22 @@ def observe_and_decide(change: ChangeInProgress, connection: SshConnection) -> A
 
 
 def _while_it_reloads(change: ChangeInProgress, connection: SshConnection) -> Action | None:
-    """What is next as long as the node's services take up the change; None when it is time to look at everything.
+    """The next action while the node's services reload; None when it is time for a full observation.
 
-    That would hold them up on a small processor, and be cut short when they take the radio down. Raises Unreachable.
+    A full observation would slow the reload on a small processor, and break when the radio goes down. Raises
+    Unreachable.
     """
     try:
         status = deadman.status(connection)
     except CommandFailed:
-        # what is wrong there the observation tells
+        # the observation reports the fault
         return None
     if status.change_id != change.id or status.state not in ("waiting", "applied"):
         return None
     if status.reload_status is not None:
         if change.is_reloaded or status.state != "applied":
             return None
-        # this very connection may have been let in before the effects were in force
+        # this connection may have been accepted before the change took effect
         change.is_reloaded = True
     if status.state == "applied":
         change.login_refused = change.connect_error = ""
@@ -251,9 +252,9 @@ def _while_it_reloads(change: ChangeInProgress, connection: SshConnection) -> Ac
 
 
 def confirm(change: ChangeInProgress) -> bool:
-    """Confirm over a connection opened only now: that it lets us in after the change is the proof.
+    """Confirm over a new connection: a login after the change is the proof that the node is reachable.
 
-    False when the window had run out on the way. Raises Unreachable.
+    False when the window ran out meanwhile. Raises Unreachable.
     """
     ctx = change.ctx
     connection = ctx.run.connections.open(ctx.node, endpoint=change.new)
@@ -271,12 +272,12 @@ def confirm(change: ChangeInProgress) -> bool:
 
 
 def unlock(change: ChangeInProgress, connection: SshConnection) -> None:
-    """Give the lock back; that it cannot be (it runs out by itself) changes nothing about the outcome."""
+    """Release the lock. A failure does not change the outcome: the lock expires by itself."""
     with suppress(NodeError):
         deadman.unlock(connection, change.ctx.run.owner)
 
 
 def abort(change: ChangeInProgress, connection: SshConnection) -> None:
-    """Have the node undo the change now. What the node refuses it will tell in its next status."""
+    """Roll the change back now. If the node refuses, its next status shows why."""
     with suppress(NodeRefused):
         deadman.abort(connection, change.ctx.run.owner, change.id)

@@ -1,9 +1,8 @@
-"""Change one node's configuration so that every way out but a proof leads back to what it had.
+"""Commit-confirm for one node: a change is confirmed after it has proven itself, or the node rolls it back.
 
-`configure` sends the change over the connection at hand and begins it, then follows the node's own dead-man's switch
-over new connections (`follow`) until the change is confirmed or undone. A cut at any point ends in the same loop: it
-asks the node what is, and does what is next. While the node is silent, and once it is back, its neighbours are asked to
-forget the radio it had (`forgetting`).
+`run_change` arms and starts the change over the existing connection, then polls the node's dead-man's switch over new
+connections (`poll`) until the change is confirmed or rolled back. After a cut at any point the same loop goes on: it
+reads the node's state and takes the next action. Meanwhile `station_flush` removes stale station entries.
 """
 
 from __future__ import annotations
@@ -30,23 +29,23 @@ from meshctl.errors import NodeError, Unreachable
 from meshctl.fleet import Outcome, Result
 from meshctl.nodes.backoff import Backoff
 
-# After the window: the node puts its files back, reloads, and its mesh finds it again; a reboot when that fails.
+# After the window the node restores its files, reloads and rejoins its mesh, or reboots where that fails.
 GRACE_AFTER_WINDOW_S = 60.0
-# A link that breaks again and again before anything began is given up after so many starts.
+# Give up on a link that breaks this often before the change starts.
 MAX_STARTS = 3
 
 
 def configure(ctx: NodeContext, connection: SshConnection) -> Outcome:
-    """Carry out the file changes of a node's plan. Owns `connection`, and keeps one to the node if all went well.
+    """Apply the file changes of a node's plan. Owns `connection`; a confirmed node's connection goes to the pool.
 
     Raises NodeError only when nothing was changed on the node.
     """
-    # a device that was met on the bench is known by its name from now on
+    # a bench device is identified by its node name from now on
     return run_change(new_change(ctx, replace(connection.endpoint, identity=ctx.name)), connection)
 
 
 def run_change(change: ChangeInProgress, connection: SshConnection) -> Outcome:
-    """Carry a change to its end. Owns `connection`, and keeps one to the node if all went well.
+    """Run a change to its end. Owns `connection`; a confirmed node's connection goes to the pool.
 
     Raises NodeError only when nothing was changed on the node.
     """
@@ -58,7 +57,7 @@ def run_change(change: ChangeInProgress, connection: SshConnection) -> Outcome:
             change.flush.watch_neighbors(for_s=_limit_s(change))
         start(change, connection)
     except Unreachable as error:
-        # how far it came, the node itself will tell
+        # the node's status shows how far it got
         change.last_error = str(error)
     except NodeRefused as refusal:
         unlock(change, connection)
@@ -73,7 +72,7 @@ def run_change(change: ChangeInProgress, connection: SshConnection) -> Outcome:
 
 
 def poll(change: ChangeInProgress) -> Outcome:
-    """Ask and do what is next until the change has ended one way or the other."""
+    """Observe and act until the change has ended."""
     run_context = change.ctx.run
     backoff = Backoff(_limit_s(change), run_context.interrupt)
     run_context.interrupt.wait(change.settle_s)
@@ -101,7 +100,7 @@ def poll(change: ChangeInProgress) -> Outcome:
 
 
 def _act(change: ChangeInProgress, connection: SshConnection) -> Outcome | None:
-    """Look at the node once and make the next move; an outcome when it was the last."""
+    """Observe the node once and take the next action; the outcome once the change has ended."""
     name = change.ctx.name
     match observe_and_decide(change, connection):
         case Action.CONFIRM:
@@ -117,7 +116,7 @@ def _act(change: ChangeInProgress, connection: SshConnection) -> Outcome | None:
             return Outcome(name, Result.ROLLED_BACK, why)
         case Action.FOREIGN:
             status = change.status
-            return Outcome(name, Result.REFUSED, f"a change of {status.owner} is {status.state} on it")
+            return Outcome(name, Result.REFUSED, f"{status.owner} has a change {status.state} on it")
         case Action.START | Action.BEGIN as move:
             return _resend(change, connection, move)
         case Action.WAIT:
@@ -126,13 +125,13 @@ def _act(change: ChangeInProgress, connection: SshConnection) -> Outcome | None:
 
 
 def _resend(change: ChangeInProgress, connection: SshConnection, move: Action) -> Outcome | None:
-    """The node has nothing of ours that would begin by itself: send what is missing again, a few times."""
+    """Arm or start again, a few times: nothing of ours will start by itself on the node."""
     name = change.ctx.name
     if change.starts >= MAX_STARTS:
         with suppress(NodeError):
             abort(change, connection)
         unlock(change, connection)
-        return Outcome(name, Result.FAILED, f"its link breaks before the change is there: {change.last_error}")
+        return Outcome(name, Result.FAILED, f"its link breaks before the change is armed: {change.last_error}")
     try:
         if move is Action.START:
             arm(change, connection)
@@ -147,7 +146,7 @@ def _resend(change: ChangeInProgress, connection: SshConnection, move: Action) -
 
 
 def _limit_s(change: ChangeInProgress) -> float:
-    """Within this time the change has been confirmed or undone."""
+    """The time within which the change is confirmed or rolled back."""
     return change.settle_s + change.extra_s + change.window_s + GRACE_AFTER_WINDOW_S
 
 
@@ -162,7 +161,7 @@ def _flush_stations(change: ChangeInProgress, outcome: Outcome) -> None:
 
 def _uncertain(change: ChangeInProgress) -> Outcome:
     if change.ctx.run.interrupt.leaving:
-        why = f"left while its change was under way; it goes back by itself within {change.window_s} s"
+        why = f"interrupted during its change; it rolls back by itself within {change.window_s} s"
     else:
-        why = f"not seen since its change began ({change.last_error}); by its own timer it has gone back"
-    return Outcome(change.ctx.name, Result.UNCERTAIN, why, hint="`meshctl resume` looks at it again")
+        why = f"unreachable since its change started ({change.last_error}); its timer has rolled it back"
+    return Outcome(change.ctx.name, Result.UNCERTAIN, why, hint="run `meshctl resume` to check it again")

@@ -1,7 +1,7 @@
-"""Carry out a plan, stage by stage: every node of it ends with exactly one outcome, in the journal as it happens.
+"""Execute a plan stage by stage; every node ends with one outcome, journaled at once.
 
-`carry_out` runs each stage's nodes together (`_one_node`: firmware, or packages and then files), a switch as one. A
-failed canary, a spent failure budget or Ctrl-C stops what has not begun; what is in work comes to its own end.
+`execute` runs the nodes of a stage in parallel (`_change_node`: firmware, or packages and then files) and a mesh change
+as one. A failed canary, an exhausted failure budget or Ctrl-C prevents further starts; nodes in progress finish.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from meshctl.plan import NodePlan, Plan, Stage, StageKind, Verdict
 
 @dataclass(frozen=True, slots=True)
 class RunSettings:
-    """Where and for whom a plan is carried out."""
+    """The settings of a run: fleet, connections, journal, owner, observers."""
 
     fleet: Fleet
     connections: ConnectionPool
@@ -58,8 +58,8 @@ class RunSettings:
 
 
 def execute(prepared: Prepared, settings: RunSettings) -> dict[str, Outcome]:
-    """Apply the plan. Raises InputError and InvalidInput before anything is changed: an image or package file that is
-    not what the inventory says."""
+    """Apply the plan. Raises InputError and InvalidInput, before any change, for an image that does not match the
+    inventory."""
     plan, fleet = prepared.plan, settings.fleet
     images = {
         node.hardware.name: checked_image(node.hardware)
@@ -76,8 +76,8 @@ def execute(prepared: Prepared, settings: RunSettings) -> dict[str, Outcome]:
     budget = FailureBudget(fleet.apply.stop_after_failures)
     stopped = ""
     for stage in plan.stages:
-        # a canary that was left in the middle is no canary that failed
-        reason = "interrupted before its turn" if settings.interrupt.stopping else stopped
+        # an interrupted canary is not a failed one
+        reason = "interrupted before it started" if settings.interrupt.stopping else stopped
         if reason:
             ended = {name: Outcome(name, Result.PENDING, reason) for name in stage.nodes}
             for outcome in ended.values():
@@ -95,8 +95,8 @@ def execute(prepared: Prepared, settings: RunSettings) -> dict[str, Outcome]:
 
 
 def _unflushed(prepared: Prepared, settings: RunSettings) -> dict[str, float]:
-    """The nodes that answered whose radios may have started anew without their neighbours having been told, and since
-    when (Unix time): of a change's beginning the end was not seen, or they have booted since they were last known."""
+    """Node -> since when (Unix time) its radios may have restarted without a station flush: the end of a change was not
+    observed, or the node has booted since. Only nodes that answered."""
     seen = prepared.observed.observations
     missing = settings.journal.unfinished_changes(settings.fleet.name)
     booted = {name: unflushed_boot_s(name, seen) for name in prepared.plan.nodes}
@@ -127,14 +127,14 @@ def _run_context(prepared: Prepared, settings: RunSettings, unflushed: Iterable[
     )
 
 
-# Results of a node that was in work and is out of sight.
+# Results of a node that was in progress and is unreachable now.
 _LOST = (Result.UNCERTAIN, Result.UNREACHABLE)
 
 
 def _with_last_seen(
     prepared: Prepared, settings: RunSettings, contexts: Mapping[str, NodeContext], outcomes: Mapping[str, Outcome]
 ) -> dict[str, Outcome]:
-    """The outcomes of nodes that did not return, with what was last seen of them, and by whom."""
+    """The outcomes of nodes that did not come back, with their last known state and who still hears them."""
     missing = [name for name in contexts if outcomes[name].result in _LOST]
     if not missing or settings.interrupt.leaving:
         return {}
@@ -154,7 +154,7 @@ def _with_last_seen(
 
 
 def _with_unflushed_neighbors(run_context: RunContext, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
-    """The outcomes of nodes that some neighbour may not hear for a while, with who that is."""
+    """The outcomes of nodes of which some neighbors may still hold a stale station entry, with these neighbors."""
     updated = {}
     for name, unflushed in retry_unanswered(run_context).items():
         updated[name] = replace(outcomes[name], facts={**outcomes[name].facts, UNFLUSHED: " ".join(unflushed)})
@@ -168,7 +168,7 @@ def _finish(settings: RunSettings, outcome: Outcome) -> None:
 
 
 def _unchanged_outcome(fleet: Fleet, plan: NodePlan) -> Outcome | None:
-    """The outcome of a node that nothing is done to; None for one that is changed."""
+    """The outcome of a node that is not changed; None for one that is."""
     match plan.verdict:
         case Verdict.SAME:
             return Outcome(plan.node, Result.UNCHANGED)
@@ -210,7 +210,7 @@ def _run_stage(
     return run(
         stage.nodes,
         lambda name: _change_node(contexts[name], images),
-        # a stage says who may be down together, the policy how many we can work on at once
+        # the stage limits which nodes may be down together, the policy how many are worked on at once
         parallel=max(1, run_context.fleet.apply.parallel),
         budget=budget,
         interrupt=settings.interrupt,
@@ -227,7 +227,7 @@ def _journaling(journal_run: Run) -> Observer:
 
 
 def _change_node(ctx: NodeContext, images: Mapping[str, Path]) -> Outcome:
-    """Firmware, or packages and then files. NodeError means that nothing was changed."""
+    """Change firmware, or packages and then files. NodeError means that nothing was changed."""
     if ctx.plan.firmware is not None:
         return flash(ctx, _connection(ctx), images[ctx.node.hardware.name])
     outcome = Outcome(ctx.name, Result.DONE)
@@ -240,13 +240,15 @@ def _change_node(ctx: NodeContext, images: Mapping[str, Path]) -> Outcome:
     except NodeError as error:
         if ctx.plan.packages is None:
             raise
-        # its packages are there to stay, and a resume has only the files left to do
+        # its packages stay installed, so a resume only has to apply the files
         failed = outcome_of_error(ctx.name, error)
-        return replace(failed, result=Result.FAILED, reason=f"its packages are installed, its files not: {error}")
+        return replace(
+            failed, result=Result.FAILED, reason=f"its packages are installed, but its files are not applied: {error}"
+        )
 
 
 def _connection(ctx: NodeContext) -> SshConnection:
-    """The kept connection, or a new one to where the node is now: on the bench, if it was met there."""
+    """The pooled connection, or a new one to where the node is now: on the bench, if it was discovered there."""
     connections = ctx.run.connections
     return connections.acquire(ctx.name) or connections.open(
         ctx.node, endpoint=connections.bench_endpoints.get(ctx.name)
@@ -256,13 +258,13 @@ def _connection(ctx: NodeContext) -> SshConnection:
 def _switch_stage(
     stage: Stage, contexts: Mapping[str, NodeContext], plan: Plan, run_context: RunContext, observer: Observer
 ) -> dict[str, Outcome]:
-    """Packages first, which cut nothing; then everybody at one moment."""
+    """Install packages first, which interrupts nothing; then change all nodes simultaneously."""
     began = time.monotonic()
     for name in stage.nodes:
         observer(Event(EventKind.STARTED, name, time.time()))
     failed = _packages_first(stage, contexts)
     if failed:
-        reason = f"the switch was called off: {', '.join(failed)} was not ready"
+        reason = f"the mesh change was cancelled: packages could not be installed on {', '.join(failed)}"
         ended = {name: failed.get(name) or Outcome(name, Result.PENDING, reason) for name in stage.nodes}
     else:
         ended = commit_mesh(

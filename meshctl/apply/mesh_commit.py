@@ -1,9 +1,9 @@
-"""Change a whole mesh at one moment: all of it, or none.
+"""Change a whole mesh simultaneously, all or nothing: arm, schedule, prove, then confirm or roll back.
 
-`switch`: every node is prepared and armed (`_prepare`); each is given the same moment, as its own uptime measured just
-before (`_schedule`), so no clock has to be right; then all are looked for in the new cell (`_gather_again`). When all
-have proven themselves they are confirmed; at the last moment a quorum of each mesh with the base among it is enough.
-Otherwise those that can be reached are taken back, the farthest first, and the others go back by their own timers.
+`commit_mesh` arms every participant (`_arm`) and schedules the same moment on all, as the uptime of each node measured
+just before (`_schedule`), so no clock has to be set. Then it looks for all of them in the new cell (`_decide`). When
+all have proven themselves they are confirmed; at the deadline a quorum of each mesh that includes the base is enough.
+Otherwise the reachable nodes are rolled back, the farthest first, and the others by their own timers.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from meshctl.errors import NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.nodes.backoff import Backoff
 
-# The moment lies this many of the slowest node's round trips ahead, for each turn of the parallel sending, and at
-# least LEAD_S, within which a start-stop-daemon and two shells have started on the slowest board.
+# The scheduled moment is this many round trips of the slowest node ahead, for each batch of parallel commands, and at
+# least LEAD_S: the slowest board needs that to start a start-stop-daemon and two shells.
 LEAD_ROUND_TRIPS = 6
 LEAD_S = 2.0
-# So much of the window is kept for confirming.
+# The share of the confirm window reserved for confirming.
 CONFIRM_SHARE = 0.25
-# The fact beside the outcome of a node that did not make it: what parts it from its mesh now.
+# The fact in the outcome of a node left in the old cell: what differs between its cell and the mesh's.
 LEFT_BEHIND = "left_behind"
 
 
 @dataclass(slots=True)
 class Participant:
-    """One node of the switch. `failure` is why it cannot take part."""
+    """One node of the mesh change. `failure` is why it cannot take part."""
 
     ctx: NodeContext
     change: ChangeInProgress | None = None
@@ -63,13 +63,13 @@ class Participant:
 
     @property
     def meshes(self) -> tuple[str, ...]:
-        """The meshes whose cell it changes."""
+        """The meshes whose cell this node changes."""
         return self.ctx.plan.parted_from
 
 
 @dataclass(slots=True)
 class _MeshCommit:
-    """The switch under way. `members` are in the order in which they may be lost: farthest first, the entry last."""
+    """A mesh change in progress. `participants` are ordered farthest first, the entry node last."""
 
     run: RunContext
     participants: Sequence[Participant]
@@ -79,7 +79,7 @@ class _MeshCommit:
     pool: ThreadPoolExecutor = field(repr=False)
 
     def each(self, participants: Iterable[Participant], act: Callable[[Participant], None]) -> None:
-        """Do it for all, `parallel` at a time, and wait; a bug is raised."""
+        """Run `act` for all, `parallel` at a time, and wait; an unexpected exception is raised."""
         for future in [self.pool.submit(act, participant) for participant in participants]:
             future.result()
 
@@ -87,36 +87,36 @@ class _MeshCommit:
 def commit_mesh(
     run_context: RunContext, contexts: Sequence[NodeContext], *, quorum: float, parallel: int, entry: str
 ) -> dict[str, Outcome]:
-    """Carry out the jobs' file changes at one moment. Returns each node's outcome; nothing is raised for a node."""
+    """Apply the file changes of these nodes simultaneously. Returns each node's outcome; raises nothing for a node."""
     participants = [Participant(ctx) for ctx in contexts]
     window_s = max(ctx.node.confirm_window_s for ctx in contexts)
     with ThreadPoolExecutor(max_workers=max(1, parallel), thread_name_prefix="switch") as pool:
         commit = _MeshCommit(run_context, participants, window_s, max(1, parallel), entry, pool)
         commit.each(participants, lambda participant: _arm(commit, participant))
         if any(participant.failure for participant in participants) or run_context.interrupt.stopping:
-            return _cancel(commit, "the switch was called off: not every node was ready")
+            return _cancel(commit, "the mesh change was cancelled: not every node could be armed")
         _schedule(commit)
         if not all(participant.is_scheduled for participant in participants):
-            return _cancel(commit, "the switch was called off: not every node took the moment")
+            return _cancel(commit, "the mesh change was cancelled: not every node could be scheduled")
         needed = quorum_of(participants, quorum)
         quorum_text = ", ".join(
             f"{count} of mesh {mesh}" if len(needed) > 1 else f"{count}" for mesh, count in needed.items()
         )
-        run_context.note(f"{len(participants)} nodes change at one moment; {quorum_text} of them have to meet again")
+        run_context.note(f"{len(participants)} nodes change simultaneously; {quorum_text} must rejoin")
         return _decide(commit, needed)
 
 
 def quorum_of(participants: Iterable[Participant], quorum: float) -> dict[str, int]:
-    """How many nodes of each changing mesh have to meet again."""
+    """How many nodes of each changing mesh must rejoin it."""
     counts = Counter(mesh for participant in participants for mesh in participant.meshes)
     return {mesh: max(1, math.ceil(quorum * count)) for mesh, count in counts.items()}
 
 
 def short_of_quorum(proven: Iterable[Participant], needed: Mapping[str, int]) -> str:
-    """Which meshes are short of nodes; empty when each has as many as it needs."""
+    """Which meshes are below their quorum; empty when none is."""
     there = Counter(mesh for participant in proven for mesh in participant.meshes)
     short = {mesh: count for mesh, count in needed.items() if there[mesh] < count}
-    return "; ".join(f"{there[mesh]} of mesh {mesh} met again, {count} needed" for mesh, count in short.items())
+    return "; ".join(f"{there[mesh]} of mesh {mesh} rejoined, {count} required" for mesh, count in short.items())
 
 
 def _arm(commit: _MeshCommit, participant: Participant) -> None:
@@ -131,7 +131,7 @@ def _arm(commit: _MeshCommit, participant: Participant) -> None:
 
 
 def _schedule(commit: _MeshCommit) -> None:
-    """Tell every node the moment, in its own uptime."""
+    """Schedule the change on every node, in its own uptime."""
     slowest_s = max(
         (2 * participant.clock.error_s for participant in commit.participants if participant.clock is not None),
         default=0.0,
@@ -157,7 +157,7 @@ def _schedule(commit: _MeshCommit) -> None:
 
 
 def _cancel(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:
-    """Nothing has changed yet, or is about to: drop it everywhere."""
+    """Cancel the change on every node before it starts."""
 
     def cancel_one(participant: Participant) -> None:
         change = participant.change
@@ -171,7 +171,7 @@ def _cancel(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:
         except NodeError as error:
             change.last_error = str(error)
         if participant.is_scheduled or change.last_error:
-            # it may have begun before it could be dropped
+            # it may have started before it was aborted
             outcome = poll(change)
             if not outcome.result.is_good:
                 participant.failure = participant.failure or outcome
@@ -184,7 +184,7 @@ def _cancel(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:
 
 
 def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome]:
-    """Look for everybody in the new cell until all are there or it is time to decide; then decide, once."""
+    """Observe the participants in the new cell until all have proven themselves or time is up; then decide, once."""
     backoff = Backoff(commit.window_s * (1 - CONFIRM_SHARE), commit.run.interrupt)
     commit.run.interrupt.wait(
         max(participant.change.settle_s for participant in commit.participants if participant.change is not None)
@@ -210,7 +210,7 @@ def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome
 
 
 def unmet_of(participant: Participant) -> str:
-    """`b01: it has no way to the base`: what kept a member from proving itself when it was last looked for."""
+    """`b01: it has no route to the base`: why a participant had not proven itself in its latest observation."""
     change = participant.change
     if change is None or participant.is_unreachable or not change.unmet:
         last_error = "" if change is None else change.last_error
@@ -220,7 +220,7 @@ def unmet_of(participant: Participant) -> str:
 
 def _flush_unreachable(commit: _MeshCommit, proven: Sequence[Participant]) -> None:
     """Where a cell keeps its channel and BSSID, a node that changed early still hears one that changes late, and may
-    come to know its old radio."""
+    create a station entry of the radio before its restart."""
     names = {participant.name for participant in proven}
 
     def flush_one(participant: Participant) -> None:
@@ -247,8 +247,7 @@ def _prove(participant: Participant) -> None:
 
 
 def _confirm_all(commit: _MeshCommit) -> dict[str, Outcome]:
-    """Confirm those that are there, and those that come late, again and again until the window's end; the others are
-    left behind."""
+    """Confirm the proven participants, and late ones until the window ends; the others are left behind."""
 
     def confirm_one(participant: Participant) -> None:
         if not participant.is_proven:
@@ -275,19 +274,19 @@ def _confirmed_outcome(participant: Participant) -> Outcome:
     unmet = (
         "; ".join(participant.change.unmet)
         if participant.change is not None and participant.change.unmet
-        else "it was not seen"
+        else "it was not observed"
     )
     return Outcome(
         participant.name,
         Result.UNCERTAIN,
-        f"left behind: the others are in the new cell, it goes back to the old one ({unmet})",
-        hint="reach it by cable and `meshctl resume`, or take the mesh back to the old cell",
+        f"left behind: the others are in the new cell, it rolls back to the old one ({unmet})",
+        hint="connect it by cable and run `meshctl resume`, or change the mesh back to the old cell",
         facts={LEFT_BEHIND: ", ".join(participant.ctx.plan.splits)},
     )
 
 
 def _roll_back(commit: _MeshCommit, why: str) -> dict[str, Outcome]:
-    """Take back whoever can be reached, the farthest first, so that the way to the others lasts; then see them back."""
+    """Roll the reachable nodes back, the farthest first so that the path to the others lasts; then poll them all."""
     unmet = {
         participant.name: unmet_of(participant) for participant in commit.participants if not participant.is_proven
     }

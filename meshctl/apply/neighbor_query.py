@@ -1,7 +1,7 @@
-"""Look at those who may know a node's radio, where a command is about that node alone: restore, replace, bootstrap.
+"""Observe the neighbors of nodes, for commands that concern those nodes alone: restore, replace, bootstrap.
 
-A plan for a running mesh looks at all of it (`planning`). Here whoever the node hears is enough, and whoever it heard
-when it was last seen, if that is so short ago that they may still know it.
+A plan for a running mesh observes all of it (`prepare`). Here the neighbors a node hears are enough, and those it heard
+when last seen, if that was recent enough for them to still hold its station entry.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from meshctl.model import Fleet
 from meshctl.nodes.collect import collect, known_macs
 from meshctl.nodes.connections import ConnectionPool
 
-# So long an 802.11s mesh remembers whom it does not hear (IEEE80211_MESH_PEER_INACTIVITY_LIMIT, net/mac80211/mesh.h);
-# an ad-hoc cell forgets within a minute.
+# How long an 802.11s mesh keeps a peer it does not hear (IEEE80211_MESH_PEER_INACTIVITY_LIMIT, net/mac80211/mesh.h);
+# an ad-hoc cell drops it within a minute.
 REMEMBERED_S = 1800.0
 
 
@@ -32,9 +32,9 @@ def observe_neighbors(
     observations: Mapping[str, Observation] = MappingProxyType({}),
     interrupt: Interrupt | None = None,
 ) -> dict[str, Observation]:
-    """What these nodes told, and what those told who answer of their neighbours; `told` is what others told already.
+    """Observations of these nodes and of their reachable neighbors; `observations` holds those already made.
 
-    Connections stay with `access`.
+    Connections stay in the pool.
     """
     names = known_neighbors(fleet, seen, known, now_s=time.time())
     nodes = [fleet.nodes[name] for name in names if name not in observations]
@@ -47,7 +47,7 @@ def observe_neighbors(
 def known_neighbors(
     fleet: Fleet, seen: Mapping[str, Observation], known: Mapping[str, LastKnown], *, now_s: float
 ) -> tuple[str, ...]:
-    """The nodes beside these that may know one of them. Pure."""
+    """The other nodes that may hold a station entry of one of these. Pure."""
     names = known_macs(fleet, known)
     neighbors: list[str] = []
     for name, observation in seen.items():

@@ -1,8 +1,8 @@
-"""Install the packages a node lacks, from files: it has no internet. Under its dead-man's switch, like every change.
+"""Install missing packages from local files (nodes have no internet), under the dead-man's switch.
 
-The files are brought to the node's memory; then its own process removes what conflicts and installs, and that is
-confirmed over a new connection once nothing is lacking and the neighbours it had are heard again. Otherwise the node
-removes what it installed and puts back what it removed. Its files change afterwards, in a change of their own.
+The files are uploaded into the node's memory. A process on the node removes conflicting packages and installs the new
+ones; the change is confirmed over a new connection once nothing is missing and the node hears its neighbors again.
+Otherwise the node rolls back to its previous packages. Files are applied afterwards, as a change of their own.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS
 from meshctl.plan.seen import CONFIG
 
 DIRECTORY = "/tmp/meshctl/packages"
-# Unpacking packages into jffs2 takes a minute on the slowest boards, and as much again to keep what is removed.
+# Unpacking packages into jffs2 takes a minute on the slowest boards, and saving the removed ones as long again.
 INSTALL_TIMEOUT_S = 300.0
-# What conflicts is the radios' supplicant: netifd sets each radio up with the one there is now.
+# The conflicting package is the radios' supplicant: netifd sets each radio up with the new one.
 _RESTART_RADIOS = "[ ! -x /sbin/wifi ] || /sbin/wifi\n"
-# A package's uci-defaults edit /etc/config and commit it (base-files, default_postinst): taken up, or put back.
+# A package's uci-defaults edit /etc/config and commit it (base-files, default_postinst), which needs a reload.
 _RELOAD = "reload_config\n"
 
 
 def install(ctx: NodeContext, connection: SshConnection, step: PackageStep) -> Outcome:
-    """Install the step's packages. Owns `connection`, and keeps one to the node if all went well.
+    """Install the step's packages. Owns `connection`; a confirmed node's connection goes to the pool.
 
-    Raises NodeError when nothing but its memory was changed on the node, InputError for a file that is not there.
+    Raises NodeError when only the node's memory has changed, InputError for a missing file.
     """
     try:
         files = [_local(ctx, file) for file in step.files]
         tool = ctx.before.package_tool
         if tool is None:
-            raise NodeError(f"{ctx.name}: it did not tell whether it has opkg or apk")
+            raise NodeError(f"{ctx.name}: expected opkg or apk, found no package manager")
         with ctx.step("packages"):
-            # first, because files in memory do not outlive a boot that is yet to come to its end
+            # first, because files in memory do not survive the end of a first boot
             await_flash(ctx, connection)
             script = deadman.packages(tool, _upload(ctx, connection, files), step.remove)
     except BaseException:
@@ -59,7 +59,7 @@ def install(ctx: NodeContext, connection: SshConnection, step: PackageStep) -> O
 
 def _upload(ctx: NodeContext, connection: SshConnection, files: Sequence[Path]) -> list[str]:
     there = []
-    # of an earlier attempt with other files, which would only fill the memory
+    # files of an earlier attempt would only fill the memory
     names = "|".join(f"{quoted(file.name)}|.{quoted(file.name)}.*.part" for file in files)
     connection.run(
         f"for f in {DIRECTORY}/* {DIRECTORY}/.*; do case ${{f##*/}} in {names}) ;; *) rm -f $f ;; esac; done"
@@ -74,7 +74,7 @@ def _upload(ctx: NodeContext, connection: SshConnection, files: Sequence[Path]) 
 def _new_change(
     ctx: NodeContext, connection: SshConnection, script: str, *, has_other_supplicant: bool
 ) -> ChangeInProgress:
-    """A change of packages alone: the node stays where it is, and has to hear whom it heard."""
+    """A change of packages alone: the node keeps its address, and must hear its neighbors again."""
     here = replace(connection.endpoint, identity=ctx.name)
     expected = Expectation(neighbors=ctx.expected.neighbors, base_macs=ctx.expected.base_macs, needs=ctx.desired.needs)
     reload = _RELOAD + (_RESTART_RADIOS if has_other_supplicant else "exit 0\n")
@@ -91,12 +91,12 @@ def _new_change(
 
 
 def _configuration(before: Observation) -> tuple[str, ...]:
-    """The files below /etc/config, whatever a package's scripts do to them."""
+    """The files below /etc/config, which a package's scripts may change."""
     return tuple(f"/{CONFIG}{package}" for package in sorted(before.uci or {}))
 
 
 def _local(ctx: NodeContext, file: str) -> Path:
-    """A package file's path here; relative ones stand beside the inventory."""
+    """A package file's local path; a relative one is relative to the inventory."""
     path = Path(file).expanduser()
     path = path if path.is_absolute() else Path(ctx.run.fleet.base) / path
     if not path.is_file():

@@ -1,7 +1,7 @@
-"""From an inventory and the fleet as it is to a plan, with everything that carrying it out will need.
+"""Make a plan from the inventory and the observed fleet, with everything its execution needs.
 
-`prepare`: render -> gather -> one plan per node -> the rest of their meshes, where those are cut -> the fleet's order;
-the journal remembers what every node told.
+`prepare`: render -> collect -> one plan per node -> observe the other members of meshes that are cut -> fleet plan.
+The journal stores the facts of every observed node.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from meshctl.topology import mesh_macs
 
 @dataclass(frozen=True, slots=True)
 class PlanOptions:
-    """What a person decided about a plan."""
+    """The operator's options for a plan."""
 
     with_firmware: bool = True
     leave_behind: tuple[str, ...] = ()
@@ -39,7 +39,8 @@ class PlanOptions:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A plan, and what was rendered and seen for it; `around` is what others told who may know these nodes' radios."""
+    """A plan, with the desired and observed states it was made from; `neighbor_observations` are of nodes that may hold
+    station entries of these."""
 
     plan: Plan
     desired: Mapping[str, DesiredState] = field(repr=False)
@@ -62,8 +63,7 @@ def prepare(
 ) -> Prepared:
     """The plan for these nodes. Raises InvalidInput when one of them cannot be rendered.
 
-    Where a running mesh is cut by it, the rest of that mesh is looked at, too: who is far, and who cuts off whom, does
-    not show in a part of it.
+    Where the plan cuts a running mesh, the whole mesh is observed: distances and cut vertices need all of it.
     """
     fleet = renderer.fleet
     chosen = tuple(nodes)
@@ -96,7 +96,7 @@ def _remember(journal: Journal, fleet: Fleet, seen: FleetObservation) -> None:
 
 
 def _other_members(fleet: Fleet, plans: Iterable[NodePlan]) -> tuple[Node, ...]:
-    """The deployed nodes beside these that share a mesh which one of these would cut, leave or come back to."""
+    """The other deployed nodes of meshes that one of these would cut, leave or rejoin."""
     planned = {plan.node: plan for plan in plans}
     meshes = {
         mesh
@@ -109,7 +109,7 @@ def _other_members(fleet: Fleet, plans: Iterable[NodePlan]) -> tuple[Node, ...]:
 
 
 def _former_neighbors(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[str, LastKnown]) -> tuple[Node, ...]:
-    """Who may tell of those that do not answer: the neighbours they had when they were last seen, and the base."""
+    """Nodes that may hear the unreachable ones: their last known neighbors, and the base."""
     chosen = {plan.node: plan for plan in plans}
     macs = known_macs(fleet, known)
     away = [name for name, plan in chosen.items() if plan.verdict is Verdict.AWAY]
@@ -126,10 +126,10 @@ def _former_neighbors(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[st
 
 
 def _unchanged_plans(renderer: Renderer, others: FleetObservation, salt: bytes, owner: str) -> dict[str, NodePlan]:
-    """What would be done to these, had they been chosen, as far as it tells which cell they run."""
+    """Plans of nodes that were not selected, to know which cell they run."""
     plans = {}
     for name, observation in others.observations.items():
-        # a node that was not asked for may not be the reason why nothing can be done to the others
+        # a node that was not selected must not prevent the plan for the others
         with suppress(InvalidInput, InputError):
             desired = renderer.desired(renderer.fleet.nodes[name], observation)
             plans[name] = node_plan(desired, observation, Fingerprints(salt), owner=owner, with_firmware=False)
@@ -147,14 +147,14 @@ def assemble(
     owner: str,
     choices: PlanOptions,
 ) -> Prepared:
-    """The plan for what was rendered without the devices' facts (`first`) and what was seen."""
+    """The plan from what was rendered without device facts (`rendered`) and what was observed."""
     single = _node_plans(renderer, connections, rendered, seen, salt=salt, owner=owner, choices=choices)
     return _with_fleet_plan(renderer.fleet, single, seen, known, salt=salt, choices=choices)
 
 
 @dataclass(frozen=True, slots=True)
 class _NodePlans:
-    """Each node for itself; `around`: others of their meshes, to which nothing is done."""
+    """The plan of each node; `unchanged`: plans of the other members of their meshes."""
 
     plans: Mapping[str, NodePlan]
     desired: Mapping[str, DesiredState] = field(repr=False)
@@ -221,12 +221,12 @@ def _with_fleet_plan(
 
 
 def other_paths(desired: DesiredState) -> tuple[str, ...]:
-    """The absolute paths of a node's files that are no UCI packages."""
+    """The absolute paths of a node's files other than UCI packages."""
     return tuple(f"/{file.path}" for file in desired.files if package_of(file.path) is None)
 
 
 def base_macs(fleet: Fleet, seen: Mapping[str, Observation], known: Mapping[str, LastKnown]) -> tuple[str, ...]:
-    """The mesh MACs of the base's radio, seen now or known from before."""
+    """The mesh MACs of the base, observed now or last known."""
     base = fleet.base_node
     if base is None:
         return ()

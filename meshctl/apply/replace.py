@@ -1,8 +1,8 @@
-"""Give a node's identity to another device: same name, address, role and place in the fleet, other hardware.
+"""Replace a node's hardware: another device takes over its name, address and role.
 
-The old node is dead or gone; the new device is a spare that meshctl knows, or one on the bench. Its host key is pinned
-for the old name, the old node's configuration goes there as any other change, and the inventory learns the new MAC,
-serial number and label (`identity_edits`, pure). If the change fails, pins and inventory stay as they were.
+The new device is a spare of the inventory, or one on the bench. `adopt` pins its host key under the old name; the old
+node's configuration is then applied as any other change, and the inventory gets the new MAC, serial number and label
+(`identity_edits`, pure). If the change fails, pins and inventory stay as they were.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from meshctl.nodes.desired import Renderer
 
 @dataclass(frozen=True, slots=True)
 class Replacement:
-    """The device that takes over: `spare` is its node in the inventory, None for a stranger on the bench."""
+    """The device that takes over: `spare` is its node in the inventory, None for a device on the bench."""
 
     discovered: Discovered
     spare: Node | None
@@ -43,9 +43,9 @@ def adopt(
     target: BenchTarget | None,
     interrupt: Interrupt,
 ) -> Replacement:
-    """Meet the new device and pin its key under the old node's name.
+    """Connect to the new device and pin its key under the old node's name.
 
-    Raises NodeError when the old node still answers as itself, or the new device does not.
+    Raises NodeError when the old node still answers, or the new device does not.
     """
     _require_unreachable(connections, old)
     recorder = AcceptAnyKey()
@@ -60,11 +60,11 @@ def adopt(
         )
         key = recorder.key
     elif spare is not None:
-        # known by name, so its own pin has to fit
+        # checked against its own pin
         connection = connections.open(spare)
         key = connection.host_key
     else:
-        raise InputError("expected a spare of the inventory, or a place on the bench")
+        raise InputError("expected a spare of the inventory, or a device on the bench")
     try:
         seen = observe_cleared(connection, other_paths(renderer.desired(old)), interrupt)
         if key is None:
@@ -83,24 +83,24 @@ def adopt(
 
 
 def _require_unreachable(connections: ConnectionPool, old: Node) -> None:
-    """Two devices with one address and one name would fight: the old one has to be off."""
+    """The old device must be off: two devices with the same address conflict."""
     try:
         connections.open(old).close()
     except NodeError:
         return
     raise NodeError(
-        f"{old.name} still answers at {connections.endpoint(old).address}: two nodes with one address would fight",
-        hint="switch the old one off first",
+        f"{old.name} still answers at {connections.endpoint(old).address}: two nodes with one address conflict",
+        hint="switch the old device off first",
     )
 
 
 def restore_old_pins(trust: TrustStore, old: Node, replacement: Replacement) -> None:
-    """The change failed: believe what was believed before."""
+    """Pin the previous keys again after a failed change."""
     trust.replace(old.name, *replacement.old_pins)
 
 
 def with_identity(fleet: Fleet, old: Node, spare: Node | None) -> Fleet:
-    """The fleet in which the old node carries the spare's label and serial number, as far as they are rendered."""
+    """The fleet with the spare's label and serial number on the old node, because templates may render them."""
     if spare is None:
         return fleet
     adopted = replace(old, label=spare.label or old.label, serial=spare.serial or old.serial)
@@ -108,9 +108,9 @@ def with_identity(fleet: Fleet, old: Node, spare: Node | None) -> Fleet:
 
 
 def identity_edits(old: Node, spare: Node | None, seen: Observation) -> tuple[Mapping[str, str], Mapping[str, str]]:
-    """What the inventory shall say afterwards: of the old node's entry, and of the spare's (empty for none).
+    """The keys to set in the inventory: in the old node's entry, and in the spare's (empty for none).
 
-    Only keys that the inventory uses are written: a fleet that identifies nodes by label need not know MACs.
+    A MAC is written only where the inventory has one: a fleet may identify its nodes by label.
     """
     mine: dict[str, str] = {}
     label_mac = seen.board.label_mac if seen.board is not None else ""

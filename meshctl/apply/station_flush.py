@@ -1,14 +1,13 @@
-"""Have a node's neighbors remove their stale station entries of its radios: what `forget` says, over SSH.
+"""Flush stale station entries: neighbors remove them over SSH while a node's radios restart.
 
-    plan -> those known to hold an entry, and those that may and did not say so (`Forgetting`)
-    before the radio goes: those behind it, and the node itself, watch their entries (`beforehand`)
-    while it is silent: the others, ever more seldom (`while_silent`); when it answers again: all that do not watch,
-    those that did not answer before, and those that it hears now (`when_back`)
-    when all nodes have ended: once more those that did not answer; the operator is shown the rest (`ask_the_rest`)
-    a change that an earlier run lost sight of, or a reboot: the same, as soon as the node is seen again (`make_up_for`)
+    armed: nodes reached through the node, and the node itself, start to watch their entries (`watch_neighbors`)
+    unreachable: the other holders are queried, with growing pauses (`unreachable`)
+    ended: all holders that do not watch, and the nodes it hears now, are queried (`ended`)
+    end of the run: those that did not answer are queried again, and the operator sees the rest (`retry_unanswered`)
+    next run: the same for a change whose end was not observed, or a reboot (`flush_later`)
 
-Asking does no harm where nothing restarted: each neighbor observes whether its entry is stale before it removes it. All
-are asked at once, each within `ASK_S`. Nothing here is a reason for failure: a neighbor that does not answer, or cannot
+A query is harmless where no radio restarted: each neighbor verifies that its entry is stale before it removes it. All
+are queried in parallel, each for at most `QUERY_TIMEOUT_S`. A neighbor that does not answer, or cannot remove its entry
 (19.07), changes no outcome; a note names it.
 """
 
@@ -47,9 +46,9 @@ from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.plan.radios import EVERY_RADIO, Radios, observed_restarts, started_within
 
-# A neighbor's answer: it waits up to 3 s for an echo, once for each of a node's two radios.
+# A neighbor waits up to 3 s for an echo, once for each of a node's two radios.
 QUERY_TIMEOUT_S = 10.0
-# It is no disaster when one cannot be asked, so a new connection may take less time than elsewhere.
+# A failed query does no damage, so these deadlines are shorter than elsewhere.
 _DEADLINES = Deadlines(
     connect_s=5.0,
     handshake_s=10.0,
@@ -58,36 +57,36 @@ _DEADLINES = Deadlines(
     run_s=QUERY_TIMEOUT_S,
     silence_s=QUERY_TIMEOUT_S,
 )
-# A node whose connection is not there by then is silent: an SSH login takes a board two seconds.
+# A node that takes longer to connect counts as unreachable: an SSH login takes a board two seconds.
 SLOW_CONNECT_S = 5.0
-# The fact beside an outcome: who may still go on with the numbers of the radio that was there before.
+# The fact in an outcome: the neighbors that may still hold a stale station entry.
 UNFLUSHED = "not_asked"
-# What becomes of that, for an operator (docs/provisioning.md).
-MAY_LOSE = ": what it sends them may be lost for minutes"
+# The consequence, for the operator (docs/provisioning.md).
+MAY_LOSE = ": unicast frames to them may be lost for minutes"
 
 
-# What a neighbour is to run, written only once it can be sent: ages count up to then, and a login takes seconds, in
-# which an entry that was made anew would grow older than the change seems to be.
+# Makes the script for a neighbor once it is connected: ages count up to then, and during a login of seconds a new entry
+# would seem older than the change.
 Script: TypeAlias = Callable[[], str]
 
 
 @dataclass(slots=True)
 class StationFlush:
-    """What has been asked of the neighbours of one node since these `radios` of it were about to start anew."""
+    """The station flush of one node whose `radios` restart: which neighbors watch, were queried, or did not answer."""
 
     ctx: NodeContext
     radios: Radios = EVERY_RADIO
     _holders: dict[str, tuple[StationEntry, ...]] = field(init=False, repr=False)
-    # those who do it by themselves, and may not be reached while the node is silent
+    # nodes that watch their entries, and may be unreachable while this node is
     _watching: frozenset[str] = frozenset()
     _queried_s: list[float] = field(default_factory=list)
-    # what has been told: a node that is flashed is silent for minutes, and asked about again and again
+    # reported once each, although a node that is flashed is unreachable for minutes and queried for many times
     _journaled_steps: set[str] = field(default_factory=set)
     _reported: set[str] = field(default_factory=set)
-    # since when its radio may have started anew: for the first time, and because it went back
+    # since when its radio may have restarted: first by the change, then by its rollback
     _started_s: float | None = None
     _observed_s: float | None = None
-    # who did not answer when all were asked, and since when an entry is as it should be
+    # the holders that did not answer at the end, and since when an entry is not stale
     _unanswered: dict[str, tuple[StationEntry, ...]] = field(default_factory=dict)
     _since_s: float = 0.0
 
@@ -99,43 +98,43 @@ class StationFlush:
         return self.ctx.name
 
     def watch_neighbors(self, *, for_s: float) -> None:
-        """Have those behind the node watch it; call it while the node still carries their frames."""
+        """Start watches on the nodes reached through this one; call it while the node still forwards their frames."""
         run_context = self.ctx.run
         hidden = routed_through(self.node, run_context.observations, run_context.base_macs)
         names = [name for name in self._holders if name in hidden]
         answers = self._query(
-            "neighbours watch it",
+            "watch neighbor station entries",
             {name: partial(watch_script, self.node, self._holders[name], for_s=for_s) for name in names},
         )
         self._watching = frozenset(name for name, answer in answers.items() if answer)
         unwatched = [name for name in names if name not in self._watching]
         if unwatched:
             run_context.note(
-                f"{_listed(unwatched)} did not answer, and cannot watch for its radio's restart", self.node
+                f"{_listed(unwatched)} did not answer and cannot watch their entries of its radio", self.node
             )
 
     def watch_own_entries(self, connection: SshConnection, *, for_s: float) -> None:
-        """Have the node watch its own entries: should a neighbor remove its entry although the radio did not restart,
-        the node removes its own, and both count from 0. Raises Unreachable."""
+        """Start a watch on the node itself: if a neighbor removes its entry although the radio did not restart, the
+        node removes its own, and both count from 0. Raises Unreachable."""
         entries = own_entries(self.node, self.ctx.before, self.radios)
         if entries:
             connection.run(watch_script(self.node, entries, for_s=for_s))
 
     def started(self) -> None:
-        """From now on its radio may start anew."""
+        """The change starts: from now on its radio may restart."""
         self._started_s = time.monotonic()
 
     def started_ago(self, ago_s: float) -> None:
-        """Its radio may have started anew at any time within the last `ago_s`."""
+        """The change started `ago_s` ago: its radio may have restarted since."""
         self._started_s = time.monotonic() - ago_s
 
     def observed(self) -> None:
-        """It answers, and has not gone back yet."""
+        """The node answered, and the change is still applied."""
         self._observed_s = time.monotonic()
 
     @contextmanager
     def flush_if_slow(self) -> Iterator[None]:
-        """Ask beside what is tried meanwhile, if that takes so long that the node must be silent."""
+        """Query the neighbors in the background if the block takes so long that the node must be unreachable."""
         timer = threading.Timer(SLOW_CONNECT_S, self.unreachable)
         timer.daemon = True
         timer.start()
@@ -146,7 +145,7 @@ class StationFlush:
             timer.join()
 
     def unreachable(self, among: Container[str] | None = None) -> None:
-        """Ask if it is time to; call it whenever the node did not answer. `among`: only these can be reached."""
+        """The node did not answer: query its neighbors if it is time to. `among`: the only ones that are reachable."""
         now_s = time.monotonic()
         if self._started_s is None or now_s < next_query_s(self._queried_s):
             return
@@ -156,8 +155,8 @@ class StationFlush:
             self._flush({name: self._holders[name] for name in names}, self._started_s)
 
     def ended(self, now: Observation | None = None, *, went_back: bool = False, rebooted: bool = False) -> None:
-        """Ask all that do not watch, once the node answers for good. `now` is what it tells then; who has `rebooted`
-        has started all of its radios anew."""
+        """The change has ended: query all holders that do not watch. `now` is the latest observation; a node that has
+        `rebooted` has restarted all of its radios."""
         since_s = self._observed_s if went_back and self._observed_s is not None else self._started_s
         if rebooted:
             self.radios = EVERY_RADIO
@@ -176,8 +175,7 @@ class StationFlush:
     def _flush_seen(
         self, unsure: Sequence[str], asked: Mapping[str, tuple[StationEntry, ...]], now: Observation, since_s: float
     ) -> None:
-        """Those that cannot find out whether their entry is stale remove it for the radios that the node was seen to
-        have restarted."""
+        """Holders that cannot verify their entries remove those of the radios that were observed to restart."""
         restarted = observed_restarts(self.ctx.before, now, time.monotonic() - since_s)
         if not restarted:
             return
@@ -186,8 +184,8 @@ class StationFlush:
         self._flush({name: some for name, some in entries.items() if some}, since_s, has_restarted=True)
 
     def _possible_holders(self, now: Observation | None) -> dict[str, tuple[StationEntry, ...]]:
-        """Who holds an entry as they told; then, on any of their interfaces, those who did not tell, and those who came
-        to know it since."""
+        """Nodes known to hold a station entry, then nodes that may hold one on any interface: those not observed, and
+        new neighbors."""
         run_context, ctx = self.ctx.run, self.ctx
         asked = by_holder(entries_of(self.node, run_context.observations, self.radios))
         observed_macs = {
@@ -199,7 +197,7 @@ class StationFlush:
             *possible_holders(self.node, run_context.observations, names, mesh_nodes),
             *(current_neighbors(now, names) if now else ()),
         )
-        # the radio may have been another one's the last time, or another MAC: whatever is known of it
+        # the radio's MAC may have changed: use all that are known
         own = [
             radio_macs(seen, self.radios) for seen in (run_context.observations.get(self.node), now) if seen is not None
         ]
@@ -212,17 +210,17 @@ class StationFlush:
     def _flush(
         self, asked: Mapping[str, Sequence[StationEntry]], since_s: float, *, has_restarted: bool = False
     ) -> dict[str, str]:
-        """Have them remove stale entries; what each said that answered."""
+        """Have these holders remove stale entries; returns the answers."""
         scripts = {
             name: partial(_flush_since, entries, since_s, has_restarted=has_restarted)
             for name, entries in asked.items()
         }
-        answers = self._query("neighbours forget it", scripts)
+        answers = self._query("flush neighbor station entries", scripts)
         self.report(answers)
         return answers
 
     def report(self, answers: Mapping[str, str]) -> None:
-        """Note who removed a stale entry and who could not, each once."""
+        """Report which holders removed a stale entry and which could not, each once."""
         for word, text in (
             (GONE, "removed a stale entry of its radio"),
             (KEPT, "cannot remove its stale entry" + MAY_LOSE),
@@ -233,16 +231,16 @@ class StationFlush:
                 self.ctx.run.note(f"{_listed(news)} {text}", self.node)
 
     def own_lines(self, answer: str) -> str:
-        """The lines of an answer that are about its radios."""
+        """The lines of an answer that concern this node's radios."""
         macs = {entry.mac for entries in self._unanswered.values() for entry in entries}
         return "\n".join(line for line in answer.splitlines() if line.partition(" ")[2] in macs)
 
     def retries(self) -> dict[str, Script]:
-        """Whom to ask once more, and with what."""
+        """The holders to query again, and their scripts."""
         return {name: partial(_flush_since, entries, self._since_s) for name, entries in self._unanswered.items()}
 
     def _query(self, step: str, scripts: Mapping[str, Script]) -> dict[str, str]:
-        """Run each node's script, all at once; what each printed that answered. The step is told once."""
+        """Run each node's script in parallel; returns the answers. The step is journaled once."""
         if not scripts or self.ctx.run.interrupt.leaving:
             return {}
         telling = nullcontext() if step in self._journaled_steps else self.ctx.step(step)
@@ -252,9 +250,9 @@ class StationFlush:
 
 
 def retry_unanswered(run_context: RunContext) -> dict[str, tuple[str, ...]]:
-    """Ask once more who did not answer when a node was back, each of them for all nodes at once.
+    """Query the neighbors that did not answer again, each once for all nodes.
 
-    Returns node -> who still has not; the operator is told.
+    Returns node -> neighbors that still did not answer, and reports them.
     """
     unfinished = [(flush, flush.retries()) for flush in run_context.unfinished_flushes]
     if not unfinished or run_context.interrupt.leaving:
@@ -275,8 +273,8 @@ def retry_unanswered(run_context: RunContext) -> dict[str, tuple[str, ...]]:
 
 
 def flush_later(ctx: NodeContext, ago_s: float) -> None:
-    """A change was begun on the node that long ago and its end not seen, or it booted then: whichever of its radios
-    have started since, their neighbours are asked to forget those that were there before."""
+    """Flush the entries of radios that have restarted within `ago_s`, since a change whose end was not observed, or
+    since a boot."""
     flush = StationFlush(ctx, started_within(ctx.before, ago_s))
     if ctx.before.uptime_s is not None:
         ago_s = min(ago_s, ctx.before.uptime_s + time.time() - ctx.before.asked_at_s)
@@ -293,7 +291,7 @@ def _joined(scripts: Iterable[Script]) -> str:
 
 
 def _query_all(run_context: RunContext, scripts: Mapping[str, Script]) -> dict[str, str]:
-    """What each printed that answered in time."""
+    """The output of each node that answered in time."""
     with ThreadPoolExecutor(max_workers=min(len(scripts), MAX_QUERIED), thread_name_prefix="forget") as pool:
         answers = pool.map(lambda name: _query_one(run_context, name, scripts[name]), scripts)
         return {name: said for name, said in zip(scripts, answers, strict=True) if said is not None}
@@ -305,7 +303,7 @@ def _query_one(run_context: RunContext, name: str, script: Script) -> str | None
         connection = connections.acquire(name) or connections.open(run_context.fleet.nodes[name], deadlines=_DEADLINES)
     except NodeError:
         return None
-    # a kept connection has longer deadlines of its own, and may lead through the very node that is silent
+    # a pooled connection has longer deadlines, and may lead through the unreachable node
     patience = threading.Timer(QUERY_TIMEOUT_S, connection.close)
     patience.daemon = True
     patience.start()

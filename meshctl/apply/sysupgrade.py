@@ -1,8 +1,9 @@
-"""Replace one node's firmware: everything that can fail is tried before anything is stopped, success is proven.
+"""Flash one node's firmware: check everything that can fail before any service stops, then prove the result.
 
-`flash`: image checked here (`checked_image`), memory on the node, upload, `sysupgrade -T`, the recovery recipe told,
-then `sysupgrade -n -f` detached, with the rendered configuration, the node's own host keys, the dead-man's switch and a
-marker in the archive (`archive`, pure). Proof of success is a new boot id, the wanted revision, the board, the marker.
+`flash`: check the image (`checked_image`) and the node's memory, upload, `sysupgrade -T`, print the recovery recipe,
+start `sysupgrade -n -f` detached. The archive for the new system (`archive`, pure) holds the rendered configuration,
+the node's host keys, the dead-man's switch and a marker. Success means a new boot id, the desired revision, the board
+and the marker.
 """
 
 from __future__ import annotations
@@ -36,16 +37,16 @@ IMAGE_PATH = "/tmp/meshctl/firmware.bin"
 ARCHIVE_PATH = "/tmp/meshctl/firmware.tgz"
 MARKER_PATH = "/etc/meshctl/flashed"
 HOST_KEYS = "/etc/dropbear/dropbear_*_host_key"
-# sysupgrade's own copy of busybox and what it runs in RAM; less and the kernel kills it half way.
+# For sysupgrade's copy of busybox and what it runs in RAM; with less, the kernel kills it half way.
 HEADROOM_BYTES = 4 << 20
-# Writing 16 MB of NOR takes up to 3 minutes, the first boot 2 more, and making keys or joining the mesh its own.
+# Writing 16 MB of NOR takes up to 3 minutes and the first boot 2 more; then keys are made and the mesh is joined.
 RETURN_TIMEOUT_S = 900.0
-# sysupgrade that has not taken the node down by then has given up.
+# If the node has not rebooted by then, sysupgrade has failed.
 START_TIMEOUT_S = 120.0
 
 
 def checked_image(profile: HardwareProfile) -> Path:
-    """The profile's image, once it has passed every check that needs no device. Raises InvalidInput, InputError."""
+    """The profile's image, after every check that needs no device. Raises InvalidInput, InputError."""
     path = image_path(profile)
     if path is None:
         raise InputError(f"hardware {profile.name}: the inventory names no firmware image")
@@ -56,7 +57,7 @@ def checked_image(profile: HardwareProfile) -> Path:
 
 
 def flash(ctx: NodeContext, connection: SshConnection, image: Path) -> Outcome:
-    """Flash a node and prove it. Owns `connection`. Raises NodeError only while nothing on the node has stopped."""
+    """Flash a node and prove it. Owns `connection`. Raises NodeError only while nothing is stopped on the node."""
     flush = StationFlush(ctx)
     try:
         marker = _upload_and_start(ctx, connection, image, flush)
@@ -71,11 +72,11 @@ def flash(ctx: NodeContext, connection: SshConnection, image: Path) -> Outcome:
 
 
 def _upload_and_start(ctx: NodeContext, connection: SshConnection, image: Path, flush: StationFlush) -> str:
-    """Everything up to the moment sysupgrade starts; returns the marker that the new system will hold."""
+    """All steps up to the start of sysupgrade; returns the marker that the new system will have."""
     size = image.stat().st_size
     with ctx.step("check"):
         _check_memory(ctx.before, size)
-        # for its lock: a device fresh from its box has none
+        # for its lock: a factory device has none
         install_switch(ctx, connection)
         deadman.lock(connection, ctx.run.owner, ttl_s=int(RETURN_TIMEOUT_S) + LOCK_SLACK_S)
     with ctx.step("upload"):
@@ -85,7 +86,7 @@ def _upload_and_start(ctx: NodeContext, connection: SshConnection, image: Path, 
     with ctx.step("test"):
         tested = openwrt.check_firmware(connection, IMAGE_PATH)
         if not tested.valid:
-            raise NodeError(f"{ctx.name}: its own sysupgrade refuses the image: {tested.reason}")
+            raise NodeError(f"{ctx.name}: its sysupgrade rejects the image: {tested.reason}")
         if tested.available_bytes is not None and tested.available_bytes < HEADROOM_BYTES:
             raise NodeError(
                 f"{ctx.name}: {tested.available_bytes >> 20} MiB of memory left beside the image, "
@@ -94,10 +95,10 @@ def _upload_and_start(ctx: NodeContext, connection: SshConnection, image: Path, 
             )
         keys = openwrt.fetch_files(connection, [HOST_KEYS])
         if not keys:
-            raise NodeError(f"{ctx.name}: its host keys cannot be read, so they could not be kept")
+            raise NodeError(f"{ctx.name}: cannot read its host keys, so they would be lost")
         marker = secrets.token_hex(16)
         upload(connection, archive(ctx.desired, keys, marker), ARCHIVE_PATH, mode=0o600)
-    recipe = ctx.node.hardware.recovery or "none is written down in its hardware profile"
+    recipe = ctx.node.hardware.recovery or "its hardware profile has no recovery instructions"
     ctx.run.note(f"if it does not come back: {recipe}", ctx.name)
     flush.watch_neighbors(for_s=RETURN_TIMEOUT_S)
     flush.started()
@@ -115,7 +116,7 @@ def _check_memory(before: Observation, size: int) -> None:
 
 
 def archive(desired: DesiredState, host_keys: Mapping[str, FetchedFile], marker: str) -> bytes:
-    """The tar.gz that the new system unpacks at its first boot: same in, same bytes out."""
+    """The tar.gz that the new system unpacks at its first boot, deterministic."""
     files = [(f"/{file.path}", file.content, file.mode) for file in desired.files]
     files += [(path, file.content, file.mode) for path, file in host_keys.items()]
     files += [(path, content, mode) for path, (mode, content) in deadman.installed_files().items()]
@@ -139,7 +140,7 @@ def _tar(files: Iterable[tuple[str, bytes, int]], links: Iterable[tuple[str, str
 
 
 def _await_return(ctx: NodeContext, marker: str, flush: StationFlush) -> Outcome:
-    """Look for the node until it is back and proven, or it is clear that it will not be."""
+    """Poll the node until it is back and verified, or the timeout."""
     backoff = Backoff(RETURN_TIMEOUT_S, ctx.run.interrupt)
     last_error = ""
     while not backoff.is_over and not ctx.run.interrupt.leaving:
@@ -159,19 +160,22 @@ def _await_return(ctx: NodeContext, marker: str, flush: StationFlush) -> Outcome
                 return _verdict(ctx, seen, marker)
             if backoff.elapsed_s > START_TIMEOUT_S:
                 return Outcome(
-                    ctx.name, Result.FAILED, "sysupgrade did not take it down; it runs what it ran", hint="see its log"
+                    ctx.name,
+                    Result.FAILED,
+                    "sysupgrade did not reboot it; it runs the previous firmware",
+                    hint="see its log",
                 )
         backoff.pause()
     return Outcome(
         ctx.name,
         Result.UNCERTAIN,
         f"not back after it was flashed ({last_error})",
-        hint=ctx.node.hardware.recovery or "`meshctl resume` looks at it again",
+        hint=ctx.node.hardware.recovery or "run `meshctl resume` to check it again",
     )
 
 
 def _verdict(ctx: NodeContext, seen: Observation, marker: str) -> Outcome:
-    """Whether the node that came back is the one that was meant to, piece by piece."""
+    """The outcome of a node that came back: revision, board and marker must match."""
     running = seen.release.revision if seen.release else "unknown"
     board = seen.board.board_name if seen.board else "unknown"
     desired = ctx.plan.firmware.to_revision if ctx.plan.firmware is not None else running

@@ -101,7 +101,7 @@ def run(
                     outcomes[node] = future.result()
     if bugs:
         raise bugs[0]
-    why = "interrupted before its turn" if signal.stopping else failure_budget.reason
+    why = "interrupted before it started" if signal.stopping else failure_budget.reason
     for node in waiting:
         outcomes[node] = Outcome(node, Result.PENDING, why)
         observer(Event(EventKind.FINISHED, node, time.time(), why, outcome=outcomes[node]))

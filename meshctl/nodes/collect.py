@@ -1,7 +1,7 @@
-"""Observe many nodes: who answers and what they tell, who does not and why, and the mesh as they see it.
+"""Observe many nodes: their observations, why others gave none, and the mesh graph.
 
-`gather` looks at every node in parallel over connections it keeps; what a dead meshctl of this machine left behind on a
-node (a lock, an armed change) is cleared away first, because nobody else ever will before it runs out.
+`collect` observes nodes in parallel over pooled connections. A lock or an armed change that a dead meshctl process of
+this machine left on a node is cleared first, because nothing else removes it before it expires.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from meshctl.nodes.backoff import Backoff
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.topology import Graph, Report, mesh_macs, observed_graph, report_of, with_alternates
 
-# How long a node may take to put back what a dead process had armed: its files, and a reload.
+# How long a node may take to roll back a change of a dead process: its files, and a reload.
 CLEARING_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class FleetObservation:
-    """`observations` of the nodes that answered; `away` and `refused`: why others gave none (silence, or a host key or
-    login that does not fit)."""
+    """`observations` of the nodes that answered; why others gave none: `unreachable`, or `refused` (a host key or login
+    that does not match)."""
 
     observations: Mapping[str, Observation]
     unreachable: Mapping[str, str]
@@ -43,7 +43,7 @@ class FleetObservation:
         return tuple(report_of(name, seen) for name, seen in self.observations.items())
 
     def graph(self, fleet: Fleet, known: Mapping[str, LastKnown]) -> Graph:
-        """The mesh as these nodes see it. A robot's radios on its switch count as wired together."""
+        """The mesh as these nodes observe it. The radios of a robot are wired together."""
         wires = [
             (first, second)
             for robot in fleet.robots.values()
@@ -55,8 +55,7 @@ class FleetObservation:
 
 
 def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
-    """MAC -> node, from the inventory, from what nodes reported when they were last seen, and the other addresses by
-    which their radios may be heard now."""
+    """MAC -> node: from the inventory, from the journal, and alternate MACs of these radios."""
     macs = {
         mac.lower(): name
         for name, last in known.items()
@@ -77,7 +76,7 @@ def collect(
     interrupt: Interrupt | None = None,
     observer: Observer = silent,
 ) -> FleetObservation:
-    """Observe these nodes; `paths` names the files beside UCI's to look at. Connections stay with `access`."""
+    """Observe these nodes; `paths` names further files to read. Connections stay in the pool."""
     wanted = {node.name: node for node in nodes}
     found: dict[str, Observation] = {}
     errors: dict[str, NodeError] = {}
@@ -107,7 +106,7 @@ def collect(
 
 
 def observe_cleared(connection: SshConnection, paths: tuple[str, ...], interrupt: Interrupt) -> Observation:
-    """One observation, after clearing away what a dead meshctl of this machine left on the node."""
+    """One observation, after clearing the lock and change of a dead meshctl process of this machine."""
     seen = observe(connection, extra_paths=paths)
     change = seen.change
     if change is None or not (is_dead(change.lock_owner) or (is_dead(change.owner) and change.state != "idle")):
@@ -124,7 +123,7 @@ def observe_cleared(connection: SshConnection, paths: tuple[str, ...], interrupt
 
 
 def _clear(connection: SshConnection, change: ChangeStatus) -> None:
-    # what the node refuses here it will tell in its next status
+    # if the node refuses, its next status shows why
     with suppress(NodeRefused):
         if is_dead(change.owner) and change.change_id and change.state not in ("idle", "restoring"):
             deadman.abort(connection, change.owner, change.change_id)
@@ -134,7 +133,7 @@ def _clear(connection: SshConnection, change: ChangeStatus) -> None:
 
 
 def facts_of(seen: Observation) -> dict[str, str]:
-    """What the journal keeps of a node: enough to find it again and to say how it was."""
+    """The facts of a node that the journal stores: how to find it again, and its last known state."""
     facts = {
         "macs": " ".join(mesh_macs(seen)),
         "boot_id": seen.boot_id or "",

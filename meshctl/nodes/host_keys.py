@@ -1,4 +1,4 @@
-"""Which host keys nodes show, against those that are pinned: what `meshctl trust` asks about."""
+"""The nodes' host keys compared with the pinned ones, for `meshctl trust`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from meshctl.nodes.connections import ConnectionPool
 
 @dataclass(frozen=True, slots=True)
 class HostKeyState:
-    """A node's key as it shows it; None with `trouble` when it does not answer. `pinned` are fingerprints."""
+    """A node's current host key; None, with `error`, when it does not answer. `pinned` are fingerprints."""
 
     node: Node
     key: HostKey | None
@@ -41,7 +41,7 @@ class HostKeyState:
 def fetch_host_keys(
     connections: ConnectionPool, trust: TrustStore, nodes: Iterable[Node], *, parallel: int
 ) -> tuple[HostKeyState, ...]:
-    """Ask every node for its host key, believing nothing."""
+    """Fetch the host key of every node, trusting none."""
     by_name = {node.name: node for node in nodes}
     found: dict[str, HostKeyState] = {}
     lock = threading.Lock()
@@ -53,7 +53,7 @@ def fetch_host_keys(
         try:
             connections.open(node, policy=host_key_policy).close()
         except AuthenticationRefused:
-            # the key was shown before the login was refused, and it is the key that was asked for
+            # the host key is known before the login is refused
             pass
         except NodeError as error:
             last_error = str(error)

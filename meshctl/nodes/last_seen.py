@@ -1,7 +1,7 @@
-"""What is known of a node that does not answer: what it told when it was last seen, and who still hears it.
+"""The last known state of an unreachable node, and which nodes still hear it.
 
-`ask_around` looks at the nodes that may hear it, `whereabouts` (pure) puts together what they and the journal know,
-`Whereabouts.text` says it in one line.
+`query_neighbors` observes the nodes that may hear it, `last_seen_of` (pure) combines their observations with the
+journal, `LastSeen.text` is one line for the operator.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from meshctl.nodes.collect import FleetObservation, collect, known_macs
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.topology import Sighting, names_by_mac, report_of, seen_by
 
-# batman-adv forgets whom it has not heard for 200 s (PURGE_TIMEOUT, net/batman-adv/main.h).
+# batman-adv purges an originator after 200 s (PURGE_TIMEOUT, net/batman-adv/main.h).
 REMEMBERED_MS = 200_000
-# Neighbours come first; so many nodes tell enough, and looking at more would hold up a big fleet's end.
+# Neighbors come first; observing more nodes than this would delay the end of a large fleet's run.
 MAX_QUERIED = 12
-# How many of those that hear it are named.
+# How many of the nodes that hear it are named.
 MAX_NAMED = 3
 
 
 @dataclass(frozen=True, slots=True)
 class LastSeen:
-    """`heard` by direct neighbours, `routed` by nodes that had a way to it, both latest first; `asked` is how many
-    nodes told."""
+    """`heard` by direct neighbors, `routed` by nodes with a route to it, both latest first; `asked` is the number of
+    nodes observed."""
 
     last: LastKnown | None
     heard: tuple[Sighting, ...]
@@ -45,7 +45,7 @@ class LastSeen:
             return "never seen before"
         moment = datetime.fromtimestamp(self.last.seen_s, UTC)
         age_s = max(0.0, now_s - self.last.seen_s)
-        # the time of day alone misleads about another day
+        # the time of day alone is ambiguous after half a day
         shown = moment.strftime("%H:%M:%S UTC" if age_s < 12 * 3600 else "%Y-%m-%d %H:%M UTC")
         parts = [f"last seen {_span(age_s)} ago ({shown})"]
         uptime = self.last.facts.get("uptime_s", "")
@@ -58,11 +58,11 @@ class LastSeen:
         if self.heard:
             return "heard by " + ", ".join(_sighting(one) for one in self.heard[:MAX_NAMED])
         if self.routed:
-            return "no neighbour that answers hears it; a way to it was known by " + ", ".join(
+            return "no reachable neighbor hears it; a route to it is known by " + ", ".join(
                 _sighting(one) for one in self.routed[:MAX_NAMED]
             )
         if not self.asked:
-            return "no other node could be asked"
+            return "no other node is reachable"
         return f"heard by none of the {self.asked} node{'s' if self.asked != 1 else ''} that answered"
 
     @property
@@ -93,7 +93,7 @@ def _span(seconds: float) -> str:
 def last_seen_of(
     fleet: Fleet, names: Iterable[str], observations: Mapping[str, Observation], known: Mapping[str, LastKnown]
 ) -> dict[str, LastSeen]:
-    """What is known of each of `names` from what other nodes were seen to hear and from the journal."""
+    """What the other nodes' observations and the journal say about each of `names`."""
     missing = tuple(names)
     others = {name: seen for name, seen in observations.items() if name not in missing}
     reports = [report_of(name, seen) for name, seen in others.items()]
@@ -104,7 +104,7 @@ def last_seen_of(
 
 
 def _routed(observations: Mapping[str, Observation], names: Mapping[str, str]) -> dict[str, tuple[Sighting, ...]]:
-    """Who has an originator's entry of whom, the latest of each."""
+    """Node -> the nodes with an originator entry of it, latest first."""
     latest: dict[str, dict[str, int]] = {}
     for by, seen in observations.items():
         for entry in seen.originators or ():
@@ -127,7 +127,7 @@ def query_neighbors(
     *,
     interrupt: Interrupt,
 ) -> dict[str, LastSeen]:
-    """The same, from a new look at those who heard them before, at the base, and at some others that answered then."""
+    """The same, from new observations of former neighbors, the base, and some other nodes that answered before."""
     missing = tuple(names)
     graph = before.graph(fleet, known)
     neighbors = [other for name in missing for other in graph.neighbours.get(name, ())]

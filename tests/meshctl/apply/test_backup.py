@@ -65,8 +65,8 @@ def test_what_would_disable_services_at_the_next_boot_is_told_and_not_put_back()
         (b"", "expected a tar.gz archive"),
         (b"not gzip at all", "expected a tar.gz archive"),
         (gzip.compress(b"no tar"), "expected a tar.gz archive"),
-        (archive(("etc/config/network", b"x")), "no meshctl-backup.json in it"),
-        (with_info(archive(("etc/passwd", b"x")), INFO), "no configuration in it"),
+        (archive(("etc/config/network", b"x")), "contains no meshctl-backup.json"),
+        (with_info(archive(("etc/passwd", b"x")), INFO), "contains no configuration"),
         (archive(("meshctl-backup.json", b"["), ("etc/config/x", b"")), "meshctl-backup.json is damaged"),
         (archive(("meshctl-backup.json", b"[]"), ("etc/config/x", b"")), "expected an object"),
     ],
@@ -90,7 +90,7 @@ def test_damaged_bytes_give_an_error_or_a_backup_and_nothing_else(noise: bytes, 
 def test_a_backup_goes_onto_its_own_node_and_board_only() -> None:
     seen = running(fleet(), "b01")
     assert incompatibility(saved(), "b01", seen) == ""
-    assert "the backup is of b01, not of b02" in incompatibility(saved(), "b02", seen)
+    assert "the backup is of node b01, not b02" in incompatibility(saved(), "b02", seen)
     assert "is ubnt,rocket-m" in incompatibility(saved(), "b01", replace(seen, board=BoardInfo("ubnt,rocket-m")))
     assert uninstalled_packages(saved(), replace(seen, packages={"iw": "1"})) == ("wpad",)
 

@@ -48,20 +48,20 @@ def test_a_mac_tells_who_it_is() -> None:
 
 
 def test_a_device_that_nobody_knows_needs_the_operators_word() -> None:
-    with pytest.raises(NodeError, match="nothing tells which node it is"):
+    with pytest.raises(NodeError, match="cannot identify the node"):
         identify(labelled(), device("02:00:00:00:00:42"), "")
     assert identify(labelled(), device("02:00:00:00:00:42"), "b02").name == "b02"
 
 
 def test_the_wrong_device_is_refused_whatever_the_operator_says() -> None:
-    with pytest.raises(NodeError, match="said to be b02, its MAC is that of b01"):
+    with pytest.raises(NodeError, match="expected b02, its MAC belongs to b01"):
         identify(labelled(), device(MAC), "b02")
-    with pytest.raises(NodeError, match="b01 has 02:4d:00:00:00:01, this one has 02:00:00:00:00:42"):
+    with pytest.raises(NodeError, match="b01 has MAC 02:4d:00:00:00:01, this one has 02:00:00:00:00:42"):
         identify(labelled(), device("02:00:00:00:00:42"), "b01")
 
 
 def test_one_node_is_not_found_twice() -> None:
-    with pytest.raises(NodeError, match="found at another place already"):
+    with pytest.raises(NodeError, match="already found at another address"):
         identify(labelled(), device(MAC), "", identified=["b01"])
 
 

@@ -104,5 +104,5 @@ def test_that_it_let_nobody_in_counts_more_than_what_was_missing_afterwards() ->
 def test_that_it_could_not_be_reached_is_said_where_nothing_was_missing_afterwards() -> None:
     late = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
     told = rollback_reason(late, (), "", "cannot connect: Connection refused")
-    assert told == "it was not confirmed in time: it could not be reached: cannot connect: Connection refused"
+    assert told == "it was not confirmed in time: it was unreachable: cannot connect: Connection refused"
     assert "reached" not in rollback_reason(late, ("its LAN is down",), "", "cannot connect")

@@ -26,10 +26,10 @@ def prepared(verdict: Verdict) -> Prepared:
 @pytest.mark.parametrize(
     ("verdict", "text"),
     [
-        (Verdict.SAME, "now it is as wanted"),
-        (Verdict.CHANGE, "now it runs what it ran before (it was not confirmed in time), and is changed again"),
-        (Verdict.REFUSED, "now it answers, and is refused: no board"),
-        (Verdict.AWAY, "now it is still not seen"),
+        (Verdict.SAME, "now it is as desired"),
+        (Verdict.CHANGE, "now it runs its previous state (it was not confirmed in time) and is changed again"),
+        (Verdict.REFUSED, "now it answers and is refused: no board"),
+        (Verdict.AWAY, "now it is still unreachable"),
     ],
 )
 def test_each_end_of_an_uncertain_node_is_told(verdict: Verdict, text: str) -> None:
@@ -40,8 +40,8 @@ def test_each_end_of_an_uncertain_node_is_told(verdict: Verdict, text: str) -> N
 def test_one_that_stayed_in_the_old_cell_is_told_how_to_reach_it() -> None:
     left = Outcome("b01", Result.UNCERTAIN, facts={LEFT_BEHIND: "radio0: channel 6 -> 11"})
     assert resolutions(7, [left], prepared(Verdict.AWAY))["b01"].endswith(
-        "still not seen: it stayed in its mesh's old cell (radio0: channel 6 -> 11), "
-        "where only a cable, or a node taken back to it, reaches it"
+        "still unreachable: it is still in the old cell of its mesh (radio0: channel 6 -> 11); "
+        "reach it by cable or from another node in that cell"
     )
 
 

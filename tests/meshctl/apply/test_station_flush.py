@@ -99,7 +99,7 @@ def test_a_node_that_is_silent_for_long_is_told_of_once_however_often_its_neighb
         forgetting.unreachable()
     forgetting.ended()
     assert near.names == ["b01"] * 6
-    assert near.steps == ["neighbours forget it"]
+    assert near.steps == ["flush neighbor station entries"]
     assert near.notes == ["b02: b01 removed a stale entry of its radio"]
 
 
@@ -143,7 +143,7 @@ def test_who_does_not_answer_then_either_is_asked_once_more_in_the_end_and_the_o
     assert near.notes == [
         "b02: b01 removed a stale entry of its radio",
         "b02: b03 and b04 did not answer and may hold a stale entry of its radio: "
-        "what it sends them may be lost for minutes",
+        "unicast frames to them may be lost for minutes",
     ]
 
 
@@ -164,7 +164,7 @@ def test_who_cannot_forget_is_told_to_the_operator() -> None:
     forgetting = StationFlush(near.job)
     forgetting.started()
     forgetting.ended(node("b02"))
-    assert near.notes == ["b02: b01 cannot remove its stale entry: what it sends them may be lost for minutes"]
+    assert near.notes == ["b02: b01 cannot remove its stale entry: unicast frames to them may be lost for minutes"]
 
 
 def test_who_cannot_find_out_removes_the_entry_only_of_a_radio_that_was_seen_to_restart() -> None:
@@ -261,7 +261,7 @@ class TestOnAVirtualFleet:
             ended = rig.meshctl("provision", variant, "n001", "--yes", "--json")
             assert ended.results == {"n001": "done"}, ended.out + ended.err
             assert notes(ended) == []
-            assert not [event for event in ended.events if event.get("text") == "neighbours forget it"]
+            assert not [event for event in ended.events if event.get("text") == "flush neighbor station entries"]
 
     def test_a_node_that_is_put_back_from_a_backup_is_forgotten_by_its_neighbour(self, rig: Rig) -> None:
         folder = rig.directory / "backups"
@@ -281,8 +281,10 @@ class TestOnAVirtualFleet:
         _, new = rig.flip()
         ended = rig.meshctl("provision", new, "n001", "--yes", "--json")
         assert ended.results == {"n001": "done"}, ended.out + ended.err
-        told = "base did not answer and may hold a stale entry of its radio: what it sends them may be lost for minutes"
-        assert notes(ended) == [told]
+        assert notes(ended) == [
+            "base did not answer and may hold a stale entry of its radio: "
+            "unicast frames to them may be lost for minutes"
+        ]
         assert ended.events[-1]["outcomes"][0]["facts"] == {"not_asked": "base"}
         _, new = rig.flip()
         said: list[str] = []

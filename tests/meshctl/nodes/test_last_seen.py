@@ -43,9 +43,7 @@ def test_where_no_neighbour_hears_it_a_way_that_somebody_knew_is_told() -> None:
         running(fleet(), "base"), originators=(Originator(LOST, "02:00:00:00:01:00", "mesh0", 12_000, True, 90),)
     )
     assert (
-        of(base=far)
-        .text(NOW_S)
-        .endswith("; no neighbour that answers hears it; a way to it was known by base 12 s ago")
+        of(base=far).text(NOW_S).endswith("; no reachable neighbor hears it; a route to it is known by base 12 s ago")
     )
 
 
@@ -55,7 +53,7 @@ def test_nobody_who_hears_it_is_told_with_the_number_of_those_asked() -> None:
         .text(NOW_S)
         .endswith("; heard by none of the 2 nodes that answered")
     )
-    assert of().text(NOW_S).endswith("; no other node could be asked")
+    assert of().text(NOW_S).endswith("; no other node is reachable")
 
 
 def test_what_batman_has_long_forgotten_does_not_count() -> None:
@@ -64,7 +62,7 @@ def test_what_batman_has_long_forgotten_does_not_count() -> None:
 
 def test_a_node_never_seen_is_told_as_such_and_an_old_sighting_with_its_day() -> None:
     assert last_seen_of(fleet(), ["b04"], {}, {})["b04"].text(NOW_S) == (
-        "never seen before; no other node could be asked"
+        "never seen before; no other node is reachable"
     )
     assert "last seen 3 d ago (1970-01-01 02:46 UTC)" in of().text(10_000.0 + 3 * 86400)
 
