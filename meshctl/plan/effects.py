@@ -1,7 +1,7 @@
-"""Which services a change of configuration reloads, and what that cuts.
+"""Which services a configuration change reloads, and what that interrupts.
 
-`reload_config` reloads the service of each package that changed (procd's triggers); what that interrupts depends on
-what changed within it and on the release, since netifd takes down only what differs.
+`reload_config` reloads the service of each changed package (procd's triggers). What that interrupts depends on the
+changed options and the release, since netifd takes down only what differs.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from meshctl.plan.radios import RadioChange, radio_changes
 from meshctl.plan.values import Cut, Effect
 from meshctl.uci import Package, Section
 
-# Package -> (service, what its reload cuts), where the content does not matter.
+# Package -> (service, what its reload cuts), whatever options changed.
 _RELOADS: Mapping[str, tuple[str, Cut]] = {
     "system": ("system, log", Cut.NOTHING),
     "dhcp": ("dnsmasq, odhcpd", Cut.NOTHING),
@@ -37,7 +37,7 @@ def _effects(
     path: str, before: Mapping[str, Package | None], after: Mapping[str, Package | None], release: Release
 ) -> list[Effect]:
     if not path.startswith("etc/config/"):
-        # keys and markers are read when they are needed
+        # keys and markers are read on use
         return []
     package = path.rpartition("/")[2]
     if package == "network":
@@ -50,7 +50,7 @@ def _effects(
 
 def _wireless(before: Package | None, after: Package | None, release: Release) -> list[Effect]:
     if not _has_live_radio(before):
-        return [Effect("wifi", Cut.NOTHING, "radios were off")]
+        return [Effect("wifi", Cut.NOTHING, "radios are off")]
     if before is None or after is None:
         return [Effect("wifi", Cut.MESH, "wireless changes")]
     found = [_radio(change) for change in radio_changes(before, after, release)]
@@ -80,10 +80,10 @@ def _network(before: Package | None, after: Package | None) -> list[Effect]:
     found = []
     if any(section.get("proto") in ("batadv", "batadv_hardif") for section in was_there):
         # any option of bat0 destroys and recreates it (openwrt-facts.md section 1)
-        found.append(Effect("network", Cut.MESH, "bat0 is made anew"))
+        found.append(Effect("network", Cut.MESH, "bat0 is recreated"))
     address = _address(old.get("lan")), _address(new.get("lan"))
     if address[0] != address[1]:
-        found.append(Effect("network", Cut.LAN, f"its address moves from {address[0] or '-'} to {address[1] or '-'}"))
+        found.append(Effect("network", Cut.LAN, f"its address changes from {address[0] or '-'} to {address[1] or '-'}"))
     return found or [Effect("network", Cut.LAN, "network changes")]
 
 

@@ -1,7 +1,7 @@
-"""One node: what the inventory wants of it against what was seen of it -> `NodePlan`.
+"""The plan of one node: desired state against observation -> `NodePlan`.
 
-`node_plan` looks for what forbids touching it (`objections`), then for the firmware step, the package step, the files
-that differ, what their reload cuts, and what would part the node from its mesh. A second plan after an apply is empty.
+`node_plan` checks the preconditions, then finds the firmware step, the package step, the files that differ, what their
+reload interrupts, and whether the node would leave the cell of its mesh. A second plan after an apply is empty.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PUBLIC_FILES = (MARKER_PATH, "etc/dropbear/authorized_keys")
 
 @dataclass(frozen=True, slots=True)
 class DesiredState:
-    """What the inventory wants of one node: its rendered files, the secrets in them, its packages."""
+    """The desired state of one node: its rendered files, the secrets in them, its packages."""
 
     node: Node
     files: Sequence[RenderedFile] = field(repr=False)
@@ -53,8 +53,8 @@ def node_plan(
     with_firmware: bool = True,
     own_keys: Sequence[OwnKey] | None = None,
 ) -> NodePlan:
-    """The plan of one node. `seen` None means it did not answer, `away` says why; `owner` is who we are to its lock,
-    `own_keys` what we log in with (None: not asked)."""
+    """The plan of one node. `seen` is None for a node that did not answer, and `unreachable` is the reason; `owner` is
+    our name in its lock; `own_keys` are checked for a lockout (None: not checked)."""
     node = desired.node
     target = fingerprints.of(
         {file.path: f"{file.mode:o} " + file.content.decode("utf-8", "surrogateescape") for file in desired.files},
@@ -113,7 +113,7 @@ def node_plan(
 
 
 def _partitioned_meshes(node: Node, radios: Iterable[str]) -> tuple[str, ...]:
-    """The meshes of these radios, or all of the node's when one of the radios is not in the inventory."""
+    """The meshes of these radios; all of the node's if a radio is not in the inventory."""
     mesh_of = {radio.name: radio.mesh for radio in node.radios}
     names = set(radios)
     if not names <= set(mesh_of):
@@ -122,19 +122,20 @@ def _partitioned_meshes(node: Node, radios: Iterable[str]) -> tuple[str, ...]:
 
 
 def _tagged_ports(node: Node, seen: Observation, network: Package | None) -> tuple[str, ...]:
-    """Ports that lead to a switch which takes tagged frames alone: the inventory names eth0, the board eth0.1."""
+    """Ports to a switch that accepts only tagged frames: the inventory names eth0, the board eth0.1."""
     if network is None or seen.board is None or not any(network.of_type("switch_vlan")):
         return ()
     parents = {port.partition(".")[0]: port for port in seen.board.lan_ports if "." in port}
     return tuple(
-        f"{port} leads to a switch, whose LAN is {parents[port]}: what is on its ports will not be heard (lan_ports)"
+        f"{port} connects to a switch whose LAN is {parents[port]}: devices on its ports will be unreachable; "
+        "correct lan_ports"
         for port in node.lan_ports
         if port in parents
     )
 
 
 def _lacking_scripts(node: Node, seen: Observation, basis: NodePlan, firmware: FirmwareStep | None) -> tuple[str, ...]:
-    """That the radio's own scripts are not all there. A node that is in its mesh has them, by whatever name."""
+    """A note if the package with the wireless scripts is missing. A node in its mesh has them, by whatever name."""
     package = wireless_scripts(node.release)
     if package is None or firmware is not None or seen.packages is None or package in seen.packages:
         return ()
@@ -142,14 +143,14 @@ def _lacking_scripts(node: Node, seen: Observation, basis: NodePlan, firmware: F
         return ()
     return (
         f"it lacks {package}: without its /usr/share/hostap/wdev.uc OpenWrt {node.release} brings up no mesh "
-        "interface, encrypted or not; if so, the node goes back by itself. Build the image with it",
+        "interface, and the node would roll back. Build the image with it",
     )
 
 
 def file_changes(files: Sequence[RenderedFile], seen: Observation) -> tuple[FileChange, ...]:
-    """The files that are not on the node as they shall be, each with a masked diff.
+    """The files that differ from the desired ones, each with a masked diff.
 
-    UCI packages are compared as trees: other quoting, comments or blank lines are no difference to OpenWrt.
+    UCI packages are compared as trees: quoting, comments and blank lines make no difference to OpenWrt.
     """
     return tuple(change for file in files if (change := _file_change(file, seen)) is not None)
 
@@ -166,7 +167,7 @@ def _file_change(file: RenderedFile, seen: Observation) -> FileChange | None:
         return None
     if live == content:
         return FileChange(file.path, "changed", f"mode {info.mode:04o} -> {file.mode:04o}\n")
-    # what stands there now may hold secrets of a kind that nobody can tell: only what is public by nature is shown
+    # the current file may hold unknown secrets, so only files that are public by nature are shown
     old = live if live is not None and file.path in PUBLIC_FILES else "(not shown)\n"
     return FileChange(file.path, "changed", _diff(file.path, old, file.masked))
 
@@ -176,7 +177,7 @@ def _package_change(path: str, desired: Package, live: str | None) -> FileChange
         return FileChange(path, "added", _diff(path, "", masked_text(desired)))
     current = parsed(live, desired.name)
     if current is None:
-        return FileChange(path, "changed", f"--- a/{path}\n(no UCI reader accepts what is there)\n+++ b/{path}\n")
+        return FileChange(path, "changed", f"--- a/{path}\n(not readable as UCI)\n+++ b/{path}\n")
     if current == desired:
         return None
     old = masked_text(current, differing_from=desired)

@@ -1,8 +1,8 @@
-"""The order of a fleet's change: who first, who together, who alone, who last, each with its reason.
+"""The stages of a fleet's change, each with its nodes and its reason.
 
-`stages_of` takes the nodes with something to do and the observed mesh and gives stages: nodes outside any running mesh
-(nothing is cut), then whole-mesh switches, then the running mesh from its far end, cut vertices alone, and last the
-node we stand on. The first stage of each kind is a canary when the policy asks for one.
+`stages_of` orders the nodes to change by the observed mesh: nodes outside any running mesh (nothing is cut), then
+whole-mesh changes, then the running mesh from its far end, with each cut vertex alone, and the entry node last. If the
+policy asks for it, the first stage of a kind is a canary.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from meshctl.topology import Graph, Path
 
 @dataclass(frozen=True, slots=True)
 class MeshContext:
-    """What the order depends on besides the plans: the observed mesh, the node we reach it through, the robots."""
+    """What the order depends on besides the plans: the observed mesh, its entry node, the policy, the robots."""
 
     graph: Graph
     entry: str
@@ -29,7 +29,7 @@ class MeshContext:
 def stages_of(
     plans: Iterable[NodePlan], context: MeshContext, switches: Mapping[str, Sequence[str]] | None = None
 ) -> tuple[Stage, ...]:
-    """The stages for all plans with something to do. `switches` maps meshes to the nodes that change cell together."""
+    """The stages of these plans. `switches` maps meshes to the nodes that change their cell simultaneously."""
     switched = {name for nodes in (switches or {}).values() for name in nodes}
     todo = [plan for plan in plans if plan.node not in switched]
     rank = {name: position for position, name in enumerate(context.graph.farthest_first(context.entry))}
@@ -38,19 +38,19 @@ def stages_of(
     harmless = [plan for plan in todo if plan.is_meshed and plan.cut <= Cut.LOGIN]
     cutting = [plan for plan in todo if plan.is_meshed and plan.cut > Cut.LOGIN]
     return (
-        *_together(free, context.policy, "outside any running mesh: nothing in use is cut"),
+        *_together(free, context.policy, "outside any running mesh: nothing in use is interrupted"),
         *(_switch(mesh, nodes, context) for mesh, nodes in (switches or {}).items()),
-        *_together(harmless, context.policy, "nothing is cut by it"),
+        *_together(harmless, context.policy, "interrupts nothing"),
         *_rolling(cutting, context),
     )
 
 
 def _together(plans: Sequence[NodePlan], policy: ApplyPolicy, reason: str) -> tuple[Stage, ...]:
-    """All at once (the executor bounds how many are in work), after one of them alone."""
+    """All in one stage (the executor limits the parallelism), after a canary."""
     names = [plan.node for plan in plans]
-    # devices fresh from their box have nothing to lose, and undo themselves like all others
+    # factory devices need no canary: they have no configuration to lose
     if policy.canary and len(names) > 1 and any(plan.has_cell for plan in plans):
-        first = Stage(StageKind.CANARY, (names[0],), f"first alone, to see it work; {reason}")
+        first = Stage(StageKind.CANARY, (names[0],), f"canary: first alone; {reason}")
         return (first, Stage(StageKind.FREE, tuple(names[1:]), reason))
     return (Stage(StageKind.FREE, tuple(names), reason),) if names else ()
 
@@ -64,38 +64,42 @@ def _switch(mesh: str, nodes: Sequence[str], context: MeshContext) -> Stage:
     return Stage(
         StageKind.SWITCH,
         (*names, *last),
-        f"{what}: {count} node{'s' if count > 1 else ''} at one moment, undone everywhere unless "
-        f"{context.policy.quorum:.0%} of them meet again",
+        f"{what}: {count} node{'s' if count > 1 else ''} simultaneously, rolled back unless "
+        f"{context.policy.quorum:.0%} rejoin",
         mesh=mesh,
     )
 
 
 def _rolling(plans: Sequence[NodePlan], context: MeshContext) -> tuple[Stage, ...]:
-    """From the far end inward, at most `max_down` at once, cut vertices alone, the entry last."""
+    """From the far end inward, at most `max_down` at once, each cut vertex alone, the entry last."""
     paths = context.graph.paths(context.entry)
     cuts = context.graph.cut_off_by(context.entry)
     waiting = [plan.node for plan in plans if plan.node != context.entry]
     stages: list[Stage] = []
     if context.policy.canary and len(waiting) > 1:
-        # the farthest node whose loss harms nobody else
+        # the farthest node that is not a cut vertex
         canary = next((name for name in waiting if name not in cuts), waiting[0])
         waiting.remove(canary)
-        reason = f"first alone, to see it work: {_distance(canary, paths)}"
+        reason = f"canary: first alone; {_distance(canary, paths)}"
         stages.append(Stage(StageKind.CANARY, (canary,), reason, cuts.get(canary, ())))
     while waiting:
         batch = _batch(waiting, context, cuts)
         waiting = [name for name in waiting if name not in batch]
         lost = cuts.get(batch[0], ())
         if lost:
-            reason = f"alone, a cut vertex: while it is down {', '.join(lost)} cannot be reached"
+            reason = f"alone, because it is a cut vertex: while it is down {', '.join(lost)} cannot be reached"
         elif len(batch) == 1:
             reason = _distance(batch[0], paths)
         else:
-            reason = f"together, they cut nobody else off: {'; '.join(_distance(name, paths) for name in batch)}"
+            reason = (
+                f"together, because they cut off no other node: {'; '.join(_distance(name, paths) for name in batch)}"
+            )
         stages.append(Stage(StageKind.ROLLING, batch, reason, lost))
     if any(plan.node == context.entry for plan in plans):
         rest = sorted(context.graph.reachable(context.entry) - {context.entry})
-        stages.append(Stage(StageKind.LAST, (context.entry,), "last: we reach the mesh through it", tuple(rest)))
+        stages.append(
+            Stage(StageKind.LAST, (context.entry,), "last, because the mesh is reached through it", tuple(rest))
+        )
     return tuple(stages)
 
 
@@ -107,7 +111,7 @@ def _batch(waiting: Sequence[str], context: MeshContext, cuts: Mapping[str, tupl
         if len(batch) >= max(1, context.policy.max_down):
             break
         robots = {context.robot_of.get(other) for other in batch} - {None, ""}
-        # both radios of a robot down at once would cut the robot itself off
+        # with both radios of a robot down, the robot itself would be cut off
         if name in cuts or context.robot_of.get(name) in robots:
             continue
         if not context.graph.cut_off_by_all(context.entry, [*batch, name]):
@@ -118,5 +122,5 @@ def _batch(waiting: Sequence[str], context: MeshContext, cuts: Mapping[str, tupl
 def _distance(name: str, paths: Mapping[str, Path]) -> str:
     path = paths.get(name)
     if path is None:
-        return f"{name} has no known way to us"
+        return f"{name} has no known path to the entry"
     return f"{name} is {path.hops} hop{'s' if path.hops != 1 else ''} away, quality {path.quality:.0%}"

@@ -1,4 +1,4 @@
-"""Why meshctl would not touch a node: found before anything is sent to it, each with its remedy."""
+"""Preconditions of changing a node, checked before anything is sent to it; each failed one has a hint."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def failed_precondition(
     is_flashed: bool,
     packages: PackageStep | None,
 ) -> FailedPrecondition | None:
-    """The first reason against touching this node, or None. `owner` is who we are to the node's lock."""
+    """The first precondition that this node fails, or None. `owner` is our name in the node's lock."""
     case = _Checked(node, seen, uci, owner, is_flashed, packages)
     return next((found for check in _CHECKS if (found := check(case)) is not None), None)
 
@@ -46,7 +46,7 @@ def failed_precondition(
 def _observed(case: _Checked) -> FailedPrecondition | None:
     if case.seen.uci is None or case.seen.board is None:
         missing = "its configuration" if case.seen.uci is None else "its board"
-        return FailedPrecondition(f"it did not tell {missing}", "; ".join(case.seen.notes))
+        return FailedPrecondition(f"cannot read {missing}", "; ".join(case.seen.notes))
     return None
 
 
@@ -57,7 +57,7 @@ def _board(case: _Checked) -> FailedPrecondition | None:
         return None
     return FailedPrecondition(
         f"wrong board: expected {expected} ({case.node.hardware.name}), found {found or 'none'}",
-        "another device answers here, or the node's hardware is wrong in the inventory",
+        "another device answers at this address, or the node's hardware is wrong in the inventory",
     )
 
 
@@ -67,7 +67,7 @@ def _release(case: _Checked) -> FailedPrecondition | None:
     found = case.seen.release.version if case.seen.release else "an unknown release"
     return FailedPrecondition(
         f"its configuration is for OpenWrt {case.node.release}, it runs {found}",
-        "name the firmware's image and revision in the inventory so that it is flashed, or correct the release",
+        "set the firmware image and revision in the inventory to have it flashed, or correct the release",
     )
 
 
@@ -78,7 +78,7 @@ def _radio_paths(case: _Checked) -> FailedPrecondition | None:
         found = "" if section is None else section.get("path")
         if found and radio.hardware.path and found != radio.hardware.path:
             return FailedPrecondition(
-                f"{radio.name} stands at another path: expected {radio.hardware.path}, found {found}",
+                f"wrong path of {radio.name}: expected {radio.hardware.path}, found {found}",
                 "copy the path from the device into its hardware profile",
             )
     return None
@@ -103,8 +103,8 @@ def _packages(case: _Checked) -> FailedPrecondition | None:
     if not lacking:
         return None
     return FailedPrecondition(
-        f"it lacks {', '.join(lacking)} and no package file brings it",
-        "bake it into the image (`meshctl render --imagebuilder`), or name package_files in its hardware profile",
+        f"it lacks {', '.join(lacking)}, and no package file provides it",
+        "build it into the image (`meshctl render --imagebuilder`), or set package_files in its hardware profile",
     )
 
 
@@ -113,7 +113,7 @@ def _foreign_changes(case: _Checked) -> FailedPrecondition | None:
     if not changes:
         return None
     return FailedPrecondition(
-        f"somebody has uncommitted changes on it: {'; '.join(changes[:3])}",
+        f"it has uncommitted UCI changes: {'; '.join(changes[:3])}",
         "run `uci commit` or `uci revert` on the node, then plan again",
     )
 
@@ -123,11 +123,11 @@ def _other_operator(case: _Checked) -> FailedPrecondition | None:
     if change is None:
         return None
     if change.lock_owner and change.lock_owner != case.owner:
-        left = f" for another {change.lock_left_s:.0f} s" if change.lock_left_s else ""
-        return FailedPrecondition(f"{change.lock_owner} has locked it{left}")
+        left = f" for {change.lock_left_s:.0f} more seconds" if change.lock_left_s else ""
+        return FailedPrecondition(f"locked by {change.lock_owner}{left}")
     if change.state in ("armed", "waiting", "applied", "restoring") and change.owner != case.owner:
         return FailedPrecondition(
-            f"a change of {change.owner or 'somebody'} is {change.state} on it", "wait until it has ended"
+            f"{change.owner or 'another operator'} has a change {change.state} on it", "wait until it has ended"
         )
     return None
 

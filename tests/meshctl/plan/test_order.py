@@ -64,7 +64,7 @@ def test_one_at_a_time_no_node_goes_before_a_farther_one(mesh: Graph) -> None:
 def test_a_line_goes_from_its_end_and_names_its_cut_vertices() -> None:
     stages = stages_of([changing(name) for name in NAMES[:4]], around(graph("base-b00", "b00-b01", "b01-b02")))
     assert [stage.nodes for stage in stages] == [("b02",), ("b01",), ("b00",), ("base",)]
-    assert stages[1].reason == "alone, a cut vertex: while it is down b02 cannot be reached"
+    assert stages[1].reason == "alone, because it is a cut vertex: while it is down b02 cannot be reached"
     assert stages[0].reason == "b02 is 3 hops away, quality 73%"
 
 
